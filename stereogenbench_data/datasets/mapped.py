@@ -4,7 +4,7 @@ import copy
 import multiprocessing
 import operator
 import warnings
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, Self, Unpack, get_args
 
@@ -27,7 +27,7 @@ from stereogenbench_data.datasets.shared_epoch import DrawnSamples, FetchedCount
 from stereogenbench_data.datasets.tensors import to_tensors
 from stereogenbench_data.errors import SelectionError, text_without_secrets
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.checks import check_samples
+from stereogenbench_data.samples.checks import check_samples, without_odd_scenes
 from stereogenbench_data.samples.coming import Step
 from stereogenbench_data.samples.fields import (
     DEFAULT_PAIR_FIELDS,
@@ -41,7 +41,7 @@ from stereogenbench_data.samples.transforms import Compose, Crop, Letterbox, Res
 from stereogenbench_data.samples.writer import Allocate, new_array
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.selection.filters import SceneFilters
+from stereogenbench_data.selection.filters import SceneFilters, may_pass
 from stereogenbench_data.selection.options import options_of, require_options
 from stereogenbench_data.selection.order import EpochOrder, OrderRule, Runs, Tail
 from stereogenbench_data.selection.plan import Address, Plan, Selection, plan_pairs, plan_views
@@ -69,7 +69,11 @@ class MixedSplitsWarning(UserWarning):
 
 
 class _MappedScenes(Dataset[Sample]):
-    """Samples of a plan by number, loaded in the calling process."""
+    """Samples of a plan by number, loaded in the calling process.
+
+    Attributes:
+        left_out: How many scenes were selected and cannot give what is requested.
+    """
 
     def __init__(  # noqa: PLR0913 - what its subclasses take
         self,
@@ -82,9 +86,12 @@ class _MappedScenes(Dataset[Sample]):
         buffers: Buffers,
         fetch_ahead_bytes: int,
     ) -> None:
+        selected = len(plan.scene_rows)
+        plan = without_odd_scenes(index, plan, request)
         check_samples(index, plan, request)
         self.index = index
         self.plan = plan
+        self.left_out = selected - len(plan.scene_rows)
         self.request = request
         opened = _opens_checked(check, plan)
         ahead = FetchAhead(limit_bytes=fetch_ahead_bytes)
@@ -443,13 +450,13 @@ class StereoPairs(_MappedScenes):
             SelectionError: If nothing matches, naming the filter that left nothing and what
                 there is; or if a pair, frame or filter does not exist.
             FieldError: If a field does not exist, or a size is not one.
-            StorageError: If the data are not there, or hold broken scenes (all are named).
+            StorageError: If the data are not there, or hold more than a few broken scenes.
             MediaError: If depth that a field needs cannot have been stored whole (8 bits, a lossy
                 codec, chroma) and the depth contract does not accept it.
         """
         of_loader = options_of(self.loader)
         require_options(StereoPairs, selection, elsewhere={"loader": of_loader})
-        index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
+        index = _opened(data, selection)
         plan = plan_pairs(index, seed=seed, **selection)
         _warn_of_mixed_splits(index, plan, selection)
         request = parse_request(
@@ -517,7 +524,7 @@ class SceneViews(_MappedScenes):
         Raises:
             SelectionError: If nothing matches, or a camera does not exist.
             FieldError: If a field does not exist, or the transform swaps views.
-            StorageError: If the data are not there, or hold broken scenes (all are named).
+            StorageError: If the data are not there, or hold more than a few broken scenes.
         """
         of_loader = options_of(self.loader)
         require_options(SceneViews, filters, elsewhere={"loader": of_loader})
@@ -530,7 +537,7 @@ class SceneViews(_MappedScenes):
             depth=depth,
             transform=transform,
         )
-        index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
+        index = _opened(data, filters)
         plan = plan_views(index, cameras=cameras, frames=frames, seed=seed, filters=filters)
         _warn_of_mixed_splits(index, plan, filters)
         super().__init__(
@@ -542,6 +549,13 @@ class SceneViews(_MappedScenes):
             buffers=buffers,
             fetch_ahead_bytes=fetch_ahead_bytes,
         )
+
+
+def _opened(data: Data, filters: Mapping[str, Any]) -> SceneIndex:
+    """Return the index of some data; of a folder without one, of the scenes that may be chosen."""
+    if isinstance(data, SceneIndex):
+        return data
+    return SceneIndex.open(data, wanted=may_pass(filters))
 
 
 def _warn_of_mixed_splits(index: SceneIndex, plan: Plan, filters: SceneFilters) -> None:

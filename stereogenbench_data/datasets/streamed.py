@@ -69,7 +69,7 @@ class StereoPairStream(IterableDataset[Sample]):
         Raises:
             SelectionError: If nothing matches, or an option is out of its range.
             FieldError: If a field does not exist, or a size is not one.
-            StorageError: If the data are not there, or hold broken scenes (all are named).
+            StorageError: If the data are not there, or hold more than a few broken scenes.
             MediaError: If depth that a field needs cannot have been stored whole.
         """
         require_options(StereoPairStream, options)

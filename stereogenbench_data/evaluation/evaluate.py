@@ -12,7 +12,7 @@ from typing import Any, Final, TypedDict, Unpack
 
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
-from stereogenbench_data.errors import EvaluationError, PredictionError
+from stereogenbench_data.errors import EvaluationError, PredictionError, StorageError
 from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, group_by, tally
 from stereogenbench_data.evaluation.columns import IMAGE_DISTANCES, VIDEO_DISTANCES
 from stereogenbench_data.evaluation.frame_metrics import fields_of, models_of
@@ -32,7 +32,9 @@ from stereogenbench_data.evaluation.predictions import (
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, require_tier
 from stereogenbench_data.evaluation.scene_scores import SceneWork, score_scene
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.text import counted
+from stereogenbench_data.selection.filters import may_pass
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import Selection
 from stereogenbench_data.selection.windows import Random
@@ -172,7 +174,19 @@ def select_workload(
         key: value for key, value in options.items() if key not in RunOptions.__optional_keys__
     }
     selection.setdefault("frames", "all")
-    data = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
+    wanted = may_pass(selection)
+    if not isinstance(data, SceneIndex):
+        data = SceneIndex.open(data, wanted=wanted)
+    lost = [] if data.is_from_file else [
+        key for key in data.broken if wanted is None or wanted(parse_scene_key(key))
+    ]  # fmt: skip
+    if lost:
+        raise StorageError(
+            f"{data.where}: {counted(len(lost), 'scene')} cannot be used, such as {lost[0]}: "
+            f"{data.broken[lost[0]]} A score is not computed on fewer scenes unless you ask for "
+            f"it: mend them, choose others with filters, or leave them out on purpose by an index "
+            f"of the others (`stereogenbench index`)."
+        )
     data.require_released("The evaluation")
     dataset = StereoPairs(
         data,
@@ -182,6 +196,12 @@ def select_workload(
         **selection,
     )
     plan, index = dataset.plan, dataset.index
+    if dataset.left_out:
+        raise StorageError(
+            f"{index.where}: {counted(dataset.left_out, 'selected scene')} cannot be scored, as "
+            f"the warning says, and a score is not computed on fewer scenes unless you ask for it: "
+            f"leave them out with filters, such as scenes=..., or mend their files."
+        )
     chosen, windows = plan.pairs, plan.windows
     if windows.is_clip or isinstance(windows, Random):
         raise EvaluationError(

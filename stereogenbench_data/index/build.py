@@ -4,6 +4,7 @@ A `Journal` keeps the described scenes, so a killed run continues where it stopp
 """
 
 import base64
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -30,12 +31,14 @@ from stereogenbench_data.index.tree import FoundScenes, find_remote_scenes, find
 from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.schema.document import brief
 from stereogenbench_data.schema.parse import parse_scene_key
-from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
+from stereogenbench_data.schema.records import REMARKS, DepthEncoding, Scene, SceneId
 from stereogenbench_data.schema.release import TRAIN_MAPS, Subset, depth_name
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.location import is_remote, shown
 
 _NAMED: Final = 6
+ALIKE: Final = 20
+"""How many scenes that are broken for one reason show that it is the format."""
 POOL_FROM: Final = 64
 """How many scenes there must be for worker processes to be worth their start."""
 
@@ -86,6 +89,7 @@ def walk(  # noqa: PLR0913 - each is an option of the command
     journal: Journal | None = None,
     valid_depth: ValidDepth = "skip",
     wanted: Callable[[SceneId], bool] | None = None,
+    if_none: Literal["refuse", "all"] = "refuse",
 ) -> TreeReport:
     """Return every scene of a tree in the released layout, and what is wrong with the others.
 
@@ -100,12 +104,16 @@ def walk(  # noqa: PLR0913 - each is an option of the command
         valid_depth: "sample" decodes some depth pictures of each scene, for the share of pixels
             that have a depth.
         wanted: Returns whether to describe the scene of a path; None is all.
+        if_none: What to do where no scene is wanted: refuse, or describe all of them.
 
     Raises:
-        StorageError: If there is no such scene below the root, or a worker process died.
+        StorageError: If there is no such scene below the root, or a worker process died; or if the
+            first `ALIKE` scenes are broken for one reason, so that it is the format of the files.
     """
     require_workers(workers)
     folders = find_remote_scenes(str(root)) if is_remote(root) else find_scene_folders(root)
+    if wanted is not None and if_none == "all":
+        wanted = wanted if any(wanted(parse_scene_key(key)) for key in folders.keys) else None
     if wanted is not None:
         folders = _chosen(root, folders, wanted)
     outcomes = _reused(root, folders.keys, journal)
@@ -118,12 +126,28 @@ def walk(  # noqa: PLR0913 - each is an option of the command
     task = _DescribeTask(str(root), valid_depth)
     for outcome in engine.map(task, pending, name=str, workers=workers):
         outcomes[outcome.key] = outcome
+        if len(outcomes) == ALIKE:
+            _require_not_all_alike(root, outcomes.values())
         if journal is not None and outcome.scene is not None:
             journal.record(outcome.key, _journalled(outcome.scene), stamp=outcome.stamp)
         if progress is not None:
             progress(len(outcomes), total)
     in_order = [outcomes[key] for key in folders.keys]
     return _report(root, folders, in_order, is_part=wanted is not None)
+
+
+def _require_not_all_alike(root: str | Path, outcomes: Iterable[_Outcome]) -> None:
+    """Refuse a tree whose first scenes are broken for one reason: so are the others."""
+    kinds = {
+        out.kind + re.sub(r"[0-9.]+", "#", out.reason.replace(out.key, "")) for out in outcomes
+    }
+    first = min(outcomes, key=lambda out: out.key)
+    if len(kinds) == 1 and first.kind == "broken":
+        raise StorageError(
+            f"{shown(root)}: the first {ALIKE} scenes cannot be used, all for one reason, so it is "
+            f"the format of the files and no single scene. The first: {first.reason}\nThe names "
+            f"that are understood stand in docs/formats.md; ask for others with this message."
+        )
 
 
 def _chosen(
@@ -210,9 +234,23 @@ def _report(
         scenes=tuple(scenes),
         incomplete={out.key: out.reason for out in outcomes if out.kind == "incomplete"},
         broken=dict(sorted((folders.refused | broken).items())),
-        notes=(*subsets, *labels, *_depth_notes(found)),
+        notes=(*subsets, *labels, *_remarks(found), *_depth_notes(found)),
         is_part=is_part,
     )
+
+
+def _remarks(scenes: list[Scene]) -> list[str]:
+    """Return what is remarked about scenes, once for each kind, and what it holds up."""
+    first: dict[str, str] = {}
+    counts: Counter[str] = Counter()
+    for scene in scenes:
+        for about in {remark.about for remark in scene.remarks}:
+            counts[about] += 1
+            first.setdefault(about, scene.remark(about))
+    return [
+        f"{about} of {counted(counts[about], 'scene')} (holds up {REMARKS[about]}), such as {text}"
+        for about, text in sorted(first.items())
+    ]
 
 
 def _depth_notes(scenes: list[Scene]) -> list[str]:

@@ -10,7 +10,7 @@ any other root is for the user to name.
 """
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
@@ -31,6 +31,7 @@ from stereogenbench_data.index.parquet import (
 )
 from stereogenbench_data.index.stale import StaleIndexWarning, stale_message
 from stereogenbench_data.index.tree import find_remote_scenes
+from stereogenbench_data.schema.records import SceneId
 from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.sources.location import (
     is_remote,
@@ -49,6 +50,9 @@ MAX_INDEX_BYTES: Final = 256 * 2**20
 
 MOST_REMOTE_SCENES: Final = 64
 """The most scenes behind a URL that are described when a tree without an index is opened."""
+
+MOST_LEFT_OUT: Final = 0.05
+"""The largest share of a tree's scenes that may be broken; one always may."""
 
 _LONGEST_ROOT: Final = 300
 _LONGEST_REASON: Final = 5000
@@ -80,7 +84,13 @@ class Opened(NamedTuple):
     seek_tables: SeekTables = None
 
 
-def open_table(data: str | Path, *, root: str | Path | None, retry: RetryPolicy | None) -> Opened:
+def open_table(
+    data: str | Path,
+    *,
+    root: str | Path | None,
+    retry: RetryPolicy | None,
+    wanted: Callable[[SceneId], bool] | None = None,
+) -> Opened:
     """Return the scenes of some data; `SceneIndex.open` describes the arguments and the errors.
 
     Warnings name scenes that cannot be used, and an index that is older than its data; they point
@@ -95,7 +105,7 @@ def open_table(data: str | Path, *, root: str | Path | None, retry: RetryPolicy 
         where = str(path)
         if path.is_dir() and not (path / INDEX_NAME).is_file():
             _require_no_root(path, named_root)
-            opened = _open_tree(path)
+            opened = _open_tree(path, wanted)
         elif path.is_dir() or path.is_file():
             file = path / INDEX_NAME if path.is_dir() else path
             opened = _open_file(file, root=named_root)
@@ -159,7 +169,7 @@ def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opene
                 f"their headers each time. Index it once, or the part you need: `stereogenbench "
                 f"index {shown(beside)} -o index.parquet --split eval`, and open that file."
             ) from None
-        return _open_tree(beside)
+        return _open_tree(beside, None)
     if size > MAX_INDEX_BYTES:
         raise StorageError(
             f"{remote.where}: an index may have {MAX_INDEX_BYTES:,} bytes, this one has "
@@ -173,18 +183,26 @@ def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opene
     return Opened(table, head, seek_tables=read_seek_tables(content))
 
 
-def _open_tree(root: str | Path) -> Opened:
-    """Describe the scenes of a folder or URL in the released layout."""
+def _open_tree(root: str | Path, wanted: Callable[[SceneId], bool] | None) -> Opened:
+    """Describe the scenes of a folder or URL in the released layout, without a few broken ones."""
     # In this process: a script without `if __name__ == "__main__"` could start no others.
-    report, where = walk(root, workers=1), shown(root)
-    if report.broken:
+    report, where = walk(root, workers=1, wanted=wanted, if_none="all"), shown(root)
+    if not report.scenes:
+        raise StorageError(
+            f"{where}: no scene is complete: {_listed(report.broken | report.incomplete)}"
+        )
+    found = len(report.scenes) + len(report.broken)
+    if len(report.broken) > max(1, found * MOST_LEFT_OUT):
         raise StorageError(
             f"{where}: {_listed(report.broken)}\nRepair or remove them; or leave them out on "
             f"purpose: `stereogenbench index {where}` makes an index without them."
         )
-    if not report.scenes:
-        raise StorageError(f"{where}: no scene is complete: {_listed(report.incomplete)}")
-    head = IndexHead(root=report.root, incomplete=report.incomplete, is_part=report.is_part)
+    head = IndexHead(
+        root=report.root,
+        incomplete=report.incomplete,
+        broken=report.broken,
+        is_part=report.is_part,
+    )
     table = table_of_scenes(report.scenes, where=where)
     return Opened(table, head, seek_tables=seek_tables_of(report.scenes))
 

@@ -24,7 +24,7 @@ from stereogenbench_data.errors import StorageError, cure_of, describe_os_error,
 from stereogenbench_data.index.arrow import as_numpy, one_array
 from stereogenbench_data.index.rows import ADDED, SCHEMA, SEEK_COLUMN, TRAINING_COLUMNS, row_of
 from stereogenbench_data.schema.document import MOST_LETTERS
-from stereogenbench_data.schema.records import Scene, ShardFacts
+from stereogenbench_data.schema.records import REMARKS, Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.schema.training import MOST_PSNR_DB
@@ -361,6 +361,10 @@ def require_sound(table: pa.Table, *, where: str) -> None:
                 f"The index was altered. {made_again(where)}"
             )
     _require_texts(table, where=where)
+    about = pc.struct_field(pc.list_flatten(table.column("remarks")), "about")
+    odd = [text for text in pc.unique(about).to_pylist() if text not in REMARKS]
+    if odd:
+        raise _odd(where, "remarks", odd[0], f"not about one of {', '.join(REMARKS)}")
     _require_numbers(table, members, where=where)
 
 
@@ -369,6 +373,8 @@ def _require_lengths(table: pa.Table, members: Any, *, where: str) -> None:
     texts = {name: column for name, column in columns.items() if pa.types.is_string(column.type)}
     for name in ("depth_unit_source", "depth_codec", "depth_pixel_format"):
         texts[name] = pc.list_flatten(columns[name])
+    remarks = pc.list_flatten(columns["remarks"])
+    texts |= {f"a remark's {name}": pc.struct_field(remarks, name) for name in ("about", "text")}
     texts |= {f"a member's {name}": pc.struct_field(members, name) for name in ("name", "path")}
     for name, column in texts.items():
         most = _LONGEST_NAME if name in ("family", "map_name") else MOST_LETTERS

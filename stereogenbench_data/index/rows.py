@@ -11,6 +11,7 @@ import pyarrow as pa
 
 from stereogenbench_data.schema.records import (
     Member,
+    Remark,
     Rig,
     Scene,
     SceneId,
@@ -27,6 +28,9 @@ _MEMBER: Final = pa.struct(
         pa.field("size", pa.int64(), nullable=False),
         pa.field("crc32", pa.uint32()),
     ]
+)
+_REMARK: Final = pa.struct(
+    [pa.field("about", pa.string(), nullable=False), pa.field("text", pa.string(), nullable=False)]
 )
 
 
@@ -85,6 +89,8 @@ _COLUMNS: Final[dict[str, tuple[pa.DataType, bool, tuple[str | int, ...]]]] = {
     "training_settings": (_TEXT, _NULLABLE, ("training", "settings")),
     "psnr_db": (_list(_NUMBER), _NULLABLE, ("training", "psnr_db")),
     "worst_psnr_db": (_list(_NUMBER), _NULLABLE, ("training", "worst_psnr_db")),
+    "remarks": (_list(_REMARK), _NULLABLE, ("remarks",)),
+    "pose_form": (_TEXT, _NULLABLE, ("pose_form",)),
     "members": (_list(_MEMBER), _REQUIRED, ("members",)),
 }
 """Name of a column to its type, whether it may be null, and where `Scene` holds its value."""
@@ -94,7 +100,10 @@ TRAINING_COLUMNS: Final = tuple(
 )
 """Columns of what training shards say; all are null for released scenes."""
 
-ADDED: Final = ("key_frames", "recorded_width_px", "recorded_height_px", *TRAINING_COLUMNS)
+ADDED: Final = (
+    "key_frames", "recorded_width_px", "recorded_height_px", *TRAINING_COLUMNS, "remarks",
+    "pose_form",
+)  # fmt: skip
 """Columns that indexes of earlier versions lack: null means what these knew."""
 
 SCHEMA: Final = pa.schema(
@@ -122,6 +131,7 @@ def row_of(scene: Scene) -> dict[str, Any]:
         row[name] = list(value) if isinstance(value, tuple) else value
     if scene.key_frames == (0,):
         row["key_frames"] = None
+    row["remarks"] = [asdict(remark) for remark in scene.remarks] or None
     row["members"] = [
         {"name": name, **asdict(member)} for name, member in sorted(scene.members.items())
     ]
@@ -147,6 +157,7 @@ def scene_of(row: Mapping[str, Any]) -> Scene:
 
     scene = values()
     scene["key_frames"] = scene["key_frames"] or (0,)
+    scene["remarks"] = tuple(Remark(**each) for each in scene["remarks"] or ())
     scene["members"] = {
         item["name"]: Member(item["path"], item["offset"], item["size"], item["crc32"])
         for item in row["members"]

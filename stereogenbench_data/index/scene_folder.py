@@ -15,16 +15,19 @@ from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
-from jaxtyping import Float64
 
-from stereogenbench_data.errors import MediaError, SchemaError, StorageError, explain_os_errors
+from stereogenbench_data.errors import (
+    MediaError,
+    SchemaError,
+    StereoGenBenchError,
+    StorageError,
+    explain_os_errors,
+    text_without_secrets,
+)
 from stereogenbench_data.geometry.camera import recorded_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
-from stereogenbench_data.geometry.rig import (
-    baseline_deviation_cm,
-    lateral_offsets_m,
-    rectification_residual_px,
-)
+from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
+from stereogenbench_data.index.evidence import poses_as, understood_poses
 from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
@@ -48,6 +51,7 @@ from stereogenbench_data.schema.records import (
     DepthEncoding,
     DepthUnitSource,
     Member,
+    Remark,
     Rig,
     Scene,
     SceneLabels,
@@ -67,8 +71,8 @@ from stereogenbench_data.schema.release import (
     VIDEO_FILES,
     depth_name,
 )
+from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.schema.training import TrainingDocument, parse_training
-from stereogenbench_data.schema.trajectory import parse_trajectory
 from stereogenbench_data.sources.location import is_remote, joined
 from stereogenbench_data.sources.members import read_text_file
 from stereogenbench_data.sources.ranged_file import MemberFile, RangedFile
@@ -79,14 +83,14 @@ _T = TypeVar("_T")
 ValidDepth = Literal["skip", "sample"]
 
 _DESCRIPTIONS: Final = (DESCRIPTION_JSON, DESCRIPTION_TXT)
-_NEEDED: Final = (COMPLETE_JSON, BASELINE_JSON, TRAJECTORY_JSON)
+_DEPTHS: Final = frozenset(name for name in VIDEO_FILES if name.endswith("_depth.mkv"))
+_LONGEST_REMARK: Final = 2000
+_MOST_FRAMES_APART: Final = 2
+"""How many frames the streams of a scene may differ by; more is a video that was cut short."""
 _NO_DEPTH: Final = StreamFacts(CODEC_NAME, "gray16le", 0, 0, 0, 0.0, {})
 """What the index says of depth of a scene of training shards that has none."""
 _DEVIATION_CM: Final = 0.1
 _DEVIATION_SHARE: Final = 0.001
-_LEAST_BESIDE: Final = 0.9
-"""How much of a baseline must lie along camera 0's x axis; in a lateral rig the cameras turn by at
-most 25 degrees from the line on which they stand."""
 _FILES: Final = frozenset(
     {*METADATA_FILES, TRAINING_JSON, *VIDEO_FILES, *PACKED_DEPTH_NAMES.values()}
 )
@@ -171,6 +175,9 @@ def stamp_of(files: Mapping[str, tuple[int, int]]) -> str:
 def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "skip") -> Scene:
     """Return the index row of a finished scene.
 
+    What no sample needs, or only some fields, becomes a remark of the row: poses that are not
+    understood (the rig is then assumed rectified), videos that cannot be opened, odd texts.
+
     Args:
         root: The folder that holds ``train`` and ``eval``, or its URL.
         key: The scene's path below it.
@@ -179,9 +186,9 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
 
     Raises:
         IncompleteScene: If the scene is not marked as complete or has no video at all.
-        StorageError: If files are missing, unreadable or contradict each other.
-        SchemaError: If a metadata file does not follow the format.
-        MediaError: If a video is not what its header says.
+        StorageError: If files that every sample needs are missing, unreadable or contradict each
+            other, or `SchemaError` or `MediaError` if one of them is not understood. All problems
+            of all files are in one message.
     """
     folder = SceneFolder(root, key)
     files = folder.stamps()
@@ -190,28 +197,35 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         document = parse_training(folder.read(TRAINING_JSON), where=f"{key}/{TRAINING_JSON}")
     videos = _videos_of(document)
     _require_finished(key, files, videos=videos)
-    rig, labels = parse_rig(folder.read(BASELINE_JSON), where=f"{key}/{BASELINE_JSON}")
-    marked = parse_complete(folder.read(COMPLETE_JSON), where=f"{key}/{COMPLETE_JSON}")
-    trajectory = parse_trajectory(folder.read(TRAJECTORY_JSON), where=f"{key}/{TRAJECTORY_JSON}")
+    problems: list[StereoGenBenchError] = []
+    remarks: list[Remark] = []
+    rig, labels = None, SceneLabels()
+    try:
+        where = f"{key}/{BASELINE_JSON}"
+        rig, labels, odd = parse_rig(folder.read(BASELINE_JSON), where=where)
+        remarks += odd
+    except StereoGenBenchError as error:
+        problems.append(error)
+    marked, odd = parse_complete(folder.read(COMPLETE_JSON), where=f"{key}/{COMPLETE_JSON}")
+    remarks += odd
     texts: dict[str, bytes] = {name: folder.read(name) for name in _DESCRIPTIONS if name in files}
-    caption = _caption(texts, key=key)
-    facts, tables = {}, {}
-    for name in videos:
-        held = _held(files, name)
-        facts[name], table = _probed(folder, key, held)
-        if table is not None:
-            tables[held] = table
-    counts = {name: fact.frames for name, fact in facts.items()}
-    counts[TRAJECTORY_JSON] = trajectory.frame_count
-    frames = _common(key, counts, what="number of frames", unit="frames")
-    rig = _sized_as_videos(key, rig, facts, document=document)
-    _require_kinds(key, rig, facts)
-    poses = CameraPoses.from_trajectory(trajectory)
-    _require_recorded_baselines(key, rig, poses)
-    lateral_m = lateral_offsets_m(poses)
-    residual_px = rectification_residual_px(poses, recorded_intrinsics(rig))
-    _require_lateral_rig(key, rig, lateral_m, residual_px=residual_px)
-    depths = _of_each_camera({name: facts[name] for name in videos if name.endswith("_depth.mkv")})
+    caption, odd = _caption(texts, key=key)
+    remarks += odd
+    facts, tables, unread = _all_probed(folder, key, files, videos)
+    try:
+        frames = _common_frames(key, facts, remarks)
+        _require_one_size(key, facts)
+        if rig is not None:
+            rig = _sized_as_videos(key, rig, facts, document=document, remarks=remarks)
+            _require_kinds(key, rig, facts)
+    except StereoGenBenchError as error:
+        problems.append(error)
+    if rig is None or problems:
+        raise _all_of(key, problems)
+    if unread:
+        remarks.append(Remark("videos", "; ".join(unread.values())))
+    poses, pose_form = _poses(folder, key, files, rig, frames=frames, remarks=remarks)
+    depths = _of_each_camera({name: fact for name, fact in facts.items() if name in _DEPTHS})
     units = [_depth_unit(facts, name=f"{key}/{name}") for name, facts in depths]
     ratio = None if valid_depth == "skip" else _valid_ratio(folder, key, frames)
     scene = Scene(
@@ -221,19 +235,34 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         rig=rig,
         frames=frames,
         frame_rate_hz=next(iter(facts.values())).frame_rate_hz,
-        lateral_m=tuple(map(float, lateral_m)),
-        rig_residual_px=residual_px,
+        lateral_m=_assumed_places_m(rig) if poses is None else _places_m(poses),
+        rig_residual_px=(
+            0.0 if poses is None else rectification_residual_px(poses, recorded_intrinsics(rig))
+        ),
         depth_unit_m=tuple(unit_m for unit_m, _ in units),
         depth_unit_source=tuple(source for _, source in units),
         depth_codec=tuple(facts.codec for _, facts in depths),
         depth_pixel_format=tuple(facts.pixel_format for _, facts in depths),
         valid_depth_ratio=ratio,
         key_frames=_common_key_frames(facts, frames=frames),
-        members={name: Member(f"{key}/{name}", 0, size) for name, (size, _) in files.items()},
+        remarks=tuple(
+            Remark(each.about, shortened(text_without_secrets(each.text), _LONGEST_REMARK))
+            for each in remarks
+        ),
+        pose_form=pose_form,
+        members={
+            name: Member(f"{key}/{name}", 0, size)
+            for name, (size, _) in files.items()
+            if name not in unread
+        },
         seek_tables=packed_tables(tables),
     )
-    if document is None:
-        return scene
+    return scene if document is None else _of_training(scene, document)
+
+
+def _of_training(scene: Scene, document: TrainingDocument) -> Scene:
+    """Return the row of a scene of training shards, which must be what its document says."""
+    key = scene.id.key
     derived = replace(derived_scene(scene, document), depth_codec=scene.depth_codec)
     for what, found, said in (
         ("key", key, document.key),
@@ -245,6 +274,97 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
                 f"{brief(found)}. A file is of another scene: fetch the scene again."
             )
     return derived
+
+
+def _all_of(key: str, problems: list[StereoGenBenchError]) -> StereoGenBenchError:
+    """Return one error for all problems of a scene's files."""
+    if len(problems) == 1:
+        return problems[0]
+    listed = "\n  ".join(str(problem) for problem in problems)
+    return StorageError(f"{key}: {len(problems)} of its files cannot be used:\n  {listed}")
+
+
+def _all_probed(
+    folder: SceneFolder, key: str, files: Mapping[str, object], videos: tuple[str, ...]
+) -> tuple[dict[str, StreamFacts], dict[str, SeekTable], dict[str, str]]:
+    """Return what videos are, where their packets lie, and why others cannot be opened.
+
+    A scene without the videos of one camera still has the pairs of the others.
+    """
+    facts, tables, unread = {}, {}, {}
+    for name in videos:
+        held = _held(files, name)
+        if held not in files:
+            unread[held] = f"{key}/{held}: is missing, and the scene is marked as complete"
+            continue
+        try:
+            facts[name], table = _probed(folder, key, held)
+        except MediaError as error:
+            unread[held] = str(error)
+            continue
+        if table is not None:
+            tables[held] = table
+    return facts, tables, unread
+
+
+def _poses(
+    folder: SceneFolder,
+    key: str,
+    files: Mapping[str, object],
+    rig: Rig,
+    *,
+    frames: int,
+    remarks: list[Remark],
+) -> tuple[CameraPoses | None, str | None]:
+    """Return the poses that fit the rig and the names of their readings, or neither."""
+    where = f"{key}/{TRAJECTORY_JSON}"
+    found, reason = None, f"{where}: is missing."
+    if TRAJECTORY_JSON in files:
+        try:
+            found = understood_poses(folder.read(TRAJECTORY_JSON), rig, where=where)
+        except SchemaError as error:
+            reason = str(error)
+    if found is not None and found.poses.frame_count < frames:
+        reason = (
+            f"{where}: has poses of {found.poses.frame_count} frames, and the videos have {frames}."
+        )
+        found = None
+    if found is None:
+        if not _assumed_places_m(rig):
+            raise StorageError(
+                f"{reason} Without poses the rig is assumed to be a straight line of cameras, and "
+                f"the baselines in {BASELINE_JSON} do not add up to one: correct either file."
+            )
+        remarks.append(Remark("poses", reason))
+        return None, None
+    if found.differ:
+        listed = ", ".join(name.partition(" @ ")[0] for name in found.names)
+        remarks.append(
+            Remark("world", f"{where}: several readings of its poses fit the rig: {listed}")
+        )
+    return found.poses, "|".join(found.names)
+
+
+def _places_m(poses: CameraPoses) -> tuple[float, ...]:
+    return tuple(map(float, lateral_offsets_m(poses)))
+
+
+def _assumed_places_m(rig: Rig) -> tuple[float, ...]:
+    """Return the distance of each camera to the right of camera 0 by the baselines alone.
+
+    The cameras are assumed to stand on a line; () where the baselines are not those of a line.
+    """
+    first, last = max(CAMERA_PAIRS, key=lambda pair: rig.baseline_cm(*pair))
+    along_cm = [
+        0.0 if camera == first else rig.baseline_cm(first, camera) for camera in range(CAMERA_COUNT)
+    ]
+    for (a, b), baseline_cm in zip(CAMERA_PAIRS, rig.baselines_cm, strict=True):
+        allowed_cm = _DEVIATION_CM + _DEVIATION_SHARE * along_cm[last]
+        if abs(abs(along_cm[b] - along_cm[a]) - baseline_cm) > allowed_cm:
+            return ()
+    left, right = rig.primary_pair
+    sign = 1 if along_cm[right] > along_cm[left] else -1
+    return tuple(sign * (place_cm - along_cm[0]) / 100 for place_cm in along_cm)
 
 
 def _videos_of(document: TrainingDocument | None) -> tuple[str, ...]:
@@ -290,30 +410,33 @@ def _require_finished(key: str, files: Mapping[str, object], *, videos: tuple[st
         raise IncompleteScene(f"{key}: has no {COMPLETE_JSON}, so it was never finished")
     if not any(_held(files, name) in files for name in videos):
         raise IncompleteScene(f"{key}: has metadata only, and none of its {len(videos)} videos")
-    missing = [name for name in (*_NEEDED, *videos) if _held(files, name) not in files]
-    if missing:
+    if BASELINE_JSON not in files:
         raise StorageError(
-            f"{key}: is marked as complete and has no {', '.join(missing)} "
+            f"{key}: is marked as complete and has no {BASELINE_JSON} "
             f"(it has {', '.join(files)}). Fetch what is missing."
         )
 
 
-def _caption(texts: Mapping[str, bytes], *, key: str) -> str:
+def _caption(texts: Mapping[str, bytes], *, key: str) -> tuple[str, tuple[Remark, ...]]:
     """Return a scene's caption from its files: the detailed one, else the short one, else ""."""
+    remarks: tuple[Remark, ...] = ()
     if DESCRIPTION_JSON in texts:
-        description = parse_description(texts[DESCRIPTION_JSON], where=f"{key}/{DESCRIPTION_JSON}")
+        where = f"{key}/{DESCRIPTION_JSON}"
+        description, remarks = parse_description(texts[DESCRIPTION_JSON], where=where)
         written = description.detailed_caption or description.short_caption
         if written:
-            return written
+            return written, remarks
     if DESCRIPTION_TXT in texts:
-        written = parse_text(texts[DESCRIPTION_TXT], where=f"{key}/{DESCRIPTION_TXT}").strip()
+        where = f"{key}/{DESCRIPTION_TXT}"
+        try:
+            written = parse_text(texts[DESCRIPTION_TXT], where=where).strip()
+        except SchemaError as error:
+            return "", (*remarks, Remark("caption", str(error)))
         if len(written) > MOST_LETTERS:
-            raise SchemaError(
-                f"{key}/{DESCRIPTION_TXT}: may have {MOST_LETTERS:,} letters, this one has "
-                f"{len(written):,}. Replace it with the file of the release."
-            )
-        return written
-    return ""
+            odd = f"{where}: may have {MOST_LETTERS:,} letters, this one has {len(written):,}"
+            return "", (*remarks, Remark("caption", odd))
+        return written, remarks
+    return "", remarks
 
 
 def _merged_labels(labels: SceneLabels, marked: SceneLabels) -> SceneLabels:
@@ -329,46 +452,82 @@ def _common_key_frames(facts: Mapping[str, StreamFacts], *, frames: int) -> tupl
     return tuple(sorted(common | {0}))
 
 
-def _common(key: str, found: Mapping[str, _T], *, what: str, unit: str) -> _T:
-    """Return what all files of a scene must have in common, given what each has."""
-    common = Counter(found.values()).most_common(1)[0][0]
-    others = [f"{name} has {value}" for name, value in found.items() if value != common]
-    if others:
+def _common_frames(key: str, facts: Mapping[str, StreamFacts], remarks: list[Remark]) -> int:
+    """Return how many frames all videos have."""
+    if not facts:
+        raise MediaError(f"{key}: none of its videos can be opened. Fetch the scene again.")
+    counts = {name: fact.frames for name, fact in facts.items()}
+    common = Counter(counts.values()).most_common(1)[0][0]
+    odd = [f"{name} has {count}" for name, count in counts.items() if count != common]
+    told = (
+        f"{key}: its videos must have one number of frames: {len(counts) - len(odd)} have "
+        f"{common}, but {', '.join(odd)}"
+    )
+    if any(abs(count - common) > _MOST_FRAMES_APART for count in counts.values()):
+        raise StorageError(f"{told}. Fetch those again.")
+    frames = min(counts.values())
+    if odd:
+        remarks.append(Remark("frames", f"{told}. The first {frames} of all are used"))
+    return frames
+
+
+def _require_one_size(key: str, facts: Mapping[str, StreamFacts]) -> None:
+    sizes = {name: f"{fact.width_px}x{fact.height_px}" for name, fact in facts.items()}
+    common = Counter(sizes.values()).most_common(1)[0][0]
+    odd = [f"{name} has {size}" for name, size in sizes.items() if size != common]
+    if odd:
         raise StorageError(
-            f"{key}: its files must have one {what}: {len(found) - len(others)} have {common} "
-            f"{unit}, but {', '.join(others)}. Fetch those again."
+            f"{key}: its files must have one picture size: {len(sizes) - len(odd)} have {common} "
+            f"pixels, but {', '.join(odd)}. Fetch those again."
         )
-    return common
 
 
 def _sized_as_videos(
-    key: str, rig: Rig, facts: Mapping[str, StreamFacts], *, document: TrainingDocument | None
+    key: str,
+    rig: Rig,
+    facts: Mapping[str, StreamFacts],
+    *,
+    document: TrainingDocument | None,
+    remarks: list[Remark],
 ) -> Rig:
-    """Return the rig for pictures of the videos' size.
+    """Return the rig for pictures of the videos' size, which counts whatever baseline.json says.
 
-    This differs from the recorded one where baseline.json records no size, and where the videos
-    were derived.
+    A principal point, in pixels of the recorded image, moves with the size.
     """
-    sizes = {name: f"{fact.width_px}x{fact.height_px}" for name, fact in facts.items()}
-    common = _common(key, sizes, what="picture size", unit="pixels")
     first = next(iter(facts.values()))
-    size_px = (first.width_px, first.height_px)
-    recorded_px = size_px if document is None else document.source_size_px
-    if document is not None and size_px != document.size_px:
+    width_px, height_px = first.width_px, first.height_px
+    if document is not None and (width_px, height_px) != document.size_px:
         raise StorageError(
             f"{key}: {TRAINING_JSON} is for pictures of {document.size_px[0]}x"
-            f"{document.size_px[1]} pixels, and all videos have {common}. Fetch the scene again."
+            f"{document.size_px[1]} pixels, and all videos have {width_px}x{height_px} pixels. "
+            f"Fetch the scene again."
         )
-    is_fixed = rig.image_size_source == "recorded" or rig.principal_point_px is not None
-    if recorded_px != (rig.image_width_px, rig.image_height_px) and is_fixed:
-        raise StorageError(
-            f"{key}: {BASELINE_JSON} is for pictures of {rig.image_width_px}x"
-            f"{rig.image_height_px} pixels, and all videos have {common}. Correct image_width "
-            f"and image_height, or fetch the videos again."
+    recorded_px = (width_px, height_px) if document is None else document.source_size_px
+    known_px = rig.image_width_px, rig.image_height_px
+    if rig.image_size_source == "recorded" and known_px != recorded_px:
+        remarks.append(
+            Remark(
+                "size",
+                f"{key}: {BASELINE_JSON} is for pictures of {known_px[0]}x{known_px[1]} pixels, "
+                f"and all videos have {recorded_px[0]}x{recorded_px[1]}, which counts",
+            )
         )
-    width_px, height_px = size_px
+    point_px = rig.principal_point_px
+    if point_px is not None and known_px != recorded_px:
+        scales = [recorded / known for recorded, known in zip(recorded_px, known_px, strict=True)]
+        if rig.image_size_source == "default":  # in pixels of the videos, then
+            scales = [1.0, 1.0]
+        point_px = (point_px[0] * scales[0], point_px[1] * scales[1])
+        if all(abs(at - side / 2) <= 1 for at, side in zip(point_px, recorded_px, strict=True)):
+            point_px = None
+    height_mm = rig.sensor_height_mm
+    if height_mm == rig.sensor_width_mm * known_px[1] / known_px[0]:
+        # Recorded pixels are square, and Unreal renders square pixels at any size.
+        height_mm = rig.sensor_width_mm * recorded_px[1] / recorded_px[0]
     return replace(
         rig,
+        principal_point_px=point_px,
+        sensor_height_mm=height_mm,
         image_width_px=width_px,
         image_height_px=height_px,
         recorded_size_px=None if document is None else document.source_size_px,
@@ -398,38 +557,6 @@ def _require_kinds(key: str, rig: Rig, facts: Mapping[str, StreamFacts]) -> None
                 f"{key}/{name}: holds colours (codec {fact.codec}, {fact.pixel_format}, container "
                 f"{fact.container}), and depth is one number a pixel, as in {grey} other depth "
                 f"videos of the scene. Another video stands under this name: fetch it again."
-            )
-
-
-def _require_recorded_baselines(key: str, rig: Rig, poses: CameraPoses) -> None:
-    if baseline_deviation_cm(poses, rig) <= _DEVIATION_CM:
-        return
-    for (camera_a, camera_b), recorded_cm in zip(CAMERA_PAIRS, rig.baselines_cm, strict=True):
-        for frame in range(poses.frame_count):
-            posed_cm = poses.baseline_m(frame, camera_a, camera_b) * 100
-            allowed_cm = _DEVIATION_CM + _DEVIATION_SHARE * recorded_cm
-            if not abs(posed_cm - recorded_cm) <= allowed_cm:
-                raise StorageError(
-                    f"{key}: {BASELINE_JSON} says that cameras {camera_a} and {camera_b} are "
-                    f"{recorded_cm:.6g} cm apart, and by the poses of {TRAJECTORY_JSON} they are "
-                    f"{posed_cm:.6g} cm apart in frame {frame} (allowed: {allowed_cm:.3g} cm). "
-                    f"Is one of the files another scene's, or the unit wrong?"
-                )
-
-
-def _require_lateral_rig(
-    key: str, rig: Rig, lateral_m: Float64[np.ndarray, "6"], *, residual_px: float
-) -> None:
-    """Refuse poses in which the cameras are not side by side, or do not look the same way."""
-    for (camera_a, camera_b), recorded_cm in zip(CAMERA_PAIRS, rig.baselines_cm, strict=True):
-        beside_cm = abs(float(lateral_m[camera_b] - lateral_m[camera_a])) * 100
-        if not math.isfinite(residual_px) or beside_cm < _LEAST_BESIDE * recorded_cm:
-            raise StorageError(
-                f"{key}: by the poses of {TRAJECTORY_JSON}, cameras {camera_a} and {camera_b} are "
-                f"{beside_cm:.6g} cm beside each other as camera 0 looks, and {BASELINE_JSON} says "
-                f"that they are {recorded_cm:.6g} cm apart; or a camera looks away from what the "
-                f"others see. Are the rotations transposed, in other axes, or in radians? Correct "
-                f"rotation_representation or the poses."
             )
 
 
@@ -529,15 +656,17 @@ def _differing_place(scene: Scene) -> Iterator[Difference]:
 
 
 def _differing_rig(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
-    rig, _ = parse_rig(texts[BASELINE_JSON], where=f"{scene.id.key}/{BASELINE_JSON}")
+    rig, _, _ = parse_rig(texts[BASELINE_JSON], where=f"{scene.id.key}/{BASELINE_JSON}")
     recorded = scene.rig
     if recorded.recorded_size_px is not None:
         width_px, height_px = recorded.recorded_size_px
         recorded = replace(
             recorded, image_width_px=width_px, image_height_px=height_px, recorded_size_px=None
         )
+    is_resized = (rig.image_width_px, rig.image_height_px) != _size_px(recorded)
     for each in fields(Rig):
-        if each.name.startswith("image_") and rig.image_size_source == "default":
+        of_size = each.name.startswith(("image_", "principal_", "sensor_height"))
+        if of_size and is_resized and (rig.image_size_source == "default" or scene.remark("size")):
             continue
         found, indexed = getattr(rig, each.name), getattr(recorded, each.name)
         if not _same(found, indexed):
@@ -546,8 +675,8 @@ def _differing_rig(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Differe
 
 def _differing_labels(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
     key = scene.id.key
-    _, labels = parse_rig(texts[BASELINE_JSON], where=f"{key}/{BASELINE_JSON}")
-    marked = parse_complete(texts[COMPLETE_JSON], where=f"{key}/{COMPLETE_JSON}")
+    _, labels, _ = parse_rig(texts[BASELINE_JSON], where=f"{key}/{BASELINE_JSON}")
+    marked, _ = parse_complete(texts[COMPLETE_JSON], where=f"{key}/{COMPLETE_JSON}")
     merged = _merged_labels(labels, marked)
     for each in fields(SceneLabels):
         found, indexed = getattr(merged, each.name), getattr(scene.labels, each.name)
@@ -593,12 +722,13 @@ def _same_text(found: object, indexed: object) -> bool:
 
 
 def _differing_poses(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
-    where = f"{scene.id.key}/{TRAJECTORY_JSON}"
-    trajectory = parse_trajectory(texts[TRAJECTORY_JSON], where=where)
-    if trajectory.frame_count != scene.frames:
-        yield _difference(TRAJECTORY_JSON, "frames", trajectory.frame_count, scene.frames)
+    if scene.remark("poses"):
         return
-    poses = CameraPoses.from_trajectory(trajectory)
+    where = f"{scene.id.key}/{TRAJECTORY_JSON}"
+    poses = poses_as(texts[TRAJECTORY_JSON], scene.pose_form, where=where)
+    if poses.frame_count < scene.frames:
+        yield _difference(TRAJECTORY_JSON, "frames", poses.frame_count, scene.frames)
+        return
     lateral_m = lateral_offsets_m(poses)
     if not np.allclose(lateral_m, scene.lateral_m, rtol=0, atol=_SAME_M):
         places_m = tuple(map(float, lateral_m))
@@ -610,7 +740,7 @@ def _differing_poses(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Diffe
 
 def _differing_caption(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
     names = [name for name in _DESCRIPTIONS if name in texts]
-    caption = _caption(texts, key=scene.id.key)
+    caption, _ = _caption(texts, key=scene.id.key)
     if names and caption != scene.caption:
         yield _difference(names[0], "the caption", caption, scene.caption)
 

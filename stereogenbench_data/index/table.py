@@ -4,7 +4,7 @@ On disk it is one Parquet file; in memory one Arrow table, sorted by key. Paths 
 data's root and never lead out of it.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,11 +24,11 @@ from stereogenbench_data.index.parquet import (
     write_index_file,
 )
 from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, scene_of
-from stereogenbench_data.schema.records import Scene, ShardFacts
+from stereogenbench_data.schema.records import Scene, SceneId, ShardFacts
 from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.retry import RetryPolicy
 
-_LISTS: Final = ("members", "key_frames", "psnr_db", "worst_psnr_db")
+_LISTS: Final = ("members", "remarks", "key_frames", "psnr_db", "worst_psnr_db")
 
 
 class SceneIndex:
@@ -45,6 +45,8 @@ class SceneIndex:
         passed_over: Keys of scenes that the root holds and the index omits on purpose.
         stale: How the root differs from the index, and the cure; empty if no difference was found.
             URLs are not checked.
+        is_from_file: Whether it was read from an index file, so that scenes which it leaves out
+            were left out on purpose.
     """
 
     def __init__(
@@ -65,6 +67,7 @@ class SceneIndex:
         self.is_part = head.is_part
         self.passed_over = head.passed_over
         self.stale = stale
+        self.is_from_file = bool(head.digest)
         self._table = table
         self._columns: dict[str, np.ndarray] = {}
         self._digest = head.digest
@@ -77,6 +80,7 @@ class SceneIndex:
         *,
         root: str | Path | None = None,
         retry: RetryPolicy | None = None,
+        wanted: Callable[[SceneId], bool] | None = None,
     ) -> "SceneIndex":
         """Open the index of some data.
 
@@ -94,13 +98,18 @@ class SceneIndex:
             root: Where the data of an index file are, whatever the file says: any folder or URL
                 that you trust.
             retry: How slow a server may be.
+            wanted: Which scenes of a folder without an index are described, by their paths; None
+                is all.
+
+        Warns with `IncompleteSceneWarning` of scenes that were left out: it counts them and names
+        the first.
 
         Raises:
             StorageError: If there are no such data, they hold no scene, the index is damaged or of
-                another version, only you may name the place of its data, or scenes of a tree are
-                broken.
+                another version, only you may name the place of its data, or more than a few scenes
+                of a tree are broken.
         """
-        table, head, stale, seek_tables = open_table(data, root=root, retry=retry)
+        table, head, stale, seek_tables = open_table(data, root=root, retry=retry, wanted=wanted)
         return cls(table, head, retry=retry, stale=stale, seek_tables=seek_tables)
 
     @classmethod
@@ -253,6 +262,13 @@ class SceneIndex:
                 which[rows] = len(kinds) + of_row.reshape(-1)
                 kinds += [tuple(each) for each in found.tolist()]
         return kinds, which
+
+    def remarked(self, about: str) -> np.ndarray:
+        """Return the rows of scenes with a remark about something, ascending (`REMARKS`)."""
+        lists = one_array(self._table.column("remarks"))
+        names = pc.struct_field(lists.flatten(), "about").to_pylist()
+        rows = as_numpy(pc.list_parent_indices(lists)).astype(np.int64)
+        return np.unique(rows[[name == about for name in names]])
 
     def video_counts(self) -> np.ndarray:
         """Return how many videos each scene has, (n,) int64: below 12 in a part of a release."""

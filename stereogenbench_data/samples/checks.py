@@ -1,11 +1,13 @@
 """Checks before the first sample: missing videos, lossy depth, unusual rigs and units."""
 
+import multiprocessing
 import warnings
 from typing import Any, NoReturn
 
 import numpy as np
 
-from stereogenbench_data.errors import MediaError, StorageError
+from stereogenbench_data.errors import MediaError, StorageError, text_without_secrets
+from stereogenbench_data.index.open import MOST_LEFT_OUT
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.samples.derive import RECTIFIED_PX
@@ -13,11 +15,47 @@ from stereogenbench_data.samples.request import Request
 from stereogenbench_data.samples.size import EnlargedSizeWarning, warn_if_swapped
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT, depth_name
+from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.plan import Plan
 
 
 class OddSceneWarning(UserWarning):
     """Selected scenes differ from what the release promises: the message says how and which."""
+
+
+def without_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> Plan:
+    """Return a plan without the few scenes that cannot give what is requested.
+
+    These lack a video that others have, or a field of them is held up by what is not understood.
+    `OddSceneWarning` counts them and names the first.
+
+    Raises:
+        StorageError: If they are more than a few; it names the field, the first scene and why.
+    """
+    reasons: dict[int, str] = {}
+    selected = set(plan.scene_rows.tolist())
+    for name in request.fields:
+        for about in request.known[name].held_up_by:
+            for row in selected.intersection(index.remarked(about).tolist()):
+                reasons.setdefault(row, f"{name!r} needs {index.scene(row).remark(about)}")
+    for row in selected.intersection(index.remarked("videos").tolist()):
+        if _missing_videos(index, plan, request, int(np.searchsorted(plan.scene_rows, row))):
+            reasons.setdefault(row, index.scene(row).remark("videos"))
+    if not reasons:
+        return plan
+    first = min(reasons)
+    told = (
+        f"{index.where}: {counted(len(reasons), 'selected scene')} of {len(selected)} cannot give "
+        f"what is asked for. The first: {index.column('key')[first]}: {reasons[first]}."
+    )
+    if len(reasons) == len(selected) or len(reasons) > max(1, MOST_LEFT_OUT * len(selected)):
+        raise StorageError(
+            f"{told} Leave out that field, choose other pairs or scenes, or mend the files."
+        )
+    if multiprocessing.parent_process() is None:
+        message = f"{told} Left out: {', '.join(index.column('key')[sorted(reasons)[:3]])}."
+        warnings.warn(text_without_secrets(message), OddSceneWarning, stacklevel=5)
+    return plan.without(index, sorted(reasons))
 
 
 def check_samples(index: SceneIndex, plan: Plan, request: Request) -> None:
@@ -55,24 +93,29 @@ def _require_videos(index: SceneIndex, plan: Plan, request: Request) -> None:
     """Refuse samples of videos that the index does not have: some cameras alone were downloaded."""
     partial = index.video_counts()[plan.scene_rows] < 2 * CAMERA_COUNT
     for place in np.flatnonzero(partial).tolist():
-        row = int(plan.scene_rows[place])
-        pairs = slice(plan.first_pair[place], plan.first_pair[place + 1])
-        sources = set(plan.pairs.source[pairs].tolist())
-        targets = set(plan.pairs.targets[pairs].ravel().tolist()) - {-1}
-        needed = {
-            f"cam_{camera:02d}_{stream.partition('_')[2]}"
-            for stream in request.streams
-            for camera in (sources if stream.startswith("source") else targets)
-        }
-        scene = index.scene(row)
-        missing = sorted(needed - {name.partition(".")[0] for name in scene.members})
+        missing = _missing_videos(index, plan, request, place)
         if missing:
+            scene = index.scene(int(plan.scene_rows[place]))
             there = sorted({name[4:6] for name in scene.members if name.startswith("cam_")})
             raise StorageError(
                 f"{index.where}: {scene.id.key} has no {', '.join(missing)}; videos of cameras "
                 f"{', '.join(there) or 'none'} were fetched. Choose pairs of these, or download "
                 "the others too."
             )
+
+
+def _missing_videos(index: SceneIndex, plan: Plan, request: Request, place: int) -> list[str]:
+    """Return the videos that the samples of a scene need and that are not there."""
+    pairs = slice(plan.first_pair[place], plan.first_pair[place + 1])
+    sources = set(plan.pairs.source[pairs].tolist())
+    targets = set(plan.pairs.targets[pairs].ravel().tolist()) - {-1}
+    needed = {
+        f"cam_{camera:02d}_{stream.partition('_')[2]}"
+        for stream in request.streams
+        for camera in (sources if stream.startswith("source") else targets)
+    }
+    members = index.scene(int(plan.scene_rows[place])).members
+    return sorted(needed - {name.partition(".")[0] for name in members})
 
 
 def _require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> None:
@@ -134,6 +177,14 @@ def _warn_of_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> None
             index, rows[residuals_px > RECTIFIED_PX],
             f"are not rectified (by up to {residuals_px.max(initial=0):.3g} px): their pixels are "
             "projected through the poses, and no field holds what that moves up or down",
+        )  # fmt: skip
+        unknown = np.intersect1d(rows, index.remarked("poses"))
+        reason = index.scene(int(unknown[0])).remark("poses") if len(unknown) else ""
+        _warn(
+            index, unknown,
+            f"have poses that are not understood, so their rigs are assumed rectified, with the "
+            f"baselines of baseline.json ({reason}). `stereogenbench doctor` measures from the "
+            f"pictures whether they are",
         )  # fmt: skip
     if request.streams & {"source_depth", "target_depth"} and not (
         request.depth and request.depth.unit_m

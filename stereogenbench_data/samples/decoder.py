@@ -12,6 +12,7 @@ import numpy as np
 from stereogenbench_data.errors import MediaError, SchemaError, ShardError
 from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.index.evidence import poses_as
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import depth_frame_index
 from stereogenbench_data.samples.coming import ComingSamples, NeededFiles, Step
@@ -25,7 +26,6 @@ from stereogenbench_data.schema.release import (
     depth_name,
     rgb_name,
 )
-from stereogenbench_data.schema.trajectory import parse_trajectory
 from stereogenbench_data.selection.plan import Address
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.fetch_ahead import FetchAhead
@@ -408,7 +408,7 @@ class SampleDecoder:
         if poses is None:
             text = self._source.read(scene, TRAJECTORY_JSON)
             where = self._source.label(scene, TRAJECTORY_JSON)
-            poses = CameraPoses.from_trajectory(parse_trajectory(text, where=where))
+            poses = poses_as(text, scene.pose_form, where=where)
             self._poses[scene.id.key] = poses
             if len(self._poses) > KEPT_POSES:
                 self._poses.popitem(last=False)

@@ -38,6 +38,7 @@ class Field:
         write: Writes it into float32 (t, h, w) instead: for maps too large to be copied.
         streams: The videos that it is made from.
         needs_poses: "always", "unless rectified" (only where the rig is not), or "never".
+        held_up_by: What makes the field impossible where it is not understood (`REMARKS`).
         per_target: Whether a sweep has one for each target.
         per_frame: Whether a clip has one for each frame.
         picture_of: Whose picture it is, exactly as decoded, so that the decoder can write the
@@ -52,6 +53,7 @@ class Field:
     write: Callable[[PairSample, MapF32], None] | None = field(default=None, repr=False)
     streams: frozenset[Stream] = NOTHING
     needs_poses: Literal["always", "unless rectified", "never"] = "never"
+    held_up_by: tuple[str, ...] = ()
     per_target: bool = False
     per_frame: bool = True
     picture_of: Literal["source", "target"] | None = None
@@ -143,7 +145,7 @@ PAIR_FIELDS: Final[dict[str, Field]] = _table(
     Field(
         "intrinsics", "float64", "(3,3)", "of every view, px, after resizing and cropping",
         make=lambda s: s.views.intrinsics.matrix(),
-        per_frame=False,
+        per_frame=False, held_up_by=("principal point",),
     ),
     Field(
         "baseline_m", "float64", "()", "m; negative if the second view is to the left",
@@ -154,12 +156,12 @@ PAIR_FIELDS: Final[dict[str, Field]] = _table(
         "right_from_left", "float64", "(4,4)",
         "first camera's coordinates to the second's, m, x right y down z ahead",
         make=lambda s: s.forward.target_from_source,
-        needs_poses="always", per_target=True,
+        needs_poses="always", per_target=True, held_up_by=("poses",),
     ),
     Field(
         "world_from_left", "float64", "(4,4)", "first camera's coordinates to the world's, m",
         make=lambda s: s.world_from(s.views.source),
-        needs_poses="always",
+        needs_poses="always", held_up_by=("poses", "world"),
     ),
     Field(
         "frame_index", "int64", "()", "number of the frame in its video",
@@ -230,12 +232,12 @@ VIEW_FIELDS: Final[dict[str, Field]] = _table(
     Field(
         "world_from_cam", "float64", "(4,4)", "camera's coordinates to the world's, m",
         make=lambda s: s.world_from(s.target),
-        needs_poses="always", per_target=True,
+        needs_poses="always", per_target=True, held_up_by=("poses", "world"),
     ),
     Field(
         "first_from_cam", "float64", "(4,4)", "camera's coordinates to the first camera's, m",
         make=lambda s: s.backward.target_from_source,
-        needs_poses="always", per_target=True,
+        needs_poses="always", per_target=True, held_up_by=("poses",),
     ),
     Field(
         "stored_depth", "uint16", "(1,H,W)",

@@ -1,20 +1,15 @@
-"""JSON documents that nobody has checked: from bytes to values that know their place in the file.
+"""JSON documents that nobody has checked: from bytes to objects, and values as messages show them.
 
-A check that fails records a problem and returns a stand-in of the right type, so that the rest of
-the file is checked too. `Problems.require_none` then raises one error with all of them; a parser
-calls it before it returns anything.
+What a document's values mean is found by `quantities`, and of poses by `trajectory`.
 """
 
 import functools
 import json
 import math
 import re
-from dataclasses import dataclass
 from typing import Any, Final, TypeGuard
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.release import CAMERA_COUNT
-from stereogenbench_data.schema.spellings import KNOWN_KEYS, LOOKALIKES, SPELLINGS
 from stereogenbench_data.schema.text import shortened
 
 MAX_TEXT_BYTES: Final = 32 * 2**20
@@ -26,11 +21,7 @@ MOST_LETTERS: Final = 2**16
 _SHOWN: Final = 20
 _LARGEST_INT: Final = 2**53
 _PLAIN_KEY: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
-_CAMERA_NAME: Final = re.compile(r"[Cc]am_?([0-9]{1,6})\Z")
-_PATHS: Final = {
-    quantity: tuple(tuple(spelling.split(".")) for spelling in spellings)
-    for quantity, spellings in SPELLINGS.items()
-}
+_CAMERA_NAME: Final = re.compile(r"(?:cam(?:era)?[ _-]?|\A|_)([0-9]{1,6})\Z", re.IGNORECASE)
 
 
 def require_text_size(size_bytes: int, *, where: str) -> None:
@@ -173,193 +164,6 @@ def _keys(document: dict[str, object]) -> str:
     return ", ".join(map(shortened, plain)) + more or "none"
 
 
-class Problems:
-    """The problems of one file. The same complaint about several places is reported once."""
-
-    def __init__(self, where: str) -> None:
-        self._where = where
-        self._paths: dict[str, list[str]] = {}
-        self._count = 0
-
-    def __len__(self) -> int:
-        """The number of problems recorded so far."""
-        return self._count
-
-    def add(self, path: str, complaint: str) -> None:
-        """Record a complaint about the value at a JSON path."""
-        self._paths.setdefault(complaint, []).append(path)
-        self._count += 1
-
-    def require_none(self) -> None:
-        """Raise one error that lists the problems recorded so far.
-
-        Raises:
-            SchemaError: If there are any. It lists twenty complaints and counts the others.
-        """
-        if not self._paths:
-            return
-        lines = []
-        for complaint, paths in list(self._paths.items())[:_SHOWN]:
-            again = f" (and in {len(paths) - 1} more places)" if len(paths) > 1 else ""
-            lines.append(f"{paths[0]}: {complaint}{again}")
-        if len(self._paths) > _SHOWN:
-            lines.append(f"and {sum(map(len, list(self._paths.values())[_SHOWN:]))} more")
-        head = "1 problem" if self._count == 1 else f"{self._count} problems"
-        raise SchemaError(f"{self._where}: {head}:\n  " + "\n  ".join(lines))
-
-
-@dataclass(frozen=True, slots=True)
-class JsonValue:
-    """One JSON value, its path, and the problems of its file."""
-
-    value: Any
-    path: str
-    problems: Problems
-
-    @classmethod
-    def parse(cls, text: bytes, *, where: str) -> "JsonValue":
-        """Return the top-level object of a file.
-
-        Raises:
-            SchemaError: As `parse_object` does.
-        """
-        return cls(parse_object(text, where=where), "$", Problems(where))
-
-    def child(self, *keys: str | int) -> "JsonValue":
-        """Return the element that the keys lead to."""
-        value, path = self.value, self.path
-        for key in keys:
-            value, path = value[key], child_path(path, key)
-        return JsonValue(value, path, self.problems)
-
-    def complain(self, complaint: str) -> None:
-        """Record a problem with this value."""
-        self.problems.add(self.path, complaint)
-
-    def find(self, quantity: str) -> "JsonValue | None":
-        """Return a quantity of this object, None where it is absent.
-
-        An unknown key that may hold the quantity (`LOOKALIKES`) is recorded as a problem.
-        """
-        found = self._known(quantity)
-        if found is not None or quantity not in LOOKALIKES:
-            return found
-        inner = [self.child(key) for key in self.value if isinstance(self.value[key], dict)]
-        for holder in (self, *inner):
-            alike = [
-                holder.child(key)
-                for key, value in holder.value.items()
-                if value is not None and key not in KNOWN_KEYS and _may_be(quantity, key)
-            ]
-            keys = _keys(holder.value) if alike else ""
-            for each in alike:
-                each.complain(
-                    f"is not a known key and may stand for {SPELLINGS[quantity][0]}. Rename "
-                    f"or remove it; the keys here are: {keys}"
-                )
-        return None
-
-    def find_text(self, quantity: str) -> str | None:
-        """Return a text of this object, None where it is absent."""
-        found = self.find(quantity)
-        return None if found is None else found.text()
-
-    def require(self, quantity: str) -> "JsonValue | None":
-        """Return a quantity of this object; where it is absent, record that with the keys found."""
-        found = self._known(quantity)
-        if found is None:
-            *parents, last = _PATHS[quantity][0]
-            holder = self
-            while parents and isinstance(holder.value.get(parents[0]), dict):
-                holder = holder.child(parents.pop(0))
-            missing = ".".join([*parents, last])
-            holder.complain(f"{missing} is missing; the keys here are: {_keys(holder.value)}")
-        return found
-
-    def _known(self, quantity: str) -> "JsonValue | None":
-        for keys in _PATHS[quantity]:
-            value = self.value
-            for key in keys:
-                value = value.get(key) if isinstance(value, dict) else None
-                if value is None:
-                    break
-            else:
-                return self.child(*keys)
-        return None
-
-    def objects(self) -> "list[JsonValue]":
-        """Return the elements of this list, each of which must be an object."""
-        if not isinstance(self.value, list):
-            self.complain(f"must be a list, found {brief(self.value)}")
-            return []
-        elements = [self.child(place) for place in range(len(self.value))]
-        for element in elements:
-            if not isinstance(element.value, dict):
-                element.complain(f"must be an object, found {brief(element.value)}")
-        return [element for element in elements if isinstance(element.value, dict)]
-
-    def number(self) -> float:
-        """Return this value as a finite number."""
-        if not is_number(self.value):
-            self.complain(f"must be a finite number, found {brief(self.value)}")
-            return 1.0
-        return float(self.value)
-
-    def positive(self) -> float:
-        """Return this value as a finite number above zero."""
-        number = self.number()
-        if number > 0:
-            return number
-        self.complain(f"must be a number above zero, found {brief(self.value)}")
-        return 1.0
-
-    def integer(self) -> int:
-        """Return this value as an integer; 3.0 counts as 3."""
-        number = _as_integer(self.value)
-        if number is None:
-            self.complain(f"must be an integer, found {brief(self.value)}")
-            return 1
-        return number
-
-    def text(self) -> str:
-        """Return this value as a text that can be written as UTF-8."""
-        if not isinstance(self.value, str):
-            self.complain(f"must be a text, found {brief(self.value)}")
-            return ""
-        if len(self.value) > MOST_LETTERS:
-            self.complain(f"may have {MOST_LETTERS:,} letters, found {len(self.value):,}")
-            return ""
-        if any("\ud800" <= letter <= "\udfff" for letter in self.value):
-            self.complain(f"contains half a character (a lone surrogate): {brief(self.value)}")
-            return ""
-        return self.value
-
-    def camera(self) -> int:
-        """Return the camera that this index, or this name ending in ``Cam_00``, stands for."""
-        index = camera_of(self.value)
-        if index is None:
-            self.complain(
-                f"must be the index of a camera or a name such as 'Cam_00', "
-                f"found {brief(self.value)}"
-            )
-            return 0
-        if not 0 <= index < CAMERA_COUNT:
-            self.complain(f"is camera {index}, and the rig has cameras 0 to {CAMERA_COUNT - 1}")
-            return 0
-        return index
-
-    def axes(self, names: tuple[str, ...]) -> list[Any] | None:
-        """Return the named components of this object, unchecked; None where one is missing."""
-        if isinstance(self.value, dict) and all(name in self.value for name in names):
-            return [self.value[name] for name in names]
-        return None
-
-
-def _may_be(quantity: str, key: str) -> bool:
-    snake = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", key).lower()
-    return LOOKALIKES[quantity].search(snake) is not None
-
-
 def is_number(value: object) -> TypeGuard[int | float]:
     """Return whether a JSON value is a finite number (a bool is not)."""
     if type(value) is int:
@@ -377,7 +181,7 @@ def _as_integer(value: object) -> int | None:
 def camera_of(value: object) -> int | None:
     """Return the number of the camera that an index or a name stands for, None for other values.
 
-    >>> camera_of("Town_scene_7_Cam_03"), camera_of("cam2"), camera_of(4), camera_of("left")
+    >>> camera_of("Town_scene_7_Cam_03"), camera_of("Camera 2"), camera_of(4), camera_of("left")
     (3, 2, 4, None)
     """
     if isinstance(value, str):

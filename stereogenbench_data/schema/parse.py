@@ -1,16 +1,38 @@
 """Metadata files to typed records: scene keys, ``baseline.json``, markers and descriptions.
 
-Each function records every problem of its file and raises one `SchemaError` that names the file
-and the JSON path of each problem. ``trajectory.json`` has a module of its own.
+A file is read in tiers. What every sample needs (focal length, sensor width, baselines, which
+camera is left) must be there and be understood: `SchemaError` lists everything else that is wrong.
+What only some fields need, or none (principal point, labels, captions), becomes a `Remark`.
 """
 
+import itertools
 import math
 import re
-from typing import Final
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.document import JsonValue, brief
-from stereogenbench_data.schema.records import Description, Rig, SceneId, SceneLabels
+from stereogenbench_data.schema.document import (
+    MOST_LETTERS,
+    brief,
+    camera_of,
+    child_path,
+    is_number,
+    parse_object,
+)
+from stereogenbench_data.schema.quantities import (
+    UNITS_M,
+    Node,
+    Stated,
+    length_unit_m,
+    nodes_of,
+    numbers,
+    stated,
+    without_unit,
+    words,
+)
+from stereogenbench_data.schema.records import Description, Remark, Rig, SceneId, SceneLabels
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     CAMERA_COUNT,
@@ -18,18 +40,28 @@ from stereogenbench_data.schema.release import (
     IMAGE_SIZE_PX,
     subset_of_folder,
 )
-from stereogenbench_data.schema.spellings import UNITS_M
 from stereogenbench_data.schema.text import shortened
 
 _FOLDER: Final = re.compile(r"[!-\-0-\[\]-~](?:[ -\-0-\[\]-~]*[!-\-0-\[\]-~])?\Z")
 """Printable ASCII without dot, slash and backslash, and without a space at either end."""
 
 _KEY_SHOWN: Final = 300
+_SHOWN: Final = 20
+_PAIR_KEY: Final = re.compile(r"(?:[a-z_]*?)(\d+)(?:_to)?_(?:cam_?|camera_?|c)?(\d+)\Z")
+_CENTRE_PX: Final = 1.0
+"""How far a principal point may be from the image's centre to be that centre: conventions of pixels
+differ by a half, and centres are written as whole pixels."""
 
-_AGREEMENT: Final = 1e-6
-"""How far two records of one baseline may differ, relative: ten float32 roundings."""
+_BY_PLACE: Final = "by place"
+"""What stands for the unit of baselines whose cameras follow from their place in a list."""
+
+_NAMES_A_CAMERA: Final = re.compile(
+    r"cam|left|right|index|\A[abij]\Z|_[abij12]\Z|src|dst|from|to\Z"
+)
 
 Pair = tuple[int, int]
+_Recorded = tuple[Pair, float, Stated]
+"""The cameras of a pair as they are written, their baseline in cm, and where it stands."""
 
 
 def parse_scene_key(key: str) -> SceneId:
@@ -73,242 +105,488 @@ def parse_scene_key(key: str) -> SceneId:
     )
 
 
-def _labels(root: JsonValue) -> SceneLabels:
-    """Return the identifiers in a file; each is optional."""
-    index, fstop = root.find("scene_index"), root.find("aperture_fstop")
+@dataclass(slots=True)
+class _Findings:
+    """What is wrong in a file: what stops a sample, and what only concerns some fields."""
+
+    where: str
+    keys: str = ""
+    problems: list[str] = field(default_factory=list)
+    remarks: list[Remark] = field(default_factory=list)
+
+    def conflict(self, what: str, first: Stated, other: Stated) -> None:
+        self.problems.append(
+            f"{other.path}: states another {what} ({brief(other.value)} {other.unit}) than "
+            f"{first.path} ({brief(first.value)} {first.unit}). Remove the wrong one"
+        )
+
+    def require_none(self) -> None:
+        if self.problems:
+            head = "1 problem" if len(self.problems) == 1 else f"{len(self.problems)} problems"
+            listed = self.problems[:_SHOWN]
+            if len(self.problems) > _SHOWN:
+                listed.append(f"and {len(self.problems) - _SHOWN} more")
+            raise SchemaError(f"{self.where}: {head}:\n  " + ".\n  ".join(listed) + ".")
+
+
+def _labels(nodes: list[Node], findings: _Findings) -> SceneLabels:
+    """Return the identifiers in a file; one that is not of its kind is left out with a remark."""
+
+    def text(quantity: str) -> str | None:
+        return _text(nodes, quantity, findings, about="labels")
+
     return SceneLabels(
-        scene_label=root.find_text("scene_label"),
-        scene_index=None if index is None else index.integer(),
-        map_name=root.find_text("map_name"),
-        map_path=root.find_text("map_path"),
-        character=root.find_text("character"),
-        animation=root.find_text("animation"),
-        aperture_fstop=None if fstop is None else fstop.positive(),
+        scene_label=text("scene_label"),
+        scene_index=_scene_index(nodes),
+        map_name=text("map_name"),
+        map_path=text("map_path"),
+        character=text("character"),
+        animation=text("animation"),
+        aperture_fstop=next(
+            (float(each.value) for each in numbers(nodes, "aperture_fstop") if each.value > 0),
+            None,
+        ),
     )
 
 
-def parse_complete(text: bytes, *, where: str) -> SceneLabels:
+def _scene_index(nodes: list[Node]) -> int | None:
+    for each in stated(nodes, "scene_index"):
+        text = str(each.value)
+        if type(each.value) in (int, str) and re.fullmatch(r"[0-9]{1,15}", text):
+            return int(text)
+    return None
+
+
+def _text(nodes: list[Node], quantity: str, findings: _Findings, *, about: str) -> str | None:
+    """Return a text that can be written as UTF-8, None where there is none."""
+    odd = None
+    for each in stated(nodes, quantity):
+        value = each.value
+        if isinstance(value, str) and len(value) <= MOST_LETTERS:
+            if not any("\ud800" <= letter <= "\udfff" for letter in value):
+                return value
+        elif isinstance(value, dict | list) and not each.path.endswith("]"):
+            continue
+        odd = odd or f"{each.path}: must be a text, found {brief(value)}"
+    if odd is not None:
+        findings.remarks.append(Remark(about, f"{findings.where}: {odd}"))
+    return None
+
+
+def parse_complete(text: bytes, *, where: str) -> tuple[SceneLabels, tuple[Remark, ...]]:
     """Return the identifiers in a ``_scene_complete.json``, the marker of a finished scene.
 
-    Raises:
-        SchemaError: If the file is not a JSON object or an identifier has the wrong type.
+    Whatever it holds, the scene is finished; what is not understood is left out with a remark.
 
     Source: the paper's appendix on the file schema.
     """
-    root = JsonValue.parse(text, where=where)
-    labels = _labels(root)
-    root.problems.require_none()
-    return labels
+    findings = _Findings(where)
+    try:
+        labels = _labels(nodes_of(parse_object(text, where=where)), findings)
+    except SchemaError as error:
+        return SceneLabels(), (Remark("labels", str(error)),)
+    return labels, tuple(findings.remarks)
 
 
-def parse_description(text: bytes, *, where: str) -> Description:
+def parse_description(text: bytes, *, where: str) -> tuple[Description, tuple[Remark, ...]]:
     """Return a scene's machine-written description; absent texts are empty.
 
-    Raises:
-        SchemaError: If the file is not a JSON object, a text has the wrong type, or an unknown
-            key may stand for a caption that is absent.
+    What is not understood is left out with a remark: no picture depends on it.
 
     Source: the paper's appendix on the file schema.
     """
-    root = JsonValue.parse(text, where=where)
+    findings = _Findings(where)
+    try:
+        nodes = nodes_of(parse_object(text, where=where))
+    except SchemaError as error:
+        return Description(), (Remark("caption", str(error)),)
     short, detailed, scene_type, setting = (
-        root.find_text(quantity) or ""
+        _text(nodes, quantity, findings, about="caption") or ""
         for quantity in ("short_caption", "detailed_caption", "scene_type", "setting")
     )
-    tags, texts = root.find("tags"), []
-    if tags is not None and isinstance(tags.value, list):
-        texts = [tags.child(place).text() for place in range(len(tags.value))]
-    elif tags is not None:
-        tags.complain(f"must be a list of texts, found {brief(tags.value)}")
-    root.problems.require_none()
-    return Description(short, detailed, scene_type, setting, tuple(texts))
+    tags: tuple[str, ...] = ()
+    for each in stated(nodes, "tags"):
+        listed = each.value.split(",") if isinstance(each.value, str) else each.value
+        if isinstance(listed, list):
+            tags = tuple(tag.strip() for tag in listed if isinstance(tag, str))
+            break
+    return Description(short, detailed, scene_type, setting, tags), tuple(findings.remarks)
 
 
-def parse_rig(text: bytes, *, where: str) -> tuple[Rig, SceneLabels]:
-    """Return the rig and the identifiers that a ``baseline.json`` records.
+def parse_rig(text: bytes, *, where: str) -> tuple[Rig, SceneLabels, tuple[Remark, ...]]:
+    """Return the rig and the identifiers that a ``baseline.json`` records, and what is odd.
 
     Without an image size, the release's 1280 x 1280 is assumed (``image_size_source`` says so).
     Without a sensor height, pixels are square, as in the paper's loading example. A principal
-    point is in pixels of the recorded image, with the centre of the top-left pixel at (0.5, 0.5).
+    point is in pixels of the recorded image, with the centre of the top-left pixel at (0.5, 0.5);
+    one within a pixel of the centre is the centre. A value that is stated again and agrees within
+    the digits that are written is the same value.
 
     Args:
         text: The file's bytes.
         where: The file's path, for messages.
 
     Raises:
-        SchemaError: If the file does not follow the format; the message lists every problem.
+        SchemaError: If focal length, sensor width, a baseline or the primary pair is missing, not
+            understood or stated twice with other values; the message lists every problem.
 
     Source: the paper's appendix on the file schema.
     """
-    root = JsonValue.parse(text, where=where)
-    unit_m(root)
-    require_six_cameras(root)
-    width, height = root.find("image_width_px"), root.find("image_height_px")
-    width_px, height_px = _side_px(width), _side_px(height)
-    sensor_width_mm = _required_positive(root, "sensor_width_mm")
-    sensor_height = root.find("sensor_height_mm")
-    baselines_cm = _pairwise(root)
-    _require_adjacent_agree(root, baselines_cm)
+    document = parse_object(text, where=where)
+    nodes = nodes_of(document)
+    findings = _Findings(where, keys=_keys(document))
+    baselines_cm, first_number = _baselines(document, nodes, findings)
+    width, height = _side(nodes, "image_width"), _side(nodes, "image_height")
+    width_px, height_px = width or IMAGE_SIZE_PX, height or width or IMAGE_SIZE_PX
+    focal_mm, sensor_width_mm = _lens(nodes, findings, width_px=width_px)
+    sensor_height_mm = _length_mm(nodes, "sensor_height", findings, is_needed=False)
     rig = Rig(
-        focal_mm=_required_positive(root, "focal_mm"),
+        focal_mm=focal_mm,
         sensor_width_mm=sensor_width_mm,
-        sensor_height_mm=(
-            sensor_width_mm * height_px / width_px
-            if sensor_height is None
-            else sensor_height.positive()
-        ),
+        sensor_height_mm=sensor_height_mm or sensor_width_mm * height_px / width_px,
         image_width_px=width_px,
         image_height_px=height_px,
-        principal_point_px=_principal_point(root, size_px=(width_px, height_px)),
+        principal_point_px=_principal_point(nodes, findings, size_px=(width_px, height_px)),
         baselines_cm=tuple(baselines_cm.get(pair, math.nan) for pair in CAMERA_PAIRS),
-        primary_pair=_primary_pair(root),
+        primary_pair=_primary_pair(nodes, findings, first_number=first_number),
         image_size_source="default" if width is None and height is None else "recorded",
     )
-    labels = _labels(root)
-    root.problems.require_none()
-    return rig, labels
+    labels = _labels(nodes, findings)
+    findings.require_none()
+    return rig, labels, tuple(findings.remarks)
 
 
-def _required_positive(root: JsonValue, quantity: str) -> float:
-    found = root.require(quantity)
-    return 1.0 if found is None else found.positive()
+def _side(nodes: list[Node], quantity: str) -> int | None:
+    """Return a side of the recorded image in pixels; what is none is as good as not recorded."""
+    for each in numbers(nodes, quantity):
+        if each.value > 0 and float(each.value).is_integer():
+            return int(each.value)
+    return None
 
 
-def _side_px(side: JsonValue | None) -> int:
-    if side is None:
-        return IMAGE_SIZE_PX
-    size_px = side.integer()
-    if size_px <= 0:
-        side.complain(f"must be a positive number of pixels, found {brief(side.value)}")
-        return 1
-    return size_px
+def _length_mm(nodes: list[Node], quantity: str, findings: _Findings, *, is_needed: bool) -> float:
+    """Return a length of the camera in mm, the unit of cameras; 0 where there is none."""
+    found: Stated | None = None
+    length_mm = 0.0
+    for each in stated(nodes, quantity):
+        if each.unit and each.unit not in UNITS_M:
+            continue
+        scale_mm = UNITS_M.get(each.unit, 1e-3) * 1000
+        if not is_number(each.value) or each.value <= 0:
+            if is_needed and not isinstance(each.value, dict | list):
+                findings.problems.append(
+                    f"{each.path}: must be a number above zero, found {brief(each.value)}"
+                )
+            continue
+        again_mm = each.value * scale_mm
+        if found is None:
+            found, length_mm = each, again_mm
+        elif abs(again_mm - length_mm) > each.rounding * scale_mm + found.rounding:
+            findings.conflict(quantity.replace("_", " "), found, each)
+    return length_mm
 
 
-def _principal_point(root: JsonValue, *, size_px: Pair) -> tuple[float, float] | None:
-    point = root.find("principal_point_px")
-    if point is None:
-        return None
-    if point.axes(("x", "y")) is None:
-        point.complain(
-            f"must be {{x, y}} in pixels, found {brief(point.value)}; "
-            f"leave it out where it is the image's centre"
-        )
-        return None
-    place_px = []
-    for side, side_px in zip((point.child("x"), point.child("y")), size_px, strict=True):
-        place_px.append(side.number())
-        if not 1 < place_px[-1] < side_px:
-            side.complain(
-                f"must lie inside a picture of {side_px} pixels, in pixels and not as a "
-                f"fraction, found {brief(side.value)}"
+def _lens(nodes: list[Node], findings: _Findings, *, width_px: int) -> tuple[float, float]:
+    """Return focal length and sensor width in mm.
+
+    One of them may follow from a field of view, or a focal length in pixels, which must agree where
+    both are there.
+    """
+    focal_mm = _length_mm(nodes, "focal", findings, is_needed=True)
+    sensor_mm = _length_mm(nodes, "sensor_width", findings, is_needed=True)
+    ratios = []
+    for each in numbers(nodes, "fov"):
+        angle = each.value if each.unit.startswith("rad") else math.radians(each.value)
+        if 0 < angle < math.pi:
+            ratios.append((each, 0.5 / math.tan(angle / 2)))
+    ratios += [
+        (each, each.value / width_px)
+        for each in numbers(nodes, "focal_px")
+        if each.value > 0 and (each.unit.startswith("p") or each.path.lower().endswith("x"))
+    ]
+    for each, ratio in ratios:
+        if focal_mm and not sensor_mm:
+            sensor_mm = focal_mm / ratio
+        elif sensor_mm and not focal_mm:
+            focal_mm = ratio * sensor_mm
+        elif focal_mm and sensor_mm and abs(focal_mm / sensor_mm - ratio) > _RATIO * ratio:
+            findings.problems.append(
+                f"{each.path}: {brief(each.value)} means {ratio:.6g} focal lengths a sensor width, "
+                f"and focal length and sensor width in mm mean {focal_mm / sensor_mm:.6g}. Remove "
+                f"the wrong ones"
             )
+    for name, length_mm in (("focal_length_mm", focal_mm), ("sensor_width_mm", sensor_mm)):
+        if not length_mm and not any(name[:5] in problem for problem in findings.problems):
+            findings.problems.append(
+                f"$.camera_intrinsics.{name} is missing; the keys are: {findings.keys}"
+            )
+    return focal_mm or 1.0, sensor_mm or 1.0
+
+
+_RATIO: Final = 1e-3
+"""How far a field of view may be from focal length over sensor width: it is often rounded."""
+
+
+def _keys(document: dict[str, Any]) -> str:
+    inner = document.get("camera_intrinsics")
+    inner = inner if isinstance(inner, dict) else {}
+    keys = [*document, *(f"camera_intrinsics.{key}" for key in inner)]
+    plain = [key if key.isascii() and key.isprintable() else ascii(key) for key in sorted(keys)]
+    return shortened(", ".join(plain) or "none", 400)
+
+
+def _principal_point(
+    nodes: list[Node], findings: _Findings, *, size_px: Pair
+) -> tuple[float, float] | None:
+    """Return the principal point in pixels; None where it is the image's centre or not known."""
+    points = [stated(nodes, quantity) for quantity in ("principal_x", "principal_y")]
+    if not any(points):
+        return None
+    place_px: list[float] = []
+    for found, side_px in zip(points, size_px, strict=True):
+        usable = [each for each in found if is_number(each.value)]
+        if usable and abs(usable[0].value - 0.5) < 1e-3:
+            place_px.append(side_px / 2)  # a share of the side
+        elif usable and 1 < usable[0].value < side_px:
+            place_px.append(float(usable[0].value))
+        else:
+            shown = ", ".join(f"{each.path} {brief(each.value)}" for each in found) or "one side"
+            findings.remarks.append(
+                Remark(
+                    "principal point",
+                    f"{findings.where}: the principal point is not understood ({shown}): it must "
+                    f"be x and y in pixels inside a picture of {size_px[0]}x{size_px[1]}",
+                )
+            )
+            return None
+    if all(abs(a - b / 2) <= _CENTRE_PX for a, b in zip(place_px, size_px, strict=True)):
+        return None
     return place_px[0], place_px[1]
 
 
-def _primary_pair(root: JsonValue) -> Pair:
-    pair = root.require("primary_pair")
-    if pair is None:
-        return 0, 1
-    before = len(root.problems)
-    if isinstance(pair.value, dict):
-        sides = [pair.require("left_camera"), pair.require("right_camera")]
-        left, right = (0 if side is None else side.camera() for side in sides)
-    elif isinstance(pair.value, list) and len(pair.value) == 2:
-        left, right = pair.child(0).camera(), pair.child(1).camera()
-    else:
-        pair.complain(
-            f"must be {{left_camera, right_camera}} or a list of two cameras, "
-            f"found {brief(pair.value)}"
-        )
-        return 0, 1
-    if left == right and len(root.problems) == before:
-        pair.complain(f"has camera {left} on both sides")
-    return left, right
-
-
-def _pairwise(root: JsonValue) -> dict[Pair, float]:
-    """Return the baseline of each pair in cm; each of the 15 pairs must be there once."""
-    entries = root.require("pairwise_pairs")
-    if entries is None:
-        return {}
-    seen: dict[Pair, str] = {}
-    baselines_cm: dict[Pair, float] = {}
-    for entry in entries.objects():
-        pair, baseline_cm = _pair_of(entry), entry.require("baseline_cm")
-        length_cm = math.nan if baseline_cm is None else baseline_cm.positive()
-        if pair is None:
-            continue
-        if pair in seen:
-            entry.complain(
-                f"cameras {pair[0]} and {pair[1]} are already at {seen[pair]}; "
-                f"remove the wrong entry"
-            )
-            continue
-        seen[pair] = entry.path
-        baselines_cm[pair] = length_cm
-    missing = [f"{a}-{b}" for a, b in CAMERA_PAIRS if (a, b) not in seen]
-    if missing and isinstance(entries.value, list):
-        entries.complain(
-            f"must have each of the {len(CAMERA_PAIRS)} camera pairs once, "
-            f"and lacks {', '.join(missing)}"
-        )
-    return baselines_cm
-
-
-def _pair_of(entry: JsonValue) -> Pair | None:
-    ends = [entry.require("camera_a"), entry.require("camera_b")]
-    before = len(entry.problems)
-    cameras = [end.camera() for end in ends if end is not None]
-    if len(cameras) < 2 or len(entry.problems) > before:
-        return None
-    if cameras[0] == cameras[1]:
-        entry.complain(f"has camera {cameras[0]} twice")
-        return None
-    return min(cameras), max(cameras)
-
-
-def _require_adjacent_agree(root: JsonValue, baselines_cm: dict[Pair, float]) -> None:
-    """Record a problem where a second record of an adjacent baseline differs from the first."""
-    records: list[tuple[Pair, JsonValue]] = []
-    entries = root.find("adjacent_pairs")
-    for entry in [] if entries is None else entries.objects():
-        pair, baseline_cm = _pair_of(entry), entry.require("baseline_cm")
-        if pair is not None and baseline_cm is not None:
-            records.append((pair, baseline_cm))
-    lengths = root.find("adjacent_cm")
-    if lengths is not None:
-        if not isinstance(lengths.value, list) or len(lengths.value) != len(ADJACENT_PAIRS):
-            lengths.complain(
-                f"must be a list of {len(ADJACENT_PAIRS)} baselines, found {brief(lengths.value)}"
-            )
+def _primary_pair(nodes: list[Node], findings: _Findings, *, first_number: int) -> Pair:
+    pairs: list[tuple[Stated, Pair]] = []
+    odd: list[str] = []
+    for each in stated(nodes, "primary_pair"):
+        value = each.value
+        if isinstance(value, dict):
+            left, right = (_end(value, side) for side in ("left", "right"))
+        elif isinstance(value, list) and len(value) == 2:
+            left, right = map(_camera, value)
         else:
-            records += [(pair, lengths.child(place)) for place, pair in enumerate(ADJACENT_PAIRS)]
-    for pair, record in records:
-        again_cm, first_cm = record.positive(), baselines_cm.get(pair, math.nan)
-        if abs(again_cm - first_cm) > _AGREEMENT * first_cm:
-            record.complain(
-                f"the baseline of cameras {pair[0]} and {pair[1]} is {again_cm:.9g} cm here "
-                f"and {first_cm:.9g} cm in pairwise_pairs"
+            left = right = None
+        if left is None or right is None:
+            odd.append(
+                f"{each.path}: must be {{left_camera, right_camera}} or a list of two cameras, "
+                f"found {brief(value)}"
             )
+            continue
+        left, right = left - first_number, right - first_number
+        if left == right or not {left, right} <= set(range(CAMERA_COUNT)):
+            odd.append(
+                f"{each.path}: names cameras {left} and {right}, and a pair is two of the "
+                f"cameras 0 to {CAMERA_COUNT - 1}"
+            )
+            continue
+        if pairs and pairs[0][1] != (left, right):
+            findings.conflict("primary pair", pairs[0][0], each)
+        pairs.append((each, (left, right)))
+    if pairs:
+        return pairs[0][1]
+    findings.problems += odd or [
+        f"$.primary_stereo_pair is missing, so nothing tells which camera is left; the keys are: "
+        f"{findings.keys}"
+    ]
+    return 0, 1
 
 
-def unit_m(root: JsonValue) -> float:
-    """Return the metres in the unit of a file's lengths; Unreal's centimetre where none is named.
+def _end(pair: dict[str, Any], side: str) -> int | None:
+    """Return the camera of a side of the primary pair."""
+    for key, value in pair.items():
+        if side in words(key).split("_"):
+            camera = _camera(value)
+            if camera is not None:
+                return camera
+    return None
 
-    Other units are recorded as a problem.
+
+def _camera(value: object) -> int | None:
+    """Return the camera that an index, a name, or an object with one of these stands for."""
+    if isinstance(value, dict):
+        found = {camera_of(each) for each in value.values()} - {None}
+        return found.pop() if len(found) == 1 else None
+    return camera_of(value)
+
+
+def _baselines(
+    document: dict[str, Any], nodes: list[Node], findings: _Findings
+) -> tuple[dict[Pair, float], int]:
+    """Return each pair's baseline in cm, and the number of the first camera.
+
+    Baselines of pairs that are not recorded follow from those that are, if these lie on a line.
     """
-    unit = root.find("unit")
-    if unit is None:
-        return 0.01
-    metres = UNITS_M.get(unit.value.strip().lower()) if isinstance(unit.value, str) else None
-    if metres is None:
-        unit.complain(f"must be one of {', '.join(UNITS_M)}, found {brief(unit.value)}")
-        return 0.01
-    return metres
+    found = sorted(
+        _recorded_lengths(document, nodes, findings),
+        key=lambda each: not each[2].path.startswith("$.pairwise_pairs"),
+    )
+    cameras = {camera for pair, _, each in found for camera in pair if each.unit != _BY_PLACE}
+    first_number = 1 if cameras and min(cameras) == 1 and max(cameras) == CAMERA_COUNT else 0
+    best: dict[Pair, tuple[float, float, Stated]] = {}
+    for (a, b), length_cm, each in found:
+        first = 0 if each.unit == _BY_PLACE else first_number
+        low, high = sorted((a - first, b - first))
+        pair = (low, high)
+        if pair not in CAMERA_PAIRS:
+            findings.problems.append(
+                f"{each.path}: is of cameras {a} and {b}, and the rig has cameras 0 to "
+                f"{CAMERA_COUNT - 1}"
+            )
+            continue
+        rounding_cm = abs(length_cm / each.value) * each.rounding if each.value else 0.0
+        if pair in best:
+            known_cm, known_rounding_cm, known = best[pair]
+            if abs(length_cm - known_cm) > rounding_cm + known_rounding_cm:
+                findings.problems.append(
+                    f"{each.path}: the baseline of cameras {low} and {high} is {length_cm:.9g} cm "
+                    f"here and {known_cm:.9g} cm at {known.path}. Remove the wrong one"
+                )
+            continue
+        best[pair] = length_cm, rounding_cm, each
+    lengths_cm = {pair: length_cm for pair, (length_cm, _, _) in best.items()}
+    missing = [f"{a}-{b}" for a, b in CAMERA_PAIRS if (a, b) not in lengths_cm]
+    if missing:
+        lengths_cm = _completed(lengths_cm, best)
+    if len(lengths_cm) < len(CAMERA_PAIRS):
+        findings.problems.append(
+            f"$.pairwise_pairs must have the baseline of each of the {len(CAMERA_PAIRS)} camera "
+            f"pairs, and lacks {', '.join(missing)}; the keys are: {findings.keys}"
+        )
+    elif missing:
+        findings.remarks.append(
+            Remark(
+                "baselines",
+                f"{findings.where}: the baselines of {', '.join(missing)} are not recorded and "
+                f"were added up from the others",
+            )
+        )
+    return lengths_cm, first_number
 
 
-def require_six_cameras(root: JsonValue) -> None:
-    """Record a problem where a file says that the rig does not have six cameras."""
-    count = root.find("camera_count")
-    if count is not None and count.integer() != CAMERA_COUNT:
-        count.complain(f"a rig has {CAMERA_COUNT} cameras, found {brief(count.value)}")
+def _completed(
+    lengths_cm: dict[Pair, float], best: dict[Pair, tuple[float, float, Stated]]
+) -> dict[Pair, float]:
+    """Return all 15 baselines where those of neighbours are known and add up to the others."""
+    if not set(ADJACENT_PAIRS) <= set(lengths_cm):
+        return lengths_cm
+    places_cm = [0.0, *itertools.accumulate(lengths_cm[pair] for pair in ADJACENT_PAIRS)]
+    rounding_cm = sum(best[pair][1] for pair in ADJACENT_PAIRS)
+    added_cm = {(a, b): places_cm[b] - places_cm[a] for a, b in CAMERA_PAIRS}
+    for pair, (length_cm, own_cm, _) in best.items():
+        if abs(added_cm[pair] - length_cm) > rounding_cm + own_cm:
+            return lengths_cm
+    return added_cm | lengths_cm
+
+
+def _recorded_lengths(
+    document: dict[str, Any], nodes: list[Node], findings: _Findings
+) -> Iterable[_Recorded]:
+    """Yield the cameras, baseline in cm and place of each pair that a document records.
+
+    Pairs are objects with two cameras and a length, keys such as "0-1" with a length, or lists of
+    five lengths of neighbours, below a key that speaks of pairs or baselines.
+    """
+    default_m = length_unit_m(nodes) or 0.01
+    keys = sorted(document, key=lambda key: key != "pairwise_pairs")
+    waiting: list[tuple[Any, str, str]] = [
+        (document[key], words(key), child_path("$", key)) for key in keys
+    ]
+    for node, name, path in waiting:
+        if "primary" in name or not isinstance(node, dict | list):
+            continue
+        if re.search(r"pair|baseline", name) is None:
+            inner = node if isinstance(node, dict) else {}
+            waiting += [(v, f"{name}_{words(k)}", child_path(path, k)) for k, v in inner.items()]
+        elif isinstance(node, dict):
+            cameras = _cameras_of(node)
+            if cameras is not None:
+                yield from _lengths_of(node, cameras, path, default_m, findings)
+                continue
+            for key, value in node.items():
+                pair, place = _PAIR_KEY.match(words(key)), child_path(path, key)
+                ends = None if pair is None else (int(pair[1]), int(pair[2]))
+                if ends is not None and isinstance(value, dict):
+                    yield from _lengths_of(value, ends, place, default_m, findings)
+                elif ends is not None:
+                    unit_m = UNITS_M.get(without_unit(name)[1], default_m)
+                    yield from _length(ends, value, unit_m, place, findings)
+                else:
+                    waiting.append((value, f"{name}_{words(key)}", place))
+        elif "adjacent" in name and node and all(map(is_number, node)):
+            yield from _neighbours(node, name, path, default_m, findings)
+        else:
+            waiting += [(each, name, child_path(path, at)) for at, each in enumerate(node)]
+
+
+def _neighbours(
+    lengths: list[Any], name: str, path: str, default_m: float, findings: _Findings
+) -> Iterable[_Recorded]:
+    """Yield the baselines of neighbours, of which a list has one each."""
+    if len(lengths) != len(ADJACENT_PAIRS):
+        findings.problems.append(
+            f"{path}: must be a list of {len(ADJACENT_PAIRS)} baselines, found {brief(lengths)}"
+        )
+        return
+    unit_m = UNITS_M.get(without_unit(name)[1], default_m)
+    for place, (pair, value) in enumerate(zip(ADJACENT_PAIRS, lengths, strict=True)):
+        for _, length_cm, each in _length(pair, value, unit_m, child_path(path, place), findings):
+            yield pair, length_cm, replace(each, unit=_BY_PLACE)
+
+
+def _cameras_of(entry: dict[str, Any]) -> Pair | None:
+    """Return the two cameras that an entry names, None where it does not name two."""
+    by_number: list[int] = []
+    by_name: list[int] = []
+    for key, value in entry.items():
+        name = words(key)
+        if re.search(r"baseline|distance|length|count", name):
+            continue
+        pair = _PAIR_KEY.match(words(value)) if isinstance(value, str) else None
+        if isinstance(value, list) and len(value) == 2:
+            by_number += [each for each in map(camera_of, value) if each is not None]
+        elif pair is not None and re.search(r"pair|key|id|name", name):
+            by_name += [int(pair[1]), int(pair[2])]
+        elif "pair" not in name and _NAMES_A_CAMERA.search(name):
+            camera = _camera(value)
+            own = by_name if isinstance(value, str) else by_number
+            own += [] if camera is None else [camera]
+    for cameras in (by_number, by_name):
+        if len(cameras) == 2 and cameras[0] != cameras[1]:
+            return cameras[0], cameras[1]
+    return None
+
+
+def _lengths_of(
+    entry: dict[str, Any], cameras: Pair, path: str, default_m: float, findings: _Findings
+) -> Iterable[_Recorded]:
+    """Yield the baselines that an entry of a pair states, in one unit or in several."""
+    keys = [key for key in entry if re.search(r"baseline|distance|length|separation", words(key))]
+    if not keys:
+        findings.problems.append(
+            f"{path}: baseline_cm is missing; the keys here are: {', '.join(sorted(entry))}"
+        )
+    for key in keys:
+        _, unit = without_unit(words(key))
+        if isinstance(entry[key], dict | list) or unit not in ("", *UNITS_M):
+            continue
+        place = child_path(path, key)
+        unit_m = UNITS_M.get(unit, default_m)
+        yield from _length(cameras, entry[key], unit_m, place, findings)
+
+
+def _length(
+    cameras: Pair, value: object, unit_m: float, path: str, findings: _Findings
+) -> Iterable[_Recorded]:
+    if not is_number(value) or value <= 0:
+        findings.problems.append(f"{path}: must be a number above zero, found {brief(value)}")
+        return
+    yield cameras, float(value) * (unit_m / 0.01), Stated(value, "", path)

@@ -8,7 +8,7 @@ anything is rounded.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Final, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float64
@@ -69,6 +69,33 @@ class Rig:
         """Return the recorded distance in cm between two cameras, in either order."""
         pair = (min(camera_a, camera_b), max(camera_a, camera_b))
         return self.baselines_cm[CAMERA_PAIRS.index(pair)]
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """Something in a scene's files that is odd, missing or not understood, and stops no sample.
+
+    Attributes:
+        about: What it concerns: a name of `REMARKS`.
+        text: The place, what was found and, where there is one, the cure.
+    """
+
+    about: str
+    text: str
+
+
+REMARKS: Final = {
+    "poses": "fields and rigs that need poses; without them the rig is assumed rectified",
+    "world": "poses in the world: several readings fit",
+    "principal point": "the intrinsics; the image's centre is assumed",
+    "videos": "pairs of cameras whose videos are missing",
+    "frames": "nothing: frames that all files have are used",
+    "size": "nothing: the videos' size is used",
+    "baselines": "nothing",
+    "labels": "nothing",
+    "caption": "nothing",
+}
+"""What a remark may be about, and what it holds up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,6 +292,10 @@ class Scene:
         key_frames: The frames, ascending from 0, at which the decoding of all cameras' pictures
             can begin.
         training: What is known of a scene of training shards; None for released scenes.
+        remarks: What is odd in its files and stops no sample.
+        pose_form: The names of the readings of its trajectory that the rig's geometry confirms,
+            the chosen one first, joined by "|"; None where poses are not understood, or in an index
+            of an earlier version, which knew the one that the file names.
         members: File name to the place of its bytes. Depth packed by blosc2 has a name of its own,
             which `held_name` returns.
         seek_tables: Where the packets of its videos lie, as `media.seek_table` packs it; None where
@@ -287,6 +318,8 @@ class Scene:
     members: Mapping[str, Member] = field(hash=False)
     key_frames: tuple[int, ...] = (0,)
     training: TrainingFacts | None = None
+    remarks: tuple[Remark, ...] = ()
+    pose_form: str | None = None
     seek_tables: bytes | None = field(default=None, compare=False, repr=False)
 
     def held_name(self, name: str) -> str:
@@ -307,6 +340,10 @@ class Scene:
                 "or download the others too."
             )
         return found
+
+    def remark(self, *about: str) -> str:
+        """Return what is remarked about some things, "" where nothing is."""
+        return " ".join(remark.text for remark in self.remarks if remark.about in about)
 
     @property
     def held_videos(self) -> tuple[str, ...]:

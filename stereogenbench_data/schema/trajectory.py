@@ -1,274 +1,374 @@
-"""``trajectory.json``: the poses of six cameras over the frames of a scene.
+"""``trajectory.json``: the numbers of six cameras over the frames of a scene, found by structure.
 
-Nothing about a rotation is guessed. Its numbers are read as the file's ``rotation_representation``
-says; a file without one must have {pitch, yaw, roll}, which Unreal writes in degrees.
+Nobody of this project has seen a released trajectory. So no key is expected: every list, and every
+object whose keys only count (``"Cam_00"``, ``"frame_0007"``), is an axis, and numbers at the same
+place in all of them become one array. `RecordedPoses` holds those that have an axis of six cameras
+and an axis of frames; what they mean as poses is for `geometry.pose_forms` to say and for
+`index.evidence` to confirm.
 """
 
+import re
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float64
 
-from stereogenbench_data.schema.document import JsonValue, brief, camera_of, is_number
-from stereogenbench_data.schema.parse import require_six_cameras, unit_m
-from stereogenbench_data.schema.records import RotationKind, Trajectory
+from stereogenbench_data.errors import SchemaError
+from stereogenbench_data.schema.document import brief, camera_of, is_number, parse_object
+from stereogenbench_data.schema.quantities import (
+    length_unit_m,
+    nodes_of,
+    stated,
+    without_unit,
+    words,
+)
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
-TOLERANCE: Final = 1e-3
-"""How far a quaternion's norm may be from 1, and a matrix from orthonormal."""
+_COUNTING: Final = re.compile(r"(.*?)(\d+)\Z")
+_SPEAKS_OF_FORM: Final = re.compile(
+    r"rotation|orientation|euler|quaternion|representation|convention|coordinate|handed|axes|axis|"
+    r"matrix|transform|pose|extrinsic|world|angle|format|unit|frame_of_reference|system"
+)
+_COMPONENTS: Final = (
+    ("pitch", "yaw", "roll"),
+    ("qx", "qy", "qz", "qw"),
+    ("x", "y", "z", "w"),
+    ("x", "y", "z"),
+    ("tx", "ty", "tz"),
+    ("rx", "ry", "rz"),
+)
+"""Names of components, in the order in which they are kept; the first that are all there win."""
+_TRAILING: Final = ((4, 4), (3, 4), (3, 3), (16,), (12,), (9,), (4,), (3,))
+_MOST_VALUES: Final = 2_000_000
+
+Place = tuple[str, ...]
+Columns = dict[Place, tuple[tuple[int, ...], list[Any]]]
+"""The values at each place of a document, with the lengths of the axes on the way to them."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Representation:
-    """How a file writes rotations.
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """Numbers of each camera in each frame.
 
     Attributes:
-        kind: What `Trajectory.rotations` holds.
-        shape: The shape of one rotation there.
-        form: The form of one rotation in the file, for messages.
-        order: For each component of a quaternion x, y, z, w, its place in the file's list.
+        name: The keys on the way to them, in snake_case, outermost first; "*" is an axis.
+        components: The names of the components, where they are keys: ("pitch", "yaw", "roll").
+        unit: The unit at the end of their keys, "" without one.
+        values: (frames, 6, ...) float64: frames and cameras in the order of their numbers.
     """
 
-    kind: RotationKind
-    shape: tuple[int, ...]
-    form: str
-    order: tuple[int, ...] = ()
+    name: Place
+    components: tuple[str, ...]
+    unit: str
+    values: np.ndarray
 
+    @property
+    def words(self) -> frozenset[str]:
+        """The words of the last two keys: what the numbers are called."""
+        keys = [key for key in self.name if key != "*"][-2:]
+        return frozenset(word for key in keys for word in key.split("_"))
 
-_ROTATOR: Final = _Representation("rotator_deg", (3,), "{pitch, yaw, roll} in degrees")
-REPRESENTATIONS: Final[dict[str, _Representation]] = {
-    "unreal_rotator_degrees": _ROTATOR,
-    "quaternion_xyzw": _Representation("quaternion_xyzw", (4,), "a list x, y, z, w", (0, 1, 2, 3)),
-    "quaternion_wxyz": _Representation("quaternion_xyzw", (4,), "a list w, x, y, z", (1, 2, 3, 0)),
-    "matrix_3x3": _Representation("matrix", (3, 3), "three rows of three numbers"),
-}
-"""By the name in ``rotation_representation``. The first stands in a scene that was rendered
-elsewhere; the others are those that `synthesis.export` writes, as the paper leaves them open."""
+    @property
+    def key(self) -> str:
+        """The keys as messages show them."""
+        return ".".join("[]" if key == "*" else key for key in self.name).replace(".[]", "[]")
 
 
 @dataclass(frozen=True, slots=True)
-class _Pose:
-    """One camera in one frame: its centre and its rotation, with their unchecked components."""
+class RecordedPoses:
+    """What a trajectory records.
 
-    frame: int
-    camera: int
-    location: JsonValue
-    centre: list[Any]
-    rotation: JsonValue
-    turn: list[Any]
+    Attributes:
+        blocks: The numbers that may be part of poses.
+        hints: The words of the texts in which a file says how they are to be read.
+        unit_m: Metres in the unit that the file names for lengths, None without one.
+    """
+
+    blocks: tuple[Block, ...]
+    hints: frozenset[str]
+    unit_m: float | None
+
+    @property
+    def shape(self) -> str:
+        """What the scenes of one writer have in common: the keys of the numbers, and the hints."""
+        keys = sorted(f"{block.key}({','.join(block.components)})" for block in self.blocks)
+        return " ".join([*keys, *sorted(self.hints)])
 
 
-def parse_trajectory(text: bytes, *, where: str) -> Trajectory:
-    """Return the poses that a ``trajectory.json`` records, unrounded and in its own world axes.
-
-    Any number of frames is read. Frames and cameras are ordered by their indices. Quaternions are
-    normalised.
+def record_poses(text: bytes, *, where: str) -> RecordedPoses:
+    """Return the numbers of a ``trajectory.json`` that belong to six cameras in each frame.
 
     Args:
         text: The file's bytes.
         where: The file's path, for messages.
 
     Raises:
-        SchemaError: If the file does not follow the format; the message lists every problem.
+        SchemaError: If the file is not JSON, or no numbers of six cameras over frames are in it.
 
     Source: the paper's appendix on the file schema.
     """
-    root = JsonValue.parse(text, where=where)
-    metres = unit_m(root)
-    require_six_cameras(root)
-    representation = _representation(root.find("rotation_representation"))
-    poses = [
-        pose
-        for frame, node in enumerate(_frames(root))
-        for pose in _poses(node, frame=frame, representation=representation)
-    ]
-    centres = _numbers([(pose.location, pose.centre) for pose in poses], count=3)
-    rotations = _rotations(poses, representation)
-    root.problems.require_none()
-    rows = np.lexsort(([pose.camera for pose in poses], [pose.frame for pose in poses]))
-    return Trajectory(
-        locations=_frozen(centres[rows].reshape(-1, CAMERA_COUNT, 3)),
-        unit_m=metres,
-        rotations=_frozen(rotations[rows].reshape(-1, CAMERA_COUNT, *representation.shape)),
-        rotation_kind=representation.kind,
-    )
-
-
-def _frozen(values: np.ndarray) -> np.ndarray:
-    values = np.ascontiguousarray(values)
-    values.setflags(write=False)
-    return values
-
-
-def _representation(name: JsonValue | None) -> _Representation:
-    if name is None:
-        return _ROTATOR
-    if isinstance(name.value, str) and name.value in REPRESENTATIONS:
-        return REPRESENTATIONS[name.value]
-    name.complain(f"must be one of {', '.join(REPRESENTATIONS)}, found {brief(name.value)}")
-    return _ROTATOR
-
-
-def _frames(root: JsonValue) -> list[JsonValue]:
-    """Return the frames in the order of their indices, which must run from 0 without a gap."""
-    entries = root.require("frames")
-    if entries is None:
-        return []
-    frames = entries.objects()
-    if isinstance(entries.value, list) and not entries.value:
-        entries.complain("has no frame")
-    indices = [frame.find("frame_index") for frame in frames]
-    if all(index is None for index in indices):
-        return frames
-    places: dict[int, JsonValue] = {}
-    for frame, index in zip(frames, indices, strict=True):
-        if index is None:
-            frame.require("frame_index")
+    document = parse_object(text, where=where)
+    columns = _columns(document)
+    if sum(len(values) for _, values in columns.values()) > _MOST_VALUES:
+        raise SchemaError(f"{where}: has over {_MOST_VALUES:,} values. Replace it with the file of "
+                          "the release.")  # fmt: skip
+    blocks, odd = [], []
+    for name, components, unit, values in _vectors(columns):
+        try:
+            ordered = _ordered(name, values, columns)
+        except _Odd as error:
+            odd.append(str(error))
             continue
-        place = index.integer()
-        if place in places:
-            index.complain(f"frame {place} is already at {places[place].path}")
-        places.setdefault(place, frame)
-    missing = sorted(set(range(len(places))) - set(places))
-    if missing:
-        shown = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
-        entries.complain(
-            f"frames must be numbered from 0 without a gap; there are {len(places)} numbers up "
-            f"to {max(places)}, without {shown}"
+        if ordered is not None:
+            blocks.append(Block(name, components, unit, ordered))
+    if not blocks or odd:
+        reason = "; ".join(dict.fromkeys(odd)) or (
+            f"no numbers of {CAMERA_COUNT} cameras in each frame are in it; the keys are: "
+            f"{', '.join(sorted(document)[:20])}"
         )
-    return [places[place] for place in sorted(places)]
+        raise SchemaError(f"{where}: {reason}.")
+    return RecordedPoses(tuple(blocks), _hints(document), _unit_m(document, where))
 
 
-def _poses(frame_node: JsonValue, *, frame: int, representation: _Representation) -> list[_Pose]:
-    entries = frame_node.require("cameras")
-    if entries is None:
-        return []
-    cameras: dict[int, JsonValue] = {}
-    for node in entries.objects():
-        camera = _camera(node)
-        if camera is None:
-            continue
-        if camera in cameras:
-            node.complain(f"camera {camera} is already at {cameras[camera].path}")
-        cameras.setdefault(camera, node)
-    missing = sorted(set(range(CAMERA_COUNT)) - set(cameras))
-    if missing:
-        entries.complain(f"has no pose of camera {', '.join(map(str, missing))}")
-    poses = []
-    for camera, node in cameras.items():
-        location, rotation = node.require("location"), node.require("rotation")
-        if location is None or rotation is None:
-            continue
-        centre, turn = location.axes(("x", "y", "z")), _components(rotation, representation)
-        if centre is None:
-            location.complain(f"must be {{x, y, z}}, found {brief(location.value)}")
-        if centre is not None and turn is not None:
-            poses.append(_Pose(frame, camera, location, centre, rotation, turn))
-    return poses
+def _unit_m(document: dict[str, Any], where: str) -> float | None:
+    nodes = nodes_of(document)
+    unit_m = length_unit_m(nodes)
+    for each in stated(nodes, "unit"):
+        if unit_m is None and isinstance(each.value, str):
+            raise SchemaError(
+                f"{where}: {each.path}: {brief(each.value)} is not a unit of length that is known "
+                f"(mm, cm, m). Correct it."
+            )
+    return unit_m
 
 
-def _camera(node: JsonValue) -> int | None:
-    """Return the camera of an entry by its index or else its name, None where that fails."""
-    before = len(node.problems)
-    index, name = node.find("camera_index"), node.find("camera_name")
-    if index is not None:
-        camera = index.camera()
-        named = None if name is None else camera_of(name.value)
-        if named is not None and named != camera:
-            node.complain(f"camera_index is {camera} but camera_name is that of camera {named}")
-    elif name is not None:
-        camera = name.camera()
-    else:
-        node.require("camera_index")
-    return None if len(node.problems) > before else camera
+def _hints(document: dict[str, Any]) -> frozenset[str]:
+    """Return the words of short texts, outside frames, that speak of how poses are written."""
+    found: set[str] = set()
+    waiting: list[tuple[str, Any]] = [(words(key), value) for key, value in document.items()]
+    while waiting:
+        name, value = waiting.pop()
+        if isinstance(value, dict) and len(value) < _MOST_HINTS:
+            waiting += [(f"{name}_{words(key)}", inner) for key, inner in value.items()]
+        elif isinstance(value, str) and len(value) < 200 and _SPEAKS_OF_FORM.search(name):
+            found |= {*words(value).split("_"), *name.split("_")}
+        elif isinstance(value, list) and 0 < len(value) <= 4 and _SPEAKS_OF_FORM.search(name):
+            found |= {"".join(map(str, value)).lower()}
+    return frozenset(found)
 
 
-def _components(rotation: JsonValue, representation: _Representation) -> list[Any] | None:
-    """Return the numbers of a rotation in the order kept, None where it has another form.
+_MOST_HINTS: Final = 64
 
-    They are pitch, yaw, roll; x, y, z, w; or nine elements by rows.
+
+class _Odd(Exception):
+    """Numbers of cameras that cannot be put in order."""
+
+
+def _columns(node: Any) -> Columns:
+    """Return the values at each place of a document: the lengths of its axes, and all values.
+
+    Places that not all elements of a list have alike are left out.
     """
-    value = rotation.value
-    if representation.kind == "rotator_deg":
-        components = rotation.axes(("pitch", "yaw", "roll"))
-    elif not isinstance(value, list) or len(value) != representation.shape[0]:
-        components = None
-    elif representation.kind == "quaternion_xyzw":
-        components = [value[place] for place in representation.order]
-    elif all(isinstance(row, list) and len(row) == 3 for row in value):
-        components = [element for row in value for element in row]
+    if isinstance(node, dict):
+        counted = _counted(node)
+        if counted is not None:
+            inner = _stacked([value for _, value in counted])
+            numbers = [number for number, _ in counted]
+            return inner | {("*", "#"): ((len(numbers),), numbers)}
+        found = {}
+        for key, value in node.items():
+            name = words(key)
+            for place, column in _columns(value).items():
+                found[(name, *place)] = column
+        return found
+    if isinstance(node, list):
+        return _stacked(node)
+    return {(): ((), [node])}
+
+
+def _counted(node: dict[str, Any]) -> list[tuple[int, Any]] | None:
+    """Return the values of an object whose keys only count, by their numbers."""
+    if len(node) < 2 or not all(isinstance(value, dict | list) for value in node.values()):
+        return None
+    found = [_COUNTING.match(key) for key in node]
+    if None in found or len({match[1] for match in found if match}) > 1:
+        return None
+    numbers = [(int(match[2]), value) for match, value in zip(found, node.values(), strict=True)
+               if match]  # fmt: skip
+    return sorted(numbers, key=lambda each: each[0])
+
+
+def _stacked(nodes: list[Any]) -> Columns:
+    if all(not isinstance(node, dict | list) for node in nodes):
+        return {("*",): ((len(nodes),), nodes)}
+    parts = [_columns(node) for node in nodes]
+    found: Columns = {}
+    for place, (lengths, _) in parts[0].items():
+        others = [part.get(place, (None, ())) for part in parts]
+        if all(other[0] == lengths for other in others):
+            values = [value for other in others for value in other[1]]
+            found[("*", *place)] = ((len(nodes), *lengths), values)
+    return found
+
+
+def _vectors(columns: Columns) -> list[tuple[Place, tuple[str, ...], str, np.ndarray]]:
+    """Return what may be a location, a rotation or a matrix: place, components, unit and values."""
+    lists = [_of_list(place, *column) for place, column in columns.items()]
+    return [each for each in lists if each is not None] + _of_components(columns)
+
+
+def _of_list(
+    place: Place, lengths: tuple[int, ...], values: list[Any]
+) -> tuple[Place, tuple[str, ...], str, np.ndarray] | None:
+    """Return the numbers of a list or of nested lists in each camera of each frame."""
+    if not place or place[-1] != "*" or len(lengths) < 3:
+        return None
+    axes = len(lengths) - 2
+    if lengths[2:] not in _TRAILING:
+        return None
+    array = _as_numbers(values, lengths)
+    if {*place[-axes:]} != {"*"} or array is None:
+        return None
+    base, unit = place[:-axes], ""
+    if base and base[-1] != "*":
+        name, unit = without_unit(base[-1])
+        base = (*base[:-1], name)
+    return base, (), unit, array
+
+
+def _of_components(columns: Columns) -> list[tuple[Place, tuple[str, ...], str, np.ndarray]]:
+    """Return the numbers whose components are keys; a prefix (``location_x``) joins the place."""
+    groups: dict[tuple[Place, tuple[int, ...]], dict[str, tuple[str, list[Any]]]] = {}
+    for place, (lengths, values) in columns.items():
+        if place and place[-1] not in ("*", "#") and len(lengths) == 2:
+            name, unit = without_unit(place[-1])
+            head, _, last = name.rpartition("_")
+            base = (*place[:-1], head) if head else place[:-1]
+            groups.setdefault((base, lengths), {}).setdefault(last, (unit, values))
+    found: list[tuple[Place, tuple[str, ...], str, np.ndarray]] = []
+    for (base, lengths), components in groups.items():
+        names_there = [names for names in _COMPONENTS if set(names) <= set(components)]
+        if ("x", "y", "z", "w") in names_there:
+            names_there.remove(("x", "y", "z"))
+        plain, own_unit = without_unit(base[-1]) if base and base[-1] != "*" else ("", "")
+        place = (*base[:-1], plain) if plain else base
+        for names in names_there:
+            parts = [_as_numbers(components[name][1], lengths) for name in names]
+            numbers = [part for part in parts if part is not None]
+            if len(numbers) == len(names):
+                unit = components[names[0]][0] or own_unit
+                found.append((place, names, unit, np.stack(numbers, axis=-1)))
+    return found
+
+
+def _as_numbers(values: list[Any], lengths: tuple[int, ...]) -> np.ndarray | None:
+    """Return values as float64, None where one is not a number; nan stays where the file has it."""
+    kinds = set(map(type, values))
+    if not kinds <= {int, float}:
+        return None
+    if int in kinds and not all(is_number(value) for value in values if type(value) is int):
+        return None
+    return np.array(values, dtype=np.float64).reshape(lengths)
+
+
+def _ordered(
+    place: Place,
+    values: np.ndarray,
+    columns: Columns,
+) -> np.ndarray | None:
+    """Return values as (frames, 6, ...), in the order of the numbers; None where no axis has six.
+
+    Raises:
+        _Odd: If frames or cameras are numbered twice or with a gap.
+    """
+    axes = [at for at, key in enumerate(place) if key == "*"][:2]
+    if len(axes) < 2 or CAMERA_COUNT not in values.shape[:2]:
+        return None
+    owners = [next((key for key in reversed(place[:at]) if key != "*"), "") for at in axes]
+    is_of_cameras = ["cam" in owner or "view" in owner for owner in owners]
+    if values.shape[0] != values.shape[1] or is_of_cameras[0] == is_of_cameras[1]:
+        camera_axis = 0 if values.shape[0] == CAMERA_COUNT and (
+            values.shape[1] != CAMERA_COUNT or is_of_cameras[0]
+        ) else 1  # fmt: skip
     else:
-        components = None
-    if components is None:
-        rotation.complain(
-            f"must be {representation.form}, as rotation_representation says or by default, "
-            f"found {brief(value)}"
-        )
-    return components
+        camera_axis = 0 if is_of_cameras[0] else 1
+    if values.shape[camera_axis] != CAMERA_COUNT:
+        return None
+    # Cameras first: each frame may list them in an order of its own.
+    for axis in (camera_axis, 1 - camera_axis):
+        is_camera, at = axis == camera_axis, axes[axis]
+        numbers = _numbers_of(place, axes, axis, at, columns, is_camera=is_camera)
+        if numbers is None:
+            continue
+        what = "cameras" if is_camera else "frames"
+        if numbers.ndim == 1:
+            values = np.take(values, _order(numbers, what), axis=axis)
+            continue
+        rows = numbers if axis == 1 else numbers.T
+        taken = values if axis == 1 else np.swapaxes(values, 0, 1)
+        taken = np.stack([taken[row][_order(rows[row], what)] for row in range(len(rows))])
+        values = taken if axis == 1 else np.swapaxes(taken, 0, 1)
+    return np.ascontiguousarray(values if camera_axis == 1 else np.swapaxes(values, 0, 1))
 
 
-def _numbers(
-    values: list[tuple[JsonValue, list[Any]]], *, count: int
-) -> Float64[np.ndarray, "n count"]:
-    """Return components as float64; record each that is not a finite number, and keep 0 for it."""
-    flat = [component for _, components in values for component in components]
-    if set(map(type, flat)) <= {float}:
-        array = np.array(flat, dtype=np.float64).reshape(-1, count)
-        if np.isfinite(array).all():
-            return array
-    for node, components in values:
-        for component in components:
-            if not is_number(component):
-                node.complain(f"must hold finite numbers, found {brief(component)}")
-    kept = [float(value) if is_number(value) else 0.0 for value in flat]
-    return np.array(kept, dtype=np.float64).reshape(-1, count)
+def _order(numbers: np.ndarray, what: str) -> np.ndarray:
+    """Return how elements are put in the order of their numbers, from 0 or 1 without a gap."""
+    order = np.argsort(numbers, kind="stable")
+    ascending = numbers[order]
+    if ascending[0] not in (0, 1) or (np.diff(ascending) != 1).any():
+        repeated = ascending[1:][np.diff(ascending) == 0]
+        found = f"{repeated[0]} is there twice" if len(repeated) else (
+            f"there are {len(numbers)} of {ascending[0]} to {ascending[-1]}"
+        )  # fmt: skip
+        raise _Odd(f"{what} must be numbered from 0 or 1 without a gap, and {found}")
+    return order
 
 
-def _rotations(poses: list[_Pose], representation: _Representation) -> np.ndarray:
-    """Return the rotations of the poses, checked to be rotations."""
-    before = len(poses[0].rotation.problems) if poses else 0
-    values = _numbers(
-        [(pose.rotation, pose.turn) for pose in poses], count=int(np.prod(representation.shape))
-    )
-    is_checked = poses and len(poses[0].rotation.problems) == before
-    if representation.kind == "rotator_deg" or not is_checked:
-        return values
-    check = _rotation_matrices if representation.kind == "matrix" else _unit_quaternions
-    checked, bad = check(values)
-    for row, complaint in bad.items():
-        poses[row].rotation.complain(complaint)
-    return checked
+def _numbers_of(
+    place: Place,
+    axes: list[int],
+    axis: int,
+    at: int,
+    columns: Columns,
+    *,
+    is_camera: bool,
+) -> np.ndarray | None:
+    """Return the numbers of the elements of an axis, (n,) or (frames, 6); None if they have none.
+
+    They are the keys of an object, or stand in the elements under a key that speaks of them.
+    """
+    keyed = columns.get((*place[: at + 1], "#"))
+    if keyed is not None:
+        lengths, values = keyed
+        numbers = np.array(values).reshape(lengths)
+        return numbers if numbers.ndim == 1 or len(lengths) == 2 else None
+    known: dict[str, np.ndarray] = {}
+    for name in _CAMERA_KEYS if is_camera else _FRAME_KEYS:
+        column = columns.get((*place[: at + 1], name))
+        if column is None or len(column[0]) > 2:
+            continue
+        found = [camera_of(value) if is_camera else _frame_of(value) for value in column[1]]
+        if None not in found:
+            known[name] = np.array(found, dtype=np.int64).reshape(column[0])
+    if not known:
+        return None
+    first, numbers = next(iter(known.items()))
+    for name, others in known.items():
+        is_number_too = {*np.unique(others)} == {*np.unique(numbers)}
+        if is_number_too and not np.array_equal(others, numbers):
+            raise _Odd(f"{first} and {name} number {'cameras' if is_camera else 'frames'} apart")
+    is_same = numbers.ndim == 2 and bool((numbers == numbers[:1]).all())
+    return np.asarray(numbers[0]) if is_same else numbers
 
 
-def _unit_quaternions(
-    values: Float64[np.ndarray, "n 4"],
-) -> tuple[Float64[np.ndarray, "n 4"], dict[int, str]]:
-    """Return normalised quaternions, and a complaint for each row that is not nearly unit."""
-    norms = np.sqrt(np.sum(np.square(values), axis=1))
-    bad = {
-        int(row): f"a quaternion must have length 1 within {TOLERANCE}, found {norms[row]:.6g}"
-        for row in np.flatnonzero(np.abs(norms - 1) > TOLERANCE)
-    }
-    return values / np.where(norms > 0, norms, 1.0)[:, None], bad
+def _frame_of(value: object) -> int | None:
+    if isinstance(value, str):
+        match = _COUNTING.match(value)
+        return int(match[2]) if match else None
+    return int(value) if is_number(value) and float(value).is_integer() else None
 
 
-def _rotation_matrices(
-    values: Float64[np.ndarray, "n 9"],
-) -> tuple[Float64[np.ndarray, "n 3 3"], dict[int, str]]:
-    """Return 3 x 3 matrices, and a complaint for each row that is not nearly a rotation."""
-    matrices = values.reshape(-1, 3, 3)
-    products = matrices @ matrices.transpose(0, 2, 1)
-    skews = np.max(np.abs(products - np.eye(3)), axis=(1, 2))
-    bad = {
-        int(row): f"a rotation matrix must be orthonormal within {TOLERANCE}, "
-        f"found a deviation of {skews[row]:.3g}"
-        for row in np.flatnonzero(skews > TOLERANCE)
-    }
-    mirrored = np.linalg.det(matrices) < 0
-    return matrices, bad | {
-        int(row): "the matrix mirrors (its determinant is negative); its columns must be the "
-        "camera's forward, right and up axes in the world"
-        for row in np.flatnonzero(mirrored)
-        if int(row) not in bad
-    }
+_CAMERA_KEYS: Final = ("camera_index", "camera_id", "cam_index", "cam_id", "camera_number", "index",
+                       "id", "camera", "cam", "camera_name", "name", "label")  # fmt: skip
+_FRAME_KEYS: Final = ("frame_index", "frame", "frame_number", "frame_id", "index", "id", "number",
+                      "t", "frame_idx", "idx")  # fmt: skip

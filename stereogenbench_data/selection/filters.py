@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypedDict
 
 import numpy as np
@@ -10,6 +10,7 @@ from jaxtyping import Bool, Int64
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.records import SceneId
 from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.selection.options import did_you_mean
 
@@ -92,6 +93,28 @@ def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray,
     if len(rows) == 0:
         raise SelectionError(f"{index.where}: the index holds no scene at all.")
     return rows
+
+
+def may_pass(filters: Mapping[str, Any]) -> Callable[[SceneId], bool] | None:
+    """Return whether a scene may pass filters, by its path alone; None if all may."""
+    of_path = {
+        name: {wanted} if isinstance(wanted, str) else set(wanted)
+        for name, wanted in filters.items()
+        if name in ("split", "family", "map", "scenes") and isinstance(wanted, str | list | tuple)
+    }
+    if not of_path:
+        return None
+
+    def passes(scene: SceneId) -> bool:
+        values = {"split": scene.split, "family": scene.family, "map": scene.map_name}
+        return all(
+            any(str(part).strip("/").lower() in scene.key.lower() for part in wanted)
+            if name == "scenes"
+            else values[name] in wanted
+            for name, wanted in of_path.items()
+        )
+
+    return passes
 
 
 def stale_note(index: SceneIndex) -> str:

@@ -98,6 +98,11 @@ class Plan:
     def __len__(self) -> int:
         return int(self.first_sample[-1])
 
+    def without(self, index: SceneIndex, rows: Sequence[int]) -> "Plan":
+        """Return the plan without some scenes, by their rows."""
+        kept = self.pairs[~np.isin(self.pairs.row, rows)]
+        return _plan(index, kept, windows=self.windows, seed=self.seed)
+
     @property
     def digest(self) -> str:
         """A sha256 of the selection, in hex: the same for the same samples by the same numbers."""

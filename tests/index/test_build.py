@@ -30,7 +30,7 @@ def linked_scenes(make_scene, root):
 def test_every_scene_is_whole_incomplete_or_broken(linked_scenes, root):
     keys = linked_scenes(4)
     (root / keys[1] / "_scene_complete.json").unlink()
-    (root / keys[2] / "cam_00_rgb.mp4").unlink()
+    (root / keys[2] / "baseline.json").unlink()
     (root / "train/Uniform/scene.7").mkdir()
     (root / "train/Uniform/scene.7/baseline.json").write_text("{}")
 
@@ -39,12 +39,12 @@ def test_every_scene_is_whole_incomplete_or_broken(linked_scenes, root):
     assert [scene.id.key for scene in report.scenes] == [keys[0], keys[3]]
     assert list(report.incomplete) == [keys[1]]
     assert list(report.broken) == [keys[2], "train/Uniform/scene.7"]
-    assert "has no cam_00_rgb.mp4" in report.broken[keys[2]]
+    assert "has no baseline.json" in report.broken[keys[2]]
 
 
 def test_worker_processes_find_what_one_process_finds(linked_scenes, root, monkeypatch):
     keys = linked_scenes(5)
-    (root / keys[3] / "trajectory.json").unlink()
+    (root / keys[3] / "baseline.json").unlink()
     alone = walk(root, workers=1)
     monkeypatch.setattr(walk_module, "POOL_FROM", 1)
 

@@ -88,7 +88,7 @@ def test_incomplete_scenes_are_listed_and_not_fatal(make_scene, root, run):
 
 def test_broken_scenes_are_listed_and_the_others_indexed(make_scene, root, run):
     make_scene()
-    (make_scene("train/Uniform/Car_Dealer/scene_000002") / "trajectory.json").unlink()
+    (make_scene("train/Uniform/Car_Dealer/scene_000002") / "baseline.json").unlink()
 
     result = run(root)
 

@@ -587,15 +587,46 @@ def test_incomplete_scenes_of_a_tree_are_warned_of(make_scene, root):
 def test_broken_scenes_of_a_tree_are_an_error_that_lists_them(make_scene, root):
     for number in range(12):
         make_scene(f"train/Uniform/Car_Dealer/scene_{number:06d}")
-        (root / f"train/Uniform/Car_Dealer/scene_{number:06d}" / "trajectory.json").unlink()
+        (root / f"train/Uniform/Car_Dealer/scene_{number:06d}" / "baseline.json").unlink()
 
     with pytest.raises(StorageError, match="12 scenes cannot be used:") as caught:
         SceneIndex.open(root)
 
     lines = str(caught.value).splitlines()
-    assert "scene_000009: is marked as complete and has no trajectory.json" in lines[10]
+    assert "scene_000009: is marked as complete and has no baseline.json" in lines[10]
     assert lines[11].strip() == "and 2 more"
-    assert "stereogenbench index" in lines[12]
+
+
+def test_a_few_broken_scenes_of_a_tree_are_left_out_with_one_warning(make_scene, root):
+    for number in range(4):
+        make_scene(f"train/Uniform/Car_Dealer/scene_{number:06d}")
+    (root / "train/Uniform/Car_Dealer/scene_000002" / "baseline.json").write_text("{}")
+
+    with pytest.warns(IncompleteSceneWarning, match="1 scene cannot be used:") as caught:
+        index = SceneIndex.open(root)
+
+    assert len(caught) == 1
+    assert "scene_000002/baseline.json: 4 problems" in str(caught[0].message)
+    assert len(index) == 3
+
+
+def test_twenty_scenes_that_fail_alike_are_told_as_a_format(make_scene, root):
+    for number in range(21):
+        folder = make_scene(f"train/Uniform/Car_Dealer/scene_{number:06d}")
+        (folder / "baseline.json").write_text('{"lens": {}}')
+
+    with pytest.raises(StorageError, match="first 20 scenes cannot be used, all for one reason"):
+        SceneIndex.open(root)
+
+
+def test_scenes_that_are_not_wanted_are_not_described(make_scene, root):
+    make_scene("train/Uniform/Car_Dealer/scene_000001")
+    folder = make_scene("eval/MapSeenInTrain/Uniform/Car_Dealer/scene_000002")
+    (folder / "baseline.json").write_text("{}")
+
+    index = SceneIndex.open(root, wanted=lambda scene: scene.split == "train")
+
+    assert index.column("split").tolist() == ["train"]
 
 
 def test_a_tree_of_unfinished_scenes_is_an_error(make_scene, root):

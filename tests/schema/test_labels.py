@@ -54,61 +54,60 @@ def test_any_text_is_a_key_or_refused(key):
 
 def test_the_completion_marker_is_read():
     text = json.dumps(
-        {"scene_label": "A_1", "scene_index": 1.0, "map_name": "A", "map_path": "/Game/A"}
+        {"scene_label": "A_1", "scene_index": 1, "map_name": "A", "map_path": "/Game/A"}
     )
 
-    labels = parse_complete(text.encode(), where="m.json")
+    labels, remarks = parse_complete(text.encode(), where="m.json")
 
     assert labels == SceneLabels(scene_label="A_1", scene_index=1, map_name="A", map_path="/Game/A")
+    assert remarks == ()
 
 
-def test_every_identifier_of_a_wrong_type_is_reported():
-    text = b'{"scene_label": 3, "scene_index": "4", "map_name": ["A"]}'
+@pytest.mark.parametrize(
+    "text",
+    [
+        b'{"scene_label": 3}', b'{"scene_label": ["A"]}', b'{"map_name": "\\ud800"}', b"", b"[]",
+        b"\xff\xfe{}", b'{"map_name": "A", "map_name": "B"}',
+    ],
+)  # fmt: skip
+def test_a_marker_that_is_not_understood_stops_nothing(text):
+    labels, remarks = parse_complete(text, where="m.json")
 
-    with pytest.raises(SchemaError, match=r"m\.json: 3 problems") as caught:
-        parse_complete(text, where="m.json")
-
-    assert str(caught.value).splitlines()[1:] == [
-        "  $.scene_label: must be a text, found 3",
-        "  $.scene_index: must be an integer, found '4'",
-        "  $.map_name: must be a text, found a list of 1",
-    ]
+    assert labels == SceneLabels()
+    assert all(remark.text.startswith("m.json: ") for remark in remarks)
 
 
-def test_half_a_character_is_refused():
-    with pytest.raises(SchemaError, match=r"\$\.map_name: contains half a character"):
-        parse_complete(b'{"map_name": "\\ud800"}', where="m.json")
+@pytest.mark.parametrize(
+    ("written", "number"), [(4, 4), ("0041", 41), (1.5, None), ("x", None), (True, None)]
+)
+def test_the_number_of_a_scene_may_be_a_text(written, number):
+    labels, _ = parse_complete(json.dumps({"scene_index": written}).encode(), where="m.json")
+
+    assert labels.scene_index == number
 
 
 def test_a_description_is_read():
     text = b"""{"scene_type": "outdoor", "setting": "yard", "short_caption": "A yard.",
                "detailed_caption": "A yard with a wall.", "tags": ["yard", "wall"], "other": 1}"""
 
-    assert parse_description(text, where="d.json") == Description(
-        "A yard.", "A yard with a wall.", "outdoor", "yard", ("yard", "wall")
+    assert parse_description(text, where="d.json") == (
+        Description("A yard.", "A yard with a wall.", "outdoor", "yard", ("yard", "wall")),
+        (),
     )
 
 
-def test_a_caption_under_an_unknown_key_is_refused():
-    with pytest.raises(SchemaError, match=r"d\.json: .*problem") as caught:
-        parse_description(b'{"caption": "A yard.", "tags": []}', where="d.json")
+def test_a_caption_is_found_under_likely_keys():
+    text = b'{"caption": "A yard.", "output": {"detailedCaption": "A long yard."}, "tags": "a, b"}'
 
-    assert "$.caption: is not a known key and may stand for short_caption" in str(caught.value)
-    assert "the keys here are: caption, tags" in str(caught.value)
+    description, remarks = parse_description(text, where="d.json")
 
-
-def test_an_empty_description_has_empty_texts():
-    assert parse_description(b"{}", where="d.json") == Description()
+    assert description == Description("A yard.", "A long yard.", tags=("a", "b"))
+    assert remarks == ()
 
 
-@pytest.mark.parametrize(
-    ("text", "match"),
-    [
-        (b'{"tags": "yard"}', r"\$\.tags: must be a list of texts, found 'yard'"),
-        (b'{"tags": ["yard", 3]}', r"\$\.tags\[1\]: must be a text, found 3"),
-        (b'{"short_caption": true}', r"\$\.short_caption: must be a text, found True"),
-    ],
-)
-def test_a_description_of_a_wrong_type_is_refused(text, match):
-    with pytest.raises(SchemaError, match=match):
-        parse_description(text, where="d.json")
+@pytest.mark.parametrize("text", [b"{}", b'{"short_caption": true}', b'{"tags": [3]}', b"[]", b""])
+def test_a_description_without_texts_is_empty_and_stops_nothing(text):
+    description, remarks = parse_description(text, where="d.json")
+
+    assert description == Description()
+    assert {remark.about for remark in remarks} <= {"caption"}

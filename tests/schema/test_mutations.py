@@ -1,14 +1,16 @@
 """Any change of a metadata file gives records or a `SchemaError`, never another error."""
 
 import copy
+import json
 import random
 from contextlib import suppress
+from functools import partial
 
 import pytest
 
 from stereogenbench_data.errors import SchemaError
+from stereogenbench_data.index.evidence import poses_as, understood_poses
 from stereogenbench_data.schema.parse import parse_complete, parse_description, parse_rig
-from stereogenbench_data.schema.trajectory import parse_trajectory
 
 VALUES = (
     None, True, 0, -1, 1.5, "x", "Cam_07", [], {}, [1], {"a": 1}, [[1, 2, 3]] * 3, [0, 0, 0, 1],
@@ -44,11 +46,13 @@ def mutated(document, pick):
 
 @pytest.fixture
 def parsers(rig_document, trajectory_document):
+    rig, _, _ = parse_rig(json.dumps(rig_document).encode(), where="baseline.json")
     labels = {"scene_label": "A_1", "scene_index": 1, "map_name": "A", "map_path": "/Game/A"}
     description = {"short_caption": "A yard.", "detailed_caption": "A yard.", "tags": ["yard"]}
     return (
         (parse_rig, rig_document),
-        (parse_trajectory, trajectory_document),
+        (partial(poses_as, form=None), trajectory_document),
+        (partial(understood_poses, rig=rig), trajectory_document),
         (parse_complete, labels),
         (parse_description, description),
     )

@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.geometry.pose_forms import readings
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.schema.parse import parse_rig
 from stereogenbench_data.schema.release import CAMERA_PAIRS
-from stereogenbench_data.schema.trajectory import parse_trajectory
+from stereogenbench_data.schema.trajectory import record_poses
 from stereogenbench_data.synthesis.ray_renderer import RayCasting
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
@@ -26,7 +27,8 @@ def small(**changes):
 
 
 def trajectory_of(scene):
-    return parse_trajectory((scene.folder / "trajectory.json").read_bytes(), where="trajectory")
+    recorded = record_poses((scene.folder / "trajectory.json").read_bytes(), where="trajectory")
+    return next(iter(readings(recorded))).trajectory
 
 
 def rig_of(scene):

@@ -35,6 +35,7 @@ from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.index.evidence import poses_as
 from stereogenbench_data.media.depth import depth_frame_index, depth_m_from_units
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.samples.streams import Streams
@@ -48,7 +49,6 @@ from stereogenbench_data.schema.release import (
     depth_name,
     rgb_name,
 )
-from stereogenbench_data.schema.trajectory import parse_trajectory
 
 LONG_PAIR: Final = (0, CAMERA_COUNT - 1)
 """The non-adjacent pair that the paper audits beside the primary one."""
@@ -256,9 +256,7 @@ class _SceneCheck:
             document = self.files.attempt(name, parse_object, text, where=name)
             documents += [] if document is None else [document]
             if name == TRAJECTORY_JSON:
-                trajectory = self.files.attempt(name, parse_trajectory, text, where=name)
-                if trajectory is not None:
-                    poses = self.files.attempt(name, CameraPoses.from_trajectory, trajectory)
+                poses = self.files.attempt(name, poses_as, text, self.scene.pose_form, where=name)
         if poses is None:
             return RigAudit(fx_px=self.intrinsics.fx_px, fy_px=self.intrinsics.fy_px), None
         rig = rig_audit(self.scene.rig, poses, documents)
