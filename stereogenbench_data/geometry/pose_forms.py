@@ -203,12 +203,18 @@ def _all_readings(recorded: RecordedPoses) -> Iterator[_Form]:
             for place in places if needs_place else [None]:
                 if place is turn:
                     continue
-                for axes in AXES:
+                for axes in _possible_axes(hints):
                     unit_m, unit = _unit(recorded, place or turn)
                     tier = _tier(turn, kind, axes, hints)
                     where = turn.key if place is None else f"{place.key} and {turn.key}"
                     name = f"{where}: {kind}, {axes} axes{unit}"
                     yield _Form(name, tier, turn, place, kind, axes, unit_m)
+
+
+def _possible_axes(hints: frozenset[str]) -> list[str]:
+    """Return the axes that a file may mean: those with left for right only where it names them."""
+    said = [axes for axes in AXES if axes in hints]
+    return said or [axes for axes in AXES if axes != "ros"]
 
 
 def _unit(recorded: RecordedPoses, place: Block) -> tuple[float, str]:

@@ -33,6 +33,8 @@ _EXACT: Final = 1e-3
 """How far the line of the cameras may be from their x axis, as a sine, in a form that no name
 supports; a rig that is recorded without rounding has 1e-9 or less."""
 _SAME: Final = 1e-4
+_UNREAL_M: Final = 0.01
+"""Metres in the unit of poses whose file names none: Unreal's."""
 _LEFT, _RIGHT = (list(cameras) for cameras in zip(*CAMERA_PAIRS, strict=True))
 _SHOWN: Final = 4
 
@@ -43,9 +45,10 @@ class Understood:
 
     Attributes:
         poses: The poses.
-        names: The readings that pass, the one that was taken first.
+        names: The readings that pass, the one that was taken first; () where that is the one that
+            the file itself names.
         differ: Whether poses in the world differ between these readings.
-        note: What the file says of itself and is not so; "" where nothing is.
+        note: How the poses contradict the primary pair; "" where they do not.
     """
 
     poses: CameraPoses
@@ -65,13 +68,24 @@ def understood_poses(text: bytes, rig: Rig, *, where: str) -> Understood:
     failures: dict[str, str] = {}
     passed: list[tuple[Reading, CameraPoses, float]] = []
     for reading in readings(recorded):
-        if passed and reading.tier > passed[0][0].tier and _is_exact(passed):
+        is_found = passed and _is_exact(passed) and not _is_reversed(passed[0][1], rig)
+        if is_found and reading.tier > passed[0][0].tier:
             break
         poses, off, reason = _checked(reading, rig)
         if poses is None:
             failures.setdefault(reason, reading.name)
         else:
             passed.append((reading, poses, off))
+    left, right = rig.primary_pair
+    reversed_ = [each for each in passed if _is_reversed(each[1], rig)]
+    note = ""
+    if len(reversed_) < len(passed):
+        passed = [each for each in passed if not _is_reversed(each[1], rig)]
+    elif passed:
+        note = (
+            f"baseline.json says that camera {left} is the left one of the primary pair, and by "
+            f"the poses it is to the right of camera {right}. The poses count: correct one of them"
+        )
     exact = [each for each in passed if each[2] <= _EXACT]
     if exact:
         passed = [each for each in exact if each[0].tier == exact[0][0].tier]
@@ -93,13 +107,18 @@ def understood_poses(text: bytes, rig: Rig, *, where: str) -> Understood:
             f"stand to each other: {listed}. Name the right one in the file."
         )
     worlds = [taken, *(each for each in passed[1:] if not _same_world(each[1], taken[1]))]
-    note = ""
-    if taken[0].tier == 2:
-        note = (
-            f"poses are read as {taken[0].name}, which fits the rig; what the file names does not"
-        )
     names = tuple(_full_name(reading, poses) for reading, poses, _ in worlds)
-    return Understood(taken[1], names, differ=len(worlds) > 1, note=note)
+    is_plain = len(worlds) == 1 and taken[0].tier == 0 and taken[1].unit_m in (
+        taken[0].trajectory.unit_m, _UNREAL_M,
+    )  # fmt: skip
+    return Understood(taken[1], () if is_plain else names, differ=len(worlds) > 1, note=note)
+
+
+def _is_reversed(poses: CameraPoses, rig: Rig) -> bool:
+    """Return whether the left camera of the primary pair stands to the right of the other."""
+    lateral_m = lateral_offsets_m(poses)
+    left, right = rig.primary_pair
+    return bool(lateral_m[left] > lateral_m[right])
 
 
 def poses_as(text: bytes, form: str | None, *, where: str) -> CameraPoses:
@@ -120,7 +139,7 @@ def poses_as(text: bytes, form: str | None, *, where: str) -> CameraPoses:
         if name:
             trajectory = replace(trajectory, unit_m=float(unit_m))
         elif not np.isfinite(trajectory.unit_m):
-            trajectory = replace(trajectory, unit_m=0.01)
+            trajectory = replace(trajectory, unit_m=_UNREAL_M)
         return CameraPoses.from_trajectory(trajectory)
     raise SchemaError(
         f"{where}: has no poses {f'of the form {shortened(name, 200)}' if name else 'at all'}. "
@@ -178,9 +197,6 @@ def _checked(reading: Reading, rig: Rig) -> tuple[CameraPoses | None, float, str
             f"looks, and {baselines_cm[pair]:.6g} cm apart; or a camera looks away from what the "
             f"others see"
         )  # fmt: skip
-    left, right = rig.primary_pair
-    if lateral_m[left] > lateral_m[right]:
-        return None, 0.0, f"camera {left}, the left one, is to the right of camera {right}"
     axes = poses.world_from_cam_rotations[..., 0][:, _LEFT]
     along = np.sum((steps @ OPENCV_FROM_UNREAL.T) * axes, axis=-1) / distances
     return poses, float(np.sqrt(np.maximum(0.0, 1 - np.square(along))).max()), ""

@@ -342,7 +342,9 @@ def _poses(
         remarks.append(
             Remark("world", f"{where}: several readings of its poses fit the rig: {listed}")
         )
-    return found.poses, "|".join(found.names)
+    if found.note:
+        remarks.append(Remark("left", f"{where}: {found.note}"))
+    return found.poses, "|".join(found.names) or None
 
 
 def _places_m(poses: CameraPoses) -> tuple[float, ...]:

@@ -88,6 +88,7 @@ REMARKS: Final = {
     "poses": "fields and rigs that need poses; without them the rig is assumed rectified",
     "world": "poses in the world: several readings fit",
     "principal point": "the intrinsics; the image's centre is assumed",
+    "left": "nothing, but the sign of disparity is that of the poses",
     "videos": "pairs of cameras whose videos are missing",
     "frames": "nothing: frames that all files have are used",
     "size": "nothing: the videos' size is used",
@@ -294,8 +295,8 @@ class Scene:
         training: What is known of a scene of training shards; None for released scenes.
         remarks: What is odd in its files and stops no sample.
         pose_form: The names of the readings of its trajectory that the rig's geometry confirms,
-            the chosen one first, joined by "|"; None where poses are not understood, or in an index
-            of an earlier version, which knew the one that the file names.
+            the chosen one first, joined by "|"; None for the one that the file itself names, and
+            where poses are not understood.
         members: File name to the place of its bytes. Depth packed by blosc2 has a name of its own,
             which `held_name` returns.
         seek_tables: Where the packets of its videos lie, as `media.seek_table` packs it; None where

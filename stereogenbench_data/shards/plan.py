@@ -209,6 +209,11 @@ def _require_released(index: SceneIndex, *, training: TrainingSettings | None) -
             f"{index.where}: its index leaves out {len(index.broken)} broken scenes ({names}). "
             f"Repair or remove them, and run `stereogenbench index` again."
         )
+    for row in index.remarked("videos")[:1].tolist():
+        raise ShardError(
+            f"{index.where}: {index.scene(row).remark('videos')}. Shards hold whole scenes: fetch "
+            f"the scene again or remove it, and run `stereogenbench index` again."
+        )
 
 
 def _group_of(scene: Scene) -> str:
