@@ -295,7 +295,7 @@ def _all_probed(
     for name in videos:
         held = _held(files, name)
         if held not in files:
-            unread[held] = f"{key}/{held}: is missing, and the scene is marked as complete"
+            unread[name] = f"{key}/{name}: is missing, and the scene is marked as complete"
             continue
         try:
             facts[name], table = _probed(folder, key, held)
@@ -337,6 +337,11 @@ def _poses(
             )
         remarks.append(Remark("poses", reason))
         return None, None
+    if found.poses.frame_count > frames and not any(each.about == "frames" for each in remarks):
+        told = (
+            f"{where}: has poses of {found.poses.frame_count} frames, and the videos have {frames}"
+        )
+        remarks.append(Remark("frames", f"{told}. The first {frames} are used"))
     if found.differ:
         listed = ", ".join(name.partition(" @ ")[0] for name in found.names)
         remarks.append(
@@ -728,7 +733,8 @@ def _differing_poses(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Diffe
         return
     where = f"{scene.id.key}/{TRAJECTORY_JSON}"
     poses = poses_as(texts[TRAJECTORY_JSON], scene.pose_form, where=where)
-    if poses.frame_count < scene.frames:
+    is_longer = poses.frame_count > scene.frames
+    if poses.frame_count != scene.frames and not (is_longer and scene.remark("frames")):
         yield _difference(TRAJECTORY_JSON, "frames", poses.frame_count, scene.frames)
         return
     lateral_m = lateral_offsets_m(poses)

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, Final, Literal
 
+import numpy as np
+
 from stereogenbench_data.errors import ShardError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Scene
@@ -20,6 +22,7 @@ from stereogenbench_data.schema.release import (
     METADATA_FILES,
     PACKED_DEPTH_NAMES,
     TRAINING_JSON,
+    TRAJECTORY_JSON,
     depth_name,
     rgb_name,
 )
@@ -209,11 +212,16 @@ def _require_released(index: SceneIndex, *, training: TrainingSettings | None) -
             f"{index.where}: its index leaves out {len(index.broken)} broken scenes ({names}). "
             f"Repair or remove them, and run `stereogenbench index` again."
         )
-    for row in index.remarked("videos")[:1].tolist():
-        raise ShardError(
-            f"{index.where}: {index.scene(row).remark('videos')}. Shards hold whole scenes: fetch "
-            f"the scene again or remove it, and run `stereogenbench index` again."
-        )
+    for row in np.union1d(index.remarked("videos"), index.remarked("poses")).tolist():
+        scene = index.scene(row)
+        missing = scene.remark("videos")
+        if TRAJECTORY_JSON not in scene.members:
+            missing = missing or scene.remark("poses")
+        if missing:
+            raise ShardError(
+                f"{index.where}: {missing.removesuffix('.')}. Shards hold whole scenes: fetch the "
+                f"scene again or remove it, and run `stereogenbench index` again."
+            )
 
 
 def _group_of(scene: Scene) -> str:

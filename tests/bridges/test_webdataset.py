@@ -82,8 +82,8 @@ def test_nothing_is_left_in_the_temporary_folder(scenes, tmp_path, monkeypatch):
 def test_a_missing_member_is_named(scenes):
     del scenes[0]["cam_02_depth.mkv"]
 
-    with pytest.raises(StorageError, match=r"is marked as complete and has no cam_02_depth\.mkv"):
-        list(decode(("left",))(scenes[:1]))
+    with pytest.raises(StorageError, match=r"cam_02_depth\.mkv: is missing, and the scene"):
+        list(decode(("disparity",), pairs=[(2, 3)])(scenes[:1]))
 
 
 def test_a_damaged_video_is_named(scenes):

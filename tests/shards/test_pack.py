@@ -759,7 +759,7 @@ def test_the_command_refuses_a_release_with_broken_scenes(tree, tmp_path):
     result = command(tree, tmp_path / "out")
 
     assert result.exit_code == 2
-    assert "scene_000001: is marked as complete and has no trajectory.json" in result.stderr
+    assert "scene_000001/trajectory.json: is missing. Shards hold whole scenes" in result.stderr
     assert not (tmp_path / "out").exists()
 
 

@@ -396,6 +396,8 @@ def test_remote_shards_must_be_downloaded_first(tmp_path):
          "tells primary_pair (0, 1), and by the index it is (2, 4)"),
         ("trajectory.json", lambda scene: {"frames": 6},
          "tells frames 7, and by the index it is 6"),
+        ("trajectory.json", lambda scene: {"frames": 8},
+         "tells frames 7, and by the index it is 8"),
         ("trajectory.json", lambda scene: {"lateral_m": (0.0,) * 6}, "tells lateral_m (0.0, "),
         ("trajectory.json", lambda scene: {"rig_residual_px": 5.0}, "tells rig_residual_px "),
         ("scene_description_qwen_dataset_level.json", lambda scene: {"caption": "Snow."},

@@ -46,6 +46,7 @@ from stereogenbench_data.schema.release import (
     BASELINE_JSON,
     CAMERA_COUNT,
     TRAJECTORY_JSON,
+    VIDEO_FILES,
     depth_name,
     rgb_name,
 )
@@ -92,7 +93,8 @@ class AuditedFiles:
 
     def _require_member(self, name: str) -> None:
         if self.scene.held_name(name) not in self.scene.members:
-            raise StorageError("is missing: the index has no such file of this scene")
+            reason = self.scene.remark("videos" if name in VIDEO_FILES else "poses")
+            raise StorageError(reason or "is missing: the index has no such file of this scene")
 
     def counted(self, camera: int) -> tuple[int, int]:
         """Return the number of frames of a camera's two videos, -1 for one that does not open."""
