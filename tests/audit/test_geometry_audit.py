@@ -33,7 +33,6 @@ from stereogenbench_data.synthesis.request import SynthRequest
 from tests.audit.corruption import (
     as_ray,
     copied,
-    edit_baseline,
     exchange,
     lengthen_label,
     read_depth,
