@@ -11,11 +11,10 @@ import shutil
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of, no_advance
+from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
 from stereogenbench_data.errors import ShardError, describe_os_error
 from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.index.parquet import INDEX_NAME
@@ -25,32 +24,23 @@ from stereogenbench_data.media.depth_frames import CODEC_NAME, blosc2_module
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
-    METADATA_FILES,
     PACKED_DEPTH_NAMES,
     TRAINING_JSON,
 )
 from stereogenbench_data.schema.training import parse_training
 from stereogenbench_data.shards.plan import DEFAULT_SHARD_BYTES, DepthCodec, ShardPlan, plan_shards
-from stereogenbench_data.shards.tar import CHUNK_BYTES, read_members
 from stereogenbench_data.shards.training import Derivation, TrainingSettings
 from stereogenbench_data.shards.writer import (
     PARTS,
     TEMPORARY_SUFFIX,
     ShardManifest,
     ShardTask,
-    SourceStamp,
     derive_task,
     find_packed,
-    find_touched,
     not_of_plan,
     pack_task,
-    read_manifest,
-    readable,
-    require_indexed_metadata,
-    row_digest,
-    seek_tables_of,
 )
-from stereogenbench_data.sources.files import copy_with_crc32, write_atomic
+from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.sources.location import is_remote
 from stereogenbench_data.sources.members import require_own_files
 
@@ -217,12 +207,6 @@ def prepare(  # noqa: PLR0913 - what `pack` takes
     )
     try:
         _claim_folder(plan, out)
-        for task in tasks:
-            manifest = read_manifest(task)
-            if manifest is not None and task.target.is_file():
-                if task.derivation is None:  # else the plan holds the digest of the source's index
-                    _require_same_sources(task, manifest)
-                _require_same_rows(task, manifest)
     except OSError as error:
         if isinstance(error, ShardError):
             raise
@@ -255,9 +239,9 @@ def _finish(job: PackJob, *, packed: set[str]) -> PackReport:
 
     Raises:
         StorageError: If the index cannot be written.
-        ShardError: If it would contradict the metadata in the shards.
+        ShardError: If a shard was changed after it was packed.
     """
-    found = [find_packed(task) or find_touched(task, no_advance) for task in job.tasks]
+    found = [find_packed(task) for task in job.tasks]
     shards = [manifest for manifest in found if manifest is not None]
     part = tuple(task.shard.name for task in job.part)
     here = {manifest.name for manifest in shards}
@@ -269,8 +253,7 @@ def _finish(job: PackJob, *, packed: set[str]) -> PackReport:
     )
     if report.missing:
         return report
-    for task, manifest in zip(job.tasks, shards, strict=True):
-        _require_same_rows(task, manifest)
+    for task in job.tasks:
         shutil.rmtree(task.derived, ignore_errors=True)  # of a run killed after its last shard
     index = SceneIndex.from_scenes(
         [
@@ -297,8 +280,6 @@ def _scenes_in(task: ShardTask, shard: ShardManifest) -> Iterator[Scene]:
         key, _, name = member.name.partition(".")
         places[key][name] = Member(shard.name, member.offset, member.size, crc32)
     tables = {key: base64.b64decode(text) for key, text in shard.seek_tables.items()}
-    if not tables:  # packed by a version that did not know them
-        tables = seek_tables_of(task.target, shard)
     for each in task.shard.scenes:
         scene = replace(each, seek_tables=tables.get(each.id.key))
         members = places[scene.id.key]
@@ -335,7 +316,9 @@ def _claim_folder(plan: ShardPlan, out: Path) -> None:
         expected["training"] = plan.training.describe()
     _require_outside_release(plan, out)
     if not place.exists():
-        _require_own_shards(plan, out)
+        for path in sorted(out.iterdir()) if out.exists() else []:
+            if path.name == INDEX_NAME or path.name.removesuffix(TEMPORARY_SUFFIX).endswith(".tar"):
+                raise not_of_plan(path)
         place.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(place, json.dumps(expected).encode())
     try:
@@ -377,27 +360,6 @@ def _require_outside_release(plan: ShardPlan, out: Path) -> None:
             )
 
 
-def _require_own_shards(plan: ShardPlan, out: Path) -> None:
-    """Refuse a folder without a plan that holds anything but shards of this plan.
-
-    A shard with the same members may be a finished one without its manifest: its bytes are compared
-    later, by the worker that packs it.
-    """
-    _require_no_others(plan, out)
-    ours = [shard for shard in plan.shards if (out / shard.name).exists()]
-    for shard in ours:
-        path = out / shard.name
-        try:
-            with path.open("rb") as file:
-                found = read_members(file, path.stat().st_size, where=str(path))
-        except ShardError:
-            found = []
-        if [each.name for each in found] != [each.name for each in shard.members]:
-            raise not_of_plan(path)
-    if not ours and (out / INDEX_NAME).exists():
-        raise not_of_plan(out / INDEX_NAME)
-
-
 def _require_no_others(plan: ShardPlan, out: Path) -> None:
     """Refuse a folder that holds a shard of another plan."""
     known = {shard.name for shard in plan.shards}
@@ -405,61 +367,3 @@ def _require_no_others(plan: ShardPlan, out: Path) -> None:
         name = path.name.removesuffix(TEMPORARY_SUFFIX)
         if name.endswith(".tar") and name not in known:
             raise not_of_plan(path)
-
-
-# Whether a finished shard is what packing it now would give. Files that were removed since do not
-# contradict it.
-
-
-def _require_same_sources(task: ShardTask, manifest: ShardManifest) -> None:
-    """Refuse to keep a finished shard whose source files have changed.
-
-    Metadata files are read. Videos are read only if their size or modification time has changed.
-
-    Raises:
-        ShardError: Naming the first such file, and what to do.
-    """
-    for member, stamp in zip(task.shard.members, manifest.sources, strict=True):
-        key, _, name = member.name.partition(".")
-        found = _contents_now(Path(task.root, member.source), stamp, read=name in METADATA_FILES)
-        if found is not None and found != (stamp.size, stamp.crc32):
-            raise ShardError(
-                f"{key}: its {member.source.rpartition('/')[2]} is not the one that "
-                f"{task.target} was packed from: it has {found[0]} bytes with crc32 "
-                f"{found[1]:08x}, and had {stamp.size} with {stamp.crc32:08x}. Remove that shard "
-                f"to pack it again and run the same command again, or restore the file, or pack "
-                f"into an empty folder."
-            )
-
-
-def _contents_now(source: Path, stamp: SourceStamp, *, read: bool) -> tuple[int, int] | None:
-    """Return a source's size and crc32, as stamped if it was not touched; None if it is gone."""
-    with readable(source):
-        try:
-            status = source.stat()
-            if not read and (status.st_size, status.st_mtime_ns) == stamp[:2]:
-                return stamp.size, stamp.crc32
-            with source.open("rb", buffering=0) as file:
-                chunks = iter(partial(file.read, CHUNK_BYTES), b"")
-                return status.st_size, copy_with_crc32(chunks, lambda chunk: None)
-        except (FileNotFoundError, NotADirectoryError):
-            return None
-
-
-def _require_same_rows(task: ShardTask, manifest: ShardManifest) -> None:
-    """Refuse to keep a finished shard if the index contradicts its metadata.
-
-    Raises:
-        ShardError: Naming the first such scene, and what to do.
-    """
-    for scene in task.shard.scenes:
-        if manifest.rows.get(scene.id.key) == row_digest(scene):
-            continue
-        texts = {}
-        with task.target.open("rb") as file:
-            for member in manifest.tar_members:
-                key, _, name = member.name.partition(".")
-                if key == scene.id.key and name in METADATA_FILES:
-                    file.seek(member.offset)
-                    texts[name] = file.read(member.size)
-        require_indexed_metadata(scene, texts, root=task.root)

@@ -15,6 +15,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from stereogenbench_data.errors import ShardError
+from stereogenbench_data.index.rows import row_of
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import (
@@ -101,8 +102,9 @@ class ShardPlan:
         root: The release's folder.
         target_bytes: The largest size of a shard, unless one scene alone exceeds it; packed depth
             counts with its released size, derived files with an estimate.
-        digest: sha256 of the target size and of all names and sizes; of training shards, also of
-            their settings and of the source's index. It does not depend on the root.
+        digest: sha256 of the target size, of all names and sizes and of what the index says of the
+            scenes; of training shards, also of their settings and of the source's index. It does
+            not depend on the root.
         training: What training shards hold; None for a release.
     """
 
@@ -165,7 +167,12 @@ def plan_shards(
                 f"Rename one of the two families' folders."
             )
     content = [
-        [shard.name, shard.size, [[member.name, member.size] for member in shard.members]]
+        [
+            shard.name,
+            shard.size,
+            [[member.name, member.size] for member in shard.members],
+            [_facts_of(scene) for scene in shard.scenes],
+        ]
         for shard in shards
     ]
     whole: list[Any] = [target_bytes, content]
@@ -174,6 +181,13 @@ def plan_shards(
     content_text = json.dumps(whole, separators=(",", ":"))
     digest = hashlib.sha256(content_text.encode()).hexdigest()
     return ShardPlan(index.root, target_bytes, shards, digest, depth_codec, training)
+
+
+def _facts_of(scene: Scene) -> dict[str, Any]:
+    """Return a scene's row in the index, without the places of its files."""
+    row = row_of(scene)
+    del row["members"], row["valid_depth_ratio"]
+    return row
 
 
 def parse_bytes(text: str) -> int:

@@ -1,7 +1,8 @@
 """Tar files as shards use them: POSIX ustar with regular files and ASCII names only.
 
-Headers are written here, so a shard's bytes depend on the names, sizes and contents of its members
-alone. Reading refuses everything else that a tar can hold, and extracts nothing.
+Python's ``tarfile`` makes and parses the headers. A shard's bytes depend on the names, sizes and
+contents of its members alone. Reading refuses everything else that a tar can hold, and extracts
+nothing.
 
 A member is a header of one block of 512 bytes, its bytes, and zeros up to a whole block. The
 archive ends with two blocks of zeros. The further zeros with which tar fills 10,240 bytes are
@@ -12,6 +13,7 @@ Source: POSIX.1-2017, pax, "ustar Interchange Format".
 
 import hashlib
 import re
+import tarfile
 from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
@@ -21,7 +23,7 @@ from stereogenbench_data.media.container import BinaryFile
 from stereogenbench_data.sources.files import copy_with_crc32
 from stereogenbench_data.sources.members import UNSAFE_PATH
 
-BLOCK_BYTES: Final = 512
+BLOCK_BYTES: Final = tarfile.BLOCKSIZE
 END_OF_ARCHIVE: Final = bytes(2 * BLOCK_BYTES)
 
 LARGEST_MEMBER_BYTES: Final = 8**11 - 1
@@ -36,27 +38,10 @@ CODE_SUFFIXES: Final = frozenset(
 CHUNK_BYTES: Final = 4 * 1024 * 1024
 """How much of a file is read at a time."""
 
-_NAME_BYTES: Final = 100
-_PREFIX_BYTES: Final = 155
 _CHECKSUM: Final = slice(148, 156)
+_DEVICES: Final = slice(329, 345)
 _UNSAFE_NAME: Final = re.compile(rf"{UNSAFE_PATH}|[^ -~]")
-_OCTAL: Final = re.compile(rb"([0-7]+)[ \0]*")
 FETCH_AGAIN: Final = "Fetch the shard again, or pack it again."
-_REFUSED_KINDS: Final = {
-    "\0": "a file of the kind before POSIX",
-    "1": "a hard link",
-    "2": "a symbolic link",
-    "3": "a character device",
-    "4": "a block device",
-    "5": "a directory",
-    "6": "a FIFO",
-    "7": "a contiguous file",
-    "x": "a PAX header",
-    "g": "a global PAX header",
-    "L": "a GNU long name",
-    "K": "a GNU long link name",
-    "S": "a GNU sparse file",
-}
 
 
 class TarMember(NamedTuple):
@@ -86,33 +71,19 @@ def member_header(name: str, size: int) -> bytes:
             f"member {name!r}: has {size} bytes, and ustar holds 0 to {LARGEST_MEMBER_BYTES}. "
             f"Split the file."
         )
-    prefix, base = _split_name(name)
-    header = (
-        base.ljust(_NAME_BYTES, b"\0")
-        + b"0000644\0"
-        + b"0000000\0" * 2
-        + b"%011o\0" % size
-        + b"%011o\0" % 0
-        + b" " * 8
-        + b"0".ljust(1 + _NAME_BYTES, b"\0")
-        + b"ustar\x0000".ljust(8 + 2 * 32, b"\0")
-        + b"0000000\0" * 2
-        + prefix.ljust(BLOCK_BYTES - 345, b"\0")
-    )
-    return header[:148] + b"%06o\0 " % sum(header) + header[156:]
-
-
-def _split_name(name: str) -> tuple[bytes, bytes]:
-    """Return the prefix and name fields of a name; the prefix of a short name is empty."""
-    if len(name) <= _NAME_BYTES:
-        return b"", name.encode("ascii")
-    for cut in (place for place, letter in enumerate(name) if letter == "/"):
-        if cut <= _PREFIX_BYTES and len(name) - cut - 1 <= _NAME_BYTES:
-            return name[:cut].encode("ascii"), name[cut + 1 :].encode("ascii")
-    raise ShardError(
-        f"member {name!r}: has {len(name)} characters, and ustar holds {_NAME_BYTES}, or "
-        f"{_PREFIX_BYTES} before a slash and {_NAME_BYTES} after it. Shorten its folders' names."
-    )
+    info = tarfile.TarInfo(name)
+    info.size = size
+    try:
+        header = bytearray(info.tobuf(tarfile.USTAR_FORMAT, "ascii", "strict"))
+    except ValueError as error:
+        raise ShardError(
+            f"member {name!r}: has {len(name)} characters, and ustar holds 100, or 155 "
+            f"before a slash and 100 after it. Shorten its folders' names."
+        ) from error
+    header[_DEVICES] = b"0000000\0" * 2  # in which the versions of tarfile differ
+    header[_CHECKSUM] = b" " * 8
+    header[_CHECKSUM] = b"%06o\0 " % sum(header)
+    return bytes(header)
 
 
 def _unfit_name(name: str) -> str:
@@ -181,37 +152,23 @@ def _require_end(file: BinaryFile, left: int, *, place: str) -> None:
 
 def _parse_header(block: bytes, *, place: str) -> tuple[str, int]:
     """Return the name and size in a header, which must be that of a regular file."""
-    stated = _OCTAL.fullmatch(block[_CHECKSUM])
-    real = sum(block) - sum(block[_CHECKSUM]) + 8 * ord(" ")
-    if stated is None or int(stated[1], 8) != real:
+    try:
+        info = tarfile.TarInfo.frombuf(block, "latin-1", "strict")
+    except tarfile.HeaderError as error:
+        raise ShardError(f"{place} the header is damaged ({error}). {FETCH_AGAIN}") from error
+    refused = f"{place} member {info.name!r}"
+    kind = block[156:157]
+    if kind != tarfile.REGTYPE or block[257:265] != tarfile.POSIX_MAGIC:
         raise ShardError(
-            f"{place} the header is damaged: its checksum is {block[_CHECKSUM]!r}, and its bytes "
-            f"add up to {real:06o}. {FETCH_AGAIN}"
+            f"{refused} is of the tar kind {kind!r} with the magic {block[257:265]!r}, but a shard "
+            f"holds regular files of POSIX ustar only. Use a shard that this package packed."
         )
-    parts = (block[345:500].rstrip(b"\0"), block[:_NAME_BYTES].rstrip(b"\0"))
-    name = b"/".join(part for part in parts if part).decode("latin-1")
-    refused = f"{place} member {name!r}"
-    kind = chr(block[156])
-    if kind != "0":
-        raise ShardError(
-            f"{refused} is {_REFUSED_KINDS.get(kind, f'of the unknown kind {kind!r}')}, but a "
-            f"shard holds regular files only. Use a shard that this package packed."
-        )
-    if block[257:265] != b"ustar\x0000":
-        raise ShardError(
-            f"{refused} has the magic {block[257:265]!r}, which is not that of POSIX ustar. Use a "
-            f"shard that this package packed."
-        )
-    unfit = _unfit_name(name)
+    unfit = _unfit_name(info.name)
     if unfit:
         raise ShardError(f"{refused}: {unfit}. Do not use this shard.")
-    length = _OCTAL.fullmatch(block[124:136])
-    if length is None:
-        raise ShardError(
-            f"{refused} has the size {block[124:136]!r}, which is not an octal number. Do not use "
-            f"this shard."
-        )
-    return name, int(length[1], 8)
+    if info.size < 0:
+        raise ShardError(f"{refused} has the size {info.size}. Do not use this shard.")
+    return info.name, info.size
 
 
 class Checksums(NamedTuple):

@@ -1,7 +1,7 @@
-"""One shard on disk, whole or absent: written beside its place, read back, then renamed.
+"""One shard on disk, whole or absent: written beside its place, then renamed.
 
 The manifest of a shard, ``OUT/.parts/<shard>.json``, is written just before the rename. A shard
-whose manifest fits it is finished, and later runs keep it. Source files must be as they were when
+under its final name is finished, and later runs keep it. Source files must be as they were when
 the plan was made, and must not change while they are read.
 """
 
@@ -15,15 +15,14 @@ import stat
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from io import FileIO
 from itertools import groupby
 from pathlib import Path
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
-from stereogenbench_data.engine import Advance, no_advance
+from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import DISK_FULL, MediaError, ShardError, describe_os_error
-from stereogenbench_data.index.rows import ADDED, row_of
 from stereogenbench_data.index.scene_folder import derived_scene, metadata_differences
 from stereogenbench_data.media.depth_packing import packed_depth
 from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
@@ -34,13 +33,10 @@ from stereogenbench_data.shards.plan import SCENE_TEXTS, PlannedMember, PlannedS
 from stereogenbench_data.shards.tar import (
     BLOCK_BYTES,
     END_OF_ARCHIVE,
-    Checksums,
     TarMember,
     member_header,
     padded,
-    read_checksums,
     read_chunks,
-    read_members,
 )
 from stereogenbench_data.shards.training import Derivation, derive_scene, derived_names
 from stereogenbench_data.sources.files import copy_with_crc32, try_locked, write_atomic
@@ -86,36 +82,23 @@ class ShardTask:
         return self.target.parent / PARTS / f"{self.target.stem}.json"
 
 
-class SourceStamp(NamedTuple):
-    """A source file when it was packed: its size, modification time and crc32."""
-
-    size: int
-    modified_ns: int
-    crc32: int
-
-
 @dataclass(frozen=True, slots=True)
 class ShardManifest:
-    """A finished shard: its checksums, its members in order, and what they were made from.
+    """A finished shard: its checksums and its members, in order.
 
     Attributes:
         plan: The digest of its plan.
-        modified_ns: The shard's modification time.
-        rows: Each scene's key, with the digest of its row in the index.
         seek_tables: Each scene's key, with its `Scene.seek_tables` as base64.
     """
 
     name: str
     size: int
     sha256: str
+    members: tuple[str, ...]
     offsets: tuple[int, ...]
     sizes: tuple[int, ...]
     crc32s: tuple[int, ...]
     plan: str
-    modified_ns: int
-    members: tuple[str, ...]
-    sources: tuple[SourceStamp, ...]
-    rows: dict[str, str]
     seek_tables: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -124,82 +107,31 @@ class ShardManifest:
         return list(map(TarMember, self.members, self.offsets, self.sizes))
 
 
-def row_digest(scene: Scene) -> str:
-    """Return a digest of a scene's row in the index, without the places of its files."""
-    row = row_of(scene)
-    del row["members"], row["valid_depth_ratio"]
-    for name in ADDED:
-        if row[name] is None:
-            del row[name]  # so that shards packed before there were such are kept
-    return hashlib.sha256(json.dumps(row, sort_keys=True).encode()).hexdigest()
-
-
-def read_manifest(task: ShardTask) -> ShardManifest | None:
-    """Return the manifest that this plan wrote for a shard, None if there is no usable one."""
-    try:
-        found = json.loads(task.manifest.read_bytes())
-        found |= {name: tuple(found[name]) for name in ("offsets", "sizes", "crc32s", "members")}
-        found["sources"] = tuple(SourceStamp(*stamp) for stamp in found["sources"])
-        found["rows"] = dict(found["rows"])
-        found["seek_tables"] = dict(found.get("seek_tables", {}))  # none in those of older versions
-        manifest = ShardManifest(**{each.name: found[each.name] for each in fields(ShardManifest)})
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    is_ours = (manifest.plan, manifest.name) == (task.plan_digest, task.shard.name)
-    listed = (manifest.offsets, manifest.sizes, manifest.crc32s, manifest.members, manifest.sources)
-    is_whole = set(map(len, listed)) == {len(task.shard.members)}
-    return manifest if is_ours and is_whole else None
-
-
-def _write_manifest(task: ShardTask, manifest: ShardManifest) -> None:
-    write_atomic(task.manifest, json.dumps(asdict(manifest)).encode())
-
-
 def find_packed(task: ShardTask) -> ShardManifest | None:
-    """Return the manifest of a finished shard, None if it must be packed or its bytes compared.
-
-    A shard whose size or modification time differs from its manifest may be another file.
-    """
-    manifest = read_manifest(task)
-    try:
-        status = task.target.stat()
-    except OSError:
-        return None
-    if manifest is None:
-        return None
-    found = (status.st_size, status.st_mtime_ns)
-    return manifest if found == (manifest.size, manifest.modified_ns) else None
-
-
-def find_touched(task: ShardTask, after_bytes: Advance) -> ShardManifest | None:
-    """Return the manifest of a finished shard that was touched but holds the same bytes.
+    """Return the manifest of a finished shard; None if the shard is not there.
 
     Raises:
-        OSError: If it cannot be read.
+        ShardError: If a file has its name that this plan did not pack, or that was changed since.
     """
-    manifest = read_manifest(task)
-    if manifest is None or not task.target.is_file():
+    try:
+        size = task.target.stat().st_size
+    except FileNotFoundError:
         return None
-    manifest = _with_bytes_of(task.target, manifest, after_bytes)
-    if manifest is not None:
-        _write_manifest(task, manifest)
-        after_bytes(task.shard.source_bytes)
-    return manifest
-
-
-def _with_bytes_of(
-    path: Path, manifest: ShardManifest, after_bytes: Advance
-) -> ShardManifest | None:
-    """Return the manifest with a file's modification time, None if the file's bytes differ."""
-    with path.open("rb", buffering=0) as file:
-        status = os.fstat(file.fileno())
-        if status.st_size != manifest.size:
-            return None
-        found = read_checksums(
-            file, status.st_size, parts=[], after_bytes=lambda count: after_bytes(0)
+    try:
+        found = json.loads(task.manifest.read_bytes())
+        for name in ("members", "offsets", "sizes", "crc32s"):
+            found[name] = tuple(found[name])
+        manifest = ShardManifest(**found)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise not_of_plan(task.target) from error
+    if (manifest.plan, manifest.name) != (task.plan_digest, task.shard.name):
+        raise not_of_plan(task.target)
+    if manifest.size != size:
+        raise ShardError(
+            f"{task.target}: has {size} bytes, and had {manifest.size} when it was packed. Remove "
+            f"it, then run the same command again."
         )
-    is_same = found.sha256 == manifest.sha256
-    return replace(manifest, modified_ns=status.st_mtime_ns) if is_same else None
+    return manifest
 
 
 def pack_task(
@@ -209,23 +141,22 @@ def pack_task(
 
     Raises:
         ShardError: If a source is missing, unreadable, changes meanwhile or contradicts the index;
-            the disk is full; the shard does not read back as written; another file has its name;
-            or another process is packing it.
+            the disk is full; another file has its name; or another process is packing it.
     """
     done = find_packed(task)
     if done is not None:
         return done, "kept"
     with _named_errors(task), _open_exclusive(task.temporary) as file:
-        done = find_packed(task) or find_touched(task, after_bytes)
+        done = find_packed(task)
         if done is not None:
             return done, "kept"
         if task.derivation is None:
-            return _pack(task, file, after_bytes)
+            return _pack(task, file, after_bytes), "packed"
         derived = _with_derived_files(task, task.derivation, after_bytes)
         # What is copied from now on was counted when it was derived.
         packed = _pack(derived, file, lambda count: after_bytes(0))
         shutil.rmtree(task.derived, ignore_errors=True)
-        return packed
+        return packed, "packed"
 
 
 def derive_task(work: tuple[ShardTask, Scene], after_bytes: Advance) -> None:
@@ -314,27 +245,12 @@ def _with_derived_files(task: ShardTask, derivation: Derivation, after_bytes: Ad
     return replace(task, shard=shard, root=str(task.derived))
 
 
-def _pack(
-    task: ShardTask, file: FileIO, after_bytes: Advance
-) -> tuple[ShardManifest, Literal["packed", "kept"]]:
-    # A shard whose manifest was removed is kept if it holds the bytes that packing gives.
-    is_unknown = read_manifest(task) is None and task.target.exists()
+def _pack(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardManifest:
     manifest = _write_shard(task, file, after_bytes)
-    _require_read_back(task, file, manifest)
-    manifest = replace(
-        manifest,
-        seek_tables={
-            key: base64.b64encode(packed).decode()
-            for key, packed in seek_tables_of(task.temporary, manifest).items()
-        },
-    )
-    if is_unknown:
-        same = _with_bytes_of(task.target, manifest, after_bytes)
-        if same is None:
-            raise not_of_plan(task.target)
-        _write_manifest(task, same)
-        return same, "kept"
-    _write_manifest(task, manifest)
+    tables = _seek_tables(task, manifest)
+    encoded = {key: base64.b64encode(packed).decode() for key, packed in tables.items()}
+    manifest = replace(manifest, seek_tables=encoded)
+    write_atomic(task.manifest, json.dumps(asdict(manifest)).encode())
     task.temporary.replace(task.target)
     # The rename outlives a power cut where folders can be synchronised.
     folder = os.open(task.target.parent, os.O_RDONLY)
@@ -343,7 +259,7 @@ def _pack(
             os.fsync(folder)
     finally:
         os.close(folder)
-    return manifest, "packed"
+    return manifest
 
 
 def not_of_plan(path: Path) -> ShardError:
@@ -361,7 +277,7 @@ class _Output:
         self._file = file
         self.sha256 = hashlib.sha256()
         self.size = 0
-        self.members: list[tuple[int, int, int, SourceStamp]] = []
+        self.members: list[tuple[int, int, int]] = []
 
     def write(self, content: bytes) -> None:
         self.sha256.update(content)
@@ -370,15 +286,15 @@ class _Output:
         while left:
             left = left[self._file.write(left) :]
 
-    def end_member(self, size: int, crc32: int, source: SourceStamp) -> None:
+    def end_member(self, size: int, crc32: int) -> None:
         """Pad the member whose last byte was just written, and note its place."""
-        self.members.append((self.size - size, size, crc32, source))
+        self.members.append((self.size - size, size, crc32))
         self.write(bytes(-self.size % BLOCK_BYTES))
 
-    def write_member(self, name: str, content: bytes, source: SourceStamp) -> None:
+    def write_member(self, name: str, content: bytes) -> None:
         self.write(member_header(name, len(content)))
         self.write(content)
-        self.end_member(len(content), zlib.crc32(content), source)
+        self.end_member(len(content), zlib.crc32(content))
 
 
 def _write_shard(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardManifest:
@@ -388,19 +304,16 @@ def _write_shard(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardMa
         _write_scene(task, list(members), output, scene=scenes.get(key), after_bytes=after_bytes)
     output.write(END_OF_ARCHIVE)
     os.fsync(file.fileno())
-    offsets, sizes, crc32s, sources = zip(*output.members, strict=True)
+    offsets, sizes, crc32s = zip(*output.members, strict=True)
     return ShardManifest(
         name=task.shard.name,
         size=output.size,
         sha256=output.sha256.hexdigest(),
+        members=tuple(member.name for member in task.shard.members),
         offsets=offsets,
         sizes=sizes,
         crc32s=crc32s,
         plan=task.plan_digest,
-        modified_ns=os.fstat(file.fileno()).st_mtime_ns,
-        members=tuple(member.name for member in task.shard.members),
-        sources=sources,
-        rows={key: row_digest(scene) for key, scene in scenes.items()},
     )
 
 
@@ -420,65 +333,46 @@ def _write_scene(
         if name not in SCENE_TEXTS:
             videos.append(member)
             continue
-        texts[name], stamp = _read_whole(Path(task.root, member.source), member.size, after_bytes)
-        output.write_member(member.name, texts[name], stamp)
+        texts[name] = _read_whole(Path(task.root, member.source), member.size, after_bytes)
+        output.write_member(member.name, texts[name])
     if scene is not None and texts:
         if task.derivation is not None:
             where = f"{scene.id.key}/{TRAINING_JSON}"
             document = parse_training(texts[TRAINING_JSON], where=where)
             scene = replace(derived_scene(scene, document), members={})
-        require_indexed_metadata(scene, texts, root=task.root)
+        _require_indexed_metadata(scene, texts, root=task.root)
     for member in videos:
         source = Path(task.root, member.source)
         if member.form == "released" or scene is None:
             output.write(member_header(member.name, member.size))
-            stamp = _copy_source(source, member.size, output.write, after_bytes)
-            output.end_member(member.size, stamp.crc32, stamp)
+            crc32 = _copy_source(source, member.size, output.write, after_bytes)
+            output.end_member(member.size, crc32)
         else:
-            content, stamp = _packed_depth(
+            content = _packed_depth(
                 source, member.size, frames=scene.frames, after_bytes=after_bytes
             )
-            output.write_member(member.name, content, stamp)
+            output.write_member(member.name, content)
 
 
-def seek_tables_of(path: Path, manifest: ShardManifest) -> dict[str, bytes]:
-    """Return each scene's `Scene.seek_tables`, from the shard that holds its videos.
+def _seek_tables(task: ShardTask, manifest: ShardManifest) -> dict[str, bytes]:
+    """Return each scene's `Scene.seek_tables`, from the shard before it has its final name.
 
     A video that cannot be read has none; whoever reads it is told why.
     """
-    tables: dict[str, dict[str, SeekTable]] = {key: {} for key in manifest.rows}
+    tables: dict[str, dict[str, SeekTable]] = {key: {} for key in task.shard.keys}
     for member in manifest.tar_members:
         key, _, name = member.name.partition(".")
         if key not in tables or name not in SEEKABLE:
             continue
-        place = Member(path.name, member.offset, member.size)
-        with suppress(MediaError), FileSlice(path, place) as video:
+        place = Member(task.temporary.name, member.offset, member.size)
+        with suppress(MediaError), FileSlice(task.temporary, place) as video:
             table = read_seek_table(video, name=name)
             if table is not None:
                 tables[key][name] = table
     return {key: packed_tables(found) for key, found in tables.items()}
 
 
-def _require_read_back(task: ShardTask, file: FileIO, manifest: ShardManifest) -> None:
-    """Read a shard from the disk, not from memory where the system allows, and compare."""
-    if hasattr(os, "posix_fadvise"):
-        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-    found = read_members(file, manifest.size, where=str(task.target))
-    checksums = read_checksums(
-        file,
-        os.fstat(file.fileno()).st_size,
-        parts=list(zip(manifest.offsets, manifest.sizes, strict=True)),
-        after_bytes=no_advance,
-    )
-    expected = (manifest.tar_members, Checksums(manifest.sha256, manifest.crc32s))
-    if (found, checksums) != expected:
-        raise ShardError(
-            f"{task.target}: does not read back as it was written. Check the disk and the memory "
-            f"of this machine, then run the same command again."
-        )
-
-
-def require_indexed_metadata(scene: Scene, texts: Mapping[str, bytes], *, root: str) -> None:
+def _require_indexed_metadata(scene: Scene, texts: Mapping[str, bytes], *, root: str) -> None:
     """Refuse to pack metadata files that contradict the index of their release.
 
     Raises:
@@ -494,8 +388,8 @@ def require_indexed_metadata(scene: Scene, texts: Mapping[str, bytes], *, root: 
 
 def _copy_source(
     source: Path, size: int, write: Callable[[bytes], object], after_bytes: Advance
-) -> SourceStamp:
-    """Pass on all bytes of a released file of the planned size, and return its stamp.
+) -> int:
+    """Pass on all bytes of a released file of the planned size, and return zlib's crc32 of them.
 
     Raises:
         ShardError: If it is missing, unreadable, has another size or changes meanwhile.
@@ -505,7 +399,7 @@ def _copy_source(
         write(chunk)
         after_bytes(len(chunk))
 
-    with readable(source):
+    with _readable(source):
         if not stat.S_ISREG(source.stat().st_mode):
             raise ShardError(f"{source}: is not a file. Put the release's own file in its place.")
         file = FileIO(source)
@@ -518,7 +412,7 @@ def _copy_source(
                 f"index."
             )
         crc32 = copy_with_crc32(_source_chunks(source, file, size), take)
-        with readable(source):
+        with _readable(source):
             after = source.stat()
         found = (after.st_size, after.st_mtime_ns)
         if found != (size, before.st_mtime_ns) or not os.path.samestat(after, before):
@@ -526,29 +420,27 @@ def _copy_source(
                 f"{source}: was changed while it was packed. Let nothing write to the release, "
                 f"then run the same command again."
             )
-    return SourceStamp(size, before.st_mtime_ns, crc32)
+    return crc32
 
 
 def _source_chunks(source: Path, file: FileIO, size: int) -> Iterator[bytes]:
-    with readable(source):
+    with _readable(source):
         yield from read_chunks(file, size)
 
 
-def _read_whole(source: Path, size: int, after_bytes: Advance) -> tuple[bytes, SourceStamp]:
+def _read_whole(source: Path, size: int, after_bytes: Advance) -> bytes:
     parts: list[bytes] = []
-    stamp = _copy_source(source, size, parts.append, after_bytes)
-    return b"".join(parts), stamp
+    _copy_source(source, size, parts.append, after_bytes)
+    return b"".join(parts)
 
 
-def _packed_depth(
-    source: Path, size: int, *, frames: int, after_bytes: Advance
-) -> tuple[bytes, SourceStamp]:
-    """Return a released depth video as blosc2's frames, with the stamp of the video.
+def _packed_depth(source: Path, size: int, *, frames: int, after_bytes: Advance) -> bytes:
+    """Return a released depth video as blosc2's frames.
 
     Raises:
         ShardError: If it cannot be read, or not be packed bit for bit.
     """
-    video, stamp = _read_whole(source, size, lambda count: after_bytes(0))
+    video = _read_whole(source, size, lambda count: after_bytes(0))
     share = size // frames
     try:
         content = packed_depth(
@@ -560,11 +452,11 @@ def _packed_depth(
     except MediaError as error:
         raise ShardError(str(error)) from error
     after_bytes(size - share * frames)
-    return content, stamp
+    return content
 
 
 @contextmanager
-def readable(source: Path) -> Iterator[None]:
+def _readable(source: Path) -> Iterator[None]:
     """Turn errors of the system about a source file into a ShardError that names it."""
     try:
         yield
