@@ -232,14 +232,36 @@ class EpochBatches(Sampler[list[int]]):
             f"batch, rank {self.rank} of {self.world_size}, {kind}, tail={self.tail!r}>"
         )
 
-    def __iter__(self) -> "SamplerPass":
+    def __iter__(self) -> Iterator[list[int]]:
         """Return this rank's batches of the current epoch, or what a loaded state left of it.
+
+        The pass begins with its first batch.
 
         Raises:
             SelectionError: If Accelerate would share these batches among ranks a second time.
         """
         self.require_shared_once(self)
-        return SamplerPass(self)
+        following = self.next_pass()
+        if following.is_complete:
+            # torchdata's loader asks for no batch of a pass that it saved at its end.
+            self.passes.begin(following)
+            self.passes.end(following)
+            return iter(())
+        return self._batches_of_a_pass()
+
+    def _batches_of_a_pass(self) -> Iterator[list[int]]:
+        begun = self.next_pass()
+        begun.is_read_ahead = True
+        self.passes.begin(begun)
+        try:
+            for number in begun.share:
+                begun.taken += 1
+                if begun.is_complete:
+                    self.passes.end(begun)
+                yield self.batch(number, epoch=begun.epoch)
+            begun.exhaust()
+        finally:
+            self.passes.end(begun)
 
     def next_pass(self) -> Pass:
         """Return the pass that begins at the next position; it begins with its first batch."""
@@ -463,43 +485,6 @@ def batch_samples(order: EpochOrder, number: int, *, tail: Tail) -> tuple[list[i
     samples = order.batch(number) if number < order.batches else np.empty(0, dtype=np.int64)
     ends: list[int] = samples[order.ends_run(number)].tolist() if len(samples) else []
     return (order.full_batch(number) if tail == "wrap" else samples).tolist(), ends
-
-
-class SamplerPass(Iterator[list[int]]):
-    """One pass over the numbers of a rank's batches, for torch's own `DataLoader`."""
-
-    def __init__(self, batches: EpochBatches) -> None:
-        """Represent the next pass; it begins with its first batch."""
-        self._batches = batches
-        self._pass: Pass | None = None
-        if batches.next_pass().is_complete:
-            # torchdata's loader asks for no batch of a pass that it saved at its end.
-            self._begin()
-
-    def _begin(self) -> Pass:
-        self._pass = self._batches.next_pass()
-        self._pass.is_read_ahead = True
-        self._batches.passes.begin(self._pass)
-        return self._pass
-
-    def __next__(self) -> EpochBatch:
-        """Return the next batch: the numbers of its samples."""
-        begun = self._pass or self._begin()
-        if begun.is_complete:
-            self._batches.passes.end(begun)
-            raise StopIteration
-        number = begun.share[begun.taken]
-        begun.taken += 1
-        if begun.is_complete:
-            self._batches.passes.end(begun)
-        return self._batches.batch(number, epoch=begun.epoch)
-
-    def __repr__(self) -> str:
-        """Return a summary."""
-        if self._pass is None:
-            return "<SamplerPass: not begun>"
-        taken, count = self._pass.taken, len(self._pass.share)
-        return f"<SamplerPass: {taken} of {count} batches of epoch {self._pass.epoch}>"
 
 
 def _order_kind(options: EpochOptions) -> OrderKind:

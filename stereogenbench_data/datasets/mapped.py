@@ -156,7 +156,7 @@ class _MappedScenes(Dataset[Sample]):
 
         Raises:
             IndexError: If there is no such sample.
-            SelectionError: If it is a slice.
+            SelectionError: If it is a slice or several numbers.
             StorageError: If a file is missing or altered.
             MediaError: If a video does not decode to what the index says.
         """
@@ -186,7 +186,7 @@ class _MappedScenes(Dataset[Sample]):
             reading.sort(key=operator.itemgetter(1))
         self._expect(batch, read="as they come" if isinstance(numbers, EpochBatch) else "by number")
         for place, number in reading:
-            loaded[place] = self.load_into(arrays, place, number, batch=batch)
+            loaded[place] = self._load_into(arrays, place, number, batch=batch)
         self.fetched.publish(self._loader.fetched)
         return [loaded[place] for place in range(len(numbers))]
 
@@ -198,10 +198,16 @@ class _MappedScenes(Dataset[Sample]):
             epoch = batch.epoch, self.shared_epoch.times_set
             self._drawn.mark(own, epoch=epoch, dataset=self)
 
-    def expect(self, batch: EpochBatch) -> None:
-        """Let the bytes of a batch's samples, and of those after it, be fetched ahead."""
+    def samples_of(self, batch: EpochBatch, *, start: int = 0) -> Iterator[Sample]:
+        """Yield the samples of a batch one after another, from one of its places on.
+
+        They lie side by side in memory where `BatchBuffers.collate` makes batches of them.
+        """
         self.fetched.publish(self._loader.fetched)
         self._expect(batch, read="as they come")
+        arrays = self.buffers.allocate(len(batch)) if self.buffers.makes_batches else None
+        for place in range(start, len(batch)):
+            yield self._load_into(arrays, place, batch[place], batch=batch)
 
     def _expect(self, batch: EpochBatch, *, read: Literal["by number", "as they come"]) -> None:
         """Let the bytes of a batch's samples, and of the batches after it, be fetched ahead."""
@@ -235,7 +241,7 @@ class _MappedScenes(Dataset[Sample]):
         address = self.plan.locate(number % len(self.plan), epoch=epoch, group=group)
         return address._replace(run=0) if self._access == "random" else address
 
-    def load_into(
+    def _load_into(
         self, arrays: BatchArrays | None, place: int, number: int, *, batch: EpochBatch
     ) -> Sample:
         """Return a sample of a batch, as slices of the batch's arrays if they are given."""
@@ -253,14 +259,14 @@ class _MappedScenes(Dataset[Sample]):
 
     def _sample(self, number: int, batch: EpochBatch, allocate: Allocate = new_array) -> Sample:
         """Return a sample of a batch as arrays, written into what is allocated for them."""
-        if isinstance(number, slice):
-            start, stop, step = number.indices(len(self.plan))
+        count = len(self.plan)
+        if isinstance(number, slice | list | tuple | range):
+            several = range(*number.indices(count)) if isinstance(number, slice) else number
             raise SelectionError(
-                f"a sample is chosen by its number, got {number!r}. For several of them: "
-                f"torch.utils.data.Subset(pairs, {range(start, stop, step)!r})."
+                f"a sample is chosen by its number, got {number!r:.60}. For several of them: "
+                f"torch.utils.data.Subset(pairs, {several!r:.60})."
             )
         number = operator.index(number)
-        count = len(self.plan)
         if not -count <= number < count:
             raise IndexError(f"no sample {number}: there are {count}")
         number %= count

@@ -4,12 +4,17 @@ A position is an epoch and how many of its batches are consumed, counted over al
 counts what was taken of it. `Passes` says where the next one begins and which one a state is of.
 """
 
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
-from stereogenbench_data.datasets.shared_epoch import SharedEpoch, require_epoch
+from torch.utils.data import get_worker_info
+
+from stereogenbench_data.datasets.shared_epoch import SharedEpoch, SharedNumbers, require_epoch
 
 Position = tuple[int, int]
 """An epoch, and how many of its global batches are consumed."""
+
+_MOST_WORKERS: Final = 4096
+"""Workers with a number of their own in `StreamPasses`."""
 
 
 class Pass:
@@ -17,8 +22,10 @@ class Pass:
 
     Attributes:
         epoch: The epoch.
+        start: The global batch at which all ranks began.
         share: The global numbers of its batches.
         taken: How many of them were taken.
+        part: How many samples of the next one were taken, where samples are taken one by one.
         is_read_ahead: Whether "taken" counts what was given out to another `DataLoader`, whose
             workers read ahead of its loop.
     """
@@ -36,9 +43,10 @@ class Pass:
             world_size: How many ranks take turns.
         """
         self.epoch = epoch
+        self.start = start
         self.share = share
-        self.taken = 0
-        self._start, self._end, self._world_size = start, end, world_size
+        self.taken = self.part = 0
+        self._end, self._world_size = end, world_size
         self._is_exhausted = False
 
     @property
@@ -55,7 +63,7 @@ class Pass:
         """The position after the batch taken last."""
         if self._is_exhausted:
             return self.epoch, self._end
-        return self.epoch, min(self._start + self.taken * self._world_size, self._end)
+        return self.epoch, min(self.start + self.taken * self._world_size, self._end)
 
 
 class Passes:
@@ -151,3 +159,61 @@ class Passes:
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy needs: none of these passes is its own."""
         return self.__dict__ | {"_running": [], "latest": None}
+
+
+class StreamPasses(Passes):
+    """The passes of a stream. Worker processes begin them, so all processes see where."""
+
+    def __init__(self, epoch: SharedEpoch) -> None:
+        """Begin with the epoch of a dataset; a stream sets it, too."""
+        self._set_to = SharedNumbers([epoch.value, 0])
+        self._begun = SharedNumbers([0] * _MOST_WORKERS)
+        super().__init__(epoch, then="same epoch")
+
+    def go_to(self, epoch: int, start: int) -> None:
+        """Let the next pass of each worker begin at a global batch of an epoch."""
+        self.latest = None
+        self._set_to[0], self._set_to[1] = epoch, start
+        self._begun.tensor.zero_()
+
+    @property
+    def first_position(self) -> Position:
+        """Where the first pass began since the position was set; workers may have begun it."""
+        epoch = self._dataset_epoch.value
+        return epoch, self._set_to[1] if self._set_to[0] == epoch else 0
+
+    @property
+    def next_position(self) -> Position:
+        """Where the next pass of this process begins."""
+        return (self._dataset_epoch.value, 0) if self._times_begun else self.first_position
+
+    @property
+    def position(self) -> Position:
+        """The position after what this process has taken."""
+        epoch = self._dataset_epoch.value
+        is_of_pass = self.latest is not None and self.latest.epoch == epoch
+        return self.latest.position if self.latest and is_of_pass else self.next_position
+
+    @property
+    def are_begun_by_workers(self) -> bool:
+        """Whether worker processes alone have begun passes since the position was set."""
+        return self.latest is None and bool(self._begun.tensor.any())
+
+    @property
+    def is_second_of_unset_epoch(self) -> bool:
+        """Whether the next pass would be the first one to repeat an epoch that nobody chose."""
+        return self._times_begun == 1 and self._dataset_epoch.times_set == 0
+
+    def begin(self, begun: Pass) -> None:
+        """Record that a pass begins in this process."""
+        self._begun[_worker_number()] += 1
+        self.latest = begun
+
+    @property
+    def _times_begun(self) -> int:
+        return self._begun[_worker_number()]
+
+
+def _worker_number() -> int:
+    info = get_worker_info()
+    return 0 if info is None else info.id % _MOST_WORKERS

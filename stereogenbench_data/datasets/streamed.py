@@ -1,22 +1,18 @@
 """An iterable dataset with the order of the map-style ones, for trainers that want one."""
 
+import os
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, Unpack
+from typing import Any, Unpack, cast
 
 from torch.utils.data import IterableDataset, get_worker_info
 
-from stereogenbench_data.datasets.batch_buffers import BatchArrays, Buffers
-from stereogenbench_data.datasets.batches import (
-    EpochBatch,
-    EpochBatches,
-    EpochOptions,
-    State,
-    require_count,
-)
+from stereogenbench_data.datasets.batch_buffers import Buffers
+from stereogenbench_data.datasets.batches import EpochBatches, EpochOptions, State, require_count
 from stereogenbench_data.datasets.loader import split_options
 from stereogenbench_data.datasets.mapped import Check, Data, StereoPairs
-from stereogenbench_data.datasets.shared_epoch import RepeatedEpochWarning, SharedNumbers
+from stereogenbench_data.datasets.passes import Pass, StreamPasses
+from stereogenbench_data.datasets.shared_epoch import RepeatedEpochWarning
 from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.request import Transform
@@ -24,8 +20,6 @@ from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import Selection
 from stereogenbench_data.sources.cache import ShardCache
-
-MOST_WORKERS = 4096
 
 
 class StreamOptions(Selection, EpochOptions, total=False):
@@ -78,12 +72,9 @@ class StereoPairStream(IterableDataset[Sample]):
             others["seed"] = ordering["seed"]
         self.pairs = StereoPairs(data, **others)
         self.batches = EpochBatches(self.pairs, batch_size, **ordering)
-        # The position loaded last, and how many passes each worker has begun since: workers may be
-        # new copies in every epoch.
-        self._loaded = SharedNumbers([0, 0])
-        self._begun = SharedNumbers([0] * MOST_WORKERS)
-        self._was_told = SharedNumbers([0])
-        self._latest: SamplePass | None = None
+        self.batches.passes = StreamPasses(self.pairs.shared_epoch)
+        # A pass that was loaded, and the process that may go on with it: no worker forked from it.
+        self._resumed: tuple[Pass, int] | None = None
 
     def collate(self, samples: Sequence[Sample]) -> Any:
         """Make a batch of samples: `DataLoader`'s ``collate_fn``, where speed matters.
@@ -108,8 +99,7 @@ class StereoPairStream(IterableDataset[Sample]):
         Raises:
             SelectionError: If it is negative.
         """
-        self.pairs.set_epoch(epoch)
-        self._was_told[0] = 1
+        self.batches.set_epoch(epoch)
 
     def __len__(self) -> int:
         """Return how many samples this rank has in a whole epoch."""
@@ -123,28 +113,61 @@ class StereoPairStream(IterableDataset[Sample]):
         """Return a summary."""
         return f"<{type(self).__name__}: epoch {self.epoch} of {self.pairs!r}, {self.batches!r}>"
 
-    def __iter__(self) -> "SamplePass":
+    def __iter__(self) -> Iterator[Sample]:
         """Return this rank's and this worker's samples of the current epoch.
 
         Raises:
             SelectionError: If Accelerate would share these samples among ranks a second time.
         """
         self.batches.require_shared_once(self)
-        info = get_worker_info()
-        worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
-        epoch, place = self.epoch, worker % MOST_WORKERS
-        start = self._loaded[1] if self._loaded[0] == epoch and not self._begun[place] else 0
-        if self._begun[place] == 1 and worker == 0 and not self._was_told[0]:
+        self.pairs.keep_open(
+            self.batches, processes=self._place["world_size"] * self._place["workers"]
+        )
+        if self._passes.is_second_of_unset_epoch and self._place["worker"] == 0:
             warnings.warn(
-                f"{self!r} begins epoch {epoch} a second time: with the same order, random frames "
-                "and transforms. Call set_epoch(epoch) of the stream before each pass.",
+                f"{self!r} begins epoch {self.epoch} a second time: with the same order, random "
+                "frames and transforms. Call set_epoch(epoch) of the stream before each pass.",
                 RepeatedEpochWarning,
                 stacklevel=2,
             )
-        self._begun[place] += 1
-        self.pairs.keep_open(self.batches, processes=self.batches.world_size * workers)
-        self._latest = SamplePass(self, epoch=epoch, start=start, worker=worker, workers=workers)
-        return self._latest
+        begun = self._next_pass()
+        self._passes.begin(begun)
+        return self._samples(begun)
+
+    def _samples(self, begun: Pass) -> Iterator[Sample]:
+        for number in begun.share[begun.taken :]:
+            batch = self.batches.batch(number, epoch=begun.epoch)
+            for sample in self.pairs.samples_of(batch, start=begun.part):
+                begun.part += 1
+                if begun.part == len(batch):
+                    begun.taken, begun.part = begun.taken + 1, 0
+                yield sample
+        begun.exhaust()
+
+    def _next_pass(self) -> Pass:
+        """Return the pass that this worker begins next: where it was itself, or its epoch's."""
+        (loaded, pid), self._resumed = self._resumed or (None, 0), None
+        if loaded is not None and pid == os.getpid() and loaded.epoch == self.epoch:
+            return loaded
+        return self._pass_of_worker(*self._passes.next_position)
+
+    def _pass_of_worker(self, epoch: int, start: int) -> Pass:
+        """Return a pass over this worker's part of the rank's batches."""
+        begun = self.batches.pass_from(epoch, start)
+        begun.share = begun.share[self._place["worker"] :: self._place["workers"]]
+        return begun
+
+    @property
+    def _passes(self) -> StreamPasses:
+        return cast("StreamPasses", self.batches.passes)
+
+    @property
+    def _place(self) -> dict[str, int]:
+        """Which part of the batches this process iterates."""
+        info = get_worker_info()
+        worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
+        rank, world_size = self.batches.rank, self.batches.world_size
+        return {"rank": rank, "world_size": world_size, "worker": worker, "workers": workers}
 
     def state_dict(self, *, batches: int | None = None) -> State:
         """Return a position that any number of ranks and workers can load.
@@ -157,35 +180,59 @@ class StereoPairStream(IterableDataset[Sample]):
         Raises:
             StateError: If the number is needed and not given.
         """
-        if self._latest is not None and batches is None:
-            return self._latest.state_dict()
-        if batches is None:
-            if self._begun.tensor.any():
-                raise StateError(
-                    "worker processes iterate this stream and read ahead: pass the number of "
-                    "batches the loop has taken, state_dict(batches=...), or use the loader of "
-                    "StereoPairs or torchdata's StatefulDataLoader, which count them."
-                )
-            batches = 0
-        epoch = self.epoch
-        taken = self.batches.pass_from(epoch, self._loaded[1] if self._loaded[0] == epoch else 0)
-        taken.taken = batches
-        return self.batches.state_at(*taken.position)
+        if batches is not None:
+            taken = self.batches.pass_from(*self._passes.first_position)
+            taken.taken = batches
+            return self.batches.state_at(*taken.position)
+        latest = self._passes.latest
+        if latest is None and self._passes.are_begun_by_workers and get_worker_info() is None:
+            raise StateError(
+                "worker processes iterate this stream and read ahead: pass the number of "
+                "batches the loop has taken, state_dict(batches=...), or use the loader of "
+                "StereoPairs or torchdata's StatefulDataLoader, which count them."
+            )
+        state = self.batches.state_dict()
+        if latest is not None and latest.epoch == state["epoch"]:
+            given = latest.taken * self.batches.batch_size + latest.part
+            state |= {"start": latest.start, "samples_given": given, **self._place}
+        return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go to a saved position: the next pass begins there, all later ones at the beginning.
 
+        In a worker process, as of torchdata's loader, it is the position of this worker.
+
         Raises:
-            StateError: If it belongs to other samples or another order, naming what differs.
+            StateError: If it belongs to other samples or another order, naming what differs; or,
+                in a worker, to another one.
         """
-        epoch, start = self.batches.position_in(state)
-        self.set_epoch(epoch)
-        if get_worker_info() is not None:
-            # torchdata's: it gives the position of each worker to its pass.
-            return
-        self._loaded[0], self._loaded[1] = epoch, start
-        self._begun.tensor.zero_()
-        self._latest = None
+        epoch, _ = self.batches.position_in(state)
+        resumed = self._resumed_in(state, epoch)
+        if get_worker_info() is None:
+            self.batches.load_state_dict(state)
+        else:
+            self.pairs.set_epoch(epoch)
+        self._resumed = None if resumed is None else (resumed, os.getpid())
+
+    def _resumed_in(self, state: Mapping[str, Any], epoch: int) -> Pass | None:
+        """Return the pass of this very worker that a state holds; None if it is another's."""
+        differing = [
+            f"{name} is {value} here and {state.get(name)} there"
+            for name, value in self._place.items()
+            if state.get(name) != value
+        ]
+        if differing and get_worker_info() is None:
+            return None
+        if differing:
+            raise StateError(
+                f"the position is that of another worker: {'; '.join(differing)}. Load it under "
+                "the same ranks and workers; the state of a stream itself goes with any."
+            )
+        start = require_count(state, "start", most=self.batches.batches_of_all)
+        begun, size = self._pass_of_worker(epoch, start), self.batches.batch_size
+        given = require_count(state, "samples_given", most=len(begun.share) * size)
+        begun.taken, begun.part = divmod(given, size)
+        return begun
 
     def close(self) -> None:
         """Close the videos that this process holds open; the stream can be used again."""
@@ -194,92 +241,4 @@ class StereoPairStream(IterableDataset[Sample]):
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs."""
         self.batches.require_shared_once(self)
-        return self.__dict__ | {"_latest": None}
-
-
-class SamplePass(Iterator[Sample]):
-    """One pass of one worker over its samples."""
-
-    def __init__(
-        self, stream: StereoPairStream, *, epoch: int, start: int, worker: int, workers: int
-    ) -> None:
-        """Begin an epoch at a global batch."""
-        self._stream = stream
-        self._place = {"worker": worker, "workers": workers}
-        self._go_to(epoch, start, given=0)
-
-    def __next__(self) -> Sample:
-        """Return the next sample."""
-        if self._at == len(self._batch):
-            self._next_batch()
-        sample = self._stream.pairs.load_into(
-            self._arrays, self._at, self._batch[self._at], batch=self._batch
-        )
-        self._at += 1
-        self._given += 1
-        return sample
-
-    def state_dict(self) -> State:
-        """Return the position: for all ranks, and for this worker in its own samples."""
-        batches = self._stream.batches
-        whole = batches.pass_from(self._epoch, self._start)
-        whole.taken, part = divmod(self._given, batches.batch_size)
-        if part > 0 and self._at == len(self._batch):
-            whole.taken += 1  # the epoch's last batch is short
-        return {
-            **batches.state_at(*whole.position),
-            "start": self._start,
-            "samples_given": self._given,
-            **self._own_place,
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go to the position of the same worker of as many.
-
-        Raises:
-            StateError: If it belongs to other samples, another order, or another worker.
-        """
-        batches = self._stream.batches
-        epoch, _ = batches.position_in(state)
-        differing = [
-            f"{name} is {value} here and {state.get(name)} there"
-            for name, value in self._own_place.items()
-            if state.get(name) != value
-        ]
-        if differing:
-            raise StateError(
-                f"the position is that of another worker: {'; '.join(differing)}. Load it under "
-                "the same ranks and workers; the state of a stream itself goes with any."
-            )
-        start = require_count(state, "start", most=batches.batches_of_all)
-        share = len(self._share(start))
-        given = require_count(state, "samples_given", most=share * batches.batch_size)
-        self._stream.set_epoch(epoch)
-        self._go_to(epoch, start, given=given)
-
-    @property
-    def _own_place(self) -> dict[str, int]:
-        batches = self._stream.batches
-        return {"rank": batches.rank, "world_size": batches.world_size, **self._place}
-
-    def _share(self, start: int) -> range:
-        """Return the global numbers of this worker's batches from a global batch on."""
-        share: range = self._stream.batches.share(start)
-        return share[self._place["worker"] :: self._place["workers"]]
-
-    def _go_to(self, epoch: int, start: int, *, given: int) -> None:
-        self._epoch, self._start, self._given = epoch, start, given
-        whole, part = divmod(given, self._stream.batches.batch_size)
-        self._left = iter(self._share(start)[whole:])
-        self._batch, self._at = EpochBatch((), epoch=epoch), 0
-        self._arrays: BatchArrays | None = None
-        if part > 0:
-            self._next_batch()
-            self._at = part
-
-    def _next_batch(self) -> None:
-        self._batch = self._stream.batches.batch(next(self._left), epoch=self._epoch)
-        self._at = 0
-        buffers = self._stream.pairs.buffers
-        self._arrays = buffers.allocate(len(self._batch)) if buffers.makes_batches else None
-        self._stream.pairs.expect(self._batch)
+        return self.__dict__ | {"_resumed": None}

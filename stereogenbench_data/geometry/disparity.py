@@ -307,24 +307,9 @@ def planar_from_ray(
 
     Source: Roberts et al., Hypersim, 2021, whose depth_meters is the length of the ray.
     """
-    return ray_m / _ray_per_planar(ray_m, intrinsics)
-
-
-def ray_from_planar(
-    depth_m: Float[Any, "*batch h w"], intrinsics: Intrinsics
-) -> Float[Any, "*batch h w"]:
-    """Return distances to the camera's centre from depth along the optical axis, both in metres.
-
-    Raises:
-        GeometryError: If the map does not have the image size of the intrinsics.
-    """
-    return depth_m * _ray_per_planar(depth_m, intrinsics)
-
-
-def _ray_per_planar(like: Float[Any, "*batch h w"], intrinsics: Intrinsics) -> Float[Any, "h w"]:
-    require_picture_size(like.shape, intrinsics, name="the depth map")
-    return ray_per_planar(
-        like,
+    require_picture_size(ray_m.shape, intrinsics, name="the depth map")
+    return ray_m / ray_per_planar(
+        ray_m,
         focal_px=(intrinsics.fx_px, intrinsics.fy_px),
         centre_px=(intrinsics.cx_px, intrinsics.cy_px),
     )

@@ -12,7 +12,6 @@ from jaxtyping import Float64
 
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import OPENCV_FROM_UNREAL, CameraPoses
-from stereogenbench_data.schema.records import Rig
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 
 _LEFT, _RIGHT = (list(cameras) for cameras in zip(*CAMERA_PAIRS, strict=True))
@@ -26,16 +25,6 @@ def lateral_offsets_m(poses: CameraPoses) -> Float64[np.ndarray, "6"]:
     right_axis = poses.world_from_cam_rotations[0, 0, :, 0]
     steps = (poses.centres[0] - poses.centres[0, 0]) @ OPENCV_FROM_UNREAL.T
     return np.asarray(steps @ right_axis * poses.unit_m)
-
-
-def baseline_deviation_cm(poses: CameraPoses, rig: Rig) -> float:
-    """Return the largest difference between a recorded baseline and the poses' distance, in cm.
-
-    The maximum is over all 15 pairs and all frames.
-    """
-    steps = poses.centres[:, _RIGHT] - poses.centres[:, _LEFT]
-    distances_cm = np.linalg.norm(steps, axis=-1) * (poses.unit_m * 100)
-    return float(np.abs(distances_cm - np.array(rig.baselines_cm)).max())
 
 
 def rectification_residual_px(poses: CameraPoses, intrinsics: Intrinsics) -> float:

@@ -17,7 +17,7 @@ from typing import Final, NamedTuple, TypeAlias
 
 import pyarrow as pa
 
-from stereogenbench_data.errors import StorageError, text_without_secrets
+from stereogenbench_data.errors import StorageError, describe_os_error, text_without_secrets
 from stereogenbench_data.index.arrow import table_digest
 from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.parquet import (
@@ -103,11 +103,16 @@ def open_table(
     else:
         path = local_path(data)
         where = str(path)
-        if path.is_dir() and not (path / INDEX_NAME).is_file():
+        try:
+            is_folder, is_file = path.is_dir(), path.is_file()
+            is_tree = is_folder and not (path / INDEX_NAME).is_file()
+        except OSError as error:
+            raise StorageError(describe_os_error(f"{path}: cannot be looked at", error)) from error
+        if is_tree:
             _require_no_root(path, named_root)
             opened = _open_tree(path, wanted)
-        elif path.is_dir() or path.is_file():
-            file = path / INDEX_NAME if path.is_dir() else path
+        elif is_folder or is_file:
+            file = path / INDEX_NAME if is_folder else path
             opened = _open_file(file, root=named_root)
         else:
             raise StorageError(

@@ -1,7 +1,9 @@
 """`EpochBatches`, and positions saved and loaded."""
 
+import copy
 import itertools
 import json
+import pickle
 
 import pytest
 import torch
@@ -268,6 +270,36 @@ def test_batches_made_before_the_process_group_are_refused_in_it(keyed, tmp_path
         assert len(told) == 17
     finally:
         torch.distributed.destroy_process_group()
+
+
+def test_a_pass_that_was_left_is_not_the_position_after_later_ones(keyed):
+    batches = EpochBatches(keyed, 9, tail="uneven")
+    loader = DataLoader(keyed, batch_sampler=batches)
+    for _ in range(2):
+        for number, _ in enumerate(loader):
+            if number == 3:
+                break
+    assert batches.state_dict()["batches_consumed"] == 4
+    list(loader)
+
+    assert batches.state_dict()["batches_consumed"] == 16
+
+
+def test_ranks_whose_passes_are_over_are_all_at_the_end(keyed):
+    ranks = [EpochBatches(keyed, 9, rank=r, world_size=3, tail="uneven") for r in range(3)]
+
+    assert [len(list(rank)) for rank in ranks] == [6, 5, 5]
+    assert [rank.state_dict()["batches_consumed"] for rank in ranks] == [16, 16, 16]
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_a_pass_over_batches_is_not_copied_and_goes_on(keyed, copied):
+    numbers = iter(EpochBatches(keyed, 9, tail="uneven"))
+    next(numbers)
+
+    with pytest.raises(TypeError, match="generator"):
+        copied(numbers)
+    assert len(list(numbers)) == 15
 
 
 @pytest.mark.parametrize("workers", [0, 2])

@@ -139,6 +139,15 @@ def test_a_slice_is_answered_with_a_subset_of_the_same_samples(indexed_release):
     assert torch.equal(subset[2]["left"], pairs[2]["left"])
 
 
+@pytest.mark.parametrize("numbers", [[0, 2], (0, 2), range(2)], ids=repr)
+def test_several_numbers_are_answered_with_a_subset(indexed_release, numbers):
+    pairs = StereoPairs(indexed_release, fields=("left",))
+
+    with pytest.raises(SelectionError) as refused:
+        pairs[numbers]
+    assert f"Subset(pairs, {numbers!r})" in str(refused.value)
+
+
 @pytest.mark.parametrize("pairs", [(0, 5), "0-5", np.array([[0, 5]])], ids=repr)
 def test_a_pair_may_be_given_by_itself(indexed_release, pairs):
     chosen = StereoPairs(indexed_release, fields=("pair",), pairs=pairs)
@@ -377,7 +386,7 @@ def test_a_dataset_goes_on_after_a_change_of_folder(indexed_release, monkeypatch
     assert pairs[0]["__url__"].startswith(str(indexed_release))
 
 
-@pytest.mark.parametrize("number", [2.7, "0", [0, 1], None])
+@pytest.mark.parametrize("number", [2.7, "0", None])
 def test_a_sample_is_requested_by_a_whole_number(indexed_release, number):
     with pytest.raises(TypeError, match="cannot be interpreted as an integer"):
         StereoPairs(indexed_release)[number]

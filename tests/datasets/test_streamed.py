@@ -3,6 +3,7 @@
 import copy
 import itertools
 import json
+import pickle
 
 import pytest
 import torch
@@ -147,6 +148,21 @@ def test_a_position_goes_on_under_other_ranks_and_workers_once(stream_of, worker
     assert sorted(flat(keys_of(loader))) == sorted(flat(unbroken))
 
 
+@pytest.mark.parametrize("workers", [1, 2])
+def test_workers_go_on_once_with_a_position_that_was_reached_without_them(stream_of, workers):
+    unbroken = keys_of(loaded(stream_of()))
+    first = stream_of()
+    samples = iter(first)
+    for _ in range(22):
+        next(samples)
+    stream = stream_of()
+    stream.load_state_dict(first.state_dict())
+    loader = loaded(stream, workers)
+
+    assert keys_of(loader) == unbroken[2:]
+    assert keys_of(loader) == unbroken
+
+
 def test_a_stream_iterated_in_this_process_counts_by_itself(stream_of, keyed):
     stream = stream_of()
     batches = iter(loaded(stream))
@@ -212,16 +228,35 @@ def test_torchdatas_loader_saves_and_loads_its_position(stream_of, workers, stop
     assert keys_of(resumed) == unbroken
 
 
+@pytest.mark.parametrize("taken", [1, 13, 69, 70])
+def test_a_stream_goes_on_after_its_last_sample_and_other_ranks_after_its_last_batch(
+    stream_of, taken
+):
+    first = stream_of(rank=0, world_size=2)
+    samples = iter(first)
+    for _ in range(taken):
+        next(samples)
+    state = json.loads(json.dumps(first.state_dict()))
+    same, alone = stream_of(rank=0, world_size=2), stream_of()
+    same.load_state_dict(state)
+    alone.load_state_dict(state)
+
+    whole = [sample["__key__"] for sample in stream_of()]
+    assert [sample["__key__"] for sample in same] == [sample["__key__"] for sample in samples]
+    assert [sample["__key__"] for sample in alone] == whole[18 * (taken // 9) :]
+    assert len(list(same)) == len(same)
+
+
 def test_a_workers_own_position_is_refused_by_another_worker(stream_of):
-    samples = iter(stream_of(rank=0, world_size=2))
-    next(samples)
-    state = samples.state_dict()
+    first, second = (
+        StatefulDataLoader(stream_of(rank=rank, world_size=2), batch_size=9, num_workers=1)
+        for rank in (0, 1)
+    )
+    next(iter(first))
+    second.load_state_dict(first.state_dict())
 
     with pytest.raises(StateError, match="rank is 1 here and 0 there"):
-        iter(stream_of(rank=1, world_size=2)).load_state_dict(state)
-    same = iter(stream_of(rank=0, world_size=2))
-    same.load_state_dict(state)
-    assert [s["__key__"] for s in same] == [s["__key__"] for s in samples]
+        next(iter(second))
 
 
 @pytest.mark.parametrize(
@@ -235,11 +270,21 @@ def test_a_workers_own_position_is_refused_by_another_worker(stream_of):
     ids=str,
 )
 def test_a_workers_damaged_position_is_refused(stream_of, change, message):
+    stream = stream_of()
+    next(iter(stream))
+
+    with pytest.raises(StateError, match=message):
+        stream.load_state_dict(stream.state_dict() | change)
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_a_pass_over_a_stream_is_not_copied_and_goes_on(stream_of, copied):
     samples = iter(stream_of())
     next(samples)
 
-    with pytest.raises(StateError, match=message):
-        samples.load_state_dict(samples.state_dict() | change)
+    with pytest.raises(TypeError, match="generator"):
+        copied(samples)
+    assert len(list(samples)) == 139
 
 
 def test_the_shares_of_many_ranks_and_workers_are_the_selection(stream_of):

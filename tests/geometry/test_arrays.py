@@ -17,7 +17,6 @@ from stereogenbench_data.geometry.disparity import (
     disparity_from_depth,
     disparity_from_units,
     planar_from_ray,
-    ray_from_planar,
 )
 from stereogenbench_data.geometry.projection import project_rectified, project_through_poses
 from stereogenbench_data.geometry.visibility import visible_from_source, visible_in_target
@@ -46,7 +45,6 @@ def maps(units, image):
         "depth": depth_from_disparity(depth_m, **PAIR),
         "error": disparity_error_px(depth_m, **PAIR, quantum_m=0.1),
         "planar": planar_from_ray(depth_m, CAMERA),
-        "ray": ray_from_planar(depth_m, CAMERA),
     }
     for name, projection in lands.items():
         judged = {"measured": measured, "quantum_m": 0.1}

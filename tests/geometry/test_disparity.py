@@ -12,7 +12,6 @@ from stereogenbench_data.geometry.disparity import (
     disparity_from_depth,
     disparity_from_units,
     planar_from_ray,
-    ray_from_planar,
     write_disparity,
 )
 
@@ -201,13 +200,11 @@ def test_the_bound_is_no_looser_than_the_worst_case():
 def test_the_ray_to_the_corner_is_longer_than_its_depth(library):
     """In a 6x2 image with f = 1 the corner's centre is at x = 2.5, y = 0.5."""
     intrinsics = Intrinsics(1.0, 1.0, 3.0, 1.0, 6, 2)
-    depth_m = library.array(np.full((2, 6), 4.0, dtype=np.float32))
+    depth_m = planar_from_ray(library.array(np.full((2, 6), 4.0, dtype=np.float32)), intrinsics)
 
-    ray_m = ray_from_planar(depth_m, intrinsics)
-
-    assert library.numpy(ray_m).dtype == np.float32
-    assert library.numpy(ray_m)[0, 0] == pytest.approx(4 * np.sqrt(1 + 2.5**2 + 0.5**2))
-    np.testing.assert_allclose(library.numpy(planar_from_ray(ray_m, intrinsics)), 4.0, rtol=2e-7)
+    assert library.numpy(depth_m).dtype == np.float32
+    assert library.numpy(depth_m)[0, 0] == pytest.approx(4 / np.sqrt(1 + 2.5**2 + 0.5**2))
+    assert library.numpy(depth_m)[1, 3] == pytest.approx(4 / np.sqrt(1 + 0.5**2 + 0.5**2))
 
 
 @pytest.mark.parametrize("value_m", [0.0, np.inf])

@@ -6,11 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
-from stereogenbench_data.geometry.rig import (
-    baseline_deviation_cm,
-    lateral_offsets_m,
-    rectification_residual_px,
-)
+from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
 
 LATERAL_CM = np.array([0.0, 18.5, 51.5, 61.25, 122.5, 163.0])
 TURNED = Rotation.from_euler("ZYX", [200.0, 12.0, -7.0], degrees=True).as_matrix()
@@ -36,11 +32,10 @@ def test_lateral_offsets_are_where_the_cameras_stand_along_the_rig(make_rig):
 
 
 @pytest.mark.parametrize("offset_cm", [(0, 0, 0), (1e6, -1e6, 1e6)])
-def test_a_lateral_rig_is_rectified_wherever_it_stands(make_rig, recorded_rig, offset_cm):
+def test_a_lateral_rig_is_rectified_wherever_it_stands(make_rig, offset_cm):
     poses = make_rig(LATERAL_CM, rotation=TURNED, offset_cm=offset_cm, frames=2)
 
     assert rectification_residual_px(poses, INTRINSICS) < 1e-6
-    assert baseline_deviation_cm(poses, recorded_rig(LATERAL_CM)) < 1e-9
 
 
 def test_one_frame_with_a_pitch_error_shows_in_the_residual(make_rig):
@@ -80,9 +75,3 @@ def test_a_camera_that_looks_back_has_no_closed_form_at_all(make_rig):
     poses = with_camera_turned(make_rig(LATERAL_CM), 2, Rotation.from_euler("y", np.pi))
 
     assert rectification_residual_px(poses, INTRINSICS) == np.inf
-
-
-def test_the_deviation_is_that_of_the_worst_pair_in_the_worst_frame(make_rig, recorded_rig):
-    poses = with_camera_moved(make_rig(LATERAL_CM, frames=3), 5, (0.0, 0.25, 0.0))
-
-    assert baseline_deviation_cm(poses, recorded_rig(LATERAL_CM)) == pytest.approx(0.25)

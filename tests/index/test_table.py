@@ -283,6 +283,11 @@ def test_data_that_do_not_exist_are_named(tmp_path):
         SceneIndex.open(tmp_path / "nowhere")
 
 
+def test_a_name_that_no_system_takes_is_refused_with_the_cure():
+    with pytest.raises(StorageError, match=r"nnn: cannot be looked at .*Choose a shorter name"):
+        SceneIndex.open("n" * 300)
+
+
 def test_an_index_behind_a_url_is_fetched_and_its_data_lie_beside_it(scenes, web):
     SceneIndex.from_scenes(scenes, web.folder).write(web.folder / "index.parquet")
     for url in (web.url, f"{web.url}/", f"{web.url}/index.parquet"):
