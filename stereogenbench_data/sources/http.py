@@ -20,7 +20,7 @@ from urllib3.exceptions import HTTPError, LocationValueError
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.sources.connections import failure_reason, request
-from stereogenbench_data.sources.location import WEB_SCHEMES, is_inside, shown, split_url
+from stereogenbench_data.sources.location import WEB_SCHEMES, shown, split_url
 from stereogenbench_data.sources.retry import Attempt, ProcessLock, TooSlow, TransientError
 from stereogenbench_data.sources.transport import (
     MISSING,
@@ -281,10 +281,6 @@ class WebTransport:
             reason = f"redirects to {shown(there)[:200]!r}, which is not a URL of a web server"
         elif (split_url(url).scheme, parts.scheme) == ("https", "http"):
             reason = f"redirects from https to {shown(there)[:200]}, which is not encrypted"
-        elif parts.hostname != split_url(url).hostname and (
-            is_inside(parts.hostname) and not is_inside(split_url(url).hostname or "")
-        ):
-            reason = f"redirects to {shown(there)[:200]}, inside this machine's own network"
         if reason:
             raise StorageError(
                 f"{self._where}: the server answers {response.status} and {reason}. Check the URL "

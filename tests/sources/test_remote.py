@@ -551,15 +551,9 @@ def test_a_redirect_to_no_place_is_named(served, location, message):
     ("url", "there", "message"),
     [
         ("https://8.8.8.8/x", "http://8.8.8.8/x", "redirects from https to http://8.8.8.8/x,"),
-        ("https://8.8.8.8/x", "https://127.0.0.1/y", "inside this machine's own network"),
-        ("http://8.8.8.8/x", "http://[::ffff:10.0.0.1]/y", "inside this machine's own network"),
-        ("http://8.8.8.8/x", "http://169.254.169.254/", "inside this machine's own network"),
-        ("http://8.8.8.8/x", "http://localhost:80/", "inside this machine's own network"),
     ],
 )
-def test_a_redirect_into_the_own_network_or_without_tls_is_refused(
-    monkeypatch, url, there, message
-):
+def test_a_redirect_without_tls_is_refused(monkeypatch, url, there, message):
     def moved(*_, **how):
         return urllib3.HTTPResponse(status=302, headers={"Location": there})
 
