@@ -41,8 +41,7 @@ from stereogenbench_data.sources.location import (
     split_name,
 )
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import RetryPolicy
-from stereogenbench_data.sources.transport import MissingObject
+from stereogenbench_data.sources.retry import MissingObject, RetryPolicy
 
 MAX_INDEX_BYTES: Final = 256 * 2**20
 """The largest index that is fetched. One of 8,493 scenes has a few megabytes."""

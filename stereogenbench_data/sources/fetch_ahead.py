@@ -19,7 +19,6 @@ from itertools import islice, takewhile
 from typing import Final, Literal, NamedTuple
 
 from stereogenbench_data.errors import SelectionError
-from stereogenbench_data.sources.retry import Cancellation
 
 FETCH_AHEAD_BYTES: Final = 256_000_000
 """Bytes that a process fetches ahead at the most, unless the user says otherwise."""
@@ -51,7 +50,7 @@ class Wanted(NamedTuple):
     place: Hashable
     start: int
     stop: int
-    fetch: Callable[[int, int, Cancellation], bytes]
+    fetch: Callable[[int, int, threading.Event], bytes]
     held_bytes: int | None = None
 
 
@@ -67,7 +66,7 @@ class _Part:
     place: Hashable
     start: int
     stop: int
-    fetch: Callable[[int, int, Cancellation], bytes]
+    fetch: Callable[[int, int, threading.Event], bytes]
     first: int
     last: int
     held_bytes: int
@@ -81,7 +80,7 @@ class _State:
     """What the threads of a process share."""
 
     pid: int = field(default_factory=os.getpid)
-    cancellation: Cancellation = field(default_factory=Cancellation)
+    cancellation: threading.Event = field(default_factory=threading.Event)
     changed: threading.Condition = field(default_factory=threading.Condition)
     queue: list[tuple[int, int, _Part]] = field(default_factory=list)
     threads: set[threading.Thread] = field(default_factory=set)
@@ -324,7 +323,7 @@ def _end(state: _State) -> None:
         state.queue.clear()
         state.due.clear()
         threads = list(state.threads)
-    state.cancellation.cancel()
+    state.cancellation.set()
     for thread in threads:
         if thread is not threading.current_thread():
             thread.join(_END_S / len(threads))

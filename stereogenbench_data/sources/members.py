@@ -27,7 +27,7 @@ from stereogenbench_data.sources.ranged_file import (
     require_crc32,
 )
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import Cancellation, RetryPolicy
+from stereogenbench_data.sources.retry import RetryPolicy
 
 UNSAFE_PATH: Final = r"^/|\\|:|(?:^|/)\.{0,2}(?:/|$)|[\x00-\x1f]"
 """What a member's path may not hold: a root, a drive, a backslash, an empty part, '.' or '..'."""
@@ -187,7 +187,7 @@ class MemberSource:
         cache = self._cache
         if cache is not None:
 
-            def fill(start: int, stop: int, cancellation: Cancellation) -> bytes:
+            def fill(start: int, stop: int, cancellation: threading.Event) -> bytes:
                 cache.open(member, remote=remote, revision=self._revision).close()
                 return b""
 
@@ -195,7 +195,7 @@ class MemberSource:
                 return []
             return [Wanted(_cached(member), 0, 1, fill, member.size)]
 
-        def fetch(start: int, stop: int, cancellation: Cancellation) -> bytes:
+        def fetch(start: int, stop: int, cancellation: threading.Event) -> bytes:
             self.fetched.add(stop - start)
             return remote.read(start, stop, cancellation=cancellation)
 
