@@ -6,7 +6,7 @@ Errors do not chain those of the file systems, whose messages may hold signed UR
 import os
 import sys
 from collections.abc import Generator, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import Any, Final
 
 from stereogenbench_data.errors import ExtraError, StorageError, missing_extra
@@ -14,6 +14,7 @@ from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.retry import (
     CHUNK_BYTES,
     MISSING,
+    PASSING,
     MissingObject,
     TransientError,
     replaced,
@@ -28,7 +29,6 @@ _NOT_READ: Final = ("ftp", "ftps")
 _CALL_BYTES: Final = 2 * 1024 * 1024
 """Bytes of one call of a file system, whose progress is not seen before it returns."""
 
-_REFUSED: Final = frozenset({400, 401, 403, 404, 405, 410, 416, 451})
 _CHANGED: Final = 412
 _NETWORK_ERRORS: Final = (
     ("builtins", "OSError"),
@@ -41,9 +41,6 @@ _NETWORK_ERRORS: Final = (
     ("huggingface_hub.errors", "HfHubHTTPError"),
 )
 """What file systems raise where a server cannot be reached; only imported modules count."""
-
-_CHANGE_MARKS: Final = ("ETag", "etag", "LastModified", "last_modified", "mtime", "size")
-"""What file systems report of a file that changes with its content."""
 
 _SETUP_ERRORS: Final = (("botocore.exceptions", "BotoCoreError"),)
 """What file systems raise where they are not set up, for example without a login."""
@@ -63,7 +60,6 @@ class FilesystemTransport:
             StorageError: If it is on an FTP server.
         """
         self._url = url
-        self._expected_size = expected_size
         self._where = shown(url)
         if url.partition("://")[0].lower() in _NOT_READ:
             raise StorageError(
@@ -71,9 +67,10 @@ class FilesystemTransport:
                 f"them and pass the folder."
             )
         self.server = "/".join(self._where.split("/")[:3])
+        self._expected_size = expected_size
+        self._has_expected_size = expected_size is None
+        self._etags: dict[str, str] = {}
         self._opened: tuple[int, Any, str] | None = None
-        self._first_seen: dict[str, dict[str, str]] = {}
-        self._has_expected_size = False
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy in another process, which opens its own file system."""
@@ -86,7 +83,8 @@ class FilesystemTransport:
             if _is_s3(files):
                 size = self._s3_call("head_object", files, path, timeout_s)["ContentLength"]
             else:
-                size = files.size(path, **_limit(files, timeout_s))
+                limit = {"timeout": timeout_s} if files.async_impl else {}
+                size = files.size(path, **limit)
         if not isinstance(size, int):
             raise StorageError(f"{self._where}: has no size ({size!r}): is it a folder?")
         return size
@@ -95,7 +93,8 @@ class FilesystemTransport:
         """List a folder: name to size in bytes, None for a folder."""
         with self._named_errors():
             files, path = self._open()
-            listed = files.ls(path, detail=True, **_limit(files, timeout_s))
+            limit = {"timeout": timeout_s} if files.async_impl else {}
+            listed = files.ls(path, detail=True, **limit)
         found: dict[str, int | None] = {}
         for entry in listed:
             name = str(entry["name"]).strip("/")
@@ -111,26 +110,15 @@ class FilesystemTransport:
             if _is_s3(files):
                 yield from self._s3_part(start, stop, timeout_s, files, path)
                 return
-        if self._expected_size is not None and not self._has_expected_size:
             self._require_size(timeout_s)
-        for first in range(start, stop, _CALL_BYTES):
-            last = min(first + _CALL_BYTES, stop)
-            with self._named_errors():
-                if files.async_impl:
-                    data = files.cat_file(path, start=first, end=last, timeout=timeout_s)
-                else:
-                    data = self._read_file(first, last, files, path)
-            yield bytes(data)
-            if len(data) != last - first:
-                return
-
-    def _read_file(self, first: int, last: int, files: Any, path: str) -> bytes:
-        # Without a cache, or fsspec would read megabytes ahead.
-        with files.open(path, "rb", cache_type="none") as file:
-            file.seek(first)
-            data: bytes = file.read(last - first)
-            self._require_same(getattr(file, "details", None))
-        return data
+            # Without a cache, or fsspec would read megabytes ahead.
+            how = {"timeout": timeout_s} if files.async_impl else {"cache_type": "none"}
+            for first in range(start, stop, _CALL_BYTES):
+                last = min(first + _CALL_BYTES, stop)
+                data = bytes(files.cat_file(path, start=first, end=last, **how))
+                yield data
+                if len(data) != last - first:
+                    return
 
     def _s3_part(
         self, start: int, stop: int, timeout_s: float, files: Any, path: str
@@ -142,12 +130,15 @@ class FilesystemTransport:
         try:
             stated = self._s3_call("get_object", files, path, timeout_s, **part)
         except OSError as error:
-            if _status(error) == 416 and self._expected_size is not None:
+            if _answer(error)[0] == 416:
                 self._require_size(timeout_s)  # it may end before the part
             raise
         body = stated["Body"]
         try:
-            self._require_same({"ETag": stated["ETag"]} if "ETag" in stated else None)
+            etag = str(stated.get("ETag", ""))
+            first = self._etags.setdefault("first", etag)
+            if etag != first:
+                raise replaced(self._where, "in its store", f"its ETag was {first} and is {etag}")
             whole = str(stated.get("ContentRange", "")).rpartition("/")[2]
             if whole.isdecimal():
                 require_expected_size(int(whole), expected=self._expected_size, where=self._where)
@@ -162,26 +153,15 @@ class FilesystemTransport:
         options = {"Bucket": bucket, "Key": key, **how}
         if version is not None:
             options["VersionId"] = version
-        first = self._first_seen.get("marks", {})
-        if "ETag" in first:
-            options["IfMatch"] = first["ETag"]
+        if self._etags.get("first"):
+            options["IfMatch"] = self._etags["first"]
         return files.call_s3(method, timeout=timeout_s, **options)
 
     def _require_size(self, timeout_s: float) -> None:
-        found = self.size(timeout_s)
-        require_expected_size(found, expected=self._expected_size, where=self._where)
-        self._has_expected_size = True
-
-    def _require_same(self, details: Any) -> None:
-        """Refuse a file that was replaced since the first read, if its file system reports it."""
-        if not isinstance(details, Mapping):
-            return
-        now = {name: str(details[name]) for name in _CHANGE_MARKS if name in details}
-        before = self._first_seen.setdefault("marks", now)
-        changed = [name for name in before if name in now and before[name] != now[name]]
-        if changed:
-            changes = [f"its {name} was {before[name]} and is {now[name]}" for name in changed]
-            raise replaced(self._where, "in its store", ", ".join(changes))
+        if not self._has_expected_size:
+            found = self.size(timeout_s)
+            require_expected_size(found, expected=self._expected_size, where=self._where)
+            self._has_expected_size = True
 
     def _open(self) -> tuple[Any, str]:
         """Return this process's file system, and the object's path in it."""
@@ -207,10 +187,7 @@ class FilesystemTransport:
                 f"{self._where}: does not exist, or is private. {MISSING}"
             ) from None
         except PermissionError as error:
-            raise StorageError(
-                f"{self._where}: permission denied ({_reason(error)}). Log in to its store, or ask "
-                f"for access."
-            ) from None
+            raise self._no_permission(error) from None
         except ImportError as error:
             extra = _EXTRAS.get(self._url.partition("://")[0])
             raise _not_installed(self._where, error, extra=extra) from None
@@ -220,16 +197,20 @@ class FilesystemTransport:
                 f"pass the folder."
             ) from None
         except network_errors() as error:
-            if _status(error) == _CHANGED:
+            status, wait_s = _answer(error)
+            if status == _CHANGED:
                 raise replaced(self._where, "in its store", "its ETag is another") from None
-            if _status(error) in _REFUSED:
+            if 400 <= status < 500 and status not in PASSING:
                 raise StorageError(f"{self._where}: {_reason(error)}. {MISSING}") from None
-            raise TransientError(_reason(error), wait_s=_wait_s(error)) from None
+            raise TransientError(_reason(error), wait_s=wait_s) from None
         except _loaded(_SETUP_ERRORS) as error:
-            raise StorageError(
-                f"{self._where}: permission denied ({_reason(error)}). Log in to its store, or set "
-                f"up its file system."
-            ) from None
+            raise self._no_permission(error) from None
+
+    def _no_permission(self, error: BaseException) -> StorageError:
+        return StorageError(
+            f"{self._where}: permission denied ({_reason(error)}). Log in to its store, or ask for "
+            f"access."
+        )
 
 
 @contextmanager
@@ -256,40 +237,26 @@ def _is_s3(files: Any) -> bool:
     return type(files).__module__.partition(".")[0] == "s3fs"
 
 
-def _limit(files: Any, timeout_s: float) -> dict[str, float]:
-    """Return the option that limits a call of a file system: asynchronous ones have it."""
-    return {"timeout": timeout_s} if files.async_impl else {}
-
-
-def _status(error: BaseException) -> int | None:
-    """Return the status of the server's response, if the error or its cause holds one."""
+def _answer(error: BaseException) -> tuple[int, float]:
+    """Return the status and the Retry-After, in seconds, of a server's response; 0 without any."""
     for each in (error, error.__cause__):
         response = getattr(each, "response", None)
         if isinstance(response, Mapping):  # of boto
-            status = response.get("ResponseMetadata", {}).get("HTTPStatusCode")
+            stated = response.get("ResponseMetadata", {})
+            status, headers = stated.get("HTTPStatusCode"), stated.get("HTTPHeaders")
         else:
             status = getattr(response, "status_code", None)
+            headers = getattr(response, "headers", None)
         if isinstance(status, int):
-            return status
-    return None
-
-
-def _wait_s(error: BaseException) -> float:
-    """Return how many seconds the server asks to wait, 0 if it does not."""
-    for each in (error, error.__cause__):
-        response = getattr(each, "response", None)
-        headers: Any = getattr(response, "headers", None)
-        if isinstance(response, Mapping):
-            headers = response.get("ResponseMetadata", {}).get("HTTPHeaders")
-        with suppress(TypeError, AttributeError, ValueError):
-            return retry_after_s(str(headers.get("retry-after") or ""))
-    return 0.0
+            return status, retry_after_s(str((headers or {}).get("retry-after") or ""))
+    return 0, 0.0
 
 
 def _reason(error: BaseException) -> str:
     """Return what happened without any URL, which may hold secrets."""
-    if _status(error) is not None:
-        return f"the server answers {_status(error)}"
+    status, _ = _answer(error)
+    if status:
+        return f"the server answers {status}"
     text = error.strerror if isinstance(error, OSError) else None
     return f"{type(error).__name__}: {text}" if text and "://" not in text else type(error).__name__
 

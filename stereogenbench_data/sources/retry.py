@@ -20,6 +20,9 @@ MISSING: Final = "Check the URL, and that the index and its shards lie in one fo
 CHUNK_BYTES: Final = 64 * 1024
 """A read that received so many more bytes has its whole time and all its attempts again."""
 
+PASSING: Final = (408, 425, 429, 500, 502, 503, 504)
+"""Status codes of failures that may pass."""
+
 _pauses: Final[dict[str, float]] = {}
 """Until when, on the monotonic clock, servers asked this process to wait."""
 

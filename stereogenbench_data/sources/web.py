@@ -25,6 +25,7 @@ from stereogenbench_data.sources.location import shown, split_url
 from stereogenbench_data.sources.retry import (
     CHUNK_BYTES,
     MISSING,
+    PASSING,
     ProcessLock,
     TransientError,
     replaced,
@@ -46,8 +47,6 @@ _REDIRECTS_ONLY: Final = urllib3.Retry(
 """What is left to urllib3: other failures are counted per read, by `retry.Attempts`."""
 
 _WITH_CONTENT: Final = (200, 206, 416)
-_PASSING: Final = (408, 425, 429, 500, 502, 503, 504)
-"""Status codes of failures that may pass."""
 
 _FETCH: Final = "or fetch the data and pass the folder"
 _CURES: Final = {
@@ -207,7 +206,7 @@ class WebTransport:
         except TransientError:
             self._address = ""  # its server may be gone; another one may not
             raise
-        if response.status in _WITH_CONTENT or response.status in _PASSING:
+        if response.status in _WITH_CONTENT or response.status in PASSING:
             return response
         _use_up(response)
         if self._address == address:
@@ -279,7 +278,7 @@ class WebTransport:
         """Return the error of a response without content."""
         reason = re.sub(r"[^ -~]", "?", response.reason or "")[:60]
         answer = f"the server answers {response.status} {reason}".rstrip()
-        if response.status in _PASSING:
+        if response.status in PASSING:
             limit = _RATE_LIMIT.search(response.headers.get("RateLimit", "")[:200])
             if response.status == 429 and limit is not None:
                 return TransientError(answer, wait_s=float(limit[1]) + 1)  # the Hub rounds it

@@ -1,11 +1,9 @@
 """Ranges from real servers of each kind: nginx, an S3 endpoint, and a Hub for its own client."""
 
-import io
 import os
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import ClassVar
 
 import fsspec
 import pytest
@@ -136,40 +134,18 @@ def test_an_object_of_a_store_that_is_replaced_between_two_ranges_is_reported(s3
     store.close()
 
 
-def test_a_file_that_a_file_system_tells_otherwise_is_reported_as_replaced(monkeypatch):
-    files = fsspec.filesystem("memory")
-    files.pipe_file("/shard.tar", b"0123456789")
-    tags = iter("aab")
-
-    class Tagged(io.BytesIO):
-        details: ClassVar = {}
-
-    def opened(path, *args, **how):
-        file = Tagged(b"0123456789")
-        file.details = {"ETag": next(tags), "size": 10}
-        return file
-
-    monkeypatch.setattr(files, "open", opened)
-    remote = RemoteObject("memory://shard.tar", retry=retry_policy(attempts=1))
-
-    assert remote.read(0, 3) + remote.read(3, 6) == b"012345"
-    with pytest.raises(ShardError, match=r"was replaced in its store .*: its ETag was a and is b"):
-        remote.read(6, 9)
-    files.rm("/shard.tar")
-
-
 def test_a_file_system_that_fails_is_requested_again(monkeypatch):
     waits = Waits()
     files = fsspec.filesystem("memory")
     files.pipe_file("/shard.tar", b"0123456789")
     failures = [OSError("connection reset"), TimeoutError()]
 
-    def opened(*args, **how):
+    def fetched(*args, **how):
         if failures:
             raise failures.pop()
-        return type(files).open(files, *args, **how)
+        return type(files).cat_file(files, *args, **how)
 
-    monkeypatch.setattr(files, "open", opened)
+    monkeypatch.setattr(files, "cat_file", fetched)
 
     assert RemoteObject("memory://shard.tar").read(2, 6, cancellation=waits) == b"2345"
     assert len(waits.seconds) == 2
@@ -185,12 +161,12 @@ def test_a_wait_that_a_store_asks_for_holds_for_all_its_objects(monkeypatch):
 
     failures = [BusyError()]
 
-    def opened(*args, **how):
+    def fetched(*args, **how):
         if failures:
             raise failures.pop()
-        return type(files).open(files, *args, **how)
+        return type(files).cat_file(files, *args, **how)
 
-    monkeypatch.setattr(files, "open", opened)
+    monkeypatch.setattr(files, "cat_file", fetched)
     for _ in range(2):
         waits = Waits()
         remote = RemoteObject("memory://busy/shard.tar")
