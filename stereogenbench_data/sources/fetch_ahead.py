@@ -98,7 +98,8 @@ class FetchAhead:
 
     Attributes:
         limit_bytes: How many bytes may be planned and not yet released; 0 plans nothing ahead.
-        most_bytes: The most that `planned_bytes` ever was.
+        requests: How many ranges were fetched, of those that were released.
+        bytes: Their bytes.
     """
 
     def __init__(self, *, limit_bytes: int = FETCH_AHEAD_BYTES) -> None:
@@ -112,7 +113,7 @@ class FetchAhead:
                 f"fetch_ahead_bytes must be a whole number from 0, got {limit_bytes!r}."
             )
         self.limit_bytes = limit_bytes
-        self.most_bytes = 0
+        self.requests = self.bytes = 0
         self._own: _State | None = None
         self._finalizer: Callable[[], object] | None = None
 
@@ -135,7 +136,6 @@ class FetchAhead:
             for each in wanted:
                 for start, stop in _uncovered(state, each, sample):
                     _add(state, each, start, stop, sample)
-            self.most_bytes = max(self.most_bytes, state.planned_bytes)
 
     def begin(self, sample: int = sys.maxsize) -> None:
         """Fetch what is planned for the samples up to one; what is planned for others may grow."""
@@ -177,8 +177,11 @@ class FetchAhead:
         state = self._state
         with state.changed:
             for part in state.due.pop(sample, ()):
-                if part.last == sample:
-                    _drop(state, part)
+                if part.last != sample:
+                    continue
+                if part.state == "here" and part.held_bytes == part.stop - part.start:
+                    self.requests, self.bytes = self.requests + 1, self.bytes + part.held_bytes
+                _drop(state, part)
 
     def close(self) -> None:
         """Forget everything, and end all threads; it can be used again."""
@@ -188,19 +191,11 @@ class FetchAhead:
 
     def __getstate__(self) -> dict[str, object]:
         """Return the state for a copy in another process."""
-        return self.__dict__ | {"_own": None, "_finalizer": None}
+        return self.__dict__ | {"_own": None, "_finalizer": None, "requests": 0, "bytes": 0}
 
 
 class PlannedFetches(FetchAhead):
-    """Counts what would be fetched, and fetches nothing.
-
-    Attributes:
-        requests: Requests for what was released.
-        bytes: Their bytes.
-    """
-
-    requests = 0
-    bytes = 0
+    """Counts what would be fetched, and fetches nothing."""
 
     def begin(self, sample: int = sys.maxsize) -> None:
         """Take what is planned for the samples up to one as fetched."""
@@ -210,14 +205,6 @@ class PlannedFetches(FetchAhead):
             part = heapq.heappop(state.queue)[2]
             if part.state == "queued":
                 part.state = "here"
-
-    def release(self, sample: int) -> None:
-        """Count what no sample after this one needs, and forget it."""
-        for part in self._state.due.get(sample, ()):
-            if part.last == sample and part.state == "here":
-                self.requests += 1
-                self.bytes += part.stop - part.start
-        super().release(sample)
 
 
 def _uncovered(state: _State, wanted: Wanted, sample: int) -> list[tuple[int, int]]:
