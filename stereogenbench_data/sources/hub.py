@@ -68,12 +68,6 @@ class HubFile:
         kind, repository, revision, path = found.groups(default="")
         return cls(kind[:-1] or "models", repository, unquote(revision) or "main", path)
 
-    def web_path(self, revision: str) -> str:
-        """Return the path of the file's own URL at a revision."""
-        prefix = "" if self.kind == "models" else f"{self.kind}/"
-        place = f"{prefix}{self.repository}/resolve/{quote(revision, safe='')}"
-        return f"{place}/{quote(self.path)}"
-
 
 class HubTransport:
     """One file of a repository of the Hub."""
@@ -123,9 +117,8 @@ class HubTransport:
                     f"short: remove it, and it is fetched from the Hub."
                 )
             file.seek(start)
-            while start < stop and (data := file.read(min(_CHUNK, stop - start))):
-                start += len(data)
-                yield data
+            for begin in range(start, stop, _CHUNK):
+                yield file.read(min(_CHUNK, stop - begin))
 
     def entries(self, timeout_s: float) -> dict[str, int | None]:
         """List a folder: name to size in bytes, None for a folder."""
@@ -192,7 +185,8 @@ class _HubWeb(WebTransport):
             from huggingface_hub.utils import build_hf_headers
         endpoint, token = _settings()
         headers = build_hf_headers(token=token, library_name="stereogenbench-data")
-        url = f"{endpoint}/{file.web_path(revision)}"
+        place = file.repository if file.kind == "models" else f"{file.kind}/{file.repository}"
+        url = f"{endpoint}/{place}/resolve/{quote(revision, safe='')}/{quote(file.path)}"
         super().__init__(url, expected_size=expected_size, headers=headers)
         self._where = where
         self._revision = revision

@@ -231,14 +231,13 @@ class WebTransport:
                 preload_content=False,
             )  # fmt: skip
         except (ValueError, UnicodeError):
-            raise StorageError(
-                f"{self._where}: not a valid URL: correct it, or the redirect of its server."
+            raise self._error(
+                "not a valid URL: correct it, or the redirect of its server."
             ) from None
         except HTTPError as error:
             if isinstance(error, MaxRetryError) and isinstance(error.reason, ResponseError):
-                raise StorageError(
-                    f"{self._where}: is redirected more than {_MOST_REDIRECTS} times: check the "
-                    f"URL."
+                raise self._error(
+                    f"is redirected more than {_MOST_REDIRECTS} times: check the URL."
                 ) from None
             raise TransientError(_reason(error)) from None
         finally:
@@ -248,9 +247,9 @@ class WebTransport:
             url = urljoin(url, hop.redirect_location or "")
         if self._url.startswith("https://") and not url.startswith("https://"):
             response.close()
-            raise StorageError(
-                f"{self._where}: redirects from https to {shown(url)[:200]}, which is not "
-                f"encrypted. Check the URL and the server, {_FETCH}."
+            raise self._error(
+                f"redirects from https to {shown(url)[:200]}, which is not encrypted. Check the "
+                f"URL and the server, {_FETCH}."
             )
         if hops:
             self._address, self._is_redirected = url, True
@@ -285,30 +284,33 @@ class WebTransport:
             wait_s = retry_after_s(response.headers.get("Retry-After", ""))
             return TransientError(answer, wait_s=wait_s)
         cure = _CURES.get(response.status, f"Check the URL and the server, {_FETCH}.")
-        return StorageError(f"{self._where}: {answer}. {cure}")
+        return self._error(f"{answer}. {cure}")
+
+    def _error(self, what: str) -> StorageError:
+        return StorageError(f"{self._where}: {what}")
 
     def _require_part(
         self, response: urllib3.BaseHTTPResponse, stated: _Stated, start: int, stop: int
     ) -> None:
         """Refuse a response that is neither the requested part, nor its beginning, nor all."""
         first, last, size = stated
+        asked = f"asked for bytes {start} to {stop - 1}"
         if response.status == 200:
             if (start, stop) != (0, size) and not stop <= size <= self.longest_whole_bytes:
-                raise StorageError(
-                    f"{self._where}: the server sends the whole file "
-                    f"({size if size >= 0 else 'unknown'} bytes) when asked for bytes {start} to "
-                    f"{stop}. Members are read in parts: use a server that honours ranges, as "
-                    f"nginx does, {_FETCH}."
+                raise self._error(
+                    f"the server sends the whole file ({size if size >= 0 else 'unknown'} bytes) "
+                    f"when {asked}. Members are read in parts: use a server that honours ranges, "
+                    f"as nginx does, {_FETCH}."
                 )
         elif first < 0 or response.status == 416:
-            raise StorageError(
-                f"{self._where}: has {size} bytes, and byte {stop - 1} is asked for. It was cut "
-                f"short or replaced: use the index that was made with it."
+            raise self._error(
+                f"has {size} bytes, and byte {stop - 1} is asked for. It was cut short or "
+                f"replaced: use the index that was made with it."
             )
         elif first != start or not start <= last < stop:
-            raise StorageError(
-                f"{self._where}: the server sends bytes {first} to {last} when asked for {start} "
-                f"to {stop - 1}. It does not honour ranges: use another, {_FETCH}."
+            raise self._error(
+                f"the server sends bytes {first} to {last} when {asked}. It does not honour "
+                f"ranges: use another, {_FETCH}."
             )
 
     def _stated(self, response: urllib3.BaseHTTPResponse) -> _Stated:
@@ -324,18 +326,19 @@ class WebTransport:
         told = response.headers.get("Content-Range", "")
         found = _PART.fullmatch(told)
         if found is None:
-            raise StorageError(
-                f"{self._where}: the server answers {response.status} and does not state which "
-                f"part it sends (Content-Range: {told[:80]!r}): use another, {_FETCH}."
+            raise self._error(
+                f"the server answers {response.status} and does not state which part it sends "
+                f"(Content-Range: {told[:80]!r}): use another, {_FETCH}."
             )
         return _Stated(*(int(each) if each and each != "*" else -1 for each in found.groups()))
 
     def _require_size_stated(self, response: urllib3.BaseHTTPResponse, stated: _Stated) -> None:
         if stated.size < 0:
             header = "Content-Length" if response.status == 200 else "Content-Range"
-            raise StorageError(
-                f"{self._where}: its server does not state its size ({header}: "
-                f"{response.headers.get(header, '')[:80]!r}): fetch the data and pass the folder."
+            told = response.headers.get(header, "")[:80]
+            raise self._error(
+                f"its server does not state its size ({header}: {told!r}): fetch the data and pass "
+                f"the folder."
             )
 
 
