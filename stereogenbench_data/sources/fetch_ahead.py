@@ -16,6 +16,7 @@ from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
 from itertools import islice, takewhile
+from operator import attrgetter
 from typing import Final, Literal, NamedTuple
 
 from stereogenbench_data.errors import SelectionError
@@ -32,6 +33,7 @@ LARGEST_REQUEST: Final = 2 * 1024 * 1024
 LARGEST_GAP: Final = 2048
 """Bytes that nobody needs between two ranges that are merged: the headers of a tar."""
 
+_START: Final = attrgetter("start")
 _END_S: Final = 2.0
 """Seconds that closing waits for requests under way."""
 
@@ -223,19 +225,15 @@ def _uncovered(state: _State, wanted: Wanted, sample: int) -> list[tuple[int, in
 def _touching(state: _State, place: Hashable, start: int, stop: int) -> list[_Part]:
     """Return the parts that share a byte with a range; parts share none with each other."""
     parts = state.parts.get(place, [])
-    first = bisect_right(parts, start, key=_start)
+    first = bisect_right(parts, start, key=_START)
     first -= first > 0 and parts[first - 1].stop > start
     return list(takewhile(lambda part: part.start < stop, islice(parts, first, None)))
-
-
-def _start(part: _Part) -> int:
-    return part.start
 
 
 def _add(state: _State, wanted: Wanted, start: int, stop: int, sample: int) -> None:
     """Plan a range: by a request that has not begun and ends just before it, else by its own."""
     parts = state.parts[wanted.place]
-    place = bisect_right(parts, start, key=_start)
+    place = bisect_right(parts, start, key=_START)
     before = parts[place - 1] if place else None
     if (
         before is not None
@@ -254,7 +252,7 @@ def _add(state: _State, wanted: Wanted, start: int, stop: int, sample: int) -> N
         end = min(begin + LARGEST_REQUEST, stop)
         held_bytes = end - begin if wanted.held_bytes is None else wanted.held_bytes
         part = _Part(wanted.place, begin, end, wanted.fetch, sample, sample, held_bytes)
-        insort(parts, part, key=_start)
+        insort(parts, part, key=_START)
         state.due[sample].append(part)
         state.planned_bytes += held_bytes
         state.count += 1

@@ -196,8 +196,7 @@ class _HubWeb(WebTransport):
 
     def commit(self, timeout_s: float) -> str:
         """Return the commit that a branch is at; the branch itself where the Hub does not say."""
-        response = self.ask(self._url, {"Range": "bytes=0-0"}, timeout_s, follow=False)
-        response.close()
+        response = self.head(timeout_s)
         found = response.headers.get("X-Repo-Commit", "")
         if response.status >= 400 and not _COMMIT.fullmatch(found):
             raise self.refusal(response)

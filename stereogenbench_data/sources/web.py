@@ -7,9 +7,13 @@ Errors do not chain urllib3's own, whose messages hold the whole URL with its se
 """
 
 import atexit
+import http.client
+import io
 import logging
 import os
 import re
+import socket
+import time
 from collections.abc import Generator, Mapping
 from contextlib import nullcontext
 from contextvars import ContextVar
@@ -18,6 +22,7 @@ from urllib.parse import unquote, urljoin, urlunsplit
 from urllib.request import getproxies, proxy_bypass
 
 import urllib3
+import urllib3.connection
 from urllib3.exceptions import HTTPError, MaxRetryError, ResponseError
 
 from stereogenbench_data.errors import StorageError
@@ -63,7 +68,66 @@ _RATE_LIMIT: Final = re.compile(r";r=0;t=([0-9]{1,6})(?:[;,]|$)")
 _pools: Final[dict[tuple[int, str], urllib3.PoolManager]] = {}
 """Connections by process and proxy: those of the process that forked this one stay its own."""
 
-_is_requesting: Final = ContextVar("_is_requesting", default=False)
+
+class _Limit:
+    """Until when a server may keep a request waiting."""
+
+    def __init__(self, timeout_s: float) -> None:
+        self.timeout_s = timeout_s
+        self.renew()
+
+    def renew(self) -> None:
+        self._until_s = time.monotonic() + self.timeout_s
+
+    def left_s(self) -> float:
+        left_s = self._until_s - time.monotonic()
+        if left_s <= 0:
+            raise TimeoutError(f"no answer within {self.timeout_s:g} s")
+        return left_s
+
+
+_limit: Final[ContextVar[_Limit | None]] = ContextVar("_limit", default=None)
+"""The limit of the request that this thread makes."""
+
+
+class _LimitedStream(io.RawIOBase):
+    """The bytes of a connection; all waits for them together end at the limit, also of trickles.
+
+    urllib3 limits each wait alone.
+    """
+
+    def __init__(self, stream: io.RawIOBase, connection: socket.socket, limit: _Limit) -> None:
+        super().__init__()
+        self._stream, self._connection, self._limit = stream, connection, limit
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any, /) -> int | None:
+        self._connection.settimeout(self._limit.left_s())
+        return self._stream.readinto(buffer)
+
+    def close(self) -> None:
+        self._stream.close()
+        super().close()
+
+
+class _LimitedResponse(http.client.HTTPResponse):
+    def __init__(self, sock: socket.socket, *args: Any, **how: Any) -> None:
+        super().__init__(sock, *args, **how)
+        limit = _limit.get()
+        if limit is not None:
+            self.fp = io.BufferedReader(_LimitedStream(self.fp.detach(), sock, limit))
+
+
+class _Pool(urllib3.HTTPConnectionPool):
+    class ConnectionCls(urllib3.connection.HTTPConnection):
+        response_class = _LimitedResponse
+
+
+class _SecurePool(urllib3.HTTPSConnectionPool):
+    class ConnectionCls(urllib3.connection.HTTPSConnection):
+        response_class = _LimitedResponse
 
 
 class _Version(NamedTuple):
@@ -136,10 +200,17 @@ class WebTransport:
 
     def size(self, timeout_s: float) -> int:
         """Return how many bytes the object has, as the response for its first byte states."""
-        response, stated = self._get(0, 1, timeout_s)
+        response, stated = self._get(0, 1, _Limit(timeout_s))
         response.close()
         self._require_size_stated(response, stated)
         return stated.size
+
+    def head(self, timeout_s: float) -> urllib3.BaseHTTPResponse:
+        """Return the response of the URL itself for the first byte, which may be a redirect."""
+        part = {"Range": "bytes=0-0"}
+        response = self._ask(self._url, part, _Limit(timeout_s), follow=False)
+        response.close()
+        return response
 
     def entries(self, timeout_s: float) -> dict[str, int | None]:
         """Refuse to list a folder: plain web servers have no listings."""
@@ -150,16 +221,19 @@ class WebTransport:
 
     def part(self, start: int, stop: int, timeout_s: float) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop, or the first of them."""
-        response, stated = self._get(start, stop, timeout_s)
+        limit = _Limit(timeout_s)
+        response, stated = self._get(start, stop, limit)
         try:
             self._require_part(response, stated, start, stop)
             skipped, wanted = start - stated.first, stop - start
+            limit.renew()
             while data := response.read1(CHUNK_BYTES):
                 piece = data[skipped:][:wanted]
                 skipped -= min(skipped, len(data))
                 wanted -= len(piece)
                 if piece:
                     yield piece
+                    limit.renew()
                 if response.status == 200 and not wanted:
                     return
         except HTTPError as error:
@@ -169,17 +243,17 @@ class WebTransport:
             response.close()
 
     def _get(
-        self, start: int, stop: int, timeout_s: float
+        self, start: int, stop: int, limit: _Limit
     ) -> tuple[urllib3.BaseHTTPResponse, _Stated]:
         """Return a response that has content of the object that was read before."""
         part = {"Range": f"bytes={start}-{stop - 1}"}
-        response = self._ask_address(part, timeout_s)
+        response = self._ask_address(part, limit)
         if response is None:
             # One thread is redirected, and the others use the address that it found.
-            with self._resolving.held(timeout_s) if self._is_redirected else nullcontext():
-                response = self._ask_address(part, timeout_s)
+            with self._resolving.held(limit.timeout_s) if self._is_redirected else nullcontext():
+                response = self._ask_address(part, limit)
                 if response is None:
-                    response = self.ask(self._url, part, timeout_s)
+                    response = self._ask(self._url, part, limit)
         try:
             if response.status not in _WITH_CONTENT:
                 raise self.refusal(response)
@@ -195,14 +269,14 @@ class WebTransport:
         return response, stated
 
     def _ask_address(
-        self, part: Mapping[str, str], timeout_s: float
+        self, part: Mapping[str, str], limit: _Limit
     ) -> urllib3.BaseHTTPResponse | None:
         """Return a response from where the URL led to; None if that is not known or refuses."""
         address = self._address
         if not address:
             return None
         try:
-            response = self.ask(address, part, timeout_s)
+            response = self._ask(address, part, limit)
         except TransientError:
             self._address = ""  # its server may be gone; another one may not
             raise
@@ -213,19 +287,20 @@ class WebTransport:
             self._address = ""
         return None
 
-    def ask(
-        self, url: str, headers: Mapping[str, str], timeout_s: float, *, follow: bool = True
+    def _ask(
+        self, url: str, headers: Mapping[str, str], limit: _Limit, *, follow: bool = True
     ) -> urllib3.BaseHTTPResponse:
         """Return a server's response, of which nothing but the head is read yet."""
         sent = {**self._headers, **headers, **self._condition()}
         if _origin(url) != _origin(self._url):
             sent = {name: sent[name] for name in sent if name.lower() != "authorization"}
-        token = _is_requesting.set(True)
+        limit.renew()
+        token = _limit.set(limit)
         try:
             response = _pool(url).request(
                 "GET", url,
                 headers=sent,
-                timeout=urllib3.Timeout(connect=timeout_s, read=timeout_s),
+                timeout=limit.timeout_s,
                 retries=_REDIRECTS_ONLY,
                 redirect=follow,
                 preload_content=False,
@@ -241,7 +316,7 @@ class WebTransport:
                 ) from None
             raise TransientError(_reason(error)) from None
         finally:
-            _is_requesting.reset(token)
+            _limit.reset(token)
         hops = response.retries.history if response.retries is not None else ()
         for hop in hops:
             url = urljoin(url, hop.redirect_location or "")
@@ -353,6 +428,7 @@ def _pool(url: str) -> urllib3.PoolManager:
             if proxy
             else urllib3.PoolManager(maxsize=_MOST_CONNECTIONS)
         )
+        pool.pool_classes_by_scheme = {"http": _Pool, "https": _SecurePool}
         _pools.setdefault(key, pool)
     return _pools[key]
 
@@ -392,7 +468,7 @@ class _WithoutQueries(logging.Filter):
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Keep every record, changed where it is of a request of this module."""
-        if _is_requesting.get() and isinstance(record.args, tuple):
+        if _limit.get() is not None and isinstance(record.args, tuple):
             record.args = tuple(
                 each.partition("?")[0] if isinstance(each, str) else each for each in record.args
             )

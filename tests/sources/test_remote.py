@@ -366,12 +366,38 @@ def a_byte_an_answer(start, stop):
     yield head(start, stop) + DATA[start : start + 1]
 
 
+def a_trickling_head(start, stop):
+    for letter in head(start, stop, f"X: {'x' * 5000}"):
+        yield bytes([letter])
+        yield 0.02
+
+
+def a_trickling_redirect(start, stop):
+    yield b"HTTP/1.1 302 x\r\nLocation: /y\r\nContent-Length: 5000\r\n\r\n"
+    while True:
+        yield b"x"
+        yield 0.02
+
+
+def a_trickling_length_of_a_chunk(start, stop):
+    yield (
+        f"HTTP/1.1 206 x\r\nContent-Range: bytes {start}-{stop - 1}/{len(DATA)}\r\n"
+        "Transfer-Encoding: chunked\r\n\r\n"
+    ).encode()
+    while True:
+        yield b"0"
+        yield 0.02
+
+
 @pytest.mark.parametrize(
     ("answering", "reason"),
     [
         (half_then_silence, "ReadTimeoutError"),
         (a_byte_at_a_time, "too little came for 0.3 s"),
         (a_byte_an_answer, "ProtocolError"),
+        (a_trickling_head, "ReadTimeoutError"),
+        (a_trickling_redirect, "ReadTimeoutError"),
+        (a_trickling_length_of_a_chunk, "ReadTimeoutError"),
     ],
 )
 def test_a_server_that_trickles_is_given_up_with_the_bounds_it_broke(answering, reason):
