@@ -131,7 +131,7 @@ def index(  # noqa: PLR0913 - one parameter an option
         )
         raise typer.Exit(status)
     typer.echo(f"{target}: {counted(len(report.scenes), 'scene')}")
-    if not is_remote(root) and target.parent.resolve() != local_path(root).resolve():
+    if is_remote(root) or target.parent.resolve() != local_path(root).resolve():
         console.print(
             f"its data are not beside it: open it as SceneIndex.open({str(target)!r}, "
             f"root={full_place(root)!r}), or with --root {full_place(root)}",

@@ -5,8 +5,8 @@
     a URL ──────── fetched ─────── read ────────────────────── digest
     a folder or URL without one ── its scenes are described
 
-An index file may come from a stranger. A place that it names is opened only if that is harmless;
-any other root is for the user to name.
+An index file may come from a stranger: it opens data beside itself, and any other root is the
+user's own word.
 """
 
 import warnings
@@ -39,11 +39,9 @@ from stereogenbench_data.sources.location import (
     local_path,
     shown,
     split_name,
-    why_not_from_a_file,
 )
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import RetryPolicy
-from stereogenbench_data.sources.transport import MissingObject
+from stereogenbench_data.sources.retry import MissingObject, RetryPolicy
 
 MAX_INDEX_BYTES: Final = 256 * 2**20
 """The largest index that is fetched. One of 8,493 scenes has a few megabytes."""
@@ -172,7 +170,8 @@ def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opene
             raise StorageError(
                 f"{shown(beside)}: has no {INDEX_NAME}, and {count} scenes are too many to fetch "
                 f"their headers each time. Index it once, or the part you need: `stereogenbench "
-                f"index {shown(beside)} -o index.parquet --split eval`, and open that file."
+                f"index {shown(beside)} -o index.parquet --split eval`, and open that file with "
+                f"--root {shown(beside)}, or SceneIndex.open('index.parquet', root=...)."
             ) from None
         return _open_tree(beside, None)
     if size > MAX_INDEX_BYTES:
@@ -241,10 +240,7 @@ def _require_no_root(where: str | Path, root: str | None) -> None:
 
 
 def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:
-    """Return the data's root: the index's own folder if the data are there, else the recorded one.
-
-    A recorded root must be below the index's own folder, or a URL that `why_not_from_a_file`
-    allows.
+    """Return the data's root: the index's own folder, or a recorded folder below it.
 
     Raises:
         StorageError: If the user must name the root, or it is not a folder.
@@ -254,14 +250,9 @@ def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:
         return str(beside)
     if any((beside / file["path"]).exists() for file in table.column("members")[0].as_py()):
         return str(beside)
-    if is_remote(recorded):
-        reason = why_not_from_a_file(recorded)
-        if reason:
-            raise _must_be_named(path, recorded, reason)
-        return recorded
-    folder = _recorded_folder(recorded, beside)
+    folder = None if is_remote(recorded) else _recorded_folder(recorded, beside)
     if folder is None or not folder.is_relative_to(beside.resolve()):
-        raise _must_be_named(path, recorded, "it is outside the index's own folder")
+        raise _must_be_named(path, recorded)
     if not folder.is_dir():
         raise StorageError(
             f"{path}: its data were at {folder}, which is not a folder now. Move the index into "
@@ -279,15 +270,14 @@ def _recorded_folder(recorded: str, beside: Path) -> Path | None:
         return None
 
 
-def _must_be_named(path: Path, recorded: str, reason: str) -> StorageError:
+def _must_be_named(path: Path, recorded: str) -> StorageError:
     place = shown(recorded)
     if not place.isprintable() or len(place) > _LONGEST_ROOT:
         place = repr(shortened(place, _LONGEST_ROOT))
     return StorageError(
-        f"{path}: its data are not beside it, and it records their root as {place}. A file may not "
-        f"choose such a place ({reason}). If you trust it, name the root yourself: "
-        f"SceneIndex.open({str(path)!r}, root=...), or --root with a command. Or move the index "
-        f"into that root."
+        f"{path}: its data are not beside it, and it records their root as {place}. An index opens "
+        f"data beside itself; any other root is your own word: SceneIndex.open({str(path)!r}, "
+        f"root=...), or --root with a command. Or move the index into that root."
     )
 
 

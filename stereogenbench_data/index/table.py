@@ -84,10 +84,8 @@ class SceneIndex:
     ) -> "SceneIndex":
         """Open the index of some data.
 
-        The data are looked for beside the index first. An index that was written elsewhere records
-        where its data are, but the file may be a stranger's: without ``root``, that place is used
-        only if it is a folder below the index's own, or a plain URL (``https://``, ``http://``,
-        ``hf://``, ``s3://``) without a login and outside this machine's own network.
+        An index opens data beside itself: in its own folder, or in a folder below that. Any other
+        root is your own word, ``root``, as the file may be a stranger's.
 
         Args:
             data: An index file; a folder with an ``index.parquet``, such as one of shards; the URL

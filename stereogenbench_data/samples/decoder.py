@@ -148,7 +148,7 @@ class SampleDecoder:
     @property
     def fetched(self) -> tuple[int, int]:
         """How many ranges this process has fetched, and how many bytes."""
-        return self._source.fetched.requests, self._source.fetched.bytes
+        return self._source.fetched
 
     @property
     def has_order(self) -> bool:

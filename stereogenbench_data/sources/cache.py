@@ -16,7 +16,7 @@ import os
 import re
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -34,8 +34,8 @@ from stereogenbench_data.sources.remote import RemoteObject
 
 FOLDER_NAME: Final = "stereogenbench-members"
 _TAG: Final = "CACHEDIR.TAG"
-_SIGNATURE: Final = b"Signature: 8a477f597d28d172789f06886806bc55\n"
-_TAG_TEXT: Final = _SIGNATURE + (
+_TAG_TEXT: Final = (
+    b"Signature: 8a477f597d28d172789f06886806bc55\n"
     b"# Members of StereoGenBench shards, kept by stereogenbench-data. The folder may be deleted.\n"
 )
 _OWN_FILE: Final = re.compile(r"([0-9a-f]{64})\.(member|part)")
@@ -61,13 +61,16 @@ class ShardCache:
             limit_bytes: The most bytes of all members together.
 
         Raises:
-            StorageError: If the folder has no name or the limit is not a whole number above 0; or
-                the folder holds shards, cannot be written, or holds something else under the
-                cache's name.
+            StorageError: If the folder has no name or cannot be made, or the limit is not a whole
+                number above 0.
         """
         if not str(folder):
             raise StorageError("a cache needs a folder, got '': name one, such as 'cache/'.")
-        require_limit(limit_bytes, folder=folder)
+        if type(limit_bytes) is not int or limit_bytes < 1:
+            raise StorageError(
+                f"{folder}: a cache needs a limit in whole bytes above 0, got {limit_bytes!r}: "
+                f"give a number, such as limit_bytes=50_000_000_000."
+            )
         self.folder = Path(folder, FOLDER_NAME)
         self.limit_bytes = limit_bytes
         self._items = self.folder / "items"
@@ -129,31 +132,10 @@ class ShardCache:
         return sum(size for _, size, _ in self._own_files())
 
     def _make(self) -> None:
-        shard = next(self.folder.parent.glob("*.tar"), None)
-        if shard is not None:
-            raise StorageError(
-                f"{self.folder.parent}: holds shards ({shard.name}), which are read where they "
-                f"are. A cache keeps what comes from a URL: give it a folder of its own."
-            )
-        self.folder.mkdir(parents=True, exist_ok=True)
-        tag = self.folder / _TAG
-        begun = f".{_TAG}."  # by another process, or by one that was killed
-        names = sorted(
-            each.name for each in self.folder.iterdir() if not each.name.startswith(begun)
-        )
-        if not names:
-            write_atomic(tag, _TAG_TEXT)
-        elif _TAG not in names:
-            raise StorageError(
-                f"{self.folder}: holds {names[0]} and is not a cache of this package. Choose "
-                f"another folder, or delete it."
-            )
-        if not tag.read_bytes().startswith(_SIGNATURE):
-            raise StorageError(
-                f"{tag}: was not written by this package. Choose another folder, or delete it."
-            )
-        self._items.mkdir(exist_ok=True)
+        self._items.mkdir(parents=True, exist_ok=True)
         self._locks.mkdir(exist_ok=True)
+        if not (self.folder / _TAG).exists():
+            write_atomic(self.folder / _TAG, _TAG_TEXT)
 
     def _find(self, key: str, member: Member) -> FileSlice | None:
         """Return an item that is stored and unchanged; it counts as used now."""
@@ -161,10 +143,6 @@ class ShardCache:
         try:
             found = FileSlice(place, Member(key, 0, member.size))
         except FileNotFoundError:
-            return None
-        except IsADirectoryError:
-            with suppress(FileNotFoundError):  # another process may have renamed it
-                place.rename(place.with_suffix(f".not-a-member.{os.getpid()}"))
             return None
         status = found.status()
         if status.st_size == member.size and (
@@ -258,19 +236,6 @@ class ShardCache:
         path = self._locks / name
         with locked(path):
             yield path
-
-
-def require_limit(limit_bytes: object, *, folder: str | Path) -> None:
-    """Refuse a limit that is not a whole number of bytes above 0.
-
-    Raises:
-        StorageError: If it is not.
-    """
-    if type(limit_bytes) is not int or limit_bytes < 1:
-        raise StorageError(
-            f"{folder}: a cache needs a limit in whole bytes above 0, got {limit_bytes!r}: give a "
-            f"number, such as limit_bytes=50_000_000_000."
-        )
 
 
 def _stamp_ns(key: str) -> int:

@@ -16,10 +16,10 @@ from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
 from itertools import islice, takewhile
+from operator import attrgetter
 from typing import Final, Literal, NamedTuple
 
 from stereogenbench_data.errors import SelectionError
-from stereogenbench_data.sources.retry import Cancellation
 
 FETCH_AHEAD_BYTES: Final = 256_000_000
 """Bytes that a process fetches ahead at the most, unless the user says otherwise."""
@@ -33,6 +33,7 @@ LARGEST_REQUEST: Final = 2 * 1024 * 1024
 LARGEST_GAP: Final = 2048
 """Bytes that nobody needs between two ranges that are merged: the headers of a tar."""
 
+_START: Final = attrgetter("start")
 _END_S: Final = 2.0
 """Seconds that closing waits for requests under way."""
 
@@ -51,7 +52,7 @@ class Wanted(NamedTuple):
     place: Hashable
     start: int
     stop: int
-    fetch: Callable[[int, int, Cancellation], bytes]
+    fetch: Callable[[int, int, threading.Event], bytes]
     held_bytes: int | None = None
 
 
@@ -67,7 +68,7 @@ class _Part:
     place: Hashable
     start: int
     stop: int
-    fetch: Callable[[int, int, Cancellation], bytes]
+    fetch: Callable[[int, int, threading.Event], bytes]
     first: int
     last: int
     held_bytes: int
@@ -81,7 +82,7 @@ class _State:
     """What the threads of a process share."""
 
     pid: int = field(default_factory=os.getpid)
-    cancellation: Cancellation = field(default_factory=Cancellation)
+    cancellation: threading.Event = field(default_factory=threading.Event)
     changed: threading.Condition = field(default_factory=threading.Condition)
     queue: list[tuple[int, int, _Part]] = field(default_factory=list)
     threads: set[threading.Thread] = field(default_factory=set)
@@ -99,7 +100,8 @@ class FetchAhead:
 
     Attributes:
         limit_bytes: How many bytes may be planned and not yet released; 0 plans nothing ahead.
-        most_bytes: The most that `planned_bytes` ever was.
+        requests: How many ranges were fetched, of those that were released.
+        bytes: Their bytes.
     """
 
     def __init__(self, *, limit_bytes: int = FETCH_AHEAD_BYTES) -> None:
@@ -113,7 +115,7 @@ class FetchAhead:
                 f"fetch_ahead_bytes must be a whole number from 0, got {limit_bytes!r}."
             )
         self.limit_bytes = limit_bytes
-        self.most_bytes = 0
+        self.requests = self.bytes = 0
         self._own: _State | None = None
         self._finalizer: Callable[[], object] | None = None
 
@@ -136,7 +138,6 @@ class FetchAhead:
             for each in wanted:
                 for start, stop in _uncovered(state, each, sample):
                     _add(state, each, start, stop, sample)
-            self.most_bytes = max(self.most_bytes, state.planned_bytes)
 
     def begin(self, sample: int = sys.maxsize) -> None:
         """Fetch what is planned for the samples up to one; what is planned for others may grow."""
@@ -178,8 +179,11 @@ class FetchAhead:
         state = self._state
         with state.changed:
             for part in state.due.pop(sample, ()):
-                if part.last == sample:
-                    _drop(state, part)
+                if part.last != sample:
+                    continue
+                if part.state == "here" and part.held_bytes == part.stop - part.start:
+                    self.requests, self.bytes = self.requests + 1, self.bytes + part.held_bytes
+                _drop(state, part)
 
     def close(self) -> None:
         """Forget everything, and end all threads; it can be used again."""
@@ -189,19 +193,11 @@ class FetchAhead:
 
     def __getstate__(self) -> dict[str, object]:
         """Return the state for a copy in another process."""
-        return self.__dict__ | {"_own": None, "_finalizer": None}
+        return self.__dict__ | {"_own": None, "_finalizer": None, "requests": 0, "bytes": 0}
 
 
 class PlannedFetches(FetchAhead):
-    """Counts what would be fetched, and fetches nothing.
-
-    Attributes:
-        requests: Requests for what was released.
-        bytes: Their bytes.
-    """
-
-    requests = 0
-    bytes = 0
+    """Counts what would be fetched, and fetches nothing."""
 
     def begin(self, sample: int = sys.maxsize) -> None:
         """Take what is planned for the samples up to one as fetched."""
@@ -211,14 +207,6 @@ class PlannedFetches(FetchAhead):
             part = heapq.heappop(state.queue)[2]
             if part.state == "queued":
                 part.state = "here"
-
-    def release(self, sample: int) -> None:
-        """Count what no sample after this one needs, and forget it."""
-        for part in self._state.due.get(sample, ()):
-            if part.last == sample and part.state == "here":
-                self.requests += 1
-                self.bytes += part.stop - part.start
-        super().release(sample)
 
 
 def _uncovered(state: _State, wanted: Wanted, sample: int) -> list[tuple[int, int]]:
@@ -237,19 +225,15 @@ def _uncovered(state: _State, wanted: Wanted, sample: int) -> list[tuple[int, in
 def _touching(state: _State, place: Hashable, start: int, stop: int) -> list[_Part]:
     """Return the parts that share a byte with a range; parts share none with each other."""
     parts = state.parts.get(place, [])
-    first = bisect_right(parts, start, key=_start)
+    first = bisect_right(parts, start, key=_START)
     first -= first > 0 and parts[first - 1].stop > start
     return list(takewhile(lambda part: part.start < stop, islice(parts, first, None)))
-
-
-def _start(part: _Part) -> int:
-    return part.start
 
 
 def _add(state: _State, wanted: Wanted, start: int, stop: int, sample: int) -> None:
     """Plan a range: by a request that has not begun and ends just before it, else by its own."""
     parts = state.parts[wanted.place]
-    place = bisect_right(parts, start, key=_start)
+    place = bisect_right(parts, start, key=_START)
     before = parts[place - 1] if place else None
     if (
         before is not None
@@ -268,7 +252,7 @@ def _add(state: _State, wanted: Wanted, start: int, stop: int, sample: int) -> N
         end = min(begin + LARGEST_REQUEST, stop)
         held_bytes = end - begin if wanted.held_bytes is None else wanted.held_bytes
         part = _Part(wanted.place, begin, end, wanted.fetch, sample, sample, held_bytes)
-        insort(parts, part, key=_start)
+        insort(parts, part, key=_START)
         state.due[sample].append(part)
         state.planned_bytes += held_bytes
         state.count += 1
@@ -324,7 +308,7 @@ def _end(state: _State) -> None:
         state.queue.clear()
         state.due.clear()
         threads = list(state.threads)
-    state.cancellation.cancel()
+    state.cancellation.set()
     for thread in threads:
         if thread is not threading.current_thread():
             thread.join(_END_S / len(threads))

@@ -3,30 +3,24 @@
 Errors do not chain those of the file systems, whose messages may hold signed URLs.
 """
 
-import asyncio
 import os
 import sys
-from collections.abc import Callable, Coroutine, Generator, Iterator, Mapping
-from concurrent.futures import CancelledError
-from contextlib import contextmanager, suppress
-from functools import partial
-from threading import Event, Thread
-from typing import Any, Final, TypeVar
+from collections.abc import Generator, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Final
 
 from stereogenbench_data.errors import ExtraError, StorageError, missing_extra
 from stereogenbench_data.sources.location import shown
-from stereogenbench_data.sources.retry import Attempt, TransientError
-from stereogenbench_data.sources.transport import (
+from stereogenbench_data.sources.retry import (
+    CHUNK_BYTES,
     MISSING,
+    PASSING,
     MissingObject,
-    busy,
+    TransientError,
     replaced,
     require_expected_size,
-    require_no_pause,
     retry_after_s,
 )
-
-_T = TypeVar("_T")
 
 _EXTRAS: Final = {"hf": "hub", "s3": "s3", "s3a": "s3"}
 _NOT_READ: Final = ("ftp", "ftps")
@@ -35,8 +29,6 @@ _NOT_READ: Final = ("ftp", "ftps")
 _CALL_BYTES: Final = 2 * 1024 * 1024
 """Bytes of one call of a file system, whose progress is not seen before it returns."""
 
-_CHUNK: Final = 256 * 1024
-_REFUSED: Final = frozenset({400, 401, 403, 404, 405, 410, 416, 451})
 _CHANGED: Final = 412
 _NETWORK_ERRORS: Final = (
     ("builtins", "OSError"),
@@ -49,9 +41,6 @@ _NETWORK_ERRORS: Final = (
     ("huggingface_hub.errors", "HfHubHTTPError"),
 )
 """What file systems raise where a server cannot be reached; only imported modules count."""
-
-_CHANGE_MARKS: Final = ("ETag", "etag", "LastModified", "last_modified", "mtime", "size")
-"""What file systems report of a file that changes with its content."""
 
 _SETUP_ERRORS: Final = (("botocore.exceptions", "BotoCoreError"),)
 """What file systems raise where they are not set up, for example without a login."""
@@ -71,168 +60,123 @@ class FilesystemTransport:
             StorageError: If it is on an FTP server.
         """
         self._url = url
-        self._expected_size = expected_size
         self._where = shown(url)
         if url.partition("://")[0].lower() in _NOT_READ:
             raise StorageError(
                 f"{self._where}: FTP servers are not read. Serve the data by https or S3, or fetch "
                 f"them and pass the folder."
             )
-        self._server = "/".join(self._where.split("/")[:3])
+        self.server = "/".join(self._where.split("/")[:3])
+        self._expected_size = expected_size
+        self._has_expected_size = expected_size is None
+        self._etags: dict[str, str] = {}
         self._opened: tuple[int, Any, str] | None = None
-        self._seen: dict[str, dict[str, str]] = {}
-
-    def size(self, attempt: Attempt) -> int:
-        """Return the size of the object in bytes."""
-        files, path = self._open()
-        if _is_s3(files):
-            stated = self._s3_call(attempt, files, path, "head_object")
-            size = stated["ContentLength"]
-        else:
-            size = self._call(attempt, lambda: files.size(path))
-        if not isinstance(size, int):
-            raise StorageError(f"{self._where}: has no size ({size!r}): is it a folder?")
-        return size
-
-    def entries(self, attempt: Attempt) -> dict[str, int | None]:
-        """List a folder: name to size in bytes, None for a folder."""
-        files, path = self._open()
-        folder, listed = path.strip("/"), self._call(attempt, lambda: files.ls(path, detail=True))
-        found: dict[str, int | None] = {}
-        for entry in listed:
-            path = str(entry["name"]).strip("/")
-            if path != folder and path:
-                is_folder = entry["type"] == "directory"
-                found[path.rpartition("/")[2]] = None if is_folder else int(entry["size"] or 0)
-        return found
-
-    def part(self, start: int, stop: int, attempt: Attempt) -> Generator[bytes, None, None]:
-        """Yield the bytes from start to stop, or the first of them."""
-        files, path = self._open()
-        if _is_s3(files):
-            yield from self._s3_part(start, stop, attempt, files, path)
-            return
-        if self._expected_size is not None and "size" not in self._seen:
-            found = self.size(attempt)
-            require_expected_size(found, expected=self._expected_size, where=self._where)
-            self._seen["size"] = {}
-        for first in range(start, stop, _CALL_BYTES):
-            last = min(first + _CALL_BYTES, stop)
-            data, details = self._call(attempt, partial(self._read, first, last, files, path))
-            self._require_same(details)
-            yield data
-            if len(data) != last - first:
-                return
-
-    def _read(self, first: int, last: int, files: Any, path: str) -> tuple[bytes, Any]:
-        """Return the bytes from first to last, and what the file system reports of the file."""
-        if files.async_impl:
-            return bytes(files.cat_file(path, start=first, end=last)), None
-        # Without a cache, or fsspec would read megabytes ahead.
-        with files.open(path, "rb", cache_type="none") as file:
-            file.seek(first)
-            return file.read(last - first), getattr(file, "details", None)
-
-    def _s3_part(
-        self, start: int, stop: int, attempt: Attempt, files: Any, path: str
-    ) -> Generator[bytes, None, None]:
-        """Yield a part of an object of S3, which is read only while its ETag stays the same."""
-        part = {"Range": f"bytes={start}-{stop - 1}"}
-        try:
-            stated = self._s3_call(attempt, files, path, "get_object", **part)
-        except StorageError as error:
-            if self._expected_size is not None and not isinstance(error, MissingObject):
-                # It may end before the part.
-                size = self.size(attempt)
-                require_expected_size(size, expected=self._expected_size, where=self._where)
-            raise
-        body = stated["Body"]
-        try:
-            self._require_same({"ETag": stated["ETag"]} if "ETag" in stated else None)
-            whole = str(stated.get("ContentRange", "")).rpartition("/")[2]
-            if whole.isdecimal():
-                require_expected_size(int(whole), expected=self._expected_size, where=self._where)
-            attempt.begin_body()
-            while data := self._awaited(attempt, files, lambda: body.read(_CHUNK)):
-                yield bytes(data)
-        finally:
-            files.loop.call_soon_threadsafe(body.close)
-
-    def _s3_call(self, attempt: Attempt, files: Any, path: str, method: str, **how: Any) -> Any:
-        """Return what S3 answers of the object, if it is the one that was read before."""
-        bucket, key, version = files.split_path(path)
-        options = {"Bucket": bucket, "Key": key, **how}
-        if version is not None:
-            options["VersionId"] = version
-        first = self._seen.get("first", {})
-        if "ETag" in first:
-            options["IfMatch"] = first["ETag"]
-        return self._awaited(attempt, files, lambda: files._call_s3(method, **options))
-
-    def _require_same(self, details: Any) -> None:
-        """Refuse a file that was replaced since the first read, if its file system reports it."""
-        if not isinstance(details, Mapping):
-            return
-        now = {name: str(details[name]) for name in _CHANGE_MARKS if name in details}
-        before = self._seen.setdefault("first", now)
-        changed = [name for name in before if name in now and before[name] != now[name]]
-        if changed:
-            changes = [f"its {name} was {before[name]} and is {now[name]}" for name in changed]
-            raise replaced(self._where, "in its store", ", ".join(changes))
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy in another process, which opens its own file system."""
         return self.__dict__ | {"_opened": None}
 
+    def size(self, timeout_s: float) -> int:
+        """Return the size of the object in bytes."""
+        with self._named_errors():
+            files, path = self._open()
+            if _is_s3(files):
+                size = self._s3_call("head_object", files, path, timeout_s)["ContentLength"]
+            else:
+                limit = {"timeout": timeout_s} if files.async_impl else {}
+                size = files.size(path, **limit)
+        if not isinstance(size, int):
+            raise StorageError(f"{self._where}: has no size ({size!r}): is it a folder?")
+        return size
+
+    def entries(self, timeout_s: float) -> dict[str, int | None]:
+        """List a folder: name to size in bytes, None for a folder."""
+        with self._named_errors():
+            files, path = self._open()
+            limit = {"timeout": timeout_s} if files.async_impl else {}
+            listed = files.ls(path, detail=True, **limit)
+        found: dict[str, int | None] = {}
+        for entry in listed:
+            name = str(entry["name"]).strip("/")
+            if name not in ("", path.strip("/")):
+                is_folder = entry["type"] == "directory"
+                found[name.rpartition("/")[2]] = None if is_folder else int(entry["size"] or 0)
+        return found
+
+    def part(self, start: int, stop: int, timeout_s: float) -> Generator[bytes, None, None]:
+        """Yield the bytes from start to stop, or the first of them."""
+        with self._named_errors():
+            files, path = self._open()
+            if _is_s3(files):
+                yield from self._s3_part(start, stop, timeout_s, files, path)
+                return
+            self._require_size(timeout_s)
+            # Without a cache, or fsspec would read megabytes ahead.
+            how = {"timeout": timeout_s} if files.async_impl else {"cache_type": "none"}
+            for first in range(start, stop, _CALL_BYTES):
+                last = min(first + _CALL_BYTES, stop)
+                data = bytes(files.cat_file(path, start=first, end=last, **how))
+                yield data
+                if len(data) != last - first:
+                    return
+
+    def _s3_part(
+        self, start: int, stop: int, timeout_s: float, files: Any, path: str
+    ) -> Generator[bytes, None, None]:
+        """Yield a part of an object of S3, which is read only while its ETag stays the same."""
+        from fsspec.asyn import sync
+
+        part = {"Range": f"bytes={start}-{stop - 1}"}
+        try:
+            stated = self._s3_call("get_object", files, path, timeout_s, **part)
+        except OSError as error:
+            if _answer(error)[0] == 416:
+                self._require_size(timeout_s)  # it may end before the part
+            raise
+        body = stated["Body"]
+        try:
+            etag = str(stated.get("ETag", ""))
+            first = self._etags.setdefault("first", etag)
+            if etag != first:
+                raise replaced(self._where, "in its store", f"its ETag was {first} and is {etag}")
+            whole = str(stated.get("ContentRange", "")).rpartition("/")[2]
+            if whole.isdecimal():
+                require_expected_size(int(whole), expected=self._expected_size, where=self._where)
+            while data := sync(files.loop, body.read, CHUNK_BYTES, timeout=timeout_s):
+                yield bytes(data)
+        finally:
+            files.loop.call_soon_threadsafe(body.close)
+
+    def _s3_call(self, method: str, files: Any, path: str, timeout_s: float, **how: Any) -> Any:
+        """Return what S3 answers of the object, if it is the one that was read before."""
+        bucket, key, version = files.split_path(path)
+        options = {"Bucket": bucket, "Key": key, **how}
+        if version is not None:
+            options["VersionId"] = version
+        if self._etags.get("first"):
+            options["IfMatch"] = self._etags["first"]
+        return files.call_s3(method, timeout=timeout_s, **options)
+
+    def _require_size(self, timeout_s: float) -> None:
+        if not self._has_expected_size:
+            found = self.size(timeout_s)
+            require_expected_size(found, expected=self._expected_size, where=self._where)
+            self._has_expected_size = True
+
     def _open(self) -> tuple[Any, str]:
         """Return this process's file system, and the object's path in it."""
         if self._opened is None or self._opened[0] != os.getpid():
-            with self._named_errors(None):
-                import fsspec.core
+            import fsspec.core
 
-                try:
-                    files, path = fsspec.core.url_to_fs(self._url)
-                except TypeError as error:  # a file system that needs more than a URL
-                    raise ValueError(str(error)) from None
-                self._opened = (os.getpid(), files, path)
+            try:
+                files, path = fsspec.core.url_to_fs(self._url)
+            except TypeError as error:  # a file system that needs more than a URL
+                raise ValueError(str(error)) from None
+            self._opened = (os.getpid(), files, path)
         return self._opened[1], self._opened[2]
 
-    def _call(self, attempt: Attempt, operation: Callable[[], _T]) -> _T:
-        """Return what an operation of a file system returns, within the time that is left."""
-        require_no_pause(self._server, attempt)
-        with self._named_errors(attempt):
-            return _within(attempt, operation)
-
-    def _awaited(
-        self, attempt: Attempt, files: Any, begin: Callable[[], Coroutine[Any, Any, _T]]
-    ) -> _T:
-        """Return what an asynchronous operation returns, within the limits of the attempt."""
-        require_no_pause(self._server, attempt)
-        with self._named_errors(attempt):
-            try:
-                allowed_s = attempt.next_wait_s()
-            except TimeoutError as error:
-                raise TransientError(str(error)) from None
-            began_s, received = attempt.clock(), 0
-            running = asyncio.run_coroutine_threadsafe(begin(), files.loop)
-            attempt.on_cancel(partial(_cancel, running))
-            try:
-                result = running.result(allowed_s)
-                received = len(result) if isinstance(result, bytes) else 0
-            except (TimeoutError, CancelledError) as error:
-                if isinstance(error, TimeoutError) and running.done() and not running.cancelled():
-                    raise  # the store's own
-                attempt.add(attempt.clock() - began_s, 0)
-                began_s = attempt.clock()
-                raise TransientError(str(attempt.too_slow())) from None
-            else:
-                return result
-            finally:
-                running.cancel()
-                attempt.add(attempt.clock() - began_s, received)
-
     @contextmanager
-    def _named_errors(self, attempt: Attempt | None) -> Iterator[None]:
+    def _named_errors(self) -> Iterator[None]:
         """Raise errors of file systems as a `TransientError`, or an error that names the cure."""
         try:
             yield
@@ -243,10 +187,7 @@ class FilesystemTransport:
                 f"{self._where}: does not exist, or is private. {MISSING}"
             ) from None
         except PermissionError as error:
-            raise StorageError(
-                f"{self._where}: permission denied ({_reason(error)}). Log in to its store, or ask "
-                f"for access."
-            ) from None
+            raise self._no_permission(error) from None
         except ImportError as error:
             extra = _EXTRAS.get(self._url.partition("://")[0])
             raise _not_installed(self._where, error, extra=extra) from None
@@ -256,23 +197,20 @@ class FilesystemTransport:
                 f"pass the folder."
             ) from None
         except network_errors() as error:
-            raise self._network_failure(error, attempt) from None
+            status, wait_s = _answer(error)
+            if status == _CHANGED:
+                raise replaced(self._where, "in its store", "its ETag is another") from None
+            if 400 <= status < 500 and status not in PASSING:
+                raise StorageError(f"{self._where}: {_reason(error)}. {MISSING}") from None
+            raise TransientError(_reason(error), wait_s=wait_s) from None
         except _loaded(_SETUP_ERRORS) as error:
-            raise StorageError(
-                f"{self._where}: permission denied ({_reason(error)}). Log in to its store, or set "
-                f"up its file system."
-            ) from None
+            raise self._no_permission(error) from None
 
-    def _network_failure(self, error: BaseException, attempt: Attempt | None) -> Exception:
-        """Return our error for one of a network or a server."""
-        status, wait_s = _status(error), _wait_s(error)
-        if status == _CHANGED:
-            return replaced(self._where, "in its store", "its ETag is another")
-        if status in _REFUSED:
-            return StorageError(f"{self._where}: {_reason(error)}. {MISSING}")
-        if wait_s > 0 and attempt is not None:
-            return busy(_reason(error), server=self._server, wait_s=wait_s, attempt=attempt)
-        return TransientError(_reason(error))
+    def _no_permission(self, error: BaseException) -> StorageError:
+        return StorageError(
+            f"{self._where}: permission denied ({_reason(error)}). Log in to its store, or ask for "
+            f"access."
+        )
 
 
 @contextmanager
@@ -299,73 +237,26 @@ def _is_s3(files: Any) -> bool:
     return type(files).__module__.partition(".")[0] == "s3fs"
 
 
-def _cancel(running: Any) -> None:
-    running.cancel()
-
-
-def _within(attempt: Attempt, call: Callable[[], _T]) -> _T:
-    """Return what a call returns, within the time that a read has left.
-
-    File systems limit single waits at best. A call that takes longer, or whose read is cancelled,
-    is abandoned, in a thread that does not keep the process alive.
-
-    Raises:
-        TransientError: If it takes longer.
-    """
-    returned: list[_T] = []
-    raised: list[BaseException] = []
-    ended = Event()
-
-    def run() -> None:
-        try:
-            returned.append(call())
-        except BaseException as error:  # noqa: BLE001 - raised again in the thread that waits
-            raised.append(error)
-        ended.set()
-
-    attempt.on_cancel(ended.set)
-    thread = Thread(target=run, daemon=True)
-    began_s = attempt.clock()
-    thread.start()
-    ended.wait(max(0.0, min(attempt.left_s, attempt.outage_left_s)))
-    attempt.add(attempt.clock() - began_s, 0)
-    if raised:
-        raise raised[0]
-    if not returned:
-        raise TransientError(str(attempt.too_slow()))
-    attempt.outage_left_s = attempt.policy.longest_outage_s
-    return returned[0]
-
-
-def _status(error: BaseException) -> int | None:
-    """Return the status of the server's response, if the error or its cause holds one."""
+def _answer(error: BaseException) -> tuple[int, float]:
+    """Return the status and the Retry-After, in seconds, of a server's response; 0 without any."""
     for each in (error, error.__cause__):
         response = getattr(each, "response", None)
         if isinstance(response, Mapping):  # of boto
-            status = response.get("ResponseMetadata", {}).get("HTTPStatusCode")
+            stated = response.get("ResponseMetadata", {})
+            status, headers = stated.get("HTTPStatusCode"), stated.get("HTTPHeaders")
         else:
             status = getattr(response, "status_code", None)
+            headers = getattr(response, "headers", None)
         if isinstance(status, int):
-            return status
-    return None
-
-
-def _wait_s(error: BaseException) -> float:
-    """Return how many seconds the server asks to wait, 0 if it does not."""
-    for each in (error, error.__cause__):
-        response = getattr(each, "response", None)
-        headers: Any = getattr(response, "headers", None)
-        if isinstance(response, Mapping):
-            headers = response.get("ResponseMetadata", {}).get("HTTPHeaders")
-        with suppress(TypeError, AttributeError, ValueError):
-            return retry_after_s(str(headers.get("retry-after") or ""))
-    return 0.0
+            return status, retry_after_s(str((headers or {}).get("retry-after") or ""))
+    return 0, 0.0
 
 
 def _reason(error: BaseException) -> str:
     """Return what happened without any URL, which may hold secrets."""
-    if _status(error) is not None:
-        return f"the server answers {_status(error)}"
+    status, _ = _answer(error)
+    if status:
+        return f"the server answers {status}"
     text = error.strerror if isinstance(error, OSError) else None
     return f"{type(error).__name__}: {text}" if text and "://" not in text else type(error).__name__
 

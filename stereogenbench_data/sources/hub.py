@@ -1,8 +1,8 @@
 """Files of the Hub's repositories: ranges by HTTP, the Hub's cache, offline mode.
 
-``resolve`` redirects to a signed URL of a content network, which `WebTransport` keeps until it
-expires; the login goes to the Hub alone. All that a process reads of a branch is of one commit. A
-file that lies in huggingface_hub's own cache is read from there. Where the Hub is, the login,
+``resolve`` redirects to a signed URL of a content network, which `WebTransport` uses again until it
+is refused; the login goes to the Hub alone. All that a process reads of a branch is of one commit.
+A file that lies in huggingface_hub's own cache is read from there. Where the Hub is, the login,
 the cache's place and offline mode are those of huggingface_hub (HF_ENDPOINT, HF_TOKEN, HF_HOME,
 HF_HUB_OFFLINE ...), and fsspec's settings for ``hf`` go before them.
 """
@@ -19,10 +19,14 @@ import urllib3
 
 from stereogenbench_data.errors import StorageError, explain_os_errors
 from stereogenbench_data.sources.filesystems import FilesystemTransport, require_installed
-from stereogenbench_data.sources.http import WebTransport, server_of
 from stereogenbench_data.sources.location import shown
-from stereogenbench_data.sources.retry import Attempt, ProcessLock
-from stereogenbench_data.sources.transport import MISSING, MissingObject, require_expected_size
+from stereogenbench_data.sources.retry import (
+    MISSING,
+    MissingObject,
+    ProcessLock,
+    require_expected_size,
+)
+from stereogenbench_data.sources.web import WebTransport
 
 _ADDRESS: Final = re.compile(
     r"hf://(datasets/|spaces/|models/)?(?!(?:datasets|spaces|models|buckets)/)([\w.-]+/[\w.-]+)"
@@ -64,12 +68,6 @@ class HubFile:
         kind, repository, revision, path = found.groups(default="")
         return cls(kind[:-1] or "models", repository, unquote(revision) or "main", path)
 
-    def web_path(self, revision: str) -> str:
-        """Return the path of the file's own URL at a revision."""
-        prefix = "" if self.kind == "models" else f"{self.kind}/"
-        place = f"{prefix}{self.repository}/resolve/{quote(revision, safe='')}"
-        return f"{place}/{quote(self.path)}"
-
 
 class HubTransport:
     """One file of a repository of the Hub."""
@@ -80,30 +78,34 @@ class HubTransport:
         Args:
             url: ``hf://datasets/ORG/NAME@REVISION/PATH``; see `is_hub_file`.
             expected_size: The size in bytes that the index records; None if it is not known.
+
+        Raises:
+            StorageError: If it is not such a URL.
         """
         found = HubFile.of_url(url)
-        if found is None:
-            raise StorageError(f"{shown(url)}: not a repository of the Hub: correct the URL.")
+        if found is None or re.search(r"(?:^|/)\.{1,2}(?:/|$)", found.path):
+            raise StorageError(f"{shown(url)}: not a file of a repository: correct the URL.")
+        self.server = "hf://"
         self._file = found
         self._where = shown(url)
         self._expected_size = expected_size
-        self._opened: tuple[int, WebTransport | Path] | None = None
+        self._opened: WebTransport | Path | None = None
         self._opening = ProcessLock()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy in another process, without logins and signed URLs."""
         return self.__dict__ | {"_opened": None}
 
-    def size(self, attempt: Attempt) -> int:
+    def size(self, timeout_s: float) -> int:
         """Return the size of the file in bytes."""
-        opened = self._open(attempt)
-        return opened.stat().st_size if isinstance(opened, Path) else opened.size(attempt)
+        opened = self._open(timeout_s)
+        return opened.stat().st_size if isinstance(opened, Path) else opened.size(timeout_s)
 
-    def part(self, start: int, stop: int, attempt: Attempt) -> Generator[bytes, None, None]:
+    def part(self, start: int, stop: int, timeout_s: float) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop, or the first of them."""
-        opened = self._open(attempt)
+        opened = self._open(timeout_s)
         if not isinstance(opened, Path):
-            yield from opened.part(start, stop, attempt)
+            yield from opened.part(start, stop, timeout_s)
             return
         gone = "It was removed from the Hub's cache: open the data again."
         with explain_os_errors(f"{opened}: cannot be read", gone), opened.open("rb") as file:
@@ -115,11 +117,10 @@ class HubTransport:
                     f"short: remove it, and it is fetched from the Hub."
                 )
             file.seek(start)
-            while start < stop and (data := file.read(min(_CHUNK, stop - start))):
-                start += len(data)
-                yield data
+            for begin in range(start, stop, _CHUNK):
+                yield file.read(min(_CHUNK, stop - begin))
 
-    def entries(self, attempt: Attempt) -> dict[str, int | None]:
+    def entries(self, timeout_s: float) -> dict[str, int | None]:
         """List a folder: name to size in bytes, None for a folder."""
         if is_offline():
             raise StorageError(
@@ -127,41 +128,39 @@ class HubTransport:
                 f"folders. Unset it, or pass an index or a folder of this machine."
             )
         file = self._file
-        commit = self._commit(attempt, of="folder")
+        commit = self._commit(timeout_s, of="folder")
         url = f"hf://{file.kind}/{file.repository}@{quote(commit, safe='')}/{file.path}"
-        return FilesystemTransport(url.replace("hf://models/", "hf://")).entries(attempt)
+        return FilesystemTransport(url.replace("hf://models/", "hf://")).entries(timeout_s)
 
-    def _open(self, attempt: Attempt) -> WebTransport | Path:
+    def _open(self, timeout_s: float) -> WebTransport | Path:
         """Return the file in the Hub's cache, or else where it is on the Hub."""
-        with self._opening.held(attempt):
-            if self._opened is not None and self._opened[0] == os.getpid():
-                return self._opened[1]
-            with require_installed(self._where, extra="hub"):
-                from huggingface_hub import constants, try_to_load_from_cache
-            if re.search(r"(?:^|/)\.{1,2}(?:/|$)", self._file.path):
-                raise StorageError(f"{self._where}: a path holds no '.' or '..': correct the URL.")
-            offline = is_offline()
-            revision = self._file.revision if offline else self._commit(attempt)
-            cached = try_to_load_from_cache(
-                self._file.repository, self._file.path, revision=revision,
-                repo_type=self._file.kind.removesuffix("s"),
-            )  # fmt: skip
-            if isinstance(cached, str):
-                self._opened = (os.getpid(), Path(cached))
-            elif offline:
-                raise StorageError(
-                    f"{self._where}: HF_HUB_OFFLINE is set, and the file is not in the Hub's cache "
-                    f"({constants.HF_HUB_CACHE}). Unset it, or fetch the file while online: `hf "
-                    f"download`, or `stereogenbench download` and pass its folder."
-                )
-            else:
-                web = _HubWeb(
-                    self._file, revision, where=self._where, expected_size=self._expected_size
-                )
-                self._opened = (os.getpid(), web)
-        return self._opened[1]
+        if self._opened is not None:
+            return self._opened
+        with self._opening.held(timeout_s):
+            if self._opened is None:
+                self._opened = self._find(timeout_s)
+        return self._opened
 
-    def _commit(self, attempt: Attempt, *, of: Literal["file", "folder"] = "file") -> str:
+    def _find(self, timeout_s: float) -> WebTransport | Path:
+        with require_installed(self._where, extra="hub"):
+            from huggingface_hub import constants, try_to_load_from_cache
+        offline = is_offline()
+        revision = self._file.revision if offline else self._commit(timeout_s)
+        cached = try_to_load_from_cache(
+            self._file.repository, self._file.path, revision=revision,
+            repo_type=self._file.kind.removesuffix("s"),
+        )  # fmt: skip
+        if isinstance(cached, str):
+            return Path(cached)
+        if offline:
+            raise StorageError(
+                f"{self._where}: HF_HUB_OFFLINE is set, and the file is not in the Hub's cache "
+                f"({constants.HF_HUB_CACHE}). Unset it, or fetch the file while online: `hf "
+                f"download`, or `stereogenbench download` and pass its folder."
+            )
+        return _HubWeb(self._file, revision, where=self._where, expected_size=self._expected_size)
+
+    def _commit(self, timeout_s: float, *, of: Literal["file", "folder"] = "file") -> str:
         """Return the commit of the revision, the same for all that this process reads."""
         if _COMMIT.fullmatch(self._file.revision):
             return self._file.revision
@@ -170,7 +169,7 @@ class HubTransport:
             # Of a folder, which has no such URL, a file is asked for that every repository has.
             asked = replace(self._file, path=self._file.path if of == "file" else ".gitattributes")
             web = _HubWeb(asked, asked.revision, where=self._where, expected_size=None)
-            _commits.setdefault(key, web.commit(attempt))
+            _commits.setdefault(key, web.commit(timeout_s))
         return _commits[key]
 
 
@@ -186,24 +185,25 @@ class _HubWeb(WebTransport):
             from huggingface_hub.utils import build_hf_headers
         endpoint, token = _settings()
         headers = build_hf_headers(token=token, library_name="stereogenbench-data")
-        url = f"{endpoint}/{file.web_path(revision)}"
+        place = file.repository if file.kind == "models" else f"{file.kind}/{file.repository}"
+        url = f"{endpoint}/{place}/resolve/{quote(revision, safe='')}/{quote(file.path)}"
         super().__init__(url, expected_size=expected_size, headers=headers)
         self._where = where
         self._revision = revision
-        self._was_signed = True  # so that threads do not all ask the Hub at first
+        # A commit does not change; ETags and dates of a content network's servers may differ.
+        self._is_versioned = _COMMIT.fullmatch(revision) is None
+        self._is_redirected = True  # so that threads do not all ask the Hub at first
 
-    def commit(self, attempt: Attempt) -> str:
+    def commit(self, timeout_s: float) -> str:
         """Return the commit that a branch is at; the branch itself where the Hub does not say."""
-        response = self._ask(self._url, {**self._headers, "Range": "bytes=0-0"}, attempt)
-        response.close()
+        response = self.head(timeout_s)
         found = response.headers.get("X-Repo-Commit", "")
         if response.status >= 400 and not _COMMIT.fullmatch(found):
-            raise self._refusal(response, server=server_of(self._url), attempt=attempt)
+            raise self.refusal(response)
         return found if _COMMIT.fullmatch(found) else self._revision
 
-    def _refusal(
-        self, response: urllib3.BaseHTTPResponse, *, server: str, attempt: Attempt
-    ) -> Exception:
+    def refusal(self, response: urllib3.BaseHTTPResponse) -> Exception:
+        """Return the error of a response without content, as the Hub names it."""
         code = response.headers.get("X-Error-Code", "")
         if code == "GatedRepo":
             return StorageError(
@@ -212,7 +212,7 @@ class _HubWeb(WebTransport):
             )
         if response.status in (401, 404, 410) or code in ("RepoNotFound", "EntryNotFound"):
             return MissingObject(f"{self._where}: does not exist, or is private. {MISSING}")
-        return super()._refusal(response, server=server, attempt=attempt)
+        return super().refusal(response)
 
 
 def is_hub_file(url: str) -> bool:

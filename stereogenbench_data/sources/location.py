@@ -1,13 +1,6 @@
-"""Locations of data, paths or URLs: how they are joined and shown, and which ones may be opened.
+"""Locations of data, paths or URLs: how they are joined, and how messages show them."""
 
-A location that the user names is always opened. One that a file names may be a stranger's choice:
-see `why_not_from_a_file`.
-"""
-
-import ipaddress
 import os
-import re
-import socket
 from pathlib import Path
 from typing import Final
 from urllib.parse import SplitResult, quote, unquote, urlsplit, urlunsplit
@@ -16,17 +9,6 @@ from stereogenbench_data.errors import StorageError, url_without_secrets
 from stereogenbench_data.schema.text import shortened
 
 WEB_SCHEMES: Final = ("http", "https")
-FILE_SCHEMES: Final = ("https", "http", "hf", "s3")
-"""What a file may name as the place of data: stores of bytes only.
-
-Other file systems of fsspec reach into this machine (``local``, ``reference``, ``ssh`` ...), or
-open what another part of the URL names.
-"""
-
-_ODD: Final = re.compile(r"[\x00-\x20\x7f\\]")
-_IPV6_HOST: Final = re.compile(r"(?<=://)\[[0-9A-Fa-f:.]*\]")
-_EMBEDDED: Final = ipaddress.ip_network("64:ff9b::/96")
-"""IPv6 addresses that hold an IPv4 address in their last 32 bits."""
 
 
 def is_remote(location: str | Path) -> bool:
@@ -118,49 +100,3 @@ def shown(location: str | Path) -> str:
     """Return a location as messages and files may show it: URLs without login, query, fragment."""
     text = str(location)
     return url_without_secrets(text) if is_remote(text) else text
-
-
-def why_not_from_a_file(url: str) -> str:
-    """Return why a URL that a file names is not opened unless the user names it; "" if it is.
-
-    It must be of `FILE_SCHEMES`, without a chain of file systems, a login or a query. A web server
-    must be outside this machine and its own network.
-    """
-    scheme = url.partition("://")[0].lower()
-    try:
-        host = split_url(url).hostname or "" if is_web(url) else ""
-    except StorageError:
-        return "it is not a URL"
-    if "::" in (_IPV6_HOST.sub("", url) if is_web(url) else url):
-        return "it is a chain of file systems"
-    if scheme not in FILE_SCHEMES:
-        return f"it is none of {', '.join(f'{each}://' for each in FILE_SCHEMES)}"
-    if shown(url) != url or _ODD.search(url):
-        return "it holds a login, a query, or characters that no address has"
-    return "it is on this machine or in its own network" if is_web(url) and is_inside(host) else ""
-
-
-def is_inside(host: str) -> bool:
-    """Return whether a host is this machine, or in a network that the internet cannot reach.
-
-    Names are looked up; an unknown one is neither.
-    """
-    name = unquote(host).rstrip(".").lower()
-    if name in ("", "localhost") or name.endswith(".localhost"):
-        return True
-    try:
-        found = socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)
-    except (OSError, UnicodeError, ValueError):
-        return False
-    return any(_is_inside(str(address[0])) for *_, address in found)
-
-
-def _is_inside(text: str) -> bool:
-    address: ipaddress.IPv4Address | ipaddress.IPv6Address
-    address = ipaddress.ip_address(text.partition("%")[0])
-    if isinstance(address, ipaddress.IPv6Address):
-        if address in _EMBEDDED:
-            address = ipaddress.IPv4Address(int(address) & 0xFFFFFFFF)
-        else:
-            address = address.ipv4_mapped or address.sixtofour or address
-    return not address.is_global or address.is_multicast

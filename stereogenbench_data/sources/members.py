@@ -27,7 +27,7 @@ from stereogenbench_data.sources.ranged_file import (
     require_crc32,
 )
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import Cancellation, RetryPolicy
+from stereogenbench_data.sources.retry import RetryPolicy
 
 UNSAFE_PATH: Final = r"^/|\\|:|(?:^|/)\.{0,2}(?:/|$)|[\x00-\x1f]"
 """What a member's path may not hold: a root, a drive, a backslash, an empty part, '.' or '..'."""
@@ -35,35 +35,6 @@ UNSAFE_PATH: Final = r"^/|\\|:|(?:^|/)\.{0,2}(?:/|$)|[\x00-\x1f]"
 
 _KEPT_TABLES: Final = 256
 """Of how many scenes the seek tables are kept."""
-
-
-class Fetched:
-    """What a source has fetched from its URL, without what went into a cache."""
-
-    def __init__(self) -> None:
-        """Begin with nothing."""
-        # Each thread counts for itself: a fork cannot copy a lock that is held.
-        self._of_thread: dict[int, tuple[int, int]] = {}
-
-    def add(self, count: int) -> None:
-        """Count one more range of so many bytes; any thread may do that."""
-        thread = threading.get_ident()
-        requests, total = self._of_thread.get(thread, (0, 0))
-        self._of_thread[thread] = requests + 1, total + count
-
-    @property
-    def requests(self) -> int:
-        """How many ranges."""
-        return sum(requests for requests, _ in [*self._of_thread.values()])
-
-    @property
-    def bytes(self) -> int:
-        """How many bytes."""
-        return sum(count for _, count in [*self._of_thread.values()])
-
-    def __reduce__(self) -> tuple[type["Fetched"], tuple[()]]:
-        """Return what another process begins with."""
-        return Fetched, ()
 
 
 class MemberSource:
@@ -108,7 +79,7 @@ class MemberSource:
         self._tables: OrderedDict[str, dict[str, SeekTable]] = OrderedDict()
         self._sound: set[tuple[str, int]] = set()
         self._objects: dict[str, RemoteObject] = {}
-        self.fetched = Fetched()
+        self._requests = self._bytes = 0
 
     def __repr__(self) -> str:
         """Return the root without secrets, and what is compared with its checksum."""
@@ -138,7 +109,7 @@ class MemberSource:
             if found is not None and found[0] + len(found[1]) >= offset + stop:
                 begin = offset + start - found[0]
                 return found[1][begin : begin + stop - start]
-            self.fetched.add(stop - start)
+            self._requests, self._bytes = self._requests + 1, self._bytes + stop - start
             return remote.read(offset + start, offset + stop)
 
         def fetched(at: int) -> tuple[int, bytes] | None:
@@ -156,8 +127,15 @@ class MemberSource:
     def fetching_by(self, ahead: FetchAhead) -> "MemberSource":
         """Return the same source, for another reader."""
         twin = copy.copy(self)
-        twin._ahead, twin.fetched = ahead, Fetched()
+        twin._ahead, twin._requests, twin._bytes = ahead, 0, 0
         return twin
+
+    @property
+    def fetched(self) -> tuple[int, int]:
+        """How many ranges were fetched, and their bytes, without what went into a cache."""
+        if self._ahead is None:
+            return self._requests, self._bytes
+        return self._requests + self._ahead.requests, self._bytes + self._ahead.bytes
 
     @property
     def is_cached(self) -> bool:
@@ -187,7 +165,7 @@ class MemberSource:
         cache = self._cache
         if cache is not None:
 
-            def fill(start: int, stop: int, cancellation: Cancellation) -> bytes:
+            def fill(start: int, stop: int, cancellation: threading.Event) -> bytes:
                 cache.open(member, remote=remote, revision=self._revision).close()
                 return b""
 
@@ -195,8 +173,7 @@ class MemberSource:
                 return []
             return [Wanted(_cached(member), 0, 1, fill, member.size)]
 
-        def fetch(start: int, stop: int, cancellation: Cancellation) -> bytes:
-            self.fetched.add(stop - start)
+        def fetch(start: int, stop: int, cancellation: threading.Event) -> bytes:
             return remote.read(start, stop, cancellation=cancellation)
 
         parts = [(0, member.size)] if ranges is None else ranges
@@ -291,7 +268,8 @@ class MemberSource:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy in another process, which checks sizes for itself."""
-        return self.__dict__ | {"_objects": {}, "_tables": OrderedDict()}
+        anew = {"_objects": {}, "_tables": OrderedDict(), "_requests": 0, "_bytes": 0}
+        return self.__dict__ | anew
 
 
 def _cached(member: Member) -> tuple[str, int]:

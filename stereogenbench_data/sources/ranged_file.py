@@ -8,7 +8,7 @@ import zlib
 from abc import abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.media.seek_table import SeekTable
@@ -66,13 +66,6 @@ class MemberFile(io.RawIOBase):
         data = self._bytes(self._position, stop)
         self._position = stop
         return data
-
-    def readinto(self, buffer: Any, /) -> int:
-        """Read into a buffer as far as there are bytes; return how many."""
-        room = memoryview(buffer).cast("B")
-        data = self.read(len(room))
-        room[: len(data)] = data
-        return len(data)
 
     @abstractmethod
     def _bytes(self, start: int, stop: int) -> bytes:

@@ -21,6 +21,8 @@ from stereogenbench_data.media.seek_table import packed_tables, parse_tables
 from stereogenbench_data.samples import coming
 from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources.cache import ShardCache
+from stereogenbench_data.sources.fetch_ahead import FetchAhead
+from stereogenbench_data.sources.retry import RetryPolicy
 from tests.servers.failing_server import Answer, serving
 from tests.servers.gate import Gate
 from tests.sources.policies import LONGEST_S, ended
@@ -57,7 +59,7 @@ def fetching():
 
 
 def remote_pools_closed():
-    from stereogenbench_data.sources.connections import close_connections
+    from stereogenbench_data.sources.web import close_connections
 
     close_connections()
 
@@ -157,12 +159,19 @@ def test_the_streams_of_a_sample_are_fetched_at_the_same_time(served, alone):
     assert gate.came_together
 
 
-def test_what_is_planned_stays_within_the_bound(served, alone):
+def test_what_is_planned_stays_within_the_bound(served, monkeypatch, alone):
     bound = 100_000
     pairs = StereoPairs(served.url, fields=("left",), frames="all", fetch_ahead_bytes=bound)
     loader = pairs.loader(1, tail="uneven")
+    planned, add = [], FetchAhead.plan
+
+    def noted(ahead, sample, wanted):
+        add(ahead, sample, wanted)
+        planned.append(ahead.planned_bytes)
+
+    monkeypatch.setattr(FetchAhead, "plan", noted)
     assert len([*loader]) == len(pairs)
-    largest = loader.batches.dataset._loader._ahead.most_bytes
+    largest = max(planned)
     loader.close()
 
     of_one_sample = pairs.index.scene(0).members[rgb_name(0)].size
@@ -355,14 +364,25 @@ def test_a_negative_number_of_bytes_is_named(large_shards):
         StereoPairs(large_shards, fetch_ahead_bytes=-1)
 
 
-def test_closing_ends_requests_that_hang_at_once(served):
-    pairs = StereoPairs(served.url, fields=("left",), frames="all")
+def test_closing_does_not_wait_for_requests_that_hang_and_they_end(served):
+    index = SceneIndex.open(served.url, retry=RetryPolicy(timeout_s=0.5))
+    pairs = StereoPairs(index, fields=("left",), frames="all")
     shards = {member.path for member in pairs.index.scene(0).members.values()}
     served.always = {path: Answer(delay_s=2 * LONGEST_S) for path in shards}
-    address = pairs.plan.locate(0, epoch=0)
-    pairs._loader.begin(address)
-    time.sleep(0.5)
-    assert fetching()
-    ended(pairs.close)
+    batches, failures = iter(pairs.loader(1)), []
 
+    def failure_of(batches):
+        with pytest.raises(StorageError) as caught:
+            next(batches)
+        return caught.type
+
+    waiting = threading.Thread(target=lambda: failures.append(failure_of(batches)))
+    waiting.start()
+    while not fetching():
+        time.sleep(0.01)
+    ended(pairs.close)
+    waiting.join()
+    assert len(failures) == 1
+
+    ended(lambda: [thread.join() for thread in threading.enumerate() if "fetch" in thread.name])
     assert fetching() == []

@@ -50,12 +50,13 @@ def test_the_command_indexes_a_part_of_a_repository(tmp_path, small_release):
     done = CliRunner().invoke(app, ["index", HUB, "--split", "eval", "-o", str(out)])
 
     assert done.exit_code == 0, done.output
-    index = SceneIndex.open(out)
-    assert index.root == HUB
+    assert f"--root {HUB}" in done.output
+    index = SceneIndex.open(out, root=HUB)
     assert set(index.column("split")) == {"eval"}
     key = index.scene(0).id.key
     folder = StereoPairs(small_release, split="eval", fields=("left",))
-    np.testing.assert_array_equal(StereoPairs(out, fields=("left",))[0]["left"], folder[0]["left"])
+    pairs = StereoPairs(index, fields=("left",))
+    np.testing.assert_array_equal(pairs[0]["left"], folder[0]["left"])
     assert key == folder.index.column("key")[folder.plan.scene_rows[0]]
 
 

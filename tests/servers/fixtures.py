@@ -20,14 +20,6 @@ BUCKET = "some-bucket"
 NOISE_PX = 320
 
 
-@pytest.fixture(scope="session", autouse=True)
-def own_pauses(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keep the pauses that servers of the tests ask for apart from those of the user."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("runtime")))
-        yield
-
-
 @pytest.fixture(scope="session")
 def small_shards(small_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The scenes of `small_release` in shards."""

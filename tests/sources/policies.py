@@ -1,4 +1,4 @@
-"""Retry policies with other numbers than the built-in ones, for tests that cannot wait."""
+"""Retry policies and waits for tests that cannot wait."""
 
 import threading
 
@@ -6,6 +6,18 @@ from stereogenbench_data.sources.retry import RetryPolicy
 
 LONGEST_S = 50.0
 """What hangs in these tests hangs for longer, so that what waits for it fails."""
+
+
+class Waits(threading.Event):
+    """The cancellation of a read, for which waits take no time and are noted."""
+
+    def __init__(self):
+        super().__init__()
+        self.seconds = []
+
+    def wait(self, timeout=None):
+        self.seconds.append(timeout)
+        return self.is_set()
 
 
 def ended(call):
@@ -28,13 +40,6 @@ def ended(call):
     return value
 
 
-def retry_policy(*, timeout_s=20.0, sleep=None, chance=None, clock=None, **numbers):
-    """Return a policy of other numbers, or whose waits, chance or clock are functions."""
-    changes = dict(numbers)
-    if sleep is not None:
-        changes["sleep"] = lambda _, wait_s, *, cancellation: sleep(wait_s)
-    if chance is not None:
-        changes["chance"] = lambda _: chance()
-    if clock is not None:
-        changes["clock"] = lambda _: clock()
-    return type("Limits", (RetryPolicy,), changes)(timeout_s)
+def retry_policy(*, timeout_s=20.0, **numbers):
+    """Return a policy of other numbers than the built-in ones."""
+    return type("Limits", (RetryPolicy,), numbers)(timeout_s)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.schema.records import Member
 from stereogenbench_data.sources import cache as cache_module
-from stereogenbench_data.sources.cache import FOLDER_NAME, ShardCache, require_limit
+from stereogenbench_data.sources.cache import FOLDER_NAME, ShardCache
 from stereogenbench_data.sources.remote import RemoteObject
 from tests.servers.failing_server import Answer
 from tests.servers.tools import small_disk
@@ -161,18 +161,6 @@ def test_an_item_of_another_time_is_kept_if_its_checksum_is_right(
     assert len(shard.fetched) == fetched
 
 
-def test_a_folder_in_an_items_place_makes_way_for_it_and_is_kept(cache, shard, tmp_path):
-    read(cache, member(1000, 2000), shard)
-    item = items(tmp_path)[0]
-    item.unlink()
-    item.mkdir()
-    (item / "mine.txt").touch()
-
-    assert read(cache, member(1000, 2000), shard) == DATA[1000:3000]
-    assert item.is_file()
-    assert len(list(tmp_path.rglob("mine.txt"))) == 1
-
-
 def test_a_damaged_item_is_found_and_dropped_when_it_is_looked_for(cache, shard, tmp_path):
     wanted = member(1000, 2000)
     how = {"where": shard.where, "revision": "1"}
@@ -235,17 +223,6 @@ def test_files_of_others_are_neither_counted_nor_deleted(cache, shard, tmp_path)
     assert (tmp_path / FOLDER_NAME / "items" / "mine.tar").stat().st_size == 50_000
 
 
-def test_a_folder_of_that_name_that_is_no_cache_is_refused(tmp_path):
-    (tmp_path / FOLDER_NAME).mkdir()
-    (tmp_path / FOLDER_NAME / "thesis.tex").touch()
-    with pytest.raises(StorageError, match=r"members: holds thesis.tex and is not a cache of this"):
-        ShardCache(tmp_path, limit_bytes=1)
-
-    (tmp_path / FOLDER_NAME / "CACHEDIR.TAG").write_text("something else")
-    with pytest.raises(StorageError, match=r"CACHEDIR.TAG: was not written by this package"):
-        ShardCache(tmp_path, limit_bytes=1)
-
-
 def test_a_folder_that_cannot_be_made_is_reported(tmp_path):
     (tmp_path / "file").touch()
 
@@ -255,27 +232,15 @@ def test_a_folder_that_cannot_be_made_is_reported(tmp_path):
         ShardCache(tmp_path / "file", limit_bytes=1)
 
 
-@pytest.mark.parametrize("limit", [0, -1, "1GB", None, 1.5, True], ids=repr)
+@pytest.mark.parametrize("limit", [0, -1, True], ids=repr)
 def test_a_limit_that_is_no_number_of_bytes_is_refused(tmp_path, limit):
-    refused = pytest.raises(StorageError, match=rf"{tmp_path}: .*, got {limit!r}: give a number")
-    with refused:
-        require_limit(limit, folder=tmp_path)
-    if type(limit) is int:
-        with refused:
-            ShardCache(tmp_path, limit_bytes=limit)
+    with pytest.raises(StorageError, match=rf"{tmp_path}: .*, got {limit!r}: give a number"):
+        ShardCache(tmp_path, limit_bytes=limit)
 
 
 def test_a_folder_without_a_name_is_refused():
     with pytest.raises(StorageError, match="a cache needs a folder, got ''"):
         ShardCache("", limit_bytes=1)
-
-
-def test_a_folder_of_shards_is_refused_and_left_as_it_is(tmp_path):
-    (tmp_path / "train-Uniform-000000.tar").touch()
-
-    with pytest.raises(StorageError, match=r"holds shards \(train-Uniform-000000.tar\), which"):
-        ShardCache(tmp_path, limit_bytes=1)
-    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_a_full_disk_is_reported_and_leaves_nothing(cache, shard, tmp_path, monkeypatch):

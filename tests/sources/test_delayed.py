@@ -10,7 +10,7 @@ from benchmarks.server import serving as delayed_serving
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import Cancellation, ReadCancelled
+from stereogenbench_data.sources.retry import ReadCancelled
 from tests.servers.gate import Gate
 from tests.servers.hub import COMMIT, REPOSITORY
 from tests.servers.raw import raw_serving
@@ -112,7 +112,7 @@ def test_a_dead_store_is_a_named_error_within_the_longest_outage(store, how):
         yield 60.0
 
     _, point = store
-    policy = retry_policy(attempts=999, timeout_s=0.5, longest_outage_s=1.5)
+    policy = retry_policy(attempts=999, timeout_s=0.2, longest_outage_s=0.4)
     with raw_serving(never) as silent:
         root = point("http://127.0.0.1:1" if how == "refusing" else silent)
         remote = RemoteObject(f"{root}/x.tar", retry=policy)
@@ -121,16 +121,16 @@ def test_a_dead_store_is_a_named_error_within_the_longest_outage(store, how):
             ended(lambda: remote.read(0, 9))
 
 
-def test_a_read_of_a_store_is_cancelled_at_once(store):
+def test_a_read_of_a_store_ends_when_it_is_cancelled(store):
     def never(start, stop):
         yield 60.0
 
     _, point = store
-    cancellation = Cancellation()
+    cancellation = threading.Event()
     with raw_serving(never) as silent:
         root = point(silent)
-        threading.Timer(0.5, cancellation.cancel).start()
-        remote = RemoteObject(f"{root}/x.tar", retry=retry_policy(timeout_s=999))
+        threading.Timer(0.1, cancellation.set).start()
+        remote = RemoteObject(f"{root}/x.tar", retry=retry_policy(timeout_s=0.4))
 
         with pytest.raises(ReadCancelled, match=rf"{root}/x.tar : reading was cancelled"):
             ended(lambda: remote.read(0, 9, cancellation=cancellation))

@@ -2,7 +2,6 @@
 
 import os
 import pickle
-import shutil
 import subprocess
 import sys
 import zlib
@@ -31,7 +30,7 @@ def root(tmp_path):
     return tmp_path
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def scene(small_release):
     return SceneIndex.open(small_release).scene(0)
 
@@ -284,15 +283,11 @@ for opens in (lambda: pairs[len(pairs) - 1], lambda: StereoPairs(sys.argv[1])):
 
 
 @pytest.mark.parametrize("kind", ["tree", "shards", "packed depth"])
-def test_too_many_open_files_are_reported_as_such(kind, small_release, tmp_path):
-    data = small_release
-    if kind == "tree":
-        data = shutil.copytree(small_release, tmp_path / "tree")
-        SceneIndex.open(data).write(data / "index.parquet")
-    else:
+def test_too_many_open_files_are_reported_as_such(kind, indexed_release, small_shards, tmp_path):
+    data = indexed_release if kind == "tree" else small_shards
+    if kind == "packed depth":
         data = tmp_path / "shards"
-        codec = "released" if kind == "shards" else "blosc2"
-        pack(small_release, data, depth_codec=codec, workers=1)
+        pack(indexed_release, data, depth_codec="blosc2", workers=1)
 
     told = subprocess.run(
         [sys.executable, "-c", OUT_OF_FILES, data], check=True, capture_output=True, text=True

@@ -203,16 +203,6 @@ def test_parts_of_a_member_are_not_compared():
     assert file.failure is None
 
 
-def test_bytes_can_be_read_into_a_buffer():
-    store = Store(10)
-    file, buffer = store.open(), bytearray(4)
-
-    assert [file.readinto(buffer), file.readinto(buffer), file.readinto(buffer)] == [4, 4, 2]
-    assert file.readable()
-    assert file.seekable()
-    assert not file.writable()
-
-
 def test_a_place_before_the_start_is_refused():
     with pytest.raises(ValueError, match="a file has no position -1"):
         Store(10).open().seek(-1)

@@ -2,35 +2,25 @@
 
 import re
 import threading
+import time
 
 import pytest
-import urllib3
 
 from stereogenbench_data.errors import ShardError, StorageError
-from stereogenbench_data.sources.connections import close_connections
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy
+from stereogenbench_data.sources.web import close_connections
 from tests.servers.failing_server import Answer, serving
 from tests.servers.raw import raw_serving
-from tests.sources.policies import retry_policy
+from tests.sources.policies import Waits, retry_policy
 from tests.sources.source_kit import read_range, size_of
 
 DATA = bytes(range(256)) * 1000
 
 
-class Clock:
-    """Waits that take no time, and are noted."""
-
-    def __init__(self):
-        self.waits_s = []
-
-    def policy(self, **how):
-        return retry_policy(sleep=self.waits_s.append, chance=lambda: 0.0, **how)
-
-
 @pytest.fixture
-def clock():
-    return Clock()
+def waits():
+    return Waits()
 
 
 @pytest.fixture
@@ -54,70 +44,69 @@ def test_the_size_costs_one_byte(served):
     assert served.sent == 1
 
 
-def test_an_answer_cut_short_is_gone_on_with_where_it_ended(served, clock):
+def test_an_answer_cut_short_is_gone_on_with_where_it_ended(served, waits):
     served.answers = [Answer(stop_after=30_000), Answer(stop_after=100_000)]
-    remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy())
+    remote = RemoteObject(f"{served.url}/x.tar")
 
-    assert remote.read(500, 200_500) == DATA[500:200_500]
+    assert remote.read(500, 200_500, cancellation=waits) == DATA[500:200_500]
     assert ranges(served) == [(500, 200_500), (30_500, 200_500), (130_500, 200_500)]
     assert served.sent == 200_000
-    assert clock.waits_s == [0.02, 0.02]
+    assert len(waits.seconds) == 2
+    assert all(0.01 <= wait_s <= 0.02 for wait_s in waits.seconds)
 
 
-def test_waits_double_up_to_a_limit_while_nothing_is_gained(served, clock):
+def test_waits_double_up_to_a_limit_while_nothing_is_gained(served, waits):
     served.always["x.tar"] = Answer(status=503)
-    remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy(longest_wait_s=3.0))
+    remote = RemoteObject(f"{served.url}/x.tar", retry=retry_policy(longest_wait_s=3.0))
 
     with pytest.raises(
         StorageError,
         match=r"x.tar : .* byte 0 of 9 \(the server answers 503 .*; 10 tries\). Check the network",
     ):
-        remote.read(0, 9)
-    assert clock.waits_s == [0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28, 2.56, 3.0]
+        remote.read(0, 9, cancellation=waits)
+    longest_s = [0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28, 2.56, 3.0]
+    assert all(
+        most_s / 2 <= wait_s <= most_s
+        for wait_s, most_s in zip(waits.seconds, longest_s, strict=True)
+    )
 
 
 @pytest.mark.parametrize("status", [429, 503])
-def test_the_server_says_how_long_to_wait(served, clock, status):
+def test_the_server_says_how_long_to_wait(served, waits, status):
     served.answers = [Answer(status=status, headers={"Retry-After": "7"})]
-    remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy())
+    remote = RemoteObject(f"{served.url}/x.tar")
 
-    assert remote.read(0, 9) == DATA[:9]
-    assert clock.waits_s == [7.0]
+    assert remote.read(0, 9, cancellation=waits) == DATA[:9]
+    assert waits.seconds == [pytest.approx(7.0, abs=0.5)]
 
 
-def test_the_server_may_say_until_when_to_wait(served, clock):
+def test_the_server_may_say_until_when_to_wait(served, waits):
     dates = ["Wed, 21 Oct 2015 07:28:00 GMT", "Fri, 21 Oct 2095 07:28:00 -0000", "soon"]
     served.answers = [
         Answer(status=503, headers={"Retry-After": date}) for date in (dates[0], dates[2], dates[1])
     ]
-    remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy())
+    remote = RemoteObject(f"{served.url}/x.tar")
 
-    with pytest.raises(StorageError, match=r"503 Service Unavailable, which asks to wait \d{9,} s"):
-        remote.read(0, 9)
-    assert clock.waits_s == [0.02, 0.04]
-
-
-def test_jitter_shortens_a_wait_by_up_to_a_half_and_lengthens_one_that_is_asked_for():
-    policies = [retry_policy(chance=lambda chance=chance: chance) for chance in (0.0, 0.5, 1.0)]
-
-    assert [each.backoff_s(3) for each in policies] == pytest.approx([0.08, 0.06, 0.04])
-    assert [each.spread_s(5.0) for each in policies] == pytest.approx([5.0, 5.25, 5.5])
+    with pytest.raises(StorageError, match=r"503 Service Unavailable, which asks to wait \d{4,} s"):
+        remote.read(0, 9, cancellation=waits)
+    assert len(waits.seconds) == 2
+    assert max(waits.seconds) <= 0.04
 
 
-def test_silence_is_retried(served, clock):
+def test_silence_is_retried(served, waits):
     served.answers = [Answer(delay_s=1.0)]
-    remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy(timeout_s=0.2))
+    remote = RemoteObject(f"{served.url}/x.tar", retry=retry_policy(timeout_s=0.2))
 
-    assert remote.read(0, 9) == DATA[:9]
-    assert len(clock.waits_s) == 1
+    assert remote.read(0, 9, cancellation=waits) == DATA[:9]
+    assert len(waits.seconds) == 1
 
 
-def test_a_server_that_is_not_there_is_reported_after_some_tries(served, clock):
-    remote = RemoteObject("http://127.0.0.1:1/x.tar", retry=clock.policy(attempts=3))
+def test_a_server_that_is_not_there_is_reported_after_some_tries(served, waits):
+    remote = RemoteObject("http://127.0.0.1:1/x.tar", retry=retry_policy(attempts=3))
 
     with pytest.raises(StorageError, match=r"Connection refused.*; 3 tries\)"):
-        remote.read(0, 9)
-    assert len(clock.waits_s) == 2
+        remote.read(0, 9, cancellation=waits)
+    assert len(waits.seconds) == 2
 
 
 @pytest.mark.parametrize(
@@ -129,14 +118,14 @@ def test_a_server_that_is_not_there_is_reported_after_some_tries(served, clock):
         (400, "Check the URL and the server"),
     ],
 )
-def test_what_will_not_pass_is_reported_at_once(served, clock, status, cure):
+def test_what_will_not_pass_is_reported_at_once(served, waits, status, cure):
     served.always["x.tar"] = Answer(status=status)
-    remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy())
+    remote = RemoteObject(f"{served.url}/x.tar")
 
     with pytest.raises(StorageError, match=rf"x.tar : the server answers {status} .*\. {cure}"):
-        remote.read(0, 9)
+        remote.read(0, 9, cancellation=waits)
     assert len(served.asked) == 1
-    assert clock.waits_s == []
+    assert waits.seconds == []
 
 
 def test_a_server_that_ignores_ranges_is_refused_before_it_has_sent_all(served):
@@ -144,7 +133,7 @@ def test_a_server_that_ignores_ranges_is_refused_before_it_has_sent_all(served):
 
     with pytest.raises(
         StorageError,
-        match=r"x.tar : .*whole file \(256000 bytes\) .* bytes 5 to 9.* use a server that honours",
+        match=r"x.tar : .*whole file \(256000 bytes\) .* bytes 5 to 8.* use a server that honours",
     ):
         read_range(f"{served.url}/x.tar", 5, 9)
 
@@ -159,8 +148,8 @@ def test_the_whole_may_be_sent_where_the_whole_is_requested(served):
 @pytest.mark.parametrize(
     ("told", "message"),
     [
-        ("bytes 6-8/256000", r"sends bytes 6 to 8 when asked for 5 to 8. It does not honour"),
-        ("bytes 5-9/256000", r"sends bytes 5 to 9 when asked for 5 to 8. It does not honour"),
+        ("bytes 6-8/256000", r"sends bytes 6 to 8 when asked for bytes 5 to 8. It does not honour"),
+        ("bytes 5-9/256000", r"sends bytes 5 to 9 when asked for bytes 5 to 8. It does not honour"),
         ("pages 5-8/256000", r"does not state which part it sends \(Content-Range: 'pages 5-8/256"),
     ],
 )
@@ -227,10 +216,10 @@ def test_a_login_in_the_url_is_sent_and_never_shown(served):
         read_range(f"{url}/x.tar?key=secret", 0, 9)
 
 
-def test_a_query_is_neither_shown_nor_chained(clock):
-    remote = RemoteObject("http://127.0.0.1:1/x.tar?key=secret", retry=clock.policy(attempts=1))
+def test_a_query_is_neither_shown_nor_chained(waits):
+    remote = RemoteObject("http://127.0.0.1:1/x.tar?key=secret", retry=retry_policy(attempts=1))
     with pytest.raises(StorageError, match=r"http://127\.0\.0\.1:1/x\.tar : .*try again") as caught:
-        remote.read(0, 9)
+        remote.read(0, 9, cancellation=waits)
 
     error: BaseException | None = caught.value
     while error is not None:
@@ -238,9 +227,9 @@ def test_a_query_is_neither_shown_nor_chained(clock):
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
 
 
-def test_a_url_that_is_none_is_reported(clock):
+def test_a_url_that_is_none_is_reported(waits):
     with pytest.raises(StorageError, match="not a valid URL: correct it"):
-        RemoteObject("http://a:b:c/x", retry=clock.policy()).read(0, 9)
+        RemoteObject("http://a:b:c/x").read(0, 9, cancellation=waits)
 
 
 def test_threads_read_at_the_same_time_over_connections_that_are_used_again(served):
@@ -277,7 +266,7 @@ MONDAY, TUESDAY = "Mon, 02 Feb 2026 07:28:00 GMT", "Tue, 03 Feb 2026 07:28:00 GM
     ("before", "after", "message"),
     [
         ({"ETag": '"a"'}, {"ETag": '"b"'}, r'its ETag was "a" and is "b"'),
-        ({"ETag": 'W/"a"'}, {"ETag": 'W/"b"'}, r'its ETag was "a" and is "b"'),
+        ({"ETag": 'W/"a"'}, {"ETag": 'W/"b"'}, r'its ETag was W/"a" and is W/"b"'),
         (
             {"Last-Modified": MONDAY},
             {"Last-Modified": TUESDAY},
@@ -306,11 +295,11 @@ def test_a_file_that_is_replaced_between_two_ranges_is_reported(
             remote.read(9, 18)
 
 
-def test_a_file_that_is_replaced_within_one_read_is_reported(served, clock):
+def test_a_file_that_is_replaced_within_one_read_is_reported(served, waits):
     served.validators = {"ETag": '"a"'}
     served.answers = [Answer(stop_after=30_000)]
-    remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy())
-    chunks = remote.chunks(0, 200_000)
+    remote = RemoteObject(f"{served.url}/x.tar")
+    chunks = remote.chunks(0, 200_000, cancellation=waits)
     next(chunks)
     served.validators = {"ETag": '"b"'}
 
@@ -331,7 +320,7 @@ def test_a_file_of_another_size_is_reported_as_replaced_without_any_validator(se
     ("validators", "condition"),
     [
         ({"ETag": '"a"', "Last-Modified": MONDAY}, '"a"'),
-        ({"Last-Modified": MONDAY}, MONDAY),
+        ({"Last-Modified": MONDAY}, None),
         ({"ETag": 'W/"a"', "Last-Modified": MONDAY}, None),
         ({"ETag": "odd \u00b2"}, None),
         ({}, None),
@@ -384,9 +373,10 @@ def a_trickling_head(start, stop):
 
 
 def a_trickling_redirect(start, stop):
-    for letter in b"HTTP/1.1 302 x\r\nLocation: /y\r\nContent-Length: 5000\r\n\r\n" + b"x" * 5000:
-        yield bytes([letter])
-        yield 0.005
+    yield b"HTTP/1.1 302 x\r\nLocation: /y\r\nContent-Length: 5000\r\n\r\n"
+    while True:
+        yield b"x"
+        yield 0.02
 
 
 def a_trickling_length_of_a_chunk(start, stop):
@@ -402,70 +392,56 @@ def a_trickling_length_of_a_chunk(start, stop):
 @pytest.mark.parametrize(
     ("answering", "reason"),
     [
-        (half_then_silence, "fewer than 1000000 bytes a second over 0.2 s"),
-        (a_byte_at_a_time, "fewer than 1000000 bytes a second over 0.2 s"),
+        (half_then_silence, "ReadTimeoutError"),
+        (a_byte_at_a_time, "too little came for 0.3 s"),
         (a_byte_an_answer, "ProtocolError"),
-        (a_trickling_head, "no answer within 0.4 s"),
-        (a_trickling_redirect, "no answer within 0.4 s"),
-        (a_trickling_length_of_a_chunk, "fewer than 1000000 bytes a second over 0.2 s"),
+        (a_trickling_head, "ReadTimeoutError"),
+        (a_trickling_redirect, "ReadTimeoutError"),
+        (a_trickling_length_of_a_chunk, "ReadTimeoutError"),
     ],
 )
 def test_a_server_that_trickles_is_given_up_with_the_bounds_it_broke(answering, reason):
-    retry = retry_policy(
-        attempts=2, first_wait_s=0.001, timeout_s=0.4, window_s=0.2, least_rate_bytes_s=1e6
-    )
+    retry = retry_policy(attempts=2, timeout_s=0.2, longest_outage_s=0.3)
     with (
         raw_serving(answering) as url,
         pytest.raises(
             StorageError,
-            match=rf"x.tar : .* byte \d+ of 65536 \({reason}; 2 tries\).* than timeout_s=0.4: "
-            r"SceneIndex.open\(..., retry=RetryPolicy\(timeout_s=0.8\)\)",
+            match=rf"x.tar : .* byte \d+ of 65536 \({reason}; \d tr\w+\).* than timeout_s=0.2: "
+            r"SceneIndex.open\(..., retry=RetryPolicy\(timeout_s=0.4\)\)",
         ),
     ):
         RemoteObject(f"{url}/x.tar", retry=retry).read(0, 65536)
 
 
-def test_a_read_has_a_bound_in_all_whatever_it_gains():
-    def slow(start, stop):
-        yield head(start, stop)
-        for place in range(start, stop, 100):
-            yield DATA[place : place + 100]
-            yield 0.02
-
-    retry = retry_policy(least_rate_bytes_s=0.0, longest_read_s=0.3)
-    with (
-        raw_serving(slow) as url,
-        pytest.raises(StorageError, match=r"a read may take 0.3 s; 1 try\)"),
-    ):
-        RemoteObject(f"{url}/x.tar", retry=retry).read(0, 65536)
-
-
-def test_waits_count_into_the_bound(served):
-    now_s = [0.0]
+def test_the_waits_that_a_server_asks_for_have_a_bound_in_all(served, waits):
     served.always["x.tar"] = Answer(status=503, headers={"Retry-After": "40"})
 
-    def sleep(seconds):
-        now_s[0] += seconds
-
-    retry = retry_policy(
-        attempts=99, longest_read_s=100.0, longest_outage_s=30.0, sleep=sleep,
-        clock=lambda: now_s[0], chance=lambda: 0.0,
-    )  # fmt: skip
     with pytest.raises(StorageError, match=r"which asks to wait 40 s; 3 tries\)"):
-        RemoteObject(f"{served.url}/x.tar", retry=retry).read(0, 9)
-    assert now_s == [80.0]
+        RemoteObject(f"{served.url}/x.tar", retry=retry_policy(longest_pause_s=100.0)).read(
+            0, 9, cancellation=waits
+        )
+    assert waits.seconds == [pytest.approx(40.0, abs=1.0)] * 2
 
 
-def test_a_steady_server_above_the_least_rate_is_read_to_the_end():
+def test_a_slow_server_is_read_to_the_end_while_it_goes_on(waits):
     def steady(start, stop):
         yield head(start, stop)
-        for place in range(start, stop, 4096):
-            yield DATA[place : min(place + 4096, stop)]
-            yield 0.01
+        for place in range(start, stop, 16_384):
+            yield DATA[place : min(place + 16_384, stop)]
+            yield 0.02
 
-    retry = retry_policy(window_s=5.0, least_rate_bytes_s=1000.0, attempts=1)
+    retry = retry_policy(attempts=1, longest_outage_s=0.2)
     with raw_serving(steady) as url:
-        assert RemoteObject(f"{url}/x.tar", retry=retry).read(7, 65536) == DATA[7:65536]
+        assert RemoteObject(f"{url}/x.tar", retry=retry).read(0, len(DATA)) == DATA
+
+
+def test_the_time_that_a_reader_takes_does_not_count(served):
+    retry = retry_policy(attempts=1, longest_outage_s=0.05)
+    chunks = RemoteObject(f"{served.url}/x.tar", retry=retry).chunks(0, len(DATA))
+    data = next(chunks)
+    time.sleep(0.1)
+
+    assert data + b"".join(chunks) == DATA
 
 
 @pytest.mark.parametrize("timeout_s", [0.0, -1.0, float("nan")])
@@ -476,24 +452,21 @@ def test_a_retry_policy_without_an_end_is_refused(timeout_s):
 
 
 def test_a_slower_server_is_allowed_more_of_everything():
-    limits = [
-        (policy.window_s, policy.longest_outage_s, policy.longest_read_s)
-        for policy in (RetryPolicy(), RetryPolicy(timeout_s=60))
-    ]
+    limits = [policy.longest_outage_s for policy in (RetryPolicy(), RetryPolicy(timeout_s=60))]
 
-    assert limits == [(10, 45, 600), (30, 135, 1800)]
+    assert limits == [45, 135]
 
 
 @pytest.mark.parametrize(
     "told", ["\u00b2", "9" * 5000, "Fri, 21 Oct 99999 07:28:00 GMT", ",", "-1"]
 )
-def test_a_retry_after_that_is_none_is_no_error_of_its_own(clock, told):
+def test_a_retry_after_that_is_none_is_no_error_of_its_own(waits, told):
     def busy(start, stop):
         lines = ["HTTP/1.1 503 x", f"Retry-After: {told}", "Content-Length: 0", "Connection: close"]
         yield "\r\n".join([*lines, "", ""]).encode("latin-1")
 
     with raw_serving(busy) as url, pytest.raises(StorageError, match=r"the server answers 503 x"):
-        RemoteObject(f"{url}/x.tar", retry=clock.policy(attempts=2)).read(0, 9)
+        RemoteObject(f"{url}/x.tar", retry=retry_policy(attempts=2)).read(0, 9, cancellation=waits)
 
 
 @pytest.mark.parametrize("told", ["\u00b2\u00b2", "9" * 5000, "-5", "0x10", ""])
@@ -503,7 +476,10 @@ def test_a_length_that_is_no_number_is_named(told):
 
     with (
         raw_serving(whole) as url,
-        pytest.raises(StorageError, match=rf"its server does not state its size \('{told[:80]}'\)"),
+        pytest.raises(
+            StorageError,
+            match=rf"its server does not state its size \(Content-Length: '{told[:80]}'\)",
+        ),
     ):
         RemoteObject(f"{url}/x.tar").size()
 
@@ -531,12 +507,12 @@ def test_a_content_range_that_is_none_is_named(told, status):
 @pytest.mark.parametrize(
     ("location", "message"),
     [
-        (None, "the server answers 302 and redirects without a location"),
-        ("http://[::1", r"redirects to 'http://\[::1', which is not a URL of a web server"),
-        ("file:///etc/passwd", "redirects to 'file:///etc/passwd', which is not a URL"),
-        ("ftp://me:word@h/x", "redirects to 'ftp://h/x', which is not a URL of a web server"),
-        ("http://h:99999/", "redirects to 'http://h:99999/', which is not a URL of a web server"),
-        ("http://a..b/", "is redirected to http://a..b/, which is not a valid URL"),
+        (None, "the server answers 302"),
+        ("http://[::1", "not a valid URL: correct it, or the redirect"),
+        ("file:///etc/passwd", "not a valid URL: correct it, or the redirect"),
+        ("ftp://me:word@h/x", "not a valid URL: correct it, or the redirect"),
+        ("http://h:99999/", "not a valid URL: correct it, or the redirect"),
+        ("http://a..b/", "not a valid URL: correct it, or the redirect"),
     ],
 )
 def test_a_redirect_to_no_place_is_named(served, location, message):
@@ -545,28 +521,6 @@ def test_a_redirect_to_no_place_is_named(served, location, message):
 
     with pytest.raises(StorageError, match=rf"x.tar : .*{message}"):
         read_range(f"{served.url}/x.tar", 5, 9)
-
-
-@pytest.mark.parametrize(
-    ("url", "there", "message"),
-    [
-        ("https://8.8.8.8/x", "http://8.8.8.8/x", "redirects from https to http://8.8.8.8/x,"),
-        ("https://8.8.8.8/x", "https://127.0.0.1/y", "inside this machine's own network"),
-        ("http://8.8.8.8/x", "http://[::ffff:10.0.0.1]/y", "inside this machine's own network"),
-        ("http://8.8.8.8/x", "http://169.254.169.254/", "inside this machine's own network"),
-        ("http://8.8.8.8/x", "http://localhost:80/", "inside this machine's own network"),
-    ],
-)
-def test_a_redirect_into_the_own_network_or_without_tls_is_refused(
-    monkeypatch, url, there, message
-):
-    def moved(*_, **how):
-        return urllib3.HTTPResponse(status=302, headers={"Location": there})
-
-    monkeypatch.setattr(urllib3.PoolManager, "request", moved)
-
-    with pytest.raises(StorageError, match=message):
-        read_range(url, 0, 9)
 
 
 def test_a_login_is_not_sent_on_to_another_server(served, tmp_path):

@@ -1,12 +1,9 @@
 """Ranges from real servers of each kind: nginx, an S3 endpoint, and a Hub for its own client."""
 
-import io
 import os
 import sys
-import threading
 from pathlib import Path
 from types import SimpleNamespace
-from typing import ClassVar
 
 import fsspec
 import pytest
@@ -17,7 +14,7 @@ from stereogenbench_data.sources.remote import RemoteObject
 from tests.servers.fixtures import BUCKET
 from tests.servers.hub import COMMIT, REPOSITORY
 from tests.servers.tools import require_module
-from tests.sources.policies import retry_policy
+from tests.sources.policies import Waits, retry_policy
 from tests.sources.source_kit import read_range, size_of
 
 
@@ -137,59 +134,21 @@ def test_an_object_of_a_store_that_is_replaced_between_two_ranges_is_reported(s3
     store.close()
 
 
-def test_a_file_system_that_does_not_come_back_is_left(monkeypatch):
-    files = fsspec.filesystem("memory")
-    files.pipe_file("/shard.tar", b"0123456789")
-    done = threading.Event()
-    monkeypatch.setattr(files, "open", lambda *args, **how: done.wait())
-    remote = RemoteObject("memory://shard.tar", retry=retry_policy(longest_read_s=0.2))
-
-    with pytest.raises(StorageError, match=r"a read may take 0.2 s; 1 try\)"):
-        remote.read(0, 9)
-    done.set()
-    files.rm("/shard.tar")
-
-
-def test_a_file_that_a_file_system_tells_otherwise_is_reported_as_replaced(monkeypatch):
-    files = fsspec.filesystem("memory")
-    files.pipe_file("/shard.tar", b"0123456789")
-    tags = iter("aab")
-
-    class Tagged(io.BytesIO):
-        details: ClassVar = {}
-
-    def opened(path, *args, **how):
-        file = Tagged(b"0123456789")
-        file.details = {"ETag": next(tags), "size": 10}
-        return file
-
-    monkeypatch.setattr(files, "open", opened)
-    remote = RemoteObject("memory://shard.tar", retry=retry_policy(attempts=1))
-
-    assert remote.read(0, 3) + remote.read(3, 6) == b"012345"
-    with pytest.raises(ShardError, match=r"was replaced in its store .*: its ETag was a and is b"):
-        remote.read(6, 9)
-    files.rm("/shard.tar")
-
-
 def test_a_file_system_that_fails_is_requested_again(monkeypatch):
-    waits_s: list[float] = []
+    waits = Waits()
     files = fsspec.filesystem("memory")
     files.pipe_file("/shard.tar", b"0123456789")
     failures = [OSError("connection reset"), TimeoutError()]
 
-    def opened(*args, **how):
+    def fetched(*args, **how):
         if failures:
             raise failures.pop()
-        return type(files).open(files, *args, **how)
+        return type(files).cat_file(files, *args, **how)
 
-    monkeypatch.setattr(files, "open", opened)
-    remote = RemoteObject(
-        "memory://shard.tar", retry=retry_policy(sleep=waits_s.append, chance=lambda: 0.0)
-    )
+    monkeypatch.setattr(files, "cat_file", fetched)
 
-    assert remote.read(2, 6) == b"2345"
-    assert waits_s == [0.02, 0.04]
+    assert RemoteObject("memory://shard.tar").read(2, 6, cancellation=waits) == b"2345"
+    assert len(waits.seconds) == 2
     files.rm("/shard.tar")
 
 
@@ -202,18 +161,17 @@ def test_a_wait_that_a_store_asks_for_holds_for_all_its_objects(monkeypatch):
 
     failures = [BusyError()]
 
-    def opened(*args, **how):
+    def fetched(*args, **how):
         if failures:
             raise failures.pop()
-        return type(files).open(files, *args, **how)
+        return type(files).cat_file(files, *args, **how)
 
-    monkeypatch.setattr(files, "open", opened)
+    monkeypatch.setattr(files, "cat_file", fetched)
     for _ in range(2):
-        waits_s: list[float] = []
-        retry = retry_policy(sleep=waits_s.append, chance=lambda: 0.0)
-        remote = RemoteObject("memory://busy/shard.tar", retry=retry)
-        assert remote.read(2, 6) == b"2345"
-        assert waits_s == [pytest.approx(2.0, abs=1.1)]
+        waits = Waits()
+        remote = RemoteObject("memory://busy/shard.tar")
+        assert remote.read(2, 6, cancellation=waits) == b"2345"
+        assert waits.seconds == [pytest.approx(2.0, abs=1.1)]
     files.rm("/busy", recursive=True)
 
 

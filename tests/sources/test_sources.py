@@ -12,12 +12,12 @@ from tests.sources.source_kit import BASELINE_JSON, SourceTests, read_range
 
 class TestReleasedFolder(SourceTests):
     @pytest.fixture
-    def root(self, small_release):
-        return small_release
+    def root(self, indexed_release):
+        return indexed_release
 
     @pytest.fixture
-    def index(self, small_release):
-        return SceneIndex.open(small_release)
+    def index(self, indexed_release):
+        return SceneIndex.open(indexed_release)
 
     # The files of a released folder have no checksums in its index.
     test_bytes_that_are_not_those_of_the_index_are_an_error = None

@@ -37,7 +37,7 @@ from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.sources.location import is_remote, joined, local_path
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.transport import MissingObject
+from stereogenbench_data.sources.retry import MissingObject
 
 DEFAULT_FRAMES: Final = 5
 _FORMAT: Final = 3

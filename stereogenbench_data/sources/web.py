@@ -1,0 +1,479 @@
+"""Ranges over http and https, with urllib3; every response is checked to be the part requested.
+
+Each process has a pool of connections of its own. urllib3 follows redirects, and the address that
+one led to is used again until it is refused, as a signed URL is that has expired.
+
+Errors do not chain urllib3's own, whose messages hold the whole URL with its secrets.
+"""
+
+import atexit
+import http.client
+import io
+import logging
+import os
+import re
+import socket
+import time
+from collections.abc import Generator, Mapping
+from contextlib import nullcontext
+from contextvars import ContextVar
+from typing import Any, Final, NamedTuple
+from urllib.parse import unquote, urljoin, urlunsplit
+from urllib.request import getproxies, proxy_bypass
+
+import urllib3
+import urllib3.connection
+from urllib3.exceptions import HTTPError, MaxRetryError, ResponseError
+
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.sources.location import shown, split_url
+from stereogenbench_data.sources.retry import (
+    CHUNK_BYTES,
+    MISSING,
+    PASSING,
+    ProcessLock,
+    TransientError,
+    replaced,
+    require_expected_size,
+    retry_after_s,
+)
+
+_MOST_CONNECTIONS: Final = 64
+"""Connections to one server that a process keeps for later requests."""
+
+_MOST_REDIRECTS: Final = 5
+_REDIRECTS_ONLY: Final = urllib3.Retry(
+    total=None,
+    connect=False,
+    read=False,
+    redirect=_MOST_REDIRECTS,
+    respect_retry_after_header=False,
+)
+"""What is left to urllib3: other failures are counted per read, by `retry.Attempts`."""
+
+_WITH_CONTENT: Final = (200, 206, 416)
+
+_FETCH: Final = "or fetch the data and pass the folder"
+_CURES: Final = {
+    401: f"It asks for a login: use hf:// or s3://, which know yours, {_FETCH}.",
+    403: f"It may not be read with what the URL says: check access, {_FETCH}.",
+    404: MISSING,
+    410: MISSING,
+}
+_NUMBER: Final = re.compile(r"[0-9]{1,18}")
+_PART: Final = re.compile(r"bytes (?:([0-9]{1,18})-([0-9]{1,18})|\*)/([0-9]{1,18}|\*)")
+_STRONG_TAG: Final = re.compile(r'"[!#-~]{0,256}"')
+_RATE_LIMIT: Final = re.compile(r";r=0;t=([0-9]{1,6})(?:[;,]|$)")
+
+_pools: Final[dict[tuple[int, str], urllib3.PoolManager]] = {}
+"""Connections by process and proxy: those of the process that forked this one stay its own."""
+
+
+class _Limit:
+    """Until when a server may keep a request waiting."""
+
+    def __init__(self, timeout_s: float) -> None:
+        self.timeout_s = timeout_s
+        self.renew()
+
+    def renew(self) -> None:
+        self._until_s = time.monotonic() + self.timeout_s
+
+    def left_s(self) -> float:
+        left_s = self._until_s - time.monotonic()
+        if left_s <= 0:
+            raise TimeoutError(f"no answer within {self.timeout_s:g} s")
+        return left_s
+
+
+_limit: Final[ContextVar[_Limit | None]] = ContextVar("_limit", default=None)
+"""The limit of the request that this thread makes."""
+
+
+class _LimitedStream(io.RawIOBase):
+    """The bytes of a connection; all waits for them together end at the limit, also of trickles.
+
+    urllib3 limits each wait alone.
+    """
+
+    def __init__(self, stream: io.RawIOBase, connection: socket.socket, limit: _Limit) -> None:
+        super().__init__()
+        self._stream, self._connection, self._limit = stream, connection, limit
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any, /) -> int | None:
+        self._connection.settimeout(self._limit.left_s())
+        return self._stream.readinto(buffer)
+
+    def close(self) -> None:
+        self._stream.close()
+        super().close()
+
+
+class _LimitedResponse(http.client.HTTPResponse):
+    def __init__(self, sock: socket.socket, *args: Any, **how: Any) -> None:
+        super().__init__(sock, *args, **how)
+        limit = _limit.get()
+        if limit is not None:
+            self.fp = io.BufferedReader(_LimitedStream(self.fp.detach(), sock, limit))
+
+
+class _Pool(urllib3.HTTPConnectionPool):
+    class ConnectionCls(urllib3.connection.HTTPConnection):
+        response_class = _LimitedResponse
+
+
+class _SecurePool(urllib3.HTTPSConnectionPool):
+    class ConnectionCls(urllib3.connection.HTTPSConnection):
+        response_class = _LimitedResponse
+
+
+class _Version(NamedTuple):
+    """What a server states of an object that changes with its content; "" if it sends none."""
+
+    etag: str
+    modified: str
+    size: str
+
+    def changes(self, now: "_Version") -> str:
+        """Return how another response differs, "" if the object is the same."""
+        compared = [("ETag", self.etag, now.etag), ("size", self.size, now.size)]
+        if not (self.etag and now.etag):
+            compared.insert(1, ("Last-Modified", self.modified, now.modified))
+        return ", ".join(
+            f"its {name} was {then[:80]} and is {here[:80]}"
+            for name, then, here in compared
+            if then and here and then.removeprefix("W/") != here.removeprefix("W/")
+        )
+
+
+class _Stated(NamedTuple):
+    """The first and last byte of a response, and the object's size; -1 where it does not say."""
+
+    first: int
+    last: int
+    size: int
+
+
+class WebTransport:
+    """One object of a web server."""
+
+    longest_whole_bytes = 0
+    """The size up to which a whole object is accepted where a part was requested."""
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        expected_size: int | None = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> None:
+        """Name an object; user and password of its URL are sent as a login, and never shown.
+
+        Args:
+            url: Where it is.
+            expected_size: The size in bytes that the index records; None if it is not known.
+            headers: Further headers. "authorization" goes to the URL's own server alone.
+
+        Raises:
+            StorageError: If it is not a URL.
+        """
+        parts = split_url(url)
+        login, _, self.server = parts.netloc.rpartition("@")
+        self._where = shown(url)
+        self._url = urlunsplit(parts._replace(netloc=self.server, fragment=""))
+        self._expected_size = expected_size
+        self._headers = {"Accept-Encoding": "identity", **(headers or {})}
+        if login:
+            self._headers |= urllib3.make_headers(basic_auth=unquote(login))
+        self._first_seen: dict[str, _Version] = {}
+        self._is_versioned = True
+        self._address = ""  # where the URL leads to, as far as it is known
+        self._is_redirected = False
+        self._resolving = ProcessLock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for a copy in another process, without signed URLs."""
+        return self.__dict__ | {"_address": ""}
+
+    def size(self, timeout_s: float) -> int:
+        """Return how many bytes the object has, as the response for its first byte states."""
+        response, stated = self._get(0, 1, _Limit(timeout_s))
+        response.close()
+        self._require_size_stated(response, stated)
+        return stated.size
+
+    def head(self, timeout_s: float) -> urllib3.BaseHTTPResponse:
+        """Return the response of the URL itself for the first byte, which may be a redirect."""
+        part = {"Range": "bytes=0-0"}
+        response = self._ask(self._url, part, _Limit(timeout_s), follow=False)
+        response.close()
+        return response
+
+    def entries(self, timeout_s: float) -> dict[str, int | None]:
+        """Refuse to list a folder: plain web servers have no listings."""
+        raise StorageError(
+            f"{self._where}: a web server does not list its folders. Pass a folder with an "
+            f"index.parquet, or an index and this URL as its root."
+        )
+
+    def part(self, start: int, stop: int, timeout_s: float) -> Generator[bytes, None, None]:
+        """Yield the bytes from start to stop, or the first of them."""
+        limit = _Limit(timeout_s)
+        response, stated = self._get(start, stop, limit)
+        try:
+            self._require_part(response, stated, start, stop)
+            skipped, wanted = start - stated.first, stop - start
+            limit.renew()
+            while data := response.read1(CHUNK_BYTES):
+                piece = data[skipped:][:wanted]
+                skipped -= min(skipped, len(data))
+                wanted -= len(piece)
+                if piece:
+                    yield piece
+                    limit.renew()
+                if response.status == 200 and not wanted:
+                    return
+        except HTTPError as error:
+            raise TransientError(_reason(error)) from None
+        finally:
+            # A response that was read to its end is back in the pool, and is not closed.
+            response.close()
+
+    def _get(
+        self, start: int, stop: int, limit: _Limit
+    ) -> tuple[urllib3.BaseHTTPResponse, _Stated]:
+        """Return a response that has content of the object that was read before."""
+        part = {"Range": f"bytes={start}-{stop - 1}"}
+        response = self._ask_address(part, limit)
+        if response is None:
+            # One thread is redirected, and the others use the address that it found.
+            with self._resolving.held(limit.timeout_s) if self._is_redirected else nullcontext():
+                response = self._ask_address(part, limit)
+                if response is None:
+                    response = self._ask(self._url, part, limit)
+        try:
+            if response.status not in _WITH_CONTENT:
+                raise self.refusal(response)
+            stated = self._stated(response)
+            if response.status != 416:
+                self._require_same(response, stated)
+            if self._expected_size is not None:
+                self._require_size_stated(response, stated)
+                require_expected_size(stated.size, expected=self._expected_size, where=self._where)
+        except (StorageError, TransientError):
+            _use_up(response)
+            raise
+        return response, stated
+
+    def _ask_address(
+        self, part: Mapping[str, str], limit: _Limit
+    ) -> urllib3.BaseHTTPResponse | None:
+        """Return a response from where the URL led to; None if that is not known or refuses."""
+        address = self._address
+        if not address:
+            return None
+        try:
+            response = self._ask(address, part, limit)
+        except TransientError:
+            self._address = ""  # its server may be gone; another one may not
+            raise
+        if response.status in _WITH_CONTENT or response.status in PASSING:
+            return response
+        _use_up(response)
+        if self._address == address:
+            self._address = ""
+        return None
+
+    def _ask(
+        self, url: str, headers: Mapping[str, str], limit: _Limit, *, follow: bool = True
+    ) -> urllib3.BaseHTTPResponse:
+        """Return a server's response, of which nothing but the head is read yet."""
+        sent = {**self._headers, **headers, **self._condition()}
+        if _origin(url) != _origin(self._url):
+            sent = {name: sent[name] for name in sent if name.lower() != "authorization"}
+        limit.renew()
+        token = _limit.set(limit)
+        try:
+            response = _pool(url).request(
+                "GET", url,
+                headers=sent,
+                timeout=limit.timeout_s,
+                retries=_REDIRECTS_ONLY,
+                redirect=follow,
+                preload_content=False,
+            )  # fmt: skip
+        except (ValueError, UnicodeError):
+            raise self._error(
+                "not a valid URL: correct it, or the redirect of its server."
+            ) from None
+        except HTTPError as error:
+            if isinstance(error, MaxRetryError) and isinstance(error.reason, ResponseError):
+                raise self._error(
+                    f"is redirected more than {_MOST_REDIRECTS} times: check the URL."
+                ) from None
+            raise TransientError(_reason(error)) from None
+        finally:
+            _limit.reset(token)
+        hops = response.retries.history if response.retries is not None else ()
+        for hop in hops:
+            url = urljoin(url, hop.redirect_location or "")
+        if self._url.startswith("https://") and not url.startswith("https://"):
+            response.close()
+            raise self._error(
+                f"redirects from https to {shown(url)[:200]}, which is not encrypted. Check the "
+                f"URL and the server, {_FETCH}."
+            )
+        if hops:
+            self._address, self._is_redirected = url, True
+        return response
+
+    def _condition(self) -> dict[str, str]:
+        """Return the header that asks for a part only if the object is unchanged."""
+        seen = self._first_seen.get("version")
+        if self._is_versioned and seen is not None and _STRONG_TAG.fullmatch(seen.etag):
+            return {"If-Range": seen.etag}
+        return {}
+
+    def _require_same(self, response: urllib3.BaseHTTPResponse, stated: _Stated) -> None:
+        """Refuse a response of an object that was replaced since the first read."""
+        now = _Version(
+            etag=response.headers.get("ETag", "").strip() if self._is_versioned else "",
+            modified=response.headers.get("Last-Modified", "") if self._is_versioned else "",
+            size="" if stated.size < 0 else str(stated.size),
+        )
+        changes = self._first_seen.setdefault("version", now).changes(now)
+        if changes:
+            raise replaced(self._where, "on its server", changes)
+
+    def refusal(self, response: urllib3.BaseHTTPResponse) -> Exception:
+        """Return the error of a response without content."""
+        reason = re.sub(r"[^ -~]", "?", response.reason or "")[:60]
+        answer = f"the server answers {response.status} {reason}".rstrip()
+        if response.status in PASSING:
+            limit = _RATE_LIMIT.search(response.headers.get("RateLimit", "")[:200])
+            if response.status == 429 and limit is not None:
+                return TransientError(answer, wait_s=float(limit[1]) + 1)  # the Hub rounds it
+            wait_s = retry_after_s(response.headers.get("Retry-After", ""))
+            return TransientError(answer, wait_s=wait_s)
+        cure = _CURES.get(response.status, f"Check the URL and the server, {_FETCH}.")
+        return self._error(f"{answer}. {cure}")
+
+    def _error(self, what: str) -> StorageError:
+        return StorageError(f"{self._where}: {what}")
+
+    def _require_part(
+        self, response: urllib3.BaseHTTPResponse, stated: _Stated, start: int, stop: int
+    ) -> None:
+        """Refuse a response that is neither the requested part, nor its beginning, nor all."""
+        first, last, size = stated
+        asked = f"asked for bytes {start} to {stop - 1}"
+        if response.status == 200:
+            if (start, stop) != (0, size) and not stop <= size <= self.longest_whole_bytes:
+                raise self._error(
+                    f"the server sends the whole file ({size if size >= 0 else 'unknown'} bytes) "
+                    f"when {asked}. Members are read in parts: use a server that honours ranges, "
+                    f"as nginx does, {_FETCH}."
+                )
+        elif first < 0 or response.status == 416:
+            raise self._error(
+                f"has {size} bytes, and byte {stop - 1} is asked for. It was cut short or "
+                f"replaced: use the index that was made with it."
+            )
+        elif first != start or not start <= last < stop:
+            raise self._error(
+                f"the server sends bytes {first} to {last} when {asked}. It does not honour "
+                f"ranges: use another, {_FETCH}."
+            )
+
+    def _stated(self, response: urllib3.BaseHTTPResponse) -> _Stated:
+        """Return what a response states of its part and the object.
+
+        Raises:
+            StorageError: If a part is sent and it does not say which.
+        """
+        if response.status == 200:
+            length = response.headers.get("Content-Length", "")
+            size = int(length) if _NUMBER.fullmatch(length) else -1
+            return _Stated(0, size - 1, size)
+        told = response.headers.get("Content-Range", "")
+        found = _PART.fullmatch(told)
+        if found is None:
+            raise self._error(
+                f"the server answers {response.status} and does not state which part it sends "
+                f"(Content-Range: {told[:80]!r}): use another, {_FETCH}."
+            )
+        return _Stated(*(int(each) if each and each != "*" else -1 for each in found.groups()))
+
+    def _require_size_stated(self, response: urllib3.BaseHTTPResponse, stated: _Stated) -> None:
+        if stated.size < 0:
+            header = "Content-Length" if response.status == 200 else "Content-Range"
+            told = response.headers.get(header, "")[:80]
+            raise self._error(
+                f"its server does not state its size ({header}: {told!r}): fetch the data and pass "
+                f"the folder."
+            )
+
+
+def _pool(url: str) -> urllib3.PoolManager:
+    """Return the connections of this process, through the machine's proxy where it has one."""
+    parts = split_url(url)
+    proxy = "" if proxy_bypass(parts.netloc) else getproxies().get(parts.scheme, "")
+    key = (os.getpid(), proxy)
+    if key not in _pools:
+        pool = (
+            urllib3.ProxyManager(proxy, maxsize=_MOST_CONNECTIONS)
+            if proxy
+            else urllib3.PoolManager(maxsize=_MOST_CONNECTIONS)
+        )
+        pool.pool_classes_by_scheme = {"http": _Pool, "https": _SecurePool}
+        _pools.setdefault(key, pool)
+    return _pools[key]
+
+
+@atexit.register
+def close_connections() -> None:
+    """Close the connections of this process; reading opens new ones."""
+    for key in [key for key in _pools if key[0] == os.getpid()]:
+        _pools.pop(key).clear()
+
+
+def _origin(url: str) -> tuple[str, str]:
+    parts = split_url(url)
+    return parts.scheme, parts.netloc
+
+
+def _use_up(response: urllib3.BaseHTTPResponse) -> None:
+    """Finish a response whose content is not needed; its connection is kept if that is short."""
+    length = response.headers.get("Content-Length", "")
+    if _NUMBER.fullmatch(length) and int(length) <= CHUNK_BYTES:
+        response.drain_conn()
+    response.close()
+
+
+def _reason(error: BaseException) -> str:
+    """Return what happened, without the URL that urllib3's messages hold."""
+    reason = getattr(error, "reason", None)
+    inner = reason if isinstance(reason, BaseException) else error
+    cause = inner.__cause__ or inner.__context__
+    if isinstance(cause, OSError) and cause.strerror:
+        return f"{type(inner).__name__}: {cause.strerror}"
+    return type(inner).__name__
+
+
+class _WithoutQueries(logging.Filter):
+    """Removes the queries of requested URLs, which may be signed, from what urllib3 logs."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Keep every record, changed where it is of a request of this module."""
+        if _limit.get() is not None and isinstance(record.args, tuple):
+            record.args = tuple(
+                each.partition("?")[0] if isinstance(each, str) else each for each in record.args
+            )
+        return True
+
+
+for _name in ("connectionpool", "poolmanager", "util.retry"):
+    logging.getLogger(f"urllib3.{_name}").addFilter(_WithoutQueries())
