@@ -529,7 +529,7 @@ def _pasted(
 
 def encoding_line(encoding: DepthEncoding) -> str:
     """Return the Python expression of a contract, without defaults."""
-    default = replace(encoding, unit_m=None, kind="planar", form="depth", frame_lag=0)
+    default = DepthEncoding(source=encoding.source)
     arguments = [
         f"{field.name}={getattr(encoding, field.name)!r}"
         for field in fields(encoding)
