@@ -33,6 +33,7 @@ from stereogenbench_data.media.clock import MOST_EXTRA_FRAMES
 from stereogenbench_data.media.container import StreamFacts, depth_coding
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
+    grey_format,
     measured,
     open_depth,
     read_depth_units,
@@ -652,6 +653,9 @@ def derived_scene(scene: Scene, document: TrainingDocument) -> Scene:
             recorded_size_px=document.source_size_px,
         ),
         depth_codec=(CODEC_NAME,) * CAMERA_COUNT if is_packed else scene.depth_codec,
+        depth_pixel_format=tuple(map(grey_format, scene.depth_pixel_format))
+        if is_packed
+        else scene.depth_pixel_format,
         key_frames=document.key_frames,
         training=document.facts,
     )

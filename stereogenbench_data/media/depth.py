@@ -143,6 +143,18 @@ def _dtype(bits: str | None, order: str | None) -> str:
     return "u1" if bits is None else ">u2" if order == "be" else "<u2"
 
 
+def grey_format(pixel_format: str) -> str:
+    """Return the pixel format of one grey plane that holds the numbers of a depth stream.
+
+    >>> grey_format("gray12be"), grey_format("yuv420p10le"), grey_format("bgr0")
+    ('gray12be', 'gray10le', 'gray16le')
+    """
+    layout = _layout(pixel_format)
+    if layout is None or not (layout.channels or layout.has_chroma):
+        return pixel_format
+    return "gray" if layout.bits == 8 else f"gray{layout.bits}le"
+
+
 def require_depth_stream(
     *, codec: str, pixel_format: str, encoding: DepthEncoding, name: str
 ) -> DepthLayout:
@@ -233,7 +245,7 @@ def read_depth_units(
     if isinstance(reader, DepthFrames):
         return reader.units(index)
     if layout.channels:
-        units = _units_of_channels(reader, index, layout, encoding=encoding)
+        units = _units_of_channels(reader, index, layout)
     else:
         numbers = plane_numbers(reader.frame(index), 0, dtype=layout.dtype)
         units = numbers.astype(np.uint16, copy=False)
@@ -242,17 +254,15 @@ def read_depth_units(
 
 
 def _units_of_channels(
-    reader: VideoReader, index: int, layout: DepthLayout, *, encoding: DepthEncoding
+    reader: VideoReader, index: int, layout: DepthLayout
 ) -> UInt16[np.ndarray, "h w"]:
     """Return depth of three equal channels, or of its high and low byte in two of them.
 
     Which byte is high is decided by the video's first frame, so that all frames are read alike.
     """
-    order: tuple[int, ...] | None = None
+    red, green, blue = channels = _channels(reader, index, layout)
     if layout.is_bytes:
         order = _byte_order(_channels(reader, 0, layout), name=reader.name)
-    red, green, blue = channels = _channels(reader, index, layout)
-    if order:
         (other,) = {0, 1, 2}.difference(order)
         if not _is_flat(channels[other]):
             raise _not_numbers(reader.name, f"frame {index} has a third channel with numbers")
@@ -260,12 +270,6 @@ def _units_of_channels(
         return high << 8 | low
     if not (np.array_equal(red, green) and np.array_equal(green, blue)):
         raise _not_numbers(reader.name, f"frame {index} has different numbers in its channels")
-    if layout.is_bytes and "8-bit" not in encoding.accept:
-        raise MediaError(
-            f"{reader.name}: depth is stored as {reader.facts.pixel_format} with equal channels of "
-            f"8 bits, which do not keep depth whole: if this is intended, pass "
-            f"DepthEncoding(accept=frozenset({{'8-bit'}}), unit_m=...), by command --accept 8-bit."
-        )
     return red.astype(np.uint16)
 
 
@@ -282,10 +286,8 @@ def _channels(
     )
 
 
-def _byte_order(
-    channels: tuple[Shaped[np.ndarray, "h w"], ...], *, name: str
-) -> tuple[int, int] | None:
-    """Return the places of the high and the low byte, None where all channels are equal.
+def _byte_order(channels: tuple[Shaped[np.ndarray, "h w"], ...], *, name: str) -> tuple[int, int]:
+    """Return the places of the high and the low byte.
 
     Neighbouring pixels have nearly the same depth: with the bytes in their right order, numbers
     differ far less from pixel to pixel than in the other order.
@@ -293,11 +295,9 @@ def _byte_order(
     Raises:
         MediaError: If the channels are colours, or the order cannot be told.
     """
-    if all(np.array_equal(channels[0], other) for other in channels[1:]):
-        return None
     busy = [place for place, channel in enumerate(channels) if not _is_flat(channel)]
     if len(busy) > 2:
-        raise _not_numbers(name, "all three of its channels differ")
+        raise _not_numbers(name, "all three of its channels of 8 bits have numbers")
     if len(busy) < 2:
         raise _not_numbers(name, "only one of its channels has numbers, a high or a low byte")
     first, second = busy

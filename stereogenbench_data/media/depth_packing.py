@@ -26,6 +26,7 @@ from stereogenbench_data.media.container import (
 )
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
+    grey_format,
     open_depth,
     read_depth_units,
     require_depth_stream,
@@ -67,7 +68,8 @@ def packed_depth(
         frames: How many frames it must have.
         size: (height, width) to take the nearest pixels of, as `resized_nearest` does; None for
             the stored size.
-        encoding: With a size, what streams are accepted (``accept``).
+        encoding: With a size, what streams are accepted (``accept``); those of any bits always
+            are, as their numbers are kept.
         after_frame: Called after each frame.
 
     Raises:
@@ -78,8 +80,10 @@ def packed_depth(
     chunks, pts = [], []
     with open_depth(video, name=name, frames=frames) as reader:
         facts = reader.facts
-        accepted = _ANY_BITS if size is None else encoding or DepthEncoding()
-        pixel_format = _packed_format(reader, accepted, is_resized=size is not None)
+        accepted = _ANY_BITS
+        if size is not None and encoding is not None:
+            accepted = replace(_ANY_BITS, accept=_ANY_BITS.accept | encoding.accept)
+        _require_packable(reader, accepted, is_resized=size is not None)
         time_base = Fraction(1)
         for index in range(frames):
             units = read_depth_units(reader, index, encoding=accepted)
@@ -104,7 +108,13 @@ def packed_depth(
         packed_before = reader.clip if isinstance(reader, DepthFrames) else None
     clip = packed_before or _clip_of(video, facts, name=name, pts=tuple(pts), time_base=time_base)
     if size is not None:
-        clip = replace(clip, width_px=size[1], height_px=size[0], pixel_format=pixel_format)
+        clip = replace(
+            clip,
+            width_px=size[1],
+            height_px=size[0],
+            codec="ffv1",
+            pixel_format=grey_format(facts.pixel_format),
+        )
     content = frame_file(clip, chunks)
     with DepthFrames(io.BytesIO(content), name=name, frames=frames) as packed:
         for index, chunk in enumerate(chunks):
@@ -113,14 +123,10 @@ def packed_depth(
     return content
 
 
-def _packed_format(
+def _require_packable(
     reader: VideoReader | DepthFrames, encoding: DepthEncoding, *, is_resized: bool
-) -> str:
-    """Return the pixel format of one grey plane that has a stream's numbers.
-
-    Raises:
-        MediaError: If the stream is refused, or could not be written again as it was.
-    """
+) -> None:
+    """Refuse a stream that the encoding does not accept, or that could not be written again."""
     facts = reader.facts
     layout = require_depth_stream(
         codec=depth_coding(facts),
@@ -133,7 +139,6 @@ def _packed_format(
             f"{reader.name}: its depth is stored by codec {facts.codec} as {facts.pixel_format}, "
             f"and blosc2 packs only FFV1 of one grey plane. Pack with --depth-codec released."
         )
-    return f"gray{layout.bits}le" if layout.channels else facts.pixel_format
 
 
 def _clip_of(
