@@ -15,7 +15,6 @@ import typer
 
 from stereogenbench_data.cli.data import open_data
 from stereogenbench_data.cli.help import RARE, SCENES
-from stereogenbench_data.schema.records import DepthRisk
 from stereogenbench_data.schema.release import (
     CAMERA_PAIRS,
     FAMILIES,
@@ -172,7 +171,9 @@ AcceptOption = Annotated[
         metavar="LOSS",
         help="Accept depth with a loss: 8-bit ... 14-bit, lossy, chroma. May be repeated.",
         rich_help_panel=RARE,
-        autocompletion=complete_from(get_args(DepthRisk)),
+        autocompletion=complete_from(
+            ("8-bit", "9-bit", "10-bit", "12-bit", "14-bit", "lossy", "chroma")
+        ),
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Report as JSON on stdout.")]
