@@ -283,12 +283,10 @@ def _begin(root: Path, settings: Mapping[str, Any]) -> None:
 def _export_scene(work: _SceneWork, advance: Advance) -> None:
     """Write the missing folders of one scene, each whole or not at all."""
     scene, selected = work.index.scene(0), work.selected
-    points, contract = selected.points, selected.depth or DepthEncoding()
-    encodings = dict.fromkeys(selected.cameras, contract)
-    for camera in selected.cameras:
-        source = scene.depth_unit_source[camera]
-        if source != "unreadable":
-            encodings[camera] = contract.with_file_unit(scene.depth_unit_m[camera], source=source)
+    points = selected.points
+    encodings = {
+        camera: scene.depth_encoding(camera, selected.depth) for camera in selected.cameras
+    }
     writers: dict[Layout, Callable[[Path], ViewWriter]] = {
         "colmap": lambda folder: ColmapWriter(folder, points=points, encodings=encodings),
         "transforms": lambda folder: TransformsWriter(folder, points=points),

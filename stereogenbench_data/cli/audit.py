@@ -12,6 +12,7 @@ from stereogenbench_data.cli.data import full_place
 from stereogenbench_data.cli.errors import FINDINGS, resumable
 from stereogenbench_data.cli.help import RARE
 from stereogenbench_data.cli.options import (
+    AcceptOption,
     DataOptions,
     JsonOption,
     OutOption,
@@ -58,17 +59,7 @@ def audit(  # noqa: PLR0913 - one parameter an option
         Literal["planar", "ray"],
         typer.Option(help="Depth along the axis or the ray.", rich_help_panel=RARE),
     ] = "planar",
-    accept: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="LOSS",
-            help="Accept depth with a loss: 8-bit ... 14-bit, lossy, chroma. May be repeated.",
-            rich_help_panel=RARE,
-            autocompletion=complete_from(
-                ("8-bit", "9-bit", "10-bit", "12-bit", "14-bit", "lossy", "chroma")
-            ),
-        ),
-    ] = None,
+    accept: AcceptOption = None,
     limit: Annotated[
         list[str] | None,
         typer.Option(

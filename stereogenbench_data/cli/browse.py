@@ -6,7 +6,13 @@ from typing import Annotated
 import typer
 
 from stereogenbench_data.cli.data import full_place
-from stereogenbench_data.cli.options import DataOptions, DepthUnitOption, depth_of, grouped
+from stereogenbench_data.cli.options import (
+    AcceptOption,
+    DataOptions,
+    DepthUnitOption,
+    depth_of,
+    grouped,
+)
 from stereogenbench_data.schema.text import counted
 
 
@@ -19,6 +25,7 @@ def browse(
         bool, typer.Option("--open/--no-open", help="Open the web browser.")
     ] = True,
     depth_unit_m: DepthUnitOption = None,
+    accept: AcceptOption = None,
 ) -> None:
     """Look through scenes in a local web page.
 
@@ -31,7 +38,8 @@ def browse(
     from stereogenbench_data.audit.browser.service import Service
     from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 
-    index, depth, shown_data = source.open(), depth_of(depth_unit_m), full_place(source.data)
+    depth = depth_of(depth_unit_m, accept)
+    index, shown_data = source.open(), full_place(source.data)
     reader = SceneReader(index, depth=depth)
     service = Service(Catalogue(index, shown_data=shown_data, depth=depth), reader)
     with PageServer(service, port=port) as server:

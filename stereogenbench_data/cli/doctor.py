@@ -10,6 +10,7 @@ import typer
 
 from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import (
+    AcceptOption,
     DataOptions,
     JsonOption,
     OutOption,
@@ -67,6 +68,7 @@ def doctor(  # noqa: PLR0913 - one parameter an option
         int,
         typer.Option(help="Picture t belongs to depth frame t + N.", rich_help_panel=_DECLARED),
     ] = 0,
+    accept: AcceptOption = None,
     out: OutOption = None,
     as_json: JsonOption = False,
     work: WorkOptions,
@@ -85,7 +87,8 @@ def doctor(  # noqa: PLR0913 - one parameter an option
 
     if out is not None:
         require_picture_file(out)
-    depth = DepthEncoding(unit_m=unit_m, kind=kind, form=form, frame_lag=frame_lag)
+    losses: Any = frozenset(accept or ())
+    depth = DepthEncoding(unit_m=unit_m, kind=kind, form=form, frame_lag=frame_lag, accept=losses)
     filters: Any = chosen.filters()
     index = source.open()
     with progress_bar("examining", unit="scenes") as progress:

@@ -13,6 +13,7 @@ import typer
 
 from stereogenbench_data.cli.errors import FINDINGS, resumable
 from stereogenbench_data.cli.options import (
+    AcceptOption,
     DataOptions,
     DepthUnitOption,
     JsonOption,
@@ -105,6 +106,7 @@ class ProtocolOptions:
         ),
     ] = "filtered"
     depth_unit_m: DepthUnitOption = None
+    accept: AcceptOption = None
     weights: Annotated[
         Path | None,
         typer.Option(
@@ -144,7 +146,7 @@ class ProtocolOptions:
             keypoint_matcher=self.keypoint_matcher,
             stereo_matcher=self.stereo_matcher,
             fit=fit,
-            depth=depth_of(self.depth_unit_m),
+            depth=depth_of(self.depth_unit_m, self.accept),
             models=ModelOptions(device=self.device, weights=self.weights, checkout=self.checkout),
         )
 
@@ -205,6 +207,7 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
     chosen: SampleSelectionOptions,
     size: SizeOption = PAPER_SIZE,
     depth_unit_m: DepthUnitOption = None,
+    accept: AcceptOption = None,
     work: WorkOptions,
 ) -> None:
     """Write what a method is given: left views, geometry, camera.
@@ -224,7 +227,7 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
             out,
             tier=tier,
             size=size_px,
-            depth=depth_of(depth_unit_m),
+            depth=depth_of(depth_unit_m, accept),
             **work.options(),
             progress=progress,
             **selection,

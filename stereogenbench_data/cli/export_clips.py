@@ -10,6 +10,7 @@ import typer
 
 from stereogenbench_data.cli.errors import resumable
 from stereogenbench_data.cli.options import (
+    AcceptOption,
     DataOptions,
     DepthUnitOption,
     JsonOption,
@@ -180,6 +181,7 @@ def export_clips(  # noqa: PLR0913 - one parameter an option
     chosen: ExportedPairOptions,
     clip: ClipOptions,
     depth_unit_m: DepthUnitOption = None,
+    accept: AcceptOption = None,
     workers: WorkersOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -201,7 +203,7 @@ def export_clips(  # noqa: PLR0913 - one parameter an option
             layout=layout,
             form=form,
             run=ExportRun(
-                depth=depth_of(depth_unit_m),
+                depth=depth_of(depth_unit_m, accept),
                 workers=workers,
                 progress=progress,
             ),

@@ -10,6 +10,7 @@ import typer
 from stereogenbench_data.cli.errors import resumable
 from stereogenbench_data.cli.help import SCENES
 from stereogenbench_data.cli.options import (
+    AcceptOption,
     DataOptions,
     DepthUnitOption,
     WorkersOption,
@@ -45,6 +46,7 @@ class ViewOptions(ExportedSceneOptions):
         ),
     ] = None
     depth_unit_m: DepthUnitOption = None
+    accept: AcceptOption = None
     workers: WorkersOption = None
 
     def selection(self) -> dict[str, Any]:
@@ -64,7 +66,7 @@ class ViewOptions(ExportedSceneOptions):
             "cameras": cameras,
             "frames": frames_option(self.frames),
             "size": None if self.size is None else parse_picture_size(self.size),
-            "depth": depth_of(self.depth_unit_m),
+            "depth": depth_of(self.depth_unit_m, self.accept),
             "workers": self.workers,
         }
 

@@ -8,7 +8,14 @@ from typing import Annotated, Any
 import typer
 
 from stereogenbench_data.cli.help import RARE, SCENES
-from stereogenbench_data.cli.options import DataOptions, JsonOption, grouped
+from stereogenbench_data.cli.options import (
+    AcceptOption,
+    DataOptions,
+    DepthUnitOption,
+    JsonOption,
+    depth_of,
+    grouped,
+)
 from stereogenbench_data.cli.samples import (
     SampleSelectionOptions,
     frames_option,
@@ -82,6 +89,8 @@ def forecast(  # noqa: PLR0913 - one parameter an option
     batch_size: Annotated[int, typer.Option(min=1, help="Samples of a batch.")] = 8,
     measure_s: Annotated[float, _of("How long to decode.", min=0.1, panel=RARE)] = 6.0,
     chosen: TrainedOptions,
+    depth_unit_m: DepthUnitOption = None,
+    accept: AcceptOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Forecast what will limit a training: processors, network, requests.
@@ -96,6 +105,7 @@ def forecast(  # noqa: PLR0913 - one parameter an option
         options["fields"] = [each.strip() for each in fields.split(",")]
     if size is not None:
         options["size"] = parse_picture_size(size)
+    options["depth"] = depth_of(depth_unit_m, accept)
     found = forecast_by(source.open(), batch_size=batch_size, measure_s=measure_s, **options)
     typer.echo(json.dumps(asdict(found), indent=1) if as_json else _table(found))
 

@@ -111,11 +111,16 @@ def pair_of(text: str, *, option: str) -> tuple[int, int]:
     return pair
 
 
-def depth_of(unit_m: float | None) -> "DepthEncoding | None":
-    """Return the depth contract of ``--depth-unit-m``; None without it: files state their own."""
+def depth_of(unit_m: float | None, accept: list[str] | None) -> "DepthEncoding | None":
+    """Return the depth contract of ``--depth-unit-m`` and ``--accept``, None without both.
+
+    Files state their own unit then.
+    """
     from stereogenbench_data.schema.records import DepthEncoding
 
-    return None if unit_m is None else DepthEncoding(unit_m=unit_m)
+    losses: Any = frozenset(accept or ())
+    contract = DepthEncoding(unit_m=unit_m, accept=losses)
+    return None if contract == DepthEncoding() else contract
 
 
 RootOption = Annotated[
@@ -157,6 +162,18 @@ DepthUnitOption = Annotated[
     typer.Option(
         help="Metres in a stored unit of depth [as files state].",
         rich_help_panel=RARE,
+    ),
+]
+AcceptOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--accept",
+        metavar="LOSS",
+        help="Accept depth with a loss: 8-bit ... 14-bit, lossy, chroma. May be repeated.",
+        rich_help_panel=RARE,
+        autocompletion=complete_from(
+            ("8-bit", "9-bit", "10-bit", "12-bit", "14-bit", "lossy", "chroma")
+        ),
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Report as JSON on stdout.")]

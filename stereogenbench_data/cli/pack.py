@@ -12,6 +12,7 @@ from stereogenbench_data.cli.data import open_index
 from stereogenbench_data.cli.errors import FINDINGS, resumable
 from stereogenbench_data.cli.help import RARE
 from stereogenbench_data.cli.options import (
+    AcceptOption,
     JsonOption,
     RootOption,
     SceneOptions,
@@ -73,6 +74,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
         str | None,
         typer.Option(help="Such as 0,1 [all that a scene has].", rich_help_panel=_TRAINING),
     ] = None,
+    accept: AcceptOption = None,
     dry_run: Annotated[
         bool,
         typer.Option(
@@ -113,7 +115,9 @@ def pack(  # noqa: PLR0913 - one parameter an option
             f"{part!r} is not a part: write I/N, such as 1/4.", param_hint="--part"
         )
     target_bytes = parse_bytes(shard_size)
-    training = _training(size, quality=quality, cameras=cameras, depth_codec=depth_codec)
+    training = _training(
+        size, quality=quality, cameras=cameras, depth_codec=depth_codec, accept=accept
+    )
     if dry_run and training is None:
         raise typer.BadParameter("estimates training shards: give --size.", param_hint="--dry-run")
     index = open_index(root, root=data_root)
@@ -160,15 +164,23 @@ def pack(  # noqa: PLR0913 - one parameter an option
 
 
 def _training(
-    size: str | None, *, quality: Any, cameras: str | None, depth_codec: str
+    size: str | None,
+    *,
+    quality: Any,
+    cameras: str | None,
+    depth_codec: str,
+    accept: list[str] | None,
 ) -> "TrainingSettings | None":
     """Return the settings of training shards; None without a size."""
     if size is None:
-        for option, value in (("--quality", quality), ("--cameras", cameras)):
-            if value is not None:
+        for option, value in (
+            ("--quality", quality), ("--cameras", cameras), ("--accept", accept),
+        ):  # fmt: skip
+            if value:
                 raise typer.BadParameter("is of training shards: give --size.", param_hint=option)
         return None
     from stereogenbench_data.cli.samples import parse_picture_size
+    from stereogenbench_data.schema.records import DepthEncoding
     from stereogenbench_data.shards.training import TrainingSettings
 
     if depth_codec != "released":
@@ -183,7 +195,10 @@ def _training(
                 f"{cameras!r}: write numbers from 0 to 5, such as 0,1", param_hint="--cameras"
             )
         numbers = tuple(sorted({int(part) for part in parts}))
-    return TrainingSettings(parse_picture_size(size), quality or "balanced", numbers)
+    losses: Any = frozenset(accept or ())
+    return TrainingSettings(
+        parse_picture_size(size), quality or "balanced", numbers, DepthEncoding(accept=losses)
+    )
 
 
 def _print_estimate(

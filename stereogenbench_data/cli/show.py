@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from stereogenbench_data.cli.options import (
+    AcceptOption,
     DataOptions,
     DepthUnitOption,
     complete_scene,
@@ -61,6 +62,7 @@ def show(  # noqa: PLR0913 - one parameter an option
         bool, typer.Option("--live", help="Open Rerun's viewer; write no file.")
     ] = False,
     depth_unit_m: DepthUnitOption = None,
+    accept: AcceptOption = None,
 ) -> None:
     """Draw one scene with the disparity of a pair.
 
@@ -75,7 +77,7 @@ def show(  # noqa: PLR0913 - one parameter an option
 
     cameras = None if pair is None else pair_of(pair, option="--pair")
     if rerun or live or (out is not None and out.suffix.lower() in _RECORDINGS):
-        shown: dict[str, Any] = {"pair": cameras, "depth": depth_of(depth_unit_m)}
+        shown: dict[str, Any] = {"pair": cameras, "depth": depth_of(depth_unit_m, accept)}
         _show_in_rerun(source, scene, out, width_px=size, is_live=live, **shown)
         return
     clip = clip or (out is not None and out.suffix.lower() in _CLIPS)
@@ -87,7 +89,7 @@ def show(  # noqa: PLR0913 - one parameter an option
     recorded = index.scene(row)
     key = recorded.id.key
     target = out or Path(key.replace("/", "_") + (".mp4" if clip else ".png"))
-    reader = SceneReader(index, depth=depth_of(depth_unit_m))
+    reader = SceneReader(index, depth=depth_of(depth_unit_m, accept))
     with writing(target):
         if clip:
             with progress_bar("drawing", unit="frames") as progress:

@@ -31,8 +31,8 @@ from stereogenbench_data.geometry.visibility import agrees_with_target, visible_
 from stereogenbench_data.geometry.warp import front_pixels
 
 DERIVE_FIELDS: Final = (
-    "image", "stored_depth", "depth_unit_m", "no_depth", "depth_kind", "depth_form", "rig",
-    "intrinsics", "baselines_m", "cams_from_cam", "camera",
+    "image", "stored_depth", "depth_unit_m", "depth_offset_m", "no_depth", "depth_kind",
+    "depth_form", "rig", "intrinsics", "baselines_m", "cams_from_cam", "camera",
 )  # fmt: skip
 """The fields of `SceneViews` that `derive` takes; ``image`` only for fields that show pictures."""
 
@@ -205,7 +205,8 @@ class _Contract(NamedTuple):
     Attributes:
         rig: "rectified" if disparity is the closed form, "posed" if points go through the poses.
         kind: "planar" or "ray" depth.
-        form: Whether a stored number is proportional to "depth" or to its "inverse".
+        form: Whether a stored number is proportional to "depth" or to its "inverse", or depth
+            begins at an offset ("ranged").
     """
 
     rig: str
@@ -279,6 +280,7 @@ class _Moments:
         units: Stored numbers, int32.
         measured: Where they mean a depth.
         unit_m: Metres in a stored unit.
+        offset_m: Depth in metres of the stored number 0.
         intrinsics: (b, 3, 3), of every view.
         baselines_m: (b, v, v), from the first view's camera to the second's, signed.
         cams_from_cam: (b, v, t, v, 4, 4), from the first view's camera's coordinates to those of
@@ -292,6 +294,7 @@ class _Moments:
     units: torch.Tensor
     measured: torch.Tensor
     unit_m: torch.Tensor
+    offset_m: torch.Tensor
     intrinsics: torch.Tensor
     baselines_m: torch.Tensor
     cams_from_cam: torch.Tensor
@@ -313,6 +316,7 @@ class _Moments:
             units=units,
             measured=units != _per_map(batch["no_depth"]),
             unit_m=batch["depth_unit_m"],
+            offset_m=batch["depth_offset_m"],
             intrinsics=batch["intrinsics"],
             baselines_m=batch["baselines_m"],
             cams_from_cam=motions,
@@ -323,9 +327,8 @@ class _Moments:
     def stored(self) -> torch.Tensor:
         """Stored numbers as `disparity_from_shifts` takes them."""
         stored = self.units.to(torch.float64)
-        return (
-            torch.where(stored == 0, torch.inf, stored) if self.contract.form == "depth" else stored
-        )
+        is_inverse = self.contract.form == "inverse"
+        return stored if is_inverse else torch.where(stored == 0, torch.inf, stored)
 
     @_once
     def seen_m(self) -> torch.Tensor:
@@ -338,6 +341,9 @@ class _Moments:
         units, unit_m = self.units.to(torch.float64), _per_map(self.unit_m)
         if self.contract.form == "depth":
             depth_m = (units * unit_m).to(torch.float32) * self.measured
+        elif self.contract.form == "ranged":
+            ranged_m = units * unit_m + _per_map(self.offset_m)
+            depth_m = ranged_m.to(torch.float32) * self.measured
         else:
             depth_m = torch.where(self.measured, (unit_m / units).to(torch.float32), 0.0)
         if self.contract.kind == "planar":
@@ -423,7 +429,7 @@ class _Direction:
             u_px = torch.arange(width_px, dtype=torch.float64, device=self.measured.device) + 0.5
             moved = torch.where(self.known, u_px - self.projection.u_px, 0.0)
             return moved.to(torch.float32)
-        if self._contract.kind == "ray":
+        if self._contract.kind == "ray" or self._contract.form == "ranged":
             depth_m = torch.where(self.depth_m > 0, self.depth_m, torch.inf).to(torch.float64)
             return (_per_map(self.shift_px_m) / depth_m).to(torch.float32)
         disparity = disparity_from_shifts(

@@ -436,6 +436,11 @@ def _require_numbers(table: pa.Table, members: Any, *, where: str) -> None:
         unknown = [pc.is_null(table.column(name)) for name in names]
         if any(pc.any(pc.not_equal(unknown[0], other)).as_py() for other in unknown[1:]):
             raise StorageError(f"{where}: {what}. {made_again(where)}")
+    offsets = one_array(table.column("depth_offset_m")).drop_null()
+    flat = as_numpy(offsets.flatten())
+    is_whole = (as_numpy(pc.list_value_length(offsets)) == CAMERA_COUNT).all()
+    if not (is_whole and np.isfinite(flat).all()):
+        raise _odd(where, "depth_offset_m", flat[:1].tolist(), "not metres for each camera")
     for name in ("psnr_db", "worst_psnr_db"):
         lists = one_array(table.column(name)).drop_null()
         flat = as_numpy(lists.flatten())
@@ -475,7 +480,7 @@ _KNOWN: Final = {
     "split": ("train", "eval"),
     "subset": ("seen_map", "unseen_map", None),
     "image_size_source": ("recorded", "default"),
-    "depth_unit_source": ("tag", "default", "unreadable"),
+    "depth_unit_source": ("tag", "metadata", "default", "unreadable"),
 }
 _OF_BYTES: Final = (0, 2**61)
 _ABOVE: Final = (sys.float_info.min, sys.float_info.max)

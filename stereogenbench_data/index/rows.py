@@ -91,6 +91,7 @@ _COLUMNS: Final[dict[str, tuple[pa.DataType, bool, tuple[str | int, ...]]]] = {
     "worst_psnr_db": (_list(_NUMBER), _NULLABLE, ("training", "worst_psnr_db")),
     "remarks": (_list(_REMARK), _NULLABLE, ("remarks",)),
     "pose_form": (_TEXT, _NULLABLE, ("pose_form",)),
+    "depth_offset_m": (_list(_NUMBER), _NULLABLE, ("depth_offset_m",)),
     "members": (_list(_MEMBER), _REQUIRED, ("members",)),
 }
 """Name of a column to its type, whether it may be null, and where `Scene` holds its value."""
@@ -102,7 +103,7 @@ TRAINING_COLUMNS: Final = tuple(
 
 ADDED: Final = (
     "key_frames", "recorded_width_px", "recorded_height_px", *TRAINING_COLUMNS, "remarks",
-    "pose_form",
+    "pose_form", "depth_offset_m",
 )  # fmt: skip
 """Columns that indexes of earlier versions lack: null means what these knew."""
 
@@ -131,6 +132,8 @@ def row_of(scene: Scene) -> dict[str, Any]:
         row[name] = list(value) if isinstance(value, tuple) else value
     if scene.key_frames == (0,):
         row["key_frames"] = None
+    if not any(scene.depth_offset_m):
+        row["depth_offset_m"] = None
     row["remarks"] = [asdict(remark) for remark in scene.remarks] or None
     row["members"] = [
         {"name": name, **asdict(member)} for name, member in sorted(scene.members.items())
@@ -157,6 +160,7 @@ def scene_of(row: Mapping[str, Any]) -> Scene:
 
     scene = values()
     scene["key_frames"] = scene["key_frames"] or (0,)
+    scene["depth_offset_m"] = scene["depth_offset_m"] or (0.0,) * CAMERA_COUNT
     scene["remarks"] = tuple(Remark(**each) for each in scene["remarks"] or ())
     scene["members"] = {
         item["name"]: Member(item["path"], item["offset"], item["size"], item["crc32"])

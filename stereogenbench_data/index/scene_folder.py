@@ -9,7 +9,8 @@ import hashlib
 import math
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
@@ -28,9 +29,11 @@ from stereogenbench_data.geometry.camera import recorded_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
 from stereogenbench_data.index.evidence import poses_as, understood_poses
-from stereogenbench_data.media.container import StreamFacts
+from stereogenbench_data.media.clock import MOST_EXTRA_FRAMES
+from stereogenbench_data.media.container import StreamFacts, depth_coding
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
+    grey_format,
     measured,
     open_depth,
     read_depth_units,
@@ -40,7 +43,14 @@ from stereogenbench_data.media.depth import (
 from stereogenbench_data.media.depth_frames import CODEC_NAME
 from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
 from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
-from stereogenbench_data.schema.document import MOST_LETTERS, brief, parse_text, require_text_size
+from stereogenbench_data.schema.depth_contract import Statement, stated_in_json
+from stereogenbench_data.schema.document import (
+    MOST_LETTERS,
+    brief,
+    parse_object,
+    parse_text,
+    require_text_size,
+)
 from stereogenbench_data.schema.parse import (
     parse_complete,
     parse_description,
@@ -71,7 +81,7 @@ from stereogenbench_data.schema.release import (
     VIDEO_FILES,
     depth_name,
 )
-from stereogenbench_data.schema.text import shortened
+from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.schema.training import TrainingDocument, parse_training
 from stereogenbench_data.sources.location import is_remote, joined
 from stereogenbench_data.sources.members import read_text_file
@@ -85,8 +95,6 @@ ValidDepth = Literal["skip", "sample"]
 _DESCRIPTIONS: Final = (DESCRIPTION_JSON, DESCRIPTION_TXT)
 _DEPTHS: Final = frozenset(name for name in VIDEO_FILES if name.endswith("_depth.mkv"))
 _LONGEST_REMARK: Final = 2000
-_MOST_FRAMES_APART: Final = 2
-"""How many frames the streams of a scene may differ by; more is a video that was cut short."""
 _NO_DEPTH: Final = StreamFacts(CODEC_NAME, "gray16le", 0, 0, 0, 0.0, {})
 """What the index says of depth of a scene of training shards that has none."""
 _DEVIATION_CM: Final = 0.1
@@ -226,7 +234,8 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         remarks.append(Remark("videos", "; ".join(unread.values())))
     poses, pose_form = _poses(folder, key, files, rig, frames=frames, remarks=remarks)
     depths = _of_each_camera({name: fact for name, fact in facts.items() if name in _DEPTHS})
-    units = [_depth_unit(facts, name=f"{key}/{name}") for name, facts in depths]
+    stated = _depth_in_metadata(folder, key, files)
+    encodings = _depth_encodings(key, depths, stated=stated, remarks=remarks)
     ratio = None if valid_depth == "skip" else _valid_ratio(folder, key, frames)
     scene = Scene(
         id=parse_scene_key(key),
@@ -239,9 +248,10 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         rig_residual_px=(
             0.0 if poses is None else rectification_residual_px(poses, recorded_intrinsics(rig))
         ),
-        depth_unit_m=tuple(unit_m for unit_m, _ in units),
-        depth_unit_source=tuple(source for _, source in units),
-        depth_codec=tuple(facts.codec for _, facts in depths),
+        depth_unit_m=tuple(math.nan if each is None else each.known_unit_m for each in encodings),
+        depth_offset_m=tuple(0.0 if each is None else each.offset_m for each in encodings),
+        depth_unit_source=tuple(_source_of(each) for each in encodings),
+        depth_codec=tuple(depth_coding(facts) for _, facts in depths),
         depth_pixel_format=tuple(facts.pixel_format for _, facts in depths),
         valid_depth_ratio=ratio,
         key_frames=_common_key_frames(facts, frames=frames),
@@ -470,7 +480,7 @@ def _common_frames(key: str, facts: Mapping[str, StreamFacts], remarks: list[Rem
         f"{key}: its videos must have one number of frames: {len(counts) - len(odd)} have "
         f"{common}, but {', '.join(odd)}"
     )
-    if any(abs(count - common) > _MOST_FRAMES_APART for count in counts.values()):
+    if any(abs(count - common) > MOST_EXTRA_FRAMES for count in counts.values()):
         raise StorageError(f"{told}. Fetch those again.")
     frames = min(counts.values())
     if odd:
@@ -554,7 +564,10 @@ def _require_kinds(key: str, rig: Rig, facts: Mapping[str, StreamFacts]) -> None
             raise MediaError(f"{where}: is stored by codec {fact.codec} as {stored}{NO_COLOUR}")
         if name.endswith("_depth.mkv"):
             require_depth_stream(
-                codec=fact.codec, pixel_format=fact.pixel_format, encoding=ANY_DEPTH, name=where
+                codec=depth_coding(fact),
+                pixel_format=fact.pixel_format,
+                encoding=ANY_DEPTH,
+                name=where,
             )
     depths = {name: fact for name, fact in facts.items() if name.endswith("_depth.mkv")}
     grey = sum(not fact.is_colour for fact in depths.values())
@@ -567,21 +580,55 @@ def _require_kinds(key: str, rig: Rig, facts: Mapping[str, StreamFacts]) -> None
             )
 
 
-def _depth_unit(facts: StreamFacts, *, name: str) -> tuple[float, DepthUnitSource]:
-    """Return metres in a stored unit and their source; nan where the tags contradict.
+def _depth_in_metadata(
+    folder: SceneFolder, key: str, files: Mapping[str, object]
+) -> list[Statement]:
+    """Return what the scene's JSON files say of its depth, most say nothing."""
+    found: list[Statement] = []
+    for name in (BASELINE_JSON, TRAJECTORY_JSON, COMPLETE_JSON):
+        text = folder.read(name) if name in files else b""
+        if b"depth" in text.lower():
+            with suppress(SchemaError):
+                document = parse_object(text, where=name)
+                found += stated_in_json(document, name=f"{key}/{name}")
+    return found
+
+
+def _depth_encodings(
+    key: str,
+    depths: Iterable[tuple[str, StreamFacts]],
+    *,
+    stated: Sequence[Statement],
+    remarks: list[Remark],
+) -> list[DepthEncoding | None]:
+    """Return what files state of each camera's depth, None where that is not understood.
 
     Such a scene can still be used, for its colours or with the user's own unit.
     """
-    try:
-        encoding = resolve_encoding(facts, name=name)
-    except MediaError:
-        return math.nan, "unreadable"
-    return encoding.known_unit_m, "tag" if encoding.source == "tag" else "default"
+    found: list[DepthEncoding | None] = []
+    problems: list[str] = []
+    for name, facts in depths:
+        try:
+            found.append(resolve_encoding(facts, name=f"{key}/{name}", stated=stated))
+        except MediaError as error:
+            found.append(None)
+            problems.append(str(error))
+    if problems:
+        others = len(problems) - 1
+        more = f" ({counted(others, 'other video')} likewise.)" if others else ""
+        remarks.append(Remark("depth", problems[0] + more))
+    return found
+
+
+def _source_of(encoding: DepthEncoding | None) -> DepthUnitSource:
+    if encoding is None or encoding.source == "user":
+        return "unreadable"
+    return encoding.source
 
 
 def _valid_ratio(folder: SceneFolder, key: str, frames: int) -> float:
     shares = []
-    encoding = DepthEncoding()
+    encoding = ANY_DEPTH
     files = folder.stamps()
     for name in (_held(files, depth_name(camera)) for camera in range(CAMERA_COUNT)):
         if name not in files:
@@ -611,6 +658,9 @@ def derived_scene(scene: Scene, document: TrainingDocument) -> Scene:
             recorded_size_px=document.source_size_px,
         ),
         depth_codec=(CODEC_NAME,) * CAMERA_COUNT if is_packed else scene.depth_codec,
+        depth_pixel_format=tuple(map(grey_format, scene.depth_pixel_format))
+        if is_packed
+        else scene.depth_pixel_format,
         key_frames=document.key_frames,
         training=document.facts,
     )

@@ -61,11 +61,15 @@ class TableClock:
 Clock = SteadyClock | TableClock
 
 
+MOST_EXTRA_FRAMES: Final = 2
+"""How many frames a video may have beyond those that its scene uses."""
+
+
 def steady_clock(container: InputContainer, *, frames: int) -> SteadyClock | None:
     """Return the clock that the header describes, None if it contradicts itself or ``frames``.
 
     An MP4 header lists all samples: their number and decoding times must be those of ``frames``
-    frames at one rate. A Matroska header gives only the duration.
+    frames at one rate, or of a few more. A Matroska header gives only the duration.
     """
     stream = container.streams.video[0]
     rate, time_base = exact(stream.average_rate), exact(stream.time_base)
@@ -73,11 +77,12 @@ def steady_clock(container: InputContainer, *, frames: int) -> SteadyClock | Non
         return None
     step = 1 / (rate * time_base)
     if stream.frames == 0:
-        agrees = frames_by_duration(container) == frames
+        agrees = 0 <= (frames_by_duration(container) or 0) - frames <= MOST_EXTRA_FRAMES
     else:
         entries = list(stream.index_entries)
         agrees = (
-            stream.frames == frames == len(entries)
+            0 <= stream.frames - frames <= MOST_EXTRA_FRAMES
+            and stream.frames == len(entries)
             and not any(entry.is_discard for entry in entries)
             and all(abs(b.timestamp - a.timestamp - step) <= 1 for a, b in pairwise(entries))
         )

@@ -17,7 +17,7 @@ import av
 from av.container import InputContainer
 
 from stereogenbench_data.errors import MediaError, StorageError, cure_of
-from stereogenbench_data.media.siting import has_coded_chroma
+from stereogenbench_data.media.siting import has_coded_chroma, is_coded_lossless
 
 
 @runtime_checkable
@@ -139,6 +139,7 @@ class StreamFacts:
         key_frames: The frames at which decoding can begin, from 0, as an MP4 header lists them;
             (0,) where no header does.
         container: FFmpeg's names of the container, such as "matroska,webm".
+        is_lossless: Whether a header of H.264 or HEVC says that it was coded without loss.
     """
 
     codec: str
@@ -152,6 +153,19 @@ class StreamFacts:
     pixel_aspect: float = 0.0
     key_frames: tuple[int, ...] = (0,)
     container: str = field(default="", compare=False)
+    is_lossless: bool = False
+
+
+LOSSLESS_SUFFIX: Final = " lossless"
+
+
+def depth_coding(facts: StreamFacts) -> str:
+    """Return the codec of a depth video, and whether one that can lose coded it without loss.
+
+    >>> depth_coding(StreamFacts("hevc", "gray12le", 8, 8, 1, 15.0, {}, is_lossless=True))
+    'hevc lossless'
+    """
+    return facts.codec + (LOSSLESS_SUFFIX if facts.is_lossless else "")
 
 
 def open_container(
@@ -309,6 +323,7 @@ def stream_facts(
         pixel_aspect=float(exact(stream.sample_aspect_ratio) or 0),
         key_frames=_key_frames(container),
         container=container.format.name,
+        is_lossless=is_coded_lossless(context.codec.canonical_name, context.extradata),
     )
 
 

@@ -4,101 +4,155 @@ A depth picture is read in the pixel format in which it is stored. No conversion
 FFmpeg: its conversion to 8 bits drops the low byte, and one between 10, 12 and 16 bits rescales.
 """
 
-import itertools
-import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Final, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float32, Shaped, UInt16
 
-from stereogenbench_data.errors import MediaError
+from stereogenbench_data.errors import MediaError, SchemaError
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import planar_from_ray
-from stereogenbench_data.media.container import StreamFacts, VideoFile
+from stereogenbench_data.media.container import (
+    LOSSLESS_SUFFIX,
+    StreamFacts,
+    VideoFile,
+    depth_coding,
+)
 from stereogenbench_data.media.depth_frames import CODEC_NAME, PACKED_SUFFIX, DepthFrames
 from stereogenbench_data.media.video import VideoReader, plane_numbers
+from stereogenbench_data.schema.depth_contract import Statement, agreed, stated_in_tags
 from stereogenbench_data.schema.records import DepthEncoding, DepthRisk
 from stereogenbench_data.schema.release import DEFAULT_DEPTH_UNIT_M
-from stereogenbench_data.schema.text import shortened
 
 _LOSSLESS_CODECS: Final = frozenset(
     {CODEC_NAME, "ffv1", "ffvhuff", "huffyuv", "png", "rawvideo", "utvideo"}
 )
 """Codecs that return what they were given, whatever their settings."""
 
-_TAGS_SHOWN: Final = 4
-
 ANY_DEPTH: Final = DepthEncoding(accept=frozenset(get_args(DepthRisk)))
 """A contract that takes whatever holds one number a pixel."""
+
+NO_DEPTH_UNIT: Final = "its files do not tell how many metres a stored unit of depth has"
+DEPTH_CURES: Final = (
+    "Pass DepthEncoding(unit_m=...), by command --depth-unit-m, with what `stereogenbench doctor "
+    "ROOT` measures; or correct the files and index them again."
+)
+"""What to do where no unit is known."""
 
 _NUMBER_FORMAT: Final = re.compile(
     r"(?P<kind>gray|yuvj?\d{3}p)(?P<bits>9|10|12|14|16)?(?P<order>le|be)?"
 )
+_COLOUR_FORMAT: Final = re.compile(
+    r"(?P<planes>gbrp|gbrap)(?P<bits>9|10|12|14|16)?(?P<order>le|be)?|"
+    r"(?P<packed>[rgba0]{3,4})(?:24|(?P<wide>48|64)(?P<wide_order>le|be))?"
+)
+_PLANES_OF_GBR: Final = ((2, 0), (0, 0), (1, 0))
+_DECIDED: Final = 4.0
+"""By how much the smoother of two orders of bytes must be smoother, to be the right one."""
 
 
 def resolve_encoding(
-    facts: StreamFacts, *, name: str, override: DepthEncoding | None = None
+    facts: StreamFacts,
+    *,
+    name: str,
+    override: DepthEncoding | None = None,
+    stated: Sequence[Statement] = (),
 ) -> DepthEncoding:
-    """Return how a depth stream's numbers become metres: as the user says, else as it is tagged.
+    """Return how a depth stream's numbers become metres: as the user says, else as files state.
 
-    A tag is one whose key contains "scale", in any case, of the container or of the stream; its
-    value is metres in a stored unit. Without such a tag the release's default holds, 0.1 m. If one
-    such tag is a number, others that are not numbers are ignored.
+    Tags of the container and the stream and the scene's JSON are read as `depth_contract` reads
+    them; all must agree. Where nothing is stated the release's default holds, 0.1 m.
 
     Args:
         facts: What `probe` found.
         name: What messages call the file.
-        override: The user's contract, which holds whatever the tags say.
+        override: The user's contract, which holds whatever files say if it has a unit.
+        stated: What the scene's JSON says.
 
     Raises:
-        MediaError: If a tag is not a positive number, or two tags disagree.
+        MediaError: If what is stated is not understood, or contradicts itself.
 
     Source: the paper's appendix on the file schema.
     """
     if override is not None and override.unit_m is not None:
         return replace(override, source="user")
     contract = override or DepthEncoding()
-    scales = {key: value for key, value in facts.tags.items() if "scale" in key}
-    if not scales:
-        return contract.with_file_unit(DEFAULT_DEPTH_UNIT_M, source="default")
-    units_m = {unit_m for value in scales.values() if (unit_m := _unit_m(value)) is not None}
-    if len(units_m) != 1:
-        tags = (f"{shortened(key)}={shortened(value)!r}" for key, value in sorted(scales.items()))
-        found = ", ".join(itertools.islice(tags, _TAGS_SHOWN))
-        raise MediaError(
-            f"{name}: its tags must give one positive number of metres for a stored unit of depth, "
-            f"found {found}: correct the tags, or pass DepthEncoding(unit_m=...)."
-        )
-    return contract.with_file_unit(units_m.pop(), source="tag")
-
-
-def _unit_m(value: str) -> float | None:
+    layout = _layout(facts.pixel_format)
+    largest = (1 << (16 if layout is None else layout.bits)) - 1
     try:
-        unit_m = float(value)
-    except ValueError:
-        return None
-    return unit_m if math.isfinite(unit_m) and unit_m > 0 else None
+        found = agreed([*stated_in_tags(facts.tags, name=name), *stated], largest=largest)
+    except SchemaError as error:
+        raise MediaError(f"{error}. {DEPTH_CURES}") from error
+    if found.unit_m is None:
+        return contract.with_file_unit(DEFAULT_DEPTH_UNIT_M, source="default")
+    return contract.with_file_unit(found.unit_m, source=found.origin, offset_m=found.offset_m)
 
 
 @dataclass(frozen=True, slots=True)
 class DepthLayout:
-    """How a pixel format stores depth: ``bits`` a number, in a plane of ``dtype``."""
+    """How a pixel format stores depth: ``bits`` a number, channels of ``dtype``.
+
+    Attributes:
+        bits: Bits of a stored number.
+        has_chroma: Whether there are chroma planes, which are not read.
+        dtype: The type of a channel as it is stored.
+        channels: Of colours, where red, green and blue stand: (plane, place in the pixel); () for
+            one channel of numbers.
+        per_pixel: How many numbers a pixel has in a plane.
+    """
 
     bits: int
     has_chroma: bool
     dtype: str
+    channels: tuple[tuple[int, int], ...] = ()
+    per_pixel: int = 1
+
+    @property
+    def is_bytes(self) -> bool:
+        """Whether a 16-bit number may stand in two channels of 8 bits."""
+        return bool(self.channels) and self.dtype == "u1"
 
 
+@cache
 def _layout(pixel_format: str) -> DepthLayout | None:
-    """Return where a pixel format holds one number a pixel, None where it stores colours."""
+    """Return where a pixel format holds the numbers of a pixel, None if it cannot hold them."""
     match = _NUMBER_FORMAT.fullmatch(pixel_format)
+    if match is not None:
+        dtype = _dtype(match["bits"], match["order"])
+        return DepthLayout(int(match["bits"] or 8), match["kind"] != "gray", dtype)
+    match = _COLOUR_FORMAT.fullmatch(pixel_format)
     if match is None:
         return None
-    bits = int(match["bits"] or 8)
-    dtype = "u1" if bits == 8 else ">u2" if match["order"] == "be" else "<u2"
-    return DepthLayout(bits, has_chroma=match["kind"] != "gray", dtype=dtype)
+    if match["planes"]:
+        bits = int(match["bits"] or 16)  # two channels of 8
+        dtype = _dtype(match["bits"], match["order"])
+        return DepthLayout(bits, has_chroma=False, dtype=dtype, channels=_PLANES_OF_GBR)
+    packed = match["packed"]
+    if not {"r", "g", "b"} <= set(packed) or len(set(packed)) != len(packed):
+        return None
+    channels = tuple((0, packed.index(letter)) for letter in "rgb")
+    dtype = _dtype(match["wide"], match["wide_order"])
+    return DepthLayout(16, has_chroma=False, dtype=dtype, channels=channels, per_pixel=len(packed))
+
+
+def _dtype(bits: str | None, order: str | None) -> str:
+    return "u1" if bits is None else ">u2" if order == "be" else "<u2"
+
+
+def grey_format(pixel_format: str) -> str:
+    """Return the pixel format of one grey plane that holds the numbers of a depth stream.
+
+    >>> grey_format("gray12be"), grey_format("yuv420p10le"), grey_format("bgr0")
+    ('gray12be', 'gray10le', 'gray16le')
+    """
+    layout = _layout(pixel_format)
+    if layout is None or not (layout.channels or layout.has_chroma):
+        return pixel_format
+    return "gray" if layout.bits == 8 else f"gray{layout.bits}le"
 
 
 def require_depth_stream(
@@ -106,9 +160,15 @@ def require_depth_stream(
 ) -> DepthLayout:
     """Return how a stream stores 16-bit depth whole, or otherwise if the encoding accepts it.
 
+    Args:
+        codec: What `depth_coding` returns.
+        pixel_format: FFmpeg's name of the stored pixel format.
+        encoding: The depth contract.
+        name: What messages call the file.
+
     Raises:
-        MediaError: If the stream stores colours, or has a risk (fewer than 16 bits, a lossy codec,
-            chroma planes) that ``encoding.accept`` does not name.
+        MediaError: If the stream cannot hold numbers, or has a risk (fewer than 16 bits, a lossy
+            codec, chroma planes) that ``encoding.accept`` does not name.
     """
     layout = _layout(pixel_format)
     stored = f"{name}: depth is stored by codec {codec} as {pixel_format}"
@@ -117,19 +177,31 @@ def require_depth_stream(
             f"{stored}, which is not one number of 8 to 16 bits a pixel: no DepthEncoding accepts "
             f"it. Store depth as gray16le with FFV1."
         )
+    is_lossy = codec not in _LOSSLESS_CODECS and not codec.endswith(LOSSLESS_SUFFIX)
+    if layout.channels and is_lossy:
+        raise MediaError(
+            f"{stored} (lossy), and depth in channels of colours survives only without loss: no "
+            f"DepthEncoding accepts it. Store depth as gray16le with FFV1."
+        )
     risks = {
         f"{layout.bits}-bit": layout.bits < 16,
-        "lossy": codec not in _LOSSLESS_CODECS,
+        "lossy": is_lossy,
         "chroma": layout.has_chroma,
     }
     refused = [risk for risk, present in risks.items() if present and risk not in encoding.accept]
     if refused:
         accept = ", ".join(repr(risk) for risk in sorted({*encoding.accept, *refused}))
+        rescaled = (
+            f" If it was 16-bit before, its numbers were divided by {1 << (16 - layout.bits)}, and "
+            f"a stated unit no longer holds: `stereogenbench doctor ROOT` measures it."
+            if layout.bits < 16
+            else ""
+        )
         raise MediaError(
             f"{stored} ({', '.join(refused)}), which does not keep depth whole. Store it as "
             f"gray16le with FFV1; if this is intended, pass "
-            f"DepthEncoding(accept=frozenset({{{accept}}})), with unit_m=... if the file does not "
-            f"tell its unit."
+            f"DepthEncoding(accept=frozenset({{{accept}}})), by command --accept, with unit_m=... "
+            f"if the file does not tell its unit.{rescaled}"
         )
     return layout
 
@@ -165,14 +237,88 @@ def read_depth_units(
     """
     facts = reader.facts
     layout = require_depth_stream(
-        codec=facts.codec, pixel_format=facts.pixel_format, encoding=encoding, name=reader.name
+        codec=depth_coding(facts),
+        pixel_format=facts.pixel_format,
+        encoding=encoding,
+        name=reader.name,
     )
     if isinstance(reader, DepthFrames):
         return reader.units(index)
-    numbers = plane_numbers(reader.frame(index), 0, dtype=layout.dtype)
-    units: UInt16[np.ndarray, "h w"] = numbers.astype(np.uint16, copy=False)
+    if layout.channels:
+        units = _units_of_channels(reader, index, layout)
+    else:
+        numbers = plane_numbers(reader.frame(index), 0, dtype=layout.dtype)
+        units = numbers.astype(np.uint16, copy=False)
     units.flags.writeable = False
     return units
+
+
+def _units_of_channels(
+    reader: VideoReader, index: int, layout: DepthLayout
+) -> UInt16[np.ndarray, "h w"]:
+    """Return depth of three equal channels, or of its high and low byte in two of them.
+
+    Which byte is high is decided by the video's first frame, so that all frames are read alike.
+    """
+    red, green, blue = channels = _channels(reader, index, layout)
+    if layout.is_bytes:
+        order = _byte_order(_channels(reader, 0, layout), name=reader.name)
+        (other,) = {0, 1, 2}.difference(order)
+        if not _is_flat(channels[other]):
+            raise _not_numbers(reader.name, f"frame {index} has a third channel with numbers")
+        high, low = (channels[place].astype(np.uint16) for place in order)
+        return high << 8 | low
+    if not (np.array_equal(red, green) and np.array_equal(green, blue)):
+        raise _not_numbers(reader.name, f"frame {index} has different numbers in its channels")
+    return red.astype(np.uint16)
+
+
+def _channels(
+    reader: VideoReader, index: int, layout: DepthLayout
+) -> tuple[Shaped[np.ndarray, "h w"], ...]:
+    """Return the red, green and blue channel of a frame."""
+    frame = reader.frame(index)
+    return tuple(
+        plane_numbers(frame, plane, dtype=layout.dtype, per_pixel=layout.per_pixel)[
+            :, place :: layout.per_pixel
+        ]
+        for plane, place in layout.channels
+    )
+
+
+def _byte_order(channels: tuple[Shaped[np.ndarray, "h w"], ...], *, name: str) -> tuple[int, int]:
+    """Return the places of the high and the low byte.
+
+    Neighbouring pixels have nearly the same depth: with the bytes in their right order, numbers
+    differ far less from pixel to pixel than in the other order.
+
+    Raises:
+        MediaError: If the channels are colours, or the order cannot be told.
+    """
+    busy = [place for place, channel in enumerate(channels) if not _is_flat(channel)]
+    if len(busy) > 2:
+        raise _not_numbers(name, "all three of its channels of 8 bits have numbers")
+    if len(busy) < 2:
+        raise _not_numbers(name, "only one of its channels has numbers, a high or a low byte")
+    first, second = busy
+    steps = []
+    for high, low in ((first, second), (second, first)):
+        numbers = channels[high].astype(np.int32) << 8 | channels[low]
+        steps.append(float(np.abs(np.diff(numbers, axis=1)).mean()))
+    if max(steps) < _DECIDED * min(steps):
+        raise _not_numbers(name, "neither order of its two bytes gives smooth depth")
+    return (first, second) if steps[0] < steps[1] else (second, first)
+
+
+def _is_flat(channel: Shaped[np.ndarray, "h w"]) -> bool:
+    return bool((channel == channel.flat[0]).all())
+
+
+def _not_numbers(name: str, why: str) -> MediaError:
+    return MediaError(
+        f"{name}: depth is stored in channels of colours, and {why}: they are neither three equal "
+        f"channels nor the high and the low byte of a number. Store depth as gray16le with FFV1."
+    )
 
 
 def measured(
@@ -221,7 +367,10 @@ def depth_m_from_units(
         )
     unit_m = encoding.known_unit_m
     depth_m = np.empty(units.shape, dtype=np.float32)
-    if encoding.form == "depth":
+    if encoding.form == "depth" and encoding.offset_m:
+        np.add(units * np.float64(unit_m), encoding.offset_m, out=depth_m, casting="same_kind")
+        depth_m *= measured
+    elif encoding.form == "depth":
         np.multiply(units, unit_m, out=depth_m, dtype=np.float64, casting="same_kind")
         depth_m *= measured
     else:

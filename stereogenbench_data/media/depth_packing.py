@@ -19,19 +19,20 @@ from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.container import (
     StreamFacts,
     VideoFile,
+    depth_coding,
     exact,
     open_container,
     text_tags,
 )
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
+    grey_format,
     open_depth,
     read_depth_units,
     require_depth_stream,
     resized_nearest,
 )
 from stereogenbench_data.media.depth_frames import (
-    CODEC_NAME,
     DepthFrames,
     StoredClip,
     blosc2_module,
@@ -56,6 +57,7 @@ def packed_depth(
     name: str,
     frames: int,
     size: tuple[int, int] | None = None,
+    encoding: DepthEncoding | None = None,
     after_frame: AfterFrame = lambda: None,
 ) -> bytes:
     """Return a depth video as a file of blosc2's frames.
@@ -66,6 +68,8 @@ def packed_depth(
         frames: How many frames it must have.
         size: (height, width) to take the nearest pixels of, as `resized_nearest` does; None for
             the stored size.
+        encoding: With a size, what streams are accepted (``accept``); those of any bits always
+            are, as their numbers are kept.
         after_frame: Called after each frame.
 
     Raises:
@@ -76,17 +80,13 @@ def packed_depth(
     chunks, pts = [], []
     with open_depth(video, name=name, frames=frames) as reader:
         facts = reader.facts
-        if facts.codec not in ("ffv1", CODEC_NAME):
-            raise MediaError(
-                f"{name}: its depth is stored by codec {facts.codec}, and blosc2 packs only FFV1. "
-                f"Pack with --depth-codec released."
-            )
-        require_depth_stream(
-            codec=facts.codec, pixel_format=facts.pixel_format, encoding=_ANY_BITS, name=name
-        )
+        accepted = _ANY_BITS
+        if size is not None and encoding is not None:
+            accepted = replace(_ANY_BITS, accept=_ANY_BITS.accept | encoding.accept)
+        _require_packable(reader, accepted, is_resized=size is not None)
         time_base = Fraction(1)
         for index in range(frames):
-            units = read_depth_units(reader, index, encoding=_ANY_BITS)
+            units = read_depth_units(reader, index, encoding=accepted)
             if size is not None:
                 units = resized_nearest(units, size=size)
             chunk = compressed_chunk(units.tobytes())
@@ -108,13 +108,37 @@ def packed_depth(
         packed_before = reader.clip if isinstance(reader, DepthFrames) else None
     clip = packed_before or _clip_of(video, facts, name=name, pts=tuple(pts), time_base=time_base)
     if size is not None:
-        clip = replace(clip, width_px=size[1], height_px=size[0])
+        clip = replace(
+            clip,
+            width_px=size[1],
+            height_px=size[0],
+            codec="ffv1",
+            pixel_format=grey_format(facts.pixel_format),
+        )
     content = frame_file(clip, chunks)
     with DepthFrames(io.BytesIO(content), name=name, frames=frames) as packed:
         for index, chunk in enumerate(chunks):
             if packed.chunk(index) != (b"" if is_zeros(chunk) else chunk):
                 raise _not_whole(name, index)
     return content
+
+
+def _require_packable(
+    reader: VideoReader | DepthFrames, encoding: DepthEncoding, *, is_resized: bool
+) -> None:
+    """Refuse a stream that the encoding does not accept, or that could not be written again."""
+    facts = reader.facts
+    layout = require_depth_stream(
+        codec=depth_coding(facts),
+        pixel_format=facts.pixel_format,
+        encoding=encoding,
+        name=reader.name,
+    )
+    if not is_resized and (facts.codec != "ffv1" or layout.channels):
+        raise MediaError(
+            f"{reader.name}: its depth is stored by codec {facts.codec} as {facts.pixel_format}, "
+            f"and blosc2 packs only FFV1 of one grey plane. Pack with --depth-codec released."
+        )
 
 
 def _clip_of(

@@ -30,6 +30,7 @@ _EXTENDED_ASPECT: Final = 255
 _GREY: Final = 0
 _SEPARATE_PLANES: Final = 3
 _PROFILE_BITS: Final = 88
+_HEVC_PICTURE_PARAMETERS: Final = 34
 
 
 class Converter:
@@ -154,6 +155,47 @@ def has_coded_chroma(codec: str, extradata: bytes | None) -> bool | None:
         return profile not in _HIGH_PROFILES or bits.golomb() != _GREY
     except EOFError:
         return None
+
+
+def is_coded_lossless(codec: str, extradata: bytes | None) -> bool:
+    """Return whether a header of H.264 or HEVC says that pictures are coded without loss.
+
+    In H.264 that is the sequence's flag for transform bypass, which encoders set where they code
+    with a quantiser of 0; in HEVC the picture's flag for transquant bypass, unless the encoder
+    writes that it chooses for each block.
+    """
+    units = _units(codec, extradata or b"") if codec in ("h264", "hevc") else []
+    try:
+        if codec == "h264":
+            bits = _sequence_parameters(codec, extradata)
+            return bits is not None and _has_h264_bypass(bits)
+        chosen = any(b" cu-lossless" in unit for unit in units)
+        pictures = [unit for unit in units if unit[0] >> 1 & 63 == _HEVC_PICTURE_PARAMETERS]
+        return (
+            bool(pictures)
+            and not chosen
+            and all(_has_hevc_bypass(_Bits(unit.replace(b"\0\0\3", b"\0\0"))) for unit in pictures)
+        )
+    except EOFError:
+        return False
+
+
+def _has_h264_bypass(bits: "_Bits") -> bool:
+    bits.skip(8)
+    profile = bits.take(8)
+    bits.skip(8, 8, 0)
+    if profile not in _HIGH_PROFILES:
+        return False
+    bits.skip(*([1] if bits.golomb() == _SEPARATE_PLANES else []), 0, 0)
+    return bool(bits.take())
+
+
+def _has_hevc_bypass(bits: "_Bits") -> bool:
+    bits.skip(16, 0, 0, 1, 1, 3, 1, 1, 0, 0, 0, 1, 1)
+    if bits.take():
+        bits.skip(0)
+    bits.skip(0, 0, 1, 1, 1)
+    return bool(bits.take())
 
 
 def _sequence_parameters(codec: str, extradata: bytes | None) -> "_Bits | None":

@@ -18,6 +18,7 @@ from jaxtyping import UInt8, UInt16
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.clock import (
     INTRA_ONLY,
+    MOST_EXTRA_FRAMES,
     Clock,
     TableClock,
     require_file_order,
@@ -140,7 +141,7 @@ class VideoReader(FrameReader):
         Args:
             file: A path, or a seekable binary file; the latter stays the caller's to close.
             name: What messages call the file.
-            frames: How many frames the video must have.
+            frames: How many frames the video must have; it may have `MOST_EXTRA_FRAMES` more.
 
         Raises:
             StorageError: If the file cannot be read.
@@ -274,7 +275,7 @@ class VideoReader(FrameReader):
         steady = steady_clock(container, frames=self.frames)
         clock = table_clock(container, name=self.name, steady=steady)
         found, expected = len(clock.times), self.frames
-        if found != expected:
+        if not 0 <= found - expected <= MOST_EXTRA_FRAMES:
             raise MediaError(
                 f"{self.name}: holds {found} frames where {expected} are expected. It is cut "
                 f"short, or belongs to another scene: fetch it again."

@@ -9,12 +9,12 @@ import numpy as np
 from stereogenbench_data.errors import MediaError, StorageError, text_without_secrets
 from stereogenbench_data.index.open import MOST_LEFT_OUT
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.media.depth import require_depth_stream
+from stereogenbench_data.media.depth import DEPTH_CURES, NO_DEPTH_UNIT, require_depth_stream
 from stereogenbench_data.samples.derive import RECTIFIED_PX
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.samples.size import EnlargedSizeWarning, warn_if_swapped
 from stereogenbench_data.schema.records import DepthEncoding, Scene
-from stereogenbench_data.schema.release import CAMERA_COUNT, depth_name
+from stereogenbench_data.schema.release import CAMERA_COUNT, DEFAULT_DEPTH_UNIT_M, depth_name
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.plan import Plan
 
@@ -162,10 +162,7 @@ def _refuse_depth(scene: Scene, camera: int, *, encoding: DepthEncoding) -> NoRe
         encoding=encoding,
         name=name,
     )
-    raise MediaError(
-        f"{name}: its tags do not tell one positive number of metres in a stored unit of depth. "
-        "Correct the tags, or pass DepthEncoding(unit_m=...)."
-    )
+    raise MediaError(scene.remark("depth") or f"{name}: {NO_DEPTH_UNIT}. {DEPTH_CURES}")
 
 
 def _warn_of_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> None:
@@ -193,6 +190,13 @@ def _warn_of_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> None
         request.depth and request.depth.unit_m
     ):
         units_m = index.column("depth_unit_m")[rows]
+        defaults = (index.column("depth_unit_source")[rows] == "default").any(axis=1)
+        _warn(
+            index, rows[defaults],
+            f"state no unit of depth, so the release's default of {DEFAULT_DEPTH_UNIT_M:g} m is "
+            f"taken. `stereogenbench doctor {text_without_secrets(index.where)}` measures it from "
+            f"the pictures; DepthEncoding(unit_m=...) sets it",
+        )  # fmt: skip
         _warn(
             index, rows[(units_m != units_m[:, :1]).any(axis=1)],
             "state other units of depth for some cameras than for others: if a tag is missing or "

@@ -108,7 +108,6 @@ class SampleDecoder:
         self._scenes: OrderedDict[int, _KnownScene] = OrderedDict()
         self._poses: OrderedDict[str, CameraPoses] = OrderedDict()
         self._depths: OrderedDict[tuple[int, ...], StoredDepth] = OrderedDict()
-        self._encodings: dict[tuple[float, str], DepthEncoding] = {}
 
     @property
     def stats(self) -> StreamStats:
@@ -203,7 +202,8 @@ class SampleDecoder:
                 height, width = self._request.size
                 intrinsics = intrinsics.resized(width_px=width, height_px=height)
             encodings = {
-                camera: self._encoding(scene, camera) for camera in range(len(scene.depth_unit_m))
+                camera: scene.depth_encoding(camera, self._request.depth)
+                for camera in range(len(scene.depth_unit_m))
             }
             known = self._scenes[row] = _KnownScene(scene, intrinsics, encodings)
             if len(self._scenes) > KEPT_SCENES:
@@ -315,15 +315,6 @@ class SampleDecoder:
         if f"target_{suffix}" in self._needs:
             cameras.extend(address.targets)
         return list(dict.fromkeys(cameras))
-
-    def _encoding(self, scene: Scene, camera: int) -> DepthEncoding:
-        contract = self._request.depth or DepthEncoding()
-        unit_m, source = scene.depth_unit_m[camera], scene.depth_unit_source[camera]
-        if source == "unreadable":
-            return contract
-        if (unit_m, source) not in self._encodings:
-            self._encodings[unit_m, source] = contract.with_file_unit(unit_m, source=source)
-        return self._encodings[unit_m, source]
 
     def _pictures(
         self,

@@ -177,7 +177,7 @@ class PairGeometry:
             u_px = np.arange(self.depth_m.shape[-1]) + 0.5
             moved = np.where(self.known, u_px - self.projection.u_px, 0)
             np.multiply(moved, sign, out=out, casting="same_kind")
-        elif self.encoding.kind == "ray":
+        elif self.encoding.kind == "ray" or self.encoding.offset_m:
             rig = {"focal_px": self._views.intrinsics.fx_px, "baseline_m": self.baseline_m}
             np.multiply(disparity_from_depth(self.depth_m, **rig), np.float32(sign), out=out)
         else:

@@ -256,12 +256,19 @@ VIEW_FIELDS: Final[dict[str, Field]] = _table(
         per_target=True, per_frame=False,
     ),
     Field(
+        "depth_offset_m", "float64", "()", "m, the depth of the stored number 0",
+        make=lambda s: np.float64(s.backward.encoding.offset_m),
+        per_target=True, per_frame=False,
+    ),
+    Field(
         "depth_kind", "str", "", "planar or ray: what stored depth measures",
         make=lambda s: s.forward.encoding.kind, per_frame=False,
     ),
     Field(
-        "depth_form", "str", "", "depth or inverse: what a stored number is proportional to",
-        make=lambda s: s.forward.encoding.form, per_frame=False,
+        "depth_form", "str", "",
+        "depth or inverse: what a stored number is proportional to; ranged if depth has an offset",
+        make=lambda s: "ranged" if s.forward.encoding.offset_m else s.forward.encoding.form,
+        per_frame=False,
     ),
     Field(
         "rig", "str", "", "rectified, or posed where disparity needs the poses",

@@ -60,6 +60,7 @@ PAIRS: Final[dict[str, tuple[str, str]]] = {
 UNITS_M: Final = {
     **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1e-3),
     **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 1e-2),
+    **dict.fromkeys(("dm", "decimeter", "decimeters", "decimetre", "decimetres"), 1e-1),
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1.0),
     **dict.fromkeys(("uu", "unreal_unit", "unreal_units"), 1e-2),
 }

@@ -26,7 +26,7 @@ RotationKind = Literal["rotator_deg", "quaternion_xyzw", "matrix"]
 DepthKind = Literal["planar", "ray"]
 DepthForm = Literal["depth", "inverse"]
 DepthRisk = Literal["8-bit", "9-bit", "10-bit", "12-bit", "14-bit", "lossy", "chroma"]
-DepthUnitSource = Literal["tag", "default", "unreadable"]
+DepthUnitSource = Literal["tag", "metadata", "default", "unreadable"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +91,7 @@ REMARKS: Final = {
     "left": "nothing, but the sign of disparity is that of the poses",
     "videos": "pairs of cameras whose videos are missing",
     "frames": "nothing: frames that all files have are used",
+    "depth": "depth, unless you pass a DepthEncoding with its unit_m",
     "size": "nothing: the videos' size is used",
     "baselines": "nothing",
     "labels": "nothing",
@@ -155,9 +156,11 @@ class DepthEncoding:
     """The depth contract: how a number stored in a depth video becomes metres.
 
     Attributes:
-        unit_m: Metres in one stored unit. None means the file's own tag, or the release's default
-            of 0.1 m if it has no tag. With ``form="inverse"``, the depth in metres of the stored
-            number 1: depth = unit_m / stored.
+        unit_m: Metres in one stored unit. None means what the scene's files state, or the release's
+            default of 0.1 m if they state nothing. With ``form="inverse"``, the depth in metres of
+            the stored number 1: depth = unit_m / stored.
+        offset_m: Depth in metres of the stored number 0, as a stream has it that was normalised to
+            a range: depth = offset_m + unit_m * stored. It needs ``unit_m``.
         kind: "planar" is depth along the optical axis (z); "ray" is the distance from the
             camera's centre, turned into z by the intrinsics.
         form: "depth" or "inverse".
@@ -167,7 +170,8 @@ class DepthEncoding:
         accept: Kinds of streams that are refused unless listed here: fewer than 16 bits ("8-bit",
             "9-bit", "10-bit", "12-bit", "14-bit"), "lossy" (a lossy codec) or "chroma" (only the
             luma plane is read).
-        source: The origin of ``unit_m``: a tag of the file, the release's default, or the user.
+        source: The origin of ``unit_m``: a tag of the file, JSON of the scene, the release's
+            default, or the user.
 
     Raises:
         SchemaError: If a value is out of range.
@@ -181,7 +185,8 @@ class DepthEncoding:
     frame_lag: int = 0
     no_depth: tuple[int | Literal["max"], ...] = (0, "max")
     accept: frozenset[DepthRisk] = frozenset()
-    source: Literal["tag", "default", "user"] = "user"
+    source: Literal["tag", "metadata", "default", "user"] = "user"
+    offset_m: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
@@ -189,6 +194,14 @@ class DepthEncoding:
         is_number = isinstance(unit_m, int | float) and math.isfinite(unit_m) and unit_m > 0
         if unit_m is not None and not is_number:
             raise SchemaError(f"unit_m must be a positive number of metres, got {self.unit_m!r}.")
+        offset_m: object = self.offset_m
+        if not (isinstance(offset_m, int | float) and math.isfinite(offset_m)):
+            raise SchemaError(f"offset_m must be a number of metres, got {self.offset_m!r}.")
+        if offset_m != 0 and (unit_m is None or self.form != "depth"):
+            raise SchemaError(
+                f"offset_m={self.offset_m!r} needs unit_m, the range over the stored numbers that "
+                f'it has, and form="depth".'
+            )
         for name, numbers in (
             ("frame_lag", (self.frame_lag,)),
             ("no_depth", [number for number in self.no_depth if number != "max"]),
@@ -222,10 +235,16 @@ class DepthEncoding:
         return self.unit_m
 
     def with_file_unit(
-        self, unit_m: float, *, source: Literal["tag", "default"]
+        self,
+        unit_m: float,
+        *,
+        source: Literal["tag", "metadata", "default"],
+        offset_m: float = 0.0,
     ) -> "DepthEncoding":
-        """Return the encoding with the file's unit, unless it has its own."""
-        return self if self.unit_m is not None else replace(self, unit_m=unit_m, source=source)
+        """Return the encoding with the file's unit and offset, unless it has its own unit."""
+        if self.unit_m is not None:
+            return self
+        return replace(self, unit_m=unit_m, source=source, offset_m=offset_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,9 +302,10 @@ class Scene:
             0's x axis, from the poses.
         rig_residual_px: The largest distance between the closed form of a rectified rig and
             the pose chain, in pixels of the recorded image.
-        depth_unit_m: Metres in a stored unit of each camera's depth, from its tag or the default.
-        depth_unit_source: "tag", "default", or "unreadable" (contradictory tags, unit nan), per
-            camera.
+        depth_unit_m: Metres in a stored unit of each camera's depth, as stated or by default.
+        depth_offset_m: Depth in metres of the stored number 0 of each camera.
+        depth_unit_source: Where that stands: "tag", "metadata" (JSON), "default" (nowhere), or
+            "unreadable" (not understood, or contradictory: unit nan), per camera.
         depth_codec: FFmpeg's name of the codec of each camera's depth, or "blosc2" for depth
             packed by blosc2.
         depth_pixel_format: FFmpeg's name of the pixel format of each camera's depth.
@@ -321,7 +341,21 @@ class Scene:
     training: TrainingFacts | None = None
     remarks: tuple[Remark, ...] = ()
     pose_form: str | None = None
+    depth_offset_m: tuple[float, ...] = (0.0,) * 6
     seek_tables: bytes | None = field(default=None, compare=False, repr=False)
+
+    def depth_encoding(self, camera: int, contract: DepthEncoding | None = None) -> DepthEncoding:
+        """Return how a camera's stored depth becomes metres: by a contract, else as files state.
+
+        Its unit stays None where files do not tell it and the contract does not either.
+        """
+        contract = contract or DepthEncoding()
+        source = self.depth_unit_source[camera]
+        if source == "unreadable":
+            return contract
+        return contract.with_file_unit(
+            self.depth_unit_m[camera], source=source, offset_m=self.depth_offset_m[camera]
+        )
 
     def held_name(self, name: str) -> str:
         """Return the name in ``members`` of one of the release's files: depth may be packed."""

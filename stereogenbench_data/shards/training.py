@@ -11,7 +11,7 @@ import io
 import time
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
@@ -36,7 +36,7 @@ from stereogenbench_data.media.picture_encoding import (
     write_pictures,
 )
 from stereogenbench_data.media.video import VideoReader, read_rgb, require_pixel_aspect
-from stereogenbench_data.schema.records import Scene, ShardFacts
+from stereogenbench_data.schema.records import DepthEncoding, Scene, ShardFacts
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
     FRAME_RATE_HZ,
@@ -70,11 +70,13 @@ class TrainingSettings:
         size: (height, width) of pictures and depth in pixels.
         quality: How pictures are encoded, a name of `QUALITIES`.
         cameras: The cameras to keep; None keeps those that each scene has.
+        depth: Whose ``accept`` names what source depth may lack.
     """
 
     size: tuple[int, int]
     quality: Quality = "balanced"
     cameras: tuple[int, ...] | None = None
+    depth: DepthEncoding = field(default_factory=DepthEncoding)
 
     def __post_init__(self) -> None:
         """Refuse what cannot be stored.
@@ -103,7 +105,7 @@ class TrainingSettings:
             "quality": self.quality,
             "cameras": cameras,
             "pictures": QUALITIES[self.quality].description(),
-        }
+        } | ({"accept": sorted(self.depth.accept)} if self.depth.accept else {})
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,6 +249,7 @@ def derive_scene(
                         name=where,
                         frames=scene.frames,
                         size=settings.size,
+                        encoding=settings.depth,
                         after_frame=step,
                     )
                 )
@@ -451,7 +454,7 @@ def estimate(
     for place in places:
         scene = scenes[place]
         camera = next(int(name[4:6]) for name in names[place] if name.endswith("_rgb.mp4"))
-        one = TrainingSettings(settings.size, settings.quality, (camera,))
+        one = replace(settings, cameras=(camera,))
         derivation = Derivation.of_index(index, one, [scene])
         began_s = time.process_time()
         document = derive_scene(derivation, scene, folder / str(place))

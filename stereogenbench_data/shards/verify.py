@@ -18,7 +18,8 @@ from stereogenbench_data.errors import MediaError, ShardError, cure_of
 from stereogenbench_data.index.scene_folder import metadata_differences
 from stereogenbench_data.index.stale import StaleIndexWarning
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.media.container import StreamFacts
+from stereogenbench_data.media.clock import MOST_EXTRA_FRAMES
+from stereogenbench_data.media.container import StreamFacts, depth_coding
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
     open_depth,
@@ -409,7 +410,8 @@ def _decode(task: _DecodeTask, name: str) -> None:
 def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
     """Compare a video's header with the index."""
     size = (scene.rig.image_width_px, scene.rig.image_height_px)
-    if (facts.frames, (facts.width_px, facts.height_px)) != (scene.frames, size):
+    is_long_enough = 0 <= facts.frames - scene.frames <= MOST_EXTRA_FRAMES
+    if not is_long_enough or (facts.width_px, facts.height_px) != size:
         raise MediaError(
             f"{name}: has {facts.frames} frames of {facts.width_px}x{facts.height_px} pixels, and "
             f"the index says {scene.frames} of {size[0]}x{size[1]}."
@@ -419,17 +421,19 @@ def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
     if name not in depth_names:
         return
     camera = depth_names.index(name)
-    encoding = resolve_encoding(facts, name=name)
-    found = (facts.codec, facts.pixel_format, encoding.known_unit_m)
-    indexed = (
-        scene.depth_codec[camera],
-        scene.depth_pixel_format[camera],
-        scene.depth_unit_m[camera],
-    )
+    found: tuple[object, ...] = (depth_coding(facts), facts.pixel_format)
+    indexed: tuple[object, ...] = (scene.depth_codec[camera], scene.depth_pixel_format[camera])
+    if scene.depth_unit_source[camera] in ("tag", "default"):
+        encoding = resolve_encoding(facts, name=name)
+        found = (*found, encoding.known_unit_m, encoding.offset_m)
+        indexed = (*indexed, scene.depth_unit_m[camera], scene.depth_offset_m[camera])
     if found != indexed:
         raise MediaError(f"{name}: is stored as {found}, and the index says {indexed}.")
     require_depth_stream(
-        codec=facts.codec, pixel_format=facts.pixel_format, encoding=encoding, name=name
+        codec=depth_coding(facts),
+        pixel_format=facts.pixel_format,
+        encoding=ANY_DEPTH,
+        name=name,
     )
 
 

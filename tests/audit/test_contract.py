@@ -37,11 +37,13 @@ from tests.audit.corruption import (
     exchange,
     late,
     place_cameras,
+    read_depth,
     rewrite_depth,
     rewrite_one_depth,
     rewrite_rgb,
     scale_camera,
     scaled,
+    write_depth,
 )
 
 UNIT_M = 0.001
@@ -742,6 +744,47 @@ def test_scenes_with_different_contracts_get_verdicts_of_their_own(right_scene, 
     assert [verdict.is_wrong for verdict in report.verdicts].count(True) == 1
     assert len(report.verdicts) == 2
     assert report.is_wrong
+
+
+def test_scenes_of_different_units_are_confirmed_each_by_itself(right_scene, tmp_path):
+    first = copied(right_scene, tmp_path)
+    rewrite_depth(first, scaled(1 / 23.9), unit_factor=23.9)
+    first.rename(first.with_name("scene_000007"))
+    copied(right_scene, tmp_path)
+
+    verdicts = diagnose(tmp_path, frames=1, workers=1).verdicts
+
+    assert [len(verdict.scenes) for verdict in verdicts] == [1, 1]
+    for verdict in verdicts:
+        assert verdict.quotient == pytest.approx(1, rel=0.01)
+        assert answer(verdict, QUOTIENT).status == "confirmed"
+
+
+def test_depth_of_a_stated_range_is_confirmed(verdict_on):
+    def normalise(folder):
+        for camera in range(6):
+            units, _ = read_depth(folder, camera)
+            depth_m = np.clip(units * UNIT_M, 0.5, 60.5)
+            numbers = np.rint((depth_m - 0.5) / 60 * 65535)
+            tags = {"depth_near": "0.5 m", "depth_far": "60.5 m"}
+            write_depth(folder, camera, numbers.astype(np.uint16), tags)
+
+    verdict = verdict_on(normalise)
+
+    assert answer(verdict, QUOTIENT).status == "confirmed"
+    assert verdict.fits
+
+
+def test_a_unit_that_files_do_not_tell_is_measured(verdict_on):
+    def untold(folder):
+        for camera in range(6):
+            units, _ = read_depth(folder, camera)
+            write_depth(folder, camera, units, {"DEPTH_FOO": "0.001"})
+
+    verdict = verdict_on(untold)
+
+    unit_m = float(verdict.choices[0].rpartition("unit_m=")[2].removesuffix(")"))
+    assert unit_m == pytest.approx(UNIT_M, rel=0.005)
 
 
 def test_the_scene_that_was_rendered_elsewhere_is_confirmed(shared_scenes):

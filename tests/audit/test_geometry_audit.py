@@ -280,7 +280,7 @@ def contradicting(folder):
         (rounded, "cam_00_depth.mkv", "depth quantum", "20 units apart, so that depth was rounded"),
         (longer_baseline, "", "pose/baseline", "differ by 0.05 cm (limit 0.001)"),
         (turned, "", "rig rotation", "turned against camera 0 by 1 deg"),
-        (contradicting, "cam_05_depth.mkv", "unreadable", "its tags do not state one positive"),
+        (contradicting, "cam_05_depth.mkv", "unreadable", "contradict each other"),
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )  # fmt: skip

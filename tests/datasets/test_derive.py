@@ -47,6 +47,8 @@ CONTRACTS = {
     "a measured 0": DepthEncoding(0.1, no_depth=("max",)),
     "an infinite depth": DepthEncoding(500.0, form="inverse", no_depth=("max", 7)),
     "a number of its own": DepthEncoding(0.07, no_depth=(77,)),
+    "a range": DepthEncoding(0.07, offset_m=0.5),
+    "a range of rays": DepthEncoding(0.07, kind="ray", offset_m=0.5, no_depth=("max",)),
 }
 RIGS = ("rectified", "posed")
 MASKS = ("valid", "visible", "visible_from_left", "valid_right", "visible_right", "hole")
@@ -266,6 +268,7 @@ def of_size(height, width, *, seed=0):
         ),
         "stored_depth": torch.from_numpy(units),
         "depth_unit_m": torch.full((1, 6), 0.01, dtype=torch.float64),
+        "depth_offset_m": torch.zeros((1, 6), dtype=torch.float64),
         "no_depth": torch.zeros(1, 6, dtype=torch.int64),
         "depth_kind": ["planar"], "depth_form": ["depth"], "rig": ["rectified"],
         "intrinsics": torch.tensor(

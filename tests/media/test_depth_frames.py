@@ -319,7 +319,7 @@ def test_packed_depth_becomes_the_same_video_again(tmp_path, pixel_format, large
 @pytest.mark.parametrize(
     ("codec", "pixel_format", "found"),
     [
-        ("libx264", "yuv420p", "stored by codec h264, and blosc2 packs only FFV1"),
+        ("libx264", "yuv420p", "depth is stored by codec h264 as yuv420p"),
         ("ffv1", "yuv420p10le", "depth is stored by codec ffv1 as yuv420p10le"),
     ],
 )

@@ -1,6 +1,6 @@
 """What stored depth numbers mean: unit, kind, form, what is not measured, and which frame."""
 
-import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -32,8 +32,6 @@ def facts(**tags):
         pytest.param({}, 0.1, "default", id="no tag is the release's 0.1 m"),
         pytest.param({"encoder": "Lavf"}, 0.1, "default", id="other tags tell nothing"),
         pytest.param({"depth_scale": "0.001"}, 0.001, "tag", id="millimetres"),
-        pytest.param({"scale": " 1e-2 "}, 0.01, "tag", id="a bare scale"),
-        pytest.param({"scale": "0.010", "stream.scale": "1e-2"}, 0.01, "tag", id="two that agree"),
     ],
 )
 def test_the_unit_is_the_tags_or_the_releases(tags, unit_m, source):
@@ -42,18 +40,19 @@ def test_the_unit_is_the_tags_or_the_releases(tags, unit_m, source):
     assert (encoding.unit_m, encoding.source, encoding.kind) == (unit_m, source, "planar")
 
 
-@pytest.mark.parametrize(
-    "tags",
-    [{"scale": text} for text in ("", "mm", "0", "-1", "nan", "inf", "0.1 m")]
-    + [{"depth_scale": "0.1", "stream.depth_scale": "0.001"}],
-    ids=str,
-)
-def test_tags_that_tell_no_unit_are_refused(tags):
-    told = re.escape(", ".join(f"{key}={value!r}" for key, value in tags.items()))
+def test_a_normalised_stream_has_its_range_over_the_formats_largest_number():
+    tags = {"depth_near": "0.5 m", "depth_far": "4095.5 m"}
+    stream = replace(facts(**tags), pixel_format="gray12le")
 
-    with pytest.raises(
-        MediaError, match=rf"clip: its tags .* found {told}: correct .*unit_m=\.\.\."
-    ):
+    encoding = resolve_encoding(stream, name="clip")
+
+    assert (encoding.unit_m, encoding.offset_m) == (1.0, 0.5)
+
+
+def test_contradicting_tags_are_refused_with_both():
+    tags = {"depth_scale": "0.1", "stream.depth_scale": "0.001"}
+
+    with pytest.raises(MediaError, match=r"clip: tag depth_scale = '0\.1', clip: .*'0\.001'"):
         resolve_encoding(facts(**tags), name="clip")
 
 
@@ -97,6 +96,15 @@ def test_metres_are_the_exact_product_rounded_once(unit_m):
 
     assert depth_m.dtype == np.float32
     np.testing.assert_array_equal(depth_m, (units.astype(float) * unit_m).astype(np.float32))
+
+
+def test_depth_of_a_range_begins_at_its_offset():
+    units = np.array([[0, 4, 65535]], dtype=np.uint16)
+    encoding = DepthEncoding(unit_m=0.5, offset_m=0.25)
+
+    depth_m = depth_m_from_units(units, measured=units != 0, encoding=encoding)
+
+    np.testing.assert_array_equal(depth_m, [[0, 2.25, 32767.75]])
 
 
 @pytest.mark.parametrize("form", ["depth", "inverse"])

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.errors import MediaError
-from stereogenbench_data.media.container import StreamFacts
+from stereogenbench_data.media.container import StreamFacts, depth_coding
 from stereogenbench_data.media.depth import ANY_DEPTH, read_depth_units, require_depth_stream
+from stereogenbench_data.media.depth_packing import grey_frame
 from stereogenbench_data.media.video import VideoReader, plane_numbers, probe
 from stereogenbench_data.schema.records import DepthEncoding
 
@@ -153,9 +154,9 @@ def test_the_luma_plane_is_read_where_chroma_is_accepted(clips):
 
 @pytest.mark.parametrize(
     "pixel_format",
-    ["rgb24", "gbrp16le", "pal8", "rgb48be", "grayf32le", "gray32le", "ya8", "nv12", "monow"],
+    ["pal8", "grayf32le", "gray32le", "ya8", "nv12", "monow"],
 )
-def test_colours_are_refused_whatever_is_accepted(pixel_format):
+def test_formats_that_hold_no_whole_numbers_are_refused_whatever_is_accepted(pixel_format):
     facts = StreamFacts(
         codec="ffv1", pixel_format=pixel_format, width_px=8, height_px=8, frames=1,
         frame_rate_hz=15.0, tags={},
@@ -167,6 +168,118 @@ def test_colours_are_refused_whatever_is_accepted(pixel_format):
         require_depth_stream(
             codec=facts.codec, pixel_format=facts.pixel_format, encoding=ANY_DEPTH, name="clip"
         )
+
+
+def smooth_depth():
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    numbers = 300 + 37 * columns + 11 * rows + np.random.default_rng(0).integers(0, 4, rows.shape)
+    return numbers.astype(np.uint16)
+
+
+def written_colours(path, channels, *, pixel_format, codec, options=()):
+    """Write one picture of red, green and blue planes."""
+    red, green, blue = channels
+    with av.open(path, "w") as container:
+        stream = container.add_stream(codec, rate=15, options=dict(options))
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixel_format
+        frame = av.VideoFrame(WIDTH, HEIGHT, pixel_format)
+        if pixel_format.startswith("gbrp"):
+            planes = list(zip(frame.planes, (green, blue, red), strict=True))
+        else:
+            order = {"r": red, "g": green, "b": blue, "0": np.zeros_like(red)}
+            letters = pixel_format.removesuffix("24")
+            packed = np.stack([order[letter] for letter in letters], axis=-1)
+            planes = [(frame.planes[0], packed.reshape(HEIGHT, -1))]
+        for plane, numbers in planes:
+            rows = np.zeros((HEIGHT, plane.line_size // numbers.itemsize), numbers.dtype)
+            rows[:, : numbers.shape[1]] = numbers
+            plane.update(rows.tobytes())
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+def read_first(path, accept=(), frames=1):
+    with VideoReader(path, name="clip", frames=frames) as reader:
+        return read_depth_units(reader, 0, encoding=DepthEncoding(accept=frozenset(accept)))
+
+
+BYTES = {
+    "red and green": (("high", "low", "none"), "bgr0", "ffv1", {}),
+    "green and red": (("low", "high", "none"), "bgr0", "ffv1", {}),
+    "blue and green": (("none", "low", "high"), "bgr0", "ffv1", {}),
+    "lossless H.264": (("high", "low", "none"), "bgr24", "libx264rgb", {"qp": "0"}),
+    "lossless HEVC": (("none", "high", "low"), "gbrp", "libx265",
+                      {"x265-params": "lossless=1:log-level=none"}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BYTES)
+def test_high_and_low_byte_are_found_in_channels_of_colours(tmp_path, case):
+    places, pixel_format, codec, options = BYTES[case]
+    depth = smooth_depth()
+    parts = {"high": depth >> 8, "low": depth & 255, "none": 0 * depth}
+    channels = [parts[place].astype(np.uint8) for place in places]
+    path = written_colours(
+        tmp_path / "x.mkv", channels, pixel_format=pixel_format, codec=codec, options=options
+    )
+
+    np.testing.assert_array_equal(read_first(path), depth)
+
+
+def test_three_equal_channels_of_16_bits_are_depth(tmp_path):
+    depth = smooth_depth()
+    path = written_colours(tmp_path / "x.mkv", [depth] * 3, pixel_format="gbrp16le", codec="ffv1")
+
+    np.testing.assert_array_equal(read_first(path), depth)
+
+
+@pytest.mark.parametrize("case", ["other numbers", "colours", "grey", "one byte", "noise"])
+def test_channels_that_are_no_number_are_refused(tmp_path, case):
+    depth, flat = smooth_depth(), np.zeros((HEIGHT, WIDTH), np.uint8)
+    busy = [each.astype(np.uint8) for each in noise(8, "u1")]
+    channels, pixel_format = {
+        "other numbers": ([depth, depth, depth // 2], "gbrp16le"),
+        "colours": (busy, "bgr0"),
+        "grey": ([busy[0]] * 3, "bgr0"),
+        "one byte": ([flat, busy[0], flat], "bgr0"),
+        "noise": ([busy[0], busy[1], flat], "bgr0"),
+    }[case]
+    path = written_colours(tmp_path / "x.mkv", channels, pixel_format=pixel_format, codec="ffv1")
+
+    with pytest.raises(MediaError, match=r"clip: depth is stored in channels of colours, and"):
+        read_first(path)
+
+
+HEVC = "x265-params"
+
+
+@pytest.mark.parametrize(
+    ("codec", "pixel_format", "options", "coding"),
+    [
+        ("libx264", "gray10le", {"qp": "0"}, "h264 lossless"),
+        ("libx264", "gray10le", {"crf": "1"}, "h264"),
+        ("libx265", "gray12le", {HEVC: "lossless=1:log-level=none"}, "hevc lossless"),
+        ("libx265", "gray12le", {HEVC: "crf=1:log-level=none"}, "hevc"),
+        ("libx265", "gray12le", {HEVC: "cu-lossless=1:crf=20:log-level=none"}, "hevc"),
+    ],
+)  # fmt: skip
+def test_h264_and_hevc_are_lossless_where_their_headers_say_so(
+    tmp_path, codec, pixel_format, options, coding
+):
+    bits = int(pixel_format[4:6])
+    pictures = noise(bits, "<u2")
+    with av.open(tmp_path / "x.mkv", "w") as container:
+        stream = container.add_stream(codec, rate=15, options=options)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixel_format
+        for picture in pictures:
+            container.mux(stream.encode(grey_frame(picture, pixel_format=pixel_format)))
+        container.mux(stream.encode(None))
+
+    assert depth_coding(probe(tmp_path / "x.mkv", name="clip")) == coding
+    if coding.endswith("lossless"):
+        found = read_first(tmp_path / "x.mkv", frames=3, accept=[f"{bits}-bit", "chroma"])
+        np.testing.assert_array_equal(found, pictures[0])
 
 
 def test_the_rendered_scene_is_read_as_ffmpeg_reads_it(clips, shared_scenes):

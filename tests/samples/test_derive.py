@@ -83,6 +83,15 @@ def test_disparity_by_hand():
     assert pair.baseline_m == 0.2
 
 
+def test_depth_of_a_range_moves_disparity_and_keeps_its_error():
+    pair = geometry(np.full((20, 40), 40), DepthEncoding(0.1, offset_m=1.0))
+    plain = geometry(np.full((20, 40), 50), DepthEncoding(0.1))
+
+    assert (pair.depth_m == 5.0).all()
+    np.testing.assert_array_equal(pair.disparity, plain.disparity)
+    np.testing.assert_array_equal(pair.disparity_error, plain.disparity_error)
+
+
 @pytest.mark.parametrize(
     ("options", "sign"),
     [

@@ -349,8 +349,8 @@ def test_depth_of_another_unit_than_the_index_says_is_reported_by_decoding(repac
     (reported,) = repacked("cam_05_depth.mkv", other.read_bytes())
 
     assert (
-        "cam_05_depth.mkv: is stored as ('ffv1', 'gray16le', 0.5), and the index says "
-        "('ffv1', 'gray16le', 0.001)"
+        "cam_05_depth.mkv: is stored as ('ffv1', 'gray16le', 0.5, 0.0), and the index says "
+        "('ffv1', 'gray16le', 0.001, 0.0)"
     ) in reported
 
 

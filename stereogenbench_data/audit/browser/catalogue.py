@@ -9,6 +9,7 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from jaxtyping import Int64
 
+from stereogenbench_data.audit.contract.verdict import encoding_line
 from stereogenbench_data.audit.pictures.scene_pictures import derived_text
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
@@ -155,7 +156,7 @@ class Catalogue:
         """Return what the page shows of the data as a whole."""
         focal_mm = self.index.column("focal_mm")
         rows = np.arange(len(self.index), dtype=np.int64)
-        depth = "" if self._depth is None else f"depth unit {self._depth.unit_m:g} m, as asked"
+        depth = "" if self._depth is None else f"depth as asked: {encoding_line(self._depth)}"
         found = baselines_cm(self.index, choose_pairs(self.index, rows, pairs="all"))
         return {
             "data": self._data,
@@ -264,7 +265,7 @@ class Catalogue:
         given = "".join(f", {option}={value!r}" for option, value in options.items())
         if self._depth is not None:
             imports = "DepthEncoding, StereoPairs"
-            given += f", depth=DepthEncoding(unit_m={self._depth.unit_m!r})"
+            given += f", depth={encoding_line(self._depth)}"
         return (
             f"from stereogenbench_data import {imports}\n"
             f"{name} = StereoPairs({self._data!r}{given})"
@@ -301,7 +302,7 @@ class Catalogue:
 
 def _facts(scene: Scene, *, depth: DepthEncoding | None) -> dict[str, Any]:
     rig, camera = scene.rig, rig_intrinsics(scene.rig)
-    unit_m = scene.depth_unit_m[0] if depth is None else depth.known_unit_m
+    encoding = scene.depth_encoding(0, depth)
     return {
         "key": scene.id.key,
         "caption": scene.caption,
@@ -315,8 +316,8 @@ def _facts(scene: Scene, *, depth: DepthEncoding | None) -> dict[str, Any]:
         "height_px": rig.image_height_px,
         "focal_mm": rig.focal_mm,
         "fx_px": camera.fx_px,
-        "depth_unit_m": unit_m if math.isfinite(unit_m) else None,
-        "depth_unit_source": scene.depth_unit_source[0] if depth is None else "as asked",
+        "depth_unit_m": encoding.unit_m,
+        "depth_unit_source": "as asked" if encoding.source == "user" else encoding.source,
         "rig_residual_px": scene.rig_residual_px,
         "derived": derived_text(scene),
     }

@@ -274,8 +274,7 @@ class SceneFrames:
 
     def unit_m(self, file: int) -> float:
         """Return the declared unit of a depth file; the release's default if there is none."""
-        unit_m = self.encoding.unit_m or self.scene.depth_unit_m[file]
-        return unit_m if np.isfinite(unit_m) else DEFAULT_DEPTH_UNIT_M
+        return self.scene.depth_encoding(file, self.encoding).unit_m or DEFAULT_DEPTH_UNIT_M
 
     def rgb(self, frame: int, file: int) -> UInt8[np.ndarray, "3 h w"]:
         """Return a picture."""
@@ -433,7 +432,9 @@ class SceneFrames:
     ) -> Points:
         """Return the disparity between a match's files by stored depths."""
         unit_m = self.unit_m(file)
-        per_m = 1 / (unit_m * number) if hypothesis.form == "depth" else number / unit_m
+        offset_m = self.scene.depth_encoding(file, self.encoding).offset_m
+        is_depth = hypothesis.form == "depth"
+        per_m = 1 / (offset_m + unit_m * number) if is_depth else number / unit_m
         if hypothesis.kind == "ray":
             per_m *= self.ray_per_planar[place]
         disparity_px: Points = self.intrinsics.fx_px * self.baseline_m(match, hypothesis) * per_m

@@ -302,8 +302,11 @@ def _length_answers(scenes: Sequence[SceneDiagnosis], unit: Unit) -> tuple[Answe
     The last two are never known by themselves.
     """
     first = scenes[0]
-    where = {"tag": "by the files' tag", "default": "by default", "user": "as given"}
-    declared = f"{first.unit_m:g} m, {where.get(first.unit_source, 'tags unreadable')}"
+    where = {
+        "tag": "by the files' tag", "metadata": "by the scene's JSON", "default": "by default",
+        "user": "as given",
+    }  # fmt: skip
+    declared = f"{first.unit_m:g} m, {where.get(first.unit_source, 'as files are not understood')}"
     quotient = _quotient(scenes, unit)
     of_unit = Answer("metres a unit", declared, "", "not seen alone", note=_ALONE)
     of_focal = replace(of_unit, topic="focal length", declared="from the sensor's width")
@@ -339,7 +342,7 @@ def _quotient(scenes: Sequence[SceneDiagnosis], unit: Unit) -> Answer:
     if doubt:
         return replace(blank, note=doubt)
     if first.unit_source == "unreadable":
-        return replace(blank, declared="tags unreadable", found=found)
+        return replace(blank, declared="files not understood", found=found)
     note = f"the 95 % interval lies within {MARGIN:.0%} of what is declared"
     return replace(blank, found=found, status="confirmed", note=note)
 
@@ -529,7 +532,7 @@ def _pasted(
 
 def encoding_line(encoding: DepthEncoding) -> str:
     """Return the Python expression of a contract, without defaults."""
-    default = replace(encoding, unit_m=None, kind="planar", form="depth", frame_lag=0)
+    default = DepthEncoding(source=encoding.source)
     arguments = [
         f"{field.name}={getattr(encoding, field.name)!r}"
         for field in fields(encoding)
@@ -586,8 +589,8 @@ def _contract_words(
 def group_by_contract(scenes: Sequence[SceneDiagnosis]) -> list[list[SceneDiagnosis]]:
     """Return scenes in groups with one contract, the largest first.
 
-    Scenes with the declared contract join a group with another one unless their own pictures rule
-    that one out.
+    Scenes whose files declare different units are never judged together. Scenes with the declared
+    contract join a group with another one unless their own pictures rule that one out.
     """
     judged = [scene for scene in scenes if not scene.problem]
     if not judged:
@@ -609,7 +612,7 @@ def _is_changed(scene: SceneDiagnosis) -> bool:
 
 def _fits(scene: SceneDiagnosis, leader: SceneDiagnosis) -> bool:
     """Tell whether a scene may have the contract of another."""
-    if scene.declared != leader.declared:
+    if (scene.declared, scene.unit_m) != (leader.declared, leader.unit_m):
         return False
     if has_camera_problems([scene, leader]):
         # Problems of single cameras are the scene's own.

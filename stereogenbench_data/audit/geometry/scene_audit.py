@@ -36,7 +36,7 @@ from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageE
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.index.evidence import poses_as
-from stereogenbench_data.media.depth import depth_frame_index, depth_m_from_units
+from stereogenbench_data.media.depth import NO_DEPTH_UNIT, depth_frame_index, depth_m_from_units
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.document import parse_object
@@ -147,14 +147,10 @@ class AuditedFiles:
         )
 
     def _encoding(self, camera: int) -> DepthEncoding:
-        source = self.scene.depth_unit_source[camera]
-        if source == "unreadable":
-            if self.contract.unit_m is None:
-                raise MediaError(
-                    "its tags do not state one positive number of metres in a stored unit of depth"
-                )
-            return self.contract
-        return self.contract.with_file_unit(self.scene.depth_unit_m[camera], source=source)
+        encoding = self.scene.depth_encoding(camera, self.contract)
+        if encoding.unit_m is None:
+            raise MediaError(self.scene.remark("depth") or NO_DEPTH_UNIT)
+        return encoding
 
     def unit_m(self, camera: int) -> float:
         """Return the metres in a stored unit of a camera's depth, nan if its tags contradict."""

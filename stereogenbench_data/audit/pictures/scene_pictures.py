@@ -31,7 +31,7 @@ from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.picture import Picture, anaglyph
-from stereogenbench_data.schema.records import Scene
+from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.sources.files import open_output
 
@@ -99,7 +99,10 @@ def scene_sheet(
     views = reader.views(row, frame=frame)
     width = tile_width(scene, tile_px)
     rows = [_view_tiles(scene, views, pair), _pair_tiles(scene, sample)]
-    return _contact_sheet(_title(scene, sample, pair=pair, frame=frame), rows, width_px=width)
+    encoding = scene.depth_encoding(pair[0], reader.depth)
+    return _contact_sheet(
+        _title(scene, sample, encoding, pair=pair, frame=frame), rows, width_px=width
+    )
 
 
 def _text_sizes(width_px: int) -> tuple[int, int]:
@@ -134,15 +137,17 @@ def _contact_sheet(title: list[str], rows: list[list[_Tile]], *, width_px: int) 
     return page.finished()
 
 
-def _title(scene: Scene, sample: Sample, *, pair: tuple[int, int], frame: int) -> list[str]:
+def _title(
+    scene: Scene, sample: Sample, encoding: DepthEncoding, *, pair: tuple[int, int], frame: int
+) -> list[str]:
     rig, camera = scene.rig, rig_intrinsics(scene.rig)
-    unit_m, source = scene.depth_unit_m[pair[0]], scene.depth_unit_source[pair[0]]
     baseline_cm = float(sample["baseline_m"]) * 100
     facts = (
         f"pair {pair[0]}-{pair[1]}, baseline {baseline_cm:.2f} cm; frame {frame} of "
         f"{scene.frames} at {scene.frame_rate_hz:g} Hz; {rig.image_width_px} x "
         f"{rig.image_height_px} px; focal length {rig.focal_mm:.4g} mm, fx {camera.fx_px:.1f} px; "
-        f"depth unit {unit_m:g} m ({source}); rig residual {scene.rig_residual_px:.2g} px"
+        f"depth unit {encoding.known_unit_m:g} m ({encoding.source}); "
+        f"rig residual {scene.rig_residual_px:.2g} px"
     )
     texts = [text for text in (derived_text(scene), scene.caption) if text]
     return [scene.id.key, facts, *texts]

@@ -1,0 +1,181 @@
+"""What tags and JSON say of stored depth, in many spellings: understood right, or refused."""
+
+import json
+
+import pytest
+
+from stereogenbench_data.errors import SchemaError
+from stereogenbench_data.schema.depth_contract import agreed, stated_in_json, stated_in_tags
+
+LARGEST = 65535
+
+
+def of_tags(**tags):
+    return agreed(stated_in_tags(tags, name="clip"), largest=LARGEST)
+
+
+def of_json(document):
+    return agreed(stated_in_json(document, name="baseline.json"), largest=LARGEST)
+
+
+MILLIMETRES = """
+scale=0.001 | depth_scale=1000 | DEPTH_UNIT=mm | unit=0.001 m | depth_unit=1 mm | scale=1e-3 m
+meters_per_unit=0.001 | units_per_meter=1000 | UNITSPERMETER=1000 | DEPTHSCALEMM=1
+scale=1/1000 | scale=1:1000 | scale=0,001 | depth_scale_cm=0.1 | depth_scale=0.001 m/unit
+depth_scale=1000 units/meter | depth_units=millimeters | depth_unit=millimeters per count
+depth_to_meters=0.001 | m_to_depth=1000 | scale_factor=1000 | DEPTH_DIVISOR=1000
+depth_multiplier=0.001 | DEPTH_M_PER_LSB=0.001 | DEPTH_MM_PER_UNIT=1 | depth_precision=1mm
+depth_quantization_step_m=0.001 | DEPTH_FORMAT=uint16_mm | comment=mm
+title=depth in mm, 16 bit | title=cam_00_depth_mm | comment=Depth (millimetres), uint16
+comment=stored = metres * 1000 | comment=depth[m] = pixel / 1000.0 | comment=z = v*0.001 m
+comment=[m] = 0.001 * raw | comment=depth*1000 | comment=1 unit = 1 mm | comment=1000 = 1m
+comment=1000 units per metre | comment=baselines in cm; depth in mm | comment=unit=mm
+comment=16-bit integers with a scale of 0.001 meters per unit. | comment=depth_scale=0.001
+comment=multiply by 0.001 to get metres | comment={"depth_scale": 0.001, "unit": "m"}
+"""
+
+
+@pytest.mark.parametrize(
+    "tag", [each.strip() for line in MILLIMETRES.splitlines() for each in line.split("|") if each]
+)
+def test_a_tag_of_millimetres_is_understood(tag):
+    key, _, value = tag.partition("=")
+
+    found = of_tags(**{key: value})
+
+    assert (found.unit_m, found.offset_m, found.origin) == (pytest.approx(0.001), 0, "tag")
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        {"depth_scale": 0.001},
+        {"depth_scale": 1000},
+        {"depth_unit": "mm"},
+        {"depthUnitMeters": 0.001},
+        {"depth_units_per_meter": 1000},
+        {"depth": {"scale": 0.001, "unit": "m", "bits": 16, "frames": 81}},
+        {"depth": {"scale": 1, "unit": "mm"}},
+        {"depth_encoding": {"meters_per_unit": 0.001, "dtype": "uint16"}},
+        {"depth_encoding": "uint16 millimeters"},
+        {"render_settings": {"depth": {"format": "gray16", "unit_m": 0.001}}},
+        {"depth_description": "16-bit depth, 1 unit = 1 mm"},
+        {"unit": "cm", "depth_unit_cm": 0.1, "depth_stats": {"min_m": 5.8, "max_m": 61.5}},
+    ],
+    ids=json.dumps,
+)
+def test_json_of_millimetres_is_understood(document):
+    found = of_json(document)
+
+    assert (found.unit_m, found.origin) == (pytest.approx(0.001), "metadata")
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        {},
+        {"unit": "cm", "meters_per_unit": 0.01},
+        {"depth_scale": None},
+        {"depth": {"bits": 16, "codec": "ffv1", "pix_fmt": "gray16le", "frames": 81}},
+        {"depth_of_field": {"scale": 2.5}},
+        {"camera": {"near_clip": 10, "far_clip": 100000}},
+        {"depth_stats": {"min_m": 5.8, "max_m": 61.5}, "valid_depth_ratio": 0.94},
+    ],
+    ids=json.dumps,
+)
+def test_json_that_says_nothing_of_the_unit_leaves_it_open(document):
+    assert of_json(document).unit_m is None
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {"encoder": "Lavf61.7.100", "DURATION": "00:00:05.4"},
+        {"CAMERA": "3", "FRAMES": "81", "BITS": "16", "FPS": "15"},
+        {"title": "AssetsvilleTown_scene_1166 depth 16 bit"},
+        {"comment": "Rendered by Unreal 5.3 with a 35 mm lens, 1280x1280"},
+        {"description": "ray-traced"},
+    ],
+    ids=str,
+)
+def test_tags_of_something_else_leave_the_unit_open(tags):
+    assert of_tags(**tags).unit_m is None
+
+
+@pytest.mark.parametrize(
+    "statements",
+    [
+        lambda: stated_in_tags({"depth_near": "0.5 m", "depth_far": "80.5 m"}, name="clip"),
+        lambda: stated_in_tags({"near": "0.5", "far": "80.5"}, name="clip"),
+        lambda: stated_in_tags({"min_depth": "0.5", "max_depth": "80.5"}, name="clip"),
+        lambda: stated_in_tags({"near_cm": "50", "far_cm": "8050"}, name="clip"),
+        lambda: stated_in_tags({"depth_range": "0.5-80.5 m"}, name="clip"),
+        lambda: stated_in_tags({"comment": "linear depth, near=0.5m far=80.5m"}, name="clip"),
+        lambda: stated_in_tags(
+            {"comment": "depth = near + (far - near) * v / 65535, near = 0.5 m, far = 80.5 m"},
+            name="clip",
+        ),
+        lambda: stated_in_json({"depth_normalization": {"min_cm": 50, "max_cm": 8050}}, name="j"),
+        lambda: stated_in_json({"depth": {"near": 0.5, "far": 80.5, "unit": "m"}}, name="j"),
+    ],
+)
+def test_a_range_gives_unit_and_offset(statements):
+    found = agreed(statements(), largest=LARGEST)
+
+    assert (found.unit_m, found.offset_m) == (pytest.approx(80 / LARGEST), 0.5)
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {"scale": ""}, {"scale": "0"}, {"scale": "-1"}, {"scale": "nan"}, {"scale": "x0.001"},
+        {"units_per_meter": "0.001"}, {"meters_per_unit": "1000"},
+        {"DEPTH_FOO": "0.001"}, {"zscale2": "0.001"}, {"DEPTH_UNIT": "m"}, {"unit": "inch"},
+        {"scale": "0.1", "DEPTH_UNIT": "mm"}, {"scale": "0.1", "unit": "cm"},
+        {"depth_scale": "0.001", "scale": "0.002"},
+        {"depth_scale": "0.1", "near": "0.5 m", "far": "80.5 m"},
+        {"depth_encoding": "inverse", "scale": "655"}, {"encoding": "log", "scale": "0.001"},
+        {"depth_type": "euclidean", "scale": "0.001"}, {"disparity_scale": "16"},
+        {"scale": "0.001", "offset": "0.5"}, {"max_depth": "100"}, {"normalized": "1"},
+        {"near": "10", "far": "10000"}, {"unit": "mm", "depth_min": "312", "depth_max": "60000"},
+        {"comment": "depth clipped at 100 m"}, {"comment": "depth / 7 + 3"},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_tags_that_do_not_tell_the_unit_are_refused_by_name(tags):
+    with pytest.raises(SchemaError, match=f"clip: tag ({'|'.join(tags)}) = "):
+        of_tags(**tags)
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        {"depth_range_m": [0.5, 80.5]},
+        {"depth": {"type": "ray_distance", "scale": 0.001}},
+        {"depth_scale": 0.1, "depth": {"unit": "mm"}},
+        {"depth_foo": 0.001},
+    ],
+    ids=json.dumps,
+)
+def test_json_that_does_not_tell_the_unit_is_refused_by_its_path(document):
+    with pytest.raises(SchemaError, match=r"baseline\.json: \$\.depth"):
+        of_json(document)
+
+
+def test_a_contradiction_of_two_files_names_both_places():
+    statements = [
+        *stated_in_tags({"DEPTH_SCALE": "0.001"}, name="cam_00_depth.mkv"),
+        *stated_in_json({"depth_scale": 0.1}, name="baseline.json"),
+    ]
+
+    with pytest.raises(SchemaError, match=r"cam_00_depth\.mkv: tag .*baseline\.json: \$\.depth_"):
+        agreed(statements, largest=LARGEST)
+
+
+def test_what_is_stated_twice_agrees_within_its_rounding():
+    statements = [
+        *stated_in_tags({"scale": "0.00152587890625"}, name="clip"),
+        *stated_in_json({"depth_units_per_meter": 655.36, "depth_max_m": 100}, name="j"),
+    ]
+
+    assert agreed(statements, largest=LARGEST).unit_m == 0.00152587890625
