@@ -86,7 +86,6 @@ def test_both_forms_of_the_primary_pair_are_read(rig_document, dumped, pair, exp
         ([0, 1, 2], "$.primary_stereo_pair: must be {left_camera, right_camera} or a list"),
         ({"left_camera": "Cam_left", "right_camera": 1}, "$.primary_stereo_pair: must be {left"),
         ({"left_camera": 0}, "$.primary_stereo_pair: must be {left_camera, right_camera}"),
-        (None, "$.primary_stereo_pair is missing, so nothing tells which camera is left"),
     ],
 )
 def test_a_wrong_primary_pair_is_refused(rig_document, dumped, pair, problem):
@@ -96,6 +95,15 @@ def test_a_wrong_primary_pair_is_refused(rig_document, dumped, pair, problem):
 
     assert len(found) == 1
     assert found[0].startswith(problem)
+
+
+def test_without_a_primary_pair_cameras_are_taken_to_ascend_to_the_right(rig_document, dumped):
+    del rig_document["primary_stereo_pair"]
+
+    rig, _, (remark,) = parse_rig(dumped(rig_document), where="baseline.json")
+
+    assert rig.primary_pair == (0, 1)
+    assert remark.about == "primary pair"
 
 
 def test_a_principal_point_is_read(rig_document, dumped):
@@ -342,7 +350,7 @@ def test_all_problems_of_a_file_are_reported_at_once(rig_document, dumped):
     rig_document["camera_intrinsics"]["focal_length_mm"] = "far"
     rig_document["camera_intrinsics"]["sensor_width_mm"] = 0
     rig_document["pairwise_pairs"][0]["baseline_cm"] = None
-    del rig_document["primary_stereo_pair"]
+    rig_document["primary_stereo_pair"] = "left"
 
     problems = problems_of(rig_document, dumped)
 
