@@ -30,11 +30,11 @@ TOLERANCE: Final = 1e-3
 
 _LOCATION: Final = {
     "location", "position", "translation", "loc", "pos", "center", "centre", "origin", "t",
-    "trans", "xyz",
+    "trans", "xyz", "tvec",
 }  # fmt: skip
 _ROTATION: Final = {
     "rotation", "rotator", "orientation", "euler", "quaternion", "quat", "rot", "q", "r",
-    "angles", "rotmat", "matrix", "rotvec", "rvec",
+    "angles", "rotmat", "matrix", "rotvec", "rvec", "qvec",
 }  # fmt: skip
 _NO_POSE: Final = {
     "scale", "scale3d", "velocity", "forward", "up", "right", "target", "lookat", "color",
@@ -54,10 +54,14 @@ _ALIASES: Final = {
     "blender": "opengl", "gl": "opengl", "nerf": "opengl", "cv": "opencv", "colmap": "opencv",
     "ue": "unreal", "ue4": "unreal", "ue5": "unreal", "rotator": "unreal",
 }  # fmt: skip
-_FROM_CAMERA: Final = ("c2w", "camera_to_world", "cam_to_world", "world_from_cam", "cam2world",
-                       "camera2world", "matrix_world", "world_from_camera")  # fmt: skip
-_FROM_WORLD: Final = ("w2c", "world_to_camera", "world_to_cam", "cam_from_world", "world2cam",
-                      "world2camera", "extrinsic", "camera_from_world", "view_matrix")  # fmt: skip
+_FROM_CAMERA: Final = (
+    "c2w", "camera_to_world", "cam_to_world", "world_from_cam", "cam2world", "camera2world",
+    "matrix_world", "world_from_camera",
+)  # fmt: skip
+_FROM_WORLD: Final = (
+    "w2c", "world_to_camera", "world_to_cam", "cam_from_world", "world2cam", "world2camera",
+    "extrinsic", "camera_from_world", "view_matrix", "colmap",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -503,15 +503,14 @@ def _baselines(
             )
             continue
         rounding_cm = abs(length_cm / each.value) * each.rounding if each.value else 0.0
-        if pair in best:
-            known_cm, known_rounding_cm, known = best[pair]
-            if abs(length_cm - known_cm) > rounding_cm + known_rounding_cm:
-                findings.problems.append(
-                    f"{each.path}: the baseline of cameras {low} and {high} is {length_cm:.9g} cm "
-                    f"here and {known_cm:.9g} cm at {known.path}. Remove the wrong one"
-                )
-            continue
-        best[pair] = length_cm, rounding_cm, each
+        known_cm, known_rounding_cm, known = best.get(pair, (length_cm, math.inf, each))
+        if abs(length_cm - known_cm) > rounding_cm + known_rounding_cm:
+            findings.problems.append(
+                f"{each.path}: the baseline of cameras {low} and {high} is {length_cm:.9g} cm "
+                f"here and {known_cm:.9g} cm at {known.path}. Remove the wrong one"
+            )
+        elif rounding_cm < known_rounding_cm:
+            best[pair] = length_cm, rounding_cm, each
     lengths_cm = {pair: length_cm for pair, (length_cm, _, _) in best.items()}
     missing = [f"{a}-{b}" for a, b in CAMERA_PAIRS if (a, b) not in lengths_cm]
     if missing:
@@ -643,7 +642,12 @@ def _lengths_of(
     entry: dict[str, Any], cameras: Pair, path: str, default_m: float, findings: _Findings
 ) -> Iterable[_Recorded]:
     """Yield the baselines that an entry of a pair states, in one unit or in several."""
-    keys = [key for key in entry if re.search(r"baseline|distance|length|separation", words(key))]
+    keys = [
+        key
+        for key in entry
+        if re.search(r"baseline|distance|length|separation", words(key))
+        and not re.search(r"target|request|nominal|desired|min|max|mean|std|range", words(key))
+    ]
     if not keys:
         findings.problems.append(
             f"{path}: baseline_cm is missing; the keys here are: {', '.join(sorted(entry))}"

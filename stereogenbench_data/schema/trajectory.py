@@ -67,7 +67,8 @@ class Block:
     def words(self) -> frozenset[str]:
         """The words of the last two keys: what the numbers are called."""
         keys = [key for key in self.name if key != "*"][-2:]
-        return frozenset(word for key in keys for word in key.split("_"))
+        found = {word for key in keys for word in key.split("_")}
+        return frozenset(found | {word.removesuffix("s") for word in found})
 
     @property
     def key(self) -> str:
@@ -154,7 +155,7 @@ def _hints(document: dict[str, Any]) -> frozenset[str]:
         if isinstance(value, dict) and len(value) < _MOST_HINTS:
             waiting += [(f"{name}_{words(key)}", inner) for key, inner in value.items()]
         elif isinstance(value, str) and len(value) < 200 and _SPEAKS_OF_FORM.search(name):
-            found |= {*words(value).split("_"), *name.split("_")}
+            found |= {words(value), *words(value).split("_"), *name.split("_")}
         elif isinstance(value, list) and 0 < len(value) <= 4 and _SPEAKS_OF_FORM.search(name):
             found |= {"".join(map(str, value)).lower()}
     return frozenset(found)
