@@ -350,7 +350,11 @@ def _poses(
     if len(found.names) > 1:
         listed = ", ".join(name.partition(" @ ")[0] for name in found.names)
         remarks.append(
-            Remark("world", f"{where}: several readings of its poses fit the rig: {listed}")
+            Remark(
+                "world",
+                f"{where}: several readings of its poses fit the rig: {listed}; `stereogenbench "
+                f"doctor` tells by depth which is right",
+            )
         )
     return found.poses, "|".join(found.names)
 
