@@ -70,7 +70,8 @@ class Reading:
 
     Attributes:
         name: What the form is, for people and for the index.
-        tier: 0 if it is what the file names, 1 if it fits what it names, 2 for the other forms.
+        tier: 0 if it is what the file names, 1 if it fits what it names, 2 for the other forms;
+            3 more for other axes.
         is_named: Whether the file names the camera's axes.
         trajectory: The poses, with the unit that the file states, else nan metres.
     """
@@ -280,31 +281,39 @@ def _kinds(block: Block) -> list[str]:
 
 
 def _tier(block: Block, kind: list[str], axes: str, hints: frozenset[str]) -> int:
-    """Return 0 for what the file names, 1 for what fits what it names, 2 for other forms."""
+    """Return 0 for what the file names, 1 for what fits what it names, 2 for other forms.
+
+    Other axes than the file names, or than Unreal's where it names none, come after all of these.
+    """
     said = hints | block.words
     text = "_".join((*(key for key in block.name if key != "*"), *sorted(said)))
     is_from_world = any(word in text for word in _FROM_WORLD) and not any(
         word in text for word in _FROM_CAMERA
     )
     is_rad = block.unit.startswith("rad") or any(word.startswith("rad") for word in said)
-    said_orders = _ORDERS & said
-    if axes not in (({*AXES} & hints) or {"unreal"}) or is_from_world != ("w2c" in kind):
-        return 2
-    if kind[0] in _ANGLES and ("rad" in kind) != is_rad:
-        return 2
+    fits = is_from_world == ("w2c" in kind) and (
+        kind[0] not in _ANGLES or ("rad" in kind) == is_rad
+    )
     named_kinds = {each for each, names in _KIND_WORDS.items() if names & hints}
+    tier = _form_tier(block, kind, said) if fits else 2
+    if tier == 0 and named_kinds and kind[0] not in named_kinds:
+        tier = 1
+    return tier if axes in ({*AXES} & hints or {"unreal"}) else tier + 3
+
+
+def _form_tier(block: Block, kind: list[str], said: frozenset[str]) -> int:
+    """Return whether a file names a form by its components, its order, or the word for it."""
+    said_orders = _ORDERS & said
     if kind[0] == "matrix":
-        tier = 2 if kind[2] == "rows" else 0
-    elif block.components in (("pitch", "yaw", "roll"), ("qx", "qy", "qz", "qw")):
-        tier = 0
-    elif kind[0] == "quaternion":
-        tier = 0 if block.components or kind[1] in said_orders else 2 if said_orders else 1
-    elif kind[0] == "vector":
-        tier = 0 if "vector" in named_kinds else 2
-    else:
-        own = {"".join(kind[1:4]), "".join(name[0] for name in kind[1:4])}
-        tier = 0 if said_orders & own else 2 if said_orders or kind[0] == "euler" else 1
-    return 1 if tier == 0 and named_kinds and kind[0] not in named_kinds else tier
+        return 2 if kind[2] == "rows" else 0
+    if block.components in (("pitch", "yaw", "roll"), ("qx", "qy", "qz", "qw")):
+        return 0
+    if kind[0] == "quaternion":
+        return 0 if block.components or kind[1] in said_orders else 2 if said_orders else 1
+    if kind[0] == "vector":
+        return 0 if _KIND_WORDS["vector"] & said else 2
+    own = {"".join(kind[1:4]), "".join(name[0] for name in kind[1:4])}
+    return 0 if said_orders & own else 2 if said_orders or kind[0] == "euler" else 1
 
 
 _ORDERS: Final = frozenset({"xyzw", "wxyz", "pitchyawroll", "rollpitchyaw", "pyr", "rpy", "xyz"})

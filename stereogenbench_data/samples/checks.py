@@ -39,7 +39,8 @@ def without_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> Plan:
         sides = () if known.needs_poses == "never" else ("left",)
         for about in (*known.held_up_by, *sides):
             for row in selected.intersection(index.remarked(about).tolist()):
-                reasons.setdefault(row, f"{name!r} needs {index.scene(row).remark(about)}")
+                text = index.scene(row).remark(about).rstrip(".")
+                reasons.setdefault(row, f"{name!r} needs {text}")
     for row in selected.intersection(index.remarked("videos").tolist()):
         if _missing_videos(index, plan, request, int(np.searchsorted(plan.scene_rows, row))):
             reasons.setdefault(row, index.scene(row).remark("videos"))
