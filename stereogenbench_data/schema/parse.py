@@ -60,6 +60,8 @@ _NAMES_A_CAMERA: Final = re.compile(
     r"cam|left|right|index|\A[abij]\Z|_[abij12]\Z|src|dst|from|to\Z"
 )
 
+_FLOAT32: Final = 1e-6
+
 Pair = tuple[int, int]
 _Recorded = tuple[Pair, float, Stated]
 """The cameras of a pair as they are written, their baseline in cm, and where it stands."""
@@ -509,7 +511,9 @@ def _baselines(
                 f"{each.path}: the baseline of cameras {low} and {high} is {length_cm:.9g} cm "
                 f"here and {known_cm:.9g} cm at {known.path}. Remove the wrong one"
             )
-        elif rounding_cm < known_rounding_cm:
+        elif pair not in best or (
+            rounding_cm < known_rounding_cm and abs(length_cm - known_cm) > _FLOAT32 * length_cm
+        ):
             best[pair] = length_cm, rounding_cm, each
     lengths_cm = {pair: length_cm for pair, (length_cm, _, _) in best.items()}
     missing = [f"{a}-{b}" for a, b in CAMERA_PAIRS if (a, b) not in lengths_cm]
