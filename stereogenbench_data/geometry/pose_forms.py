@@ -71,7 +71,7 @@ class Reading:
     Attributes:
         name: What the form is, for people and for the index.
         tier: 0 if it is what the file names, 1 if it fits what it names, 2 for the other forms;
-            3 more for other axes.
+            3 more for axes that it does not name.
         is_named: Whether the file names the camera's axes.
         trajectory: The poses, with the unit that the file states, else nan metres.
     """
@@ -283,7 +283,8 @@ def _kinds(block: Block) -> list[str]:
 def _tier(block: Block, kind: list[str], axes: str, hints: frozenset[str]) -> int:
     """Return 0 for what the file names, 1 for what fits what it names, 2 for other forms.
 
-    Other axes than the file names, or than Unreal's where it names none, come after all of these.
+    Other axes than the file names come after all of these. Where it names none, Unreal's come first
+    in forms that fit, and all else is of one rank: what is not named must be the only one to pass.
     """
     said = hints | block.words
     text = "_".join((*(key for key in block.name if key != "*"), *sorted(said)))
@@ -298,7 +299,10 @@ def _tier(block: Block, kind: list[str], axes: str, hints: frozenset[str]) -> in
     tier = _form_tier(block, kind, said) if fits else 2
     if tier == 0 and named_kinds and kind[0] not in named_kinds:
         tier = 1
-    return tier if axes in ({*AXES} & hints or {"unreal"}) else tier + 3
+    named_axes = {*AXES} & hints
+    if named_axes:
+        return tier if axes in named_axes else tier + 3
+    return tier if axes == "unreal" else 2
 
 
 def _form_tier(block: Block, kind: list[str], said: frozenset[str]) -> int:
