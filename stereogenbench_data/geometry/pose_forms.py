@@ -72,7 +72,7 @@ class Reading:
         name: What the form is, for people and for the index.
         tier: 0 if it is what the file names, 1 if it fits what it names, 2 for the other forms;
             3 more for axes that it does not name.
-        is_named: Whether the file names the camera's axes.
+        is_named: Whether the file names the camera's axes; pitch, yaw and roll are Unreal's words.
         trajectory: The poses, with the unit that the file states, else nan metres.
     """
 
@@ -90,11 +90,13 @@ def readings(recorded: RecordedPoses, *, only: str | None = None) -> Iterator[Re
         only: The name of the one reading that is wanted.
     """
     found = sorted(_all_readings(recorded), key=lambda each: each.tier)
-    is_named = bool(_hints(recorded) & {*AXES})
+    named_axes = _hints(recorded) & {*AXES}
     for each in found:
         if only is None or each.name == only:
             made = each.make()
             if made is not None:
+                is_rotator = each.turn.components == ("pitch", "yaw", "roll")
+                is_named = each.axes in (named_axes or ({"unreal"} if is_rotator else ()))
                 yield Reading(each.name, each.tier, is_named, made)
 
 

@@ -132,6 +132,15 @@ def test_without_poses_the_left_end_follows_from_the_primary_pair(make_scene, ro
     )
 
 
+def test_cameras_whose_sides_are_contradicted_have_no_poses(make_scene, root, rewrite):
+    rewrite(make_scene() / "baseline.json", lambda d: d.update(primary_stereo_pair=[1, 0]))
+
+    scene = describe_scene(root, KEY)
+
+    assert scene.pose_form is None
+    assert "camera 1 is to the right of camera 0" in scene.remark("left")
+
+
 def test_descriptions_may_be_absent(make_scene, root):
     (make_scene() / "scene_description_qwen_dataset_level.json").unlink()
 
