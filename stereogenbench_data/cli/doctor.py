@@ -143,7 +143,22 @@ def _lines(report: "DoctorReport") -> list[str]:
         lines += ["", *_conclusion(verdict, report), *_tested_lines(verdict), *verdict.beside]
     if any(math.isfinite(scene.gain.mean_db) for scene in report.scenes):
         lines += ["", QUOTIENT_MEANS, _DB_NOTE]
-    return lines
+    return lines + _world_lines(report)
+
+
+def _world_lines(report: "DoctorReport") -> list[str]:
+    """Return which of several readings of the poses depth confirms from frame to frame."""
+    worlds = report.worlds
+    if worlds is None:
+        return []
+    verdict = f"right: {worlds.chosen}" if worlds.chosen else f"cannot tell: {worlds.reason}"
+    return [
+        "",
+        "Several readings of the poses fit the rigs. Depth of one frame is found in another for:",
+        *(f"  {one:.0%}, in other scenes {other:.0%}: {name}"
+          for name, (one, other) in worlds.shares.items()),
+        f"Poses, {verdict}",
+    ]  # fmt: skip
 
 
 def _conclusion(verdict: "Verdict", report: "DoctorReport") -> list[str]:

@@ -22,7 +22,7 @@ from stereogenbench_data.geometry.pose import (
     rotation_from_rotator_deg,
 )
 from stereogenbench_data.schema.quantities import UNITS_M
-from stereogenbench_data.schema.records import Trajectory
+from stereogenbench_data.schema.records import RotationKind, Trajectory
 from stereogenbench_data.schema.trajectory import Block, RecordedPoses
 
 TOLERANCE: Final = 1e-3
@@ -30,14 +30,15 @@ TOLERANCE: Final = 1e-3
 
 _LOCATION: Final = {
     "location", "position", "translation", "loc", "pos", "center", "centre", "origin", "t",
-    "trans", "xyz",
+    "trans", "xyz", "tvec",
 }  # fmt: skip
 _ROTATION: Final = {
     "rotation", "rotator", "orientation", "euler", "quaternion", "quat", "rot", "q", "r",
-    "angles", "rotmat", "matrix",
+    "angles", "rotmat", "matrix", "rotvec", "rvec", "qvec",
 }  # fmt: skip
 _NO_POSE: Final = {
     "scale", "scale3d", "velocity", "forward", "up", "right", "target", "lookat", "color",
+    "relative", "local", "character", "subject", "intrinsics", "intrinsic", "k",
 }  # fmt: skip
 
 AXES: Final[dict[str, tuple[tuple[int, int], ...]]] = {
@@ -53,10 +54,14 @@ _ALIASES: Final = {
     "blender": "opengl", "gl": "opengl", "nerf": "opengl", "cv": "opencv", "colmap": "opencv",
     "ue": "unreal", "ue4": "unreal", "ue5": "unreal", "rotator": "unreal",
 }  # fmt: skip
-_FROM_CAMERA: Final = ("c2w", "camera_to_world", "cam_to_world", "world_from_cam", "cam2world",
-                       "camera2world", "matrix_world", "world_from_camera")  # fmt: skip
-_FROM_WORLD: Final = ("w2c", "world_to_camera", "world_to_cam", "cam_from_world", "world2cam",
-                      "world2camera", "extrinsic", "camera_from_world", "view_matrix")  # fmt: skip
+_FROM_CAMERA: Final = (
+    "c2w", "camera_to_world", "cam_to_world", "world_from_cam", "cam2world", "camera2world",
+    "matrix_world", "world_from_camera",
+)  # fmt: skip
+_FROM_WORLD: Final = (
+    "w2c", "world_to_camera", "world_to_cam", "cam_from_world", "world2cam", "world2camera",
+    "extrinsic", "camera_from_world", "view_matrix", "colmap",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,12 +70,15 @@ class Reading:
 
     Attributes:
         name: What the form is, for people and for the index.
-        tier: 0 if it is what the file names, 1 if it fits what it names, 2 for the other forms.
+        tier: 0 if it is what the file names, 1 if it fits what it names, 2 for the other forms;
+            3 more for axes that it does not name.
+        is_named: Whether the file names the camera's axes; pitch, yaw and roll are Unreal's words.
         trajectory: The poses, with the unit that the file states, else nan metres.
     """
 
     name: str
     tier: int
+    is_named: bool
     trajectory: Trajectory
 
 
@@ -82,11 +90,14 @@ def readings(recorded: RecordedPoses, *, only: str | None = None) -> Iterator[Re
         only: The name of the one reading that is wanted.
     """
     found = sorted(_all_readings(recorded), key=lambda each: each.tier)
+    named_axes = _hints(recorded) & {*AXES}
     for each in found:
         if only is None or each.name == only:
             made = each.make()
             if made is not None:
-                yield Reading(each.name, each.tier, made)
+                is_rotator = each.turn.components == ("pitch", "yaw", "roll")
+                is_named = each.axes in (named_axes or ({"unreal"} if is_rotator else ()))
+                yield Reading(each.name, each.tier, is_named, made)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,77 +114,79 @@ class _Form:
 
     def make(self) -> Trajectory | None:
         """Return the poses, None where the numbers are no rotations of this form."""
+        names, values = self.kind.split(), self.turn.values
+        place = values[..., 3] if self.place is None else self.place.values
+        is_native = self.axes == "unreal" and "w2c" not in names
         try:
-            turns, centres = self._read()
+            if names[0] == "matrix":
+                values, place = _parted(values, names, place)
+                turns = _rotations(values)
+            elif names[0] == "quaternion":
+                values = _unit_quaternions(values[..., [names[1].index(each) for each in "xyzw"]])
+                if is_native:
+                    return _finite(place, self.unit_m, values, "quaternion_xyzw")
+                turns = rotation_from_quaternion_xyzw(values)
+            else:
+                values = _degrees(values, names, self.turn.components)
+                if is_native and names[0] == "rotator":
+                    return _finite(place, self.unit_m, values, "rotator_deg")
+                turns = _ANGLES[names[0]](values)
         except GeometryError:
             return None
-        if not (np.isfinite(turns).all() and np.isfinite(centres).all()):
+        if "w2c" in names:
+            turns = np.swapaxes(turns, -1, -2)
+            place = -(turns @ place[..., None])[..., 0]
+        turns = np.stack(
+            [sign * turns[..., :, column] for column, sign in AXES[self.axes]], axis=-1
+        )
+        hands = np.linalg.det(turns)
+        if not (hands.flat[0] * hands > 0).all():
             return None
-        if self.axes == "unreal" and self.kind.startswith("rotator pitch yaw roll deg"):
-            return Trajectory(_frozen(centres), self.unit_m, _frozen(turns), "rotator_deg")
-        if self.axes == "unreal" and self.kind.startswith("quaternion"):
-            return Trajectory(_frozen(centres), self.unit_m, _frozen(turns), "quaternion_xyzw")
-        if self.kind.startswith("rotator"):
-            turns = rotation_from_rotator_deg(turns)
-        elif self.kind.startswith("quaternion"):
-            turns = rotation_from_quaternion_xyzw(turns)
-        columns = [sign * turns[..., :, column] for column, sign in AXES[self.axes]]
-        matrices = np.stack(columns, axis=-1)
-        if np.linalg.det(matrices).flat[0] < 0:
-            # The world has the other hand: all of it is mirrored, the cameras too.
-            matrices = matrices * np.array([1.0, -1.0, 1.0])[:, None]
-            centres = centres * np.array([1.0, -1.0, 1.0])
-        if (np.linalg.det(matrices) < 0).any():
-            return None
-        return Trajectory(_frozen(centres), self.unit_m, _frozen(matrices), "matrix")
-
-    def _read(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return rotations as they are written, in degrees or normalised, and centres."""
-        if self.kind.startswith("matrix"):
-            return _of_matrices(self.turn.values, self.kind.split(), self.place)
-        values, names = self.turn.values, self.kind.split()
-        if names[0] == "quaternion":
-            order = [1, 2, 3, 0] if names[1] == "wxyz" else [0, 1, 2, 3]
-            return _unit_quaternions(values[..., order]), _centres(self.place)
-        if not self.turn.components:
-            values = values[..., [names.index(each) - 1 for each in ("pitch", "yaw", "roll")]]
-        degrees = np.rad2deg(values) if "rad" in names else values
-        if not np.abs(degrees).max(initial=0) <= _MOST_TURNS_DEG:
-            raise GeometryError("no angles")
-        return degrees, _centres(self.place)
+        if hands.flat[0] < 0:  # The world has the other hand: all is mirrored, the cameras too.
+            turns, place = turns * _MIRROR[:, None], place * _MIRROR
+        return _finite(place, self.unit_m, turns, "matrix")
 
 
-def _of_matrices(
-    values: np.ndarray, names: list[str], place: Block | None
+_MIRROR: Final = np.array([1.0, -1.0, 1.0])
+
+
+def _finite(
+    places: np.ndarray, unit_m: float, turns: np.ndarray, kind: RotationKind
+) -> Trajectory | None:
+    """Return poses whose numbers are all finite, None for others."""
+    if not (np.isfinite(turns).all() and np.isfinite(places).all()):
+        return None
+    turns, places = np.ascontiguousarray(turns), np.ascontiguousarray(places)
+    turns.setflags(write=False)
+    places.setflags(write=False)
+    return Trajectory(places, unit_m, turns, kind)
+
+
+def _parted(
+    values: np.ndarray, names: list[str], place: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return world-from-camera rotations, or reflections, and centres of recorded matrices."""
+    """Return the rotations and the translations of matrices, in whatever shape they are written."""
     sides = {16: (4, 4), 12: (3, 4), 9: (3, 3)}.get(values.shape[-1])
     if values.ndim == 3 and sides is not None:
         values = values.reshape(*values.shape[:-1], *sides)
     if "rows" in names:  # vectors are rows: the transpose
         values = np.swapaxes(values, -1, -2)
-    turns = _rotations(values[..., :3, :3])
-    has_centres = values.shape[-1] == 4
-    centres = values[..., :3, 3] if has_centres else _centres(place)
-    if names[1] == "w2c":
-        turns = np.swapaxes(turns, -1, -2)
-        centres = -(turns @ centres[..., None])[..., 0] if has_centres else centres
-    return turns, centres
+    return values[..., :3, :3], values[..., :3, 3] if values.shape[-1] == 4 else place
+
+
+def _degrees(
+    values: np.ndarray, names: list[str], components: tuple[str, ...]
+) -> Float64[np.ndarray, "*n 3"]:
+    """Return angles in degrees: of rotators pitch, yaw, roll; of others in the order written."""
+    if names[0] == "rotator" and components != ("pitch", "yaw", "roll"):
+        values = values[..., [names.index(each) - 1 for each in ("pitch", "yaw", "roll")]]
+    degrees = np.rad2deg(values) if "rad" in names else values
+    if not np.abs(degrees).max(initial=0) <= _MOST_TURNS_DEG:
+        raise GeometryError("no angles")
+    return degrees
 
 
 _MOST_TURNS_DEG: Final = 1e5
-
-
-def _frozen(values: np.ndarray) -> np.ndarray:
-    values = np.ascontiguousarray(values)
-    values.setflags(write=False)
-    return values
-
-
-def _centres(place: Block | None) -> np.ndarray:
-    if place is None:
-        raise GeometryError("no location")
-    return place.values
 
 
 def _unit_quaternions(values: Float64[np.ndarray, "*n 4"]) -> Float64[np.ndarray, "*n 4"]:
@@ -192,106 +205,128 @@ def _rotations(matrices: Float64[np.ndarray, "*n 3 3"]) -> Float64[np.ndarray, "
     return np.asarray(nearest_rotation(matrices * signs) * signs)
 
 
+def _from_vectors_deg(vectors_deg: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3 3"]:
+    """Return the rotations by the lengths of vectors, in degrees, about their directions."""
+    halves = np.deg2rad(vectors_deg) / 2
+    lengths = np.linalg.norm(halves, axis=-1, keepdims=True)
+    return rotation_from_quaternion_xyzw(
+        np.concatenate([halves * np.sinc(lengths / np.pi), np.cos(lengths)], axis=-1)
+    )
+
+
+def _from_euler_deg(xyz_deg: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3 3"]:
+    """Return Rz(z) Ry(y) Rx(x), as Blender and ROS write angles."""
+    return rotation_from_rotator_deg(xyz_deg[..., [1, 2, 0]] * np.array([-1.0, 1.0, -1.0]))
+
+
+_ANGLES: Final = {
+    "rotator": rotation_from_rotator_deg, "euler": _from_euler_deg, "vector": _from_vectors_deg,
+}  # fmt: skip
+
+
 def _all_readings(recorded: RecordedPoses) -> Iterator[_Form]:
-    hints = recorded.hints | {_ALIASES[hint] for hint in recorded.hints if hint in _ALIASES}
+    hints = _hints(recorded)
     blocks = [block for block in recorded.blocks if not block.words & _NO_POSE]
-    places = [b for b in blocks if b.values.shape[-1] == 3 and b.values.ndim == 3
+    places = [b for b in blocks if b.values.shape[2:] == (3,)
               and b.components not in (("pitch", "yaw", "roll"), ("rx", "ry", "rz"))
               and (b.words & _LOCATION or (b.components and not b.words & _ROTATION))]  # fmt: skip
-    for turn in blocks:
-        for kind, needs_place in _kinds(turn):
-            for place in places if needs_place else [None]:
-                if place is turn:
-                    continue
-                for axes in _possible_axes(hints):
-                    unit_m, unit = _unit(recorded, place or turn)
-                    tier = _tier(turn, kind, axes, hints)
-                    where = turn.key if place is None else f"{place.key} and {turn.key}"
-                    name = f"{where}: {kind}, {axes} axes{unit}"
-                    yield _Form(name, tier, turn, place, kind, axes, unit_m)
+    for turn, axes in itertools.product(blocks, AXES):
+        for kind in _kinds(turn):
+            own_place = turn.values.shape[2:] in ((4, 4), (16,), (3, 4), (12,))
+            for place in [None] if own_place else places:
+                if place is not turn:
+                    tier = _tier(turn, kind.split(), axes, hints)
+                    yield _form(recorded, turn, place, kind, axes, tier)
 
 
-def _possible_axes(hints: frozenset[str]) -> list[str]:
-    """Return the axes that a file may mean: those with left for right only where it names them."""
-    said = [axes for axes in AXES if axes in hints]
-    return said or [axes for axes in AXES if axes != "ros"]
+def _hints(recorded: RecordedPoses) -> frozenset[str]:
+    return recorded.hints | {_ALIASES[hint] for hint in recorded.hints if hint in _ALIASES}
 
 
-def _unit(recorded: RecordedPoses, place: Block) -> tuple[float, str]:
-    if place.unit in UNITS_M:
-        return UNITS_M[place.unit], f", {place.unit}"
-    return (np.nan, "") if recorded.unit_m is None else (recorded.unit_m, "")
+def _form(
+    recorded: RecordedPoses, turn: Block, place: Block | None, kind: str, axes: str, tier: int
+) -> _Form:
+    where = turn.key if place is None else f"{place.key} and {turn.key}"
+    name, unit = f"{where}: {kind}, {axes} axes", (place or turn).unit
+    if unit in UNITS_M:
+        return _Form(f"{name}, {unit}", tier, turn, place, kind, axes, UNITS_M[unit])
+    unit_m = np.nan if recorded.unit_m is None else recorded.unit_m
+    return _Form(name, tier, turn, place, kind, axes, unit_m)
 
 
-def _kinds(block: Block) -> list[tuple[str, bool]]:
-    """Return the forms that numbers of this shape can have, and whether they need a location."""
-    shape = block.values.shape[2:]
-    if block.components == ("pitch", "yaw", "roll"):
-        return [(f"rotator pitch yaw roll {angle}", True) for angle in ("deg", "rad")]
-    if shape == (3,) and (block.words & _ROTATION or block.components == ("rx", "ry", "rz")):
-        orders = ("pitch yaw roll", "roll pitch yaw")
-        return [
-            (f"rotator {order} {angle}", True)
-            for order, angle in itertools.product(orders, ("deg", "rad"))
-        ]
-    if shape == (4,):
-        names: tuple[str, ...] = ("xyzw",) if block.components else ("xyzw", "wxyz")
-        return [(f"quaternion {order}", True) for order in names]
-    needs_place = shape in ((3, 3), (9,))
-    if not needs_place and shape not in ((4, 4), (16,), (3, 4), (12,)):
-        return []
-    majors: tuple[str, ...] = ("columns",) if shape in ((3, 4), (12,)) else ("columns", "rows")
-    return [
-        (f"matrix {sense} {major}", needs_place)
-        for sense, major in itertools.product(("c2w", "w2c"), majors)
-    ]
+_KINDS: Final = (
+    "rotator pitch yaw roll", "rotator roll pitch yaw", "euler x y z", "vector",
+    "quaternion xyzw", "quaternion wxyz", "matrix c2w columns", "matrix c2w rows",
+)  # fmt: skip
+"""The forms. Angles are in degrees or radians; "w2c" takes the world's coordinates to the camera's,
+and "rows" are matrices for row vectors."""
 
 
-def _tier(block: Block, kind: str, axes: str, hints: frozenset[str]) -> int:
-    """Return 0 for what the file names, 1 for what fits what it names, 2 for other forms."""
-    said_axes = {hint for hint in hints if hint in AXES} or {"unreal"}
-    if axes not in said_axes:
-        return 2
-    own_words = hints | block.words
-    names = kind.split()
-    fits = {"rotator": _rotator_fits, "quaternion": _quaternion_fits, "matrix": _matrix_fits}
-    tier = fits[names[0]](block, names, own_words)
-    said_kinds = {each for each, said in _KIND_WORDS.items() if said & hints}
-    return 1 if tier == 0 and said_kinds and names[0] not in said_kinds else tier
+def _kinds(block: Block) -> list[str]:
+    """Return the forms that numbers of this shape and these names can have."""
+    shape, names = block.values.shape[2:], block.components
+    units = ("deg", "rad")
+    if names == ("pitch", "yaw", "roll"):
+        kinds = [f"{_KINDS[0]} {unit}" for unit in units]
+    elif shape == (3,) and (block.words & _ROTATION or names == ("rx", "ry", "rz")):
+        kinds = [f"{kind} {unit}" for kind, unit in itertools.product(_KINDS[:4], units)]
+    elif shape == (4,):
+        kinds = [*_KINDS[4:5]] if names else [*_KINDS[4:6]]
+        kinds += [f"{kind} w2c" for kind in kinds]
+    elif shape in ((3, 4), (12,)):
+        kinds = [_KINDS[6], _KINDS[6].replace("c2w", "w2c")]
+    elif shape in ((3, 3), (9,), (4, 4), (16,)):
+        kinds = [*_KINDS[6:], *(kind.replace("c2w", "w2c") for kind in _KINDS[6:])]
+    else:
+        kinds = []
+    return kinds
 
 
+def _tier(block: Block, kind: list[str], axes: str, hints: frozenset[str]) -> int:
+    """Return 0 for what the file names, 1 for what fits what it names, 2 for other forms.
+
+    Other axes than the file names come after all of these. Where it names none, Unreal's come first
+    in forms that fit, and all else is of one rank: what is not named must be the only one to pass.
+    """
+    said = hints | block.words
+    text = "_".join((*(key for key in block.name if key != "*"), *sorted(said)))
+    is_from_world = any(word in text for word in _FROM_WORLD) and not any(
+        word in text for word in _FROM_CAMERA
+    )
+    is_rad = block.unit.startswith("rad") or any(word.startswith("rad") for word in said)
+    fits = is_from_world == ("w2c" in kind) and (
+        kind[0] not in _ANGLES or ("rad" in kind) == is_rad
+    )
+    named_kinds = {each for each, names in _KIND_WORDS.items() if names & hints}
+    tier = _form_tier(block, kind, said) if fits else 2
+    if tier == 0 and named_kinds and kind[0] not in named_kinds:
+        tier = 1
+    named_axes = {*AXES} & hints
+    if named_axes:
+        return tier if axes in named_axes else tier + 3
+    return tier if axes == "unreal" else 2
+
+
+def _form_tier(block: Block, kind: list[str], said: frozenset[str]) -> int:
+    """Return whether a file names a form by its components, its order, or the word for it."""
+    said_orders = _ORDERS & said
+    if kind[0] == "matrix":
+        return 2 if kind[2] == "rows" else 0
+    if block.components in (("pitch", "yaw", "roll"), ("qx", "qy", "qz", "qw")):
+        return 0
+    if kind[0] == "quaternion":
+        return 0 if block.components or kind[1] in said_orders else 2 if said_orders else 1
+    if kind[0] == "vector":
+        return 0 if _KIND_WORDS["vector"] & said else 2
+    own = {"".join(kind[1:4]), "".join(name[0] for name in kind[1:4])}
+    return 0 if said_orders & own else 2 if said_orders or kind[0] == "euler" else 1
+
+
+_ORDERS: Final = frozenset({"xyzw", "wxyz", "pitchyawroll", "rollpitchyaw", "pyr", "rpy", "xyz"})
 _KIND_WORDS: Final = {
     "quaternion": {"quaternion", "quaternions", "quat"},
     "matrix": {"matrix", "matrices"},
     "rotator": {"rotator", "rotators", "euler"},
+    "euler": {"euler"},
+    "vector": {"rodrigues", "rotvec", "rvec", "vector", "axisangle"},
 }
-
-
-def _rotator_fits(block: Block, names: list[str], said: frozenset[str]) -> int:
-    is_rad = block.unit.startswith("rad") or any(word.startswith("rad") for word in said)
-    if ("rad" in names) != is_rad:
-        return 2
-    if block.components == ("pitch", "yaw", "roll"):
-        return 0
-    said_orders = {"pitchyawroll", "rollpitchyaw", "pyr", "rpy"} & said
-    own = {"".join(names[1:4]), "".join(name[0] for name in names[1:4])}
-    return 0 if said_orders & own else 2 if said_orders else 1
-
-
-def _quaternion_fits(block: Block, names: list[str], said: frozenset[str]) -> int:
-    said_orders = {"xyzw", "wxyz"} & said
-    if block.components or names[1] in said_orders:
-        return 0
-    return 2 if said_orders else 1
-
-
-def _matrix_fits(block: Block, names: list[str], said: frozenset[str]) -> int:
-    text = "_".join((*(key for key in block.name if key != "*"), *sorted(said)))
-    senses = {"c2w"} if any(word in text for word in _FROM_CAMERA) else set()
-    senses |= {"w2c"} if any(word in text for word in _FROM_WORLD) else set()
-    is_turn_only = block.values.shape[2:] in ((3, 3), (9,))
-    if names[1] not in (senses or ({"c2w"} if is_turn_only else {"c2w", "w2c"})):
-        return 2
-    if is_turn_only or senses:
-        return 0 if names[2] == "columns" else 2
-    return 1

@@ -18,12 +18,14 @@ from stereogenbench_data.errors import (
     StereoGenBenchError,
     StorageError,
 )
+from stereogenbench_data.index.evidence import agreed_forms
 from stereogenbench_data.index.journal import Journal
 from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, row_of, scene_of
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
     SceneFolder,
     ValidDepth,
+    as_agreed,
     describe_scene,
     stamp_of,
 )
@@ -210,6 +212,8 @@ def _report(
     ids = [parse_scene_key(key) for key in folders.keys]
     maps = {scene.map_name for scene in ids if scene.split == "train"} | TRAIN_MAPS
     found = [outcome.scene for outcome in outcomes if outcome.scene is not None]
+    agreed = agreed_forms(scene.pose_form for scene in found if scene.pose_form)
+    found = [as_agreed(scene, agreed) for scene in found]
     scenes, unnamed, labels = [], set(), []
     for scene in found:
         if scene.id.split == "eval" and scene.id.subset is None:

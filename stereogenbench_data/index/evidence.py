@@ -4,11 +4,13 @@ Distances between the cameras must be the recorded baselines in every frame, the
 side by side along the axis that points to their right, and the primary pair's left camera must be
 on the left. Evidence rejects, it does not choose: the form that the file names stays if it passes.
 Where none is named, or it fails, the other forms are tried; where several pass and differ, the
-fields on which they differ are refused.
+fields on which they differ are refused. Pictures tell more: see `audit.contract.worlds`.
 """
 
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Final
 
 import numpy as np
@@ -39,22 +41,35 @@ _LEFT, _RIGHT = (list(cameras) for cameras in zip(*CAMERA_PAIRS, strict=True))
 _SHOWN: Final = 4
 
 
+class SidesError(SchemaError):
+    """Poses fit a rig, but for which camera is left: that is stated in two ways."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Understood:
     """The poses of a scene, and how they were read.
 
     Attributes:
         poses: The poses.
-        names: The readings that pass, the one that was taken first; () where that is the one that
-            the file itself names.
-        differ: Whether poses in the world differ between these readings.
-        note: How the poses contradict the primary pair; "" where they do not.
+        names: The readings that pass and move the cameras differently in the world, the one that
+            was taken first.
     """
 
     poses: CameraPoses
     names: tuple[str, ...]
-    differ: bool
-    note: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Passed:
+    """A reading that fits a rig, and how far the rig is from its x axis, as a sine."""
+
+    reading: Reading
+    poses: CameraPoses
+    off: float
+
+    @property
+    def name(self) -> str:
+        return f"{self.reading.name} @ {self.poses.unit_m!r}".replace("|", "/")
 
 
 def understood_poses(text: bytes, rig: Rig, *, where: str) -> Understood:
@@ -63,34 +78,31 @@ def understood_poses(text: bytes, rig: Rig, *, where: str) -> Understood:
     Raises:
         SchemaError: If no reading of its numbers passes, or several pass and disagree about where
             the cameras stand to each other; it says what was tried.
+        SidesError: If its own form fits but for the side of the primary pair's left camera.
     """
-    recorded = record_poses(text, where=where)
     failures: dict[str, str] = {}
-    passed: list[tuple[Reading, CameraPoses, float]] = []
-    for reading in readings(recorded):
-        is_found = passed and _is_exact(passed) and not _is_reversed(passed[0][1], rig)
-        if is_found and reading.tier > passed[0][0].tier:
+    loose: list[_Passed] = []
+    exact: list[_Passed] = []
+    reversed_: list[_Passed] = []
+    by_tier = groupby(readings(record_poses(text, where=where)), key=lambda each: each.tier)
+    for _, tier in by_tier:
+        for reading in tier:
+            found = _checked(reading, rig)
+            if isinstance(found, str):
+                failures.setdefault(found, reading.name)
+            elif _is_reversed(found.poses, rig):
+                reversed_.append(found)
+            else:
+                (exact if found.off <= _EXACT else loose).append(found)
+        if exact or any(each.reading.is_named for each in reversed_):
             break
-        poses, off, reason = _checked(reading, rig)
-        if poses is None:
-            failures.setdefault(reason, reading.name)
-        else:
-            passed.append((reading, poses, off))
-    left, right = rig.primary_pair
-    reversed_ = [each for each in passed if _is_reversed(each[1], rig)]
-    note = ""
-    if len(reversed_) < len(passed):
-        passed = [each for each in passed if not _is_reversed(each[1], rig)]
-    elif passed:
-        note = (
-            f"baseline.json says that camera {left} is the left one of the primary pair, and by "
-            f"the poses it is to the right of camera {right}. The poses count: correct one of them"
+    passed = exact or [each for each in loose if each.reading.tier == 0][:1]
+    if reversed_ and not passed:
+        left, right = rig.primary_pair
+        raise SidesError(
+            f"{where}: by its poses ({reversed_[0].reading.name}), camera {left} is to the right "
+            f"of camera {right}, and by baseline.json it is the left one. Correct one of them."
         )
-    exact = [each for each in passed if each[2] <= _EXACT]
-    if exact:
-        passed = [each for each in exact if each[0].tier == exact[0][0].tier]
-    else:
-        passed = [each for each in passed if each[0].tier == 0][:1]
     if not passed:
         tried = "; ".join(f"{reason} ({name})" for reason, name in list(failures.items())[:_SHOWN])
         raise SchemaError(
@@ -98,20 +110,47 @@ def understood_poses(text: bytes, rig: Rig, *, where: str) -> Understood:
             f"{tried or 'it has no location with a rotation'}. Is it another scene's, or its "
             f"unit wrong?"
         )
+    upright = [each for each in passed if each.reading.is_named or _is_upright(each.poses)]
+    passed = upright or passed
     taken = passed[0]
-    others = [each for each in passed[1:] if not _same_rig(each[1], taken[1])]
+    others = [each for each in passed[1:] if not _same_rig(each.poses, taken.poses)]
     if others:
-        listed = ", ".join(shortened(each[0].name, 120) for each in (taken, *others)[:_SHOWN])
+        listed = ", ".join(shortened(each.reading.name, 120) for each in (taken, *others)[:_SHOWN])
         raise SchemaError(
             f"{where}: several readings of its poses fit the rig and differ in how its cameras "
             f"stand to each other: {listed}. Name the right one in the file."
         )
-    worlds = [taken, *(each for each in passed[1:] if not _same_world(each[1], taken[1]))]
-    names = tuple(_full_name(reading, poses) for reading, poses, _ in worlds)
-    is_plain = len(worlds) == 1 and taken[0].tier == 0 and taken[1].unit_m in (
-        taken[0].trajectory.unit_m, _UNREAL_M,
-    )  # fmt: skip
-    return Understood(taken[1], () if is_plain else names, differ=len(worlds) > 1, note=note)
+    worlds = [taken, *(each for each in passed[1:] if not _same_world(each.poses, taken.poses))]
+    return Understood(taken.poses, tuple(each.name for each in worlds))
+
+
+def agreed_forms(forms: Iterable[str]) -> dict[str, tuple[str, ...]]:
+    """Return what the scenes of a dataset agree about, by the keys of their files.
+
+    One writer has one form. A reading that fits one scene by chance, of cameras that stand still or
+    never roll, does not fit the others.
+
+    Args:
+        forms: `Scene.pose_form` of each scene.
+
+    Returns:
+        For each `shape_of`, the readings that fit the most scenes; () if not over half of them.
+    """
+    votes: dict[str, Counter[str]] = {}
+    counts: Counter[str] = Counter()
+    for form in forms:
+        votes.setdefault(shape_of(form), Counter()).update(form.split("|"))
+        counts[shape_of(form)] += 1
+    return {
+        shape: tuple(name for name, count in found.items()
+                     if count == max(found.values()) and 2 * count > counts[shape])
+        for shape, found in votes.items()
+    }  # fmt: skip
+
+
+def shape_of(form: str) -> str:
+    """Return the keys of the numbers that a form reads: scenes of one writer have them alike."""
+    return form.split(": ")[0]
 
 
 def _is_reversed(poses: CameraPoses, rig: Rig) -> bool:
@@ -119,6 +158,24 @@ def _is_reversed(poses: CameraPoses, rig: Rig) -> bool:
     lateral_m = lateral_offsets_m(poses)
     left, right = rig.primary_pair
     return bool(lateral_m[left] > lateral_m[right])
+
+
+def _is_upright(poses: CameraPoses) -> bool:
+    """Return whether no camera is upside down, in a world whose z axis must be the vertical one.
+
+    An axis may be vertical if the cameras' right stays level to it and their up does not lie flat.
+    """
+    right, up = (OPENCV_FROM_UNREAL.T @ poses.world_from_cam_rotations[..., column, None]
+                 for column in (0, 1))  # fmt: skip
+    may_be = [
+        np.abs(right[..., axis, 0]).max() < _LEVEL and np.abs(up[..., axis, 0]).min() > _LEVEL
+        for axis in range(3)
+    ]
+    return bool(may_be[1] or not may_be[2] or (up[..., 2, 0] < 0).all())
+
+
+_LEVEL: Final = 0.35
+"""The sine of 20 degrees: cameras of the release roll less, and look down by less than 70."""
 
 
 def poses_as(text: bytes, form: str | None, *, where: str) -> CameraPoses:
@@ -147,44 +204,30 @@ def poses_as(text: bytes, form: str | None, *, where: str) -> CameraPoses:
     )
 
 
-def _full_name(reading: Reading, poses: CameraPoses) -> str:
-    return f"{reading.name} @ {poses.unit_m!r}".replace("|", "/")
-
-
-def _is_exact(passed: Sequence[tuple[Reading, CameraPoses, float]]) -> bool:
-    return any(off <= _EXACT for _, _, off in passed)
-
-
-def _checked(reading: Reading, rig: Rig) -> tuple[CameraPoses | None, float, str]:
-    """Return the poses of a reading that passes, how far the rig is from its axis, or why not."""
+def _checked(reading: Reading, rig: Rig) -> _Passed | str:
+    """Return a reading that fits a rig, or why it does not."""
     try:
         poses = CameraPoses.from_trajectory(reading.trajectory)
     except GeometryError as error:
-        return None, 0.0, str(error)
+        return str(error)
     steps = poses.centres[:, _RIGHT] - poses.centres[:, _LEFT]
     baselines_cm = np.array(rig.baselines_cm)
     distances = np.linalg.norm(steps, axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = float(np.median(baselines_cm / 100 / distances))
-    unit_m = _unit_of(ratio, reading.trajectory.unit_m)
-    if unit_m is None:
-        posed_cm = distances[0] * 100 * np.nan_to_num(reading.trajectory.unit_m, nan=0.01)
-        a, b = CAMERA_PAIRS[0]
-        return None, 0.0, (
-            f"baseline.json says that cameras {a} and {b} are {baselines_cm[0]:.6g} cm apart, "
-            f"and by the poses they are {posed_cm[0]:.6g} cm apart"
-        )  # fmt: skip
+    stated_m = reading.trajectory.unit_m
+    unit_m = _unit_of(ratio, stated_m) or (stated_m if np.isfinite(stated_m) else _UNREAL_M)
     allowed_cm = _DEVIATION_CM + _DEVIATION_SHARE * baselines_cm
     away_cm = np.abs(distances * unit_m * 100 - baselines_cm)
     if not (away_cm <= allowed_cm).all():
         worst = int(np.argmax(away_cm - allowed_cm))
         frame, pair = divmod(worst, len(CAMERA_PAIRS))
         a, b = CAMERA_PAIRS[pair]
-        return None, 0.0, (
+        return (
             f"baseline.json says that cameras {a} and {b} are {baselines_cm[pair]:.6g} cm apart, "
             f"and by the poses they are {distances[frame, pair] * unit_m * 100:.6g} cm apart in "
             f"frame {frame}"
-        )  # fmt: skip
+        )
     poses = replace(poses, unit_m=unit_m)
     lateral_m = lateral_offsets_m(poses)
     beside_cm = np.abs(lateral_m[_RIGHT] - lateral_m[_LEFT]) * 100
@@ -192,14 +235,14 @@ def _checked(reading: Reading, rig: Rig) -> tuple[CameraPoses | None, float, str
     if not (beside_cm >= _LEAST_BESIDE * baselines_cm).all() or not np.isfinite(residual_px):
         pair = int(np.argmin(beside_cm / baselines_cm))
         a, b = CAMERA_PAIRS[pair]
-        return None, 0.0, (
+        return (
             f"cameras {a} and {b} are {beside_cm[pair]:.6g} cm beside each other as camera 0 "
             f"looks, and {baselines_cm[pair]:.6g} cm apart; or a camera looks away from what the "
             f"others see"
-        )  # fmt: skip
+        )
     axes = poses.world_from_cam_rotations[..., 0][:, _LEFT]
     along = np.sum((steps @ OPENCV_FROM_UNREAL.T) * axes, axis=-1) / distances
-    return poses, float(np.sqrt(np.maximum(0.0, 1 - np.square(along))).max()), ""
+    return _Passed(reading, poses, float(np.sqrt(np.maximum(0.0, 1 - np.square(along))).max()))
 
 
 def _unit_of(ratio: float, stated_m: float) -> float | None:

@@ -28,7 +28,12 @@ from stereogenbench_data.errors import (
 from stereogenbench_data.geometry.camera import recorded_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
-from stereogenbench_data.index.evidence import poses_as, understood_poses
+from stereogenbench_data.index.evidence import (
+    SidesError,
+    poses_as,
+    shape_of,
+    understood_poses,
+)
 from stereogenbench_data.media.clock import MOST_EXTRA_FRAMES
 from stereogenbench_data.media.container import StreamFacts, depth_coding
 from stereogenbench_data.media.depth import (
@@ -56,6 +61,7 @@ from stereogenbench_data.schema.parse import (
     parse_description,
     parse_rig,
     parse_scene_key,
+    require_unit,
 )
 from stereogenbench_data.schema.records import (
     DepthEncoding,
@@ -211,7 +217,8 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     try:
         where = f"{key}/{BASELINE_JSON}"
         rig, labels, odd = parse_rig(folder.read(BASELINE_JSON), where=where)
-        remarks += odd
+        family = parse_scene_key(key).family
+        remarks += (*odd, *require_unit(rig, family=family, where=where))
     except StereoGenBenchError as error:
         problems.append(error)
     marked, odd = parse_complete(folder.read(COMPLETE_JSON), where=f"{key}/{COMPLETE_JSON}")
@@ -332,6 +339,9 @@ def _poses(
     if TRAJECTORY_JSON in files:
         try:
             found = understood_poses(folder.read(TRAJECTORY_JSON), rig, where=where)
+        except SidesError as error:
+            remarks.append(Remark("left", str(error)))
+            reason = str(error)
         except SchemaError as error:
             reason = str(error)
     if found is not None and found.poses.frame_count < frames:
@@ -352,14 +362,41 @@ def _poses(
             f"{where}: has poses of {found.poses.frame_count} frames, and the videos have {frames}"
         )
         remarks.append(Remark("frames", f"{told}. The first {frames} are used"))
-    if found.differ:
+    if len(found.names) > 1:
         listed = ", ".join(name.partition(" @ ")[0] for name in found.names)
         remarks.append(
-            Remark("world", f"{where}: several readings of its poses fit the rig: {listed}")
+            Remark(
+                "world",
+                f"{where}: several readings of its poses fit the rig: {listed}; `stereogenbench "
+                f"doctor` tells by depth which is right",
+            )
         )
-    if found.note:
-        remarks.append(Remark("left", f"{where}: {found.note}"))
-    return found.poses, "|".join(found.names) or None
+    return found.poses, "|".join(found.names)
+
+
+def as_agreed(scene: Scene, agreed: Mapping[str, tuple[str, ...]]) -> Scene:
+    """Return a scene whose poses are read as the scenes of its dataset agree (`agreed_forms`)."""
+    if scene.pose_form is None:
+        return scene
+    names = scene.pose_form.split("|")
+    left = [name for name in agreed[shape_of(scene.pose_form)] if name in names]
+    if left == names:
+        return scene
+    others = tuple(each for each in scene.remarks if each.about != "world")
+    if left:
+        more = scene.remarks if len(left) > 1 else others
+        return replace(scene, pose_form="|".join(left), remarks=more)
+    reason = (
+        f"{scene.id.key}/{TRAJECTORY_JSON}: fits the rig only as {names[0]}, and the files of "
+        f"other scenes with the same keys do not. Is it another scene's?"
+    )
+    return replace(
+        scene,
+        pose_form=None,
+        lateral_m=_assumed_places_m(scene.rig),
+        rig_residual_px=0.0,
+        remarks=(*others, Remark("poses", reason)),
+    )
 
 
 def _places_m(poses: CameraPoses) -> tuple[float, ...]:

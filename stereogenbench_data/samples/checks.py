@@ -35,9 +35,12 @@ def without_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> Plan:
     reasons: dict[int, str] = {}
     selected = set(plan.scene_rows.tolist())
     for name in request.fields:
-        for about in request.known[name].held_up_by:
+        known = request.known[name]
+        sides = () if known.needs_poses == "never" else ("left",)
+        for about in (*known.held_up_by, *sides):
             for row in selected.intersection(index.remarked(about).tolist()):
-                reasons.setdefault(row, f"{name!r} needs {index.scene(row).remark(about)}")
+                text = index.scene(row).remark(about).rstrip(".")
+                reasons.setdefault(row, f"{name!r} needs {text}")
     for row in selected.intersection(index.remarked("videos").tolist()):
         if _missing_videos(index, plan, request, int(np.searchsorted(plan.scene_rows, row))):
             reasons.setdefault(row, index.scene(row).remark("videos"))
@@ -175,9 +178,6 @@ def _warn_of_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> None
             f"are not rectified (by up to {residuals_px.max(initial=0):.3g} px): their pixels are "
             "projected through the poses, and no field holds what that moves up or down",
         )  # fmt: skip
-        turned = np.intersect1d(rows, index.remarked("left"))
-        reason = index.scene(int(turned[0])).remark("left") if len(turned) else ""
-        _warn(index, turned, f"contradict themselves about left and right ({reason})")
         unknown = np.intersect1d(rows, index.remarked("poses"))
         reason = index.scene(int(unknown[0])).remark("poses") if len(unknown) else ""
         _warn(

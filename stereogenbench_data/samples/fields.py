@@ -150,7 +150,7 @@ PAIR_FIELDS: Final[dict[str, Field]] = _table(
     Field(
         "baseline_m", "float64", "()", "m; negative if the second view is to the left",
         make=lambda s: np.float64(s.forward.baseline_m),
-        per_target=True, per_frame=False,
+        per_target=True, per_frame=False, held_up_by=("left",),
     ),
     Field(
         "right_from_left", "float64", "(4,4)",
@@ -228,6 +228,7 @@ VIEW_FIELDS: Final[dict[str, Field]] = _table(
     Field(
         "focal_mm", "float64", "()", "focal length, mm",
         make=lambda s: np.float64(s.facts.scene.rig.focal_mm), per_frame=False,
+        held_up_by=("sensor",),
     ),
     Field(
         "world_from_cam", "float64", "(4,4)", "camera's coordinates to the world's, m",
@@ -278,7 +279,7 @@ VIEW_FIELDS: Final[dict[str, Field]] = _table(
         "baselines_m", "float64", "(V,)",
         "m from this camera to each view's; negative if that stands to the left",
         make=lambda s: np.array([way.baseline_m for way in s.to_each_view]),
-        per_target=True, per_frame=False,
+        per_target=True, per_frame=False, held_up_by=("left",),
     ),
     Field(
         "cams_from_cam", "float64", "(V,4,4)",

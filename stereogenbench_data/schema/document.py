@@ -21,7 +21,9 @@ MOST_LETTERS: Final = 2**16
 _SHOWN: Final = 20
 _LARGEST_INT: Final = 2**53
 _PLAIN_KEY: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
-_CAMERA_NAME: Final = re.compile(r"(?:cam(?:era)?[ _-]?|\A|_)([0-9]{1,6})\Z", re.IGNORECASE)
+_CAMERA_NAME: Final = re.compile(
+    r"(?:cam(?:era)?[ _-]?|\A|_)([0-9]{1,6})(?:_rgb\.mp4|_depth\.mkv)?\Z", re.IGNORECASE
+)
 
 
 def require_text_size(size_bytes: int, *, where: str) -> None:
@@ -56,12 +58,27 @@ def parse_text(text: bytes, *, where: str) -> str:
 def parse_object(text: bytes, *, where: str) -> dict[str, Any]:
     """Return the JSON object that a metadata file holds.
 
+    Raises:
+        SchemaError: As `parse_document` does, or if there is no object at the top level.
+    """
+    document = parse_document(text, where=where)
+    if not isinstance(document, dict):
+        raise SchemaError(
+            f"{where}: $ must be an object, found {brief(document)}. "
+            f"Check that this is the file that its name says."
+        )
+    return document
+
+
+def parse_document(text: bytes, *, where: str) -> Any:
+    """Return the JSON value that a metadata file holds.
+
     NaN and Infinity, which are not JSON but which Python writes, are accepted here, so that the
     check of each value can report their place.
 
     Raises:
         SchemaError: If the text is too large, empty, truncated, not UTF-8, not JSON, nested too
-            deep, has a key twice, or is not an object at its top level.
+            deep, or has a key twice.
     """
     decoded = parse_text(text, where=where)
     if not decoded.strip():
@@ -93,11 +110,6 @@ def parse_object(text: bytes, *, where: str) -> dict[str, Any]:
         raise SchemaError(
             f"{where}: not valid JSON: {error}. Copy the file from the release again."
         ) from error
-    if not isinstance(document, dict):
-        raise SchemaError(
-            f"{where}: $ must be an object, found {brief(document)}. "
-            f"Check that this is the file that its name says."
-        )
     if repeated:
         path = child_path(_path_of(document, repeated[0][0]), repeated[0][1])
         raise SchemaError(

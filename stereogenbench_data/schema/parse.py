@@ -34,10 +34,12 @@ from stereogenbench_data.schema.quantities import (
 )
 from stereogenbench_data.schema.records import Description, Remark, Rig, SceneId, SceneLabels
 from stereogenbench_data.schema.release import (
+    ADJACENT_CM,
     ADJACENT_PAIRS,
     CAMERA_COUNT,
     CAMERA_PAIRS,
     IMAGE_SIZE_PX,
+    SENSOR_MM,
     subset_of_folder,
 )
 from stereogenbench_data.schema.text import shortened
@@ -47,7 +49,6 @@ _FOLDER: Final = re.compile(r"[!-\-0-\[\]-~](?:[ -\-0-\[\]-~]*[!-\-0-\[\]-~])?\Z
 
 _KEY_SHOWN: Final = 300
 _SHOWN: Final = 20
-_PAIR_KEY: Final = re.compile(r"(?:[a-z_]*?)(\d+)(?:_to)?_(?:cam_?|camera_?|c)?(\d+)\Z")
 _CENTRE_PX: Final = 1.0
 """How far a principal point may be from the image's centre to be that centre: conventions of pixels
 differ by a half, and centres are written as whole pixels."""
@@ -59,9 +60,13 @@ _NAMES_A_CAMERA: Final = re.compile(
     r"cam|left|right|index|\A[abij]\Z|_[abij12]\Z|src|dst|from|to\Z"
 )
 
+_FLOAT32: Final = 1e-6
+
 Pair = tuple[int, int]
 _Recorded = tuple[Pair, float, Stated]
 """The cameras of a pair as they are written, their baseline in cm, and where it stands."""
+_Waiting = tuple[Any, str, str, int | None]
+"""A value that may hold baselines, the words of its keys, its path, and the row of a table."""
 
 
 def parse_scene_key(key: str) -> SceneId:
@@ -238,8 +243,11 @@ def parse_rig(text: bytes, *, where: str) -> tuple[Rig, SceneLabels, tuple[Remar
     baselines_cm, first_number = _baselines(document, nodes, findings)
     width, height = _side(nodes, "image_width"), _side(nodes, "image_height")
     width_px, height_px = width or IMAGE_SIZE_PX, height or width or IMAGE_SIZE_PX
-    focal_mm, sensor_width_mm = _lens(nodes, findings, width_px=width_px)
-    sensor_height_mm = _length_mm(nodes, "sensor_height", findings, is_needed=False)
+    focal_mm, sensor_width_mm = _lens(nodes, findings, width_px=width)
+    sensor_height_mm = _length_mm(nodes, "sensor_height", findings)
+    for each in numbers(nodes, "focal_y_px"):
+        if each.value > 0:
+            sensor_height_mm = sensor_height_mm or focal_mm * height_px / each.value
     rig = Rig(
         focal_mm=focal_mm,
         sensor_width_mm=sensor_width_mm,
@@ -256,6 +264,30 @@ def parse_rig(text: bytes, *, where: str) -> tuple[Rig, SceneLabels, tuple[Remar
     return rig, labels, tuple(findings.remarks)
 
 
+def require_unit(rig: Rig, *, family: str, where: str) -> tuple[Remark, ...]:
+    """Return a remark on baselines that the paper's family does not have.
+
+    Raises:
+        SchemaError: If they would be those of the family in another unit of length.
+    """
+    low_cm, high_cm = ADJACENT_CM.get(family, (0.0, math.inf))
+    adjacent_cm = [rig.baseline_cm(a, b) for a, b in ADJACENT_PAIRS]
+    least_cm, most_cm = min(adjacent_cm), max(adjacent_cm)
+    if low_cm * _NEARLY[0] <= least_cm and most_cm <= high_cm * _NEARLY[1]:
+        return ()
+    told = (
+        f"{where}: neighbouring cameras are {least_cm:.6g} to {most_cm:.6g} cm apart, and in the "
+        f"paper's family {family} {low_cm:g} to {high_cm:g} cm"
+    )
+    for unit, factor in (("m", 100.0), ("mm", 0.1)):
+        if low_cm <= least_cm * factor and most_cm * factor <= high_cm:
+            raise SchemaError(f"{told}. In {unit} they would be: correct the unit.")
+    return (Remark("unit", told),)
+
+
+_NEARLY: Final = (0.9, 1.1)
+
+
 def _side(nodes: list[Node], quantity: str) -> int | None:
     """Return a side of the recorded image in pixels; what is none is as good as not recorded."""
     for each in numbers(nodes, quantity):
@@ -264,52 +296,51 @@ def _side(nodes: list[Node], quantity: str) -> int | None:
     return None
 
 
-def _length_mm(nodes: list[Node], quantity: str, findings: _Findings, *, is_needed: bool) -> float:
+def _length_mm(nodes: list[Node], quantity: str, findings: _Findings) -> float:
     """Return a length of the camera in mm, the unit of cameras; 0 where there is none."""
     found: Stated | None = None
-    length_mm = 0.0
+    length_mm, odd = 0.0, ""
     for each in stated(nodes, quantity):
         if each.unit and each.unit not in UNITS_M:
             continue
         scale_mm = UNITS_M.get(each.unit, 1e-3) * 1000
         if not is_number(each.value) or each.value <= 0:
-            if is_needed and not isinstance(each.value, dict | list):
-                findings.problems.append(
-                    f"{each.path}: must be a number above zero, found {brief(each.value)}"
-                )
+            if not isinstance(each.value, dict | list):
+                odd = f"{each.path}: must be a number above zero, found {brief(each.value)}"
             continue
         again_mm = each.value * scale_mm
-        if found is None:
+        if not each.unit and not _LEAST_MM <= again_mm <= _MOST_MM:
+            odd = f"{each.path}: {brief(each.value)} is no length in mm of a camera: name its unit"
+        elif found is None:
             found, length_mm = each, again_mm
         elif abs(again_mm - length_mm) > each.rounding * scale_mm + found.rounding:
             findings.conflict(quantity.replace("_", " "), found, each)
+    if odd and found is None:
+        findings.problems.append(odd)
     return length_mm
 
 
-def _lens(nodes: list[Node], findings: _Findings, *, width_px: int) -> tuple[float, float]:
+_LEAST_MM, _MOST_MM = 4.0, 150.0
+"""Lengths of cameras whose unit is not written: the release's lenses have 18 to 85 mm."""
+
+
+def _lens(nodes: list[Node], findings: _Findings, *, width_px: int | None) -> tuple[float, float]:
     """Return focal length and sensor width in mm.
 
     One of them may follow from a field of view, or a focal length in pixels, which must agree where
-    both are there.
+    both are there. Where neither is recorded, the sensor is that of the release.
     """
-    focal_mm = _length_mm(nodes, "focal", findings, is_needed=True)
-    sensor_mm = _length_mm(nodes, "sensor_width", findings, is_needed=True)
-    ratios = []
-    for each in numbers(nodes, "fov"):
-        angle = each.value if each.unit.startswith("rad") else math.radians(each.value)
-        if 0 < angle < math.pi:
-            ratios.append((each, 0.5 / math.tan(angle / 2)))
-    ratios += [
-        (each, each.value / width_px)
-        for each in numbers(nodes, "focal_px")
-        if each.value > 0 and (each.unit.startswith("p") or each.path.lower().endswith("x"))
-    ]
+    focal_mm, sensor_mm = (_length_mm(nodes, name, findings) for name in ("focal", "sensor_width"))
+    ratios = _focal_ratios(nodes, width_px=width_px)
+    if ratios and not findings.problems:
+        if not (focal_mm or sensor_mm):
+            sensor_mm = SENSOR_MM
+            told = f"has no sensor width; that of the release is assumed, {SENSOR_MM} mm"
+            findings.remarks.append(Remark("sensor", f"{findings.where}: {told}"))
+        sensor_mm = sensor_mm or focal_mm / ratios[0][1]
+        focal_mm = focal_mm or sensor_mm * ratios[0][1]
     for each, ratio in ratios:
-        if focal_mm and not sensor_mm:
-            sensor_mm = focal_mm / ratio
-        elif sensor_mm and not focal_mm:
-            focal_mm = ratio * sensor_mm
-        elif focal_mm and sensor_mm and abs(focal_mm / sensor_mm - ratio) > _RATIO * ratio:
+        if focal_mm and sensor_mm and abs(focal_mm / sensor_mm - ratio) > _RATIO * ratio:
             findings.problems.append(
                 f"{each.path}: {brief(each.value)} means {ratio:.6g} focal lengths a sensor width, "
                 f"and focal length and sensor width in mm mean {focal_mm / sensor_mm:.6g}. Remove "
@@ -321,6 +352,21 @@ def _lens(nodes: list[Node], findings: _Findings, *, width_px: int) -> tuple[flo
                 f"$.camera_intrinsics.{name} is missing; the keys are: {findings.keys}"
             )
     return focal_mm or 1.0, sensor_mm or 1.0
+
+
+def _focal_ratios(nodes: list[Node], *, width_px: int | None) -> list[tuple[Stated, float]]:
+    """Return the focal lengths a sensor width that follow from fields of view and pixels."""
+    ratios = []
+    for each in numbers(nodes, "fov"):
+        is_rad = each.unit.startswith("rad") or (not each.unit and each.value < math.pi)
+        angle = each.value if is_rad else math.radians(each.value)
+        if 0 < angle < math.pi:
+            ratios.append((each, 0.5 / math.tan(angle / 2)))
+    for each in numbers(nodes, "focal_px"):
+        is_px = each.unit.startswith("p") or each.path.lower().endswith("x")
+        if width_px and is_px and each.value > 0:
+            ratios.append((each, each.value / width_px))
+    return ratios
 
 
 _RATIO: Final = 1e-3
@@ -371,10 +417,12 @@ def _primary_pair(nodes: list[Node], findings: _Findings, *, first_number: int) 
         value = each.value
         if isinstance(value, dict):
             left, right = (_end(value, side) for side in ("left", "right"))
+            if left is None and right is None:
+                left, right = _cameras_of(value) or (None, None)
         elif isinstance(value, list) and len(value) == 2:
             left, right = map(_camera, value)
         else:
-            left = right = None
+            left, right = (isinstance(value, str) and _pair_of(value)) or (None, None)
         if left is None or right is None:
             odd.append(
                 f"{each.path}: must be {{left_camera, right_camera}} or a list of two cameras, "
@@ -393,10 +441,13 @@ def _primary_pair(nodes: list[Node], findings: _Findings, *, first_number: int) 
         pairs.append((each, (left, right)))
     if pairs:
         return pairs[0][1]
-    findings.problems += odd or [
-        f"$.primary_stereo_pair is missing, so nothing tells which camera is left; the keys are: "
-        f"{findings.keys}"
-    ]
+    findings.problems += odd
+    if not odd:
+        told = (
+            f"{findings.where}: has no primary_stereo_pair, so cameras are taken to be numbered "
+            f"from left to right, as in the release; the keys are: {findings.keys}"
+        )
+        findings.remarks.append(Remark("primary pair", told))
     return 0, 1
 
 
@@ -408,6 +459,17 @@ def _end(pair: dict[str, Any], side: str) -> int | None:
             if camera is not None:
                 return camera
     return None
+
+
+def _pair_of(text: str) -> Pair | None:
+    """Return the two cameras that a text names, None where it does not name two.
+
+    >>> _pair_of("0-1"), _pair_of("Town_2_Cam_00 to Town_2_Cam_03"), _pair_of("baseline_1")
+    ((0, 1), (0, 3), None)
+    """
+    name = words(text)
+    found = re.findall(r"cam(?:era)?_?(\d+)", name) or re.findall(r"\d+", name)
+    return (int(found[0]), int(found[1])) if len(found) == 2 else None
 
 
 def _camera(value: object) -> int | None:
@@ -443,15 +505,16 @@ def _baselines(
             )
             continue
         rounding_cm = abs(length_cm / each.value) * each.rounding if each.value else 0.0
-        if pair in best:
-            known_cm, known_rounding_cm, known = best[pair]
-            if abs(length_cm - known_cm) > rounding_cm + known_rounding_cm:
-                findings.problems.append(
-                    f"{each.path}: the baseline of cameras {low} and {high} is {length_cm:.9g} cm "
-                    f"here and {known_cm:.9g} cm at {known.path}. Remove the wrong one"
-                )
-            continue
-        best[pair] = length_cm, rounding_cm, each
+        known_cm, known_rounding_cm, known = best.get(pair, (length_cm, math.inf, each))
+        if abs(length_cm - known_cm) > rounding_cm + known_rounding_cm:
+            findings.problems.append(
+                f"{each.path}: the baseline of cameras {low} and {high} is {length_cm:.9g} cm "
+                f"here and {known_cm:.9g} cm at {known.path}. Remove the wrong one"
+            )
+        elif pair not in best or (
+            rounding_cm < known_rounding_cm and abs(length_cm - known_cm) > _FLOAT32 * length_cm
+        ):
+            best[pair] = length_cm, rounding_cm, each
     lengths_cm = {pair: length_cm for pair, (length_cm, _, _) in best.items()}
     missing = [f"{a}-{b}" for a, b in CAMERA_PAIRS if (a, b) not in lengths_cm]
     if missing:
@@ -497,34 +560,48 @@ def _recorded_lengths(
     """
     default_m = length_unit_m(nodes) or 0.01
     keys = sorted(document, key=lambda key: key != "pairwise_pairs")
-    waiting: list[tuple[Any, str, str]] = [
-        (document[key], words(key), child_path("$", key)) for key in keys
+    waiting: list[_Waiting] = [
+        (document[key], words(key), child_path("$", key), None) for key in keys
     ]
-    for node, name, path in waiting:
+    for node, name, path, row in waiting:
         if "primary" in name or not isinstance(node, dict | list):
             continue
-        if re.search(r"pair|baseline", name) is None:
-            inner = node if isinstance(node, dict) else {}
-            waiting += [(v, f"{name}_{words(k)}", child_path(path, k)) for k, v in inner.items()]
-        elif isinstance(node, dict):
-            cameras = _cameras_of(node)
-            if cameras is not None:
-                yield from _lengths_of(node, cameras, path, default_m, findings)
-                continue
-            for key, value in node.items():
-                pair, place = _PAIR_KEY.match(words(key)), child_path(path, key)
-                ends = None if pair is None else (int(pair[1]), int(pair[2]))
-                if ends is not None and isinstance(value, dict):
-                    yield from _lengths_of(value, ends, place, default_m, findings)
-                elif ends is not None:
-                    unit_m = UNITS_M.get(without_unit(name)[1], default_m)
-                    yield from _length(ends, value, unit_m, place, findings)
-                else:
-                    waiting.append((value, f"{name}_{words(key)}", place))
-        elif "adjacent" in name and node and all(map(is_number, node)):
+        speaks_of_pairs = re.search(r"pair|baseline", name) is not None
+        cameras = _cameras_of(node) if speaks_of_pairs and isinstance(node, dict) else None
+        if cameras is not None and isinstance(node, dict):
+            yield from _lengths_of(node, cameras, path, default_m, findings)
+        elif "adjacent" in name and isinstance(node, list) and node and all(map(is_number, node)):
             yield from _neighbours(node, name, path, default_m, findings)
-        else:
-            waiting += [(each, name, child_path(path, at)) for at, each in enumerate(node)]
+        elif speaks_of_pairs or isinstance(node, dict):
+            for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+                place, own = child_path(path, key), words(str(key))
+                pair = _pair_of(own) if isinstance(key, str) else None
+                if row is not None and own.isdigit():
+                    pair = row, int(own)  # of a table
+                if not speaks_of_pairs or pair is None:
+                    is_row = own.isdigit() and _is_row(value, of=node)
+                    longer = name if isinstance(key, int) or is_row else f"{name}_{own}"
+                    waiting.append((value, longer, place, int(own) if is_row else None))
+                elif pair[0] != pair[1]:
+                    yield from _of_pair(value, pair, name, place, default_m, findings)
+
+
+def _of_pair(
+    value: Any, pair: Pair, name: str, path: str, default_m: float, findings: _Findings
+) -> Iterable[_Recorded]:
+    """Yield the baselines of a pair: those in an object, or the value itself."""
+    if isinstance(value, dict):
+        yield from _lengths_of(value, pair, path, default_m, findings)
+    else:
+        unit_m = UNITS_M.get(without_unit(name)[1], default_m)
+        yield from _length(pair, value, unit_m, path, findings)
+
+
+def _is_row(value: Any, *, of: dict[str, Any] | list[Any]) -> bool:
+    """Return whether a value is a row of a table with a number for each two cameras."""
+    if isinstance(value, dict):
+        return bool(value) and all(key.isdigit() for key in value)
+    return isinstance(value, list) and len(of) == len(value) == CAMERA_COUNT
 
 
 def _neighbours(
@@ -550,11 +627,11 @@ def _cameras_of(entry: dict[str, Any]) -> Pair | None:
         name = words(key)
         if re.search(r"baseline|distance|length|count", name):
             continue
-        pair = _PAIR_KEY.match(words(value)) if isinstance(value, str) else None
+        pair = _pair_of(value) if isinstance(value, str) else None
         if isinstance(value, list) and len(value) == 2:
             by_number += [each for each in map(camera_of, value) if each is not None]
         elif pair is not None and re.search(r"pair|key|id|name", name):
-            by_name += [int(pair[1]), int(pair[2])]
+            by_name += pair
         elif "pair" not in name and _NAMES_A_CAMERA.search(name):
             camera = _camera(value)
             own = by_name if isinstance(value, str) else by_number
@@ -569,7 +646,12 @@ def _lengths_of(
     entry: dict[str, Any], cameras: Pair, path: str, default_m: float, findings: _Findings
 ) -> Iterable[_Recorded]:
     """Yield the baselines that an entry of a pair states, in one unit or in several."""
-    keys = [key for key in entry if re.search(r"baseline|distance|length|separation", words(key))]
+    keys = [
+        key
+        for key in entry
+        if re.search(r"baseline|distance|length|separation", words(key))
+        and not re.search(r"target|request|nominal|desired|min|max|mean|std|range", words(key))
+    ]
     if not keys:
         findings.problems.append(
             f"{path}: baseline_cm is missing; the keys here are: {', '.join(sorted(entry))}"

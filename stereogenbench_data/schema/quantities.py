@@ -13,13 +13,18 @@ from decimal import Decimal, InvalidOperation
 from typing import Any, Final
 
 from stereogenbench_data.schema.document import child_path, is_number
+from stereogenbench_data.schema.release import CAMERA_COUNT
 
 NAMES: Final[dict[str, str]] = {
-    "focal": "focal_length current_focal_length focal lens_focal_length",
+    "focal": "focal_length current_focal_length focal lens_focal_length lens f_mm",
     "focal_px": "focal_length focal fx focal_length_x fl_x",
-    "sensor_width": "sensor_width film_width filmback_width sensor_size_x film_back_width",
-    "sensor_height": "sensor_height film_height filmback_height sensor_size_y film_back_height",
-    "fov": "fov hfov fov_x horizontal_fov field_of_view horizontal_field_of_view fov_horizontal",
+    "sensor_width": "sensor_width film_width filmback_width sensor_size_x film_back_width "
+    "horizontal_aperture",
+    "sensor_height": "sensor_height film_height filmback_height sensor_size_y "
+    "film_back_height vertical_aperture",
+    "fov": "fov hfov fov_x horizontal_fov field_of_view horizontal_field_of_view fov_horizontal "
+    "fov_angle angle_of_view",
+    "focal_y_px": "fy focal_length_y fl_y",
     "image_width": "image_width image_size_x resolution_x resolution_width width_px render_width "
     "frame_width image_size_width",
     "image_height": "image_height image_size_y resolution_y resolution_height height_px "
@@ -56,6 +61,10 @@ PAIRS: Final[dict[str, tuple[str, str]]] = {
     "optical_centre": ("principal_x", "principal_y"),
 }
 """Keys of lists of two numbers, and what these are."""
+
+MATRICES: Final = frozenset({"k", "camera_matrix", "intrinsic_matrix", "intrinsics_matrix",
+                             "intrinsics", "camera_intrinsics"})  # fmt: skip
+"""Keys of a camera matrix, in pixels: 3 rows of 3 numbers, or 9 numbers."""
 
 UNITS_M: Final = {
     **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1e-3),
@@ -156,10 +165,21 @@ def nodes_of(document: dict[str, Any]) -> list[Node]:
             place = child_path(path, key)
             if name and value is not None:
                 found.append(Node(plain, unit, name, parent, value, place))
+                found += _of_matrix(value, place) if plain in MATRICES else []
             is_long = isinstance(value, list) and len(value) > _LONGEST
             if isinstance(value, dict | list) and depth < _DEEPEST and not is_long:
                 waiting.append((value, plain or parent, place, depth + 1))
     return found
+
+
+def _of_matrix(value: Any, path: str) -> list[Node]:
+    """Return the focal lengths and the principal point in a camera matrix, if it is one."""
+    if isinstance(value, list) and len(value) == 3 and all(isinstance(v, list) for v in value):
+        value = [number for row in value for number in row]
+    if not isinstance(value, list) or len(value) != 9 or value[8] != 1:
+        return []
+    places = {"fx": 0, "fy": 4, "cx": 2, "cy": 5}
+    return [Node(name, "px", name, "", value[at], path) for name, at in places.items()]
 
 
 def stated(nodes: list[Node], quantity: str) -> list[Stated]:
@@ -195,6 +215,8 @@ def length_unit_m(nodes: list[Node]) -> float | None:
 
 
 def _stated(value: Any, unit: str, path: str) -> Stated:
+    if isinstance(value, list) and len(value) == CAMERA_COUNT and is_number(value[0]):
+        value = value[0] if value.count(value[0]) == CAMERA_COUNT else value
     text = _TEXT_NUMBER.match(value) if isinstance(value, str) else None
     if text is not None:
         try:

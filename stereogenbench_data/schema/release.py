@@ -25,6 +25,16 @@ FRAME_RATE_HZ: Final = 15.0
 IMAGE_SIZE_PX: Final = 1280
 DEFAULT_DEPTH_UNIT_M: Final = 0.1
 
+ADJACENT_CM: Final = {
+    "IPD_Gaussian": (4.5, 8.5),
+    "Uniform": (1.0, 150.0),
+    "Pairwise_Uniform": (5.0, 200.0),
+}
+"""Between what the baselines of neighbours lie in each family."""
+
+SENSOR_MM: Final = 23.76
+"""Width and height of the sensor of every scene that the public viewer shows."""
+
 FAMILIES: Final = ("IPD_Gaussian", "Uniform", "Pairwise_Uniform")
 
 BASELINE_JSON: Final = "baseline.json"

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.document import brief, camera_of, is_number, parse_object
+from stereogenbench_data.schema.document import brief, camera_of, is_number, parse_document
 from stereogenbench_data.schema.quantities import (
     length_unit_m,
     nodes_of,
@@ -40,6 +40,7 @@ _COMPONENTS: Final = (
 """Names of components, in the order in which they are kept; the first that are all there win."""
 _TRAILING: Final = ((4, 4), (3, 4), (3, 3), (16,), (12,), (9,), (4,), (3,))
 _MOST_VALUES: Final = 2_000_000
+_DEEPEST: Final = 20
 
 Place = tuple[str, ...]
 Columns = dict[Place, tuple[tuple[int, ...], list[Any]]]
@@ -66,7 +67,8 @@ class Block:
     def words(self) -> frozenset[str]:
         """The words of the last two keys: what the numbers are called."""
         keys = [key for key in self.name if key != "*"][-2:]
-        return frozenset(word for key in keys for word in key.split("_"))
+        found = {word for key in keys for word in key.split("_")}
+        return frozenset(found | {word.removesuffix("s") for word in found})
 
     @property
     def key(self) -> str:
@@ -107,7 +109,9 @@ def record_poses(text: bytes, *, where: str) -> RecordedPoses:
 
     Source: the paper's appendix on the file schema.
     """
-    document = parse_object(text, where=where)
+    document = parse_document(text, where=where)
+    if not isinstance(document, dict):
+        document = {"frames": document}
     columns = _columns(document)
     if sum(len(values) for _, values in columns.values()) > _MOST_VALUES:
         raise SchemaError(f"{where}: has over {_MOST_VALUES:,} values. Replace it with the file of "
@@ -151,7 +155,7 @@ def _hints(document: dict[str, Any]) -> frozenset[str]:
         if isinstance(value, dict) and len(value) < _MOST_HINTS:
             waiting += [(f"{name}_{words(key)}", inner) for key, inner in value.items()]
         elif isinstance(value, str) and len(value) < 200 and _SPEAKS_OF_FORM.search(name):
-            found |= {*words(value).split("_"), *name.split("_")}
+            found |= {words(value), *words(value).split("_"), *name.split("_")}
         elif isinstance(value, list) and 0 < len(value) <= 4 and _SPEAKS_OF_FORM.search(name):
             found |= {"".join(map(str, value)).lower()}
     return frozenset(found)
@@ -164,44 +168,77 @@ class _Odd(Exception):
     """Numbers of cameras that cannot be put in order."""
 
 
-def _columns(node: Any) -> Columns:
+def _columns(node: Any, depth: int = 0) -> Columns:
     """Return the values at each place of a document: the lengths of its axes, and all values.
 
-    Places that not all elements of a list have alike are left out.
+    Places that not all elements of a list have alike, and very deep ones, are left out.
     """
+    if depth > _DEEPEST:
+        return {}
     if isinstance(node, dict):
-        counted = _counted(node)
-        if counted is not None:
-            inner = _stacked([value for _, value in counted])
+        found: Columns = {}
+        for name, counted in _counted(node).items():
+            owner = (name,) if name else ()
+            for place, column in _stacked([value for _, value in counted], depth).items():
+                found[(*owner, *place)] = column
             numbers = [number for number, _ in counted]
-            return inner | {("*", "#"): ((len(numbers),), numbers)}
-        found = {}
+            found[(*owner, "*", "#")] = ((len(numbers),), numbers)
+            node = {key: value for key, value in node.items() if not _is_among(value, counted)}
         for key, value in node.items():
-            name = words(key)
-            for place, column in _columns(value).items():
-                found[(name, *place)] = column
+            for place, column in _columns(value, depth + 1).items():
+                found[(words(key), *place)] = column
         return found
     if isinstance(node, list):
-        return _stacked(node)
+        return _stacked(_by_frame(node), depth)
     return {(): ((), [node])}
 
 
-def _counted(node: dict[str, Any]) -> list[tuple[int, Any]] | None:
-    """Return the values of an object whose keys only count, by their numbers."""
-    if len(node) < 2 or not all(isinstance(value, dict | list) for value in node.values()):
-        return None
-    found = [_COUNTING.match(key) for key in node]
-    if None in found or len({match[1] for match in found if match}) > 1:
-        return None
-    numbers = [(int(match[2]), value) for match, value in zip(found, node.values(), strict=True)
-               if match]  # fmt: skip
-    return sorted(numbers, key=lambda each: each[0])
+def _is_among(value: Any, counted: list[tuple[int, Any]]) -> bool:
+    return any(value is each for _, each in counted)
 
 
-def _stacked(nodes: list[Any]) -> Columns:
+def _counted(node: dict[str, Any]) -> dict[str, list[tuple[int, Any]]]:
+    """Return the objects and lists of an object whose keys only count, by their numbers.
+
+    There is one group for what stands before the numbers, of which the last word is kept.
+    """
+    groups: dict[str, list[tuple[int, Any]]] = {}
+    for key, value in node.items():
+        match = _COUNTING.match(key) if isinstance(value, dict | list) else None
+        if match is not None:
+            groups.setdefault(match[1], []).append((int(match[2]), value))
+    return {
+        words(before).rpartition("_")[2]: sorted(group, key=lambda each: each[0])
+        for before, group in groups.items()
+        if len(group) > 1
+    }
+
+
+def _by_frame(records: list[Any]) -> list[Any]:
+    """Return one list of poses for each frame, where each record names its camera and its frame."""
+    if len(records) <= CAMERA_COUNT or not all(isinstance(each, dict) for each in records):
+        return records
+    named = [{words(key): value for key, value in each.items()} for each in records]
+    key = next((name for name in _CAMERA_KEYS if name in named[0]), None)
+    frame_key = next((name for name in _FRAME_KEYS if name in named[0] and name != key), None)
+    cameras = {camera_of(each.get(key)) for each in named} if key else set()
+    if frame_key is None or len(cameras) != CAMERA_COUNT or None in cameras:
+        return records
+    frames: dict[int, list[Any]] = {}
+    for name, record in zip(named, records, strict=True):
+        frame = _frame_of(name.get(frame_key))
+        if frame is None:
+            return records
+        frames.setdefault(frame, []).append(record)
+    if max(frames) - min(frames) >= len(frames) or {*map(len, frames.values())} != {CAMERA_COUNT}:
+        return records
+    return [frames[frame] for frame in sorted(frames)]
+
+
+def _stacked(nodes: list[Any], depth: int) -> Columns:
     if all(not isinstance(node, dict | list) for node in nodes):
         return {("*",): ((len(nodes),), nodes)}
-    parts = [_columns(node) for node in nodes]
+    parts = [_columns(node, depth + 1) for node in nodes]
     found: Columns = {}
     for place, (lengths, _) in parts[0].items():
         others = [part.get(place, (None, ())) for part in parts]
@@ -312,15 +349,20 @@ def _ordered(
 
 
 def _order(numbers: np.ndarray, what: str) -> np.ndarray:
-    """Return how elements are put in the order of their numbers, from 0 or 1 without a gap."""
+    """Return how elements are put in the order of their numbers, which have no gap.
+
+    Cameras count from 0 or 1, frames from any number.
+    """
     order = np.argsort(numbers, kind="stable")
     ascending = numbers[order]
-    if ascending[0] not in (0, 1) or (np.diff(ascending) != 1).any():
+    is_odd = what == "cameras" and ascending[0] not in (0, 1)
+    if is_odd or (np.diff(ascending) != 1).any():
         repeated = ascending[1:][np.diff(ascending) == 0]
         found = f"{repeated[0]} is there twice" if len(repeated) else (
             f"there are {len(numbers)} of {ascending[0]} to {ascending[-1]}"
         )  # fmt: skip
-        raise _Odd(f"{what} must be numbered from 0 or 1 without a gap, and {found}")
+        start = " from 0 or 1" if what == "cameras" else ""
+        raise _Odd(f"{what} must be numbered{start} without a gap, and {found}")
     return order
 
 

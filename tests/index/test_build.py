@@ -1,5 +1,7 @@
 """The walk over a tree: nothing is lost, and a second walk goes on where the first stopped."""
 
+import json
+import math
 import multiprocessing
 import os
 import shutil
@@ -9,6 +11,7 @@ import pytest
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import build as walk_module
 from stereogenbench_data.index.build import scene_journal, walk
+from stereogenbench_data.index.scene_folder import describe_scene
 
 KEY = "train/Uniform/Car_Dealer/scene_{:06d}"
 
@@ -40,6 +43,36 @@ def test_every_scene_is_whole_incomplete_or_broken(linked_scenes, root):
     assert list(report.incomplete) == [keys[1]]
     assert list(report.broken) == [keys[2], "train/Uniform/scene.7"]
     assert "has no baseline.json" in report.broken[keys[2]]
+
+
+def test_scenes_of_one_writer_read_their_poses_alike(linked_scenes, root):
+    """A camera that stands level at heading 0 fits two readings; others of its shape fit one."""
+    keys = linked_scenes(3)
+    for key, yaw_deg in zip(keys, (0.0, 25.0, 40.0), strict=True):
+        _write_matrices(root / key / "trajectory.json", yaw_deg=yaw_deg)
+
+    scenes = walk(root).scenes
+
+    assert describe_scene(root, keys[0]).remark("world")
+    assert len({scene.pose_form for scene in scenes}) == 1
+    assert [scene.remark("world", "poses") for scene in scenes] == ["", "", ""]
+
+
+def _write_matrices(path, *, yaw_deg):
+    """Replace a trajectory by one of Blender's matrices: a turned rig that stands still."""
+    document = json.loads(path.read_text())
+    sin, cos = math.sin(math.radians(yaw_deg)), math.cos(math.radians(yaw_deg))
+    right, up, back = (sin, -cos, 0.0), (0.0, 0.0, 1.0), (-cos, -sin, 0.0)
+    for frame in document["frames"]:
+        first = frame["cameras"][0]["location"].copy()
+        for pose in frame["cameras"]:
+            place = pose.pop("location")
+            along_m = math.dist(place.values(), first.values()) / 100
+            pose.pop("rotation")
+            columns = (right, up, back, tuple(1 + along_m * each for each in right))
+            pose["matrix"] = [[*row] for row in zip(*columns, strict=True)] + [[0, 0, 0, 1]]
+    path.unlink()
+    path.write_text(json.dumps(document | {"unit": "m"}))
 
 
 def test_worker_processes_find_what_one_process_finds(linked_scenes, root, monkeypatch):

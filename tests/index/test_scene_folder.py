@@ -1,6 +1,7 @@
 """One scene's folder: what its row says, and each way in which it can be wrong."""
 
 import os
+import re
 import shutil
 
 import pytest
@@ -131,6 +132,15 @@ def test_without_poses_the_left_end_follows_from_the_primary_pair(make_scene, ro
     )
 
 
+def test_cameras_whose_sides_are_contradicted_have_no_poses(make_scene, root, rewrite):
+    rewrite(make_scene() / "baseline.json", lambda d: d.update(primary_stereo_pair=[1, 0]))
+
+    scene = describe_scene(root, KEY)
+
+    assert scene.pose_form is None
+    assert "camera 1 is to the right of camera 0" in scene.remark("left")
+
+
 def test_descriptions_may_be_absent(make_scene, root):
     (make_scene() / "scene_description_qwen_dataset_level.json").unlink()
 
@@ -229,13 +239,14 @@ def test_a_wrong_unit_shows_as_a_contradiction(make_scene, root, rewrite):
     rewrite(make_scene() / "trajectory.json", in_another_unit)
 
     remark = describe_scene(root, KEY).remark("poses")
-    assert "10 cm apart, and by the poses they are 1000 cm apart" in remark
+    recorded_cm, posed_cm = re.findall(r"are ([0-9.]+) cm apart", remark)
+    assert float(posed_cm) == pytest.approx(100 * float(recorded_cm))
 
 
 @pytest.mark.parametrize(
     ("name", "content", "about", "told"),
     [
-        ("trajectory.json", b"[]", "poses", f"{KEY}/trajectory.json: $ must be an object"),
+        ("trajectory.json", b"[]", "poses", f"{KEY}/trajectory.json: no numbers of 6 cameras"),
         ("_scene_complete.json", b"", "labels", f"{KEY}/_scene_complete.json: the file is empty"),
         ("cam_00_rgb.mp4", b"", "videos", f"{KEY}/cam_00_rgb.mp4: is empty"),
         ("cam_00_depth.mkv", b"\x1aE\xdf\xa3", "videos", f"{KEY}/cam_00_depth.mkv: cannot"),

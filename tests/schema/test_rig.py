@@ -1,5 +1,6 @@
 """baseline.json: which keys are read, and what is refused."""
 
+import dataclasses
 import itertools
 import json
 import math
@@ -9,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.parse import parse_rig
+from stereogenbench_data.schema.parse import parse_rig, require_unit
 from stereogenbench_data.schema.records import Rig
 
 BASELINES_CM = (6.5, 13.25, 19.0, 26.0, 32.5, 6.75, 12.5, 19.5, 26.0, 5.75, 12.75, 19.25)
 BASELINES_CM += (7.0, 13.5, 6.5)
+PAIRS = tuple(itertools.combinations(range(6), 2))
 
 
 def problems_of(document, dumped):
@@ -67,6 +69,9 @@ def test_without_a_sensor_height_pixels_are_square(rig_document, dumped):
         ({"left_camera": 3, "right_camera": 5}, (3, 5)),
         ([1, 2], (1, 2)),
         (["Cam_00", "Cam_05"], (0, 5)),
+        ("1-3", (1, 3)),
+        ({"camera_index_a": 2, "camera_index_b": 3, "baseline_cm": 5.75}, (2, 3)),
+        ({"left_camera": "cam_00_rgb.mp4", "right_camera": "cam_04_rgb.mp4"}, (0, 4)),
     ],
 )
 def test_both_forms_of_the_primary_pair_are_read(rig_document, dumped, pair, expected):
@@ -86,7 +91,6 @@ def test_both_forms_of_the_primary_pair_are_read(rig_document, dumped, pair, exp
         ([0, 1, 2], "$.primary_stereo_pair: must be {left_camera, right_camera} or a list"),
         ({"left_camera": "Cam_left", "right_camera": 1}, "$.primary_stereo_pair: must be {left"),
         ({"left_camera": 0}, "$.primary_stereo_pair: must be {left_camera, right_camera}"),
-        (None, "$.primary_stereo_pair is missing, so nothing tells which camera is left"),
     ],
 )
 def test_a_wrong_primary_pair_is_refused(rig_document, dumped, pair, problem):
@@ -96,6 +100,105 @@ def test_a_wrong_primary_pair_is_refused(rig_document, dumped, pair, problem):
 
     assert len(found) == 1
     assert found[0].startswith(problem)
+
+
+@pytest.mark.parametrize(
+    "intrinsics", [{"fx": 875.4208754, "fy": 875.4208754}, {"fov_deg": 40.15832}]
+)
+def test_without_a_sensor_that_of_the_release_is_assumed(rig_document, dumped, intrinsics):
+    rig_document["camera_intrinsics"] = intrinsics
+
+    rig, _, (remark,) = parse_rig(dumped(rig_document), where="baseline.json")
+
+    assert (rig.sensor_width_mm, rig.sensor_height_mm) == pytest.approx((23.76, 17.82))
+    assert rig.focal_mm == pytest.approx(32.5, rel=1e-5)
+    assert remark.about == "sensor"
+
+
+@pytest.mark.parametrize(
+    "intrinsics",
+    [{"focal_length": 875.42, "sensor_width_mm": 23.76}, {"fx": 875.42, "sensor_width_mm": 23.76}],
+)
+def test_a_focal_length_that_could_be_anything_is_refused(rig_document, dumped, intrinsics):
+    rig_document["camera_intrinsics"] = intrinsics
+    del rig_document["image_width"]
+
+    (problem,) = problems_of(rig_document, dumped)
+
+    assert "focal_length" in problem
+
+
+def without_pairs(document):
+    return {key: value for key, value in document.items() if key != "pairwise_pairs"}
+
+
+def table(names):
+    """Baselines of the fixture as rows of a table."""
+    places = dict(enumerate((0.0, 6.5, 13.25, 19.0, 26.0, 32.5)))
+    return {names(a): {names(b): places[b] - places[a] for b in range(a + 1, 6)} for a in range(5)}
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        {"pairwise_baselines_cm": table(str)},
+        {"baseline_matrix_cm": [
+            [abs(a - b) for b in (0.0, 6.5, 13.25, 19.0, 26.0, 32.5)]
+            for a in (0.0, 6.5, 13.25, 19.0, 26.0, 32.5)
+        ]},
+        {"pairwise_pairs": {
+            f"Town_7_Cam_{a:02d}__Town_7_Cam_{b:02d}": {"baseline_cm": length}
+            for (a, b), length in zip(PAIRS, BASELINES_CM, strict=True)
+        }},
+        {"pairs": [
+            {"pair": f"{a}-{b}", "baseline_mm": 10 * length, "target_baseline_cm": round(length)}
+            for (a, b), length in zip(PAIRS, BASELINES_CM, strict=True)
+        ]},
+    ],
+)  # fmt: skip
+def test_tables_and_names_of_pairs_are_read(rig_document, dumped, written):
+    rig, _, _ = parse_rig(dumped(without_pairs(rig_document) | written), where="baseline.json")
+
+    assert rig.baselines_cm == pytest.approx(BASELINES_CM)
+
+
+def test_of_baselines_that_agree_the_most_precise_counts(rig_document, dumped):
+    rig_document["adjacent_baselines_cm"] = [6.5, 6.8, 5.8, 7.0, 6.5]
+
+    rig, _, _ = parse_rig(dumped(rig_document), where="baseline.json")
+
+    assert rig.baselines_cm == BASELINES_CM
+
+
+@pytest.mark.parametrize(("unit_cm", "unit"), [(100, "m"), (0.1, "mm")])
+def test_baselines_that_fit_their_family_in_another_unit_alone_are_refused(
+    rig_document, dumped, unit_cm, unit
+):
+    for entry in rig_document["pairwise_pairs"]:
+        entry["baseline_cm"] /= unit_cm
+    rig, _, _ = parse_rig(dumped(rig_document), where="baseline.json")
+
+    with pytest.raises(SchemaError, match=rf"4.5 to 8.5 cm. In {unit} they would be"):
+        require_unit(rig, family="IPD_Gaussian", where="baseline.json")
+
+
+def test_baselines_outside_of_their_family_are_told(rig_document, dumped):
+    rig, _, _ = parse_rig(dumped(rig_document), where="baseline.json")
+    wide = dataclasses.replace(rig, baselines_cm=tuple(3 * each for each in BASELINES_CM))
+
+    (remark,) = require_unit(wide, family="IPD_Gaussian", where="baseline.json")
+
+    assert remark.about == "unit"
+    assert require_unit(rig, family="IPD_Gaussian", where="baseline.json") == ()
+
+
+def test_without_a_primary_pair_cameras_are_taken_to_ascend_to_the_right(rig_document, dumped):
+    del rig_document["primary_stereo_pair"]
+
+    rig, _, (remark,) = parse_rig(dumped(rig_document), where="baseline.json")
+
+    assert rig.primary_pair == (0, 1)
+    assert remark.about == "primary pair"
 
 
 def test_a_principal_point_is_read(rig_document, dumped):
@@ -165,6 +268,16 @@ def test_a_principal_point_that_is_not_understood_stops_no_disparity(rig_documen
             {"fx_px": 875.4208754, "sensor_width_mm": 23.76, "sensor_height_mm": 17.82},
             {"render_width": 640, "render_height": 480},
         ),
+        (
+            {"K": [[875.4208754, 0, 320], [0, 875.4208754, 240], [0, 0, 1]],
+             "sensor_width_mm": 23.76},
+            {},
+        ),
+        ({"lens": 32.5, "Filmback": {"SensorWidth": 23.76, "SensorHeight": 17.82}}, {}),
+        ({"f_mm": 32.5, "horizontal_aperture": 23.76, "vertical_aperture": 17.82}, {}),
+        ({"focal_length_mm": [32.5] * 6, "sensor_width_mm": 23.76}, {}),
+        ({"FOVAngle": 40.15832, "sensor_width_mm": 23.76}, {}),
+        ({"horizontal_fov": 0.70089489, "sensor_width_mm": 23.76}, {}),
     ],
 )  # fmt: skip
 def test_a_lens_is_found_under_likely_keys(rig_document, dumped, intrinsics, size):
@@ -342,7 +455,7 @@ def test_all_problems_of_a_file_are_reported_at_once(rig_document, dumped):
     rig_document["camera_intrinsics"]["focal_length_mm"] = "far"
     rig_document["camera_intrinsics"]["sensor_width_mm"] = 0
     rig_document["pairwise_pairs"][0]["baseline_cm"] = None
-    del rig_document["primary_stereo_pair"]
+    rig_document["primary_stereo_pair"] = "left"
 
     problems = problems_of(rig_document, dumped)
 

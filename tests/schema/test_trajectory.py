@@ -100,6 +100,24 @@ def named(place):
             },
             id="from one, backwards, flat",
         ),
+        pytest.param(
+            lambda d: [
+                {"frame": 1001 + f} | {f"Town_Cam_{c:02d}": {"loc": p}
+                                       for k, c, p in poses_of(d) if k == f}
+                for f in range(3)
+            ],
+            id="a bare list, cameras beside other keys",
+        ),
+        pytest.param(
+            lambda d: {"records": [{"cam": f"Cam_{c:02d}", "frame_index": f, "pos": p}
+                                   for f, c, p in poses_of(d)][::-1]},
+            id="records of a camera and a frame",
+        ),
+        pytest.param(
+            lambda d: {"frames": [{"camera_locations": [p for k, _, p in poses_of(d) if k == f]}
+                                  for f in range(3)]},
+            id="a plural",
+        ),
     ],
 )  # fmt: skip
 def test_locations_are_found_at_any_depth_and_in_any_order(trajectory_document, write):

@@ -20,12 +20,18 @@ import numpy as np
 from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis, diagnose_scene
 from stereogenbench_data.audit.contract.matching import SceneFrames
 from stereogenbench_data.audit.contract.verdict import Verdict, group_by_contract, judge
+from stereogenbench_data.audit.contract.worlds import (
+    WorldVerdict,
+    explained_shares,
+    judge_worlds,
+)
 from stereogenbench_data.audit.scene_access import SceneAccess
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.schema.release import TRAJECTORY_JSON
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 
 MOST_RESIDUAL_PX: Final = 0.5
@@ -42,6 +48,7 @@ class DoctorReport:
         scenes: Each scene's own diagnosis, sorted by key.
         verdicts: One for each group of scenes with the same contract, the largest group first.
         left_out: Maps the keys of scenes that cannot be judged to the reason.
+        worlds: Which of several readings of the poses is right; None where one alone fits the rigs.
     """
 
     data: str
@@ -49,6 +56,7 @@ class DoctorReport:
     scenes: tuple[SceneDiagnosis, ...]
     verdicts: tuple[Verdict, ...]
     left_out: dict[str, str]
+    worlds: WorldVerdict | None = None
 
     @property
     def is_wrong(self) -> bool:
@@ -121,19 +129,27 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
         DiagnosisTask(SceneAccess.of(index, index.scene(int(row))), frames, encoding)
         for row in chosen
     ]
-    found = []
+    found, shares = [], []
     results = engine.map(_diagnose, tasks, name=lambda task: task.access.key, workers=workers)
     with closing(results):
-        for diagnosis in results:
+        for diagnosis, explained in results:
             found.append(diagnosis)
+            shares += [explained] if explained else []
             if progress is not None:
                 progress(len(found), len(tasks))
     found.sort(key=lambda diagnosis: diagnosis.key)
     verdicts = tuple(judge(group, declared=encoding) for group in group_by_contract(found))
-    return DoctorReport(index.where, encoding, tuple(found), verdicts, left_out)
+    worlds = judge_worlds(shares) if shares else None
+    return DoctorReport(index.where, encoding, tuple(found), verdicts, left_out, worlds)
 
 
-def _diagnose(task: DiagnosisTask, after_bytes: Advance) -> SceneDiagnosis:
+def _diagnose(task: DiagnosisTask, after_bytes: Advance) -> tuple[SceneDiagnosis, dict[str, float]]:
+    """Return a scene's diagnosis, and what each reading of its poses explains if several fit."""
     after_bytes(0)
+    scene = task.access.scene
     with task.scene_frames() as views:
-        return diagnose_scene(views, frames=task.frames)
+        shares = {}
+        if scene.remark("world") and scene.pose_form:
+            text = task.access.source().read(scene, TRAJECTORY_JSON)
+            shares = explained_shares(views, text, scene.pose_form.split("|"))
+        return diagnose_scene(views, frames=task.frames), shares

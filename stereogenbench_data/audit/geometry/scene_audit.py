@@ -39,7 +39,7 @@ from stereogenbench_data.index.evidence import poses_as
 from stereogenbench_data.media.depth import NO_DEPTH_UNIT, depth_frame_index, depth_m_from_units
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.samples.streams import Streams
-from stereogenbench_data.schema.document import parse_object
+from stereogenbench_data.schema.document import parse_document
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
@@ -251,8 +251,8 @@ class _SceneCheck:
             text = self.files.attempt(name, self.files.text, name)
             if text is None:
                 continue
-            document = self.files.attempt(name, parse_object, text, where=name)
-            documents += [] if document is None else [document]
+            document = self.files.attempt(name, parse_document, text, where=name)
+            documents += [document] if isinstance(document, dict) else []
             if name == TRAJECTORY_JSON:
                 poses = self.files.attempt(name, poses_as, text, self.scene.pose_form, where=name)
         if poses is None:

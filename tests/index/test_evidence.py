@@ -1,0 +1,277 @@
+"""Poses in every form that the reader knows: read as the same poses, or refused."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stereogenbench_data.errors import SchemaError
+from stereogenbench_data.geometry.pose import (
+    OPENCV_FROM_UNREAL,
+    CameraPoses,
+    rotation_from_rotator_deg,
+)
+from stereogenbench_data.index.evidence import (
+    SidesError,
+    agreed_forms,
+    shape_of,
+    understood_poses,
+)
+from stereogenbench_data.schema.records import Rig
+
+PLACES_CM = np.array([0.0, 6.5, 19.0, 26.5, 60.0, 66.0])
+RIG = Rig(
+    32.5, 23.76, 23.76, 64, 64, None,
+    tuple(PLACES_CM[b] - PLACES_CM[a] for a in range(6) for b in range(a + 1, 6)),
+    (0, 1), "recorded",
+)  # fmt: skip
+
+CAMERAS = {
+    "unreal": np.eye(3),
+    "opencv": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+    "opengl": np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+    "ros": np.diag([1.0, -1.0, 1.0]),
+}
+"""A camera's x, y and z axes, as columns, in Unreal's forward, right and up."""
+WORLDS = {"unreal": np.eye(3), "opencv": OPENCV_FROM_UNREAL, "opengl": np.diag([1.0, -1.0, 1.0]),
+          "ros": np.diag([1.0, -1.0, 1.0])}  # fmt: skip
+
+
+def path(rotators, first_cm=(120.0, -340.0, 155.0)):
+    """Rotators and places, (frames, 6, 3), of a rig that turns and moves."""
+    rotators = np.repeat(np.array(rotators)[:, None], 6, axis=1)
+    right = rotation_from_rotator_deg(rotators)[..., 1]
+    steps = np.arange(len(rotators))[:, None, None] * np.array([7.0, 3.0, -2.0])
+    return rotators, np.array(first_cm) + steps + PLACES_CM[:, None] * right
+
+
+def quaternion_xyzw(turn):
+    """By the eigenvector of Bar-Itzhack's matrix: no code of the package."""
+    (a, b, c), (d, e, f), (g, h, i) = turn
+    matrix = [[a - e - i, 0, 0, 0], [d + b, e - a - i, 0, 0], [g + c, h + f, i - a - e, 0],
+              [h - f, c - g, d - b, a + e + i]]  # fmt: skip
+    return np.linalg.eigh(np.array(matrix) / 3)[1][:, 3]
+
+
+def rigid(turn, place):
+    return np.block([[turn, place[:, None]], [np.zeros(3), np.ones(1)]])
+
+
+FORMS = {
+    "rotator": lambda p: {"location": p.at("xyz"), "rotation": p.rotator("pitch", "yaw", "roll")},
+    "rotator upside": lambda p: {"Rotation": p.rotator("Roll", "Yaw", "Pitch"), "loc": p.place},
+    "rotator flat": lambda p: p.at("xyz") | p.rotator("pitch_deg", "yaw_deg", "roll_deg"),
+    "rotator list": lambda p: {"position": p.place, "rotation_pyr": p.angles("pitch yaw roll")},
+    "roll first": lambda p: {"position": p.place, "rotation_rpy": p.angles("roll pitch yaw")},
+    "quaternion": lambda p: {"location": p.at("XYZ"), "rotation": p.quaternion("xyzw")},
+    "quaternion wxyz": lambda p: {"t": p.place, "rotation_wxyz": [*p.quaternion("wxyz").values()]},
+    "qx": lambda p: {"t": p.place} | {f"q{key}": v for key, v in p.quaternion("xyzw").items()},
+    "3x3": lambda p: {"position": p.place, "rotation": p.turn.tolist()},
+    "9": lambda p: {"position": p.place, "rotation_matrix": p.turn.ravel().tolist()},
+    "4x4": lambda p: {"camera_to_world": p.matrix.tolist()},
+    "rows": lambda p: {"camera_to_world": p.matrix.T.tolist()},
+    "3x4": lambda p: {"c2w": p.matrix[:3].tolist()},
+    "inverse": lambda p: {"world_to_camera": np.linalg.inv(p.matrix).tolist()},
+    "16 inverse": lambda p: {"w2c": np.linalg.inv(p.matrix).ravel().tolist()},
+    "R and t": lambda p: {"world_to_camera": p.inverse_parts()},
+}
+ROTATORS_ONLY = {name for name in FORMS if name.startswith("ro") and name != "rows"}
+
+
+class Written:
+    """One pose, in the axes and the unit of a writer."""
+
+    def __init__(self, rotator, place_cm, axes, unit):
+        turn = WORLDS[axes] @ rotation_from_rotator_deg(rotator) @ CAMERAS[axes]
+        self.turn = turn
+        self.place = (WORLDS[axes] @ place_cm * {"cm": 1, "m": 0.01, "mm": 10}[unit]).tolist()
+        self.matrix = rigid(turn, np.array(self.place))
+        self._angles = dict(zip(("pitch", "yaw", "roll"), rotator.tolist(), strict=True))
+
+    def at(self, names):
+        return dict(zip(names, self.place, strict=True))
+
+    def rotator(self, *names):
+        return {name: self._angles[name.lower().removesuffix("_deg")] for name in names}
+
+    def angles(self, order):
+        return [self._angles[name] for name in order.split()]
+
+    def quaternion(self, names):
+        parts = dict(zip("xyzw", quaternion_xyzw(self.turn).tolist(), strict=True))
+        return {name: parts[name] for name in names}
+
+    def inverse_parts(self):
+        inverse = np.linalg.inv(self.matrix)
+        return {"R": inverse[:3, :3].tolist(), "t": inverse[:3, 3].tolist()}
+
+
+def written(form, rotators, places_cm, *, axes="unreal", unit="cm", **said):
+    frames = [
+        {
+            "frame_index": frame,
+            "cameras": [
+                {"camera_index": camera}
+                | FORMS[form](
+                    Written(rotators[frame, camera], places_cm[frame, camera], axes, unit)
+                )
+                for camera in range(6)
+            ],
+        }
+        for frame in range(len(rotators))
+    ]
+    return json.dumps({"unit": unit, "frames": frames} | said).encode()
+
+
+def motions(poses):
+    """The motions between cameras, and of each camera from its first place."""
+    first = np.linalg.inv(poses.world_from_cam(0, 0))
+    return np.array(
+        [
+            first @ poses.world_from_cam(frame, camera)
+            for frame in range(poses.frame_count)
+            for camera in range(6)
+        ]
+    )
+
+
+def truth(rotators, places_cm):
+    turns = OPENCV_FROM_UNREAL @ rotation_from_rotator_deg(rotators) @ OPENCV_FROM_UNREAL.T
+    return motions(CameraPoses(places_cm, 0.01, turns))
+
+
+def understood(text, rig=RIG):
+    return understood_poses(text, rig, where="trajectory.json")
+
+
+TURNED = path([(-12.0, 33.0, 2.0), (-14.0, 37.0, 1.0), (-15.0, 44.0, -3.0)])
+
+
+@pytest.mark.parametrize("unit", ["cm", "m", "mm"])
+@pytest.mark.parametrize("form", FORMS)
+def test_each_form_is_read_in_each_unit(form, unit):
+    found = understood(written(form, *TURNED, unit=unit, coordinate_system="Unreal"))
+
+    assert len(found.names) == 1
+    np.testing.assert_allclose(motions(found.poses), truth(*TURNED), atol=1e-9)
+
+
+@pytest.mark.parametrize("axes", ["opencv", "opengl", "ros"])
+@pytest.mark.parametrize("form", sorted(set(FORMS) - ROTATORS_ONLY))
+def test_right_handed_worlds_are_read_and_never_mirrored(form, axes):
+    found = understood(written(form, *TURNED, axes=axes, unit="m", coordinate_system=axes))
+
+    assert len(found.names) == 1
+    np.testing.assert_allclose(motions(found.poses), truth(*TURNED), atol=1e-9)
+
+
+@pytest.mark.parametrize("form", sorted(set(FORMS) - ROTATORS_ONLY - {"R and t"}))
+def test_where_no_axes_are_named_cameras_stand_upright_in_a_world_whose_z_is_up(form):
+    found = understood(written(form, *TURNED, axes="opengl", unit="m"))
+
+    assert len(found.names) == 1
+    np.testing.assert_allclose(motions(found.poses), truth(*TURNED), atol=1e-9)
+
+
+def test_a_form_that_nothing_names_must_be_the_only_one_to_pass():
+    """Cameras along an axis of the world: a matrix and its inverse both fit the rig."""
+    along = path([(0.0, 0.0, 0.0), (0.0, 0.0, 0.0)])
+
+    found = understood(written("4x4", *along, axes="opengl", unit="m"))
+
+    assert len(found.names) > 1
+
+
+def test_readings_that_only_pictures_can_tell_apart_are_all_named():
+    names = understood(written("4x4", *TURNED, axes="opencv", unit="m")).names
+
+    assert [name.rpartition(", ")[2].split()[0] for name in names] == ["opencv", "opengl"]
+
+
+angles = st.tuples(st.floats(-60, 60), st.floats(-180, 180), st.floats(-15, 15))
+
+
+@settings(max_examples=25, deadline=None)
+@given(rotators=st.lists(angles, min_size=2, max_size=3), form=st.sampled_from(sorted(FORMS)))
+def test_any_path_in_any_form_is_read_or_refused(rotators, form):
+    rotators, places_cm = path(rotators)
+    try:
+        found = understood(written(form, rotators, places_cm))
+    except SchemaError:
+        return
+
+    if len(found.names) == 1:
+        np.testing.assert_allclose(motions(found.poses), truth(rotators, places_cm), atol=1e-6)
+
+
+def test_the_form_that_a_file_names_is_kept_where_others_fit_too():
+    still = path([(0.0, 0.0, 0.0), (0.0, 0.0, 0.0)])
+
+    found = understood(written("rotator", *still, rotation_representation="rotator"))
+
+    assert len(found.names) == 1
+    assert "rotator pitch yaw roll deg, unreal axes" in found.names[0]
+
+
+def test_a_named_form_that_fails_gives_way_to_one_that_fits():
+    text = written("quaternion wxyz", *TURNED, rotation_representation="quaternion_xyzw")
+
+    np.testing.assert_allclose(motions(understood(text).poses), truth(*TURNED), atol=1e-9)
+
+
+def test_poses_beside_others_of_the_rig_alone_are_those_of_the_world():
+    document = json.loads(written("rotator", *TURNED))
+    for frame in document["frames"]:
+        for camera, pose in enumerate(frame["cameras"]):
+            pose["relative_location"] = {"x": 0.0, "y": PLACES_CM[camera], "z": 0.0}
+            pose["relative_rotation"] = {"pitch": 0.0, "yaw": 0.0, "roll": 0.0}
+
+    found = understood(json.dumps(document).encode())
+
+    np.testing.assert_allclose(motions(found.poses), truth(*TURNED), atol=1e-9)
+
+
+@pytest.mark.parametrize("unit", ["m", "mm"])
+def test_a_unit_that_the_distances_contradict_is_refused(unit):
+    document = json.loads(written("rotator", *TURNED)) | {"unit": unit}
+
+    with pytest.raises(SchemaError, match=r"trajectory\.json: .* 66 cm apart, and by the poses"):
+        understood(json.dumps(document).encode())
+
+
+def test_the_poses_of_another_rig_are_refused():
+    rotators, places_cm = TURNED
+
+    with pytest.raises(SchemaError, match=r"trajectory\.json: no reading of its poses fits"):
+        understood(written("rotator", rotators, places_cm * 1.01))
+
+
+def test_a_left_camera_that_stands_on_the_right_is_a_contradiction():
+    rotators, places_cm = TURNED
+    mirrored = 2 * places_cm[:, :1] - places_cm  # all cameras to the left of camera 0
+
+    with pytest.raises(SidesError, match="camera 0 is to the right of camera 1"):
+        understood(written("rotator", rotators, mirrored, coordinate_system="Unreal"))
+
+
+def test_scenes_of_one_shape_decide_together():
+    both, one, other = "a: x @ 1.0|a: y @ 1.0", "a: x @ 1.0", "b: z @ 1.0"
+
+    agreed = agreed_forms([both, one, both, other])
+
+    assert agreed == {"a": ("a: x @ 1.0",), "b": ("b: z @ 1.0",)}
+
+
+def test_scenes_of_one_shape_that_disagree_decide_nothing():
+    assert agreed_forms(["a: x @ 1.0", "a: y @ 1.0"]) == {"a": ()}
+
+
+def test_the_shape_of_a_form_is_its_keys():
+    first = understood(written("rotator", *TURNED)).names[0]
+    again = understood(written("rotator", *TURNED, unit="m")).names[0]
+    other = understood(written("quaternion", *TURNED)).names[0]
+
+    assert shape_of(first) == shape_of(again) != first
+    assert shape_of(other) == shape_of(first)  # the keys are alike: location and rotation
