@@ -196,7 +196,9 @@ def export_clips(
     """
     require_options(export_clips, selection)
     root = Path(out)
-    rules = _require_layout(layout)
+    if layout not in LAYOUTS:
+        raise SelectionError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}.")
+    rules = LAYOUTS[layout]
     kinds, control = _require_kinds(form, rules=rules, layout=layout)
     size = None if form.size is None else require_size(form.size)
     index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
@@ -218,7 +220,7 @@ def export_clips(
         "selection": plan.digest,
     }
     facts = StereoPairs(index, fields=_FACTS, **chosen)
-    works = _works(facts, root, form, kinds=kinds, size=size, depth=run.depth)
+    works = _works(facts, _Export(root, form, kinds, size, run.depth))
     with export_folder(root, settings):
         due = [work for work in works if not _is_finished(work)]
         still, total = (sum(len(work.address.frames) for work in each) for each in (due, works))
@@ -249,12 +251,6 @@ def export_clips(
 # What is asked for.
 
 
-def _require_layout(layout: Any) -> ClipLayout:
-    if layout not in LAYOUTS:
-        raise SelectionError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}.")
-    return LAYOUTS[cast("LayoutName", layout)]
-
-
 def _require_kinds(
     form: ClipForm, *, rules: ClipLayout, layout: LayoutName
 ) -> tuple[tuple[Kind, ...], Kind | None]:
@@ -283,8 +279,6 @@ def _windows(
     selection: Mapping[str, Any],
 ) -> FramesSpec:
     """Return the frames of clips, as `StereoPairs` takes them."""
-    if "frames" in selection:
-        raise SelectionError("frames= is not known here: a ClipForm has length, stride and step.")
     unit = 1 if form.length_rule == "any" else rules.frames_step
     length = form.length
     if length is None:
@@ -322,8 +316,8 @@ def _warn_of_sizes(
     layout: LayoutName,
 ) -> None:
     side = rules.side_px
-    sizes = {size} if size is not None else _stored_sizes(index, plan)
-    for height, width in sorted(sizes):
+    columns = (index.column(f"image_{name}_px")[plan.scene_rows] for name in ("height", "width"))
+    for height, width in [size] if size is not None else sorted(set(zip(*columns, strict=True))):
         if height % side or width % side:
             cut = f"{max(1, width // side) * side}x{max(1, height // side) * side}"
             warnings.warn(
@@ -335,13 +329,26 @@ def _warn_of_sizes(
             )
 
 
-def _stored_sizes(index: SceneIndex, plan: Plan) -> set[tuple[int, int]]:
-    sides = ("image_height_px", "image_width_px")
-    found = np.stack([index.column(name)[plan.scene_rows] for name in sides], axis=1)
-    return {(int(height), int(width)) for height, width in np.unique(found, axis=0)}
-
-
 # One clip.
+
+
+@dataclass(frozen=True, slots=True)
+class _Export:
+    """What all clips of an export have in common.
+
+    Attributes:
+        root: The folder of the export.
+        form: What a clip is.
+        kinds: The videos of a clip.
+        size: (height, width) in pixels, or None.
+        depth: A depth contract that overrides what the index says, or None.
+    """
+
+    root: Path
+    form: ClipForm
+    kinds: tuple[Kind, ...]
+    size: tuple[int, int] | None
+    depth: DepthEncoding | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -349,36 +356,35 @@ class _ClipWork:
     """One clip to be written, by whatever process.
 
     Attributes:
+        export: What it has in common with others.
         index: An index of its scene alone.
         address: Its cameras and frames, of row 0.
         facts: What is known of it before its videos are read.
-        root: The folder of the export.
         name: The name of its files.
-        videos: The file of each kind of video, relative to the folder.
-        form: What a clip is.
-        size: (height, width) in pixels, or None.
-        depth: A depth contract that overrides what the index says, or None.
     """
 
+    export: _Export
     index: SceneIndex
     address: Address
     facts: dict[str, Any]
-    root: Path
     name: str
-    videos: dict[Kind, str]
-    form: ClipForm
-    size: tuple[int, int] | None
-    depth: DepthEncoding | None
 
     @property
     def record(self) -> Path:
         """The file that says that the clip is finished."""
-        return self.root / _CLIPS / f"{self.name}.json"
+        return self.export.root / _CLIPS / f"{self.name}.json"
+
+    @property
+    def videos(self) -> dict[Kind, str]:
+        """The file of each kind of video, relative to the folder."""
+        # The ending of a grid is StereoCrafter's own.
+        ends = {"grid": "_splatting_results"}
+        return {kind: f"{kind}/{self.name}{ends.get(kind, '')}.mp4" for kind in self.export.kinds}
 
     def request(self, fields: Sequence[str]) -> Request:
         """Return what is read of every frame."""
-        size, transform = self.size, None
-        if size is not None and self.form.fit == "crop":
+        size, transform = self.export.size, None
+        if size is not None and self.export.form.fit == "crop":
             rig, (height, width) = self.index.scene(0).rig, size
             scale = max(height / rig.image_height_px, width / rig.image_width_px)
             size = (
@@ -387,50 +393,22 @@ class _ClipWork:
             )
             top, left = (size[0] - height) // 2, (size[1] - width) // 2
             transform = Crop(top, left, height, width)
+        depth = self.export.depth
         return Request(
-            "pairs", tuple(fields), "single", size=size, depth=self.depth, transform=transform
+            "pairs", tuple(fields), "single", size=size, depth=depth, transform=transform
         )
 
 
-def _works(
-    clips: StereoPairs,
-    root: Path,
-    form: ClipForm,
-    *,
-    kinds: Sequence[Kind],
-    size: tuple[int, int] | None,
-    depth: DepthEncoding | None,
-) -> list[_ClipWork]:
-    """Return all clips of a selection, in its order.
-
-    Args:
-        clips: The selection, with the fields of `_FACTS`.
-        root: The folder of the export.
-        form: What a clip is.
-        kinds: The videos of a clip.
-        size: (height, width) in pixels, or None.
-        depth: A depth contract, or None.
-    """
+def _works(clips: StereoPairs, export: _Export) -> list[_ClipWork]:
+    """Return all clips of a selection with the fields `_FACTS`, in its order."""
     index, works, scenes = clips.index, [], {}
     for number in range(len(clips)):
         row, source, targets, frames, _ = clips.plan.locate(number, epoch=0)
         if row not in scenes:
             scenes = {row: alone(index, row)}
-        facts = _facts(clips[number], frames=frames, form=form)
-        name = _clip_name(number, facts)
-        works.append(
-            _ClipWork(
-                index=scenes[row],
-                address=Address(0, source, targets, frames),
-                facts=facts,
-                root=root,
-                name=name,
-                videos={kind: _video_path(kind, name) for kind in kinds},
-                form=form,
-                size=size,
-                depth=depth,
-            )
-        )
+        facts = _facts(clips[number], frames=frames, form=export.form)
+        address = Address(0, source, targets, frames)
+        works.append(_ClipWork(export, scenes[row], address, facts, _clip_name(number, facts)))
     return works
 
 
@@ -467,17 +445,12 @@ def _clip_name(number: int, facts: Mapping[str, Any]) -> str:
     return f"{number:06d}_{scene}_{left:02d}-{right:02d}_{frames[0]:03d}-{frames[-1]:03d}"
 
 
-def _video_path(kind: Kind, name: str) -> str:
-    # The ending is StereoCrafter's own for such a grid.
-    return f"{kind}/{name}_splatting_results.mp4" if kind == "grid" else f"{kind}/{name}.mp4"
-
-
 def _is_finished(work: _ClipWork) -> bool:
     """Return whether a clip's videos are there, with the sizes that were noted."""
     if not work.record.is_file():
         return False
     sizes = read_json(work.record).get("bytes", {})
-    paths = {kind: work.root / path for kind, path in work.videos.items()}
+    paths = {kind: work.export.root / path for kind, path in work.videos.items()}
     return all(
         path.is_file() and path.stat().st_size == sizes.get(kind) for kind, path in paths.items()
     )
@@ -487,9 +460,9 @@ def _write_clip(work: _ClipWork, advance: Advance) -> None:
     """Write the videos of a clip, then its record."""
     fields = dict.fromkeys(name for kind in work.videos for name in _FIELDS[kind])
     draws_maps = {"depth", "disparity", "grid"} & work.videos.keys()
-    ranges = _map_ranges(work) if draws_maps else _NO_RANGES
+    ranges = _map_ranges(work) if draws_maps else _MapRanges(0.0, 0.0, 0.0)
     with (
-        named_errors(work.root),
+        named_errors(work.export.root),
         closing(SampleLoader(work.index, work.request([*fields]), check="opened")) as loader,
         ExitStack() as stack,
     ):
@@ -505,7 +478,7 @@ def _write_clip(work: _ClipWork, advance: Advance) -> None:
         record["disparity_max_px"] = ranges.largest_px
     record["videos"] = work.videos
     record["bytes"] = {
-        kind: (work.root / path).stat().st_size for kind, path in work.videos.items()
+        kind: (work.export.root / path).stat().st_size for kind, path in work.videos.items()
     }
     with named_errors(work.record):
         work.record.parent.mkdir(exist_ok=True)
@@ -520,14 +493,14 @@ def _frames(work: _ClipWork, loader: SampleLoader) -> Iterator[Sample]:
 
 @contextmanager
 def _encoder(work: _ClipWork, kind: Kind) -> Iterator[VideoEncoder]:
-    path = work.root / work.videos[kind]
+    path = work.export.root / work.videos[kind]
     path.parent.mkdir(exist_ok=True)
     with (
         open_atomic(path) as file,
         VideoEncoder(
             file,
             rate_hz=work.facts["frame_rate_hz"],
-            encoding=work.form.encoding,
+            encoding=work.export.form.encoding,
             quality="lossless" if kind == "mask" else "as set",
         ) as encoder,
     ):
@@ -540,9 +513,6 @@ class _MapRanges(NamedTuple):
     farthest: float
     nearest: float
     largest_px: float
-
-
-_NO_RANGES: Final = _MapRanges(0.0, 0.0, 0.0)
 
 
 def _map_ranges(work: _ClipWork) -> _MapRanges:

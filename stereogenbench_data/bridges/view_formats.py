@@ -9,7 +9,6 @@ back to the scene's world.
 import json
 import zlib
 from collections.abc import Mapping, Sequence
-from io import StringIO
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -217,24 +216,17 @@ class ColmapWriter(ViewWriter):
         """Write the model."""
         model = self._folder / "sparse" / "0"
         model.mkdir(parents=True)
-        for name, head, lines in (
-            ("cameras", "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", [self._camera]),
-            (
-                "images",
-                "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
-                "# POINTS2D[] as (X, Y, POINT3D_ID)",
-                self._image_lines,
-            ),
-            (
-                "points3D",
-                "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
-                self._point_lines,
-            ),
-        ):
-            text = StringIO()
-            text.write(f"# {head}\n")
-            text.writelines(lines)
-            (model / f"{name}.txt").write_text(text.getvalue(), encoding="utf-8")
+        heads = {
+            "cameras": "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n",
+            "images": "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
+            "# POINTS2D[] as (X, Y, POINT3D_ID)\n",
+            "points3D": "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, "
+            "TRACK[] as (IMAGE_ID, POINT2D_IDX)\n",
+        }
+        texts = ([self._camera], self._image_lines, self._point_lines)
+        for (name, head), lines in zip(heads.items(), texts, strict=True):
+            with (model / f"{name}.txt").open("w", encoding="utf-8") as file:
+                file.writelines([head, *lines])
         super().finish()
 
 
