@@ -136,18 +136,13 @@ def _musubi(root: Path, clips: Sequence[Record], control: Kind | None) -> dict[s
         "bucket_no_upscale": False,
     }
     # JSON writes such texts, numbers and lists as TOML does, but for one control character.
-    sections = [
-        [
-            header,
-            *(
-                f"{name} = {json.dumps(value, ensure_ascii=False)}"
-                for name, value in values.items()
-            ),
-            "",
-        ]
-        for header, values in (("[general]", general), ("[[datasets]]", dataset))
-    ]
-    toml = lines(line for section in sections for line in section).replace("\x7f", "\\u007f")
+    texts = []
+    for header, values in (("[general]", general), ("[[datasets]]", dataset)):
+        pairs = (
+            f"{name} = {json.dumps(each, ensure_ascii=False)}" for name, each in values.items()
+        )
+        texts += [header, *pairs, ""]
+    toml = lines(texts).replace("\x7f", "\\u007f")
     captions = {
         str(Path(clip["videos"]["right"]).with_suffix(".txt")): lines([clip["caption"]])
         for clip in clips

@@ -21,7 +21,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, Unpack, cast, get_args
 
-import av
 import numpy as np
 
 from stereogenbench_data.bridges.clip_layouts import (
@@ -31,14 +30,22 @@ from stereogenbench_data.bridges.clip_layouts import (
     LayoutName,
     lines,
 )
+from stereogenbench_data.bridges.exports import (
+    alone,
+    export_folder,
+    json_bytes,
+    named_errors,
+    read_json,
+    scene_filters,
+    training_selection,
+    write_all,
+)
 from stereogenbench_data.bridges.generation import Captions, describe_pair
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
-from stereogenbench_data.engine import LOCAL, Advance, Progress, advance_of
+from stereogenbench_data.engine import Advance, Progress
 from stereogenbench_data.errors import (
     MediaError,
     SelectionError,
-    StorageError,
-    describe_os_error,
 )
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.encoder import Encoding, VideoEncoder
@@ -52,14 +59,11 @@ from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import Address, PairOptions, Plan
 from stereogenbench_data.selection.windows import FramesSpec, parse_frames
-from stereogenbench_data.sources.files import open_atomic, try_locked, write_atomic
+from stereogenbench_data.sources.files import open_atomic, write_atomic
 
 _FORMAT: Final = 1
-_EXPORT_JSON: Final = "export.json"
 _CLIPS_JSONL: Final = "clips.jsonl"
 _CLIPS: Final = "clips"
-_LOCK: Final = ".export.lock"
-_ELSEWHERE: Final = "Choose another folder."
 
 _FIELDS: Final[Mapping[Kind, tuple[str, ...]]] = {
     "right": ("right",),
@@ -192,11 +196,13 @@ def export_clips(
     """
     require_options(export_clips, selection)
     root = Path(out)
-    rules = _require_layout(layout)
+    if layout not in LAYOUTS:
+        raise SelectionError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}.")
+    rules = LAYOUTS[layout]
     kinds, control = _require_kinds(form, rules=rules, layout=layout)
     size = None if form.size is None else require_size(form.size)
     index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
-    chosen, evaluation_scenes = _training_selection(index, selection)
+    chosen, evaluation_scenes = training_selection(index, selection)
     chosen["frames"] = _windows(index, form, rules=rules, layout=layout, selection=chosen)
     fields = dict.fromkeys(name for kind in kinds for name in _FIELDS[kind])
     stretched = size if form.fit == "stretch" else None
@@ -214,16 +220,20 @@ def export_clips(
         "selection": plan.digest,
     }
     facts = StereoPairs(index, fields=_FACTS, **chosen)
-    works = _works(facts, root, form, kinds=kinds, size=size, depth=run.depth)
-    with ExitStack() as held, _named_errors(root):
-        root.mkdir(parents=True, exist_ok=True)
-        _require_own_folder(root, settings)
-        if not held.enter_context(try_locked(root / _LOCK)):
-            raise StorageError(f"{root}: another process exports into it: wait until it is done.")
-        write_atomic(root / _EXPORT_JSON, _json(settings))
+    works = _works(facts, _Export(root, form, kinds, size, run.depth))
+    with export_folder(root, settings):
         due = [work for work in works if not _is_finished(work)]
-        _write_clips(due, run, frames=sum(len(work.address.frames) for work in works))
-        clips = [_read_json(work.record) for work in works]
+        still, total = (sum(len(work.address.frames) for work in each) for each in (due, works))
+        write_all(
+            _write_clip,
+            due,
+            name=lambda work: work.name,
+            workers=run.workers,
+            progress=run.progress,
+            done=total - still,
+            total=total,
+        )
+        clips = [read_json(work.record) for work in works]
         texts = {_CLIPS_JSONL: lines(json.dumps(clip, ensure_ascii=False) for clip in clips)}
         texts |= rules.manifests(root, clips, control)
         for name, text in texts.items():
@@ -239,12 +249,6 @@ def export_clips(
 
 
 # What is asked for.
-
-
-def _require_layout(layout: Any) -> ClipLayout:
-    if layout not in LAYOUTS:
-        raise SelectionError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}.")
-    return LAYOUTS[cast("LayoutName", layout)]
 
 
 def _require_kinds(
@@ -266,32 +270,6 @@ def _require_kinds(
     return tuple(dict.fromkeys(kinds)), control
 
 
-def _training_selection(
-    index: SceneIndex, selection: Mapping[str, Any]
-) -> tuple[dict[str, Any], int]:
-    """Return a selection without evaluation scenes, unless its split names them, and their number.
-
-    Raises:
-        SelectionError: If there are no others.
-    """
-    if selection.get("split") is not None:
-        return dict(selection), 0
-    rows = filter_scenes(index, _filters(selection))
-    evaluation = int((index.column("split")[rows] == "eval").sum())
-    if evaluation == len(rows):
-        raise SelectionError(
-            f"{index.where}: all that match are evaluation scenes ({evaluation}), and training "
-            "data are made of these only if you say so: split='eval', on the command line "
-            "--split eval."
-        )
-    return {**selection, "split": "train"}, evaluation
-
-
-def _filters(selection: Mapping[str, Any]) -> SceneFilters:
-    names = SceneFilters.__annotations__
-    return cast("SceneFilters", {name: selection[name] for name in names if name in selection})
-
-
 def _windows(
     index: SceneIndex,
     form: ClipForm,
@@ -301,13 +279,11 @@ def _windows(
     selection: Mapping[str, Any],
 ) -> FramesSpec:
     """Return the frames of clips, as `StereoPairs` takes them."""
-    if "frames" in selection:
-        raise SelectionError("frames= is not known here: a ClipForm has length, stride and step.")
     unit = 1 if form.length_rule == "any" else rules.frames_step
     length = form.length
     if length is None:
         parse_frames(("clips", 1, form.stride))
-        rows = filter_scenes(index, _filters(selection))
+        rows = filter_scenes(index, scene_filters(selection))
         shortest = int(index.column("frames")[rows].min())
         length = (shortest - 1) // form.stride // unit * unit + 1
     elif (length - 1) % unit:
@@ -340,8 +316,8 @@ def _warn_of_sizes(
     layout: LayoutName,
 ) -> None:
     side = rules.side_px
-    sizes = {size} if size is not None else _stored_sizes(index, plan)
-    for height, width in sorted(sizes):
+    columns = (index.column(f"image_{name}_px")[plan.scene_rows] for name in ("height", "width"))
+    for height, width in [size] if size is not None else sorted(set(zip(*columns, strict=True))):
         if height % side or width % side:
             cut = f"{max(1, width // side) * side}x{max(1, height // side) * side}"
             warnings.warn(
@@ -353,63 +329,26 @@ def _warn_of_sizes(
             )
 
 
-def _stored_sizes(index: SceneIndex, plan: Plan) -> set[tuple[int, int]]:
-    sides = ("image_height_px", "image_width_px")
-    found = np.stack([index.column(name)[plan.scene_rows] for name in sides], axis=1)
-    return {(int(height), int(width)) for height, width in np.unique(found, axis=0)}
-
-
-# The folder.
-
-
-def _require_own_folder(root: Path, settings: Mapping[str, Any]) -> None:
-    """Refuse a folder that holds something else, or an export with other settings."""
-    path = root / _EXPORT_JSON
-    if not path.exists():
-        if any(each.name != _LOCK for each in root.iterdir()):
-            raise StorageError(f"{root}: is not empty and holds no export. {_ELSEWHERE}")
-        return
-    there = _read_json(path)
-    differing = [name for name, value in settings.items() if there.get(name) != value]
-    if differing:
-        raise StorageError(
-            f"{root}: holds an export with another {differing[0]} "
-            f"({there.get(differing[0])!r}, now {settings[differing[0]]!r}). Choose another "
-            "folder, or remove it."
-        )
-
-
-@contextmanager
-def _named_errors(place: Path) -> Iterator[None]:
-    """Turn errors of the operating system into a `StorageError` that names the place."""
-    try:
-        yield
-    except (OSError, av.FFmpegError) as error:
-        # PyAV says only that writing to the file object failed; why is what it came upon.
-        cause = error if isinstance(error, OSError) else error.__context__
-        if isinstance(error, StorageError):
-            raise
-        if not isinstance(cause, OSError):
-            raise MediaError(f"{place}: cannot be encoded ({error}).") from error
-        what = f"{cause.filename or place}: cannot be written"
-        raise StorageError(describe_os_error(what, cause, _ELSEWHERE)) from error
-
-
-def _json(value: object) -> bytes:
-    return (json.dumps(value, ensure_ascii=False, indent=1) + "\n").encode()
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise StorageError(f"{path}: is not JSON ({error}). Remove it.") from error
-    if not isinstance(found, dict):
-        raise StorageError(f"{path}: is no JSON object. Remove it.")
-    return found
-
-
 # One clip.
+
+
+@dataclass(frozen=True, slots=True)
+class _Export:
+    """What all clips of an export have in common.
+
+    Attributes:
+        root: The folder of the export.
+        form: What a clip is.
+        kinds: The videos of a clip.
+        size: (height, width) in pixels, or None.
+        depth: A depth contract that overrides what the index says, or None.
+    """
+
+    root: Path
+    form: ClipForm
+    kinds: tuple[Kind, ...]
+    size: tuple[int, int] | None
+    depth: DepthEncoding | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -417,36 +356,35 @@ class _ClipWork:
     """One clip to be written, by whatever process.
 
     Attributes:
+        export: What it has in common with others.
         index: An index of its scene alone.
         address: Its cameras and frames, of row 0.
         facts: What is known of it before its videos are read.
-        root: The folder of the export.
         name: The name of its files.
-        videos: The file of each kind of video, relative to the folder.
-        form: What a clip is.
-        size: (height, width) in pixels, or None.
-        depth: A depth contract that overrides what the index says, or None.
     """
 
+    export: _Export
     index: SceneIndex
     address: Address
     facts: dict[str, Any]
-    root: Path
     name: str
-    videos: dict[Kind, str]
-    form: ClipForm
-    size: tuple[int, int] | None
-    depth: DepthEncoding | None
 
     @property
     def record(self) -> Path:
         """The file that says that the clip is finished."""
-        return self.root / _CLIPS / f"{self.name}.json"
+        return self.export.root / _CLIPS / f"{self.name}.json"
+
+    @property
+    def videos(self) -> dict[Kind, str]:
+        """The file of each kind of video, relative to the folder."""
+        # The ending of a grid is StereoCrafter's own.
+        ends = {"grid": "_splatting_results"}
+        return {kind: f"{kind}/{self.name}{ends.get(kind, '')}.mp4" for kind in self.export.kinds}
 
     def request(self, fields: Sequence[str]) -> Request:
         """Return what is read of every frame."""
-        size, transform = self.size, None
-        if size is not None and self.form.fit == "crop":
+        size, transform = self.export.size, None
+        if size is not None and self.export.form.fit == "crop":
             rig, (height, width) = self.index.scene(0).rig, size
             scale = max(height / rig.image_height_px, width / rig.image_width_px)
             size = (
@@ -455,54 +393,22 @@ class _ClipWork:
             )
             top, left = (size[0] - height) // 2, (size[1] - width) // 2
             transform = Crop(top, left, height, width)
+        depth = self.export.depth
         return Request(
-            "pairs", tuple(fields), "single", size=size, depth=self.depth, transform=transform
+            "pairs", tuple(fields), "single", size=size, depth=depth, transform=transform
         )
 
 
-def _works(
-    clips: StereoPairs,
-    root: Path,
-    form: ClipForm,
-    *,
-    kinds: Sequence[Kind],
-    size: tuple[int, int] | None,
-    depth: DepthEncoding | None,
-) -> list[_ClipWork]:
-    """Return all clips of a selection, in its order.
-
-    Args:
-        clips: The selection, with the fields of `_FACTS`.
-        root: The folder of the export.
-        form: What a clip is.
-        kinds: The videos of a clip.
-        size: (height, width) in pixels, or None.
-        depth: A depth contract, or None.
-    """
+def _works(clips: StereoPairs, export: _Export) -> list[_ClipWork]:
+    """Return all clips of a selection with the fields `_FACTS`, in its order."""
     index, works, scenes = clips.index, [], {}
     for number in range(len(clips)):
         row, source, targets, frames, _ = clips.plan.locate(number, epoch=0)
         if row not in scenes:
-            scenes = {
-                row: SceneIndex.from_scenes(
-                    [index.scene(row)], index.root, shards=index.shards, retry=index.retry
-                )
-            }
-        facts = _facts(clips[number], frames=frames, form=form)
-        name = _clip_name(number, facts)
-        works.append(
-            _ClipWork(
-                index=scenes[row],
-                address=Address(0, source, targets, frames),
-                facts=facts,
-                root=root,
-                name=name,
-                videos={kind: _video_path(kind, name) for kind in kinds},
-                form=form,
-                size=size,
-                depth=depth,
-            )
-        )
+            scenes = {row: alone(index, row)}
+        facts = _facts(clips[number], frames=frames, form=export.form)
+        address = Address(0, source, targets, frames)
+        works.append(_ClipWork(export, scenes[row], address, facts, _clip_name(number, facts)))
     return works
 
 
@@ -539,41 +445,24 @@ def _clip_name(number: int, facts: Mapping[str, Any]) -> str:
     return f"{number:06d}_{scene}_{left:02d}-{right:02d}_{frames[0]:03d}-{frames[-1]:03d}"
 
 
-def _video_path(kind: Kind, name: str) -> str:
-    # The ending is StereoCrafter's own for such a grid.
-    return f"{kind}/{name}_splatting_results.mp4" if kind == "grid" else f"{kind}/{name}.mp4"
-
-
 def _is_finished(work: _ClipWork) -> bool:
     """Return whether a clip's videos are there, with the sizes that were noted."""
     if not work.record.is_file():
         return False
-    sizes = _read_json(work.record).get("bytes", {})
-    paths = {kind: work.root / path for kind, path in work.videos.items()}
+    sizes = read_json(work.record).get("bytes", {})
+    paths = {kind: work.export.root / path for kind, path in work.videos.items()}
     return all(
         path.is_file() and path.stat().st_size == sizes.get(kind) for kind, path in paths.items()
     )
-
-
-def _write_clips(due: Sequence[_ClipWork], run: ExportRun, *, frames: int) -> None:
-    still = sum(len(work.address.frames) for work in due)
-    advance = advance_of(run.progress, done=frames - still, total=frames)
-    with closing(
-        LOCAL.map(
-            _write_clip, due, name=lambda work: work.name, workers=run.workers, advance=advance
-        )
-    ) as written:
-        for _ in written:
-            advance(0)
 
 
 def _write_clip(work: _ClipWork, advance: Advance) -> None:
     """Write the videos of a clip, then its record."""
     fields = dict.fromkeys(name for kind in work.videos for name in _FIELDS[kind])
     draws_maps = {"depth", "disparity", "grid"} & work.videos.keys()
-    ranges = _map_ranges(work) if draws_maps else _NO_RANGES
+    ranges = _map_ranges(work) if draws_maps else _MapRanges(0.0, 0.0, 0.0)
     with (
-        _named_errors(work.root),
+        named_errors(work.export.root),
         closing(SampleLoader(work.index, work.request([*fields]), check="opened")) as loader,
         ExitStack() as stack,
     ):
@@ -589,11 +478,11 @@ def _write_clip(work: _ClipWork, advance: Advance) -> None:
         record["disparity_max_px"] = ranges.largest_px
     record["videos"] = work.videos
     record["bytes"] = {
-        kind: (work.root / path).stat().st_size for kind, path in work.videos.items()
+        kind: (work.export.root / path).stat().st_size for kind, path in work.videos.items()
     }
-    with _named_errors(work.record):
+    with named_errors(work.record):
         work.record.parent.mkdir(exist_ok=True)
-        write_atomic(work.record, _json(record))
+        write_atomic(work.record, json_bytes(record))
 
 
 def _frames(work: _ClipWork, loader: SampleLoader) -> Iterator[Sample]:
@@ -604,14 +493,14 @@ def _frames(work: _ClipWork, loader: SampleLoader) -> Iterator[Sample]:
 
 @contextmanager
 def _encoder(work: _ClipWork, kind: Kind) -> Iterator[VideoEncoder]:
-    path = work.root / work.videos[kind]
+    path = work.export.root / work.videos[kind]
     path.parent.mkdir(exist_ok=True)
     with (
         open_atomic(path) as file,
         VideoEncoder(
             file,
             rate_hz=work.facts["frame_rate_hz"],
-            encoding=work.form.encoding,
+            encoding=work.export.form.encoding,
             quality="lossless" if kind == "mask" else "as set",
         ) as encoder,
     ):
@@ -624,9 +513,6 @@ class _MapRanges(NamedTuple):
     farthest: float
     nearest: float
     largest_px: float
-
-
-_NO_RANGES: Final = _MapRanges(0.0, 0.0, 0.0)
 
 
 def _map_ranges(work: _ClipWork) -> _MapRanges:

@@ -9,26 +9,26 @@ Each of these folders is written beside its place and renamed, so that a stopped
 killed one leaves nothing that is incomplete. `view_formats` has what is in them.
 """
 
-import json
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, Unpack, get_args
 
-from stereogenbench_data.bridges.posed_images import PosedImageReader, index_of, training_filters
-from stereogenbench_data.bridges.view_formats import (
-    INDEX_TXT,
-    ColmapWriter,
-    MogeWriter,
-    PlyWriter,
-    TransformsWriter,
-    ViewWriter,
+from stereogenbench_data.bridges.exports import (
+    alone,
+    export_folder,
+    named_errors,
+    scene_filters,
+    training_selection,
+    write_all,
 )
+from stereogenbench_data.bridges.posed_images import PosedImageReader, index_of
+from stereogenbench_data.bridges.view_formats import INDEX_TXT, WRITERS, Layout
 from stereogenbench_data.datasets.mapped import Data
-from stereogenbench_data.engine import LOCAL, Advance, Progress, advance_of
-from stereogenbench_data.errors import SelectionError, StorageError, describe_os_error
+from stereogenbench_data.engine import Advance, Progress
+from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.checks import check_samples
 from stereogenbench_data.schema.records import DepthEncoding
@@ -36,17 +36,12 @@ from stereogenbench_data.selection.filters import SceneFilters
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import plan_views
 from stereogenbench_data.selection.windows import FramesSpec
-from stereogenbench_data.sources.files import try_locked, write_atomic
+from stereogenbench_data.sources.files import write_atomic
 
-Layout = Literal["colmap", "transforms", "ply", "moge"]
 Group = Literal["moment", "scene"]
 
-EXPORT_JSON: Final = "export.json"
 USUAL_POINTS: Final[dict[str, int]] = {"colmap": 5_000, "transforms": 5_000, "ply": 100_000}
 """How many points are taken from each picture, unless another number is asked for."""
-
-_LOCK: Final = ".lock"
-_ELSEWHERE: Final = "Choose another folder."
 
 
 class ViewExportOptions(SceneFilters, total=False):
@@ -98,123 +93,78 @@ def export_views(
         MediaError: If depth cannot have been stored whole, or a video does not decode.
     """
     require_options(export_views, options)
-    root, selected = Path(out), _Selected(layout, options)
+    root, group = Path(out), options.get("group", "moment")
+    _require_layout(layout, group)
+    points = _points(layout, options.get("points"))
+    size, depth = options.get("size"), options.get("depth")
     index = index_of(data)
-    frames_of = selected.frames_of(index)
-    _begin(root, selected.description(index, frames_of))
-    folders = {
-        folder: (row, chosen)
-        for row, frames in frames_of.items()
-        for folder, chosen in selected.folders_of(root / index.scene(row).id.key, frames).items()
+    filters = scene_filters(training_selection(index, options)[0])
+    frames = options.get("frames", "first")
+    plan = plan_views(
+        index, cameras=options.get("cameras", "all"), frames=frames, seed=0, filters=filters
+    )
+    if plan.windows.is_clip:
+        raise SelectionError(
+            f"frames={frames!r} are clips: exports take 'all', 'first', ('every', k) or numbers of "
+            "frames; group='scene' puts the chosen frames of a scene together."
+        )
+    request = PosedImageReader(index, size=size, depth=depth).request
+    check_samples(index, plan, request)
+    folders: dict[Path, tuple[int, tuple[int, ...]]] = {}
+    for number in range(len(plan)):
+        address = plan.locate(number, epoch=0)
+        folder = root / index.scene(address.row).id.key
+        if group == "moment":
+            folder /= f"frame_{address.frames[0]:03d}"
+        chosen = (*folders.get(folder, (0, ()))[1], *address.frames)
+        folders[folder] = (address.row, chosen)
+    cameras = (address.source, *address.targets)
+    split = filters["split"]
+    settings: dict[str, Any] = {
+        "layout": layout,
+        "split": sorted([split] if isinstance(split, str) else split or ()),
+        "group": group,
+        "cameras": cameras,
+        "size": request.size,
+        "points": points,
+        "depth": depth
+        and asdict(depth) | {"no_depth": depth.no_depth, "accept": sorted(depth.accept)},
+        "data": index.digest,
     }
-    with try_locked(root / _LOCK) as is_ours:
-        if not is_ours:
-            raise StorageError(
-                f"{root}: another process exports into this folder. Wait for it, or choose another "
-                "folder."
-            )
+    if group == "scene":
+        settings["frames"] = sorted({chosen for _, chosen in folders.values()})
+    with export_folder(root, settings):
         missing: dict[int, dict[Path, tuple[int, ...]]] = {}
         for folder, (row, chosen) in folders.items():
             if not folder.is_dir():
                 missing.setdefault(row, {})[folder] = chosen
-        works = [_SceneWork(_alone(index, row), found, selected) for row, found in missing.items()]
-        total = len(selected.cameras) * sum(len(chosen) for _, chosen in folders.values())
-        done = total - sum(work.pictures for work in works)
-        advance = advance_of(selected.progress, done=done, total=total)
-        selected.progress = None  # it stays here, the rest goes to other processes
-        advance(0)
-        with closing(
-            LOCAL.map(
-                _export_scene,
-                works,
-                name=lambda work: str(work.index.column("key")[0]),
-                workers=selected.workers,
-                advance=advance,
-            )
-        ) as exported:
-            for _ in exported:
-                advance(0)
+        works = [
+            _SceneWork(alone(index, row), found, layout, cameras, request.size, depth, points)
+            for row, found in missing.items()
+        ]
+        total = len(cameras) * sum(len(chosen) for _, chosen in folders.values())
+        write_all(
+            _export_scene,
+            works,
+            name=lambda work: str(work.index.column("key")[0]),
+            workers=options.get("workers"),
+            progress=options.get("progress"),
+            done=total - sum(work.pictures for work in works),
+            total=total,
+        )
         if layout == "moge":
-            _list_pictures(root, folders, selected.cameras)
+            _list_pictures(root, [*folders], cameras)
     return [*folders]
 
 
-class _Selected:
-    """What is exported and how, with the defaults of what was not said.
-
-    Attributes:
-        cameras: Numbers, or "all" until `frames_of` was called.
-        points: How many points are taken from each picture, None for all.
-    """
-
-    def __init__(self, layout: Layout, options: Mapping[str, Any]) -> None:
-        if layout not in get_args(Layout):
-            known = ", ".join(map(repr, get_args(Layout)))
-            raise SelectionError(f"layout must be one of {known}, got {layout!r}.")
-        rest = dict(options)
-        self.layout: Layout = layout
-        self.group: Group = rest.pop("group", "moment")
-        if self.group not in get_args(Group):
-            raise SelectionError(f"group must be 'moment' or 'scene', got {self.group!r}.")
-        self.points = _points(layout, rest.pop("points", None))
-        if layout == "moge" and self.group != "moment":
-            raise SelectionError(f"layout='moge' has no group={self.group!r}: leave it out.")
-        self.cameras: Any = rest.pop("cameras", "all")
-        self.frames: Any = rest.pop("frames", "first")
-        self.size: Any = rest.pop("size", None)
-        self.depth: DepthEncoding | None = rest.pop("depth", None)
-        self.workers: int | None = rest.pop("workers", None)
-        self.progress: Progress | None = rest.pop("progress", None)
-        self.filters: Any = rest
-
-    def frames_of(self, index: SceneIndex) -> dict[int, tuple[int, ...]]:
-        """Return the frames of each selected row, after checking that they can be exported."""
-        self.filters = training_filters(index, self.filters)
-        plan = plan_views(
-            index, cameras=self.cameras, frames=self.frames, seed=0, filters=self.filters
-        )
-        if plan.windows.is_clip:
-            raise SelectionError(
-                f"frames={self.frames!r} are clips: exports take 'all', 'first', ('every', k) or "
-                "numbers of frames; group='scene' puts the chosen frames of a scene together."
-            )
-        request = PosedImageReader(index, size=self.size, depth=self.depth).request
-        check_samples(index, plan, request)
-        self.size = request.size
-        found: dict[int, tuple[int, ...]] = {}
-        for number in range(len(plan)):
-            address = plan.locate(number, epoch=0)
-            self.cameras = (address.source, *address.targets)
-            found[address.row] = (*found.get(address.row, ()), *address.frames)
-        return found
-
-    def folders_of(self, place: Path, frames: tuple[int, ...]) -> dict[Path, tuple[int, ...]]:
-        """Return the folders of a scene, with the frames of each."""
-        if self.group == "scene":
-            return {place: frames}
-        return {place / f"frame_{frame:03d}": (frame,) for frame in frames}
-
-    def description(
-        self, index: SceneIndex, frames_of: Mapping[int, tuple[int, ...]]
-    ) -> dict[str, Any]:
-        """Return what all of a folder has in common, as JSON holds it."""
-        split, depth = self.filters["split"], None
-        if self.depth is not None:
-            lists = {"no_depth": list(self.depth.no_depth), "accept": sorted(self.depth.accept)}
-            depth = asdict(self.depth) | lists
-        common = {
-            "layout": self.layout,
-            "split": sorted([split] if isinstance(split, str) else split),
-            "group": self.group,
-            "cameras": list(self.cameras),
-            "size": None if self.size is None else list(self.size),
-            "points": self.points,
-            "depth": depth,
-            "data": index.digest,
-        }
-        if self.group == "moment":
-            return common
-        return common | {"frames": sorted(map(list, set(frames_of.values())))}
+def _require_layout(layout: Layout, group: Group) -> None:
+    if layout not in WRITERS:
+        known = ", ".join(map(repr, WRITERS))
+        raise SelectionError(f"layout must be one of {known}, got {layout!r}.")
+    if group not in get_args(Group):
+        raise SelectionError(f"group must be 'moment' or 'scene', got {group!r}.")
+    if layout == "moge" and group != "moment":
+        raise SelectionError(f"layout='moge' has no group={group!r}: leave it out.")
 
 
 def _points(layout: Layout, points: Any) -> int | None:
@@ -233,89 +183,55 @@ def _points(layout: Layout, points: Any) -> int | None:
 
 @dataclass(frozen=True, slots=True)
 class _SceneWork:
-    """The folders of one scene that are yet to be written, with the frames of each."""
+    """The folders of one scene that are yet to be written, with the frames of each.
+
+    Attributes:
+        index: An index of the scene alone.
+        frames_of: The frames of each folder.
+        layout: The format.
+        cameras: Numbers of cameras.
+        size: (height, width) in pixels, None for the stored size.
+        depth: A depth contract instead of the one that files and release state.
+        points: How many points are taken from each picture, None for all.
+    """
 
     index: SceneIndex
     frames_of: Mapping[Path, tuple[int, ...]]
-    selected: _Selected
+    layout: Layout
+    cameras: tuple[int, ...]
+    size: tuple[int, int] | str | None
+    depth: DepthEncoding | None
+    points: int | None
 
     @property
     def pictures(self) -> int:
-        return len(self.selected.cameras) * sum(map(len, self.frames_of.values()))
-
-
-def _alone(index: SceneIndex, row: int) -> SceneIndex:
-    """Return an index of one scene, small enough to be sent to a process with its work."""
-    scene = index.scene(row)
-    return SceneIndex.from_scenes([scene], index.root, shards=index.shards, retry=index.retry)
-
-
-def _begin(root: Path, settings: Mapping[str, Any]) -> None:
-    """Write what the folder holds, or refuse one that holds something else."""
-    path = root / EXPORT_JSON
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        if not path.exists():
-            if any(root.iterdir()):
-                raise StorageError(
-                    f"{root}: is not empty and holds no {EXPORT_JSON}: choose a new folder."
-                )
-            write_atomic(path, json.dumps(settings, indent=1).encode())
-        there = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise StorageError(
-            f"{path}: is not the description of an export ({error}). {_ELSEWHERE}"
-        ) from error
-    except OSError as error:
-        if isinstance(error, StorageError):
-            raise
-        what = f"{path}: cannot be read or written"
-        raise StorageError(describe_os_error(what, error, _ELSEWHERE)) from error
-    found = there if isinstance(there, dict) else {}
-    for name, wanted in settings.items():
-        if found.get(name) != wanted:
-            raise StorageError(
-                f"{root}: holds an export of other {name}: {found.get(name)!r}, where {wanted!r} "
-                "is asked for. Choose another folder, or remove it."
-            )
+        return len(self.cameras) * sum(map(len, self.frames_of.values()))
 
 
 def _export_scene(work: _SceneWork, advance: Advance) -> None:
     """Write the missing folders of one scene, each whole or not at all."""
-    scene, selected = work.index.scene(0), work.selected
-    points = selected.points
-    encodings = {
-        camera: scene.depth_encoding(camera, selected.depth) for camera in selected.cameras
-    }
-    writers: dict[Layout, Callable[[Path], ViewWriter]] = {
-        "colmap": lambda folder: ColmapWriter(folder, points=points, encodings=encodings),
-        "transforms": lambda folder: TransformsWriter(folder, points=points),
-        "ply": lambda folder: PlyWriter(folder, points=points),
-        "moge": MogeWriter,
-    }
-    reader = PosedImageReader(work.index, size=selected.size, depth=selected.depth)
-    with closing(reader):
+    scene = work.index.scene(0)
+    encodings = {camera: scene.depth_encoding(camera, work.depth) for camera in work.cameras}
+    with closing(PosedImageReader(work.index, size=work.size, depth=work.depth)) as reader:
         for folder, frames in work.frames_of.items():
             unfinished = folder.with_name(f".{folder.name}.unfinished")
             try:
-                shutil.rmtree(unfinished, ignore_errors=True)
-                unfinished.mkdir(parents=True)
-                writer = writers[selected.layout](unfinished)
-                for frame in frames:
-                    writer.add([reader.read(0, camera, frame) for camera in selected.cameras])
-                    advance(len(selected.cameras))
-                writer.finish()
-                unfinished.replace(folder)
-            except OSError as error:
-                if isinstance(error, StorageError):
-                    raise
-                what = f"{folder}: cannot be written"
-                raise StorageError(describe_os_error(what, error, _ELSEWHERE)) from error
+                with named_errors(folder):
+                    shutil.rmtree(unfinished, ignore_errors=True)
+                    unfinished.mkdir(parents=True)
+                    writer = WRITERS[work.layout](
+                        unfinished, points=work.points, encodings=encodings
+                    )
+                    for frame in frames:
+                        writer.add([reader.read(0, camera, frame) for camera in work.cameras])
+                        advance(len(work.cameras))
+                    writer.finish()
+                    unfinished.replace(folder)
             finally:
                 shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def _list_pictures(root: Path, folders: Iterable[Path], cameras: Sequence[int]) -> None:
+def _list_pictures(root: Path, folders: Sequence[Path], cameras: Sequence[int]) -> None:
     """Write MoGe's list of folders: those of this export, and those that it named before."""
     path = root / INDEX_TXT
     lines = {

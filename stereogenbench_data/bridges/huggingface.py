@@ -145,12 +145,12 @@ def _size_of(pairs: StereoPairs) -> tuple[int, int] | None:
 
 def _feature(dtype: str, shape: tuple[int, ...]) -> Any:
     """Return the feature of a field."""
-    from datasets import Array2D, Array3D, Array4D, Array5D, List, Value
+    import datasets
 
     if len(shape) < 2:
-        return List(Value(dtype), length=shape[0]) if shape else Value(dtype)
-    arrays = {2: Array2D, 3: Array3D, 4: Array4D, 5: Array5D}
-    return arrays[len(shape)](shape=shape, dtype=dtype)
+        value = datasets.Value(dtype)
+        return datasets.List(value, length=shape[0]) if shape else value
+    return getattr(datasets, f"Array{len(shape)}D")(shape=shape, dtype=dtype)
 
 
 def features(*, depth_suffix: str = "mkv") -> "Features":

@@ -5,7 +5,6 @@ errors and samples are those of `StereoPairs`.
 """
 
 import json
-import shutil
 import tempfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -13,7 +12,12 @@ from pathlib import Path
 from typing import Any, Final, TypedDict
 
 from stereogenbench_data.datasets.mapped import StereoPairs
-from stereogenbench_data.errors import FieldError, SelectionError, StorageError
+from stereogenbench_data.errors import (
+    FieldError,
+    SelectionError,
+    StorageError,
+    explain_os_errors,
+)
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Sample
@@ -95,19 +99,15 @@ def _seed(seed: int, key: str) -> int:
 
 
 def _write_files(key: str, files: Mapping[str, Any], folder: Path) -> None:
-    free_bytes = shutil.disk_usage(folder).free
-    total = 0
-    for name in _FILES:
-        if files.get(name) is None:
-            continue
-        content = _bytes(key, name, files[name])
-        total += len(content)
-        if total > free_bytes:
-            raise StorageError(
-                f"{folder}: {free_bytes} bytes are free, and the files of {key} need more. "
-                "Set TMPDIR to a folder on a larger disk."
-            )
-        (folder / name).write_bytes(content)
+    contents = {
+        name: _bytes(key, name, files[name]) for name in _FILES if files.get(name) is not None
+    }
+    with explain_os_errors(
+        f"{folder}: the files of {key} cannot be written",
+        "Set TMPDIR to a folder on a larger disk.",
+    ):
+        for name, content in contents.items():
+            (folder / name).write_bytes(content)
 
 
 def _bytes(key: str, name: str, content: Any) -> bytes:
@@ -115,19 +115,14 @@ def _bytes(key: str, name: str, content: Any) -> bytes:
         return content
     if isinstance(content, str):
         return content.encode()
-    if name in _VIDEOS:
-        inner = content.get("bytes") if isinstance(content, dict) else None
-        if isinstance(inner, bytes):
-            return inner
-        raise StorageError(
-            f"{key}: {name} must be bytes, found {type(content).__name__}: it is already decoded. "
-            "Read the shards without decoding (webdataset: no .decode(); datasets: features())."
-        )
     if isinstance(content, dict):
-        return json.dumps(content).encode()
+        if name not in _VIDEOS:
+            return json.dumps(content).encode()
+        if isinstance(content.get("bytes"), bytes):
+            return bytes(content["bytes"])
     raise StorageError(
-        f"{key}: {name} must be bytes, found {type(content).__name__}. Read the shards without "
-        "decoding."
+        f"{key}: {name} must be bytes, found {type(content).__name__}: it is already decoded. "
+        "Read the shards without decoding (webdataset: no .decode(); datasets: features())."
     )
 
 

@@ -15,7 +15,7 @@ in pixels of the picture as resized and cropped, x_right = x_left - d.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Final, Literal, Unpack
+from typing import Final, Literal, Unpack
 
 import numpy as np
 import torch
@@ -72,6 +72,11 @@ class _LeftToRight(AdaptedPairs[Item]):
             )
 
 
+def _igev_item(sample: Sample, *, valid_below_px: float) -> RaftItem:
+    names, left, right, _, valid = to_raft_stereo(sample, valid_below_px=valid_below_px)
+    return names, left, right, sample["disparity"], valid
+
+
 class RaftStereo(_LeftToRight[RaftItem]):
     """Items of RAFT-Stereo's datasets: (names, image1, image2, flow, valid).
 
@@ -82,6 +87,8 @@ class RaftStereo(_LeftToRight[RaftItem]):
 
     Source: princeton-vl/RAFT-Stereo, core/stereo_datasets.py and train_stereo.py.
     """
+
+    _item: Callable[..., RaftItem] = staticmethod(to_raft_stereo)
 
     def __init__(
         self, data: Data, *, valid_below_px: float = LIMIT_PX, **options: Unpack[PairsOptions]
@@ -100,13 +107,13 @@ class RaftStereo(_LeftToRight[RaftItem]):
         super().__init__(
             data,
             fields=_RAFT_FIELDS,
-            adapt=partial(to_raft_stereo, valid_below_px=valid_below_px),
+            adapt=partial(self._item, valid_below_px=valid_below_px),
             frames="frame",
             options=options,
         )
 
 
-class IgevStereo(_LeftToRight[RaftItem]):
+class IgevStereo(RaftStereo):
     """Items of IGEV-Stereo's datasets: those of RAFT-Stereo, with positive disparity for flow.
 
     Selective-IGEV takes the same, with 1024 px.
@@ -114,75 +121,36 @@ class IgevStereo(_LeftToRight[RaftItem]):
     Source: gangweix/IGEV, IGEV-Stereo/core/stereo_datasets.py and train_stereo.py.
     """
 
-    def __init__(
-        self, data: Data, *, valid_below_px: float = LIMIT_PX, **options: Unpack[PairsOptions]
-    ) -> None:
-        """Select the samples, as `RaftStereo` does."""
-        super().__init__(
-            data,
-            fields=_RAFT_FIELDS,
-            adapt=partial(_igev_item, valid_below_px=valid_below_px),
-            frames="frame",
-            options=options,
-        )
+    _item = staticmethod(_igev_item)
 
 
-def _igev_item(sample: Sample, *, valid_below_px: float) -> RaftItem:
-    names, left, right, _, valid = to_raft_stereo(sample, valid_below_px=valid_below_px)
-    return names, left, right, sample["disparity"], valid
-
-
-class UniMatch(_LeftToRight[dict[str, Any]]):
+class UniMatch(_LeftToRight[dict[str, torch.Tensor]]):
     """Items of UniMatch's stereo datasets: dicts of ``left``, ``right`` and ``disp``.
 
     As the training loop takes them: pictures float32 (3, H, W), normalised by ImageNet's mean and
-    standard deviation; disparity float32 (H, W), positive, 0 where it is not known. With
-    ``sample_transform`` they are the arrays that the project's own transforms take instead:
-    pictures float32 (H, W, 3) of 0 to 255.
+    standard deviation; disparity float32 (H, W), positive, 0 where it is not known.
 
     Source: autonomousvision/unimatch, dataloader/stereo and main_stereo.py.
     """
 
-    def __init__(
-        self,
-        data: Data,
-        *,
-        sample_transform: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
-        **options: Unpack[PairsOptions],
-    ) -> None:
+    def __init__(self, data: Data, **options: Unpack[PairsOptions]) -> None:
         """Select the samples; no video is opened before the first item is asked for.
 
         Args:
             data: As for `StereoPairs`.
-            sample_transform: The project's own transforms, such as its ``Compose``; they have to
-                end in its ``ToTensor`` and ``Normalize``. They draw from numpy's global generator.
             **options: As for `StereoPairs`; ``frames`` are single frames.
 
         Raises:
             SelectionError: If nothing matches, or samples are clips, sweeps or right to left.
             StereoGenBenchError: As `StereoPairs` does.
         """
-        super().__init__(
-            data,
-            fields=("left", "right", "disparity"),
-            adapt=partial(_unimatch_item, sample_transform=sample_transform),
-            frames="frame",
-            options=options,
-        )
+        fields = ("left", "right", "disparity")
+        super().__init__(data, fields=fields, adapt=_unimatch_item, frames="frame", options=options)
 
 
-def _unimatch_item(
-    sample: Sample, *, sample_transform: Callable[[dict[str, Any]], dict[str, Any]] | None
-) -> dict[str, Any]:
-    disparity = sample["disparity"][0]
-    if sample_transform is None:
-        views = {name: _normalised(sample[name]) for name in ("left", "right")}
-        return views | {"disp": disparity}
-    arrays = {
-        name: np.ascontiguousarray(sample[name].permute(1, 2, 0).numpy(), dtype=np.float32)
-        for name in ("left", "right")
-    }
-    return sample_transform(arrays | {"disp": disparity.numpy()})
+def _unimatch_item(sample: Sample) -> dict[str, torch.Tensor]:
+    views = {name: _normalised(sample[name]) for name in ("left", "right")}
+    return views | {"disp": sample["disparity"][0]}
 
 
 def _normalised(picture: torch.Tensor) -> torch.Tensor:

@@ -13,8 +13,7 @@ axes of the world stay those of the scene.
 (6, (64, 64, 3))
 """
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import Any, Final, Literal, Unpack
 
 import numpy as np
@@ -22,6 +21,7 @@ import torch
 from PIL import Image
 from torch.utils.data import Dataset
 
+from stereogenbench_data.bridges.exports import training_selection
 from stereogenbench_data.bridges.posed_images import (
     PAIR_FIELDS,
     VIEW_FIELDS,
@@ -30,7 +30,6 @@ from stereogenbench_data.bridges.posed_images import (
     index_of,
     origin_at,
     posed_images,
-    training_filters,
 )
 from stereogenbench_data.datasets.mapped import Data, SceneViews, StereoPairs
 from stereogenbench_data.errors import SelectionError
@@ -90,8 +89,7 @@ def _dust3r_view(image: PosedImage, *, dataset: str) -> View:
 class DUSt3RViews(Dataset[list[View]]):
     """Pairs, or several views of a moment, as lists of DUSt3R's view dicts; see `dust3r_views`.
 
-    For DUSt3R's own training, which crops, scales and collates, put `DUSt3RMixin` in front of its
-    base class.
+    `examples/dust3r_dataset.py` puts them behind DUSt3R's own base class, which crops and scales.
     """
 
     def __init__(
@@ -118,9 +116,7 @@ class DUSt3RViews(Dataset[list[View]]):
         """
         self._dataset = dataset
         index = index_of(data)
-        options["split"] = training_filters(index, SceneFilters(split=options.get("split")))[
-            "split"
-        ]
+        options, _ = training_selection(index, options)
         self.samples: StereoPairs | SceneViews
         if cameras is None:
             self.samples = StereoPairs(index, fields=PAIR_FIELDS, **options)
@@ -144,82 +140,10 @@ class DUSt3RViews(Dataset[list[View]]):
         return dust3r_views(self.samples[number], dataset=self._dataset)
 
 
-class DUSt3RMixin:
-    """What stands in front of the base class of DUSt3R, MASt3R or CUT3R to train on these views.
-
-    ``class StereoGenBench(DUSt3RMixin, BaseStereoViewDataset)`` is constructed with a
-    `DUSt3RViews` and the base's own arguments:
-    ``StereoGenBench(DUSt3RViews("shards/", pairs="all"), resolution=(512, 384), aug_crop=16)``.
-    The bases are DUSt3R's ``BaseStereoViewDataset``, MASt3R's ``MASt3RBaseStereoViewDataset`` and
-    CUT3R's ``BaseMultiViewDataset``, which is told its ``num_views`` and takes so many of a moment.
-
-    Source: the files of these classes in naver/dust3r, naver/mast3r and CUT3R/CUT3R.
-    """
-
-    def __init__(self, views: DUSt3RViews, **base_options: Any) -> None:
-        """Take the views; everything else is the base's.
-
-        Args:
-            views: The views.
-            **base_options: Passed on: split, resolution, transform, aug_crop, seed, ...
-
-        Raises:
-            SelectionError: If ``num_views`` is more than there are.
-        """
-        super().__init__(**base_options)
-        self.views = views
-        self.num_views = int(base_options.get("num_views", views.num_views))
-        if self.num_views > views.num_views:
-            raise SelectionError(
-                f"num_views={self.num_views}, but the views are lists of {views.num_views}: choose "
-                "more cameras, or fewer views."
-            )
-        self.is_metric_scale = True  # MASt3R's name for depth in metres
-
-    def __len__(self) -> int:
-        """Return the number of lists of views."""
-        return len(self.views)
-
-    def _get_views(
-        self, idx: int, resolution: tuple[int, int], rng: Any, num_views: int | None = None
-    ) -> list[View]:
-        """Return views cropped and scaled by the base to one of its resolutions."""
-        base: Any = self
-        views = self.views[idx]
-        if num_views is not None:
-            views = [views[place] for place in rng.permutation(len(views))[:num_views]]
-        for number, view in enumerate(views):
-            view["img"], view["depthmap"], intrinsics = base._crop_resize_if_necessary(
-                view["img"],
-                view["depthmap"],
-                view["camera_intrinsics"],
-                resolution,
-                rng=rng,
-                info=(idx, number),
-            )
-            view["camera_intrinsics"] = np.asarray(intrinsics, dtype=np.float32)
-            if num_views is not None:
-                shows, maps_rays = base.get_img_and_ray_masks(True, number, rng)  # noqa: FBT003
-                view |= _OF_CUT3R | {"img_mask": shows, "ray_mask": maps_rays}
-        return views
-
-
-_OF_CUT3R: Final = {
-    "is_metric": True, "is_video": False, "quantile": np.array(1.0, dtype=np.float32),
-    "camera_only": False, "depth_only": False, "single_view": False, "reset": False,
-}  # fmt: skip
-"""What CUT3R's views say of themselves besides."""
-
-
-Prepare = Callable[..., tuple[Any, ...]]
-"""VGGT's ``process_one_image``: crops and scales a picture and computes its points."""
-
-
 class VGGTViews:
     """Sequences of views as records of VGGT's ``get_data``.
 
-    For VGGT's own training, which crops, scales and collates, put `VGGTMixin` in front of its
-    ``BaseDataset``.
+    `examples/vggt_dataset.py` puts them behind VGGT's own ``BaseDataset``, which crops and scales.
     """
 
     def __init__(  # noqa: PLR0913 - each names one thing that a user chooses
@@ -231,7 +155,7 @@ class VGGTViews:
         frames: FramesSpec = "first",
         size: tuple[int, int] | str | None = None,
         depth: DepthEncoding | None = None,
-        pixel_centre_px: float | Literal["installed"] = "installed",
+        pixel_centre_px: float = 0.0,
         cache: ShardCache | None = None,
         **filters: Unpack[SceneFilters],
     ) -> None:
@@ -246,8 +170,7 @@ class VGGTViews:
             size: (height, width) in pixels, or a text WIDTHxHEIGHT; None for the stored size.
             depth: A depth contract instead of the one that files and release state.
             pixel_centre_px: Where the code that takes the records puts the centre of the top-left
-                pixel: 0.0 or 0.5, which moves cx and cy. "installed" asks the installed ``vggt``,
-                and is 0.0, as on its main branch, where there is none. VGGT-Omega has 0.5.
+                pixel: 0.0, as VGGT's main branch, or 0.5, as VGGT-Omega. It moves cx and cy.
             cache: Where to keep what comes from a URL, or None.
             **filters: Filters on scenes (`SceneFilters`); ``split`` is "train" unless evaluation
                 data are asked for in so many words.
@@ -262,8 +185,8 @@ class VGGTViews:
         if sequence not in ("moment", "scene"):
             raise SelectionError(f"sequence must be 'moment' or 'scene', got {sequence!r}.")
         index = index_of(data)
-        filters = training_filters(index, filters)
-        plan = plan_views(index, cameras=cameras, frames=frames, seed=0, filters=filters)
+        chosen: Any = training_selection(index, filters)[0]
+        plan = plan_views(index, cameras=cameras, frames=frames, seed=0, filters=chosen)
         if plan.windows.is_clip:
             raise SelectionError(
                 f"frames={frames!r} are clips: a sequence of several frames is sequence='scene' "
@@ -276,9 +199,7 @@ class VGGTViews:
         self._cameras = 1 + int(plan.pairs.targets.shape[1])
         self._sequence = sequence
         self._firsts = plan.first_sample if sequence == "scene" else np.arange(len(plan) + 1)
-        self._centre_px = (
-            _installed_centre_px() if pixel_centre_px == "installed" else pixel_centre_px
-        )
+        self._centre_px = pixel_centre_px
 
     def __len__(self) -> int:
         """Return the number of sequences."""
@@ -295,28 +216,23 @@ class VGGTViews:
         moments = int(self._firsts[number + 1] - self._firsts[number])
         return moments * self._cameras
 
-    def get_data(  # noqa: PLR0913 - the parameters are VGGT's
+    def get_data(
         self,
         seq_index: int | None = None,
         img_per_seq: int | None = None,
         seq_name: str | None = None,
         ids: Sequence[int] | None = None,
         aspect_ratio: float = 1.0,
-        *,
-        repeats: Literal["never", "where too few", "always"] = "where too few",
-        prepare: Prepare | None = None,
     ) -> dict[str, Any]:
         """Return one sequence as VGGT's datasets do.
 
         Args:
             seq_index: Number of the sequence; what is beyond the last begins anew.
             img_per_seq: How many views, drawn by torch's generator, which the workers of a loader
-                seed; None for all, in order.
+                seed; None for all, in order. Views are drawn twice only where there are too few.
             seq_name: Its name instead of its number.
             ids: Numbers of the views in the sequence instead of drawn ones.
-            aspect_ratio: Height divided by width: for ``prepare``.
-            repeats: Whether a view may be drawn twice.
-            prepare: What crops and scales each picture; None gives it as it is.
+            aspect_ratio: Not used: pictures are as they are.
 
         Returns:
             ``seq_name``, ``ids`` (n,) int64 and ``frame_num`` n; lists of n: ``images`` (h, w, 3)
@@ -326,15 +242,15 @@ class VGGTViews:
             world's origin is at the first view's camera. ``tracks`` is None: VGGT makes them.
 
         Raises:
-            SelectionError: If there is no such sequence or view, or too few views.
+            SelectionError: If there is no such sequence or view.
             StorageError: If a file is missing or altered.
             MediaError: If a video does not decode to what the index says.
 
         Source: facebookresearch/vggt, training/data/base_dataset.py, datasets/vkitti.py.
         """
-        del aspect_ratio  # the pictures are as they are, unless `prepare` crops them
+        del aspect_ratio
         number = self._number(seq_index, seq_name)
-        chosen = self._chosen(number, img_per_seq, ids, repeats=repeats)
+        chosen = self._chosen(number, img_per_seq, ids)
         record: dict[str, Any] = {
             "seq_name": f"{DATASET}_{self.sequence_name(number)}",
             "dataset": DATASET,
@@ -342,7 +258,7 @@ class VGGTViews:
             "ids": chosen,
             "frame_num": len(chosen),
         }
-        lists: dict[str, list[Any]] = {name: [] for name in _VGGT_LISTS}
+        lists: dict[str, list[Any]] = {}
         shift = None
         for view in chosen:
             moment, place = divmod(int(view), self._cameras)
@@ -350,8 +266,8 @@ class VGGTViews:
             camera = (address.source, *address.targets)[place]
             image = self._reader.read(address.row, camera, address.frames[0])
             shift = origin_at(image) if shift is None else shift
-            for name, value in self._record(image.in_world(shift), prepare).items():
-                lists[name].append(value)
+            for name, value in self._record(image.in_world(shift)).items():
+                lists.setdefault(name, []).append(value)
         return record | lists | {"tracks": None, "track_masks": None}
 
     def _number(self, seq_index: int | None, seq_name: str | None) -> int:
@@ -377,8 +293,6 @@ class VGGTViews:
         number: int,
         img_per_seq: int | None,
         ids: Sequence[int] | None,
-        *,
-        repeats: Literal["never", "where too few", "always"],
     ) -> Any:
         count, name = self.view_count(number), self.sequence_name(number)
         if ids is not None:
@@ -390,96 +304,22 @@ class VGGTViews:
             return chosen
         if img_per_seq is None:
             return np.arange(count)
-        if img_per_seq < 1 or (img_per_seq > count and repeats == "never"):
-            raise SelectionError(
-                f"{name} has {count} views, got img_per_seq={img_per_seq}: ask for 1 to {count}, "
-                "allow repeats, or take sequence='scene'."
-            )
-        if repeats == "always" or img_per_seq > count:
+        if img_per_seq < 1:
+            raise SelectionError(f"img_per_seq must be at least 1, got {img_per_seq!r}.")
+        if img_per_seq > count:
             return torch.randint(count, (img_per_seq,)).numpy()
         return torch.randperm(count)[:img_per_seq].numpy()
 
-    def _record(self, image: PosedImage, prepare: Prepare | None) -> dict[str, Any]:
+    def _record(self, image: PosedImage) -> dict[str, Any]:
         """Return the values of one picture by the names of the record's lists."""
-        intrinsics = image.intrinsics_for(centre_px=self._centre_px)
-        extrinsics = image.cam_from_world[:3]
-        original_size = np.array(image.size)
-        if prepare is not None:
-            values = prepare(image.rgb, image.depth_m, extrinsics, intrinsics, original_size)
-            return dict(zip(_VGGT_PREPARED, values, strict=False)) | {
-                "original_sizes": original_size
-            }
         rows, columns = np.indices(image.size)
         return {
             "images": image.rgb,
             "depths": np.ascontiguousarray(image.depth_m),
-            "extrinsics": extrinsics,
-            "intrinsics": intrinsics,
+            "extrinsics": image.cam_from_world[:3],
+            "intrinsics": image.intrinsics_for(centre_px=self._centre_px),
             "cam_points": image.points_cam(rows, columns).astype(np.float32),
             "world_points": image.points_world(rows, columns).astype(np.float32),
             "point_masks": image.depth_m > 0,
-            "original_sizes": original_size,
+            "original_sizes": np.array(image.size),
         }
-
-
-_VGGT_PREPARED: Final = (
-    "images", "depths", "extrinsics", "intrinsics", "world_points", "cam_points", "point_masks",
-)  # fmt: skip
-"""What ``process_one_image`` returns, in its order; tracks follow."""
-_VGGT_LISTS: Final = (*_VGGT_PREPARED, "original_sizes")
-
-
-def _installed_centre_px() -> float:
-    """Return where the installed vggt unprojects the top-left pixel, 0.0 if none is installed."""
-    try:
-        from vggt.utils.geometry import depth_to_cam_coords_points
-    except ImportError:
-        return 0.0
-    return float(depth_to_cam_coords_points(np.ones((1, 1), dtype=np.float32), np.eye(3))[0, 0, 0])
-
-
-class VGGTMixin:
-    """What stands in front of VGGT's ``BaseDataset`` to train on these views.
-
-    ``class StereoGenBench(VGGTMixin, BaseDataset)`` is what the configuration of a dataset names as
-    ``_target_``, with ``views`` a `VGGTViews`, configured the same way.
-    """
-
-    def __init__(self, common_conf: Any, *, views: VGGTViews, len_train: int | None = None) -> None:
-        """Take the views; everything else is the base's.
-
-        Args:
-            common_conf: VGGT's common configuration.
-            views: The views.
-            len_train: How many samples an epoch has [the number of sequences].
-        """
-        base: Any = super()  # VGGT's BaseDataset, where this class stands in front of it
-        base.__init__(common_conf=common_conf)
-        self.views = views
-        self.training = common_conf.training
-        self.inside_random = common_conf.inside_random
-        self.allow_duplicate_img = common_conf.allow_duplicate_img
-        self.len_train = len(views) if len_train is None else len_train
-
-    def get_data(
-        self,
-        seq_index: int | None = None,
-        img_per_seq: int | None = None,
-        seq_name: str | None = None,
-        ids: Sequence[int] | None = None,
-        aspect_ratio: float = 1.0,
-    ) -> dict[str, Any]:
-        """Return a sequence whose pictures the base has cropped and scaled; see `VGGTViews`."""
-        base: Any = self
-        if self.inside_random:
-            seq_index, seq_name = int(torch.randint(len(self.views), ())), None
-        return self.views.get_data(
-            seq_index=seq_index,
-            img_per_seq=img_per_seq,
-            seq_name=seq_name,
-            ids=ids,
-            repeats="always" if self.allow_duplicate_img else "never",
-            prepare=partial(
-                base.process_one_image, target_image_shape=base.get_target_shape(aspect_ratio)
-            ),
-        )

@@ -12,14 +12,13 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int, UInt8
 
 from stereogenbench_data.datasets.mapped import Data
-from stereogenbench_data.errors import FieldError, SelectionError
+from stereogenbench_data.errors import FieldError
 from stereogenbench_data.geometry.pose import invert_rigid
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.samples.request import parse_request
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.selection.filters import SceneFilters
 from stereogenbench_data.selection.plan import Address
 from stereogenbench_data.sources.cache import ShardCache
 
@@ -111,22 +110,6 @@ class PosedImage:
 def index_of(data: Data) -> SceneIndex:
     """Return the index of a folder, an index file, or an index as it is."""
     return data if isinstance(data, SceneIndex) else SceneIndex.open(data)
-
-
-def training_filters(index: SceneIndex, filters: SceneFilters) -> SceneFilters:
-    """Return filters that leave out evaluation scenes unless ``split`` asks for them.
-
-    Raises:
-        SelectionError: If ``split`` is not given and all scenes are for evaluation.
-    """
-    if filters.get("split") is not None:
-        return filters
-    if len(index) and not (index.column("split") == "train").any():
-        raise SelectionError(
-            f"{index.where}: holds only evaluation scenes ({len(index)}), and training data are "
-            "made of these only if you say so: split='eval', on the command line --split eval."
-        )
-    return SceneFilters(**(filters | {"split": "train"}))
 
 
 def origin_at(image: PosedImage) -> Float64[np.ndarray, "4 4"]:

@@ -32,8 +32,7 @@ from stereogenbench_data.engine import Progress
 from stereogenbench_data.errors import (
     ExtraError,
     SelectionError,
-    StorageError,
-    describe_os_error,
+    explain_os_errors,
     missing_extra,
 )
 from stereogenbench_data.schema.records import DepthEncoding, Scene
@@ -83,12 +82,9 @@ def write_recording(
         stream = recording.binary_stream()
         key = log_scene(recording, data, scene, progress=progress, **options)
         content = stream.read() or b""
-    try:
-        with open_output(Path(path)) as file:
-            file.write(content)
-    except OSError as error:
-        what = f"{path}: cannot be written"
-        raise StorageError(describe_os_error(what, error, "Choose another place.")) from error
+    cannot = f"{path}: cannot be written"
+    with explain_os_errors(cannot, "Choose another place."), open_output(Path(path)) as file:
+        file.write(content)
     return key
 
 

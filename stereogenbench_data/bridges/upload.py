@@ -3,7 +3,6 @@
 huggingface_hub handles logins, offline mode and retries; this module never sees a token.
 """
 
-import importlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -13,7 +12,7 @@ from stereogenbench_data.bridges.croissant.descriptor import Publication, write_
 from stereogenbench_data.bridges.dataset_facts import About
 from stereogenbench_data.bridges.viewer import viewer_tars
 from stereogenbench_data.engine import Progress
-from stereogenbench_data.errors import DescriptorError, StorageError, missing_extra
+from stereogenbench_data.errors import DescriptorError, StorageError
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.text import counted
@@ -64,18 +63,12 @@ def prepare_upload(
             the scenes is not known.
         StorageError: If the folder has no shards or lacks one.
     """
-    try:
-        importlib.import_module("huggingface_hub")
-    except ImportError as error:
-        raise missing_extra("upload to the Hub", "hub", error) from error
     folder = local_path(shards)
     index = SceneIndex.open(folder)
     _require_whole(index, folder)
     write_card(index, folder, repository=repository, about=about, progress=progress)
-    descriptor = write_descriptor(
-        index, folder / DESCRIPTOR_NAME, publication=Publication(about=about)
-    )
-    return index, str(descriptor["name"])
+    stated = Publication(about=about)
+    return index, write_descriptor(index, folder / DESCRIPTOR_NAME, publication=stated)["name"]
 
 
 def upload(
@@ -94,8 +87,7 @@ def upload(
 
     Raises:
         ExtraError: If huggingface_hub is not installed.
-        DescriptorError: If the folder has a README.md that this package did not write, or who made
-            the scenes is not known.
+        DescriptorError: As `prepare_upload` does.
         StorageError: If the folder has no shards or lacks one, or the Hub refuses the upload.
     """
     index, name = prepare_upload(shards, repository, about=about)
@@ -103,9 +95,11 @@ def upload(
     from huggingface_hub.errors import HfHubHTTPError
 
     folder = local_path(shards)
+    descriptor = folder / DESCRIPTOR_NAME
     api = HfApi(library_name="stereogenbench-data")
     patterns = [*sorted(index.shards), *viewer_tars(index), *_COMPANIONS]
-    require_own_files(folder, [str(path.relative_to(folder)) for path in _found(folder, patterns)])
+    found = [path for pattern in patterns for path in folder.glob(pattern)]
+    require_own_files(folder, [str(path.relative_to(folder)) for path in found])
     refusals: tuple[type[BaseException], ...] = (HfHubHTTPError, ValueError, *network_errors())
     try:
         api.create_repo(repository, repo_type="dataset", exist_ok=True)
@@ -121,9 +115,9 @@ def upload(
         revision = str(api.dataset_info(repository, revision=branch).sha)
         address = f"{api.endpoint}/datasets/{repository}/resolve/{revision}"
         pinned = Publication(data_url=address, tables_url=f"{address}/croissant", about=about)
-        write_descriptor(index, folder / DESCRIPTOR_NAME, publication=pinned)
+        write_descriptor(index, descriptor, publication=pinned)
         api.upload_file(
-            path_or_fileobj=folder / DESCRIPTOR_NAME,
+            path_or_fileobj=descriptor,
             path_in_repo=DESCRIPTOR_NAME,
             repo_id=repository,
             repo_type="dataset",
@@ -133,23 +127,14 @@ def upload(
     except refusals as error:
         if isinstance(error, StorageError | DescriptorError):
             raise
-        is_answer = isinstance(error, HfHubHTTPError | ValueError)
-        what = "the Hub refused the upload" if is_answer else "the Hub cannot be reached"
-        cure = (
-            "Log in with `hf auth login` if needed"
-            if is_answer
-            else "Check the network and HF_HUB_OFFLINE"
-        )
+        what, cure = "the Hub cannot be reached", "Check the network and HF_HUB_OFFLINE"
+        if isinstance(error, HfHubHTTPError | ValueError):
+            what, cure = "the Hub refused the upload", "Log in with `hf auth login` if needed"
         raise StorageError(
             f"{repository}: {what} ({_reason(error)}). {cure}, and run the same command again to "
             "continue."
         ) from None
-    files = _found(folder, patterns)
-    return Upload(f"hf://datasets/{repository}@{revision}", revision, len(files) + 1)
-
-
-def _found(folder: Path, patterns: list[str]) -> list[Path]:
-    return [path for pattern in patterns for path in sorted(folder.glob(pattern))]
+    return Upload(f"hf://datasets/{repository}@{revision}", revision, len(found) + 1)
 
 
 def _require_whole(index: SceneIndex, folder: Path) -> None:

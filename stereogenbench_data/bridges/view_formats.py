@@ -9,9 +9,8 @@ back to the scene's world.
 import json
 import zlib
 from collections.abc import Mapping, Sequence
-from io import StringIO
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -41,16 +40,72 @@ _POINT: Final = np.dtype(
 _COUNT_DIGITS: Final = 12
 
 
-class ViewWriter(Protocol):
-    """Fills a folder with pictures and what a format says of them."""
+class ViewWriter:
+    """Fills a folder with pictures and what a format says of them.
+
+    Attributes:
+        axes: Turns the scene's axes into those of the format's world.
+    """
+
+    axes: Float64[np.ndarray, "4 4"] = np.eye(4)
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        points: int | None = None,
+        encodings: Mapping[int, DepthEncoding] | None = None,
+    ) -> None:
+        """Begin to fill a folder.
+
+        Args:
+            folder: An empty folder.
+            points: How many points are taken from each picture, None for every measured pixel.
+            encodings: The depth contract of each camera.
+        """
+        self._folder, self._points, self._encodings = folder, points, encodings or {}
+        self._export_from_scene: Any = None
+        self._pictures: list[dict[str, Any]] = []
+        self._scene = ""
+        self.begin()
+
+    def begin(self) -> None:
+        """Make what is filled picture by picture."""
 
     def add(self, images: Sequence[PosedImage]) -> None:
         """Take the pictures of one moment."""
-        ...
+        raise NotImplementedError
 
     def finish(self) -> None:
         """Write what needs all pictures."""
-        ...
+        about = {
+            "scene": self._scene,
+            "units": "metres, pixels; the centre of the top-left pixel is (0.5, 0.5)",
+            "camera_axes": "x right, y down, z forward",
+            "scene_from_export": np.linalg.inv(self._export_from_scene).tolist(),
+            "pictures": self._pictures,
+        }
+        _write_json(self._folder / ABOUT_JSON, about)
+
+    def _in_world(self, images: Sequence[PosedImage]) -> list[PosedImage]:
+        """Return pictures in the folder's world, whose origin is at the first camera."""
+        if self._export_from_scene is None:
+            self._export_from_scene = self.axes @ origin_at(images[0])
+            self._scene = images[0].scene
+        moved = [image.in_world(self._export_from_scene) for image in images]
+        self._pictures += [
+            {
+                "name": image.name,
+                "camera": image.camera,
+                "frame": image.frame,
+                "width": image.size[1],
+                "height": image.size[0],
+                "intrinsics": image.intrinsics.tolist(),
+                "export_from_cam": image.world_from_cam.tolist(),
+            }
+            for image in moved
+        ]
+        return moved
 
 
 def sampled_pixels(
@@ -88,48 +143,7 @@ def quaternion_wxyz(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray,
     return np.asarray(vectors[:, -1] * (-1.0 if vectors[0, -1] < 0 else 1.0))
 
 
-class _World:
-    """The world of a folder: its origin at the first camera, its axes the scene's or turned."""
-
-    def __init__(self, axes: Float64[np.ndarray, "4 4"]) -> None:
-        self._axes = axes
-        self.export_from_scene: Any = None
-        self._pictures: list[dict[str, Any]] = []
-        self._scene = ""
-
-    def images(self, images: Sequence[PosedImage]) -> list[PosedImage]:
-        """Return pictures with their poses in this world."""
-        if self.export_from_scene is None:
-            self.export_from_scene = self._axes @ origin_at(images[0])
-            self._scene = images[0].scene
-        moved = [image.in_world(self.export_from_scene) for image in images]
-        self._pictures += [
-            {
-                "name": image.name,
-                "camera": image.camera,
-                "frame": image.frame,
-                "width": image.size[1],
-                "height": image.size[0],
-                "intrinsics": image.intrinsics.tolist(),
-                "export_from_cam": image.world_from_cam.tolist(),
-            }
-            for image in moved
-        ]
-        return moved
-
-    def write_about(self, folder: Path) -> None:
-        """Write what the folder shows."""
-        about = {
-            "scene": self._scene,
-            "units": "metres, pixels; the centre of the top-left pixel is (0.5, 0.5)",
-            "camera_axes": "x right, y down, z forward",
-            "scene_from_export": np.linalg.inv(self.export_from_scene).tolist(),
-            "pictures": self._pictures,
-        }
-        _write_json(folder / ABOUT_JSON, about)
-
-
-class ColmapWriter:
+class ColmapWriter(ViewWriter):
     """``sparse/0/cameras.txt``, ``images.txt``, ``points3D.txt``, and the pictures in ``images/``.
 
     Pixel centres are at 0.5 and cameras have OpenCV's axes, as here. A point comes from a pixel's
@@ -139,26 +153,16 @@ class ColmapWriter:
     Source: colmap/colmap, doc/format.rst, doc/faq.rst.
     """
 
-    def __init__(
-        self, folder: Path, *, points: int | None, encodings: Mapping[int, DepthEncoding]
-    ) -> None:
-        """Begin a model.
-
-        Args:
-            folder: An empty folder.
-            points: How many points are taken from each picture, None for every measured pixel.
-            encodings: The depth contract of each camera.
-        """
-        self._folder, self._points, self._encodings = folder, points, encodings
-        self._world = _World(np.eye(4))
+    def begin(self) -> None:
+        """Make the folder of pictures."""
         self._camera = ""
         self._image_lines: list[str] = []
         self._point_lines: list[str] = []
-        (folder / "images").mkdir()
+        (self._folder / "images").mkdir()
 
     def add(self, images: Sequence[PosedImage]) -> None:
         """Take the pictures of one moment."""
-        images = self._world.images(images)
+        images = self._in_world(images)
         (fx, _, cx), (_, fy, cy), _ = images[0].intrinsics.tolist()
         height, width = images[0].size
         self._camera = f"1 PINHOLE {width} {height} {fx!r} {fy!r} {cx!r} {cy!r}\n"
@@ -212,25 +216,18 @@ class ColmapWriter:
         """Write the model."""
         model = self._folder / "sparse" / "0"
         model.mkdir(parents=True)
-        for name, head, lines in (
-            ("cameras", "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", [self._camera]),
-            (
-                "images",
-                "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
-                "# POINTS2D[] as (X, Y, POINT3D_ID)",
-                self._image_lines,
-            ),
-            (
-                "points3D",
-                "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
-                self._point_lines,
-            ),
-        ):
-            text = StringIO()
-            text.write(f"# {head}\n")
-            text.writelines(lines)
-            (model / f"{name}.txt").write_text(text.getvalue(), encoding="utf-8")
-        self._world.write_about(self._folder)
+        heads = {
+            "cameras": "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n",
+            "images": "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
+            "# POINTS2D[] as (X, Y, POINT3D_ID)\n",
+            "points3D": "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, "
+            "TRACK[] as (IMAGE_ID, POINT2D_IDX)\n",
+        }
+        texts = ([self._camera], self._image_lines, self._point_lines)
+        for (name, head), lines in zip(heads.items(), texts, strict=True):
+            with (model / f"{name}.txt").open("w", encoding="utf-8") as file:
+                file.writelines([head, *lines])
+        super().finish()
 
 
 def _depth_step_m(encoding: DepthEncoding, depth_m: Any) -> Any:
@@ -240,7 +237,7 @@ def _depth_step_m(encoding: DepthEncoding, depth_m: Any) -> Any:
     return depth_m**2 / encoding.known_unit_m
 
 
-class TransformsWriter:
+class TransformsWriter(ViewWriter):
     """``transforms.json`` with ``images/``, ``depth/`` and ``sparse_pc.ply``, for nerfstudio.
 
     Cameras have OpenGL's axes (x right, y up, z back), the world's z points up, pixel centres are
@@ -251,24 +248,19 @@ class TransformsWriter:
     nerfstudio/data/dataparsers/nerfstudio_dataparser.py, nerfstudio/data/utils/data_utils.py.
     """
 
-    def __init__(self, folder: Path, *, points: int | None) -> None:
-        """Begin a folder.
+    axes = _Z_UP_FROM_Y_DOWN
 
-        Args:
-            folder: An empty folder.
-            points: How many points are taken from each picture, None for every measured pixel.
-        """
-        self._folder = folder
-        self._world = _World(_Z_UP_FROM_Y_DOWN)
-        self._cloud = _PointFile(folder / "sparse_pc.ply", points)
+    def begin(self) -> None:
+        """Make the folders of pictures and depth, and the cloud."""
+        self._cloud = _PointFile(self._folder / "sparse_pc.ply", self._points)
         self._frames: list[dict[str, Any]] = []
         self._lens: dict[str, Any] = {}
         for name in ("images", "depth"):
-            (folder / name).mkdir()
+            (self._folder / name).mkdir()
 
     def add(self, images: Sequence[PosedImage]) -> None:
         """Take the pictures of one moment."""
-        for image in self._world.images(images):
+        for image in self._in_world(images):
             (fx, _, cx), (_, fy, cy), _ = image.intrinsics.tolist()
             height, width = image.size
             self._lens = {
@@ -293,39 +285,32 @@ class TransformsWriter:
     def finish(self) -> None:
         """Write the cameras."""
         self._cloud.close()
-        applied = self._world.export_from_scene[:3].tolist()
+        applied = self._export_from_scene[:3].tolist()
         transforms = self._lens | {
             "applied_transform": applied,
             "ply_file_path": "sparse_pc.ply",
             "frames": self._frames,
         }
         _write_json(self._folder / "transforms.json", transforms)
-        self._world.write_about(self._folder)
+        super().finish()
 
 
-class PlyWriter:
+class PlyWriter(ViewWriter):
     """``points.ply``: measured pixels as coloured points, in the scene's axes (y down)."""
 
-    def __init__(self, folder: Path, *, points: int | None) -> None:
-        """Begin a cloud.
-
-        Args:
-            folder: An empty folder.
-            points: How many points are taken from each picture, None for every measured pixel.
-        """
-        self._folder = folder
-        self._world = _World(np.eye(4))
-        self._cloud = _PointFile(folder / "points.ply", points)
+    def begin(self) -> None:
+        """Make the cloud."""
+        self._cloud = _PointFile(self._folder / "points.ply", self._points)
 
     def add(self, images: Sequence[PosedImage]) -> None:
         """Take the pictures of one moment."""
-        for image in self._world.images(images):
+        for image in self._in_world(images):
             self._cloud.add(image)
 
     def finish(self) -> None:
         """Write how many points there are, and what they are."""
         self._cloud.close()
-        self._world.write_about(self._folder)
+        super().finish()
 
 
 class _PointFile:
@@ -366,7 +351,7 @@ class _PointFile:
             file.write(self._head())
 
 
-class MogeWriter:
+class MogeWriter(ViewWriter):
     """A folder a picture: ``image.jpg``, ``depth.png``, ``meta.json``.
 
     Depth is 16 bits on a logarithmic scale between the nearest and the farthest of the picture, 0
@@ -374,14 +359,6 @@ class MogeWriter:
 
     Source: microsoft/MoGe, docs/train.md, moge/utils/io.py.
     """
-
-    def __init__(self, folder: Path) -> None:
-        """Begin a folder of pictures.
-
-        Args:
-            folder: An empty folder.
-        """
-        self._folder = folder
 
     def add(self, images: Sequence[PosedImage]) -> None:
         """Take the pictures of one moment."""
@@ -404,6 +381,15 @@ class MogeWriter:
 
     def finish(self) -> None:
         """Do nothing: every picture stands for itself."""
+
+
+Layout = Literal["colmap", "transforms", "ply", "moge"]
+WRITERS: Final[Mapping[Layout, type[ViewWriter]]] = {
+    "colmap": ColmapWriter,
+    "transforms": TransformsWriter,
+    "ply": PlyWriter,
+    "moge": MogeWriter,
+}
 
 
 def _write_log_depth(path: Path, depth_m: Any) -> None:

@@ -10,7 +10,8 @@ of tars, so the rows are tars too: one sample a scene, a member for each column.
 import io
 import json
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Callable
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,26 +20,28 @@ from PIL import Image
 
 from stereogenbench_data.datasets.mapped import StereoPairs
 from stereogenbench_data.engine import Advance, Progress, advance_of
-from stereogenbench_data.errors import DescriptorError, StorageError, describe_os_error
+from stereogenbench_data.errors import DescriptorError, explain_os_errors
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.picture import contact_sheet
 from stereogenbench_data.schema.records import Scene, SceneId
 from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources.files import open_atomic
 
-_FOLDER: Final = "viewer"
+_COLUMNS: Final[dict[str, tuple[str, Callable[[Scene], Any]]]] = {
+    "map.txt": ("string", lambda scene: scene.id.map_name),
+    "family.txt": ("string", lambda scene: scene.id.family),
+    "description.txt": ("string", lambda scene: scene.caption),
+    "shard.txt": ("string", lambda scene: next(iter(scene.members.values())).path),
+    "frames.json": ("int64", lambda scene: scene.frames),
+    "width_px.json": ("int64", lambda scene: scene.rig.image_width_px),
+    "height_px.json": ("int64", lambda scene: scene.rig.image_height_px),
+    "focal_mm.json": ("float64", lambda scene: scene.rig.focal_mm),
+    "shortest_baseline_cm.json": ("float64", lambda scene: min(scene.rig.baselines_cm)),
+    "longest_baseline_cm.json": ("float64", lambda scene: max(scene.rig.baselines_cm)),
+}
 FEATURES: Final[dict[str, str]] = {
     "preview.jpg": "image",
-    "map.txt": "string",
-    "family.txt": "string",
-    "description.txt": "string",
-    "shard.txt": "string",
-    "frames.json": "int64",
-    "width_px.json": "int64",
-    "height_px.json": "int64",
-    "focal_mm.json": "float64",
-    "shortest_baseline_cm.json": "float64",
-    "longest_baseline_cm.json": "float64",
+    **{name: kind for name, (kind, _) in _COLUMNS.items()},
     "__key__": "string",
     "__url__": "string",
 }
@@ -52,6 +55,11 @@ def split_name(scene: SceneId) -> str:
     return scene.split if scene.subset is None else f"{scene.split}_{scene.subset}"
 
 
+def viewer_tar(split: str) -> str:
+    """Return the path of a split's tar below the shards."""
+    return f"viewer/{split}.tar"
+
+
 def viewer_tars(index: SceneIndex) -> dict[str, list[int]]:
     """Return the scenes' rows of the index for each tar, by its path below the shards."""
     rows: dict[str, list[int]] = {}
@@ -59,11 +67,6 @@ def viewer_tars(index: SceneIndex) -> dict[str, list[int]]:
         path = viewer_tar(split_name(index.scene(row).id))
         rows.setdefault(path, []).append(row)
     return rows
-
-
-def viewer_tar(split: str) -> str:
-    """Return the path of a split's tar below the shards."""
-    return f"{_FOLDER}/{split}.tar"
 
 
 def write_viewer_rows(
@@ -82,25 +85,17 @@ def write_viewer_rows(
         DescriptorError: If a file cannot be written.
         StorageError, MediaError: If a scene's pictures cannot be read.
     """
-    place = folder / _FOLDER
-    paths = []
+    rows_of = {folder / name: rows for name, rows in viewer_tars(index).items()}
     advance = advance_of(progress, total=len(index))
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-        for name, chosen in viewer_tars(index).items():
-            path = folder / name
+    cannot = f"{folder / 'viewer'}: cannot be written"
+    with explain_os_errors(cannot, "Check the disk.", kind=DescriptorError):
+        for path, rows in rows_of.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
             if _digest_of(path) == index.digest:
-                advance(len(chosen))
+                advance(len(rows))
             else:
-                _write(index, chosen, path, advance=advance)
-            paths.append(path)
-    except StorageError:
-        raise
-    except OSError as error:
-        raise DescriptorError(
-            describe_os_error(f"{place}: cannot be written", error, "Check the disk.")
-        ) from error
-    return paths
+                _write(index, rows, path, advance=advance)
+    return [*rows_of]
 
 
 def _digest_of(path: Path) -> str:
@@ -113,72 +108,43 @@ def _digest_of(path: Path) -> str:
 
 
 def _write(index: SceneIndex, rows: list[int], path: Path, *, advance: Advance) -> None:
-    previews = _previews(index, rows)
+    rig = index.scene(rows[0]).rig
+    width = min(_WIDEST_PX, rig.image_width_px)
+    size = (round(rig.image_height_px * width / rig.image_width_px), width)
+    blank = np.full((*size, 3), 255, dtype=np.uint8)
+    pairs = _previewed(index, rows[0], size)
+    options: dict[str, Any] = {"format": tarfile.PAX_FORMAT, "pax_headers": {_MARK: index.digest}}
     with (
+        nullcontext() if pairs is None else closing(pairs),
         open_atomic(path) as file,
-        tarfile.open(
-            fileobj=file, mode="w", format=tarfile.PAX_FORMAT, pax_headers={_MARK: index.digest}
-        ) as tar,
+        tarfile.open(fileobj=file, mode="w", **options) as tar,
     ):
-        for row, preview in zip(rows, previews, strict=True):
-            scene = index.scene(row)
-            for name, content in {"preview.jpg": preview, **_columns(scene)}.items():
+        for row in rows:
+            scene, picture = index.scene(row), io.BytesIO()
+            sheet = blank if pairs is None else contact_sheet([pairs[row]])
+            Image.fromarray(sheet).save(picture, format="JPEG", quality=85)
+            contents = {"preview.jpg": picture.getvalue()}
+            for name, (kind, value) in _COLUMNS.items():
+                text = value(scene) if kind == "string" else json.dumps(value(scene))
+                contents[name] = text.encode()
+            for name, content in contents.items():
                 member = tarfile.TarInfo(f"{scene.id.key}.{name}")
                 member.size = len(content)
                 tar.addfile(member, io.BytesIO(content))
             advance(1)
 
 
-def _columns(scene: Scene) -> dict[str, bytes]:
-    values: dict[str, Any] = {
-        "map.txt": scene.id.map_name,
-        "family.txt": scene.id.family,
-        "description.txt": scene.caption,
-        "shard.txt": next(iter(scene.members.values())).path,
-        "frames.json": scene.frames,
-        "width_px.json": scene.rig.image_width_px,
-        "height_px.json": scene.rig.image_height_px,
-        "focal_mm.json": scene.rig.focal_mm,
-        "shortest_baseline_cm.json": min(scene.rig.baselines_cm),
-        "longest_baseline_cm.json": max(scene.rig.baselines_cm),
-    }
-    return {
-        name: (value if name.endswith(".txt") else json.dumps(value)).encode()
-        for name, value in values.items()
-    }
+def _previewed(index: SceneIndex, row: int, size: tuple[int, int]) -> StereoPairs | None:
+    """Return each scene's primary pair, with disparity where there is depth.
 
-
-def _previews(index: SceneIndex, rows: list[int]) -> Iterator[bytes]:
-    """Yield the first pictures of each scene's primary pair, with disparity, as JPEG.
-
-    Scenes without these videos, as of a partial download, have an empty picture.
+    None if a scene lacks its pictures, as of a partial download.
     """
-    first = index.scene(rows[0])
-    left, right = first.rig.primary_pair
-    held = set(first.held_videos)
-    fields = ["left", "right"] if {rgb_name(left), rgb_name(right)} <= held else []
-    if fields and first.held_name(depth_name(left)) in held:
-        fields.append("disparity")
-    width = min(_WIDEST_PX, first.rig.image_width_px)
-    height = round(first.rig.image_height_px * width / first.rig.image_width_px)
-    pairs = (
-        StereoPairs(
-            index,
-            pairs="primary",
-            frames=[0],
-            size=(height, width),
-            fields=fields,
-            check="metadata",
-        )
-        if fields
-        else None
+    scene = index.scene(row)
+    held, (left, right) = set(scene.held_videos), scene.rig.primary_pair
+    if not {rgb_name(left), rgb_name(right)} <= held:
+        return None
+    has_depth = scene.held_name(depth_name(left)) in held
+    fields = ("left", "right", *(("disparity",) if has_depth else ()))
+    return StereoPairs(
+        index, pairs="primary", frames=[0], size=size, fields=fields, check="metadata"
     )
-    for row in rows:
-        picture = (
-            np.full((height, width, 3), 255, dtype=np.uint8)
-            if pairs is None
-            else contact_sheet([pairs[row]])
-        )
-        file = io.BytesIO()
-        Image.fromarray(picture).save(file, format="JPEG", quality=85)
-        yield file.getvalue()

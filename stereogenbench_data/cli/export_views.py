@@ -163,15 +163,12 @@ EXPORTS: Final[tuple[tuple[str, Callable[..., None], str], ...]] = (
 
 def _export(source: DataOptions, out: Path, chosen: ViewOptions, *, layout: Any) -> None:
     from stereogenbench_data.bridges.export_views import export_views
-    from stereogenbench_data.selection.filters import filter_scenes
+    from stereogenbench_data.bridges.exports import training_selection
 
-    selection = chosen.selection()
-    filters: Any = chosen.filters()
     index = source.open()
     with progress_bar("writing", unit="pictures") as progress:
-        folders = export_views(index, out, layout=layout, progress=progress, **selection)
-    matching = index.column("split")[filter_scenes(index, filters)]
-    for_evaluation = 0 if chosen.split else int((matching == "eval").sum())
+        folders = export_views(index, out, layout=layout, progress=progress, **chosen.selection())
+    _, for_evaluation = training_selection(index, chosen.filters())
     if for_evaluation:
         typer.echo(
             f"{counted(for_evaluation, 'evaluation scene')} left out: --split eval exports them",

@@ -93,24 +93,15 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     template: Annotated[
         bool, typer.Option("--template", help="Write the questions that --about answers.")
     ] = False,
-    mapping: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--map-file",
-            metavar="ID=PATH",
-            help="With --check: local copy of a file behind a URL.",
-            rich_help_panel=RARE,
-        ),
-    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Report as JSON on stdout.")] = False,
 ) -> None:
     """Write a Croissant 1.1 descriptor, or check one.
 
-    The check covers what `mlcroissant validate` does not: files, checksums, columns, references,
-    names and the context.
+    The check is mlcroissant's own (extra 'croissant'), and of the properties on responsible use
+    and the files that are beside the descriptor: size and checksum.
     """
     if check:
-        _check(data, mapping or [], as_json=as_json)
+        _check(data, as_json=as_json)
         return
     if out is None:
         raise typer.BadParameter(
@@ -146,21 +137,12 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         typer.echo(f"{out}: {files} files and sets of files, {counted(records, 'record set')}")
 
 
-def _check(data: str | None, mapping: list[str], *, as_json: bool) -> None:
+def _check(data: str | None, *, as_json: bool) -> None:
     if data is None:
         raise typer.BadParameter("no descriptor to check: name its file.", param_hint="DATA")
     from stereogenbench_data.bridges.croissant.check import check_descriptor
 
-    places = {}
-    for each in mapping:
-        name, equals, path = each.partition("=")
-        if not equals:
-            raise typer.BadParameter(
-                f"{each!r} is not ID=PATH, such as shards.tar=data/shards.tar.",
-                param_hint="--map-file",
-            )
-        places[name] = Path(path)
-    problems = check_descriptor(Path(data), mapping=places)
+    problems = check_descriptor(Path(data))
     if as_json:
         typer.echo(json.dumps({"descriptor": data, "problems": problems}, indent=2))
     else:

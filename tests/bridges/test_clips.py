@@ -396,13 +396,13 @@ def test_progress_tells_frames_and_begins_with_those_that_are_there(indexed_rele
     told = []
     run = ExportRun(workers=1, progress=lambda done, total: told.append((done, total)))
     names = exported(indexed_release, tmp_path, run=run).written
-    assert (told[0], told[-1]) == ((1, 15), (15, 15))
+    assert (told[0], told[-1]) == ((0, 15), (15, 15))
 
     told.clear()
     (tmp_path / "clips" / f"{names[0]}.json").unlink()
     exported(indexed_release, tmp_path, run=run)
 
-    assert (told[0], told[-1]) == ((11, 15), (15, 15))
+    assert (told[0], told[-1]) == ((10, 15), (15, 15))
 
 
 # Refusals.
@@ -435,7 +435,7 @@ def test_a_folder_of_another_export_is_refused_by_what_differs(indexed_release, 
         ({"family": "Uniform"}, "selection"),
         ({"pairs": "all"}, "selection"),
     ):
-        with pytest.raises(StorageError, match=rf"holds an export with another {named} .*remove"):
+        with pytest.raises(StorageError, match=rf"an export of other {named}: .*remove"):
             exported(indexed_release, tmp_path, **change)
     assert contents(tmp_path) == before
 
@@ -454,7 +454,7 @@ def test_two_exports_into_one_folder_are_refused(indexed_release, tmp_path):
     tmp_path.mkdir(exist_ok=True)
     with (
         try_locked(tmp_path / ".export.lock"),
-        pytest.raises(StorageError, match="another process exports into it"),
+        pytest.raises(StorageError, match="another process exports into this folder"),
     ):
         exported(indexed_release, tmp_path)
 

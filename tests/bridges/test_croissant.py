@@ -247,16 +247,15 @@ def test_a_partial_download_is_described_by_its_videos(small_shards, tmp_path, s
     part = plan_download(whole, [0, 1], cameras=(2, 3), streams=(stream,))
     tree = download(whole, part, tmp_path / "tree")
     pack(tmp_path / "tree", tmp_path / "shards", workers=1)
-    places = {"tree": {"repository": tmp_path / "tree"}, "shards": {}}
 
-    for name, mapping in places.items():
+    for name in ("tree", "shards"):
         index = tree if name == "tree" else SceneIndex.open(tmp_path / name)
         path = tmp_path / f"{name}.json"
         written = write_descriptor(index, path, publication=AT_HOME if name == "tree" else DAY)
 
         kinds = [each["@id"] for each in written["recordSet"] if each["@id"].endswith("_videos")]
         assert kinds == [f"{stream}_videos"]
-        assert check_descriptor(path, mapping=mapping) == []
+        assert check_descriptor(path) == []
 
 
 def test_shards_of_any_folder_are_named_relative_to_the_descriptor(index, tmp_path):

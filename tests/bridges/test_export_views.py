@@ -36,7 +36,7 @@ def files_of(root):
     return {
         str(path.relative_to(root)): path.read_bytes()
         for path in sorted(root.rglob("*"))
-        if path.is_file() and path.name != ".lock"
+        if path.is_file() and path.name != ".export.lock"
     }
 
 
@@ -515,7 +515,7 @@ def test_other_data_go_elsewhere(indexed_release, detailed_release, tmp_path):
 def test_a_folder_of_something_else_is_left_alone(indexed_release, tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
 
-    with pytest.raises(StorageError, match=r"not empty and holds no export\.json.*a new folder"):
+    with pytest.raises(StorageError, match=r"not empty and holds no export.*a new folder"):
         exported(indexed_release, tmp_path, layout="ply")
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
@@ -523,14 +523,14 @@ def test_a_folder_of_something_else_is_left_alone(indexed_release, tmp_path):
 def test_a_description_that_is_none_is_named(indexed_release, tmp_path):
     (tmp_path / "export.json").write_text("{")
 
-    with pytest.raises(StorageError, match=r"export\.json: is not the description of an export"):
+    with pytest.raises(StorageError, match=r"export\.json: is not JSON"):
         exported(indexed_release, tmp_path, layout="ply")
 
 
 def test_two_processes_do_not_export_into_one_folder(indexed_release, tmp_path):
     exported(indexed_release, tmp_path, layout="ply", size=(16, 16), family="Uniform")
 
-    with try_locked(tmp_path / ".lock") as is_ours:
+    with try_locked(tmp_path / ".export.lock") as is_ours:
         assert is_ours
         with pytest.raises(StorageError, match=r"another process exports into this folder"):
             exported(indexed_release, tmp_path, layout="ply", size=(16, 16))

@@ -152,20 +152,6 @@ def test_the_right_picture_of_unimatch_fetched_by_its_disparity_is_the_left_one(
     assert psnr(right, left, visible) < 22
 
 
-def test_transforms_of_unimatch_get_arrays_of_height_width_channels(indexed_release):
-    plain = StereoPairs(indexed_release)[0]
-
-    item = UniMatch(indexed_release, sample_transform=lambda sample: sample)[0]
-
-    assert {name: (value.shape, value.dtype) for name, value in item.items()} == {
-        "left": ((64, 64, 3), np.float32),
-        "right": ((64, 64, 3), np.float32),
-        "disp": ((64, 64), np.float32),
-    }
-    np.testing.assert_array_equal(item["left"].transpose(2, 0, 1), plain["left"])
-    np.testing.assert_array_equal(item["disp"], plain["disparity"][0])
-
-
 def test_the_loop_of_dynamic_stereo_takes_clips_of_both_views(indexed_release):
     clips = DynamicStereo(indexed_release, pairs="adjacent", frames=("clips", 3))
 
