@@ -31,6 +31,7 @@ from stereogenbench_data.engine import LOCAL, Advance, Progress, advance_of
 from stereogenbench_data.errors import SelectionError, StorageError, describe_os_error
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.checks import check_samples
+from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters
 from stereogenbench_data.selection.options import require_options
@@ -283,7 +284,7 @@ def _begin(root: Path, settings: Mapping[str, Any]) -> None:
 def _export_scene(work: _SceneWork, advance: Advance) -> None:
     """Write the missing folders of one scene, each whole or not at all."""
     scene, selected = work.index.scene(0), work.selected
-    points, contract = selected.points, selected.depth or DepthEncoding()
+    points, contract = selected.points, selected.depth or depth_of(scene)
     encodings = dict.fromkeys(selected.cameras, contract)
     for camera in selected.cameras:
         source = scene.depth_unit_source[camera]

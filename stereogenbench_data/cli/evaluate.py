@@ -5,7 +5,7 @@ They share their options: scenes, pairs and frames, metrics and models, the repo
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -144,7 +144,6 @@ class ProtocolOptions:
             keypoint_matcher=self.keypoint_matcher,
             stereo_matcher=self.stereo_matcher,
             fit=fit,
-            depth=depth_of(self.depth_unit_m),
             models=ModelOptions(device=self.device, weights=self.weights, checkout=self.checkout),
         )
 
@@ -224,7 +223,7 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
             out,
             tier=tier,
             size=size_px,
-            depth=depth_of(depth_unit_m),
+            depth=depth_of(index, unit_m=depth_unit_m),
             **work.options(),
             progress=progress,
             **selection,
@@ -275,6 +274,7 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
     called = name or predictions.resolve().name
     folder = report.out or Path("evaluation") / f"{called}-{tier}"
     index = source.open()
+    protocol = replace(protocol, depth=depth_of(index, unit_m=scoring.depth_unit_m))
     for column in strata:
         index.column(column)  # refuses an unknown one before the work
     with progress_bar("scoring", unit="frames") as progress:
@@ -317,6 +317,7 @@ def controls(
     protocol, selection = scoring.protocol(), chosen.selection()
     folder = report.out or Path("evaluation") / "controls"
     index = source.open()
+    protocol = replace(protocol, depth=depth_of(index, unit_m=scoring.depth_unit_m))
     with progress_bar("scoring", unit="frames") as progress:
         results = score_controls(
             index,

@@ -64,7 +64,6 @@ class ViewOptions(ExportedSceneOptions):
             "cameras": cameras,
             "frames": frames_option(self.frames),
             "size": None if self.size is None else parse_picture_size(self.size),
-            "depth": depth_of(self.depth_unit_m),
             "workers": self.workers,
         }
 
@@ -167,7 +166,14 @@ def _export(source: DataOptions, out: Path, chosen: ViewOptions, *, layout: Any)
     filters: Any = chosen.filters()
     index = source.open()
     with progress_bar("writing", unit="pictures") as progress:
-        folders = export_views(index, out, layout=layout, progress=progress, **selection)
+        folders = export_views(
+            index,
+            out,
+            layout=layout,
+            progress=progress,
+            depth=depth_of(index, unit_m=chosen.depth_unit_m),
+            **selection,
+        )
     matching = index.column("split")[filter_scenes(index, filters)]
     for_evaluation = 0 if chosen.split else int((matching == "eval").sum())
     if for_evaluation:

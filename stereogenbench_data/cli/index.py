@@ -12,6 +12,7 @@ from stereogenbench_data.cli.data import full_place
 from stereogenbench_data.cli.errors import FINDINGS, resumable
 from stereogenbench_data.cli.help import RARE
 from stereogenbench_data.cli.options import (
+    ConventionsOption,
     FamilyOption,
     JsonOption,
     MapOption,
@@ -52,6 +53,7 @@ def index(  # noqa: PLR0913 - one parameter an option
     split: SplitOption = None,
     family: FamilyOption = None,
     map_name: MapOption = None,
+    conventions: ConventionsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Index a released tree, so that it opens at once.
@@ -63,6 +65,7 @@ def index(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.index.build import scene_journal, walk
     from stereogenbench_data.index.parquet import recorded_root
     from stereogenbench_data.index.table import SceneIndex
+    from stereogenbench_data.schema.conventions import Conventions
     from stereogenbench_data.sources.location import is_remote, local_path, shown
 
     console = Console(stderr=True)
@@ -93,10 +96,12 @@ def index(  # noqa: PLR0913 - one parameter an option
                 param_hint="--out",
             ) from error
     recorded_root(root, beside=target.parent)  # Refuses a root before hours of work.
+    stated = None if conventions is None else Conventions.read(conventions)
+    how = f"valid_depth={mode} {'' if stated is None else [each.text() for each in stated.shapes]}"
     done_before = target.with_name(f"{target.name}.journal")
     with (
         writing(done_before),
-        scene_journal(done_before, walk=f"{full_place(root)} valid_depth={mode}") as journal,
+        scene_journal(done_before, walk=f"{full_place(root)} {how.strip()}") as journal,
         progress_bar("indexing", unit="scenes") as progress,
     ):
         report = walk(
@@ -106,6 +111,7 @@ def index(  # noqa: PLR0913 - one parameter an option
             journal=journal,
             valid_depth=mode,
             wanted=wanted,
+            conventions=stated,
         )
         if report.scenes:
             SceneIndex.from_report(report).write(target)

@@ -6,7 +6,7 @@ shows typer the fields in its place.
 
 import inspect
 from collections.abc import Callable, Iterable
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
@@ -111,11 +111,26 @@ def pair_of(text: str, *, option: str) -> tuple[int, int]:
     return pair
 
 
-def depth_of(unit_m: float | None) -> "DepthEncoding | None":
-    """Return the depth contract of ``--depth-unit-m``; None without it: files state their own."""
+def depth_of(index: "SceneIndex", **options: Any) -> "DepthEncoding | None":
+    """Return the depth contract of a command's options; None without any: data state their own.
+
+    What no option says is as the conventions of the data state it.
+
+    Raises:
+        typer.BadParameter: If these state several contracts.
+    """
     from stereogenbench_data.schema.records import DepthEncoding
 
-    return None if unit_m is None else DepthEncoding(unit_m=unit_m)
+    given = {name: value for name, value in options.items() if value is not None}
+    if not given:
+        return None
+    stated = {shape.depth.encoding for shape in index.shapes if shape.depth is not None}
+    if len(stated) > 1:
+        raise typer.BadParameter(
+            f"the conventions of {index.where} state {len(stated)} depth contracts, and options "
+            f"would replace all: choose scenes of one, or edit the conventions."
+        )
+    return replace(stated.pop() if stated else DepthEncoding(), **given, source="user")
 
 
 RootOption = Annotated[
@@ -123,6 +138,15 @@ RootOption = Annotated[
     typer.Option(
         "--root",
         help="Where the data of an index file are, if not beside.",
+        rich_help_panel=RARE,
+    ),
+]
+ConventionsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--conventions",
+        metavar="FILE",
+        help="How the files are read, as `conventions` writes it.",
         rich_help_panel=RARE,
     ),
 ]
@@ -188,10 +212,11 @@ class DataOptions:
         typer.Argument(help="Folder of scenes or shards, an index file, or a URL."),
     ]
     data_root: RootOption = None
+    conventions: ConventionsOption = None
 
     def open(self) -> "SceneIndex":
         """Return the index of the data as `open_data` does."""
-        return open_data(self.data, root=self.data_root)
+        return open_data(self.data, root=self.data_root, conventions=self.conventions)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ from stereogenbench_data.cli.data import open_index
 from stereogenbench_data.cli.errors import FINDINGS, resumable
 from stereogenbench_data.cli.help import RARE
 from stereogenbench_data.cli.options import (
+    ConventionsOption,
     JsonOption,
     RootOption,
     SceneOptions,
@@ -45,6 +46,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
     ],
     *,
     data_root: RootOption = None,
+    conventions: ConventionsOption = None,
     shard_size: Annotated[
         str,
         typer.Option(help="Largest shard, such as 500MB or 2GiB; a scene is never divided."),
@@ -116,7 +118,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
     training = _training(size, quality=quality, cameras=cameras, depth_codec=depth_codec)
     if dry_run and training is None:
         raise typer.BadParameter("estimates training shards: give --size.", param_hint="--dry-run")
-    index = open_index(root, root=data_root)
+    index = open_index(root, root=data_root, conventions=conventions)
     filters: Any = chosen.filters()
     rows = filter_scenes(index, filters).tolist() if filters else None
     scenes = len(index) if rows is None else len(rows)

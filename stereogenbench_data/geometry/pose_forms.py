@@ -8,7 +8,7 @@ cameras with it, so that no picture is.
 """
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -74,19 +74,28 @@ class Reading:
     trajectory: Trajectory
 
 
-def readings(recorded: RecordedPoses, *, only: str | None = None) -> Iterator[Reading]:
+def readings(
+    recorded: RecordedPoses,
+    *,
+    only: str | None = None,
+    named: Callable[[str], bool] | None = None,
+) -> Iterator[Reading]:
     """Yield the readings of recorded numbers, those that the file names first.
 
     Args:
         recorded: The numbers.
         only: The name of the one reading that is wanted.
+        named: Returns whether conventions name a reading; these then stand for the file's own.
     """
-    found = sorted(_all_readings(recorded), key=lambda each: each.tier)
-    for each in found:
+    found = [
+        (each.tier if named is None else 0 if named(each.name) else max(1, each.tier), each)
+        for each in _all_readings(recorded, named)
+    ]
+    for tier, each in sorted(found, key=lambda pair: pair[0]):
         if only is None or each.name == only:
             made = each.make()
             if made is not None:
-                yield Reading(each.name, each.tier, made)
+                yield Reading(each.name, tier, made)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,22 +201,25 @@ def _rotations(matrices: Float64[np.ndarray, "*n 3 3"]) -> Float64[np.ndarray, "
     return np.asarray(nearest_rotation(matrices * signs) * signs)
 
 
-def _all_readings(recorded: RecordedPoses) -> Iterator[_Form]:
+def _all_readings(recorded: RecordedPoses, named: Callable[[str], bool] | None) -> Iterator[_Form]:
     hints = recorded.hints | {_ALIASES[hint] for hint in recorded.hints if hint in _ALIASES}
     blocks = [block for block in recorded.blocks if not block.words & _NO_POSE]
     places = [b for b in blocks if b.values.shape[-1] == 3 and b.values.ndim == 3
               and b.components not in (("pitch", "yaw", "roll"), ("rx", "ry", "rz"))
               and (b.words & _LOCATION or (b.components and not b.words & _ROTATION))]  # fmt: skip
+    possible = _possible_axes(hints)
     for turn in blocks:
         for kind, needs_place in _kinds(turn):
             for place in places if needs_place else [None]:
                 if place is turn:
                     continue
-                for axes in _possible_axes(hints):
+                for axes in AXES:
                     unit_m, unit = _unit(recorded, place or turn)
                     tier = _tier(turn, kind, axes, hints)
                     where = turn.key if place is None else f"{place.key} and {turn.key}"
                     name = f"{where}: {kind}, {axes} axes{unit}"
+                    if axes not in possible and not (named is not None and named(name)):
+                        continue
                     yield _Form(name, tier, turn, place, kind, axes, unit_m)
 
 

@@ -7,7 +7,7 @@ Where none is named, or it fails, the other forms are tried; where several pass 
 fields on which they differ are refused.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -18,11 +18,12 @@ from stereogenbench_data.geometry.camera import recorded_intrinsics
 from stereogenbench_data.geometry.pose import OPENCV_FROM_UNREAL, CameraPoses
 from stereogenbench_data.geometry.pose_forms import Reading, readings
 from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
+from stereogenbench_data.schema.conventions import PosesAs
 from stereogenbench_data.schema.quantities import UNITS_M
 from stereogenbench_data.schema.records import Rig
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from stereogenbench_data.schema.text import shortened
-from stereogenbench_data.schema.trajectory import record_poses
+from stereogenbench_data.schema.trajectory import RecordedPoses, record_poses
 
 _DEVIATION_CM: Final = 0.1
 _DEVIATION_SHARE: Final = 0.001
@@ -49,25 +50,37 @@ class Understood:
             the file itself names.
         differ: Whether poses in the world differ between these readings.
         note: How the poses contradict the primary pair; "" where they do not.
+        form: The reading that was taken, with its unit.
+        off_axis: How far the line of the cameras is from their x axis at most, as a sine.
     """
 
     poses: CameraPoses
     names: tuple[str, ...]
     differ: bool
     note: str = ""
+    form: str = ""
+    off_axis: float = 0.0
 
 
-def understood_poses(text: bytes, rig: Rig, *, where: str) -> Understood:
+def understood_poses(
+    text: bytes, rig: Rig, *, where: str, named: PosesAs | None = None
+) -> Understood:
     """Return the poses of a ``trajectory.json`` that fit a rig.
+
+    Args:
+        text: The file's bytes.
+        rig: The rig of the scene.
+        where: The file's path, for messages.
+        named: How conventions read them, which must pass as well as the best other reading.
 
     Raises:
         SchemaError: If no reading of its numbers passes, or several pass and disagree about where
-            the cameras stand to each other; it says what was tried.
+            the cameras stand to each other, or another one than the named; it says what was tried.
     """
     recorded = record_poses(text, where=where)
     failures: dict[str, str] = {}
     passed: list[tuple[Reading, CameraPoses, float]] = []
-    for reading in readings(recorded):
+    for reading in _readings(recorded, named):
         is_found = passed and _is_exact(passed) and not _is_reversed(passed[0][1], rig)
         if is_found and reading.tier > passed[0][0].tier:
             break
@@ -76,6 +89,7 @@ def understood_poses(text: bytes, rig: Rig, *, where: str) -> Understood:
             failures.setdefault(reason, reading.name)
         else:
             passed.append((reading, poses, off))
+    all_passed = list(passed)
     left, right = rig.primary_pair
     reversed_ = [each for each in passed if _is_reversed(each[1], rig)]
     note = ""
@@ -99,6 +113,9 @@ def understood_poses(text: bytes, rig: Rig, *, where: str) -> Understood:
             f"unit wrong?"
         )
     taken = passed[0]
+    _require_named(
+        named, taken, recorded, rig, failures=failures, all_passed=all_passed, where=where
+    )
     others = [each for each in passed[1:] if not _same_rig(each[1], taken[1])]
     if others:
         listed = ", ".join(shortened(each[0].name, 120) for each in (taken, *others)[:_SHOWN])
@@ -111,7 +128,90 @@ def understood_poses(text: bytes, rig: Rig, *, where: str) -> Understood:
     is_plain = len(worlds) == 1 and taken[0].tier == 0 and taken[1].unit_m in (
         taken[0].trajectory.unit_m, _UNREAL_M,
     )  # fmt: skip
-    return Understood(taken[1], () if is_plain else names, differ=len(worlds) > 1, note=note)
+    return Understood(
+        taken[1],
+        () if is_plain and named is None else names,
+        differ=len(worlds) > 1,
+        note=note,
+        form=names[0],
+        off_axis=taken[2],
+    )
+
+
+def _readings(recorded: RecordedPoses, named: PosesAs | None) -> Iterator[Reading]:
+    """Yield readings, those that conventions name first, in the unit that they name."""
+    if named is None:
+        yield from readings(recorded)
+        return
+    for reading in readings(recorded, named=named.fits):
+        if named.unit is not None and named.fits(reading.name):
+            unit_m = UNITS_M[named.unit]
+            yield replace(reading, trajectory=replace(reading.trajectory, unit_m=unit_m))
+        else:
+            yield reading
+
+
+def _own_form(recorded: RecordedPoses, rig: Rig, named: PosesAs, poses: CameraPoses) -> str:
+    """Return the form that a file itself names, if it passes and moves the cameras otherwise."""
+    for reading in readings(recorded):
+        if reading.tier > 0:
+            break
+        own, off, _ = (None, 0.0, "") if named.fits(reading.name) else _checked(reading, rig)
+        if own is not None and off <= _EXACT and not (
+            _same_world(own, poses) and _same_rig(own, poses)
+        ):  # fmt: skip
+            return reading.name
+    return ""
+
+
+def _require_named(  # noqa: PLR0913 - what the message tells
+    named: PosesAs | None,
+    taken: tuple[Reading, CameraPoses, float],
+    recorded: RecordedPoses,
+    rig: Rig,
+    *,
+    failures: Mapping[str, str],
+    all_passed: Sequence[tuple[Reading, CameraPoses, float]],
+    where: str,
+) -> None:
+    """Refuse poses that are not as conventions read them, or that the file's own form contradicts.
+
+    Args:
+        named: How conventions read the poses; None if they do not say.
+        taken: What fits best.
+        recorded: The numbers.
+        rig: The rig of the scene.
+        failures: Reasons to readings that fail.
+        all_passed: The readings that pass, also those that fit less well.
+        where: The file's path, for messages.
+    """
+    if named is None:
+        return
+    other, why = taken[0].name, "no numbers of the file have this form"
+    if named.fits(other):
+        other = _own_form(recorded, rig, named, taken[1])
+        why = "the file names another form, which fits as well and moves the cameras otherwise"
+    if not other:
+        return
+    reasons = [f"{reason} ({name})" for reason, name in failures.items() if named.fits(name)]
+    reasons += [
+        "the left camera of the primary pair stands on the right"
+        if _is_reversed(poses, rig)
+        else f"the line of the cameras is {np.degrees(np.arcsin(min(1.0, off))):.3g} degrees off "
+        f"their x axis, and {np.degrees(np.arcsin(taken[2])):.3g} by the other form"
+        for reading, poses, off in all_passed
+        if named.fits(reading.name) and not named.fits(taken[0].name)
+    ]
+    raise SchemaError(
+        f"{where}: the conventions read its poses as {shortened(_described(named), 300)}, and that "
+        f"does not fit: {'; '.join(reasons[:_SHOWN]) or why}. What fits is: "
+        f"{shortened(other, 300)}. Correct [poses], or leave it out."
+    )
+
+
+def _described(named: PosesAs) -> str:
+    stated = ((name, getattr(named, name)) for name in ("rotation", "form", "axes", "unit"))
+    return ", ".join(f"{name} {value!r}" for name, value in stated if value is not None)
 
 
 def _is_reversed(poses: CameraPoses, rig: Rig) -> bool:

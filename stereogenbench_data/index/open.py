@@ -29,8 +29,10 @@ from stereogenbench_data.index.parquet import (
     seek_tables_of,
     table_of_scenes,
 )
+from stereogenbench_data.index.restated import restated
 from stereogenbench_data.index.stale import StaleIndexWarning, stale_message
 from stereogenbench_data.index.tree import find_remote_scenes
+from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import SceneId
 from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.sources.location import (
@@ -90,6 +92,7 @@ def open_table(
     root: str | Path | None,
     retry: RetryPolicy | None,
     wanted: Callable[[SceneId], bool] | None = None,
+    conventions: Conventions | None = None,
 ) -> Opened:
     """Return the scenes of some data; `SceneIndex.open` describes the arguments and the errors.
 
@@ -99,13 +102,13 @@ def open_table(
     named_root = None if root is None else _require_root(root)
     if is_remote(data):
         where = shown(data)
-        opened = _open_url(str(data), root=named_root, retry=retry)
+        opened = _open_url(str(data), root=named_root, retry=retry, conventions=conventions)
     else:
         path = local_path(data)
         where = str(path)
         if path.is_dir() and not (path / INDEX_NAME).is_file():
             _require_no_root(path, named_root)
-            opened = _open_tree(path, wanted)
+            opened = _open_tree(path, wanted, conventions)
         elif path.is_dir() or path.is_file():
             file = path / INDEX_NAME if path.is_dir() else path
             opened = _open_file(file, root=named_root)
@@ -114,6 +117,11 @@ def open_table(
                 f"{path}: does not exist; expected an index file, a folder with {INDEX_NAME} or "
                 f"a folder in the released layout."
             )
+    if conventions is not None:
+        stated = restated(opened.table, opened.head, conventions, retry=retry)
+        if stated is not opened.table:
+            head = replace(opened.head, digest=table_digest(stated))
+            opened = opened._replace(table=stated, head=head)
     if left_out := opened.head.incomplete | opened.head.broken:
         message = text_without_secrets(f"{where}: {_listed(left_out)}")
         warnings.warn(message, IncompleteSceneWarning, stacklevel=3)
@@ -149,7 +157,9 @@ def warn_if_stale(root: str | Path) -> None:
         warnings.warn(stale, StaleIndexWarning, stacklevel=3)
 
 
-def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opened:
+def _open_url(
+    url: str, *, root: str | None, retry: RetryPolicy | None, conventions: Conventions | None
+) -> Opened:
     """Fetch an index. Its data are beside it, unless the user names another root."""
     beside, name = split_name(url)
     is_folder = not name.endswith(".parquet")
@@ -169,7 +179,7 @@ def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opene
                 f"their headers each time. Index it once, or the part you need: `stereogenbench "
                 f"index {shown(beside)} -o index.parquet --split eval`, and open that file."
             ) from None
-        return _open_tree(beside, None)
+        return _open_tree(beside, None, conventions)
     if size > MAX_INDEX_BYTES:
         raise StorageError(
             f"{remote.where}: an index may have {MAX_INDEX_BYTES:,} bytes, this one has "
@@ -183,10 +193,15 @@ def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opene
     return Opened(table, head, seek_tables=read_seek_tables(content))
 
 
-def _open_tree(root: str | Path, wanted: Callable[[SceneId], bool] | None) -> Opened:
+def _open_tree(
+    root: str | Path,
+    wanted: Callable[[SceneId], bool] | None,
+    conventions: Conventions | None,
+) -> Opened:
     """Describe the scenes of a folder or URL in the released layout, without a few broken ones."""
     # In this process: a script without `if __name__ == "__main__"` could start no others.
-    report, where = walk(root, workers=1, wanted=wanted, if_none="all"), shown(root)
+    report = walk(root, workers=1, wanted=wanted, if_none="all", conventions=conventions)
+    where = shown(root)
     if not report.scenes:
         raise StorageError(
             f"{where}: no scene is complete: {_listed(report.broken | report.incomplete)}"

@@ -20,6 +20,7 @@ from stereogenbench_data.samples.derive import RECTIFIED_PX, SceneFacts
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.samples.streams import OPEN_STREAMS, Streams, StreamStats
 from stereogenbench_data.samples.views import StoredDepth, Views
+from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import (
     TRAJECTORY_JSON,
@@ -108,7 +109,7 @@ class SampleDecoder:
         self._scenes: OrderedDict[int, _KnownScene] = OrderedDict()
         self._poses: OrderedDict[str, CameraPoses] = OrderedDict()
         self._depths: OrderedDict[tuple[int, ...], StoredDepth] = OrderedDict()
-        self._encodings: dict[tuple[float, str], DepthEncoding] = {}
+        self._encodings: dict[tuple[DepthEncoding, float, str], DepthEncoding] = {}
 
     @property
     def stats(self) -> StreamStats:
@@ -317,13 +318,14 @@ class SampleDecoder:
         return list(dict.fromkeys(cameras))
 
     def _encoding(self, scene: Scene, camera: int) -> DepthEncoding:
-        contract = self._request.depth or DepthEncoding()
+        contract = self._request.depth or depth_of(scene)
         unit_m, source = scene.depth_unit_m[camera], scene.depth_unit_source[camera]
         if source == "unreadable":
             return contract
-        if (unit_m, source) not in self._encodings:
-            self._encodings[unit_m, source] = contract.with_file_unit(unit_m, source=source)
-        return self._encodings[unit_m, source]
+        known = contract, unit_m, source
+        if known not in self._encodings:
+            self._encodings[known] = contract.with_file_unit(unit_m, source=source)
+        return self._encodings[known]
 
     def _pictures(
         self,

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from stereogenbench_data.errors import SchemaError
+from stereogenbench_data.schema.conventions import Shape
 from stereogenbench_data.schema.document import (
     MOST_LETTERS,
     brief,
@@ -111,14 +112,22 @@ class _Findings:
 
     where: str
     keys: str = ""
+    shape: Shape | None = None
     problems: list[str] = field(default_factory=list)
     remarks: list[Remark] = field(default_factory=list)
 
     def conflict(self, what: str, first: Stated, other: Stated) -> None:
         self.problems.append(
             f"{other.path}: states another {what} ({brief(other.value)} {other.unit}) than "
-            f"{first.path} ({brief(first.value)} {first.unit}). Remove the wrong one"
+            f"{first.path} ({brief(first.value)} {first.unit}). {self.cure}"
         )
+
+    @property
+    def cure(self) -> str:
+        """What to do about values that conflict."""
+        if self.shape is None:
+            return "Remove the wrong one"
+        return "Remove the wrong one, or list its place as 'ignored' in the conventions"
 
     def require_none(self) -> None:
         if self.problems:
@@ -213,7 +222,9 @@ def parse_description(text: bytes, *, where: str) -> tuple[Description, tuple[Re
     return Description(short, detailed, scene_type, setting, tags), tuple(findings.remarks)
 
 
-def parse_rig(text: bytes, *, where: str) -> tuple[Rig, SceneLabels, tuple[Remark, ...]]:
+def parse_rig(
+    text: bytes, *, where: str, shape: Shape | None = None
+) -> tuple[Rig, SceneLabels, tuple[Remark, ...]]:
     """Return the rig and the identifiers that a ``baseline.json`` records, and what is odd.
 
     Without an image size, the release's 1280 x 1280 is assumed (``image_size_source`` says so).
@@ -225,16 +236,18 @@ def parse_rig(text: bytes, *, where: str) -> tuple[Rig, SceneLabels, tuple[Remar
     Args:
         text: The file's bytes.
         where: The file's path, for messages.
+        shape: What conventions state about such files.
 
     Raises:
         SchemaError: If focal length, sensor width, a baseline or the primary pair is missing, not
-            understood or stated twice with other values; the message lists every problem.
+            understood or stated twice with other values, or the conventions are contradicted; the
+            message lists every problem.
 
     Source: the paper's appendix on the file schema.
     """
     document = parse_object(text, where=where)
-    nodes = nodes_of(document)
-    findings = _Findings(where, keys=_keys(document))
+    nodes = nodes_of(document) if shape is None else shape.nodes(document, where=where)
+    findings = _Findings(where, keys=_keys(document), shape=shape)
     baselines_cm, first_number = _baselines(document, nodes, findings)
     width, height = _side(nodes, "image_width"), _side(nodes, "image_height")
     width_px, height_px = width or IMAGE_SIZE_PX, height or width or IMAGE_SIZE_PX
@@ -248,7 +261,7 @@ def parse_rig(text: bytes, *, where: str) -> tuple[Rig, SceneLabels, tuple[Remar
         image_height_px=height_px,
         principal_point_px=_principal_point(nodes, findings, size_px=(width_px, height_px)),
         baselines_cm=tuple(baselines_cm.get(pair, math.nan) for pair in CAMERA_PAIRS),
-        primary_pair=_primary_pair(nodes, findings, first_number=first_number),
+        primary_pair=_primary_pair(document, nodes, findings, first_number=first_number),
         image_size_source="default" if width is None and height is None else "recorded",
     )
     labels = _labels(nodes, findings)
@@ -312,17 +325,31 @@ def _lens(nodes: list[Node], findings: _Findings, *, width_px: int) -> tuple[flo
         elif focal_mm and sensor_mm and abs(focal_mm / sensor_mm - ratio) > _RATIO * ratio:
             findings.problems.append(
                 f"{each.path}: {brief(each.value)} means {ratio:.6g} focal lengths a sensor width, "
-                f"and focal length and sensor width in mm mean {focal_mm / sensor_mm:.6g}. Remove "
-                f"the wrong ones"
+                f"and focal length and sensor width in mm mean {focal_mm / sensor_mm:.6g}. "
+                f"{findings.cure}"
             )
     for name, length_mm in (("focal_length_mm", focal_mm), ("sensor_width_mm", sensor_mm)):
         if not length_mm and not any(name[:5] in problem for problem in findings.problems):
             findings.problems.append(
                 f"$.camera_intrinsics.{name} is missing; the keys are: {findings.keys}"
             )
+    if findings.shape is not None and focal_mm and sensor_mm:
+        _require_lens(focal_mm, sensor_mm, findings)
     return focal_mm or 1.0, sensor_mm or 1.0
 
 
+def _require_lens(focal_mm: float, sensor_mm: float, findings: _Findings) -> None:
+    low, high = _FOCAL_LENGTHS
+    if not low <= focal_mm / sensor_mm <= high:
+        findings.problems.append(
+            f"by the conventions a focal length is {focal_mm:.6g} mm on a sensor {sensor_mm:.6g} "
+            f"mm wide, {focal_mm / sensor_mm:.3g} widths, and lenses have {low:g} to {high:g}. "
+            f"Correct the unit or the place"
+        )
+
+
+_FOCAL_LENGTHS: Final = (0.4, 6.0)
+"""Focal lengths in widths of the sensor that conventions may mean: the release has 0.76 to 3.6."""
 _RATIO: Final = 1e-3
 """How far a field of view may be from focal length over sensor width: it is often rounded."""
 
@@ -349,6 +376,9 @@ def _principal_point(
             place_px.append(side_px / 2)  # a share of the side
         elif usable and 1 < usable[0].value < side_px:
             place_px.append(float(usable[0].value))
+            for each in usable[1:] if findings.shape is not None else ():
+                if abs(each.value - usable[0].value) > each.rounding + usable[0].rounding:
+                    findings.conflict("principal point", usable[0], each)
         else:
             shown = ", ".join(f"{each.path} {brief(each.value)}" for each in found) or "one side"
             findings.remarks.append(
@@ -364,10 +394,12 @@ def _principal_point(
     return place_px[0], place_px[1]
 
 
-def _primary_pair(nodes: list[Node], findings: _Findings, *, first_number: int) -> Pair:
+def _primary_pair(
+    document: dict[str, Any], nodes: list[Node], findings: _Findings, *, first_number: int
+) -> Pair:
     pairs: list[tuple[Stated, Pair]] = []
     odd: list[str] = []
-    for each in stated(nodes, "primary_pair"):
+    for each in [*_stated_pair(document, findings), *stated(nodes, "primary_pair")]:
         value = each.value
         if isinstance(value, dict):
             left, right = (_end(value, side) for side in ("left", "right"))
@@ -391,13 +423,26 @@ def _primary_pair(nodes: list[Node], findings: _Findings, *, first_number: int) 
         if pairs and pairs[0][1] != (left, right):
             findings.conflict("primary pair", pairs[0][0], each)
         pairs.append((each, (left, right)))
-    if pairs:
+    is_stated = findings.shape is not None and findings.shape.primary_pair is not None
+    if pairs and not (is_stated and odd):
         return pairs[0][1]
     findings.problems += odd or [
         f"$.primary_stereo_pair is missing, so nothing tells which camera is left; the keys are: "
         f"{findings.keys}"
     ]
     return 0, 1
+
+
+def _stated_pair(document: dict[str, Any], findings: _Findings) -> list[Stated]:
+    """Return the primary pair that conventions state, as a list of two cameras."""
+    shape = findings.shape
+    if shape is None or shape.primary_pair is None:
+        return []
+    paths = (shape.primary_pair.left, shape.primary_pair.right)
+    cameras = [
+        shape.value_at(document, path, table="primary_pair", where=findings.where) for path in paths
+    ]
+    return [Stated(cameras, "", " and ".join(paths))]
 
 
 def _end(pair: dict[str, Any], side: str) -> int | None:
@@ -448,7 +493,7 @@ def _baselines(
             if abs(length_cm - known_cm) > rounding_cm + known_rounding_cm:
                 findings.problems.append(
                     f"{each.path}: the baseline of cameras {low} and {high} is {length_cm:.9g} cm "
-                    f"here and {known_cm:.9g} cm at {known.path}. Remove the wrong one"
+                    f"here and {known_cm:.9g} cm at {known.path}. {findings.cure}"
                 )
             continue
         best[pair] = length_cm, rounding_cm, each
@@ -496,10 +541,30 @@ def _recorded_lengths(
     five lengths of neighbours, below a key that speaks of pairs or baselines.
     """
     default_m = length_unit_m(nodes) or 0.01
+    shape = findings.shape
+    at = None if shape is None else shape.baselines
+    if at is not None and shape is not None:
+        default_m = UNITS_M.get(at.unit or "", default_m)
+        value = shape.value_at(document, at.place, table="baselines", where=findings.where)
+        name = f"baselines_{words(at.place.rpartition('.')[2])}"
+        there = list(_lengths_below([(value, name, at.place)], default_m, findings))
+        if not any(math.isclose(cm / each.value, default_m * 100) for _, cm, each in there):
+            findings.problems.append(
+                f"{at.place}: by the conventions baselines in {at.unit or 'the unit of the file'} "
+                f"stand here, and {brief(value)} has none. Correct the place or the unit"
+            )
+        yield from there
     keys = sorted(document, key=lambda key: key != "pairwise_pairs")
-    waiting: list[tuple[Any, str, str]] = [
-        (document[key], words(key), child_path("$", key)) for key in keys
-    ]
+    by_name = [(document[key], words(key), child_path("$", key)) for key in keys]
+    for found in _lengths_below(by_name, default_m, findings):
+        if shape is None or not shape.ignores(found[2].path):
+            yield found
+
+
+def _lengths_below(
+    waiting: list[tuple[Any, str, str]], default_m: float, findings: _Findings
+) -> Iterable[_Recorded]:
+    """Yield the pairs of `_recorded_lengths` in values with their names in words and places."""
     for node, name, path in waiting:
         if "primary" in name or not isinstance(node, dict | list):
             continue

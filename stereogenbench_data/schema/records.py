@@ -26,7 +26,7 @@ RotationKind = Literal["rotator_deg", "quaternion_xyzw", "matrix"]
 DepthKind = Literal["planar", "ray"]
 DepthForm = Literal["depth", "inverse"]
 DepthRisk = Literal["8-bit", "9-bit", "10-bit", "12-bit", "14-bit", "lossy", "chroma"]
-DepthUnitSource = Literal["tag", "default", "unreadable"]
+DepthUnitSource = Literal["tag", "default", "conventions", "unreadable"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +167,8 @@ class DepthEncoding:
         accept: Kinds of streams that are refused unless listed here: fewer than 16 bits ("8-bit",
             "9-bit", "10-bit", "12-bit", "14-bit"), "lossy" (a lossy codec) or "chroma" (only the
             luma plane is read).
-        source: The origin of ``unit_m``: a tag of the file, the release's default, or the user.
+        source: The origin of ``unit_m``: a tag of the file, the release's default, the data's
+            conventions, or the user.
 
     Raises:
         SchemaError: If a value is out of range.
@@ -181,7 +182,7 @@ class DepthEncoding:
     frame_lag: int = 0
     no_depth: tuple[int | Literal["max"], ...] = (0, "max")
     accept: frozenset[DepthRisk] = frozenset()
-    source: Literal["tag", "default", "user"] = "user"
+    source: Literal["tag", "default", "conventions", "user"] = "user"
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
@@ -222,7 +223,7 @@ class DepthEncoding:
         return self.unit_m
 
     def with_file_unit(
-        self, unit_m: float, *, source: Literal["tag", "default"]
+        self, unit_m: float, *, source: Literal["tag", "default", "conventions"]
     ) -> "DepthEncoding":
         """Return the encoding with the file's unit, unless it has its own."""
         return self if self.unit_m is not None else replace(self, unit_m=unit_m, source=source)
@@ -284,8 +285,8 @@ class Scene:
         rig_residual_px: The largest distance between the closed form of a rectified rig and
             the pose chain, in pixels of the recorded image.
         depth_unit_m: Metres in a stored unit of each camera's depth, from its tag or the default.
-        depth_unit_source: "tag", "default", or "unreadable" (contradictory tags, unit nan), per
-            camera.
+        depth_unit_source: "tag", "default", "conventions", or "unreadable" (contradictory tags,
+            unit nan), per camera.
         depth_codec: FFmpeg's name of the codec of each camera's depth, or "blosc2" for depth
             packed by blosc2.
         depth_pixel_format: FFmpeg's name of the pixel format of each camera's depth.
@@ -297,6 +298,8 @@ class Scene:
         pose_form: The names of the readings of its trajectory that the rig's geometry confirms,
             the chosen one first, joined by "|"; None for the one that the file itself names, and
             where poses are not understood.
+        conventions: What conventions state about its files, as `schema.conventions.Shape.text`
+            writes it; None where it was described without any.
         members: File name to the place of its bytes. Depth packed by blosc2 has a name of its own,
             which `held_name` returns.
         seek_tables: Where the packets of its videos lie, as `media.seek_table` packs it; None where
@@ -321,6 +324,7 @@ class Scene:
     training: TrainingFacts | None = None
     remarks: tuple[Remark, ...] = ()
     pose_form: str | None = None
+    conventions: str | None = None
     seek_tables: bytes | None = field(default=None, compare=False, repr=False)
 
     def held_name(self, name: str) -> str:

@@ -30,6 +30,7 @@ from stereogenbench_data.media.depth import (
 from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.picture_encoding import measured_error
 from stereogenbench_data.media.video import VideoReader, probe, require_pixel_aspect
+from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
@@ -419,7 +420,7 @@ def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
     if name not in depth_names:
         return
     camera = depth_names.index(name)
-    encoding = resolve_encoding(facts, name=name)
+    encoding = resolve_encoding(facts, name=name, override=depth_of(scene))
     found = (facts.codec, facts.pixel_format, encoding.known_unit_m)
     indexed = (
         scene.depth_codec[camera],

@@ -302,7 +302,10 @@ def _length_answers(scenes: Sequence[SceneDiagnosis], unit: Unit) -> tuple[Answe
     The last two are never known by themselves.
     """
     first = scenes[0]
-    where = {"tag": "by the files' tag", "default": "by default", "user": "as given"}
+    where = {
+        "tag": "by the files' tag", "default": "by default", "user": "as given",
+        "conventions": "by the conventions",
+    }  # fmt: skip
     declared = f"{first.unit_m:g} m, {where.get(first.unit_source, 'tags unreadable')}"
     quotient = _quotient(scenes, unit)
     of_unit = Answer("metres a unit", declared, "", "not seen alone", note=_ALONE)
@@ -422,6 +425,7 @@ class Verdict:
 
     Attributes:
         scenes: Their keys.
+        declared: The contract under test.
         answers: One for each question.
         gain: By how much the best contract is better than the declared one.
         agreement: Share of the matches of neighbouring cameras that the best contract explains.
@@ -442,6 +446,7 @@ class Verdict:
     """
 
     scenes: tuple[str, ...]
+    declared: DepthEncoding
     answers: tuple[Answer, ...]
     gain: Gain
     agreement: float
@@ -497,6 +502,7 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
         choices = _length_choices(scenes, unit, encoding_line(with_unit))
     return Verdict(
         scenes=tuple(scene.key for scene in scenes),
+        declared=declared,
         answers=answers,
         gain=pooled([scene.gain for scene in scenes]),
         agreement=float(np.nanmean([scene.agreement for scene in scenes]))
