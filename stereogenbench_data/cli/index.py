@@ -1,9 +1,9 @@
 """``stereogenbench index``: walk a released tree once, so that it opens at once afterwards."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -19,13 +19,11 @@ from stereogenbench_data.cli.options import (
     SplitOption,
     WorkOptions,
     grouped,
+    wanted_scenes,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import require_writable, writing
 from stereogenbench_data.schema.text import counted, plain_line
-
-if TYPE_CHECKING:
-    from stereogenbench_data.schema.records import SceneId
 
 _INDEX_NAME = "index.parquet"
 
@@ -71,7 +69,7 @@ def index(  # noqa: PLR0913 - one parameter an option
     console = Console(stderr=True)
     target = out or Path("." if is_remote(root) else root, _INDEX_NAME)
     mode: Literal["skip", "sample"] = "sample" if valid_depth else "skip"
-    wanted = _passing(split, family or [], map_name or [])
+    wanted = wanted_scenes(split, family or [], map_name or [])
     if wanted is not None and out is None:
         raise typer.BadParameter(
             "the index of a part needs its own file: name it with --out FILE.",
@@ -144,19 +142,6 @@ def index(  # noqa: PLR0913 - one parameter an option
             markup=False, highlight=False, soft_wrap=True,
         )  # fmt: skip
     raise typer.Exit(status)
-
-
-def _passing(
-    split: str | None, families: list[str], maps: list[str]
-) -> "Callable[[SceneId], bool] | None":
-    """Return a function that says whether the options select a scene; None if they select all."""
-    if not (split or families or maps):
-        return None
-    return lambda scene: (
-        split in (None, "", scene.split)
-        and (not families or scene.family in families)
-        and (not maps or scene.map_name in maps)
-    )
 
 
 def _list(console: Console, title: str, reasons: Mapping[str, str]) -> None:

@@ -26,7 +26,7 @@ from stereogenbench_data.schema.release import (
 
 if TYPE_CHECKING:
     from stereogenbench_data.index.table import SceneIndex
-    from stereogenbench_data.schema.records import DepthEncoding
+    from stereogenbench_data.schema.records import DepthEncoding, SceneId
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
@@ -201,6 +201,19 @@ def out_folder(text: str) -> Path:
     if not text:
         raise typer.BadParameter("the path is empty: name a folder, or . for this one.")
     return Path(text)
+
+
+def wanted_scenes(
+    split: str | None, families: list[str], maps: list[str]
+) -> "Callable[[SceneId], bool] | None":
+    """Return a function that says whether the options select a scene; None if they select all."""
+    if not (split or families or maps):
+        return None
+    return lambda scene: (
+        split in (None, "", scene.split)
+        and (not families or scene.family in families)
+        and (not maps or scene.map_name in maps)
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -51,7 +51,6 @@ class Understood:
         differ: Whether poses in the world differ between these readings.
         note: How the poses contradict the primary pair; "" where they do not.
         form: The reading that was taken, with its unit.
-        off_axis: How far the line of the cameras is from their x axis at most, as a sine.
     """
 
     poses: CameraPoses
@@ -59,7 +58,6 @@ class Understood:
     differ: bool
     note: str = ""
     form: str = ""
-    off_axis: float = 0.0
 
 
 def understood_poses(
@@ -134,7 +132,6 @@ def understood_poses(
         differ=len(worlds) > 1,
         note=note,
         form=names[0],
-        off_axis=taken[2],
     )
 
 

@@ -581,3 +581,15 @@ def keys_of(node: Any, *, place: str = "$") -> set[str]:
             found |= {inner} if not isinstance(value, dict) else set()
             found |= keys_of(value, place=inner)
     return found
+
+
+def place_of(path: str) -> str:
+    """Return a JSON path as `keys_of` names it.
+
+    >>> place_of('$.pairwise_pairs[3].baseline_cm'), place_of('$.baselines["0-1"]')
+    ('$.pairwise_pairs[].baseline_cm', '$.baselines.#_#')
+    """
+    steps = re.findall(r'\.([^.\[]+)|\[([0-9]+)\]|\["((?:[^"\\]|\\.)*)"\]', path)
+    named = ("[]" if number else f".{re.sub('[0-9]+', '#', words(plain or quoted))}"
+             for plain, number, quoted in steps)  # fmt: skip
+    return "$" + "".join(named)

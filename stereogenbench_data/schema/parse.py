@@ -13,7 +13,15 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.conventions import Shape
+from stereogenbench_data.schema.conventions import (
+    NUMBERS,
+    BaselinesAt,
+    NumberAt,
+    PrimaryPairAt,
+    Shape,
+    keys_of,
+    place_of,
+)
 from stereogenbench_data.schema.document import (
     MOST_LETTERS,
     brief,
@@ -23,6 +31,7 @@ from stereogenbench_data.schema.document import (
     parse_object,
 )
 from stereogenbench_data.schema.quantities import (
+    NAMES,
     UNITS_M,
     Node,
     Stated,
@@ -655,3 +664,110 @@ def _length(
         findings.problems.append(f"{path}: must be a number above zero, found {brief(value)}")
         return
     yield cameras, float(value) * (unit_m / 0.01), Stated(value, "", path)
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """Where the quantities of a ``baseline.json`` stand.
+
+    Attributes:
+        shape: What conventions would state about the file.
+        found: For each table, the values that it means, and other places that state the same.
+        unknown: The places of numbers and texts, as `keys_of` names them, that nothing reads.
+    """
+
+    shape: Shape
+    found: dict[str, list[str]]
+    unknown: list[str]
+
+
+def see_rig(text: bytes, *, where: str) -> Seen:
+    """Return where the quantities of a ``baseline.json`` stand, as `parse_rig` finds them.
+
+    Raises:
+        SchemaError: If it is not a JSON object.
+    """
+    document = parse_object(text, where=where)
+    nodes, findings = nodes_of(document), _Findings(where)
+    numbers_at: dict[str, NumberAt] = {}
+    found: dict[str, list[str]] = {}
+    read: set[str] = set()
+    for name, quantity in NUMBERS.items():
+        usable = [each for each in numbers(nodes, quantity) if _is_usable(name, each)]
+        read |= {place_of(each.path) for each in stated(nodes, quantity)}
+        if not usable:
+            continue
+        first, *others = usable
+        unit = first.unit or _USUAL_UNITS.get(name)
+        numbers_at[name] = NumberAt(place=first.path, unit=unit)
+        found[name] = [f"{first.path} is {first.value:g}{f' {unit}' if unit else ''}"]
+        found[name] += [f"{each.path} is {each.value:g} {each.unit}".rstrip() for each in others]
+    lengths = list(_recorded_lengths(document, nodes, findings))
+    lengths.sort(key=lambda each: not each[2].path.startswith("$.pairwise_pairs"))
+    read |= {place_of(each.path) for _, _, each in lengths}
+    baselines = None
+    if lengths:
+        steps = [_steps(each.path) for _, _, each in lengths]
+        same = [each for each in steps if each[:1] == steps[0][:1]]
+        alike = itertools.takewhile(lambda step: len({*step}) == 1, zip(*same, strict=False))
+        common = [step[0] for step in alike]
+        place = "$" + "".join(common if len(common) < len(steps[0]) else common[:-1])
+        pair, length_cm, each = lengths[0]
+        unit_m = length_cm / 100 / each.value
+        unit = next((name for name in ("mm", "cm", "m") if math.isclose(UNITS_M[name], unit_m)), "")
+        baselines = BaselinesAt(place=place, unit=unit or None)
+        found["baselines"] = [
+            f"{each.path} is {each.value:g}, {length_cm:g} cm of cameras {pair[0]} and {pair[1]}",
+            f"{len(same)} lengths below {place}, {len(lengths) - len(same)} elsewhere",
+        ]
+    primary = _seen_pair(nodes)
+    if primary is not None:
+        found["primary_pair"] = [f"{primary.left} is the left camera, {primary.right} the right"]
+        read |= {place_of(primary.left), place_of(primary.right)}
+    read |= {place_of(each.path) for quantity in NAMES for each in stated(nodes, quantity)}
+    shape = Shape(numbers=numbers_at, baselines=baselines, primary_pair=primary)
+    keys = keys_of(document)
+    unknown = sorted(
+        key for key in keys
+        if not any(key == each or key.startswith((f"{each}.", f"{each}[")) for each in read)
+        and not any(each.startswith(f"{key}[]") for each in keys)
+        and not _NAMES_A_CAMERA.search(key.rpartition(".")[2])
+    )  # fmt: skip
+    return Seen(shape, found, unknown)
+
+
+_USUAL_UNITS: Final = {
+    **dict.fromkeys(("focal_length", "sensor_width", "sensor_height"), "mm"),
+    "field_of_view": "deg",
+}
+
+
+def _is_usable(name: str, each: Stated) -> bool:
+    """Return whether a number is what a table of conventions may mean."""
+    if name in ("focal_length", "sensor_width", "sensor_height"):
+        return each.value > 0 and each.unit in ("", *UNITS_M)
+    if name == "focal_length_px":
+        return bool(each.value > 0 and (each.unit.startswith("p") or each.path[-1:] in "xX"))
+    return bool(each.value > 0)
+
+
+def _steps(path: str) -> list[str]:
+    return re.findall(r"\.[^.\[]+|\[[^\]]*\]", path)
+
+
+def _seen_pair(nodes: list[Node]) -> PrimaryPairAt | None:
+    """Return where the primary pair names its cameras."""
+    for each in stated(nodes, "primary_pair"):
+        ends: list[str | int] = [0, 1]
+        if isinstance(each.value, dict):
+            sides = {
+                side: key for side in ("right", "left") for key, value in each.value.items()
+                if side in words(key).split("_") and _camera(value) is not None
+            }  # fmt: skip
+            ends = [sides[side] for side in ("left", "right") if side in sides]
+        elif not isinstance(each.value, list) or len(each.value) != 2:
+            continue
+        if len(ends) == 2:
+            left, right = (child_path(each.path, end) for end in ends)
+            return PrimaryPairAt(left=left, right=right)
+    return None
