@@ -27,6 +27,7 @@ def open_data(
         StorageError: If the data do not exist, hold no complete scene, or contradict conventions.
     """
     from stereogenbench_data.errors import StorageError
+    from stereogenbench_data.index.assumptions import assumptions
     from stereogenbench_data.index.build import walk
     from stereogenbench_data.index.parquet import INDEX_NAME
     from stereogenbench_data.index.table import SceneIndex
@@ -40,6 +41,9 @@ def open_data(
     stated = None if conventions is None else Conventions.read(conventions)
     with progress_bar("reading scenes", unit="scenes") as progress:
         report = walk(folder, progress=progress, conventions=stated)
+    assumed = assumptions(report.scenes, where=str(folder))
+    if assumed:
+        typer.echo(plain_line(assumed), err=True)
     reasons = [*report.broken.values(), *report.incomplete.values()]
     if not reasons:
         return SceneIndex.from_report(report)
@@ -70,6 +74,7 @@ def open_index(
     Raises:
         StorageError: If the data do not exist, hold a broken scene, or contradict conventions.
     """
+    from stereogenbench_data.index.assumptions import AssumptionWarning
     from stereogenbench_data.index.open import IncompleteSceneWarning
     from stereogenbench_data.index.stale import StaleIndexWarning
     from stereogenbench_data.index.table import SceneIndex
@@ -77,6 +82,7 @@ def open_index(
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always", IncompleteSceneWarning)
         warnings.simplefilter("always", StaleIndexWarning)
+        warnings.simplefilter("always", AssumptionWarning)
         index = SceneIndex.open(data, root=root, conventions=conventions)
     for warning in warned:
         typer.echo("\n".join(map(plain_line, str(warning.message).split("\n"))), err=True)

@@ -19,6 +19,7 @@ import pyarrow as pa
 
 from stereogenbench_data.errors import StorageError, text_without_secrets
 from stereogenbench_data.index.arrow import table_digest
+from stereogenbench_data.index.assumptions import AssumptionWarning, assumptions
 from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.parquet import (
     INDEX_NAME,
@@ -78,12 +79,14 @@ class Opened(NamedTuple):
         head: What is known besides, with the root where the data are.
         stale: How the root differs from the index, with the cure; "" if it does not.
         seek_tables: Where the packets of the videos lie.
+        assumed: What was taken for granted about the files of a tree; "" where nothing was.
     """
 
     table: pa.Table
     head: IndexHead
     stale: str = ""
     seek_tables: SeekTables = None
+    assumed: str = ""
 
 
 def open_table(
@@ -127,6 +130,8 @@ def open_table(
         warnings.warn(message, IncompleteSceneWarning, stacklevel=3)
     if opened.stale:
         warnings.warn(opened.stale, StaleIndexWarning, stacklevel=3)
+    if opened.assumed:
+        warnings.warn(opened.assumed, AssumptionWarning, stacklevel=3)
     return opened
 
 
@@ -219,7 +224,12 @@ def _open_tree(
         is_part=report.is_part,
     )
     table = table_of_scenes(report.scenes, where=where)
-    return Opened(table, head, seek_tables=seek_tables_of(report.scenes))
+    return Opened(
+        table,
+        head,
+        seek_tables=seek_tables_of(report.scenes),
+        assumed=assumptions(report.scenes, where=where),
+    )
 
 
 def _require_digest(table: pa.Table, head: IndexHead, *, where: str) -> None:

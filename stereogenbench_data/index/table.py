@@ -108,7 +108,8 @@ class SceneIndex:
                 an index are not described again: files of some scenes are compared with them.
 
         Warns with `IncompleteSceneWarning` of scenes that were left out: it counts them and names
-        the first.
+        the first; and with `AssumptionWarning` of what was taken for granted, where the files of a
+        folder without an index are not as the paper prints them and no conventions are given.
 
         Raises:
             StorageError: If there are no such data, they hold no scene, the index is damaged or of
@@ -117,10 +118,14 @@ class SceneIndex:
             SchemaError: If the conventions are not understood.
         """
         stated = None if conventions is None else Conventions.read(conventions)
-        table, head, stale, seek_tables = open_table(
-            data, root=root, retry=retry, wanted=wanted, conventions=stated
+        opened = open_table(data, root=root, retry=retry, wanted=wanted, conventions=stated)
+        return cls(
+            opened.table,
+            opened.head,
+            retry=retry,
+            stale=opened.stale,
+            seek_tables=opened.seek_tables,
         )
-        return cls(table, head, retry=retry, stale=stale, seek_tables=seek_tables)
 
     @classmethod
     def from_scenes(
