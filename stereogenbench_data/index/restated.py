@@ -52,8 +52,8 @@ def restated(
         if found:
             name, difference = found[0]
             raise StorageError(
-                f"{where}: {scene.id.key}/{name}: {difference}, by {conventions.where}. Correct "
-                f"the conventions; or {made_again(where)}"
+                f"{where}: {scene.id.key}/{name}: {difference}; so it is by {conventions.where}. "
+                f"Correct the conventions. If the index is wrong: {made_again(where)}"
             )
     replaced = {"conventions": [texts[0]] * table.num_rows}
     unit_m = None if shape.depth is None else shape.depth.encoding.unit_m

@@ -368,7 +368,7 @@ def parse_conventions(text: bytes, *, where: str) -> Conventions:
     for number, table in enumerate(tables, 1):
         place = f"{where}: shape {number}" if len(tables) > 1 else where
         if not isinstance(table, dict):
-            raise SchemaError(f"{place}: must be a table, found {_shown(table)}. Write [[shape]].")
+            raise SchemaError(f"{place}: shape must be a table, found {_shown(table)}: [[shape]].")
         shapes.append(_shape(table, where=place))
     return Conventions(tuple(shapes), where)
 
