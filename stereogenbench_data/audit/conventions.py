@@ -21,7 +21,7 @@ from stereogenbench_data.audit.contract.verdict import (
     encoding_line,
 )
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
-from stereogenbench_data.errors import SelectionError, StereoGenBenchError
+from stereogenbench_data.errors import SelectionError, StereoGenBenchError, StorageError
 from stereogenbench_data.index.learning import (
     Examined,
     Learned,
@@ -35,6 +35,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.conventions import Conventions, DepthAs, Shape, write_toml
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
 from stereogenbench_data.schema.text import counted
+from stereogenbench_data.sources.location import is_remote, shown
 
 SCENES: Final = 20
 FRAMES: Final = 3
@@ -97,20 +98,27 @@ def survey(  # noqa: PLR0913 - each names one thing that a user chooses
 
     Raises:
         SelectionError: If no scene is wanted, or a number is below 1.
-        StorageError: If the tree holds no scenes.
+        StorageError: If the tree holds no scenes, or none of those looked at is finished.
     """
     if scenes < 1 or pictured < 0:
         raise SelectionError(f"scenes must be at least 1, got {scenes}: ask for more.")
     keys = chosen_scenes(root, count=scenes, wanted=wanted)
     if not keys:
-        raise SelectionError(f"{root}: no scene passes the filters. Check their spelling.")
+        raise SelectionError(f"{shown(root)}: no scene passes the filters. Check their spelling.")
     found = list[Examined]()
-    results = engine.map(_ExamineTask(str(root), conventions), keys, name=str, workers=workers)
+    # Reading takes less time than starting processes, unless each file is fetched.
+    readers = workers if is_remote(root) or engine is not LOCAL else 1
+    results = engine.map(_ExamineTask(str(root), conventions), keys, name=str, workers=readers)
     with closing(results):
         for each in results:
             found += [] if each is None else [each]
             if progress is not None:
                 progress(len(found), len(keys))
+    if not found:
+        raise StorageError(
+            f"{shown(root)}: none of the {counted(len(keys), 'scene')} that were looked at is "
+            f"finished, with videos. Download some whole."
+        )
     found.sort(key=lambda each: keys.index(each.key))
     how: dict[str, Any] = {"workers": workers, "engine": engine}
     if conventions is not None:

@@ -205,7 +205,7 @@ def _learned_poses(folder: SceneFolder, scene: Scene) -> tuple[PosesAs | None, l
     reason = scene.remark("poses").replace(f"{scene.id.key}/", "")
     if reason:
         unread = f'to train without poses and say so, write [poses] with form = "{UNKNOWN}"'
-        return None, [f"not understood: {reason}", unread]
+        return None, [unread, f"not understood: {reason}"]
     text, where = folder.read(TRAJECTORY_JSON), TRAJECTORY_JSON
     try:
         found = understood_poses(text, scene.rig, where=where)
@@ -306,6 +306,11 @@ def learn(root: str | Path, examined: Sequence[Examined]) -> Learned:
         depth = _stated_depth(group)
         shapes.append((replace(group[0].shape, has=has, depth=depth), group))
     shapes.sort(key=lambda pair: not pair[0].has)
+    problems += [
+        f"{group[0].key}: poses: {group[0].notes['poses'][-1]}"
+        for shape, group in shapes
+        if group[0].scene is not None and shape.poses is None
+    ]
     conventions = Conventions(tuple(shape for shape, _ in shapes), "the conventions learned")
     learned = Learned(conventions, [group for _, group in shapes], problems=problems)
     verify(root, learned, others if usable else [])
