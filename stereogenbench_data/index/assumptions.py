@@ -1,7 +1,8 @@
 """What opening a tree takes for granted, in one line: where files are not as the paper prints them.
 
 Scenes as the paper prints them, and those that conventions state, have nothing to say. What fields
-of samples need and files lack (poses, units of depth) is told where samples are made.
+of samples need and files lack (poses, a principal point, units of depth) is told where samples are
+made.
 """
 
 from collections import Counter
@@ -14,8 +15,6 @@ from stereogenbench_data.schema.text import counted, shortened
 _PHRASES: Final = {
     "size": "the videos' picture size counts, where baseline.json has another",
     "baselines": "baselines that are not recorded are sums of their neighbours",
-    "principal point": "the principal point is the picture's centre, as the recorded one is not "
-    "understood",
     "frames": "the frames that all videos have are used",
     "world": "several readings of the poses fit the baselines, and fields that depend on the "
     "reading are refused",
