@@ -3,11 +3,12 @@
 import re
 import shutil
 import warnings
+from dataclasses import replace
 
 import pytest
 
 from stereogenbench_data.datasets.mapped import SceneViews, StereoPairs
-from stereogenbench_data.errors import FieldError, StereoGenBenchError
+from stereogenbench_data.errors import FieldError, StereoGenBenchError, StorageError
 from stereogenbench_data.index.assumptions import AssumptionWarning
 from stereogenbench_data.index.learning import chosen_scenes, examine, learn, tables_of_notes
 from stereogenbench_data.index.parquet import INDEX_NAME
@@ -32,7 +33,7 @@ def learned_of(root):
     return learned, write_toml(learned.conventions, dict(tables_of_notes(learned)))
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def elsewhere(shared_scenes):
     """What the scene that was rendered elsewhere teaches."""
     return learned_of(shared_scenes)
@@ -214,6 +215,15 @@ def test_conventions_of_an_index_that_lacks_them_are_compared_with_its_files(mak
     assert index.shapes[0].depth.encoding.kind == "ray"
     assert index.scene(0).depth_unit_source == ("conventions",) * 6
     assert index.digest != SceneIndex.open(root).digest
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"depth": {"unit_m": -1}}', '{"poses": {"x": 1}}'])
+def test_an_index_whose_conventions_were_altered_is_refused(make_scene, root, text):
+    make_scene()
+    scene = replace(SceneIndex.open(root).scene(0), conventions=text)
+
+    with pytest.raises(StorageError, match="conventions"):
+        SceneIndex.from_scenes([scene], root)
 
 
 def test_conventions_beside_an_open_index_are_refused(make_scene, root):
