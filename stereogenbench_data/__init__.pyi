@@ -43,6 +43,7 @@ from stereogenbench_data.evaluation.models.registry import ModelOptions as Model
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol as EvaluationProtocol
 from stereogenbench_data.evaluation.report import write_report as write_report
 from stereogenbench_data.evaluation.tables import tables_of as tables_of
+from stereogenbench_data.index.assumptions import AssumptionWarning as AssumptionWarning
 from stereogenbench_data.index.open import IncompleteSceneWarning as IncompleteSceneWarning
 from stereogenbench_data.index.stale import StaleIndexWarning as StaleIndexWarning
 from stereogenbench_data.index.table import SceneIndex as SceneIndex
@@ -60,6 +61,7 @@ from stereogenbench_data.samples.transforms import Letterbox as Letterbox
 from stereogenbench_data.samples.transforms import RandomCrop as RandomCrop
 from stereogenbench_data.samples.transforms import RandomScale as RandomScale
 from stereogenbench_data.samples.transforms import Resize as Resize
+from stereogenbench_data.schema.conventions import Conventions as Conventions
 from stereogenbench_data.schema.records import DepthEncoding as DepthEncoding
 from stereogenbench_data.selection.pairs import FewerPairsWarning as FewerPairsWarning
 from stereogenbench_data.selection.quality import order_quality as order_quality

@@ -21,6 +21,7 @@ Warnings, each a `UserWarning`, stand beside the code that gives them:
 
 StaleIndexWarning        index.stale          a folder differs from its index
 IncompleteSceneWarning   index.open           some scenes of the data cannot be used
+AssumptionWarning        index.assumptions    files are not as the paper prints them
 OddSceneWarning          samples.checks       selected scenes differ from what the release promises
 SwappedSizeWarning       samples.size         a size looks like (width, height)
 OversizedSceneWarning    shards.pack          some scenes alone exceed the size of a shard

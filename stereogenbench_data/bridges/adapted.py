@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar, Unpack, cast
 
 from torch.utils.data import ConcatDataset, Dataset, default_collate
@@ -12,6 +13,7 @@ from stereogenbench_data.datasets.mapped import Check, Data, StereoPairs
 from stereogenbench_data.errors import FieldError, SelectionError
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.request import Transform
+from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.options import options_of, require_options
 from stereogenbench_data.selection.plan import Selection
@@ -26,6 +28,7 @@ class PairsOptions(Selection, total=False):
     size: tuple[int, int] | str | None
     transform: Transform | None
     depth: DepthEncoding | None
+    conventions: str | Path | Conventions | None
     seed: int
     cache: ShardCache | None
     check: Check

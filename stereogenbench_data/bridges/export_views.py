@@ -31,6 +31,7 @@ from stereogenbench_data.engine import Advance, Progress
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.checks import check_samples
+from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters
 from stereogenbench_data.selection.options import require_options
@@ -211,7 +212,10 @@ class _SceneWork:
 def _export_scene(work: _SceneWork, advance: Advance) -> None:
     """Write the missing folders of one scene, each whole or not at all."""
     scene = work.index.scene(0)
-    encodings = {camera: scene.depth_encoding(camera, work.depth) for camera in work.cameras}
+    encodings = {
+        camera: scene.depth_encoding(camera, work.depth or depth_of(scene))
+        for camera in work.cameras
+    }
     with closing(PosedImageReader(work.index, size=work.size, depth=work.depth)) as reader:
         for folder, frames in work.frames_of.items():
             unfinished = folder.with_name(f".{folder.name}.unfinished")

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -19,6 +19,7 @@ from stereogenbench_data.cli.options import (
     SceneOptions,
     WorkOptions,
     complete_from,
+    depth_of,
     grouped,
 )
 from stereogenbench_data.cli.progress import progress_bar
@@ -56,9 +57,9 @@ def audit(  # noqa: PLR0913 - one parameter an option
         ),
     ] = None,
     depth_kind: Annotated[
-        Literal["planar", "ray"],
-        typer.Option(help="Depth along the axis or the ray.", rich_help_panel=RARE),
-    ] = "planar",
+        Literal["planar", "ray"] | None,
+        typer.Option(help="Depth along the axis or the ray [planar].", rich_help_panel=RARE),
+    ] = None,
     accept: AcceptOption = None,
     limit: Annotated[
         list[str] | None,
@@ -98,7 +99,6 @@ def audit(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.audit.geometry import audit as geometry_audit
     from stereogenbench_data.audit.geometry.records import AuditLimits
     from stereogenbench_data.audit.geometry.table import audit_markdown
-    from stereogenbench_data.schema.records import DepthEncoding
 
     if out is not None and out.is_dir():
         raise typer.BadParameter(
@@ -109,21 +109,24 @@ def audit(  # noqa: PLR0913 - one parameter an option
             f"{frames!r} is neither a number of frames, such as 5, nor 'all'.",
             param_hint="--frames",
         )
-    losses: Any = frozenset(accept or ())
-    contract = DepthEncoding(unit_m=depth_unit_m, kind=depth_kind, accept=losses)
     request = geometry_audit.AuditRequest(
         sample=scenes,
         frames=0 if frames == _ALL else int(frames),
         seed=seed,
-        depth=None if contract == DepthEncoding() else contract,
         limits=AuditLimits.parse(limit or []),
         derived=derived,
     )
     options: Any = chosen.filters() | work.options()
     with progress_bar("reading the index", unit="scenes") as progress:
         index = geometry_audit.open_for_audit(
-            source.data, root=source.data_root, progress=progress, **options
+            source.data,
+            root=source.data_root,
+            progress=progress,
+            conventions=source.conventions,
+            **options,
         )
+    contract = depth_of(index, unit_m=depth_unit_m, kind=depth_kind, accept=accept)
+    request = replace(request, depth=contract)
     notes = journal or _journal(out, source.data, request)
     kept = geometry_audit.audit_journal(notes, index, request)
     with writing(notes), kept, progress_bar("auditing", unit="frames") as progress:

@@ -38,8 +38,8 @@ def browse(
     from stereogenbench_data.audit.browser.service import Service
     from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 
-    depth = depth_of(depth_unit_m, accept)
     index, shown_data = source.open(), full_place(source.data)
+    depth = depth_of(index, unit_m=depth_unit_m, accept=accept)
     reader = SceneReader(index, depth=depth)
     service = Service(Catalogue(index, shown_data=shown_data, depth=depth), reader)
     with PageServer(service, port=port) as server:

@@ -12,6 +12,7 @@ import typer
 from stereogenbench_data.cli import export_clips, export_views
 from stereogenbench_data.cli.audit import audit
 from stereogenbench_data.cli.browse import browse
+from stereogenbench_data.cli.conventions import conventions
 from stereogenbench_data.cli.doctor import doctor
 from stereogenbench_data.cli.download import download
 from stereogenbench_data.cli.errors import ErrorsReported
@@ -45,6 +46,7 @@ _COMMANDS: Final[dict[str, dict[Callable[..., None], str]]] = {
     },
     "Check them": {
         stats: "stats shards/ --plots plots/",
+        conventions: "conventions scenes/ -o conventions.toml",
         doctor: "doctor scenes/ -o doctor.png",
         audit: "audit shards/ --scenes 20 -o audit.md",
         verify: "verify shards/ --deep",

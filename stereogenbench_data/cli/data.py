@@ -1,6 +1,7 @@
 """Opening DATA: a progress bar while a tree is read, and a report of the scenes left out."""
 
 import warnings
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
@@ -12,28 +13,37 @@ if TYPE_CHECKING:
     from stereogenbench_data.index.table import SceneIndex
 
 
-def open_data(data: str, *, root: str | None = None) -> "SceneIndex":
+def open_data(
+    data: str, *, root: str | None = None, conventions: Path | None = None
+) -> "SceneIndex":
     """Return the index of some data, without its broken scenes, which are reported on stderr.
 
     Args:
         data: What the command was given.
         root: Where an index file's data are, if the user says so.
+        conventions: The file that says how the data are read.
 
     Raises:
-        StorageError: If the data do not exist, or hold no complete scene.
+        StorageError: If the data do not exist, hold no complete scene, or contradict conventions.
     """
     from stereogenbench_data.errors import StorageError
+    from stereogenbench_data.index.assumptions import assumptions
     from stereogenbench_data.index.build import walk
     from stereogenbench_data.index.parquet import INDEX_NAME
     from stereogenbench_data.index.table import SceneIndex
+    from stereogenbench_data.schema.conventions import Conventions
     from stereogenbench_data.sources.location import is_remote, local_path
 
     folder = local_path(data)
     is_tree = not is_remote(data) and folder.is_dir() and not (folder / INDEX_NAME).is_file()
     if root is not None or not is_tree:
-        return open_index(data, root=root)
+        return open_index(data, root=root, conventions=conventions)
+    stated = None if conventions is None else Conventions.read(conventions)
     with progress_bar("reading scenes", unit="scenes") as progress:
-        report = walk(folder, progress=progress)
+        report = walk(folder, progress=progress, conventions=stated)
+    assumed = assumptions(report.scenes, where=str(folder))
+    if assumed:
+        typer.echo(plain_line(assumed), err=True)
     reasons = [*report.broken.values(), *report.incomplete.values()]
     if not reasons:
         return SceneIndex.from_report(report)
@@ -51,16 +61,20 @@ def open_data(data: str, *, root: str | None = None) -> "SceneIndex":
     return SceneIndex.from_report(report)
 
 
-def open_index(data: str, *, root: str | None = None) -> "SceneIndex":
+def open_index(
+    data: str, *, root: str | None = None, conventions: Path | None = None
+) -> "SceneIndex":
     """Return the index of some data, with its warnings printed on stderr.
 
     Args:
         data: What the command was given.
         root: Where an index file's data are, if the user says so.
+        conventions: The file that says how the data are read.
 
     Raises:
-        StorageError: If the data do not exist, or hold a broken scene.
+        StorageError: If the data do not exist, hold a broken scene, or contradict conventions.
     """
+    from stereogenbench_data.index.assumptions import AssumptionWarning
     from stereogenbench_data.index.open import IncompleteSceneWarning
     from stereogenbench_data.index.stale import StaleIndexWarning
     from stereogenbench_data.index.table import SceneIndex
@@ -68,7 +82,8 @@ def open_index(data: str, *, root: str | None = None) -> "SceneIndex":
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always", IncompleteSceneWarning)
         warnings.simplefilter("always", StaleIndexWarning)
-        index = SceneIndex.open(data, root=root)
+        warnings.simplefilter("always", AssumptionWarning)
+        index = SceneIndex.open(data, root=root, conventions=conventions)
     for warning in warned:
         typer.echo("\n".join(map(plain_line, str(warning.message).split("\n"))), err=True)
     return index

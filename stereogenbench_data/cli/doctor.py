@@ -16,6 +16,7 @@ from stereogenbench_data.cli.options import (
     OutOption,
     SceneOptions,
     WorkOptions,
+    depth_of,
     grouped,
 )
 from stereogenbench_data.cli.progress import progress_bar
@@ -57,17 +58,17 @@ def doctor(  # noqa: PLR0913 - one parameter an option
         typer.Option(help="Metres in a stored unit [as tagged].", rich_help_panel=_DECLARED),
     ] = None,
     kind: Annotated[
-        Literal["planar", "ray"],
-        typer.Option(help="Depth along the axis or the ray.", rich_help_panel=_DECLARED),
-    ] = "planar",
+        Literal["planar", "ray"] | None,
+        typer.Option(help="Depth along the axis or the ray [planar].", rich_help_panel=_DECLARED),
+    ] = None,
     form: Annotated[
-        Literal["depth", "inverse"],
-        typer.Option(help="Depth is stored, or its inverse.", rich_help_panel=_DECLARED),
-    ] = "depth",
+        Literal["depth", "inverse"] | None,
+        typer.Option(help="Depth is stored, or its inverse [depth].", rich_help_panel=_DECLARED),
+    ] = None,
     frame_lag: Annotated[
-        int,
-        typer.Option(help="Picture t belongs to depth frame t + N.", rich_help_panel=_DECLARED),
-    ] = 0,
+        int | None,
+        typer.Option(help="Picture t belongs to depth frame t + N [0].", rich_help_panel=_DECLARED),
+    ] = None,
     accept: AcceptOption = None,
     out: OutOption = None,
     as_json: JsonOption = False,
@@ -83,14 +84,12 @@ def doctor(  # noqa: PLR0913 - one parameter an option
     """
     from stereogenbench_data.audit.contract.doctor import diagnose
     from stereogenbench_data.audit.contract.picture import draw_report, require_picture_file
-    from stereogenbench_data.schema.records import DepthEncoding
 
     if out is not None:
         require_picture_file(out)
-    losses: Any = frozenset(accept or ())
-    depth = DepthEncoding(unit_m=unit_m, kind=kind, form=form, frame_lag=frame_lag, accept=losses)
     filters: Any = chosen.filters()
     index = source.open()
+    depth = depth_of(index, unit_m=unit_m, kind=kind, form=form, frame_lag=frame_lag, accept=accept)
     with progress_bar("examining", unit="scenes") as progress:
         report = diagnose(
             index,
@@ -140,7 +139,7 @@ def _lines(report: "DoctorReport") -> list[str]:
         rows += [_row(answer) for answer in verdict.answers]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines += ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
-        lines += ["", *_conclusion(verdict, report), *_tested_lines(verdict), *verdict.beside]
+        lines += ["", *_conclusion(verdict), *_tested_lines(verdict), *verdict.beside]
     if any(math.isfinite(scene.gain.mean_db) for scene in report.scenes):
         lines += ["", QUOTIENT_MEANS, _DB_NOTE]
     return lines + _world_lines(report)
@@ -161,7 +160,7 @@ def _world_lines(report: "DoctorReport") -> list[str]:
     ]  # fmt: skip
 
 
-def _conclusion(verdict: "Verdict", report: "DoctorReport") -> list[str]:
+def _conclusion(verdict: "Verdict") -> list[str]:
     from stereogenbench_data.audit.contract.verdict import encoding_line
 
     lines = [f"WRONG: {problem}." for problem in verdict.problems]
@@ -177,7 +176,7 @@ def _conclusion(verdict: "Verdict", report: "DoctorReport") -> list[str]:
     elif verdict.is_wrong:
         lines.append("Nothing to paste: no DepthEncoding is certain to correct this.")
     elif verdict.fits:
-        lines.append(f"The declared contract fits: {encoding_line(report.declared)}")
+        lines.append(f"The declared contract fits: {encoding_line(verdict.declared)}")
     elif math.isfinite(verdict.agreement) and not verdict.unexplained_cameras:
         open_topics = [a.topic for a in verdict.answers if a.status == "cannot tell"]
         undecided = f" Undecided: {', '.join(open_topics)}." if open_topics else ""

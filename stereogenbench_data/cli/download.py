@@ -48,7 +48,7 @@ def download(  # noqa: PLR0913 - one parameter an option
         )
     numbers = sorted({int(part) for part in parts})
     filters: Any = chosen.filters()
-    index = SceneIndex.open(source.data, root=source.data_root)
+    index = SceneIndex.open(source.data, root=source.data_root, conventions=source.conventions)
     rows = filter_scenes(index, filters)
     kinds = ("rgb", "depth") if streams == "both" else (streams,)
     wanted = plan_download(index, rows.tolist(), cameras=numbers, streams=kinds)

@@ -5,7 +5,7 @@ They share their options: scenes, pairs and frames, metrics and models, the repo
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -146,7 +146,6 @@ class ProtocolOptions:
             keypoint_matcher=self.keypoint_matcher,
             stereo_matcher=self.stereo_matcher,
             fit=fit,
-            depth=depth_of(self.depth_unit_m, self.accept),
             models=ModelOptions(device=self.device, weights=self.weights, checkout=self.checkout),
         )
 
@@ -227,7 +226,7 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
             out,
             tier=tier,
             size=size_px,
-            depth=depth_of(depth_unit_m, accept),
+            depth=depth_of(index, unit_m=depth_unit_m, accept=accept),
             **work.options(),
             progress=progress,
             **selection,
@@ -278,6 +277,8 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
     called = name or predictions.resolve().name
     folder = report.out or Path("evaluation") / f"{called}-{tier}"
     index = source.open()
+    contract = depth_of(index, unit_m=scoring.depth_unit_m, accept=scoring.accept)
+    protocol = replace(protocol, depth=contract)
     for column in strata:
         index.column(column)  # refuses an unknown one before the work
     with progress_bar("scoring", unit="frames") as progress:
@@ -320,6 +321,8 @@ def controls(
     protocol, selection = scoring.protocol(), chosen.selection()
     folder = report.out or Path("evaluation") / "controls"
     index = source.open()
+    contract = depth_of(index, unit_m=scoring.depth_unit_m, accept=scoring.accept)
+    protocol = replace(protocol, depth=contract)
     with progress_bar("scoring", unit="frames") as progress:
         results = score_controls(
             index,

@@ -203,7 +203,7 @@ def export_clips(  # noqa: PLR0913 - one parameter an option
             layout=layout,
             form=form,
             run=ExportRun(
-                depth=depth_of(depth_unit_m, accept),
+                depth=depth_of(index, unit_m=depth_unit_m, accept=accept),
                 workers=workers,
                 progress=progress,
             ),

@@ -66,7 +66,6 @@ class ViewOptions(ExportedSceneOptions):
             "cameras": cameras,
             "frames": frames_option(self.frames),
             "size": None if self.size is None else parse_picture_size(self.size),
-            "depth": depth_of(self.depth_unit_m, self.accept),
             "workers": self.workers,
         }
 
@@ -167,7 +166,14 @@ def _export(source: DataOptions, out: Path, chosen: ViewOptions, *, layout: Any)
 
     index = source.open()
     with progress_bar("writing", unit="pictures") as progress:
-        folders = export_views(index, out, layout=layout, progress=progress, **chosen.selection())
+        folders = export_views(
+            index,
+            out,
+            layout=layout,
+            progress=progress,
+            depth=depth_of(index, unit_m=chosen.depth_unit_m, accept=chosen.accept),
+            **chosen.selection(),
+        )
     _, for_evaluation = training_selection(index, chosen.filters())
     if for_evaluation:
         typer.echo(

@@ -105,8 +105,9 @@ def forecast(  # noqa: PLR0913 - one parameter an option
         options["fields"] = [each.strip() for each in fields.split(",")]
     if size is not None:
         options["size"] = parse_picture_size(size)
-    options["depth"] = depth_of(depth_unit_m, accept)
-    found = forecast_by(source.open(), batch_size=batch_size, measure_s=measure_s, **options)
+    index = source.open()
+    options["depth"] = depth_of(index, unit_m=depth_unit_m, accept=accept)
+    found = forecast_by(index, batch_size=batch_size, measure_s=measure_s, **options)
     typer.echo(json.dumps(asdict(found), indent=1) if as_json else _table(found))
 
 

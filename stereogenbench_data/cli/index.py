@@ -1,9 +1,9 @@
 """``stereogenbench index``: walk a released tree once, so that it opens at once afterwards."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -12,19 +12,18 @@ from stereogenbench_data.cli.data import full_place
 from stereogenbench_data.cli.errors import FINDINGS, resumable
 from stereogenbench_data.cli.help import RARE
 from stereogenbench_data.cli.options import (
+    ConventionsOption,
     FamilyOption,
     JsonOption,
     MapOption,
     SplitOption,
     WorkOptions,
     grouped,
+    wanted_scenes,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import require_writable, writing
 from stereogenbench_data.schema.text import counted, plain_line
-
-if TYPE_CHECKING:
-    from stereogenbench_data.schema.records import SceneId
 
 _INDEX_NAME = "index.parquet"
 
@@ -52,6 +51,7 @@ def index(  # noqa: PLR0913 - one parameter an option
     split: SplitOption = None,
     family: FamilyOption = None,
     map_name: MapOption = None,
+    conventions: ConventionsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Index a released tree, so that it opens at once.
@@ -63,12 +63,13 @@ def index(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.index.build import scene_journal, walk
     from stereogenbench_data.index.parquet import recorded_root
     from stereogenbench_data.index.table import SceneIndex
+    from stereogenbench_data.schema.conventions import Conventions
     from stereogenbench_data.sources.location import is_remote, local_path, shown
 
     console = Console(stderr=True)
     target = out or Path("." if is_remote(root) else root, _INDEX_NAME)
     mode: Literal["skip", "sample"] = "sample" if valid_depth else "skip"
-    wanted = _passing(split, family or [], map_name or [])
+    wanted = wanted_scenes(split, family or [], map_name or [])
     if wanted is not None and out is None:
         raise typer.BadParameter(
             "the index of a part needs its own file: name it with --out FILE.",
@@ -93,10 +94,12 @@ def index(  # noqa: PLR0913 - one parameter an option
                 param_hint="--out",
             ) from error
     recorded_root(root, beside=target.parent)  # Refuses a root before hours of work.
+    stated = None if conventions is None else Conventions.read(conventions)
+    how = f"valid_depth={mode} {'' if stated is None else [each.text() for each in stated.shapes]}"
     done_before = target.with_name(f"{target.name}.journal")
     with (
         writing(done_before),
-        scene_journal(done_before, walk=f"{full_place(root)} valid_depth={mode}") as journal,
+        scene_journal(done_before, walk=f"{full_place(root)} {how.strip()}") as journal,
         progress_bar("indexing", unit="scenes") as progress,
     ):
         report = walk(
@@ -106,6 +109,7 @@ def index(  # noqa: PLR0913 - one parameter an option
             journal=journal,
             valid_depth=mode,
             wanted=wanted,
+            conventions=stated,
         )
         if report.scenes:
             SceneIndex.from_report(report).write(target)
@@ -138,19 +142,6 @@ def index(  # noqa: PLR0913 - one parameter an option
             markup=False, highlight=False, soft_wrap=True,
         )  # fmt: skip
     raise typer.Exit(status)
-
-
-def _passing(
-    split: str | None, families: list[str], maps: list[str]
-) -> "Callable[[SceneId], bool] | None":
-    """Return a function that says whether the options select a scene; None if they select all."""
-    if not (split or families or maps):
-        return None
-    return lambda scene: (
-        split in (None, "", scene.split)
-        and (not families or scene.family in families)
-        and (not maps or scene.map_name in maps)
-    )
 
 
 def _list(console: Console, title: str, reasons: Mapping[str, str]) -> None:

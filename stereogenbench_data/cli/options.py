@@ -6,7 +6,7 @@ shows typer the fields in its place.
 
 import inspect
 from collections.abc import Callable, Iterable
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
@@ -26,7 +26,7 @@ from stereogenbench_data.schema.release import (
 
 if TYPE_CHECKING:
     from stereogenbench_data.index.table import SceneIndex
-    from stereogenbench_data.schema.records import DepthEncoding
+    from stereogenbench_data.schema.records import DepthEncoding, SceneId
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
@@ -111,16 +111,30 @@ def pair_of(text: str, *, option: str) -> tuple[int, int]:
     return pair
 
 
-def depth_of(unit_m: float | None, accept: list[str] | None) -> "DepthEncoding | None":
-    """Return the depth contract of ``--depth-unit-m`` and ``--accept``, None without both.
+def depth_of(
+    index: "SceneIndex", *, accept: list[str] | None = None, **options: Any
+) -> "DepthEncoding | None":
+    """Return the depth contract of a command's options; None without any: data state their own.
 
-    Files state their own unit then.
+    What no option says is as the conventions of the data state it.
+
+    Raises:
+        typer.BadParameter: If these state several contracts.
     """
     from stereogenbench_data.schema.records import DepthEncoding
 
-    losses: Any = frozenset(accept or ())
-    contract = DepthEncoding(unit_m=unit_m, accept=losses)
-    return None if contract == DepthEncoding() else contract
+    given = {name: value for name, value in options.items() if value is not None}
+    if accept:
+        given["accept"] = frozenset(accept)
+    if not given:
+        return None
+    stated = {shape.depth.encoding for shape in index.shapes if shape.depth is not None}
+    if len(stated) > 1:
+        raise typer.BadParameter(
+            f"the conventions of {index.where} state {len(stated)} depth contracts, and options "
+            f"would replace all: choose scenes of one, or edit the conventions."
+        )
+    return replace(stated.pop() if stated else DepthEncoding(), **given, source="user")
 
 
 RootOption = Annotated[
@@ -128,6 +142,15 @@ RootOption = Annotated[
     typer.Option(
         "--root",
         help="Where the data of an index file are, if not beside.",
+        rich_help_panel=RARE,
+    ),
+]
+ConventionsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--conventions",
+        metavar="FILE",
+        help="How the files are read, as `conventions` writes it.",
         rich_help_panel=RARE,
     ),
 ]
@@ -196,6 +219,19 @@ def out_folder(text: str) -> Path:
     return Path(text)
 
 
+def wanted_scenes(
+    split: str | None, families: list[str], maps: list[str]
+) -> "Callable[[SceneId], bool] | None":
+    """Return a function that says whether the options select a scene; None if they select all."""
+    if not (split or families or maps):
+        return None
+    return lambda scene: (
+        split in (None, "", scene.split)
+        and (not families or scene.family in families)
+        and (not maps or scene.map_name in maps)
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class DataOptions:
     """The data that a command reads."""
@@ -205,10 +241,11 @@ class DataOptions:
         typer.Argument(help="Folder of scenes or shards, an index file, or a URL."),
     ]
     data_root: RootOption = None
+    conventions: ConventionsOption = None
 
     def open(self) -> "SceneIndex":
         """Return the index of the data as `open_data` does."""
-        return open_data(self.data, root=self.data_root)
+        return open_data(self.data, root=self.data_root, conventions=self.conventions)
 
 
 @dataclass(frozen=True, kw_only=True)

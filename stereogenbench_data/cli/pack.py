@@ -13,6 +13,7 @@ from stereogenbench_data.cli.errors import FINDINGS, resumable
 from stereogenbench_data.cli.help import RARE
 from stereogenbench_data.cli.options import (
     AcceptOption,
+    ConventionsOption,
     JsonOption,
     RootOption,
     SceneOptions,
@@ -46,6 +47,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
     ],
     *,
     data_root: RootOption = None,
+    conventions: ConventionsOption = None,
     shard_size: Annotated[
         str,
         typer.Option(help="Largest shard, such as 500MB or 2GiB; a scene is never divided."),
@@ -120,7 +122,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
     )
     if dry_run and training is None:
         raise typer.BadParameter("estimates training shards: give --size.", param_hint="--dry-run")
-    index = open_index(root, root=data_root)
+    index = open_index(root, root=data_root, conventions=conventions)
     filters: Any = chosen.filters()
     rows = filter_scenes(index, filters).tolist() if filters else None
     scenes = len(index) if rows is None else len(rows)

@@ -77,7 +77,10 @@ def show(  # noqa: PLR0913 - one parameter an option
 
     cameras = None if pair is None else pair_of(pair, option="--pair")
     if rerun or live or (out is not None and out.suffix.lower() in _RECORDINGS):
-        shown: dict[str, Any] = {"pair": cameras, "depth": depth_of(depth_unit_m, accept)}
+        shown: dict[str, Any] = {
+            "pair": cameras,
+            "depth": {"unit_m": depth_unit_m, "accept": accept},
+        }
         _show_in_rerun(source, scene, out, width_px=size, is_live=live, **shown)
         return
     clip = clip or (out is not None and out.suffix.lower() in _CLIPS)
@@ -89,7 +92,7 @@ def show(  # noqa: PLR0913 - one parameter an option
     recorded = index.scene(row)
     key = recorded.id.key
     target = out or Path(key.replace("/", "_") + (".mp4" if clip else ".png"))
-    reader = SceneReader(index, depth=depth_of(depth_unit_m, accept))
+    reader = SceneReader(index, depth=depth_of(index, unit_m=depth_unit_m, accept=accept))
     with writing(target):
         if clip:
             with progress_bar("drawing", unit="frames") as progress:
@@ -113,6 +116,7 @@ def _show_in_rerun(
     *,
     width_px: int | None,
     is_live: bool,
+    depth: dict[str, Any],
     **shown: Any,
 ) -> None:
     from stereogenbench_data.bridges.rerun import view_live, write_recording
@@ -124,6 +128,7 @@ def _show_in_rerun(
     index = source.open()
     found = index.scene(0 if scene is None else find_scene(index, scene))
     key, rig = found.id.key, found.rig
+    shown["depth"] = depth_of(index, **depth)
     if width_px is not None:
         shown["size"] = (
             max(1, round(rig.image_height_px * width_px / rig.image_width_px)),

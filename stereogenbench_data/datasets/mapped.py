@@ -25,7 +25,7 @@ from stereogenbench_data.datasets.open_videos import videos_to_keep
 from stereogenbench_data.datasets.passes import Passes
 from stereogenbench_data.datasets.shared_epoch import DrawnSamples, FetchedCounts, SharedEpoch
 from stereogenbench_data.datasets.tensors import to_tensors
-from stereogenbench_data.errors import SelectionError, text_without_secrets
+from stereogenbench_data.errors import FieldError, SelectionError, text_without_secrets
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.checks import check_samples, without_odd_scenes
 from stereogenbench_data.samples.coming import Step
@@ -39,6 +39,7 @@ from stereogenbench_data.samples.request import Request, Transform, parse_reques
 from stereogenbench_data.samples.streams import StreamStats
 from stereogenbench_data.samples.transforms import Compose, Crop, Letterbox, Resize
 from stereogenbench_data.samples.writer import Allocate, new_array
+from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import SceneFilters, may_pass
@@ -417,6 +418,7 @@ class StereoPairs(_MappedScenes):
         size: tuple[int, int] | str | None = None,
         transform: Transform | None = None,
         depth: DepthEncoding | None = None,
+        conventions: str | Path | Conventions | None = None,
         seed: int = 0,
         cache: ShardCache | None = None,
         check: Check = "read",
@@ -435,6 +437,9 @@ class StereoPairs(_MappedScenes):
                 `SwappedSizeWarning` is given where the two look exchanged.
             transform: What changes pictures and cameras together, such as `Compose`.
             depth: A depth contract instead of the one that files and release state.
+            conventions: Where quantities stand in the files and how they are read, as
+                ``stereogenbench conventions`` writes it; see `SceneIndex.open`. ``depth`` counts
+                more.
             seed: Seed of random frames, transforms and the balanced subsample.
             cache: Where to keep on disk what is read from a URL; None fetches, each time, just the
                 bytes that samples need.
@@ -462,7 +467,7 @@ class StereoPairs(_MappedScenes):
         """
         of_loader = options_of(self.loader)
         require_options(StereoPairs, selection, elsewhere={"loader": of_loader})
-        index = _opened(data, selection)
+        index = _opened(data, selection, conventions)
         plan = plan_pairs(index, seed=seed, **selection)
         _warn_of_mixed_splits(index, plan, selection)
         request = parse_request(
@@ -503,6 +508,7 @@ class SceneViews(_MappedScenes):
         size: tuple[int, int] | str | None = None,
         transform: Transform | None = None,
         depth: DepthEncoding | None = None,
+        conventions: str | Path | Conventions | None = None,
         seed: int = 0,
         cache: ShardCache | None = None,
         check: Check = "read",
@@ -520,6 +526,7 @@ class SceneViews(_MappedScenes):
             size: As for `StereoPairs`.
             transform: As for `StereoPairs`; a flip, which swaps the views of a pair, is refused.
             depth: A depth contract instead of the one that files and release state.
+            conventions: As for `StereoPairs`.
             seed: Seed of random frames and transforms.
             cache: As for `StereoPairs`.
             check: As for `StereoPairs`.
@@ -543,7 +550,7 @@ class SceneViews(_MappedScenes):
             depth=depth,
             transform=transform,
         )
-        index = _opened(data, filters)
+        index = _opened(data, filters, conventions)
         plan = plan_views(index, cameras=cameras, frames=frames, seed=seed, filters=filters)
         _warn_of_mixed_splits(index, plan, filters)
         super().__init__(
@@ -557,11 +564,22 @@ class SceneViews(_MappedScenes):
         )
 
 
-def _opened(data: Data, filters: Mapping[str, Any]) -> SceneIndex:
-    """Return the index of some data; of a folder without one, of the scenes that may be chosen."""
+def _opened(
+    data: Data, filters: Mapping[str, Any], conventions: str | Path | Conventions | None
+) -> SceneIndex:
+    """Return the index of some data; of a folder without one, of the scenes that may be chosen.
+
+    Raises:
+        FieldError: If conventions are given beside an index, which was opened without them.
+    """
     if isinstance(data, SceneIndex):
+        if conventions is not None:
+            raise FieldError(
+                "conventions concern the opening of data, and an index is open already: pass them "
+                "to SceneIndex.open(..., conventions=...)."
+            )
         return data
-    return SceneIndex.open(data, wanted=may_pass(filters))
+    return SceneIndex.open(data, wanted=may_pass(filters), conventions=conventions)
 
 
 def _warn_of_mixed_splits(index: SceneIndex, plan: Plan, filters: SceneFilters) -> None:

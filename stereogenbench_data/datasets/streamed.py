@@ -3,6 +3,7 @@
 import os
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Unpack, cast
 
 from torch.utils.data import IterableDataset, get_worker_info
@@ -16,6 +17,7 @@ from stereogenbench_data.datasets.shared_epoch import RepeatedEpochWarning
 from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.request import Transform
+from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import Selection
@@ -29,6 +31,7 @@ class StreamOptions(Selection, EpochOptions, total=False):
     size: tuple[int, int] | str | None
     transform: Transform | None
     depth: DepthEncoding | None
+    conventions: str | Path | Conventions | None
     cache: ShardCache | None
     check: Check
     buffers: Buffers

@@ -82,7 +82,11 @@ class Reading:
     trajectory: Trajectory
 
 
-def readings(recorded: RecordedPoses, *, only: str | None = None) -> Iterator[Reading]:
+def readings(
+    recorded: RecordedPoses,
+    *,
+    only: str | None = None,
+) -> Iterator[Reading]:
     """Yield the readings of recorded numbers, those that the file names first.
 
     Args:

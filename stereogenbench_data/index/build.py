@@ -31,9 +31,10 @@ from stereogenbench_data.index.scene_folder import (
 )
 from stereogenbench_data.index.tree import FoundScenes, find_remote_scenes, find_scene_folders
 from stereogenbench_data.media.depth import require_depth_stream
+from stereogenbench_data.schema.conventions import Conventions, depth_of
 from stereogenbench_data.schema.document import brief
 from stereogenbench_data.schema.parse import parse_scene_key
-from stereogenbench_data.schema.records import REMARKS, DepthEncoding, Scene, SceneId
+from stereogenbench_data.schema.records import REMARKS, Scene, SceneId
 from stereogenbench_data.schema.release import TRAIN_MAPS, Subset, depth_name
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.location import is_remote, shown
@@ -92,6 +93,7 @@ def walk(  # noqa: PLR0913 - each is an option of the command
     valid_depth: ValidDepth = "skip",
     wanted: Callable[[SceneId], bool] | None = None,
     if_none: Literal["refuse", "all"] = "refuse",
+    conventions: Conventions | None = None,
 ) -> TreeReport:
     """Return every scene of a tree in the released layout, and what is wrong with the others.
 
@@ -107,6 +109,7 @@ def walk(  # noqa: PLR0913 - each is an option of the command
             that have a depth.
         wanted: Returns whether to describe the scene of a path; None is all.
         if_none: What to do where no scene is wanted: refuse, or describe all of them.
+        conventions: Where quantities stand in the files and how they are read.
 
     Raises:
         StorageError: If there is no such scene below the root, or a worker process died; or if the
@@ -125,7 +128,7 @@ def walk(  # noqa: PLR0913 - each is an option of the command
     pending = [key for key in folders.keys if key not in outcomes]
     if engine is LOCAL and len(pending) < POOL_FROM:
         workers = 1
-    task = _DescribeTask(str(root), valid_depth)
+    task = _DescribeTask(str(root), valid_depth, conventions)
     for outcome in engine.map(task, pending, name=str, workers=workers):
         outcomes[outcome.key] = outcome
         if len(outcomes) == ALIKE:
@@ -172,12 +175,15 @@ class _DescribeTask:
 
     root: str
     valid_depth: ValidDepth
+    conventions: Conventions | None
 
     def __call__(self, key: str, advance: Advance) -> _Outcome:
         advance(0)
         try:
             stamp = stamp_of(SceneFolder(self.root, key).stamps())
-            scene = describe_scene(self.root, key, valid_depth=self.valid_depth)
+            scene = describe_scene(
+                self.root, key, valid_depth=self.valid_depth, conventions=self.conventions
+            )
         except IncompleteScene as error:
             return _Outcome(key, "incomplete", reason=str(error))
         except StereoGenBenchError as error:
@@ -271,7 +277,7 @@ def _depth_notes(scenes: list[Scene]) -> list[str]:
                 require_depth_stream(
                     codec=codec,
                     pixel_format=pixel_format,
-                    encoding=DepthEncoding(),
+                    encoding=depth_of(scene),
                     name=f"{scene.id.key}/{depth_name(camera)}",
                 )
             except MediaError as error:

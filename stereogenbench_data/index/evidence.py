@@ -8,7 +8,8 @@ fields on which they differ are refused. Pictures tell more: see `audit.contract
 """
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Final
@@ -20,11 +21,12 @@ from stereogenbench_data.geometry.camera import recorded_intrinsics
 from stereogenbench_data.geometry.pose import OPENCV_FROM_UNREAL, CameraPoses
 from stereogenbench_data.geometry.pose_forms import Reading, readings
 from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
+from stereogenbench_data.schema.conventions import PosesAs
 from stereogenbench_data.schema.quantities import UNITS_M
 from stereogenbench_data.schema.records import Rig
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from stereogenbench_data.schema.text import shortened
-from stereogenbench_data.schema.trajectory import record_poses
+from stereogenbench_data.schema.trajectory import RecordedPoses, record_poses
 
 _DEVIATION_CM: Final = 0.1
 _DEVIATION_SHARE: Final = 0.001
@@ -53,10 +55,12 @@ class Understood:
         poses: The poses.
         names: The readings that pass and move the cameras differently in the world, the one that
             was taken first.
+        is_named: Whether the file itself names that one.
     """
 
     poses: CameraPoses
     names: tuple[str, ...]
+    is_named: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,28 +76,69 @@ class _Passed:
         return f"{self.reading.name} @ {self.poses.unit_m!r}".replace("|", "/")
 
 
-def understood_poses(text: bytes, rig: Rig, *, where: str) -> Understood:
+def understood_poses(
+    text: bytes, rig: Rig, *, where: str, named: PosesAs | None = None
+) -> Understood:
     """Return the poses of a ``trajectory.json`` that fit a rig.
+
+    Args:
+        text: The file's bytes.
+        rig: The rig of the scene.
+        where: The file's path, for messages.
+        named: How conventions read them, which must pass; a form that the file itself names and
+            that passes, too, may not contradict it.
 
     Raises:
         SchemaError: If no reading of its numbers passes, or several pass and disagree about where
-            the cameras stand to each other; it says what was tried.
+            the cameras stand to each other, or not as conventions say; it says what was tried.
         SidesError: If its own form fits but for the side of the primary pair's left camera.
     """
+    recorded = record_poses(text, where=where)
+    if named is None:
+        return _fitting(readings(recorded), rig, where=where)
+    found, own, reason = None, None, ""
+    try:
+        found = _fitting(_readings_as(recorded, named), rig, where=where)
+    except SchemaError as error:
+        reason = str(error).removeprefix(f"{where}: ").rstrip(".?")
+    with suppress(SchemaError):
+        own = _fitting(readings(recorded), rig, where=where)
+    if found is not None and (own is None or not own.is_named or _same(found.poses, own.poses)):
+        return found
+    reason = reason or "the file names another form, which fits as well and differs"
+    fits = "" if own is None else f" What fits is: {shortened(own.names[0], 300)}."
+    stated = ((name, getattr(named, name)) for name in ("rotation", "form", "axes", "unit"))
+    described = ", ".join(f"{name} {value!r}" for name, value in stated if value is not None)
+    raise SchemaError(
+        f"{where}: the conventions read its poses as {shortened(described, 300)}, and that does "
+        f"not fit: {reason}.{fits} Correct [poses], or leave it out."
+    )
+
+
+def _readings_as(recorded: RecordedPoses, named: PosesAs) -> Iterator[Reading]:
+    """Yield the readings that conventions name, in the unit that they name."""
+    for reading in readings(recorded):
+        if named.fits(reading.name):
+            unit_m = reading.trajectory.unit_m if named.unit is None else UNITS_M[named.unit]
+            trajectory = replace(reading.trajectory, unit_m=unit_m)
+            yield replace(reading, tier=0, is_named=True, trajectory=trajectory)
+
+
+def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
+    """Return the poses of the first tier of readings that fit a rig, as `understood_poses` says."""
     failures: dict[str, str] = {}
     loose: list[_Passed] = []
     exact: list[_Passed] = []
     reversed_: list[_Passed] = []
-    by_tier = groupby(readings(record_poses(text, where=where)), key=lambda each: each.tier)
-    for _, tier in by_tier:
+    for _, tier in groupby(found, key=lambda each: each.tier):
         for reading in tier:
-            found = _checked(reading, rig)
-            if isinstance(found, str):
-                failures.setdefault(found, reading.name)
-            elif _is_reversed(found.poses, rig):
-                reversed_.append(found)
+            checked = _checked(reading, rig)
+            if isinstance(checked, str):
+                failures.setdefault(checked, reading.name)
+            elif _is_reversed(checked.poses, rig):
+                reversed_.append(checked)
             else:
-                (exact if found.off <= _EXACT else loose).append(found)
+                (exact if checked.off <= _EXACT else loose).append(checked)
         if exact or any(each.reading.is_named for each in reversed_):
             break
     passed = exact or [each for each in loose if each.reading.tier == 0][:1]
@@ -121,7 +166,8 @@ def understood_poses(text: bytes, rig: Rig, *, where: str) -> Understood:
             f"stand to each other: {listed}. Name the right one in the file."
         )
     worlds = [taken, *(each for each in passed[1:] if not _same_world(each.poses, taken.poses))]
-    return Understood(taken.poses, tuple(each.name for each in worlds))
+    names = tuple(each.name for each in worlds)
+    return Understood(taken.poses, names, taken.reading.is_named and taken.reading.tier == 0)
 
 
 def agreed_forms(forms: Iterable[str]) -> dict[str, tuple[str, ...]]:
@@ -256,6 +302,10 @@ def _unit_of(ratio: float, stated_m: float) -> float | None:
 
 _ROUGH: Final = 0.1
 """How far the median of distances may be from a unit before they are compared one by one."""
+
+
+def _same(first: CameraPoses, other: CameraPoses) -> bool:
+    return _same_rig(first, other) and _same_world(first, other)
 
 
 def _same_rig(first: CameraPoses, other: CameraPoses) -> bool:

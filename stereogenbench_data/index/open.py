@@ -19,6 +19,7 @@ import pyarrow as pa
 
 from stereogenbench_data.errors import StorageError, describe_os_error, text_without_secrets
 from stereogenbench_data.index.arrow import table_digest
+from stereogenbench_data.index.assumptions import AssumptionWarning, assumptions
 from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.parquet import (
     INDEX_NAME,
@@ -29,8 +30,10 @@ from stereogenbench_data.index.parquet import (
     seek_tables_of,
     table_of_scenes,
 )
+from stereogenbench_data.index.restated import restated
 from stereogenbench_data.index.stale import StaleIndexWarning, stale_message
 from stereogenbench_data.index.tree import find_remote_scenes
+from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import SceneId
 from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.sources.location import (
@@ -74,12 +77,14 @@ class Opened(NamedTuple):
         head: What is known besides, with the root where the data are.
         stale: How the root differs from the index, with the cure; "" if it does not.
         seek_tables: Where the packets of the videos lie.
+        assumed: What was taken for granted about the files of a tree; "" where nothing was.
     """
 
     table: pa.Table
     head: IndexHead
     stale: str = ""
     seek_tables: SeekTables = None
+    assumed: str = ""
 
 
 def open_table(
@@ -88,6 +93,7 @@ def open_table(
     root: str | Path | None,
     retry: RetryPolicy | None,
     wanted: Callable[[SceneId], bool] | None = None,
+    conventions: Conventions | None = None,
 ) -> Opened:
     """Return the scenes of some data; `SceneIndex.open` describes the arguments and the errors.
 
@@ -97,7 +103,7 @@ def open_table(
     named_root = None if root is None else _require_root(root)
     if is_remote(data):
         where = shown(data)
-        opened = _open_url(str(data), root=named_root, retry=retry)
+        opened = _open_url(str(data), root=named_root, retry=retry, conventions=conventions)
     else:
         path = local_path(data)
         where = str(path)
@@ -108,7 +114,7 @@ def open_table(
             raise StorageError(describe_os_error(f"{path}: cannot be looked at", error)) from error
         if is_tree:
             _require_no_root(path, named_root)
-            opened = _open_tree(path, wanted)
+            opened = _open_tree(path, wanted, conventions)
         elif is_folder or is_file:
             file = path / INDEX_NAME if is_folder else path
             opened = _open_file(file, root=named_root)
@@ -117,11 +123,18 @@ def open_table(
                 f"{path}: does not exist; expected an index file, a folder with {INDEX_NAME} or "
                 f"a folder in the released layout."
             )
+    if conventions is not None:
+        stated = restated(opened.table, opened.head, conventions, retry=retry)
+        if stated is not opened.table:
+            head = replace(opened.head, digest=table_digest(stated))
+            opened = opened._replace(table=stated, head=head)
     if left_out := opened.head.incomplete | opened.head.broken:
         message = text_without_secrets(f"{where}: {_listed(left_out)}")
         warnings.warn(message, IncompleteSceneWarning, stacklevel=3)
     if opened.stale:
         warnings.warn(opened.stale, StaleIndexWarning, stacklevel=3)
+    if opened.assumed:
+        warnings.warn(opened.assumed, AssumptionWarning, stacklevel=3)
     return opened
 
 
@@ -152,7 +165,9 @@ def warn_if_stale(root: str | Path) -> None:
         warnings.warn(stale, StaleIndexWarning, stacklevel=3)
 
 
-def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opened:
+def _open_url(
+    url: str, *, root: str | None, retry: RetryPolicy | None, conventions: Conventions | None
+) -> Opened:
     """Fetch an index. Its data are beside it, unless the user names another root."""
     beside, name = split_name(url)
     is_folder = not name.endswith(".parquet")
@@ -173,7 +188,7 @@ def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opene
                 f"index {shown(beside)} -o index.parquet --split eval`, and open that file with "
                 f"--root {shown(beside)}, or SceneIndex.open('index.parquet', root=...)."
             ) from None
-        return _open_tree(beside, None)
+        return _open_tree(beside, None, conventions)
     if size > MAX_INDEX_BYTES:
         raise StorageError(
             f"{remote.where}: an index may have {MAX_INDEX_BYTES:,} bytes, this one has "
@@ -187,10 +202,15 @@ def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opene
     return Opened(table, head, seek_tables=read_seek_tables(content))
 
 
-def _open_tree(root: str | Path, wanted: Callable[[SceneId], bool] | None) -> Opened:
+def _open_tree(
+    root: str | Path,
+    wanted: Callable[[SceneId], bool] | None,
+    conventions: Conventions | None,
+) -> Opened:
     """Describe the scenes of a folder or URL in the released layout, without a few broken ones."""
     # In this process: a script without `if __name__ == "__main__"` could start no others.
-    report, where = walk(root, workers=1, wanted=wanted, if_none="all"), shown(root)
+    report = walk(root, workers=1, wanted=wanted, if_none="all", conventions=conventions)
+    where = shown(root)
     if not report.scenes:
         raise StorageError(
             f"{where}: no scene is complete: {_listed(report.broken | report.incomplete)}"
@@ -208,7 +228,12 @@ def _open_tree(root: str | Path, wanted: Callable[[SceneId], bool] | None) -> Op
         is_part=report.is_part,
     )
     table = table_of_scenes(report.scenes, where=where)
-    return Opened(table, head, seek_tables=seek_tables_of(report.scenes))
+    return Opened(
+        table,
+        head,
+        seek_tables=seek_tables_of(report.scenes),
+        assumed=assumptions(report.scenes, where=where),
+    )
 
 
 def _require_digest(table: pa.Table, head: IndexHead, *, where: str) -> None:

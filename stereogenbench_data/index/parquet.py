@@ -20,9 +20,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from stereogenbench_data.errors import StorageError, cure_of, describe_os_error, explain_os_errors
+from stereogenbench_data.errors import (
+    SchemaError,
+    StorageError,
+    cure_of,
+    describe_os_error,
+    explain_os_errors,
+)
 from stereogenbench_data.index.arrow import as_numpy, one_array
 from stereogenbench_data.index.rows import ADDED, SCHEMA, SEEK_COLUMN, TRAINING_COLUMNS, row_of
+from stereogenbench_data.schema.conventions import shape_of_text
 from stereogenbench_data.schema.document import MOST_LETTERS
 from stereogenbench_data.schema.records import REMARKS, Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT
@@ -361,6 +368,11 @@ def require_sound(table: pa.Table, *, where: str) -> None:
                 f"The index was altered. {made_again(where)}"
             )
     _require_texts(table, where=where)
+    for text in pc.unique(table.column("conventions")).drop_null().to_pylist():
+        try:
+            shape_of_text(text)
+        except SchemaError as error:
+            raise _odd(where, "conventions", text, f"not understood ({error})") from error
     about = pc.struct_field(pc.list_flatten(table.column("remarks")), "about")
     odd = [text for text in pc.unique(about).to_pylist() if text not in REMARKS]
     if odd:
@@ -480,7 +492,7 @@ _KNOWN: Final = {
     "split": ("train", "eval"),
     "subset": ("seen_map", "unseen_map", None),
     "image_size_source": ("recorded", "default"),
-    "depth_unit_source": ("tag", "metadata", "default", "unreadable"),
+    "depth_unit_source": ("tag", "metadata", "default", "conventions", "unreadable"),
 }
 _OF_BYTES: Final = (0, 2**61)
 _ABOVE: Final = (sys.float_info.min, sys.float_info.max)

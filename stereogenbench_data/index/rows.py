@@ -92,6 +92,7 @@ _COLUMNS: Final[dict[str, tuple[pa.DataType, bool, tuple[str | int, ...]]]] = {
     "remarks": (_list(_REMARK), _NULLABLE, ("remarks",)),
     "pose_form": (_TEXT, _NULLABLE, ("pose_form",)),
     "depth_offset_m": (_list(_NUMBER), _NULLABLE, ("depth_offset_m",)),
+    "conventions": (_TEXT, _NULLABLE, ("conventions",)),
     "members": (_list(_MEMBER), _REQUIRED, ("members",)),
 }
 """Name of a column to its type, whether it may be null, and where `Scene` holds its value."""
@@ -103,7 +104,7 @@ TRAINING_COLUMNS: Final = tuple(
 
 ADDED: Final = (
     "key_frames", "recorded_width_px", "recorded_height_px", *TRAINING_COLUMNS, "remarks",
-    "pose_form", "depth_offset_m",
+    "pose_form", "depth_offset_m", "conventions",
 )  # fmt: skip
 """Columns that indexes of earlier versions lack: null means what these knew."""
 

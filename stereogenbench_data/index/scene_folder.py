@@ -9,7 +9,7 @@ import hashlib
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, fields, replace
 from pathlib import Path
@@ -30,6 +30,7 @@ from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
 from stereogenbench_data.index.evidence import (
     SidesError,
+    Understood,
     poses_as,
     shape_of,
     understood_poses,
@@ -48,6 +49,13 @@ from stereogenbench_data.media.depth import (
 from stereogenbench_data.media.depth_frames import CODEC_NAME
 from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
 from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
+from stereogenbench_data.schema.conventions import (
+    UNKNOWN,
+    Conventions,
+    Shape,
+    keys_of,
+    shape_of_text,
+)
 from stereogenbench_data.schema.depth_contract import Statement, stated_in_json
 from stereogenbench_data.schema.document import (
     MOST_LETTERS,
@@ -186,7 +194,13 @@ def stamp_of(files: Mapping[str, tuple[int, int]]) -> str:
     return hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest()[:32]
 
 
-def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "skip") -> Scene:
+def describe_scene(
+    root: str | Path,
+    key: str,
+    *,
+    valid_depth: ValidDepth = "skip",
+    conventions: Conventions | None = None,
+) -> Scene:
     """Return the index row of a finished scene.
 
     What no sample needs, or only some fields, becomes a remark of the row: poses that are not
@@ -197,12 +211,13 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         key: The scene's path below it.
         valid_depth: "sample" decodes the first, middle and last depth picture of each camera, for
             the share of pixels that have a depth.
+        conventions: Where quantities stand and how they are read; what they do not state is found.
 
     Raises:
         IncompleteScene: If the scene is not marked as complete or has no video at all.
         StorageError: If files that every sample needs are missing, unreadable or contradict each
-            other, or `SchemaError` or `MediaError` if one of them is not understood. All problems
-            of all files are in one message.
+            other or the conventions, or `SchemaError` or `MediaError` if one of them is not
+            understood. All problems of all files are in one message.
     """
     folder = SceneFolder(root, key)
     files = folder.stamps()
@@ -213,10 +228,11 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     _require_finished(key, files, videos=videos)
     problems: list[StereoGenBenchError] = []
     remarks: list[Remark] = []
-    rig, labels = None, SceneLabels()
+    rig, labels, shape = None, SceneLabels(), None
     try:
         where = f"{key}/{BASELINE_JSON}"
-        rig, labels, odd = parse_rig(folder.read(BASELINE_JSON), where=where)
+        shape = _shape_of(folder, key, files, conventions)
+        rig, labels, odd = parse_rig(folder.read(BASELINE_JSON), where=where, shape=shape)
         family = parse_scene_key(key).family
         remarks += (*odd, *require_unit(rig, family=family, where=where))
     except StereoGenBenchError as error:
@@ -231,7 +247,7 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         frames = _common_frames(key, facts, remarks)
         _require_one_size(key, facts)
         if rig is not None:
-            rig = _sized_as_videos(key, rig, facts, document=document, remarks=remarks)
+            rig = _sized_as_videos(key, rig, facts, document=document, remarks=remarks, shape=shape)
             _require_kinds(key, rig, facts)
     except StereoGenBenchError as error:
         problems.append(error)
@@ -239,10 +255,10 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         raise _all_of(key, problems)
     if unread:
         remarks.append(Remark("videos", "; ".join(unread.values())))
-    poses, pose_form = _poses(folder, key, files, rig, frames=frames, remarks=remarks)
+    poses, pose_form = _poses(folder, key, files, rig, frames=frames, remarks=remarks, shape=shape)
     depths = _of_each_camera({name: fact for name, fact in facts.items() if name in _DEPTHS})
     stated = _depth_in_metadata(folder, key, files)
-    encodings = _depth_encodings(key, depths, stated=stated, remarks=remarks)
+    encodings = _depth_encodings(key, depths, stated=stated, remarks=remarks, shape=shape)
     ratio = None if valid_depth == "skip" else _valid_ratio(folder, key, frames)
     scene = Scene(
         id=parse_scene_key(key),
@@ -267,6 +283,7 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
             for each in remarks
         ),
         pose_form=pose_form,
+        conventions=None if shape is None else shape.text(),
         members={
             name: Member(f"{key}/{name}", 0, size)
             for name, (size, _) in files.items()
@@ -275,6 +292,23 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         seek_tables=packed_tables(tables),
     )
     return scene if document is None else _of_training(scene, document)
+
+
+def _shape_of(
+    folder: SceneFolder, key: str, files: Mapping[str, object], conventions: Conventions | None
+) -> Shape | None:
+    """Return what conventions state about a scene's files."""
+    if conventions is None:
+        return None
+
+    def keys() -> set[str]:
+        return {
+            f"{name}: {place}"
+            for name in (BASELINE_JSON, TRAJECTORY_JSON) if name in files
+            for place in keys_of(parse_object(folder.read(name), where=f"{key}/{name}"))
+        }  # fmt: skip
+
+    return conventions.shape_of(keys, where=key)
 
 
 def _of_training(scene: Scene, document: TrainingDocument) -> Scene:
@@ -324,7 +358,7 @@ def _all_probed(
     return facts, tables, unread
 
 
-def _poses(
+def _poses(  # noqa: PLR0913 - what poses are judged by
     folder: SceneFolder,
     key: str,
     files: Mapping[str, object],
@@ -332,18 +366,20 @@ def _poses(
     *,
     frames: int,
     remarks: list[Remark],
+    shape: Shape | None,
 ) -> tuple[CameraPoses | None, str | None]:
-    """Return the poses that fit the rig and the names of their readings, or neither."""
+    """Return the poses that fit the rig and the names of their readings, or neither.
+
+    Raises:
+        SchemaError: If conventions state how poses are read, and they do not fit the rig.
+    """
     where = f"{key}/{TRAJECTORY_JSON}"
-    found, reason = None, f"{where}: is missing."
-    if TRAJECTORY_JSON in files:
-        try:
-            found = understood_poses(folder.read(TRAJECTORY_JSON), rig, where=where)
-        except SidesError as error:
-            remarks.append(Remark("left", str(error)))
-            reason = str(error)
-        except SchemaError as error:
-            reason = str(error)
+    found: Understood | None = None
+    try:
+        found, reason = _read_poses(folder, files, rig, shape=shape, where=where)
+    except SidesError as error:
+        remarks.append(Remark("left", str(error)))
+        reason = str(error)
     if found is not None and found.poses.frame_count < frames:
         reason = (
             f"{where}: has poses of {found.poses.frame_count} frames, and the videos have {frames}."
@@ -372,6 +408,39 @@ def _poses(
             )
         )
     return found.poses, "|".join(found.names)
+
+
+def _read_poses(
+    folder: SceneFolder,
+    files: Mapping[str, object],
+    rig: Rig,
+    *,
+    shape: Shape | None,
+    where: str,
+) -> tuple[Understood | None, str]:
+    """Return poses that fit the rig, or why there are none.
+
+    Raises:
+        SidesError: If they fit but for the side of the primary pair's left camera.
+        SchemaError: If conventions state how poses are read, and they do not fit the rig.
+    """
+    named = None if shape is None else shape.poses
+    if named is not None and named.form == UNKNOWN:
+        return (
+            None,
+            f"{where}: is not read: the conventions call the form of its poses {UNKNOWN!r}.",
+        )
+    if TRAJECTORY_JSON not in files:
+        return None, f"{where}: is missing."
+    try:
+        text = folder.read(TRAJECTORY_JSON)
+        return understood_poses(text, rig, where=where, named=named), ""
+    except SidesError:
+        raise
+    except SchemaError as error:
+        if named is not None:
+            raise
+        return None, str(error)
 
 
 def as_agreed(scene: Scene, agreed: Mapping[str, tuple[str, ...]]) -> Scene:
@@ -543,6 +612,7 @@ def _sized_as_videos(
     *,
     document: TrainingDocument | None,
     remarks: list[Remark],
+    shape: Shape | None,
 ) -> Rig:
     """Return the rig for pictures of the videos' size, which counts whatever baseline.json says.
 
@@ -559,6 +629,12 @@ def _sized_as_videos(
     recorded_px = (width_px, height_px) if document is None else document.source_size_px
     known_px = rig.image_width_px, rig.image_height_px
     if rig.image_size_source == "recorded" and known_px != recorded_px:
+        if shape is not None and not {"image_width", "image_height"}.isdisjoint(shape.numbers):
+            raise StorageError(
+                f"{key}: by the conventions pictures have {known_px[0]}x{known_px[1]} pixels, and "
+                f"all videos have {recorded_px[0]}x{recorded_px[1]}. Correct [image_width] and "
+                f"[image_height], or leave them out: the videos' size counts."
+            )
         remarks.append(
             Remark(
                 "size",
@@ -633,14 +709,18 @@ def _depth_in_metadata(
 
 def _depth_encodings(
     key: str,
-    depths: Iterable[tuple[str, StreamFacts]],
+    depths: Sequence[tuple[str, StreamFacts]],
     *,
     stated: Sequence[Statement],
     remarks: list[Remark],
+    shape: Shape | None,
 ) -> list[DepthEncoding | None]:
     """Return what files state of each camera's depth, None where that is not understood.
 
     Such a scene can still be used, for its colours or with the user's own unit.
+
+    Raises:
+        MediaError: If conventions state another unit than a tag.
     """
     found: list[DepthEncoding | None] = []
     problems: list[str] = []
@@ -650,6 +730,19 @@ def _depth_encodings(
         except MediaError as error:
             found.append(None)
             problems.append(str(error))
+    depth = None if shape is None else shape.depth
+    if depth is not None and depth.encoding.unit_m is not None:
+        known_m = depth.instead_of_tag_m or depth.encoding.unit_m
+        for (name, _), each in zip(depths, found, strict=True):
+            is_told = each is not None and each.source in ("tag", "metadata")
+            if each is not None and is_told and not math.isclose(each.known_unit_m, known_m):
+                raise MediaError(
+                    f"{key}/{name}: its tag states {each.known_unit_m:g} m in a stored unit of "
+                    f"depth, and the conventions expect {known_m:g} m. Correct unit_m in [depth]; "
+                    f"or, if the tag is known to be wrong, add "
+                    f"instead_of_tag_m = {each.known_unit_m:g}."
+                )
+        return [depth.encoding] * len(found)
     if problems:
         others = len(problems) - 1
         more = f" ({counted(others, 'other video')} likewise.)" if others else ""
@@ -749,8 +842,14 @@ def _differing_place(scene: Scene) -> Iterator[Difference]:
             yield "", f"{told}, and by the index it is {brief(indexed)}"
 
 
+def _stated_of(scene: Scene) -> Shape | None:
+    """Return what conventions state about a scene's files, by its row."""
+    return None if scene.conventions is None else shape_of_text(scene.conventions)
+
+
 def _differing_rig(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
-    rig, _, _ = parse_rig(texts[BASELINE_JSON], where=f"{scene.id.key}/{BASELINE_JSON}")
+    where = f"{scene.id.key}/{BASELINE_JSON}"
+    rig, _, _ = parse_rig(texts[BASELINE_JSON], where=where, shape=_stated_of(scene))
     recorded = scene.rig
     if recorded.recorded_size_px is not None:
         width_px, height_px = recorded.recorded_size_px
@@ -769,7 +868,8 @@ def _differing_rig(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Differe
 
 def _differing_labels(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
     key = scene.id.key
-    _, labels, _ = parse_rig(texts[BASELINE_JSON], where=f"{key}/{BASELINE_JSON}")
+    where = f"{key}/{BASELINE_JSON}"
+    _, labels, _ = parse_rig(texts[BASELINE_JSON], where=where, shape=_stated_of(scene))
     marked, _ = parse_complete(texts[COMPLETE_JSON], where=f"{key}/{COMPLETE_JSON}")
     merged = _merged_labels(labels, marked)
     for each in fields(SceneLabels):
@@ -819,7 +919,11 @@ def _differing_poses(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Diffe
     if scene.remark("poses"):
         return
     where = f"{scene.id.key}/{TRAJECTORY_JSON}"
+    shape = _stated_of(scene)
     poses = poses_as(texts[TRAJECTORY_JSON], scene.pose_form, where=where)
+    if shape is not None and shape.poses is not None:
+        named = shape.poses
+        poses = understood_poses(texts[TRAJECTORY_JSON], scene.rig, where=where, named=named).poses
     is_longer = poses.frame_count > scene.frames
     if poses.frame_count != scene.frames and not (is_longer and scene.remark("frames")):
         yield _difference(TRAJECTORY_JSON, "frames", poses.frame_count, scene.frames)

@@ -24,6 +24,7 @@ from stereogenbench_data.index.parquet import (
     write_index_file,
 )
 from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, scene_of
+from stereogenbench_data.schema.conventions import Conventions, Shape, shape_of_text
 from stereogenbench_data.schema.records import Scene, SceneId, ShardFacts
 from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.retry import RetryPolicy
@@ -81,6 +82,7 @@ class SceneIndex:
         root: str | Path | None = None,
         retry: RetryPolicy | None = None,
         wanted: Callable[[SceneId], bool] | None = None,
+        conventions: str | Path | Conventions | None = None,
     ) -> "SceneIndex":
         """Open the index of some data.
 
@@ -98,17 +100,30 @@ class SceneIndex:
             retry: How slow a server may be.
             wanted: Which scenes of a folder without an index are described, by their paths; None
                 is all.
+            conventions: Where quantities stand in the files and how they are read, as
+                ``stereogenbench conventions`` writes it: a file's path, or what is in it. The rows
+                keep it, so that an index or shards made of this one need not be told again. Rows of
+                an index are not described again: files of some scenes are compared with them.
 
         Warns with `IncompleteSceneWarning` of scenes that were left out: it counts them and names
-        the first.
+        the first; and with `AssumptionWarning` of what was taken for granted, where the files of a
+        folder without an index are not as the paper prints them and no conventions are given.
 
         Raises:
             StorageError: If there are no such data, they hold no scene, the index is damaged or of
-                another version, only you may name the place of its data, or more than a few scenes
-                of a tree are broken.
+                another version, only you may name the place of its data, more than a few scenes
+                of a tree are broken, or the data contradict the conventions.
+            SchemaError: If the conventions are not understood.
         """
-        table, head, stale, seek_tables = open_table(data, root=root, retry=retry, wanted=wanted)
-        return cls(table, head, retry=retry, stale=stale, seek_tables=seek_tables)
+        stated = None if conventions is None else Conventions.read(conventions)
+        opened = open_table(data, root=root, retry=retry, wanted=wanted, conventions=stated)
+        return cls(
+            opened.table,
+            opened.head,
+            retry=retry,
+            stale=opened.stale,
+            seek_tables=opened.seek_tables,
+        )
 
     @classmethod
     def from_scenes(
@@ -230,6 +245,11 @@ class SceneIndex:
             self._columns[name] = as_numpy(self._table.column(name))
             self._columns[name].setflags(write=False)
         return self._columns[name]
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        """What conventions state about its scenes; () where they were described without any."""
+        return tuple(map(shape_of_text, self.categories("conventions")[0]))
 
     def categories(self, name: str) -> tuple[list[str], np.ndarray]:
         """Return the different values of a column of texts, and which each scene has.

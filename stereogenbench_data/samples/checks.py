@@ -13,6 +13,7 @@ from stereogenbench_data.media.depth import DEPTH_CURES, NO_DEPTH_UNIT, require_
 from stereogenbench_data.samples.derive import RECTIFIED_PX
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.samples.size import EnlargedSizeWarning, warn_if_swapped
+from stereogenbench_data.schema.conventions import shape_of_text
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT, DEFAULT_DEPTH_UNIT_M, depth_name
 from stereogenbench_data.schema.text import counted
@@ -122,7 +123,19 @@ def _missing_videos(index: SceneIndex, plan: Plan, request: Request, place: int)
 
 
 def _require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> None:
-    encoding = request.depth or DepthEncoding()
+    """Refuse depth that its contract does not accept, or whose unit is not known."""
+    scenes = index.column("conventions")[plan.scene_rows]
+    for text in [None] if request.depth is not None else dict.fromkeys(scenes):
+        stated = None if text is None else shape_of_text(text).depth
+        encoding = request.depth or (DepthEncoding() if stated is None else stated.encoding)
+        rows = plan.scene_rows if request.depth else plan.scene_rows[scenes == text]
+        _require_whole(index, plan, request, encoding=encoding, rows=rows)
+
+
+def _require_whole(
+    index: SceneIndex, plan: Plan, request: Request, *, encoding: DepthEncoding, rows: np.ndarray
+) -> None:
+    """Refuse depth of some scenes that a contract does not accept."""
     units_known = index.column("depth_unit_source") != "unreadable"
     codecs, codec = index.categories("depth_codec")
     pixel_formats, pixel_format = index.categories("depth_pixel_format")
@@ -130,14 +143,16 @@ def _require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> Non
     for row, column in np.ndindex(len(codecs), len(pixel_formats)):  # -1 is unknown: not kept
         keeps_depth[row, column] = _keeps_depth(codecs[row], pixel_formats[column], encoding)
     usable = keeps_depth[codec, pixel_format] & (units_known | (encoding.unit_m is not None))
-    if usable.all():
+    if usable[rows].all():
         return
     pairs = plan.pairs
+    is_of_rows = np.isin(pairs.row, rows)[:, None]
     for stream, cameras in (
         ("source_depth", pairs.source[:, None]),
         ("target_depth", pairs.targets),
     ):
-        refused = np.argwhere((cameras >= 0) & ~usable[pairs.row[:, None], cameras])
+        is_refused = is_of_rows & (cameras >= 0) & ~usable[pairs.row[:, None], cameras]
+        refused = np.argwhere(is_refused)
         if stream in request.streams and len(refused):
             pair, place = refused[0]
             scene = index.scene(int(pairs.row[pair]))

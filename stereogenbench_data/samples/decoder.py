@@ -20,6 +20,7 @@ from stereogenbench_data.samples.derive import RECTIFIED_PX, SceneFacts
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.samples.streams import OPEN_STREAMS, Streams, StreamStats
 from stereogenbench_data.samples.views import StoredDepth, Views
+from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import (
     TRAJECTORY_JSON,
@@ -202,7 +203,7 @@ class SampleDecoder:
                 height, width = self._request.size
                 intrinsics = intrinsics.resized(width_px=width, height_px=height)
             encodings = {
-                camera: scene.depth_encoding(camera, self._request.depth)
+                camera: scene.depth_encoding(camera, self._request.depth or depth_of(scene))
                 for camera in range(len(scene.depth_unit_m))
             }
             known = self._scenes[row] = _KnownScene(scene, intrinsics, encodings)

@@ -13,6 +13,15 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from stereogenbench_data.errors import SchemaError
+from stereogenbench_data.schema.conventions import (
+    NUMBERS,
+    BaselinesAt,
+    NumberAt,
+    PrimaryPairAt,
+    Shape,
+    keys_of,
+    place_of,
+)
 from stereogenbench_data.schema.document import (
     MOST_LETTERS,
     brief,
@@ -22,6 +31,7 @@ from stereogenbench_data.schema.document import (
     parse_object,
 )
 from stereogenbench_data.schema.quantities import (
+    NAMES,
     UNITS_M,
     Node,
     Stated,
@@ -116,14 +126,22 @@ class _Findings:
 
     where: str
     keys: str = ""
+    shape: Shape | None = None
     problems: list[str] = field(default_factory=list)
     remarks: list[Remark] = field(default_factory=list)
 
     def conflict(self, what: str, first: Stated, other: Stated) -> None:
         self.problems.append(
             f"{other.path}: states another {what} ({brief(other.value)} {other.unit}) than "
-            f"{first.path} ({brief(first.value)} {first.unit}). Remove the wrong one"
+            f"{first.path} ({brief(first.value)} {first.unit}). {self.cure}"
         )
+
+    @property
+    def cure(self) -> str:
+        """What to do about values that conflict."""
+        if self.shape is None:
+            return "Remove the wrong one"
+        return "Remove the wrong one, or list its place as 'ignored' in the conventions"
 
     def require_none(self) -> None:
         if self.problems:
@@ -218,7 +236,9 @@ def parse_description(text: bytes, *, where: str) -> tuple[Description, tuple[Re
     return Description(short, detailed, scene_type, setting, tags), tuple(findings.remarks)
 
 
-def parse_rig(text: bytes, *, where: str) -> tuple[Rig, SceneLabels, tuple[Remark, ...]]:
+def parse_rig(
+    text: bytes, *, where: str, shape: Shape | None = None
+) -> tuple[Rig, SceneLabels, tuple[Remark, ...]]:
     """Return the rig and the identifiers that a ``baseline.json`` records, and what is odd.
 
     Without an image size, the release's 1280 x 1280 is assumed (``image_size_source`` says so).
@@ -230,16 +250,18 @@ def parse_rig(text: bytes, *, where: str) -> tuple[Rig, SceneLabels, tuple[Remar
     Args:
         text: The file's bytes.
         where: The file's path, for messages.
+        shape: What conventions state about such files.
 
     Raises:
         SchemaError: If focal length, sensor width, a baseline or the primary pair is missing, not
-            understood or stated twice with other values; the message lists every problem.
+            understood or stated twice with other values, or the conventions are contradicted; the
+            message lists every problem.
 
     Source: the paper's appendix on the file schema.
     """
     document = parse_object(text, where=where)
-    nodes = nodes_of(document)
-    findings = _Findings(where, keys=_keys(document))
+    nodes = nodes_of(document) if shape is None else shape.nodes(document, where=where)
+    findings = _Findings(where, keys=_keys(document), shape=shape)
     baselines_cm, first_number = _baselines(document, nodes, findings)
     width, height = _side(nodes, "image_width"), _side(nodes, "image_height")
     width_px, height_px = width or IMAGE_SIZE_PX, height or width or IMAGE_SIZE_PX
@@ -256,7 +278,7 @@ def parse_rig(text: bytes, *, where: str) -> tuple[Rig, SceneLabels, tuple[Remar
         image_height_px=height_px,
         principal_point_px=_principal_point(nodes, findings, size_px=(width_px, height_px)),
         baselines_cm=tuple(baselines_cm.get(pair, math.nan) for pair in CAMERA_PAIRS),
-        primary_pair=_primary_pair(nodes, findings, first_number=first_number),
+        primary_pair=_primary_pair(document, nodes, findings, first_number=first_number),
         image_size_source="default" if width is None and height is None else "recorded",
     )
     labels = _labels(nodes, findings)
@@ -343,14 +365,16 @@ def _lens(nodes: list[Node], findings: _Findings, *, width_px: int | None) -> tu
         if focal_mm and sensor_mm and abs(focal_mm / sensor_mm - ratio) > _RATIO * ratio:
             findings.problems.append(
                 f"{each.path}: {brief(each.value)} means {ratio:.6g} focal lengths a sensor width, "
-                f"and focal length and sensor width in mm mean {focal_mm / sensor_mm:.6g}. Remove "
-                f"the wrong ones"
+                f"and focal length and sensor width in mm mean {focal_mm / sensor_mm:.6g}. "
+                f"{findings.cure}"
             )
     for name, length_mm in (("focal_length_mm", focal_mm), ("sensor_width_mm", sensor_mm)):
         if not length_mm and not any(name[:5] in problem for problem in findings.problems):
             findings.problems.append(
                 f"$.camera_intrinsics.{name} is missing; the keys are: {findings.keys}"
             )
+    if findings.shape is not None and focal_mm and sensor_mm:
+        _require_lens(focal_mm, sensor_mm, findings)
     return focal_mm or 1.0, sensor_mm or 1.0
 
 
@@ -369,6 +393,18 @@ def _focal_ratios(nodes: list[Node], *, width_px: int | None) -> list[tuple[Stat
     return ratios
 
 
+def _require_lens(focal_mm: float, sensor_mm: float, findings: _Findings) -> None:
+    low, high = _FOCAL_LENGTHS
+    if not low <= focal_mm / sensor_mm <= high:
+        findings.problems.append(
+            f"by the conventions a focal length is {focal_mm:.6g} mm on a sensor {sensor_mm:.6g} "
+            f"mm wide, {focal_mm / sensor_mm:.3g} widths, and lenses have {low:g} to {high:g}. "
+            f"Correct the unit or the place"
+        )
+
+
+_FOCAL_LENGTHS: Final = (0.4, 6.0)
+"""Focal lengths in widths of the sensor that conventions may mean: the release has 0.76 to 3.6."""
 _RATIO: Final = 1e-3
 """How far a field of view may be from focal length over sensor width: it is often rounded."""
 
@@ -395,6 +431,9 @@ def _principal_point(
             place_px.append(side_px / 2)  # a share of the side
         elif usable and 1 < usable[0].value < side_px:
             place_px.append(float(usable[0].value))
+            for each in usable[1:] if findings.shape is not None else ():
+                if abs(each.value - usable[0].value) > each.rounding + usable[0].rounding:
+                    findings.conflict("principal point", usable[0], each)
         else:
             shown = ", ".join(f"{each.path} {brief(each.value)}" for each in found) or "one side"
             findings.remarks.append(
@@ -410,10 +449,12 @@ def _principal_point(
     return place_px[0], place_px[1]
 
 
-def _primary_pair(nodes: list[Node], findings: _Findings, *, first_number: int) -> Pair:
+def _primary_pair(
+    document: dict[str, Any], nodes: list[Node], findings: _Findings, *, first_number: int
+) -> Pair:
     pairs: list[tuple[Stated, Pair]] = []
     odd: list[str] = []
-    for each in stated(nodes, "primary_pair"):
+    for each in [*_stated_pair(document, findings), *stated(nodes, "primary_pair")]:
         value = each.value
         if isinstance(value, dict):
             left, right = (_end(value, side) for side in ("left", "right"))
@@ -439,7 +480,8 @@ def _primary_pair(nodes: list[Node], findings: _Findings, *, first_number: int) 
         if pairs and pairs[0][1] != (left, right):
             findings.conflict("primary pair", pairs[0][0], each)
         pairs.append((each, (left, right)))
-    if pairs:
+    is_stated = findings.shape is not None and findings.shape.primary_pair is not None
+    if pairs and not (is_stated and odd):
         return pairs[0][1]
     findings.problems += odd
     if not odd:
@@ -449,6 +491,18 @@ def _primary_pair(nodes: list[Node], findings: _Findings, *, first_number: int) 
         )
         findings.remarks.append(Remark("primary pair", told))
     return 0, 1
+
+
+def _stated_pair(document: dict[str, Any], findings: _Findings) -> list[Stated]:
+    """Return the primary pair that conventions state, as a list of two cameras."""
+    shape = findings.shape
+    if shape is None or shape.primary_pair is None:
+        return []
+    paths = (shape.primary_pair.left, shape.primary_pair.right)
+    cameras = [
+        shape.value_at(document, path, table="primary_pair", where=findings.where) for path in paths
+    ]
+    return [Stated(cameras, "", " and ".join(paths))]
 
 
 def _end(pair: dict[str, Any], side: str) -> int | None:
@@ -509,7 +563,7 @@ def _baselines(
         if abs(length_cm - known_cm) > rounding_cm + known_rounding_cm:
             findings.problems.append(
                 f"{each.path}: the baseline of cameras {low} and {high} is {length_cm:.9g} cm "
-                f"here and {known_cm:.9g} cm at {known.path}. Remove the wrong one"
+                f"here and {known_cm:.9g} cm at {known.path}. {findings.cure}"
             )
         elif pair not in best or (
             rounding_cm < known_rounding_cm and abs(length_cm - known_cm) > _FLOAT32 * length_cm
@@ -559,10 +613,32 @@ def _recorded_lengths(
     five lengths of neighbours, below a key that speaks of pairs or baselines.
     """
     default_m = length_unit_m(nodes) or 0.01
+    shape = findings.shape
+    at = None if shape is None else shape.baselines
+    if at is not None and shape is not None:
+        default_m = UNITS_M.get(at.unit or "", default_m)
+        value = shape.value_at(document, at.place, table="baselines", where=findings.where)
+        name = f"baselines_{words(at.place.rpartition('.')[2])}"
+        there = list(_lengths_below([(value, name, at.place, None)], default_m, findings))
+        if not any(math.isclose(cm / each.value, default_m * 100) for _, cm, each in there):
+            findings.problems.append(
+                f"{at.place}: by the conventions baselines in {at.unit or 'the unit of the file'} "
+                f"stand here, and {brief(value)} has none. Correct the place or the unit"
+            )
+        yield from there
     keys = sorted(document, key=lambda key: key != "pairwise_pairs")
-    waiting: list[_Waiting] = [
+    by_name: list[_Waiting] = [
         (document[key], words(key), child_path("$", key), None) for key in keys
     ]
+    for found in _lengths_below(by_name, default_m, findings):
+        if shape is None or not shape.ignores(found[2].path):
+            yield found
+
+
+def _lengths_below(
+    waiting: list[_Waiting], default_m: float, findings: _Findings
+) -> Iterable[_Recorded]:
+    """Yield the pairs of `_recorded_lengths` in values with their names in words and places."""
     for node, name, path, row in waiting:
         if "primary" in name or not isinstance(node, dict | list):
             continue
@@ -672,3 +748,110 @@ def _length(
         findings.problems.append(f"{path}: must be a number above zero, found {brief(value)}")
         return
     yield cameras, float(value) * (unit_m / 0.01), Stated(value, "", path)
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """Where the quantities of a ``baseline.json`` stand.
+
+    Attributes:
+        shape: What conventions would state about the file.
+        found: For each table, the values that it means, and other places that state the same.
+        unknown: The places of numbers and texts, as `keys_of` names them, that nothing reads.
+    """
+
+    shape: Shape
+    found: dict[str, list[str]]
+    unknown: list[str]
+
+
+def see_rig(text: bytes, *, where: str) -> Seen:
+    """Return where the quantities of a ``baseline.json`` stand, as `parse_rig` finds them.
+
+    Raises:
+        SchemaError: If it is not a JSON object.
+    """
+    document = parse_object(text, where=where)
+    nodes, findings = nodes_of(document), _Findings(where)
+    numbers_at: dict[str, NumberAt] = {}
+    found: dict[str, list[str]] = {}
+    read: set[str] = set()
+    for name, quantity in NUMBERS.items():
+        usable = [each for each in numbers(nodes, quantity) if _is_usable(name, each)]
+        read |= {place_of(each.path) for each in stated(nodes, quantity)}
+        if not usable:
+            continue
+        first, *others = usable
+        unit = first.unit or _USUAL_UNITS.get(name)
+        numbers_at[name] = NumberAt(place=first.path, unit=unit)
+        found[name] = [f"{first.path} is {first.value:g}{f' {unit}' if unit else ''}"]
+        found[name] += [f"{each.path} is {each.value:g} {each.unit}".rstrip() for each in others]
+    lengths = list(_recorded_lengths(document, nodes, findings))
+    lengths.sort(key=lambda each: not each[2].path.startswith("$.pairwise_pairs"))
+    read |= {place_of(each.path) for _, _, each in lengths}
+    baselines = None
+    if lengths:
+        steps = [_steps(each.path) for _, _, each in lengths]
+        same = [each for each in steps if each[:1] == steps[0][:1]]
+        alike = itertools.takewhile(lambda step: len({*step}) == 1, zip(*same, strict=False))
+        common = [step[0] for step in alike]
+        place = "$" + "".join(common if len(common) < len(steps[0]) else common[:-1])
+        pair, length_cm, each = lengths[0]
+        unit_m = length_cm / 100 / each.value
+        unit = next((name for name in ("mm", "cm", "m") if math.isclose(UNITS_M[name], unit_m)), "")
+        baselines = BaselinesAt(place=place, unit=unit or None)
+        found["baselines"] = [
+            f"{each.path} is {each.value:g}, {length_cm:g} cm of cameras {pair[0]} and {pair[1]}",
+            f"{len(same)} lengths below {place}, {len(lengths) - len(same)} elsewhere",
+        ]
+    primary = _seen_pair(nodes)
+    if primary is not None:
+        found["primary_pair"] = [f"{primary.left} is the left camera, {primary.right} the right"]
+        read |= {place_of(primary.left), place_of(primary.right)}
+    read |= {place_of(each.path) for quantity in NAMES for each in stated(nodes, quantity)}
+    shape = Shape(numbers=numbers_at, baselines=baselines, primary_pair=primary)
+    keys = keys_of(document)
+    unknown = sorted(
+        key for key in keys
+        if not any(key == each or key.startswith((f"{each}.", f"{each}[")) for each in read)
+        and not any(each.startswith(f"{key}[]") for each in keys)
+        and not _NAMES_A_CAMERA.search(key.rpartition(".")[2])
+    )  # fmt: skip
+    return Seen(shape, found, unknown)
+
+
+_USUAL_UNITS: Final = {
+    **dict.fromkeys(("focal_length", "sensor_width", "sensor_height"), "mm"),
+    "field_of_view": "deg",
+}
+
+
+def _is_usable(name: str, each: Stated) -> bool:
+    """Return whether a number is what a table of conventions may mean."""
+    if name in ("focal_length", "sensor_width", "sensor_height"):
+        return each.value > 0 and each.unit in ("", *UNITS_M)
+    if name == "focal_length_px":
+        return bool(each.value > 0 and (each.unit.startswith("p") or each.path[-1:] in "xX"))
+    return bool(each.value > 0)
+
+
+def _steps(path: str) -> list[str]:
+    return re.findall(r"\.[^.\[]+|\[[^\]]*\]", path)
+
+
+def _seen_pair(nodes: list[Node]) -> PrimaryPairAt | None:
+    """Return where the primary pair names its cameras."""
+    for each in stated(nodes, "primary_pair"):
+        ends: list[str | int] = [0, 1]
+        if isinstance(each.value, dict):
+            sides = {
+                side: key for side in ("right", "left") for key, value in each.value.items()
+                if side in words(key).split("_") and _camera(value) is not None
+            }  # fmt: skip
+            ends = [sides[side] for side in ("left", "right") if side in sides]
+        elif not isinstance(each.value, list) or len(each.value) != 2:
+            continue
+        if len(ends) == 2:
+            left, right = (child_path(each.path, end) for end in ends)
+            return PrimaryPairAt(left=left, right=right)
+    return None

@@ -6,6 +6,7 @@ end (``focalLengthMM``, ``sensor_width (cm)``) do not matter, and the key above 
 (``"sensor": {"width": ...}``). A new spelling is a word more in `NAMES`.
 """
 
+import json
 import math
 import re
 from dataclasses import dataclass
@@ -75,8 +76,9 @@ UNITS_M: Final = {
 }
 """Metres in a unit of length; a unit of Unreal is a centimetre."""
 
-_OTHER_UNITS: Final = frozenset({"px", "pixel", "pixels", "deg", "degree", "degrees", "rad",
-                                 "radian", "radians"})  # fmt: skip
+OTHER_UNITS: Final = frozenset({"px", "pixel", "pixels", "deg", "degree", "degrees", "rad",
+                                "radian", "radians"})  # fmt: skip
+"""Units of what is no length."""
 _TEXT_NUMBER: Final = re.compile(r"\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([A-Za-z]*)\s*\Z")
 _DEEPEST: Final = 8
 _LONGEST: Final = 256
@@ -135,14 +137,17 @@ def without_unit(name: str) -> tuple[str, str]:
     (('sensor_width', 'mm'), ('roll', 'deg'), ('m', ''))
     """
     head, _, last = name.rpartition("_")
-    if head and (last in UNITS_M or last in _OTHER_UNITS):
+    if head and (last in UNITS_M or last in OTHER_UNITS):
         return head.removesuffix("_in"), last
     return name, ""
 
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """A value below a document: its key in words, without and with the unit, and its place."""
+    """A value below a document: its key in words, without and with the unit, and its place.
+
+    ``means`` is the quantity that conventions say it is, "" where only its name says it.
+    """
 
     plain: str
     unit: str
@@ -150,6 +155,7 @@ class Node:
     parent: str
     value: Any
     path: str
+    means: str = ""
 
 
 def nodes_of(document: dict[str, Any]) -> list[Node]:
@@ -182,11 +188,47 @@ def _of_matrix(value: Any, path: str) -> list[Node]:
     return [Node(name, "px", name, "", value[at], path) for name, at in places.items()]
 
 
+_STEP: Final = re.compile(r'\.([A-Za-z_][A-Za-z0-9_]*)|\[([0-9]{1,6})\]|\[("(?:[^"\\]|\\.)*")\]')
+
+
+def value_at(document: Any, path: str) -> Any:
+    """Return the value at a JSON path as `child_path` writes it.
+
+    Raises:
+        LookupError: If there is none.
+
+    >>> value_at({"a": [{"b c": 7}]}, '$.a[0]["b c"]')
+    7
+    """
+    node, at = document, 1
+    while at < len(path):
+        step = _STEP.match(path, at)
+        if step is None:
+            raise LookupError(path)
+        plain, number, quoted = step.groups()
+        key: Any = int(number) if number else json.loads(quoted) if quoted else plain
+        is_there = key < len(node) if number and isinstance(node, list) else (
+            isinstance(node, dict) and key in node
+        )  # fmt: skip
+        if not is_there:
+            raise LookupError(path)
+        node, at = node[key], step.end()
+    return node
+
+
 def stated(nodes: list[Node], quantity: str) -> list[Stated]:
-    """Return the values of a quantity in a document, the likeliest name and the outermost first."""
+    """Return the values of a quantity in a document, the likeliest name and the outermost first.
+
+    What conventions state comes first, and they know the unit of a key that names none.
+    """
     names = NAMES[quantity].split()
+    known = {node.path for node in nodes if node.means == quantity}
     found: list[tuple[int, Stated]] = []
     for node in nodes:
+        if node.means:
+            if node.means == quantity:
+                found.append((-1, _stated(node.value, node.unit, node.path)))
+            continue
         for key in (node.plain, f"{node.parent}_{node.plain}", node.name):
             if key in names:
                 found.append((names.index(key), _stated(node.value, node.unit, node.path)))
@@ -196,7 +238,11 @@ def stated(nodes: list[Node], quantity: str) -> list[Stated]:
             if isinstance(value, list) and len(value) == 2:
                 value, path = value[at], child_path(path, at)
             found.append((0, Stated(value, node.unit, path)))
-    return [each for _, each in sorted(found, key=lambda each: each[0])]
+    return [
+        each
+        for rank, each in sorted(found, key=lambda each: each[0])
+        if rank < 0 or each.unit or each.path not in known
+    ]
 
 
 def numbers(nodes: list[Node], quantity: str) -> list[Stated]:

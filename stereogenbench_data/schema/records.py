@@ -26,7 +26,7 @@ RotationKind = Literal["rotator_deg", "quaternion_xyzw", "matrix"]
 DepthKind = Literal["planar", "ray"]
 DepthForm = Literal["depth", "inverse"]
 DepthRisk = Literal["8-bit", "9-bit", "10-bit", "12-bit", "14-bit", "lossy", "chroma"]
-DepthUnitSource = Literal["tag", "metadata", "default", "unreadable"]
+DepthUnitSource = Literal["tag", "metadata", "default", "conventions", "unreadable"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +174,7 @@ class DepthEncoding:
             "9-bit", "10-bit", "12-bit", "14-bit"), "lossy" (a lossy codec) or "chroma" (only the
             luma plane is read).
         source: The origin of ``unit_m``: a tag of the file, JSON of the scene, the release's
-            default, or the user.
+            default, the data's conventions, or the user.
 
     Raises:
         SchemaError: If a value is out of range.
@@ -188,7 +188,7 @@ class DepthEncoding:
     frame_lag: int = 0
     no_depth: tuple[int | Literal["max"], ...] = (0, "max")
     accept: frozenset[DepthRisk] = frozenset()
-    source: Literal["tag", "metadata", "default", "user"] = "user"
+    source: Literal["tag", "metadata", "default", "conventions", "user"] = "user"
     offset_m: float = 0.0
 
     def __post_init__(self) -> None:
@@ -241,7 +241,7 @@ class DepthEncoding:
         self,
         unit_m: float,
         *,
-        source: Literal["tag", "metadata", "default"],
+        source: Literal["tag", "metadata", "default", "conventions"],
         offset_m: float = 0.0,
     ) -> "DepthEncoding":
         """Return the encoding with the file's unit and offset, unless it has its own unit."""
@@ -307,8 +307,8 @@ class Scene:
             the pose chain, in pixels of the recorded image.
         depth_unit_m: Metres in a stored unit of each camera's depth, as stated or by default.
         depth_offset_m: Depth in metres of the stored number 0 of each camera.
-        depth_unit_source: Where that stands: "tag", "metadata" (JSON), "default" (nowhere), or
-            "unreadable" (not understood, or contradictory: unit nan), per camera.
+        depth_unit_source: Where that stands: "tag", "metadata" (JSON), "conventions", "default"
+            (nowhere), or "unreadable" (not understood, or contradictory: unit nan), per camera.
         depth_codec: FFmpeg's name of the codec of each camera's depth, or "blosc2" for depth
             packed by blosc2.
         depth_pixel_format: FFmpeg's name of the pixel format of each camera's depth.
@@ -320,6 +320,8 @@ class Scene:
         pose_form: The names of the readings of its trajectory that the rig's geometry confirms,
             the chosen one first, joined by "|"; None for the one that the file itself names, and
             where poses are not understood.
+        conventions: What conventions state about its files, as `schema.conventions.Shape.text`
+            writes it; None where it was described without any.
         members: File name to the place of its bytes. Depth packed by blosc2 has a name of its own,
             which `held_name` returns.
         seek_tables: Where the packets of its videos lie, as `media.seek_table` packs it; None where
@@ -345,6 +347,7 @@ class Scene:
     remarks: tuple[Remark, ...] = ()
     pose_form: str | None = None
     depth_offset_m: tuple[float, ...] = (0.0,) * 6
+    conventions: str | None = None
     seek_tables: bytes | None = field(default=None, compare=False, repr=False)
 
     def depth_encoding(self, camera: int, contract: DepthEncoding | None = None) -> DepthEncoding:

@@ -31,6 +31,7 @@ from stereogenbench_data.media.depth import (
 from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.picture_encoding import measured_error
 from stereogenbench_data.media.video import VideoReader, probe, require_pixel_aspect
+from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
@@ -424,7 +425,7 @@ def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
     found: tuple[object, ...] = (depth_coding(facts), facts.pixel_format)
     indexed: tuple[object, ...] = (scene.depth_codec[camera], scene.depth_pixel_format[camera])
     if scene.depth_unit_source[camera] in ("tag", "default"):
-        encoding = resolve_encoding(facts, name=name)
+        encoding = resolve_encoding(facts, name=name, override=depth_of(scene))
         found = (*found, encoding.known_unit_m, encoding.offset_m)
         indexed = (*indexed, scene.depth_unit_m[camera], scene.depth_offset_m[camera])
     if found != indexed:

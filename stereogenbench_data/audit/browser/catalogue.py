@@ -14,6 +14,7 @@ from stereogenbench_data.audit.pictures.scene_pictures import derived_text
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
 from stereogenbench_data.schema.text import shortened
@@ -302,7 +303,7 @@ class Catalogue:
 
 def _facts(scene: Scene, *, depth: DepthEncoding | None) -> dict[str, Any]:
     rig, camera = scene.rig, rig_intrinsics(scene.rig)
-    encoding = scene.depth_encoding(0, depth)
+    encoding = scene.depth_encoding(0, depth or depth_of(scene))
     return {
         "key": scene.id.key,
         "caption": scene.caption,

@@ -67,7 +67,7 @@ class SceneDiagnosis:
         matches: Pixels that were found in both pictures of a view.
         textured: Pixels that were searched for.
         unit_m: The declared unit of the primary pair's left depth, in metres.
-        unit_source: Where it comes from: "tag", "default", "user" or "unreadable".
+        unit_source: Where it comes from: "tag", "default", "conventions", "user" or "unreadable".
         focal_ratios: Maps other readings of focal length and sensor, in words, to their disparity
             over that by the sensor's width; readings with equal results are left out.
         recorded_pair: The recorded primary pair if, by the poses, its left camera stands to the
@@ -476,7 +476,9 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         "matches": sum(len(match.rows) for match in matches[::2]),
         "textured": sum(match.textured for match in matches[::2]),
         "unit_m": views.unit_m(file),
-        "unit_source": "user" if views.encoding.unit_m else views.scene.depth_unit_source[file],
+        "unit_source": (
+            views.encoding.source if views.encoding.unit_m else views.scene.depth_unit_source[file]
+        ),
         "focal_ratios": focal_ratios(views.scene.rig),
         "recorded_pair": crossed_pair(views.scene),
         "declared": declared,

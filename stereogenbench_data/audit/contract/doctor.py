@@ -30,6 +30,7 @@ from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.streams import Streams
+from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import TRAJECTORY_JSON
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
@@ -44,7 +45,6 @@ class DoctorReport:
 
     Attributes:
         data: The root of the data.
-        declared: The contract under test.
         scenes: Each scene's own diagnosis, sorted by key.
         verdicts: One for each group of scenes with the same contract, the largest group first.
         left_out: Maps the keys of scenes that cannot be judged to the reason.
@@ -52,7 +52,6 @@ class DoctorReport:
     """
 
     data: str
-    declared: DepthEncoding
     scenes: tuple[SceneDiagnosis, ...]
     verdicts: tuple[Verdict, ...]
     left_out: dict[str, str]
@@ -96,7 +95,7 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
         data: What `SceneIndex.open` takes, or an index.
         scenes: How many scenes to diagnose, spread over those that pass the filters.
         frames: How many frames of each scene.
-        depth: The contract under test; None for what files and release state.
+        depth: The contract under test; None for what files, conventions and release state.
         workers: Number of processes, None for one a core.
         engine: Where they run: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called with the number of scenes done and of all scenes.
@@ -113,7 +112,6 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
         )
     index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
     index.require_released("The doctor")
-    encoding = depth or DepthEncoding()
     rows = filter_scenes(index, filters or {})
     residual_px = index.column("rig_residual_px")[rows]
     left_out = {
@@ -126,10 +124,11 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
         np.unique(np.linspace(0, len(usable) - 1, min(scenes, len(usable))).astype(int))
     ]
     tasks = [
-        DiagnosisTask(SceneAccess.of(index, index.scene(int(row))), frames, encoding)
-        for row in chosen
+        DiagnosisTask(SceneAccess.of(index, scene), frames, depth or depth_of(scene))
+        for scene in (index.scene(int(row)) for row in chosen)
     ]
     found, shares = [], []
+    contracts = {task.access.key: task.encoding for task in tasks}
     results = engine.map(_diagnose, tasks, name=lambda task: task.access.key, workers=workers)
     with closing(results):
         for diagnosis, explained in results:
@@ -138,9 +137,15 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
             if progress is not None:
                 progress(len(found), len(tasks))
     found.sort(key=lambda diagnosis: diagnosis.key)
-    verdicts = tuple(judge(group, declared=encoding) for group in group_by_contract(found))
+    groups = [
+        group
+        for contract in dict.fromkeys(contracts.values())
+        for group in group_by_contract([each for each in found if contracts[each.key] == contract])
+    ]
+    groups.sort(key=len, reverse=True)
+    verdicts = tuple(judge(group, declared=contracts[group[0].key]) for group in groups)
     worlds = judge_worlds(shares) if shares else None
-    return DoctorReport(index.where, encoding, tuple(found), verdicts, left_out, worlds)
+    return DoctorReport(index.where, tuple(found), verdicts, left_out, worlds)
 
 
 def _diagnose(task: DiagnosisTask, after_bytes: Advance) -> tuple[SceneDiagnosis, dict[str, float]]:

@@ -64,7 +64,8 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
         ),
     )  # fmt: skip
     (row,) = filter_scenes(index, {"scenes": diagnosis.key})
-    task = DiagnosisTask(SceneAccess.of(index, index.scene(int(row))), 1, report.declared)
+    (verdict,) = [each for each in report.verdicts if diagnosis.key in each.scenes]
+    task = DiagnosisTask(SceneAccess.of(index, index.scene(int(row))), 1, verdict.declared)
     figure = figure_class()(figsize=(14, 13.5), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(2, 1))
     with task.scene_frames() as views:

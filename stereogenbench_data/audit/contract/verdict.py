@@ -304,7 +304,7 @@ def _length_answers(scenes: Sequence[SceneDiagnosis], unit: Unit) -> tuple[Answe
     first = scenes[0]
     where = {
         "tag": "by the files' tag", "metadata": "by the scene's JSON", "default": "by default",
-        "user": "as given",
+        "user": "as given", "conventions": "by the conventions",
     }  # fmt: skip
     declared = f"{first.unit_m:g} m, {where.get(first.unit_source, 'as files are not understood')}"
     quotient = _quotient(scenes, unit)
@@ -425,6 +425,7 @@ class Verdict:
 
     Attributes:
         scenes: Their keys.
+        declared: The contract under test.
         answers: One for each question.
         gain: By how much the best contract is better than the declared one.
         agreement: Share of the matches of neighbouring cameras that the best contract explains.
@@ -445,6 +446,7 @@ class Verdict:
     """
 
     scenes: tuple[str, ...]
+    declared: DepthEncoding
     answers: tuple[Answer, ...]
     gain: Gain
     agreement: float
@@ -500,6 +502,7 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
         choices = _length_choices(scenes, unit, encoding_line(with_unit))
     return Verdict(
         scenes=tuple(scene.key for scene in scenes),
+        declared=declared,
         answers=answers,
         gain=pooled([scene.gain for scene in scenes]),
         agreement=float(np.nanmean([scene.agreement for scene in scenes]))

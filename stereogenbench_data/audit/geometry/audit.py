@@ -31,6 +31,7 @@ from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.rows import row_of
 from stereogenbench_data.index.scene_folder import SceneFolder
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
@@ -84,6 +85,7 @@ def open_for_audit(
     workers: int | None = None,
     engine: Engine = LOCAL,
     progress: Progress | None = None,
+    conventions: str | Path | Conventions | None = None,
     **filters: Unpack[SceneFilters],
 ) -> SceneIndex:
     """Return the index of data in which scenes may be broken; the index lists those scenes.
@@ -94,6 +96,7 @@ def open_for_audit(
         workers: Number of processes that read a tree without an index.
         engine: Where these processes run.
         progress: Called with the number of scenes read and of all scenes.
+        conventions: As for `SceneIndex.open`.
         **filters: Scenes of a tree whose paths do not match are not read.
 
     Raises:
@@ -107,11 +110,12 @@ def open_for_audit(
             engine=engine,
             progress=progress,
             wanted=key_filter.matches if key_filter.wanted else None,
+            conventions=None if conventions is None else Conventions.read(conventions),
         )
         return SceneIndex.from_report(report)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", IncompleteSceneWarning)
-        return SceneIndex.open(data, root=root)
+        return SceneIndex.open(data, root=root, conventions=conventions)
 
 
 def _is_plain_tree(data: str | Path) -> bool:

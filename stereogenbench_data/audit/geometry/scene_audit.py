@@ -39,6 +39,7 @@ from stereogenbench_data.index.evidence import poses_as
 from stereogenbench_data.media.depth import NO_DEPTH_UNIT, depth_frame_index, depth_m_from_units
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.samples.streams import Streams
+from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.document import parse_document
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import (
@@ -204,7 +205,7 @@ class _SceneCheck:
     def __init__(self, task: AuditTask) -> None:
         self.scene = task.access.scene
         self.frames = spread_frames(self.scene.frames, task.frames)
-        self.files = AuditedFiles(task.access, contract=task.depth or DepthEncoding())
+        self.files = AuditedFiles(task.access, contract=task.depth or depth_of(task.access.scene))
         self.intrinsics = self.files.intrinsics
         self.light = [LightCheck() for _ in range(CAMERA_COUNT)]
         self.payload = [PayloadCheck() for _ in range(CAMERA_COUNT)]

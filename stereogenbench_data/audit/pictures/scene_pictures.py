@@ -31,6 +31,7 @@ from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.picture import Picture, anaglyph
+from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.sources.files import open_output
@@ -99,7 +100,7 @@ def scene_sheet(
     views = reader.views(row, frame=frame)
     width = tile_width(scene, tile_px)
     rows = [_view_tiles(scene, views, pair), _pair_tiles(scene, sample)]
-    encoding = scene.depth_encoding(pair[0], reader.depth)
+    encoding = scene.depth_encoding(pair[0], reader.depth or depth_of(scene))
     return _contact_sheet(
         _title(scene, sample, encoding, pair=pair, frame=frame), rows, width_px=width
     )

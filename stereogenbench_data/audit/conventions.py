@@ -1,0 +1,300 @@
+"""Conventions of a tree, with what its pictures say of depth: the doctor measures, nobody else.
+
+`index.learning` finds where quantities stand; here the depth contract of each shape of files is
+tested on some scenes, changed where nothing states it and the pictures are sure, and tested again
+on other scenes.
+"""
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+from stereogenbench_data.audit.contract.doctor import DoctorReport, diagnose
+from stereogenbench_data.audit.contract.verdict import (
+    MARGIN,
+    QUOTIENT,
+    TOPICS,
+    Unit,
+    Verdict,
+    encoding_line,
+)
+from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
+from stereogenbench_data.errors import SelectionError, StereoGenBenchError, StorageError
+from stereogenbench_data.index.learning import (
+    Examined,
+    Learned,
+    chosen_scenes,
+    examine,
+    learn,
+    tables_of_notes,
+)
+from stereogenbench_data.index.scene_folder import IncompleteScene
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.conventions import Conventions, DepthAs, Shape, write_toml
+from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
+from stereogenbench_data.schema.text import counted
+from stereogenbench_data.sources.location import is_remote, shown
+
+SCENES: Final = 20
+FRAMES: Final = 3
+"""Of how many frames of a scene the pictures are compared."""
+PICTURED: Final = 3
+"""How many scenes of a shape are measured by their pictures, and how many others verify it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Survey:
+    """What a look at some scenes of a tree found.
+
+    Attributes:
+        root: The tree.
+        examined: The scenes, in the order in which they were chosen.
+        learned: The conventions; None where those of the user were tested instead.
+        problems: What is not understood, contradicts the conventions, or contradicts the pictures.
+        verdicts: What the pictures say of each shape's depth, in a line each.
+        notes: The comments of the file, as `write_toml` takes them.
+    """
+
+    root: str
+    examined: tuple[Examined, ...]
+    learned: Learned | None
+    problems: list[str] = field(default_factory=list)
+    verdicts: list[str] = field(default_factory=list)
+    notes: dict[tuple[int, str], list[str]] = field(default_factory=dict)
+
+    @property
+    def toml(self) -> str:
+        """The conventions as a file."""
+        if self.learned is None or not self.learned.conventions.shapes:
+            return ""
+        return write_toml(self.learned.conventions, self.notes)
+
+
+def survey(  # noqa: PLR0913 - each names one thing that a user chooses
+    root: str | Path,
+    *,
+    scenes: int = SCENES,
+    pictured: int = PICTURED,
+    conventions: Conventions | None = None,
+    wanted: Callable[[SceneId], bool] | None = None,
+    workers: int | None = None,
+    engine: Engine = LOCAL,
+    progress: Progress | None = None,
+) -> Survey:
+    """Look at some scenes of a tree in the released layout: learn its conventions, or test some.
+
+    Args:
+        root: The folder that holds ``train`` and ``eval``, or its URL.
+        scenes: How many scenes are read, spread over families, maps and keys of files.
+        pictured: How many scenes of each shape are measured by their pictures, and as many others
+            verify what was measured; 0 for none.
+        conventions: What is tested; None to learn.
+        wanted: Which scenes, by their paths.
+        workers: Number of processes, None for one a core.
+        engine: Where they run.
+        progress: Called with the number of scenes read and of all.
+
+    Raises:
+        SelectionError: If no scene is wanted, or a number is below 1.
+        StorageError: If the tree holds no scenes, or none of those looked at is finished.
+    """
+    if scenes < 1 or pictured < 0:
+        raise SelectionError(f"scenes must be at least 1, got {scenes}: ask for more.")
+    keys = chosen_scenes(root, count=scenes, wanted=wanted)
+    if not keys:
+        raise SelectionError(f"{shown(root)}: no scene passes the filters. Check their spelling.")
+    found = list[Examined]()
+    # Reading takes less time than starting processes, unless each file is fetched.
+    readers = workers if is_remote(root) or engine is not LOCAL else 1
+    results = engine.map(_ExamineTask(str(root), conventions), keys, name=str, workers=readers)
+    with closing(results):
+        for each in results:
+            found += [] if each is None else [each]
+            if progress is not None:
+                progress(len(found), len(keys))
+    if not found:
+        raise StorageError(
+            f"{shown(root)}: none of the {counted(len(keys), 'scene')} that were looked at is "
+            f"finished, with videos. Download some whole."
+        )
+    found.sort(key=lambda each: keys.index(each.key))
+    how: dict[str, Any] = {"workers": workers, "engine": engine}
+    if conventions is not None:
+        tested = Survey(str(root), tuple(found), None)
+        tested.problems.extend(each.problem for each in found if each.problem)
+        usable = [each.scene for each in found if each.scene is not None]
+        if usable and pictured:
+            _test_depth(tested, _spread(usable, 2 * pictured), None, how)
+        return tested
+    learned = learn(root, found)
+    surveyed = Survey(str(root), tuple(found), learned, problems=learned.problems)
+    surveyed.notes.update(tables_of_notes(learned))
+    shapes = []
+    for number, (shape, group) in enumerate(
+        zip(learned.conventions.shapes, learned.taught_by, strict=True)
+    ):
+        teaching = [each.scene for each in group if each.scene is not None]
+        keys_there = {each.keys for each in group}
+        others = [each.scene for each in learned.verified if each.keys in keys_there and each.scene]
+        lines, before = surveyed.notes.setdefault((number, "depth"), []), len(surveyed.verdicts)
+        if pictured and teaching:
+            teaching, others = _spread(teaching, pictured), _spread(others, pictured)
+            shape = _with_measured_depth(surveyed, shape, teaching, others, how)
+        lines += surveyed.verdicts[before:] or ["not compared with pictures"]
+        shapes.append(shape)
+    learned = replace(learned, conventions=Conventions(tuple(shapes), "the conventions learned"))
+    surveyed = replace(surveyed, learned=learned)
+    surveyed.notes[-1, ""] = _head(surveyed)
+    return surveyed
+
+
+@dataclass(frozen=True, slots=True)
+class _ExamineTask:
+    """Examines a scene by its key, in a worker process."""
+
+    root: str
+    conventions: Conventions | None
+
+    def __call__(self, key: str, advance: Advance) -> Examined | None:
+        advance(0)
+        try:
+            return examine(self.root, key, conventions=self.conventions)
+        except IncompleteScene:
+            return None
+
+
+def _spread(scenes: Sequence[Scene], count: int) -> list[Scene]:
+    """Return so many scenes or fewer, evenly spread."""
+    return list(scenes[:: max(1, -(-len(scenes) // count))])
+
+
+def _diagnosed(
+    root: str, scenes: Sequence[Scene], depth: DepthEncoding | None, how: dict[str, Any]
+) -> DoctorReport:
+    index = SceneIndex.from_scenes(scenes, root)
+    return diagnose(index, scenes=len(scenes), frames=FRAMES, depth=depth, **how)
+
+
+def _with_measured_depth(
+    surveyed: Survey,
+    shape: Shape,
+    teaching: Sequence[Scene],
+    others: Sequence[Scene],
+    how: dict[str, Any],
+) -> Shape:
+    """Return a shape with the depth contract that pictures confirm, as far as they do.
+
+    Args:
+        surveyed: Takes what pictures say, and what is wrong.
+        shape: What files state.
+        teaching: Scenes of it whose pictures are measured.
+        others: Other scenes of it, which must have the contract that was measured.
+        how: Where processes run.
+    """
+    stated = DepthEncoding(source="conventions") if shape.depth is None else shape.depth.encoding
+    try:
+        report = _diagnosed(surveyed.root, teaching, stated, how)
+    except StereoGenBenchError as error:
+        surveyed.problems.append(str(error))
+        surveyed.verdicts.append(f"the pictures tell nothing: {error}")
+        return shape
+    measured = _measured(report, stated, teaching)
+    if measured == stated:
+        _test_depth(surveyed, [*teaching, *others], stated, how)
+        return shape
+    trial = replace(surveyed, problems=[], verdicts=[])
+    if not _test_depth(trial, others or teaching, measured, how):
+        surveyed.problems.append(
+            f"depth: {encoding_line(measured)} was measured in {teaching[0].id.key}, and other "
+            f"scenes do not have it. `stereogenbench doctor` says more."
+        )
+        _test_depth(surveyed, teaching, stated, how)
+        return shape
+    declared = encoding_line(stated)
+    what = f"measured: {encoding_line(measured)}, where the files say {declared}"
+    if measured.unit_m != stated.unit_m:
+        what += "; the unit, if focal length and baselines are right: pictures show the quotient"
+    surveyed.verdicts.extend([what, *trial.verdicts])
+    if not others:
+        surveyed.verdicts.append("there were no other scenes to verify it")
+    return replace(shape, depth=DepthAs(encoding=measured))
+
+
+def _measured(
+    report: DoctorReport, stated: DepthEncoding, scenes: Sequence[Scene]
+) -> DepthEncoding:
+    """Return a contract with what the pictures of some scenes are sure of and nothing states."""
+    if len(report.verdicts) != 1 or report.verdicts[0].problems:
+        return stated
+    verdict = report.verdicts[0]
+    by_topic = {answer.topic: answer for answer in verdict.answers}
+    best = next(each.best for each in report.scenes if each.key in verdict.scenes)
+    found = {
+        question: getattr(best, question)
+        for question in ("kind", "form", "frame_lag")
+        if by_topic[TOPICS[question]].status == "wrong" and by_topic[TOPICS[question]].is_sure
+    }
+    sources = {source for scene in scenes for source in scene.depth_unit_source}
+    is_known = verdict.quotient_error <= MARGIN
+    if sources <= {"default", "unreadable"} and stated.unit_m is None and is_known:
+        unit = Unit(verdict.quotient * report.scenes[0].unit_m, verdict.quotient_error)
+        found["unit_m"] = unit.rounded_m
+    return replace(stated, **found)
+
+
+def _test_depth(
+    surveyed: Survey, scenes: Sequence[Scene], depth: DepthEncoding | None, how: dict[str, Any]
+) -> bool:
+    """Return whether pictures do not contradict a contract, and note what they say."""
+    try:
+        report = _diagnosed(surveyed.root, scenes, depth, how)
+    except StereoGenBenchError as error:
+        surveyed.problems.append(str(error))
+        return False
+    for verdict in report.verdicts:
+        line = f"pictures of {counted(len(verdict.scenes), 'scene')}: {_in_words(verdict)}"
+        surveyed.verdicts.append(line)
+        if verdict.is_wrong:
+            surveyed.problems.append(f"depth, {', '.join(verdict.scenes[:3])}: {line}")
+    if report.left_out:
+        surveyed.verdicts.append(f"{len(report.left_out)} scenes have rigs that are not rectified")
+    return not report.is_wrong
+
+
+def _in_words(verdict: Verdict) -> str:
+    """Return a verdict with its figures in a line."""
+    quotient, *_ = [answer for answer in verdict.answers if answer.topic == QUOTIENT]
+    wrong = [
+        f"{answer.topic} {answer.found}, not {answer.declared}"
+        for answer in verdict.answers
+        if answer.status == "wrong"
+    ]
+    if wrong or verdict.problems:
+        return (
+            f"{encoding_line(verdict.declared)} is WRONG: {'; '.join([*wrong, *verdict.problems])}"
+        )
+    parts = [f"{answer.topic} {answer.found}" for answer in verdict.answers
+             if answer.status == "confirmed" and answer.topic in TOPICS.values()]  # fmt: skip
+    if quotient.status == "confirmed":
+        parts.insert(0, f"{QUOTIENT} {quotient.found}")
+    held = [f"{answer.topic} {answer.found}" for answer in verdict.answers
+            if answer.status == "not contradicted"]  # fmt: skip
+    open_topics = [answer.topic for answer in verdict.answers if answer.status == "cannot tell"]
+    told = {"confirmed": parts, "not contradicted": held, "cannot tell": open_topics}
+    return "; ".join(f"{word}: {', '.join(topics)}" for word, topics in told.items() if topics)
+
+
+def _head(surveyed: Survey) -> list[str]:
+    learned = surveyed.learned
+    others = 0 if learned is None else len(learned.verified)
+    looked = counted(len(surveyed.examined), "scene")
+    return [
+        "Conventions: where quantities stand in the files of this dataset and how they are read.",
+        f"Learned from {looked}; {others} of them verified what the others taught.",
+        "Use it: StereoPairs(..., conventions='conventions.toml'), or --conventions of a command.",
+        "Edit it: what the data contradict is refused with the figures; what it leaves out is "
+        "found as ever. Test it: `stereogenbench conventions ROOT --check FILE`.",
+        *(f"NOT SETTLED: {problem}" for problem in surveyed.problems),
+    ]

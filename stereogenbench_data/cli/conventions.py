@@ -1,0 +1,89 @@
+"""``stereogenbench conventions``: how a dataset's files are read, learned once or tested."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stereogenbench_data.cli.errors import FINDINGS
+from stereogenbench_data.cli.options import (
+    FamilyOption,
+    MapOption,
+    OutOption,
+    SplitOption,
+    WorkOptions,
+    grouped,
+    wanted_scenes,
+)
+from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.writing import writing
+from stereogenbench_data.schema.text import counted, plain_line
+
+
+@grouped
+def conventions(  # noqa: PLR0913 - one parameter an option
+    root: Annotated[str, typer.Argument(help="Folder that holds train/ or eval/, or its URL.")],
+    *,
+    out: OutOption = None,
+    check: Annotated[
+        Path | None,
+        typer.Option("--check", metavar="FILE", help="Test these conventions; learn none."),
+    ] = None,
+    report: Annotated[
+        bool,
+        typer.Option("--report", help="Print the format without content, for a public issue."),
+    ] = False,
+    scenes: Annotated[int, typer.Option(min=1, help="Scenes to read.")] = 20,
+    pictures: Annotated[
+        int, typer.Option(min=0, help="Scenes of a shape to measure by pictures, and to verify.")
+    ] = 3,
+    split: SplitOption = None,
+    family: FamilyOption = None,
+    map_name: MapOption = None,
+    work: WorkOptions,
+) -> None:
+    """Learn how a dataset's files are read, and write it down.
+
+    Reads some scenes, spread over families, maps and keys of files, and says where each quantity
+    stands, how it is read and how that is known; the doctor measures the depth of some by their
+    pictures. Other scenes verify it. Without -o the file is printed. Give it to any command with
+    --conventions. The exit status is 1 if something is not understood or contradicted.
+    """
+    from stereogenbench_data.audit.conventions import survey
+    from stereogenbench_data.audit.format_report import format_report
+    from stereogenbench_data.schema.conventions import Conventions
+
+    if check is not None and out is not None:
+        raise typer.BadParameter("tests a file and writes none: leave --out out.", param_hint="-o")
+    stated = None if check is None else Conventions.read(check)
+    with progress_bar("reading scenes", unit="scenes") as progress:
+        found = survey(
+            root,
+            scenes=scenes,
+            pictured=pictures,
+            conventions=stated,
+            wanted=wanted_scenes(split, family or [], map_name or []),
+            **work.options(),
+            progress=progress,
+        )
+    if report:
+        typer.echo(format_report(found))
+    elif check is None:
+        if out is not None:
+            with writing(out):
+                out.write_text(found.toml, encoding="utf-8")
+        else:
+            typer.echo(found.toml, nl=False)
+    usable = sum(each.scene is not None for each in found.examined)
+    verified = "" if found.learned is None else f", {len(found.learned.verified)} verified the rest"
+    typer.echo(f"{counted(usable, 'scene')} of {len(found.examined)} read{verified}", err=True)
+    for line in found.verdicts:
+        typer.echo(f"depth: {plain_line(line)}", err=True)
+    for line in found.problems:
+        typer.echo(f"NOT SETTLED: {plain_line(line)}", err=True)
+    if check is not None:
+        typer.echo(f"{check}: {'contradicted' if found.problems else 'fits'}", err=True)
+    elif out is not None:
+        typer.echo(f"{out}: use it with --conventions, or StereoPairs(..., conventions=)", err=True)
+    if found.problems:
+        raise typer.Exit(FINDINGS)

@@ -1,0 +1,371 @@
+"""Learning conventions from some scenes: where quantities stand, by files and numbers alone.
+
+Scenes with the same keys have one decision, made by the first of them; decisions that are equal are
+one shape. Others then verify: described by the conventions, they must be what they are without.
+What pictures say of depth is added by `audit.conventions`.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import zip_longest
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from stereogenbench_data.errors import MediaError, SchemaError, StereoGenBenchError
+from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.index.evidence import understood_poses
+from stereogenbench_data.index.scene_folder import IncompleteScene, SceneFolder, describe_scene
+from stereogenbench_data.index.tree import find_remote_scenes, find_scene_folders
+from stereogenbench_data.media.container import StreamFacts
+from stereogenbench_data.media.video import probe
+from stereogenbench_data.schema.conventions import (
+    UNKNOWN,
+    Conventions,
+    DepthAs,
+    PosesAs,
+    Shape,
+    keys_of,
+)
+from stereogenbench_data.schema.document import parse_object
+from stereogenbench_data.schema.parse import parse_scene_key, see_rig
+from stereogenbench_data.schema.quantities import UNITS_M
+from stereogenbench_data.schema.records import (
+    DepthEncoding,
+    DepthUnitSource,
+    Rig,
+    Scene,
+    SceneId,
+)
+from stereogenbench_data.schema.release import (
+    BASELINE_JSON,
+    CAMERA_COUNT,
+    CAMERA_PAIRS,
+    TRAJECTORY_JSON,
+    depth_name,
+)
+from stereogenbench_data.schema.text import counted
+from stereogenbench_data.schema.trajectory import record_poses
+from stereogenbench_data.sources.location import is_remote
+from stereogenbench_data.sources.ranged_file import MemberFile
+
+_KEYS_READ: Final = 500
+"""Of how many scenes the keys are read, for shapes that the chosen scenes do not have."""
+_MORE_SHAPES: Final = 5
+_LEFT, _RIGHT = (list(cameras) for cameras in zip(*CAMERA_PAIRS, strict=True))
+
+Notes = dict[str, list[str]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Examined:
+    """What one scene's files say.
+
+    Attributes:
+        key: The scene.
+        keys: The keys of its files, as `Shape.has` names them.
+        shape: What conventions would state about it.
+        notes: For each table of the conventions, what was found and how it is known.
+        unknown: Keys of ``baseline.json`` that nothing reads.
+        depth: What the first depth video is; None where none can be opened.
+        scene: Its row; None where it cannot be used.
+        problem: Why not; "" where it can.
+    """
+
+    key: str
+    keys: frozenset[str]
+    shape: Shape
+    notes: Notes
+    unknown: list[str]
+    depth: StreamFacts | None
+    scene: Scene | None
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Learned:
+    """Conventions that some scenes taught.
+
+    Attributes:
+        conventions: What is stated; shapes are in the order of `taught_by`.
+        taught_by: For each shape, the scenes that were looked at for it, the deciding one first.
+        verified: Other scenes that are the same with the conventions as without.
+        problems: What is not understood or contradicts itself.
+    """
+
+    conventions: Conventions
+    taught_by: list[list[Examined]]
+    verified: list[Examined] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+
+def chosen_scenes(
+    root: str | Path, *, count: int, wanted: Callable[[SceneId], bool] | None
+) -> list[str]:
+    """Return the keys of some scenes of a tree, spread over families, maps and keys of files.
+
+    Raises:
+        StorageError: If there are no scenes.
+    """
+    found = find_remote_scenes(str(root)) if is_remote(root) else find_scene_folders(root)
+    keys = [key for key in found.keys if wanted is None or wanted(parse_scene_key(key))]
+    by_map: dict[str, list[str]] = {}
+    for key in keys:
+        by_map.setdefault(key.rpartition("/")[0], []).append(key)
+    rounds = zip_longest(*by_map.values())
+    spread = [key for each in rounds for key in each if key is not None]
+    chosen, others = spread[:count], spread[count:]
+    if not is_remote(root) and others:
+        known = {_keys(SceneFolder(root, key), (BASELINE_JSON,)) for key in chosen}
+        step = max(1, len(others) // _KEYS_READ)
+        for key in others[::step][:_KEYS_READ]:
+            keys_there = _keys(SceneFolder(root, key), (BASELINE_JSON,))
+            if keys_there not in known and len(chosen) < count + _MORE_SHAPES:
+                known.add(keys_there)
+                chosen.append(key)
+    return chosen
+
+
+def _keys(folder: SceneFolder, names: Iterable[str]) -> frozenset[str]:
+    """Return the keys of a scene's files; those of a file that cannot be read are missing."""
+    found: set[str] = set()
+    for name in names:
+        try:
+            document = parse_object(folder.read(name), where=name)
+        except (StereoGenBenchError, KeyError):
+            continue
+        found |= {f"{name}: {place}" for place in keys_of(document)}
+    return frozenset(found)
+
+
+def examine(root: str | Path, key: str, *, conventions: Conventions | None = None) -> Examined:
+    """Return what a scene's files say, also where it cannot be used.
+
+    Raises:
+        IncompleteScene: If it is not finished.
+        StorageError: If its folder cannot be read.
+    """
+    folder = SceneFolder(root, key)
+    files = folder.stamps()
+    scene, problem = None, ""
+    try:
+        scene = describe_scene(root, key, conventions=conventions)
+    except IncompleteScene:
+        raise
+    except StereoGenBenchError as error:
+        problem = str(error)
+    shape, notes, unknown = Shape(numbers={}), Notes(), list[str]()
+    try:
+        seen = see_rig(folder.read(BASELINE_JSON), where=f"{key}/{BASELINE_JSON}")
+        shape, notes, unknown = seen.shape, seen.found, seen.unknown
+    except (StereoGenBenchError, KeyError):
+        pass  # the problem says so
+    if scene is not None:
+        shape = _sized(shape, scene)
+        _note_camera(scene, notes)
+        named, notes["poses"] = _learned_poses(folder, scene)
+        shape = replace(shape, poses=named)
+    depth = _depth_facts(folder, key, files)
+    notes["depth"] = [] if depth is None else _depth_notes(depth, scene)
+    names = [name for name in (BASELINE_JSON, TRAJECTORY_JSON) if name in files]
+    return Examined(key, _keys(folder, names), shape, notes, unknown, depth, scene, problem)
+
+
+def _sized(shape: Shape, scene: Scene) -> Shape:
+    """Return a shape without an image size that the videos contradict, as theirs counts."""
+    if not scene.remark("size"):
+        return shape
+    numbers = {name: at for name, at in shape.numbers.items() if not name.startswith("image_")}
+    return replace(shape, numbers=numbers)
+
+
+def _note_camera(scene: Scene, notes: Notes) -> None:
+    rig = scene.rig
+    focal_px = rig.focal_mm / rig.sensor_width_mm * rig.image_width_px
+    notes.setdefault("focal_length", []).append(
+        f"with the sensor's width, {focal_px:.6g} px in pictures {rig.image_width_px} px wide"
+    )
+    left, right = rig.primary_pair
+    apart_cm = (scene.lateral_m[right] - scene.lateral_m[left]) * 100
+    by = "the baselines alone" if scene.remark("poses") else "the poses"
+    notes.setdefault("primary_pair", []).append(
+        f"by {by}, camera {left} is {apart_cm:.6g} cm to the left of camera {right}"
+    )
+    videos = f"the videos have {rig.image_width_px}x{rig.image_height_px} pixels, which counts"
+    notes.setdefault("image_width", []).append(videos)
+    for about, table in (("size", "image_width"), ("principal point", "principal_x"),
+                         ("baselines", "baselines"), ("left", "primary_pair")):  # fmt: skip
+        if scene.remark(about):
+            notes.setdefault(table, []).append(scene.remark(about).removeprefix(f"{scene.id.key}/"))
+
+
+def _learned_poses(folder: SceneFolder, scene: Scene) -> tuple[PosesAs | None, list[str]]:
+    """Return how poses are read, and the evidence; None where it is not decided."""
+    reason = scene.remark("poses").replace(f"{scene.id.key}/", "")
+    if reason:
+        unread = f'to train without poses and say so, write [poses] with form = "{UNKNOWN}"'
+        return None, [unread, f"not understood: {reason}"]
+    text, where = folder.read(TRAJECTORY_JSON), TRAJECTORY_JSON
+    try:
+        found = understood_poses(text, scene.rig, where=where)
+    except SchemaError as error:
+        return None, [f"not understood: {error}"]
+    name, _, unit_m = found.names[0].partition(" @ ")
+    notes = pose_evidence(found.poses, scene.rig)
+    read = set(name.partition(": ")[0].split(" and "))
+    others = [block.key for block in record_poses(text, where=where).blocks]
+    if not_read := [each for each in dict.fromkeys(others) if each not in read]:
+        notes.append(f"numbers of six cameras that are not read: {', '.join(not_read[:6])}")
+    if scene.remark("world"):
+        listed = "; ".join(each.partition(" @ ")[0] for each in found.names)
+        return None, [*notes, f"not decided, name one of these: {listed}"]
+    unit = next(each for each, metres in UNITS_M.items() if np.isclose(metres, float(unit_m)))
+    return PosesAs.of_reading(name, unit=unit), notes
+
+
+def pose_evidence(poses: CameraPoses, rig: Rig) -> list[str]:
+    """Return in words how well poses fit the baselines and the line of the cameras."""
+    steps = poses.centres[:, _RIGHT] - poses.centres[:, _LEFT]
+    lengths_cm = np.linalg.norm(steps, axis=-1) * poses.unit_m * 100
+    off_cm = np.abs(lengths_cm - np.array(rig.baselines_cm)).max()
+    lateral_m = np.array([poses.cam_from_cam(0, target=0, source=camera)[:3, 3]
+                          for camera in range(1, CAMERA_COUNT)])  # fmt: skip
+    across_m = np.abs(lateral_m[:, 1:]).max()
+    return [
+        f"distances of the cameras are the baselines to {off_cm:.2g} cm in {len(steps)} frames",
+        f"the cameras stand along the x axis of camera 0 to {across_m * 100:.2g} cm in frame 0",
+    ]
+
+
+def _depth_facts(folder: SceneFolder, key: str, files: Mapping[str, object]) -> StreamFacts | None:
+    for name in map(depth_name, range(CAMERA_COUNT)):
+        if name not in files:
+            continue
+        video = folder.video(name)
+        try:
+            return probe(video, name=f"{key}/{name}")
+        except MediaError:
+            continue
+        finally:
+            if isinstance(video, MemberFile):
+                video.close()
+    return None
+
+
+def _depth_notes(facts: StreamFacts, scene: Scene | None) -> list[str]:
+    notes = [
+        f"stored by codec {facts.codec} as {facts.pixel_format}, {facts.frames} frames; tags: "
+        f"{', '.join(sorted(facts.tags)) or 'none'}"
+    ]
+    if scene is None:
+        return notes
+    unit_m, source = scene.depth_unit_m[0], scene.depth_unit_source[0]
+    where = {"tag": "a tag states it", "conventions": "the conventions state it"}.get(
+        source, "the scene's files state it"
+    )
+    if source == "default":
+        where = "nothing states it, so this is the release's default"
+    if source == "unreadable":
+        return [*notes, "the unit is not understood: the tags contradict each other"]
+    return [*notes, f"{unit_m:g} m in a stored unit: {where}"]
+
+
+def learn(root: str | Path, examined: Sequence[Examined]) -> Learned:
+    """Return the conventions that scenes teach, verified by every second scene of a shape.
+
+    Args:
+        root: The folder that holds ``train`` and ``eval``, or its URL.
+        examined: The scenes.
+    """
+    usable = [each for each in examined if each.scene is not None]
+    problems = [each.problem for each in examined if each.scene is None]
+    decided_by: dict[frozenset[str], Examined] = {}
+    teaching, others = list[Examined](), list[Examined]()
+    for each in usable or examined:
+        is_new = each.keys not in decided_by
+        decided_by.setdefault(each.keys, each)
+        is_teaching = is_new or len(teaching) <= len(others)
+        (teaching if is_teaching else others).append(each)
+    groups: dict[str, list[Examined]] = {}
+    for each in teaching:
+        groups.setdefault(decided_by[each.keys].shape.text(), []).append(each)
+    by_size = sorted(groups.values(), key=len, reverse=True)
+    shapes: list[tuple[Shape, list[Examined]]] = []
+    for group in by_size:
+        elsewhere = {key for other in by_size if other is not group for each in other
+                     for key in each.keys}  # fmt: skip
+        own = frozenset.intersection(*(each.keys for each in group)) - elsewhere
+        has = tuple(sorted(own, key=len)[:1]) if len(by_size) > 1 else ()
+        if len(by_size) > 1 and not has and any(not shape.has for shape, _ in shapes):
+            problems.append(
+                f"{group[0].key} has the keys of other scenes and is read otherwise: the "
+                f"conventions do not state it."
+            )
+            continue
+        depth = _stated_depth(group)
+        shapes.append((replace(group[0].shape, has=has, depth=depth), group))
+    shapes.sort(key=lambda pair: not pair[0].has)
+    problems += [
+        f"{group[0].key}: poses: {group[0].notes['poses'][-1]}"
+        for shape, group in shapes
+        if group[0].scene is not None and shape.poses is None
+    ]
+    conventions = Conventions(tuple(shape for shape, _ in shapes), "the conventions learned")
+    learned = Learned(conventions, [group for _, group in shapes], problems=problems)
+    verify(root, learned, others if usable else [])
+    return learned
+
+
+def _stated_depth(group: Sequence[Examined]) -> DepthAs | None:
+    """Return the unit that all files of some scenes state; None where none or several do."""
+    units = {
+        (unit_m, source)
+        for each in group if each.scene is not None
+        for unit_m, source in zip(
+            each.scene.depth_unit_m, each.scene.depth_unit_source, strict=True
+        )
+    }  # fmt: skip
+    if len(units) != 1:
+        return None
+    ((unit_m, source),) = units
+    if source in ("default", "unreadable"):
+        return None
+    return DepthAs(encoding=DepthEncoding(unit_m=unit_m, source="conventions"))
+
+
+def verify(root: str | Path, learned: Learned, scenes: Iterable[Examined]) -> None:
+    """Describe scenes by the conventions, and note those that are not what they are without."""
+    for each in (*(each for group in learned.taught_by for each in group), *scenes):
+        if each.scene is None:
+            continue
+        try:
+            again = describe_scene(root, each.key, conventions=learned.conventions)
+        except StereoGenBenchError as error:
+            learned.problems.append(str(error))
+            continue
+        if _essence(again) != _essence(each.scene):
+            learned.problems.append(f"{each.key}: is read otherwise by the conventions learned.")
+        elif not any(each in group for group in learned.taught_by):
+            learned.verified.append(each)
+
+
+def _essence(scene: Scene) -> Scene:
+    """Return a scene without what conventions may add to its row."""
+    sources: tuple[DepthUnitSource, ...] = ("conventions",) * CAMERA_COUNT
+    return replace(scene, conventions=None, pose_form=None, remarks=(), depth_unit_source=sources)
+
+
+def tables_of_notes(learned: Learned) -> Iterator[tuple[tuple[int, str], list[str]]]:
+    """Yield the notes of each table of each shape, by the scene that decided it."""
+    for number, group in enumerate(learned.taught_by):
+        maps = sorted({parse_scene_key(each.key).map_name for each in group})
+        scenes = f"{counted(len(group), 'scene')} of {counted(len(maps), 'map')}"
+        head = f"{scenes}, decided by {group[0].key}"
+        unread = sorted({key for each in group for key in each.unknown})
+        lines = [head]
+        if unread:
+            lines.append(f"seen in {BASELINE_JSON} and not read: {', '.join(unread[:40])}")
+        yield (number, ""), lines
+        for table, notes in group[0].notes.items():
+            yield (number, table), notes

@@ -1,0 +1,117 @@
+"""``stereogenbench conventions`` as a user runs it."""
+
+import re
+import shutil
+
+import pytest
+
+from stereogenbench_data.schema.conventions import Conventions
+from stereogenbench_data.synthesis.produce import synthesise
+from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
+from tests.cli.command import invoke
+
+
+@pytest.fixture(scope="module")
+def untagged(tmp_path_factory):
+    """Two scenes of which nothing states the unit of depth, which is 0.001 m."""
+    root = tmp_path_factory.mktemp("untagged")
+    contract = ExportContract(depth_unit_m=0.001, depth_tag=None)
+    synthesise(
+        root,
+        SynthRequest(
+            family="IPD_Gaussian", scenes=2, size_px=160, frames=2, seed=6, contract=contract
+        ),
+        workers=1,
+    )
+    return root
+
+
+def test_a_unit_that_nothing_states_is_measured_and_written(untagged, tmp_path):
+    out = tmp_path / "conventions.toml"
+
+    result = invoke("conventions", untagged, "-o", out, "--pictures", 1, "--workers", 1)
+
+    assert result.exit_code == 0, result.output
+    (shape,) = Conventions.read(out).shapes
+    assert shape.depth.encoding.unit_m == pytest.approx(0.001, rel=0.005)
+    assert "the release's default" in out.read_text()
+    assert "2 scenes of 2 read" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("depth", "figure"),
+    [("unit_m = 0.01", r"0\.(09|10)\d* x declared"), ('kind = "ray"', "optical axis")],
+)
+def test_conventions_that_pictures_contradict_end_with_1_and_the_figures(
+    detailed_release, tmp_path, depth, figure
+):
+    file = tmp_path / "edited.toml"
+    tag = "instead_of_tag_m = 0.001\n" if "unit" in depth else ""
+    file.write_text(f"[depth]\n{depth}\n{tag}")
+
+    result = invoke("conventions", detailed_release, "--check", file, "--workers", 1)
+
+    assert result.exit_code == 1
+    assert re.search(figure, result.stderr)
+    assert f"{file}: contradicted" in result.stderr
+
+
+def test_conventions_that_files_contradict_end_with_1_and_the_figures(small_release, tmp_path):
+    file = tmp_path / "edited.toml"
+    file.write_text("[depth]\nunit_m = 0.01\n")
+
+    result = invoke("conventions", small_release, "--check", file, "--workers", 1)
+
+    assert result.exit_code == 1
+    assert re.search(r"cam_00_depth\.mkv.*0\.001 m.*0\.01 m", result.stderr)
+
+
+def test_a_report_has_structure_and_no_content(shared_scenes, tmp_path):
+    (scene,) = shared_scenes.glob("train/*/*/scene_*")
+    folder = tmp_path / "secret-machine" / "train" / "Uniform" / scene.parent.name / scene.name
+    shutil.copytree(scene, folder, copy_function=shutil.copyfile)
+    trajectory = folder / "trajectory.json"
+    trajectory.write_text(
+        trajectory.read_text().replace('"unit": "cm"', '"unit": "cm", "C:\\\\render\\\\joe": 1', 1)
+    )
+
+    result = invoke("conventions", tmp_path / "secret-machine", "--report", "--pictures", 0)
+
+    assert result.exit_code == 0, result.output
+    for shown in (
+        "camera_intrinsics.focal_length_mm: number x 1",
+        "frames[].cameras[].rotation.pitch: number x 486",
+        '"unreal_rotator_degrees"',
+        "ffv1 gray16le, 320x320, 81 frames",
+        "depth_scale=0.001",
+        "rotator pitch yaw roll deg, unreal axes, cm",
+    ):
+        assert shown in result.stdout
+    for hidden in (
+        "secret", str(tmp_path), "Seyeonjeong", "scene_1103", "SK_Ch13", "courtyard", "render",
+        "joe", "AN_Pontera", "45.0",
+    ):  # fmt: skip
+        assert hidden not in result.stdout
+
+
+def test_no_scene_of_a_filter_ends_with_2(small_release):
+    result = invoke("conventions", small_release, "--family", "Pairwise_Uniform")
+
+    assert result.exit_code == 2
+    assert "filter" in result.stderr
+
+
+def test_other_commands_take_conventions(small_release, tmp_path):
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text("[depth]\nunit_m = 0.5\n")
+
+    for command in (
+        ("stats", small_release),
+        ("index", small_release, "-o", tmp_path / "i.parquet"),
+        ("pack", small_release, tmp_path / "out"),
+        ("audit", small_release),
+    ):
+        result = invoke(*command, "--conventions", wrong)
+
+        assert result.exit_code != 0
+        assert "0.5 m" in result.output
