@@ -68,7 +68,7 @@ def open_index(data: str, *, root: str | None = None) -> "SceneIndex":
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always", IncompleteSceneWarning)
         warnings.simplefilter("always", StaleIndexWarning)
-        index = SceneIndex.open(data, root=root)
+        index = SceneIndex.open(data, root=root, rows="read")
     for warning in warned:
         typer.echo("\n".join(map(plain_line, str(warning.message).split("\n"))), err=True)
     return index

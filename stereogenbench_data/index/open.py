@@ -13,13 +13,13 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, Literal, NamedTuple, TypeAlias
 
 import pyarrow as pa
 
 from stereogenbench_data.errors import StorageError, text_without_secrets
 from stereogenbench_data.index.arrow import table_digest
-from stereogenbench_data.index.build import walk
+from stereogenbench_data.index.build import TreeReport, walk
 from stereogenbench_data.index.parquet import (
     INDEX_NAME,
     IndexHead,
@@ -29,8 +29,15 @@ from stereogenbench_data.index.parquet import (
     seek_tables_of,
     table_of_scenes,
 )
+from stereogenbench_data.index.presumed import (
+    ListedTree,
+    Presumption,
+    list_tree,
+    presumed_report,
+)
 from stereogenbench_data.index.stale import StaleIndexWarning, stale_message
 from stereogenbench_data.index.tree import find_remote_scenes
+from stereogenbench_data.index.tree_cache import TreeCache
 from stereogenbench_data.schema.records import SceneId
 from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.sources.location import (
@@ -63,6 +70,9 @@ class IncompleteSceneWarning(UserWarning):
     """Some scenes of the data cannot be used; the message names them and the reasons."""
 
 
+Rows = Literal["presumed", "read"]
+"""Whether the rows of many scenes without an index may be presumed; see `index.presumed`."""
+
 SeekTables: TypeAlias = pa.BinaryArray | Path | None
 """The packed seek tables of scenes, a row each, or the index file that holds them; None where there
 are none."""
@@ -76,12 +86,15 @@ class Opened(NamedTuple):
         head: What is known besides, with the root where the data are.
         stale: How the root differs from the index, with the cure; "" if it does not.
         seek_tables: Where the packets of the videos lie.
+        presumption: What describes the scenes of a table that is presumed; None for one that was
+            read.
     """
 
     table: pa.Table
     head: IndexHead
     stale: str = ""
     seek_tables: SeekTables = None
+    presumption: Presumption | None = None
 
 
 def open_table(
@@ -90,6 +103,7 @@ def open_table(
     root: str | Path | None,
     retry: RetryPolicy | None,
     wanted: Callable[[SceneId], bool] | None = None,
+    rows: Rows = "presumed",
 ) -> Opened:
     """Return the scenes of some data; `SceneIndex.open` describes the arguments and the errors.
 
@@ -105,7 +119,7 @@ def open_table(
         where = str(path)
         if path.is_dir() and not (path / INDEX_NAME).is_file():
             _require_no_root(path, named_root)
-            opened = _open_tree(path, wanted)
+            opened = _open_tree(path, wanted, rows=rows)
         elif path.is_dir() or path.is_file():
             file = path / INDEX_NAME if path.is_dir() else path
             opened = _open_file(file, root=named_root)
@@ -169,7 +183,7 @@ def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opene
                 f"their headers each time. Index it once, or the part you need: `stereogenbench "
                 f"index {shown(beside)} -o index.parquet --split eval`, and open that file."
             ) from None
-        return _open_tree(beside, None)
+        return _open_tree(beside, None, rows="read")
     if size > MAX_INDEX_BYTES:
         raise StorageError(
             f"{remote.where}: an index may have {MAX_INDEX_BYTES:,} bytes, this one has "
@@ -183,10 +197,54 @@ def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opene
     return Opened(table, head, seek_tables=read_seek_tables(content))
 
 
-def _open_tree(root: str | Path, wanted: Callable[[SceneId], bool] | None) -> Opened:
-    """Describe the scenes of a folder or URL in the released layout, without a few broken ones."""
-    # In this process: a script without `if __name__ == "__main__"` could start no others.
-    report, where = walk(root, workers=1, wanted=wanted, if_none="all"), shown(root)
+def _open_tree(root: str | Path, wanted: Callable[[SceneId], bool] | None, *, rows: Rows) -> Opened:
+    """Return the scenes of a folder or URL in the released layout, without a few broken ones.
+
+    Those of a large folder are kept in the user's cache, and presumed where that is possible.
+    """
+    tree = None if is_remote(root) else list_tree(Path(root), wanted)
+    opened = None
+    if tree is not None and rows == "presumed":
+        opened = _kept(tree, "presumed")
+        if opened is None and (report := presumed_report(tree)) is not None:
+            opened = _keep(tree, "presumed", _of_report(report))
+        if opened is not None:
+            return opened._replace(presumption=Presumption(tree.root))
+    opened = None if tree is None else _kept(tree, "read")
+    if opened is None:
+        # In this process: a script without `if __name__ == "__main__"` could start no others.
+        opened = _of_report(walk(root, workers=1, wanted=wanted, if_none="all"))
+        if tree is not None:
+            _keep(tree, "read", opened)
+    return opened
+
+
+def _kept(tree: ListedTree, rows: Rows) -> Opened | None:
+    """Return the rows of a tree that an earlier opening has kept."""
+    found = TreeCache(tree.root).table(f"{rows}-{tree.stamp}")
+    if found is None:
+        return None
+    table, head, tables = found
+    # Without a digest: the user has made no index file.
+    return Opened(table, replace(head, root=str(tree.root), digest=""), seek_tables=tables)
+
+
+def _keep(tree: ListedTree, rows: Rows, opened: Opened) -> Opened:
+    """Keep the rows of a tree for later openings, and return them."""
+    if not isinstance(opened.seek_tables, Path):
+        head = replace(opened.head, digest=table_digest(opened.table))
+        name = f"{rows}-{tree.stamp}"
+        TreeCache(tree.root).keep_table(name, opened.table, head, opened.seek_tables)
+    return opened
+
+
+def _of_report(report: TreeReport) -> Opened:
+    """Return the scenes that a walk found.
+
+    Raises:
+        StorageError: If there is none, or more than a few are broken.
+    """
+    where = shown(report.root)
     if not report.scenes:
         raise StorageError(
             f"{where}: no scene is complete: {_listed(report.broken | report.incomplete)}"
