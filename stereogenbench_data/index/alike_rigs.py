@@ -15,6 +15,7 @@ from typing import Any, Final, NamedTuple
 from stereogenbench_data.schema.document import MOST_LETTERS, camera_of, is_number, parse_object
 from stereogenbench_data.schema.parse import parse_rig
 from stereogenbench_data.schema.records import Remark, Rig, SceneLabels
+from stereogenbench_data.schema.release import CAMERA_COUNT
 
 Parsed = tuple[Rig, SceneLabels, tuple[Remark, ...]]
 
@@ -151,7 +152,10 @@ class RigReader:
 
 
 def _flat(document: dict[str, Any]) -> tuple[tuple[Any, ...], list[Any]]:
-    """Return the shape of a document, which can be compared, and its texts, numbers and others."""
+    """Return the shape of a document, which can be compared, and its texts, numbers and others.
+
+    What looks like the number of a camera is a part of the shape: primary pairs may differ.
+    """
     shape: list[Any] = []
     values: list[Any] = []
     waiting: list[Any] = [document]
@@ -163,11 +167,15 @@ def _flat(document: dict[str, Any]) -> tuple[tuple[Any, ...], list[Any]]:
             shape.append(len(node))
             inner = node
         for value in inner:
-            kind = type(value)
+            kind: Any = type(value)
             if kind is dict or kind is list:
                 waiting.append(value)
             else:
                 values.append(value)
+                if kind is int and 0 <= value <= CAMERA_COUNT:
+                    kind = value
+                elif kind is str and value[-1:].isdigit() and "cam" in value.lower():
+                    kind = value[-2:]
             shape.append(kind)
     return tuple(shape), values
 

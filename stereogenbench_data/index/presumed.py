@@ -58,7 +58,7 @@ from stereogenbench_data.schema.text import shortened
 
 _LOOKED_AT: Final = 20
 """How many scenes are described in full when a tree is opened, over all groups."""
-_LEAST_OF_A_GROUP: Final = 4
+_LEAST_OF_A_GROUP: Final = 3
 _READERS: Final = 8
 _AT_A_TIME: Final = 128
 _LONGEST_TOLD: Final = 2000

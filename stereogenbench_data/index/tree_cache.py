@@ -15,7 +15,7 @@ import json
 import os
 import sys
 from contextlib import suppress
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
@@ -59,7 +59,10 @@ class TreeCache:
         """Name the tree; nothing is read or written yet."""
         base = cache_folder()
         # What another version understood of the same files may differ.
-        what = [_FORMAT, version("stereogenbench-data"), SCHEMA.names, os.path.realpath(root)]
+        made_by = ""
+        with suppress(PackageNotFoundError):  # of a checkout that is not installed
+            made_by = version("stereogenbench-data")
+        what = [_FORMAT, made_by, SCHEMA.names, os.path.realpath(root)]
         self._folder = None if base is None else base / "trees" / _digest(json.dumps(what))
 
     def table(self, name: str) -> tuple[pa.Table, IndexHead, pa.BinaryArray | None] | None:
