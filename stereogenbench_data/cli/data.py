@@ -83,7 +83,7 @@ def open_index(
         warnings.simplefilter("always", IncompleteSceneWarning)
         warnings.simplefilter("always", StaleIndexWarning)
         warnings.simplefilter("always", AssumptionWarning)
-        index = SceneIndex.open(data, root=root, conventions=conventions)
+        index = SceneIndex.open(data, root=root, conventions=conventions, rows="read")
     for warning in warned:
         typer.echo("\n".join(map(plain_line, str(warning.message).split("\n"))), err=True)
     return index

@@ -5,7 +5,7 @@ shows typer the fields in its place.
 """
 
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from functools import wraps
 from pathlib import Path
@@ -310,6 +310,47 @@ class SceneOptions:
             "caption": self.caption,
         }
         return {name: value for name, value in options.items() if value not in (None, [], ())}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShareOptions:
+    """How much of the chosen scenes a command takes."""
+
+    scenes: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="So many scenes, of all families and maps alike.", rich_help_panel=SCENES
+        ),
+    ] = None
+    max_bytes: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SIZE",
+            help="As many scenes as fit, such as 10GB, of all families and maps alike.",
+            rich_help_panel=SCENES,
+        ),
+    ] = None
+
+    @property
+    def is_given(self) -> bool:
+        """Whether not all scenes are taken."""
+        return self.scenes is not None or self.max_bytes is not None
+
+    def rows(
+        self, index: "SceneIndex", rows: Sequence[int], sizes_bytes: Sequence[int]
+    ) -> list[int]:
+        """Return the rows to take of some scenes, given how many bytes each takes.
+
+        Raises:
+            ShardError: If the size is none.
+            SelectionError: If there are fewer scenes, or none fits.
+        """
+        from stereogenbench_data.selection.share import balanced_share
+        from stereogenbench_data.shards.plan import parse_bytes
+
+        limit = None if self.max_bytes is None else parse_bytes(self.max_bytes)
+        chosen = balanced_share(index, rows, sizes_bytes, scenes=self.scenes, max_bytes=limit)
+        return [int(row) for row in chosen]
 
 
 @dataclass(frozen=True, kw_only=True)

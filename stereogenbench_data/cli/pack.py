@@ -18,6 +18,7 @@ from stereogenbench_data.cli.options import (
     RootOption,
     SceneOptions,
     ShardsOptions,
+    ShareOptions,
     WorkOptions,
     grouped,
     out_folder,
@@ -86,6 +87,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
         ),
     ] = False,
     chosen: SceneOptions,
+    share: ShareOptions,
     work: WorkOptions,
     depth_codec: Annotated[
         Literal["released", "blosc2"],
@@ -101,7 +103,8 @@ def pack(  # noqa: PLR0913 - one parameter an option
     The same scenes give the same bytes each time. To continue a stopped run, run it again: it keeps
     finished shards by their sizes, times of change and metadata. `stereogenbench verify` reads
     every byte. With --part, run the same command once for each I; the last one to finish writes the
-    index.
+    index. --max-bytes 10GB packs a share that is balanced over families and maps, the same each
+    time; of training shards about so much.
 
     With --size the shards are derived for training: smaller pictures, a key frame every few frames,
     depth bit for bit as `size=` gives it. --quality small and balanced encode H.264, high encodes
@@ -109,7 +112,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
     """
     from stereogenbench_data.selection.filters import filter_scenes
     from stereogenbench_data.shards.pack import pack as packed_by
-    from stereogenbench_data.shards.plan import parse_bytes
+    from stereogenbench_data.shards.plan import packed_bytes, parse_bytes
 
     number, _, count = part.partition("/")
     if not (number.isdecimal() and count.isdecimal()):
@@ -124,7 +127,13 @@ def pack(  # noqa: PLR0913 - one parameter an option
         raise typer.BadParameter("estimates training shards: give --size.", param_hint="--dry-run")
     index = open_index(root, root=data_root, conventions=conventions)
     filters: Any = chosen.filters()
-    rows = filter_scenes(index, filters).tolist() if filters else None
+    rows = filter_scenes(index, filters).tolist() if filters or share.is_given else None
+    if rows is not None and share.is_given:
+        sizes = [
+            packed_bytes(index.indexed_scene(row), depth_codec=depth_codec, training=training)
+            for row in rows
+        ]
+        rows = share.rows(index, rows, sizes)
     scenes = len(index) if rows is None else len(rows)
     if dry_run and training is not None:
         _print_estimate(index, rows or range(scenes), training, as_json=as_json)

@@ -119,7 +119,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         write_node(dataset_facts.template(), out)
         typer.echo(f"{out}: answer the questions, then add --about {out}")
         return
-    index = None if data is None else SceneIndex.open(data, root=data_root)
+    index = None if data is None else SceneIndex.open(data, root=data_root, rows="read")
     publication = Publication(
         name=name,
         version=release,

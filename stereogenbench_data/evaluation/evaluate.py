@@ -176,7 +176,7 @@ def select_workload(
     selection.setdefault("frames", "all")
     wanted = may_pass(selection)
     if not isinstance(data, SceneIndex):
-        data = SceneIndex.open(data, wanted=wanted)
+        data = SceneIndex.open(data, wanted=wanted, rows="read")
     lost = [] if data.is_from_file else [
         key for key in data.broken if wanted is None or wanted(parse_scene_key(key))
     ]  # fmt: skip

@@ -6,6 +6,7 @@ u to u - B fx / z, and no row changes.
 """
 
 import itertools
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float64
@@ -13,6 +14,10 @@ from jaxtyping import Float64
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import OPENCV_FROM_UNREAL, CameraPoses
 from stereogenbench_data.schema.release import CAMERA_PAIRS
+
+RECTIFIED_PX: Final = 0.05
+"""A rig whose residual is at most this is rectified: disparity is B fx / z. Beyond it every pixel
+goes through the poses."""
 
 _LEFT, _RIGHT = (list(cameras) for cameras in zip(*CAMERA_PAIRS, strict=True))
 

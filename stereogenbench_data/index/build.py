@@ -3,16 +3,15 @@
 A `Journal` keeps the described scenes, so a killed run continues where it stopped.
 """
 
-import base64
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
-from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, require_workers
+from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, no_advance, require_workers
 from stereogenbench_data.errors import (
     MediaError,
     StereoGenBenchError,
@@ -20,7 +19,7 @@ from stereogenbench_data.errors import (
 )
 from stereogenbench_data.index.evidence import agreed_forms
 from stereogenbench_data.index.journal import Journal
-from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, row_of, scene_of
+from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, json_of, scene_of_json
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
     SceneFolder,
@@ -68,7 +67,7 @@ class TreeReport:
 
 
 @dataclass(frozen=True, slots=True)
-class _Outcome:
+class Outcome:
     """The outcome of one scene's folder: a scene and the digest of its files, or why not."""
 
     key: str
@@ -76,6 +75,12 @@ class _Outcome:
     scene: Scene | None = None
     stamp: str = ""
     reason: str = ""
+
+    @classmethod
+    def of_error(cls, key: str, error: StereoGenBenchError) -> "Outcome":
+        """Return the outcome of a scene that cannot be described."""
+        is_incomplete = isinstance(error, IncompleteScene)
+        return cls(key, "incomplete" if is_incomplete else "broken", reason=str(error))
 
 
 def scene_journal(path: Path, *, walk: str) -> Journal:
@@ -116,11 +121,7 @@ def walk(  # noqa: PLR0913 - each is an option of the command
             first `ALIKE` scenes are broken for one reason, so that it is the format of the files.
     """
     require_workers(workers)
-    folders = find_remote_scenes(str(root)) if is_remote(root) else find_scene_folders(root)
-    if wanted is not None and if_none == "all":
-        wanted = wanted if any(wanted(parse_scene_key(key)) for key in folders.keys) else None
-    if wanted is not None:
-        folders = _chosen(root, folders, wanted)
+    folders, is_part = find_scenes(root, wanted=wanted, if_none=if_none)
     outcomes = _reused(root, folders.keys, journal)
     total = len(folders.keys)
     if progress is not None:
@@ -128,20 +129,35 @@ def walk(  # noqa: PLR0913 - each is an option of the command
     pending = [key for key in folders.keys if key not in outcomes]
     if engine is LOCAL and len(pending) < POOL_FROM:
         workers = 1
-    task = _DescribeTask(str(root), valid_depth, conventions)
+    task = DescribeTask(str(root), valid_depth, conventions)
     for outcome in engine.map(task, pending, name=str, workers=workers):
         outcomes[outcome.key] = outcome
         if len(outcomes) == ALIKE:
-            _require_not_all_alike(root, outcomes.values())
+            require_not_all_alike(root, outcomes.values())
         if journal is not None and outcome.scene is not None:
-            journal.record(outcome.key, _journalled(outcome.scene), stamp=outcome.stamp)
+            journal.record(outcome.key, json_of(outcome.scene), stamp=outcome.stamp)
         if progress is not None:
             progress(len(outcomes), total)
     in_order = [outcomes[key] for key in folders.keys]
-    return _report(root, folders, in_order, is_part=wanted is not None)
+    return report_of(root, folders, in_order, is_part=is_part)
 
 
-def _require_not_all_alike(root: str | Path, outcomes: Iterable[_Outcome]) -> None:
+def find_scenes(
+    root: str | Path,
+    *,
+    wanted: Callable[[SceneId], bool] | None,
+    if_none: Literal["refuse", "all"] = "refuse",
+) -> tuple[FoundScenes, bool]:
+    """Return the wanted scenes of a tree, and whether they are a part of it; see `walk`."""
+    folders = find_remote_scenes(str(root)) if is_remote(root) else find_scene_folders(root)
+    if wanted is not None and if_none == "all":
+        wanted = wanted if any(wanted(parse_scene_key(key)) for key in folders.keys) else None
+    if wanted is not None:
+        folders = _chosen(root, folders, wanted)
+    return folders, wanted is not None
+
+
+def require_not_all_alike(root: str | Path, outcomes: Iterable[Outcome]) -> None:
     """Refuse a tree whose first scenes are broken for one reason: so are the others."""
     kinds = {
         out.kind + re.sub(r"[0-9.]+", "#", out.reason.replace(out.key, "")) for out in outcomes
@@ -170,30 +186,29 @@ def _chosen(
 
 
 @dataclass(frozen=True, slots=True)
-class _DescribeTask:
+class DescribeTask:
     """Describes a scene by its key, in a worker process."""
 
     root: str
-    valid_depth: ValidDepth
-    conventions: Conventions | None
+    valid_depth: ValidDepth = "skip"
+    conventions: Conventions | None = None
 
-    def __call__(self, key: str, advance: Advance) -> _Outcome:
+    def __call__(self, key: str, advance: Advance = no_advance) -> Outcome:
+        """Return what the scene is."""
         advance(0)
         try:
             stamp = stamp_of(SceneFolder(self.root, key).stamps())
             scene = describe_scene(
                 self.root, key, valid_depth=self.valid_depth, conventions=self.conventions
             )
-        except IncompleteScene as error:
-            return _Outcome(key, "incomplete", reason=str(error))
         except StereoGenBenchError as error:
-            return _Outcome(key, "broken", reason=str(error))
-        return _Outcome(key, "whole", scene, stamp)
+            return Outcome.of_error(key, error)
+        return Outcome(key, "whole", scene, stamp)
 
 
-def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> dict[str, _Outcome]:
+def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> dict[str, Outcome]:
     """Return the scenes that a journal holds and whose files have not changed."""
-    outcomes: dict[str, _Outcome] = {}
+    outcomes: dict[str, Outcome] = {}
     for key in keys if journal is not None and len(journal) else ():
         with suppress(
             StorageError, ValueError, KeyError, TypeError, IndexError, AttributeError
@@ -201,20 +216,14 @@ def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> d
             stamp = stamp_of(SceneFolder(root, key).stamps())
             row = None if journal is None else journal.value(key, stamp=stamp)
             if row is not None:
-                tables = base64.b64decode(row.pop("seek_tables"))
-                scene = replace(scene_of(row), seek_tables=tables)
-                outcomes[key] = _Outcome(key, "whole", scene, stamp)
+                outcomes[key] = Outcome(key, "whole", scene_of_json(row), stamp)
     return outcomes
 
 
-def _journalled(scene: Scene) -> dict[str, Any]:
-    """Return a scene as JSON."""
-    return row_of(scene) | {"seek_tables": base64.b64encode(scene.seek_tables or b"").decode()}
-
-
-def _report(
-    root: str | Path, folders: FoundScenes, outcomes: list[_Outcome], *, is_part: bool
+def report_of(
+    root: str | Path, folders: FoundScenes, outcomes: list[Outcome], *, is_part: bool
 ) -> TreeReport:
+    """Return the report of a walk that had these outcomes, one a scene in the order of keys."""
     ids = [parse_scene_key(key) for key in folders.keys]
     maps = {scene.map_name for scene in ids if scene.split == "train"} | TRAIN_MAPS
     found = [outcome.scene for outcome in outcomes if outcome.scene is not None]
@@ -265,24 +274,28 @@ def _remarks(scenes: list[Scene]) -> list[str]:
 
 def _depth_notes(scenes: list[Scene]) -> list[str]:
     """Describe depth that loading refuses unless the user's `DepthEncoding` accepts it."""
-    first: dict[tuple[str, str], str] = {}
-    others: Counter[tuple[str, str]] = Counter()
+    notes: dict[tuple[str, str], str] = {}
+    videos: Counter[tuple[str, str]] = Counter()
     for scene in scenes:
         stored = zip(scene.depth_codec, scene.depth_pixel_format, strict=True)
-        for camera, (codec, pixel_format) in enumerate(stored):
-            if (codec, pixel_format) in first:
-                others[codec, pixel_format] += 1
+        for camera, kind in enumerate(stored):
+            videos[kind] += 1
+            if kind in notes:
                 continue
+            notes[kind] = ""
             try:
                 require_depth_stream(
-                    codec=codec,
-                    pixel_format=pixel_format,
+                    codec=kind[0],
+                    pixel_format=kind[1],
                     encoding=depth_of(scene),
                     name=f"{scene.id.key}/{depth_name(camera)}",
                 )
             except MediaError as error:
-                first[codec, pixel_format] = str(error)
+                notes[kind] = str(error)
     return [
-        f"{note} ({counted(others[kind], 'other video')} likewise.)" if others[kind] else note
-        for kind, note in first.items()
+        f"{note} ({counted(videos[kind] - 1, 'other video')} likewise.)"
+        if videos[kind] > 1
+        else note
+        for kind, note in notes.items()
+        if note
     ]

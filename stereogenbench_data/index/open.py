@@ -9,18 +9,21 @@ An index file may come from a stranger: it opens data beside itself, and any oth
 user's own word.
 """
 
+import gc
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, Literal, NamedTuple, TypeAlias
 
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from stereogenbench_data.errors import StorageError, describe_os_error, text_without_secrets
 from stereogenbench_data.index.arrow import table_digest
 from stereogenbench_data.index.assumptions import AssumptionWarning, assumptions
-from stereogenbench_data.index.build import walk
+from stereogenbench_data.index.build import TreeReport, walk
 from stereogenbench_data.index.parquet import (
     INDEX_NAME,
     IndexHead,
@@ -30,9 +33,17 @@ from stereogenbench_data.index.parquet import (
     seek_tables_of,
     table_of_scenes,
 )
+from stereogenbench_data.index.presumed import (
+    ListedTree,
+    Presumption,
+    list_tree,
+    presumed_report,
+)
 from stereogenbench_data.index.restated import restated
+from stereogenbench_data.index.rows import scene_of
 from stereogenbench_data.index.stale import StaleIndexWarning, stale_message
 from stereogenbench_data.index.tree import find_remote_scenes
+from stereogenbench_data.index.tree_cache import TreeCache
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import SceneId
 from stereogenbench_data.schema.text import counted, shortened
@@ -58,11 +69,16 @@ MOST_LEFT_OUT: Final = 0.05
 _LONGEST_ROOT: Final = 300
 _LONGEST_REASON: Final = 5000
 _SHOWN: Final = 10
+_LOOKED_AT: Final = 64
+"""How many scenes tell what opening a tree takes for granted."""
 
 
 class IncompleteSceneWarning(UserWarning):
     """Some scenes of the data cannot be used; the message names them and the reasons."""
 
+
+Rows = Literal["presumed", "read"]
+"""Whether the rows of many scenes without an index may be presumed; see `index.presumed`."""
 
 SeekTables: TypeAlias = pa.BinaryArray | Path | None
 """The packed seek tables of scenes, a row each, or the index file that holds them; None where there
@@ -78,6 +94,8 @@ class Opened(NamedTuple):
         stale: How the root differs from the index, with the cure; "" if it does not.
         seek_tables: Where the packets of the videos lie.
         assumed: What was taken for granted about the files of a tree; "" where nothing was.
+        presumption: What describes the scenes of a table that is presumed; None for one that was
+            read.
     """
 
     table: pa.Table
@@ -85,6 +103,7 @@ class Opened(NamedTuple):
     stale: str = ""
     seek_tables: SeekTables = None
     assumed: str = ""
+    presumption: Presumption | None = None
 
 
 def open_table(
@@ -94,6 +113,7 @@ def open_table(
     retry: RetryPolicy | None,
     wanted: Callable[[SceneId], bool] | None = None,
     conventions: Conventions | None = None,
+    rows: Rows = "presumed",
 ) -> Opened:
     """Return the scenes of some data; `SceneIndex.open` describes the arguments and the errors.
 
@@ -114,7 +134,7 @@ def open_table(
             raise StorageError(describe_os_error(f"{path}: cannot be looked at", error)) from error
         if is_tree:
             _require_no_root(path, named_root)
-            opened = _open_tree(path, wanted, conventions)
+            opened = _open_tree(path, wanted, rows=rows, conventions=conventions)
         elif is_folder or is_file:
             file = path / INDEX_NAME if is_folder else path
             opened = _open_file(file, root=named_root)
@@ -188,7 +208,7 @@ def _open_url(
                 f"index {shown(beside)} -o index.parquet --split eval`, and open that file with "
                 f"--root {shown(beside)}, or SceneIndex.open('index.parquet', root=...)."
             ) from None
-        return _open_tree(beside, None, conventions)
+        return _open_tree(beside, None, rows="read", conventions=conventions)
     if size > MAX_INDEX_BYTES:
         raise StorageError(
             f"{remote.where}: an index may have {MAX_INDEX_BYTES:,} bytes, this one has "
@@ -205,12 +225,78 @@ def _open_url(
 def _open_tree(
     root: str | Path,
     wanted: Callable[[SceneId], bool] | None,
+    *,
+    rows: Rows,
     conventions: Conventions | None,
 ) -> Opened:
-    """Describe the scenes of a folder or URL in the released layout, without a few broken ones."""
-    # In this process: a script without `if __name__ == "__main__"` could start no others.
-    report = walk(root, workers=1, wanted=wanted, if_none="all", conventions=conventions)
-    where = shown(root)
+    """Return the scenes of a folder or URL in the released layout, without a few broken ones.
+
+    Those of a large folder are kept in the user's cache, and presumed where that is possible.
+    """
+    tree = None if is_remote(root) else list_tree(Path(root), wanted, conventions)
+    opened = None
+    if tree is not None and rows == "presumed" and tree.has_one_shape:
+        opened = _kept(tree, "presumed")
+        if opened is None:
+            with _no_collection():
+                report = presumed_report(tree)
+                opened = None if report is None else _keep(tree, "presumed", _of_report(report))
+        if opened is not None:
+            return opened._replace(presumption=Presumption(tree, forms=_forms_in(opened.table)))
+    opened = None if tree is None else _kept(tree, "read")
+    if opened is None:
+        # In this process: a script without `if __name__ == "__main__"` could start no others.
+        opened = _of_report(
+            walk(root, workers=1, wanted=wanted, if_none="all", conventions=conventions)
+        )
+        if tree is not None:
+            _keep(tree, "read", opened)
+    return opened
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Collect no garbage: beside torch's objects, the rows of thousands of scenes cost a third."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
+def _kept(tree: ListedTree, rows: Rows) -> Opened | None:
+    """Return the rows of a tree that an earlier opening has kept."""
+    found = TreeCache(tree.root, tree.read_as).table(f"{rows}-{tree.stamp}")
+    if found is None:
+        return None
+    table, head, tables = found
+    # Without a digest: the user has made no index file.
+    return Opened(
+        table,
+        replace(head, root=str(tree.root), digest=""),
+        seek_tables=tables,
+        assumed=_assumed_of(table, where=str(tree.root)),
+    )
+
+
+def _keep(tree: ListedTree, rows: Rows, opened: Opened) -> Opened:
+    """Keep the rows of a tree for later openings, and return them."""
+    if not isinstance(opened.seek_tables, Path):
+        head = replace(opened.head, digest=table_digest(opened.table))
+        name = f"{rows}-{tree.stamp}"
+        TreeCache(tree.root, tree.read_as).keep_table(name, opened.table, head, opened.seek_tables)
+    return opened
+
+
+def _of_report(report: TreeReport) -> Opened:
+    """Return the scenes that a walk found.
+
+    Raises:
+        StorageError: If there is none, or more than a few are broken.
+    """
+    where = shown(report.root)
     if not report.scenes:
         raise StorageError(
             f"{where}: no scene is complete: {_listed(report.broken | report.incomplete)}"
@@ -232,8 +318,21 @@ def _open_tree(
         table,
         head,
         seek_tables=seek_tables_of(report.scenes),
-        assumed=assumptions(report.scenes, where=where),
+        assumed=_assumed_of(table, where=where),
     )
+
+
+def _assumed_of(table: pa.Table, *, where: str) -> str:
+    """Return what was taken for granted, by some of the scenes whose files were all read."""
+    was_read = table.filter(pc.is_valid(table.column("pose_form")))
+    scenes = (was_read if was_read.num_rows else table).slice(0, _LOOKED_AT).to_pylist()
+    return assumptions(map(scene_of, scenes), where=where)
+
+
+def _forms_in(table: pa.Table) -> list[str]:
+    """Return how the poses are read of the scenes whose trajectories were read."""
+    forms: list[str] = table.column("pose_form").drop_null().to_pylist()
+    return forms
 
 
 def _require_digest(table: pa.Table, head: IndexHead, *, where: str) -> None:

@@ -3,8 +3,9 @@
 `Scene` and its parts say what the values mean.
 """
 
+import base64
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, Final
 
 import pyarrow as pa
@@ -137,7 +138,14 @@ def row_of(scene: Scene) -> dict[str, Any]:
         row["depth_offset_m"] = None
     row["remarks"] = [asdict(remark) for remark in scene.remarks] or None
     row["members"] = [
-        {"name": name, **asdict(member)} for name, member in sorted(scene.members.items())
+        {
+            "name": name,
+            "path": member.path,
+            "offset": member.offset,
+            "size": member.size,
+            "crc32": member.crc32,
+        }
+        for name, member in sorted(scene.members.items())
     ]
     return row
 
@@ -179,3 +187,14 @@ def scene_of(row: Mapping[str, Any]) -> Scene:
         training=None if row["training_quality"] is None else TrainingFacts(**values("training")),
         **scene,
     )
+
+
+def json_of(scene: Scene) -> dict[str, Any]:
+    """Return a scene as JSON, with its seek tables."""
+    return row_of(scene) | {SEEK_COLUMN: base64.b64encode(scene.seek_tables or b"").decode()}
+
+
+def scene_of_json(row: Mapping[str, Any]) -> Scene:
+    """Return the scene that `json_of` wrote."""
+    tables = base64.b64decode(row[SEEK_COLUMN])
+    return replace(scene_of(row), seek_tables=tables)

@@ -11,7 +11,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
@@ -106,7 +106,7 @@ _T = TypeVar("_T")
 
 ValidDepth = Literal["skip", "sample"]
 
-_DESCRIPTIONS: Final = (DESCRIPTION_JSON, DESCRIPTION_TXT)
+DESCRIPTIONS: Final = (DESCRIPTION_JSON, DESCRIPTION_TXT)
 _DEPTHS: Final = frozenset(name for name in VIDEO_FILES if name.endswith("_depth.mkv"))
 _LONGEST_REMARK: Final = 2000
 _NO_DEPTH: Final = StreamFacts(CODEC_NAME, "gray16le", 0, 0, 0, 0.0, {})
@@ -225,7 +225,7 @@ def describe_scene(
     if TRAINING_JSON in files:
         document = parse_training(folder.read(TRAINING_JSON), where=f"{key}/{TRAINING_JSON}")
     videos = _videos_of(document)
-    _require_finished(key, files, videos=videos)
+    require_finished(key, files, videos=videos)
     problems: list[StereoGenBenchError] = []
     remarks: list[Remark] = []
     rig, labels, shape = None, SceneLabels(), None
@@ -239,15 +239,19 @@ def describe_scene(
         problems.append(error)
     marked, odd = parse_complete(folder.read(COMPLETE_JSON), where=f"{key}/{COMPLETE_JSON}")
     remarks += odd
-    texts: dict[str, bytes] = {name: folder.read(name) for name in _DESCRIPTIONS if name in files}
-    caption, odd = _caption(texts, key=key)
+    texts: dict[str, bytes] = {name: folder.read(name) for name in DESCRIPTIONS if name in files}
+    caption, odd = caption_of(texts, key=key)
     remarks += odd
     facts, tables, unread = _all_probed(folder, key, files, videos)
     try:
         frames = _common_frames(key, facts, remarks)
         _require_one_size(key, facts)
         if rig is not None:
-            rig = _sized_as_videos(key, rig, facts, document=document, remarks=remarks, shape=shape)
+            first = next(iter(facts.values()))
+            size_px = first.width_px, first.height_px
+            rig = sized_as_videos(
+                key, rig, size_px, document=document, remarks=remarks, shape=shape
+            )
             _require_kinds(key, rig, facts)
     except StereoGenBenchError as error:
         problems.append(error)
@@ -262,12 +266,12 @@ def describe_scene(
     ratio = None if valid_depth == "skip" else _valid_ratio(folder, key, frames)
     scene = Scene(
         id=parse_scene_key(key),
-        labels=_merged_labels(labels, marked),
+        labels=merged_labels(labels, marked),
         caption=caption,
         rig=rig,
         frames=frames,
         frame_rate_hz=next(iter(facts.values())).frame_rate_hz,
-        lateral_m=_assumed_places_m(rig) if poses is None else _places_m(poses),
+        lateral_m=assumed_places_m(rig) if poses is None else _places_m(poses),
         rig_residual_px=(
             0.0 if poses is None else rectification_residual_px(poses, recorded_intrinsics(rig))
         ),
@@ -278,10 +282,7 @@ def describe_scene(
         depth_pixel_format=tuple(facts.pixel_format for _, facts in depths),
         valid_depth_ratio=ratio,
         key_frames=_common_key_frames(facts, frames=frames),
-        remarks=tuple(
-            Remark(each.about, shortened(text_without_secrets(each.text), _LONGEST_REMARK))
-            for each in remarks
-        ),
+        remarks=as_kept(remarks),
         pose_form=pose_form,
         conventions=None if shape is None else shape.text(),
         members={
@@ -292,6 +293,14 @@ def describe_scene(
         seek_tables=packed_tables(tables),
     )
     return scene if document is None else _of_training(scene, document)
+
+
+def as_kept(remarks: list[Remark]) -> tuple[Remark, ...]:
+    """Return remarks as a row keeps them: shortened, and without secrets."""
+    return tuple(
+        Remark(each.about, shortened(text_without_secrets(each.text), _LONGEST_REMARK))
+        for each in remarks
+    )
 
 
 def _shape_of(
@@ -344,9 +353,9 @@ def _all_probed(
     """
     facts, tables, unread = {}, {}, {}
     for name in videos:
-        held = _held(files, name)
+        held = held_name(files, name)
         if held not in files:
-            unread[name] = f"{key}/{name}: is missing, and the scene is marked as complete"
+            unread[name] = missing_video(key, name)
             continue
         try:
             facts[name], table = _probed(folder, key, held)
@@ -356,6 +365,11 @@ def _all_probed(
         if table is not None:
             tables[held] = table
     return facts, tables, unread
+
+
+def missing_video(key: str, name: str) -> str:
+    """Return what is remarked about a video that a scene lacks."""
+    return f"{key}/{name}: is missing, and the scene is marked as complete"
 
 
 def _poses(  # noqa: PLR0913 - what poses are judged by
@@ -386,7 +400,7 @@ def _poses(  # noqa: PLR0913 - what poses are judged by
         )
         found = None
     if found is None:
-        if not _assumed_places_m(rig):
+        if not assumed_places_m(rig):
             raise StorageError(
                 f"{reason} Without poses the rig is assumed to be a straight line of cameras, and "
                 f"the baselines in {BASELINE_JSON} do not add up to one: correct either file."
@@ -448,7 +462,7 @@ def as_agreed(scene: Scene, agreed: Mapping[str, tuple[str, ...]]) -> Scene:
     if scene.pose_form is None:
         return scene
     names = scene.pose_form.split("|")
-    left = [name for name in agreed[shape_of(scene.pose_form)] if name in names]
+    left = [name for name in agreed.get(shape_of(scene.pose_form), names) if name in names]
     if left == names:
         return scene
     others = tuple(each for each in scene.remarks if each.about != "world")
@@ -462,7 +476,7 @@ def as_agreed(scene: Scene, agreed: Mapping[str, tuple[str, ...]]) -> Scene:
     return replace(
         scene,
         pose_form=None,
-        lateral_m=_assumed_places_m(scene.rig),
+        lateral_m=assumed_places_m(scene.rig),
         rig_residual_px=0.0,
         remarks=(*others, Remark("poses", reason)),
     )
@@ -472,16 +486,18 @@ def _places_m(poses: CameraPoses) -> tuple[float, ...]:
     return tuple(map(float, lateral_offsets_m(poses)))
 
 
-def _assumed_places_m(rig: Rig) -> tuple[float, ...]:
+def assumed_places_m(rig: Rig) -> tuple[float, ...]:
     """Return the distance of each camera to the right of camera 0 by the baselines alone.
 
     The cameras are assumed to stand on a line; () where the baselines are not those of a line.
     """
-    first, last = max(CAMERA_PAIRS, key=lambda pair: rig.baseline_cm(*pair))
+    of_pair = dict(zip(CAMERA_PAIRS, rig.baselines_cm, strict=True))
+    first, last = max(of_pair, key=lambda pair: of_pair[pair])
     along_cm = [
-        0.0 if camera == first else rig.baseline_cm(first, camera) for camera in range(CAMERA_COUNT)
+        of_pair.get((first, camera), of_pair.get((camera, first), 0.0))
+        for camera in range(CAMERA_COUNT)
     ]
-    for (a, b), baseline_cm in zip(CAMERA_PAIRS, rig.baselines_cm, strict=True):
+    for (a, b), baseline_cm in of_pair.items():
         allowed_cm = _DEVIATION_CM + _DEVIATION_SHARE * along_cm[last]
         if abs(abs(along_cm[b] - along_cm[a]) - baseline_cm) > allowed_cm:
             return ()
@@ -506,7 +522,7 @@ def _of_each_camera(depths: Mapping[str, StreamFacts]) -> list[tuple[str, Stream
     return [(name, depths[name]) if name in depths else some for name in names]
 
 
-def _held(files: Mapping[str, object], name: str) -> str:
+def held_name(files: Mapping[str, object], name: str) -> str:
     """Return the name under which a folder holds a released file: depth may be packed."""
     return name if name in files else PACKED_DEPTH_NAMES.get(name, name)
 
@@ -526,12 +542,20 @@ def _probed(folder: SceneFolder, key: str, name: str) -> tuple[StreamFacts, Seek
             video.close()
 
 
-def _require_finished(key: str, files: Mapping[str, object], *, videos: tuple[str, ...]) -> None:
+def require_finished(
+    key: str, files: Mapping[str, object], *, videos: tuple[str, ...] = VIDEO_FILES
+) -> None:
+    """Refuse a scene of which the listing of its files shows that it cannot be used.
+
+    Raises:
+        IncompleteScene: If it is not marked as complete or has no video at all.
+        StorageError: If it has no ``baseline.json``.
+    """
     if not files:
         raise IncompleteScene(f"{key}: the folder is empty")
     if COMPLETE_JSON not in files:
         raise IncompleteScene(f"{key}: has no {COMPLETE_JSON}, so it was never finished")
-    if not any(_held(files, name) in files for name in videos):
+    if not any(held_name(files, name) in files for name in videos):
         raise IncompleteScene(f"{key}: has metadata only, and none of its {len(videos)} videos")
     if BASELINE_JSON not in files:
         raise StorageError(
@@ -540,7 +564,7 @@ def _require_finished(key: str, files: Mapping[str, object], *, videos: tuple[st
         )
 
 
-def _caption(texts: Mapping[str, bytes], *, key: str) -> tuple[str, tuple[Remark, ...]]:
+def caption_of(texts: Mapping[str, bytes], *, key: str) -> tuple[str, tuple[Remark, ...]]:
     """Return a scene's caption from its files: the detailed one, else the short one, else ""."""
     remarks: tuple[Remark, ...] = ()
     if DESCRIPTION_JSON in texts:
@@ -562,10 +586,11 @@ def _caption(texts: Mapping[str, bytes], *, key: str) -> tuple[str, tuple[Remark
     return "", remarks
 
 
-def _merged_labels(labels: SceneLabels, marked: SceneLabels) -> SceneLabels:
+def merged_labels(labels: SceneLabels, marked: SceneLabels) -> SceneLabels:
     """Return the labels of baseline.json; those it lacks come from the completion mark."""
-    known = {name: value for name, value in asdict(labels).items() if value is not None}
-    return SceneLabels(**(asdict(marked) | known))
+    values = {each.name: getattr(labels, each.name) for each in fields(SceneLabels)}
+    lacking = [name for name, value in values.items() if value is None]
+    return SceneLabels(**(values | {name: getattr(marked, name) for name in lacking}))
 
 
 def _common_key_frames(facts: Mapping[str, StreamFacts], *, frames: int) -> tuple[int, ...]:
@@ -605,10 +630,10 @@ def _require_one_size(key: str, facts: Mapping[str, StreamFacts]) -> None:
         )
 
 
-def _sized_as_videos(
+def sized_as_videos(
     key: str,
     rig: Rig,
-    facts: Mapping[str, StreamFacts],
+    size_px: tuple[int, int],
     *,
     document: TrainingDocument | None,
     remarks: list[Remark],
@@ -618,8 +643,7 @@ def _sized_as_videos(
 
     A principal point, in pixels of the recorded image, moves with the size.
     """
-    first = next(iter(facts.values()))
-    width_px, height_px = first.width_px, first.height_px
+    width_px, height_px = size_px
     if document is not None and (width_px, height_px) != document.size_px:
         raise StorageError(
             f"{key}: {TRAINING_JSON} is for pictures of {document.size_px[0]}x"
@@ -760,7 +784,7 @@ def _valid_ratio(folder: SceneFolder, key: str, frames: int) -> float:
     shares = []
     encoding = ANY_DEPTH
     files = folder.stamps()
-    for name in (_held(files, depth_name(camera)) for camera in range(CAMERA_COUNT)):
+    for name in (held_name(files, depth_name(camera)) for camera in range(CAMERA_COUNT)):
         if name not in files:
             continue
         with open_depth(folder.video(name), name=f"{key}/{name}", frames=frames) as reader:
@@ -871,7 +895,7 @@ def _differing_labels(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Diff
     where = f"{key}/{BASELINE_JSON}"
     _, labels, _ = parse_rig(texts[BASELINE_JSON], where=where, shape=_stated_of(scene))
     marked, _ = parse_complete(texts[COMPLETE_JSON], where=f"{key}/{COMPLETE_JSON}")
-    merged = _merged_labels(labels, marked)
+    merged = merged_labels(labels, marked)
     for each in fields(SceneLabels):
         found, indexed = getattr(merged, each.name), getattr(scene.labels, each.name)
         if found != indexed:
@@ -938,8 +962,8 @@ def _differing_poses(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Diffe
 
 
 def _differing_caption(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
-    names = [name for name in _DESCRIPTIONS if name in texts]
-    caption, _ = _caption(texts, key=scene.id.key)
+    names = [name for name in DESCRIPTIONS if name in texts]
+    caption, _ = caption_of(texts, key=scene.id.key)
     if names and caption != scene.caption:
         yield _difference(names[0], "the caption", caption, scene.caption)
 

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.arrow import as_categories, as_numpy, one_array, table_digest
 from stereogenbench_data.index.build import TreeReport
-from stereogenbench_data.index.open import SeekTables, open_table
+from stereogenbench_data.index.open import Rows, SeekTables, open_table
 from stereogenbench_data.index.parquet import (
     IndexHead,
     read_seek_tables,
@@ -23,6 +23,7 @@ from stereogenbench_data.index.parquet import (
     table_of_scenes,
     write_index_file,
 )
+from stereogenbench_data.index.presumed import Presumption
 from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, scene_of
 from stereogenbench_data.schema.conventions import Conventions, Shape, shape_of_text
 from stereogenbench_data.schema.records import Scene, SceneId, ShardFacts
@@ -48,6 +49,7 @@ class SceneIndex:
             URLs are not checked.
         is_from_file: Whether it was read from an index file, so that scenes which it leaves out
             were left out on purpose.
+        presumption: What reads the scenes whose rows are presumed; None where all were read.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class SceneIndex:
         retry: RetryPolicy | None = None,
         stale: str = "",
         seek_tables: SeekTables = None,
+        presumption: Presumption | None = None,
     ) -> None:
         """Take a checked table; use `open` or `from_scenes` to make an index."""
         self.root = head.root
@@ -73,6 +76,7 @@ class SceneIndex:
         self._columns: dict[str, np.ndarray] = {}
         self._digest = head.digest
         self._seek_tables = seek_tables
+        self.presumption = presumption
 
     @classmethod
     def open(
@@ -83,6 +87,7 @@ class SceneIndex:
         retry: RetryPolicy | None = None,
         wanted: Callable[[SceneId], bool] | None = None,
         conventions: str | Path | Conventions | None = None,
+        rows: Rows = "presumed",
     ) -> "SceneIndex":
         """Open the index of some data.
 
@@ -92,9 +97,7 @@ class SceneIndex:
         Args:
             data: An index file; a folder with an ``index.parquet``, such as one of shards; the URL
                 of either (``https://``, ``hf://datasets/``, ``s3://`` or whatever fsspec opens),
-                of which only the index is fetched; or a folder in the released layout, whose
-                scenes are then described (seconds for hundreds of scenes, minutes for all:
-                ``stereogenbench index`` keeps the result).
+                of which only the index is fetched; or a folder in the released layout.
             root: Where the data of an index file are, whatever the file says: any folder or URL
                 that you trust.
             retry: How slow a server may be.
@@ -104,6 +107,11 @@ class SceneIndex:
                 ``stereogenbench conventions`` writes it: a file's path, or what is in it. The rows
                 keep it, so that an index or shards made of this one need not be told again. Rows of
                 an index are not described again: files of some scenes are compared with them.
+            rows: How many scenes (64 and more) of a folder without an index are opened. "read"
+                describes them all, in minutes for the whole release. "presumed" lists their files,
+                reads each ``baseline.json`` and describes a few; the others are presumed to be like
+                these, and `scene` describes them when they are needed. What was found out is
+                kept in the user's cache, for as long as the files stay as they are.
 
         Warns with `IncompleteSceneWarning` of scenes that were left out: it counts them and names
         the first; and with `AssumptionWarning` of what was taken for granted, where the files of a
@@ -116,13 +124,16 @@ class SceneIndex:
             SchemaError: If the conventions are not understood.
         """
         stated = None if conventions is None else Conventions.read(conventions)
-        opened = open_table(data, root=root, retry=retry, wanted=wanted, conventions=stated)
+        opened = open_table(
+            data, root=root, retry=retry, wanted=wanted, conventions=stated, rows=rows
+        )
         return cls(
             opened.table,
             opened.head,
             retry=retry,
             stale=opened.stale,
             seek_tables=opened.seek_tables,
+            presumption=opened.presumption,
         )
 
     @classmethod
@@ -171,8 +182,13 @@ class SceneIndex:
         where the root is.
 
         Raises:
-            StorageError: If the file cannot be written.
+            StorageError: If the file cannot be written, or rows of it are presumed.
         """
+        if self.presumption is not None:
+            raise StorageError(
+                f"{self.where}: most of its rows are presumed, and an index must not be. Run "
+                f"`stereogenbench index {self.where}`, or open it with rows='read'."
+            )
         head = IndexHead(
             root=self.root,
             digest=self.digest,
@@ -196,7 +212,16 @@ class SceneIndex:
         return int(self._table.num_rows)
 
     def scene(self, row: int) -> Scene:
-        """Return the scene of a row.
+        """Return the scene of a row; where rows are presumed, as its files say.
+
+        Raises:
+            StorageError: If there is no such row, or the scene is not as presumed.
+        """
+        scene = self.indexed_scene(row)
+        return scene if self.presumption is None else self.presumption.described(scene)
+
+    def indexed_scene(self, row: int) -> Scene:
+        """Return what the index says of the scene of a row, presumed or not.
 
         Raises:
             StorageError: If there is no such row.
@@ -237,6 +262,10 @@ class SceneIndex:
         Raises:
             StorageError: If there is no such column.
         """
+        if name == "caption" and name not in self._columns and self.presumption is not None:
+            captions = self.presumption.captions(self.column("key"))
+            self._columns[name] = np.array(captions, dtype=object)
+            self._columns[name].setflags(write=False)
         if name not in self._columns:
             columns = [each for each in SCHEMA.names if each not in _LISTS]
             if name not in columns:

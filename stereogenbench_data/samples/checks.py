@@ -7,10 +7,10 @@ from typing import Any, NoReturn
 import numpy as np
 
 from stereogenbench_data.errors import MediaError, StorageError, text_without_secrets
+from stereogenbench_data.geometry.rig import RECTIFIED_PX
 from stereogenbench_data.index.open import MOST_LEFT_OUT
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import DEPTH_CURES, NO_DEPTH_UNIT, require_depth_stream
-from stereogenbench_data.samples.derive import RECTIFIED_PX
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.samples.size import EnlargedSizeWarning, warn_if_swapped
 from stereogenbench_data.schema.conventions import shape_of_text
@@ -40,11 +40,11 @@ def without_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> Plan:
         sides = () if known.needs_poses == "never" else ("left",)
         for about in (*known.held_up_by, *sides):
             for row in selected.intersection(index.remarked(about).tolist()):
-                text = index.scene(row).remark(about).rstrip(".")
+                text = index.indexed_scene(row).remark(about).rstrip(".")
                 reasons.setdefault(row, f"{name!r} needs {text}")
     for row in selected.intersection(index.remarked("videos").tolist()):
         if _missing_videos(index, plan, request, int(np.searchsorted(plan.scene_rows, row))):
-            reasons.setdefault(row, index.scene(row).remark("videos"))
+            reasons.setdefault(row, index.indexed_scene(row).remark("videos"))
     if not reasons:
         return plan
     first = min(reasons)
@@ -80,7 +80,7 @@ def check_samples(index: SceneIndex, plan: Plan, request: Request) -> None:
         _require_whole_depth(index, plan, request)
     _warn_of_odd_scenes(index, plan, request)
     if request.size is not None and len(plan.scene_rows):
-        rig = index.scene(int(plan.scene_rows[0])).rig
+        rig = index.indexed_scene(int(plan.scene_rows[0])).rig
         stored = (rig.image_height_px, rig.image_width_px)
         warn_if_swapped(request.size, stored=stored)
         if index.is_derived and (request.size[0] > stored[0] or request.size[1] > stored[1]):
@@ -99,7 +99,7 @@ def _require_videos(index: SceneIndex, plan: Plan, request: Request) -> None:
     for place in np.flatnonzero(partial).tolist():
         missing = _missing_videos(index, plan, request, place)
         if missing:
-            scene = index.scene(int(plan.scene_rows[place]))
+            scene = index.indexed_scene(int(plan.scene_rows[place]))
             there = sorted({name[4:6] for name in scene.members if name.startswith("cam_")})
             raise StorageError(
                 f"{index.where}: {scene.id.key} has no {', '.join(missing)}; videos of cameras "
@@ -118,7 +118,7 @@ def _missing_videos(index: SceneIndex, plan: Plan, request: Request, place: int)
         for stream in request.streams
         for camera in (sources if stream.startswith("source") else targets)
     }
-    members = index.scene(int(plan.scene_rows[place])).members
+    members = index.indexed_scene(int(plan.scene_rows[place])).members
     return sorted(needed - {name.partition(".")[0] for name in members})
 
 
@@ -155,7 +155,7 @@ def _require_whole(
         refused = np.argwhere(is_refused)
         if stream in request.streams and len(refused):
             pair, place = refused[0]
-            scene = index.scene(int(pairs.row[pair]))
+            scene = index.indexed_scene(int(pairs.row[pair]))
             _refuse_depth(scene, int(cameras[pair, place]), encoding=encoding)
 
 
@@ -194,7 +194,7 @@ def _warn_of_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> None
             "projected through the poses, and no field holds what that moves up or down",
         )  # fmt: skip
         unknown = np.intersect1d(rows, index.remarked("poses"))
-        reason = index.scene(int(unknown[0])).remark("poses") if len(unknown) else ""
+        reason = index.indexed_scene(int(unknown[0])).remark("poses") if len(unknown) else ""
         _warn(
             index, unknown,
             f"have poses that are not understood, so their rigs are assumed rectified, with the "

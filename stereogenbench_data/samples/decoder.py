@@ -1,6 +1,7 @@
 """The decoder: from a sample's address to its `Views`, reading no more than the fields need."""
 
 import copy
+import warnings
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -9,14 +10,22 @@ from typing import Any, Final, Literal, Self
 
 import numpy as np
 
-from stereogenbench_data.errors import MediaError, SchemaError, ShardError
+from stereogenbench_data.errors import (
+    MediaError,
+    SchemaError,
+    ShardError,
+    StorageError,
+    text_without_secrets,
+)
 from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.geometry.rig import RECTIFIED_PX
 from stereogenbench_data.index.evidence import poses_as
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import depth_frame_index
+from stereogenbench_data.samples.checks import OddSceneWarning
 from stereogenbench_data.samples.coming import ComingSamples, NeededFiles, Step
-from stereogenbench_data.samples.derive import RECTIFIED_PX, SceneFacts
+from stereogenbench_data.samples.derive import SceneFacts
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.samples.streams import OPEN_STREAMS, Streams, StreamStats
 from stereogenbench_data.samples.views import StoredDepth, Views
@@ -196,6 +205,7 @@ class SampleDecoder:
         known = self._scenes.get(row)
         if known is None:
             scene = self._index.scene(row)
+            self._require_as_presumed(row, scene)
             if self._coming is not None:
                 scene = replace(scene, seek_tables=self._index.seek_tables(row))
             intrinsics = rig_intrinsics(scene.rig)
@@ -210,6 +220,34 @@ class SampleDecoder:
             if len(self._scenes) > KEPT_SCENES:
                 self._scenes.popitem(last=False)
         return known
+
+    def _require_as_presumed(self, row: int, scene: Scene) -> None:
+        """Refuse a scene that was presumed to give what is requested, and does not.
+
+        Where all rows were read, such scenes are no part of the plan. The first of those whose
+        poses are not understood, and not needed either, is told.
+        """
+        presumption, request = self._index.presumption, self._request
+        if presumption is None:
+            return
+        for name in request.fields:
+            for about in request.known[name].held_up_by:
+                if reason := scene.remark(about):
+                    raise StorageError(
+                        f"{self._index.where}: {scene.id.key} cannot give {name!r}: {reason}. "
+                        f"{presumption.cures()}"
+                    )
+        reason = scene.remark("poses")
+        if self._poses_needed == "never" or not reason or presumption.was_told:
+            return
+        if not self._index.indexed_scene(row).remark("poses"):
+            presumption.was_told = True
+            message = (
+                f"{self._index.where}: {scene.id.key} has poses that are not understood, so its "
+                f"rig is assumed rectified ({reason}). There may be more such scenes: "
+                f"`stereogenbench index {self._index.where}` tells all of them."
+            )
+            warnings.warn(text_without_secrets(message), OddSceneWarning, stacklevel=2)
 
     def decode(
         self, address: Address, *, frames: slice, out: Mapping[int, Any]

@@ -22,15 +22,12 @@ from stereogenbench_data.geometry.projection import (
     project_rectified,
     project_through_poses,
 )
+from stereogenbench_data.geometry.rig import RECTIFIED_PX
 from stereogenbench_data.geometry.visibility import visible_from_source, visible_in_target
 from stereogenbench_data.geometry.warp import splat
 from stereogenbench_data.media.depth import depth_m_from_units
 from stereogenbench_data.samples.views import StoredDepth, Views
 from stereogenbench_data.schema.records import DepthEncoding, Scene
-
-RECTIFIED_PX: Final = 0.05
-"""A rig whose residual is at most this is rectified: disparity is B fx / z. Beyond it every pixel
-goes through the poses."""
 
 MIRROR_X: Final = np.diag([-1.0, 1.0, 1.0, 1.0])
 

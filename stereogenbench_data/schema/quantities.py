@@ -6,6 +6,7 @@ end (``focalLengthMM``, ``sensor_width (cm)``) do not matter, and the key above 
 (``"sensor": {"width": ...}``). A new spelling is a word more in `NAMES`.
 """
 
+import functools
 import json
 import math
 import re
@@ -120,6 +121,7 @@ def rounding_of(value: float) -> float:
     return max(half, abs(value) * 2**-23)
 
 
+@functools.lru_cache(maxsize=4096)  # thousands of files have the same keys
 def words(key: str) -> str:
     """Return a key in snake_case.
 
@@ -130,6 +132,7 @@ def words(key: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", parted.lower()).strip("_")
 
 
+@functools.lru_cache(maxsize=4096)
 def without_unit(name: str) -> tuple[str, str]:
     """Return a name in snake_case without the unit at its end, and the unit or "".
 

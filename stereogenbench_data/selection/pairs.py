@@ -197,7 +197,7 @@ def _of_held_cameras(
     partial = rows[index.video_counts()[rows] < len(VIDEO_FILES)]
     keep = np.ones(len(pairs), dtype=bool)
     for row in partial.tolist():
-        held = {int(video[4:6]) for video in index.scene(row).held_videos}
+        held = {int(video[4:6]) for video in index.indexed_scene(row).held_videos}
         own = slice(*np.searchsorted(pairs.row, [row, row + 1]))
         keep[own] = np.isin(pairs.source[own], [*held]) & np.isin(pairs.targets[own, 0], [*held])
     if keep.all() or not keep.any():

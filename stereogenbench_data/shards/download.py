@@ -78,21 +78,51 @@ def plan_download(
     Raises:
         StorageError: If the index lacks a wanted file.
     """
-    scenes = []
+    return Download(
+        tuple(
+            replace(scene, members=_wanted_members(scene, cameras=cameras, streams=streams))
+            for scene in (index.scene(int(row)) for row in rows)
+        )
+    )
+
+
+def _wanted_members(
+    scene: Scene, *, cameras: Sequence[int], streams: Sequence[str]
+) -> dict[str, Member]:
+    stems = [f"cam_{camera:02d}_{stream}" for camera in cameras for stream in streams]
+    videos = {name.partition(".")[0]: name for name in scene.members}
+    missing = [stem for stem in stems if stem not in videos]
+    if missing:
+        raise StorageError(
+            f"{scene.id.key}: the index has no {', '.join(missing)}: it is of a partial "
+            f"download. Download from the whole release."
+        )
+    names = [name for name in SCENE_TEXTS if name in scene.members]
+    names += [videos[stem] for stem in stems]
+    return {name: scene.members[name] for name in names}
+
+
+def download_sizes(
+    index: SceneIndex, rows: Sequence[int], *, cameras: Sequence[int], streams: Sequence[str]
+) -> dict[int, int]:
+    """Return the rows of scenes that have all wanted files, with the bytes of these.
+
+    Raises:
+        StorageError: If no scene has them.
+    """
+    sizes: dict[int, int] = {}
+    lacking: StorageError | None = None
     for row in rows:
-        scene = index.scene(int(row))
-        stems = [f"cam_{camera:02d}_{stream}" for camera in cameras for stream in streams]
-        videos = {name.partition(".")[0]: name for name in scene.members}
-        missing = [stem for stem in stems if stem not in videos]
-        if missing:
-            raise StorageError(
-                f"{scene.id.key}: the index has no {', '.join(missing)}: it is of a partial "
-                f"download. Download from the whole release."
-            )
-        names = [name for name in SCENE_TEXTS if name in scene.members]
-        names += [videos[stem] for stem in stems]
-        scenes.append(replace(scene, members={name: scene.members[name] for name in names}))
-    return Download(tuple(scenes))
+        scene = index.indexed_scene(int(row))
+        try:
+            members = _wanted_members(scene, cameras=cameras, streams=streams)
+        except StorageError as error:
+            lacking = error
+            continue
+        sizes[int(row)] = sum(member.size for member in members.values())
+    if lacking is not None and not sizes:
+        raise lacking
+    return sizes
 
 
 def download(

@@ -186,7 +186,7 @@ def prepare(  # noqa: PLR0913 - what `pack` takes
     number, count = part
     if not 1 <= number <= count:
         raise ShardError(f"part {number}/{count}: a part is I/N with I from 1 to N, such as 1/4.")
-    index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
+    index = data if isinstance(data, SceneIndex) else SceneIndex.open(data, rows="read")
     if depth_codec == "blosc2" or training is not None:
         blosc2_module()
     plan = plan_shards(index, target_bytes, depth_codec=depth_codec, training=training, rows=rows)

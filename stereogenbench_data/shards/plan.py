@@ -149,7 +149,7 @@ def plan_shards(
     )
 
     def planned(scene: Scene) -> list[PlannedMember]:
-        return _members_of(scene, depth_codec) if training is None else _derived(scene, training)
+        return _planned_members(scene, depth_codec=depth_codec, training=training)
 
     shards = tuple(
         shard
@@ -188,6 +188,30 @@ def _facts_of(scene: Scene) -> dict[str, Any]:
     row = row_of(scene)
     del row["members"], row["valid_depth_ratio"]
     return row
+
+
+def packed_bytes(
+    scene: Scene, *, depth_codec: DepthCodec = "released", training: TrainingSettings | None = None
+) -> int:
+    """Return the bytes of a scene in shards, with its share of a tar's own at most.
+
+    Packed depth counts with its released size; of training shards it is an estimate.
+
+    Raises:
+        ShardError: If the scene cannot be packed.
+    """
+    members = _planned_members(scene, depth_codec=depth_codec, training=training)
+    return len(END_OF_ARCHIVE) + _tar_bytes(members)
+
+
+def _planned_members(
+    scene: Scene, *, depth_codec: DepthCodec, training: TrainingSettings | None
+) -> list[PlannedMember]:
+    return _members_of(scene, depth_codec) if training is None else _derived(scene, training)
+
+
+def _tar_bytes(members: Iterable[PlannedMember]) -> int:
+    return sum(BLOCK_BYTES + padded(member.size) for member in members)
 
 
 def parse_bytes(text: str) -> int:
@@ -264,7 +288,7 @@ def _filled(
 
     for scene in scenes:
         added = planned(scene)
-        added_bytes = sum(BLOCK_BYTES + padded(member.size) for member in added)
+        added_bytes = _tar_bytes(added)
         if held and size + added_bytes > target_bytes:
             yield finished()
             held, members, size, number = [], [], len(END_OF_ARCHIVE), number + 1

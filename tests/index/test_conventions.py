@@ -87,7 +87,7 @@ def test_a_scene_is_the_same_by_the_file_it_taught(elsewhere, shared_scenes):
         ("rotator pitch yaw roll deg", "rotator pitch yaw roll rad", r"9\.75 cm apart"),
         ("rotator pitch yaw roll deg", "quaternion xyzw", r"quaternion xyzw"),
         ('axes = "unreal"', 'axes = "opencv"', r"9\.75 cm apart"),
-        ('axes = "unreal"\nunit = "cm"', 'axes = "unreal"\nunit = "m"', r"18\.5 cm.*1850 cm"),
+        ('axes = "unreal"\nunit = "cm"', 'axes = "unreal"\nunit = "m"', r"163 cm.*16300 cm"),
         ("unit_m = 0.001", "unit_m = 0.1", r"0\.001 m.*0\.1 m"),
     ],
 )  # fmt: skip

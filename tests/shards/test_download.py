@@ -1,6 +1,7 @@
 """Downloading a part of a release: only what is asked for, checked, gone on with, usable."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from typer.testing import CliRunner
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.shards.download import download, plan_download
+from stereogenbench_data.shards.download import download, download_sizes, plan_download
 from stereogenbench_data.shards.pack import pack
 from tests.servers.failing_server import Answer
 
@@ -149,6 +150,33 @@ def test_the_command_says_the_size_first_and_reports(small_release, tmp_path):
     assert json.loads(said.stdout)["dest"] is None
     assert json.loads(done.stdout)["bytes"] == json.loads(said.stdout)["bytes"]
     assert len(StereoPairs(dest, pairs=[(0, 5)])) == 1
+
+
+def test_the_command_takes_a_share_that_fits(small_release, tmp_path):
+    def taken(*words):
+        command = ["download", str(small_release), "--dest", str(tmp_path), "--dry-run", "--json"]
+        done = CliRunner().invoke(app, [*command, *words])
+        return json.loads(done.stdout) if done.exit_code == 0 else done.output
+
+    whole, one = taken(), taken("--scenes", "1")
+    fitting = taken("--max-bytes", str(whole["bytes"] - 1))
+
+    assert (whole["scenes"], one["scenes"]) == (4, 1)
+    assert 0 < fitting["scenes"] < 4
+    assert fitting["bytes"] < whole["bytes"]
+    assert "no scene fits into 1,000 bytes" in taken("--max-bytes", "1kB")
+
+
+def test_a_share_passes_over_scenes_without_the_wanted_videos(small_release, tmp_path):
+    root = shutil.copytree(small_release, tmp_path / "part", copy_function=os.link)
+    lacking = sorted(root.rglob("cam_05_rgb.mp4"))[0]
+    lacking.unlink()
+    index = SceneIndex.open(root)
+
+    sizes = download_sizes(index, range(4), cameras=[5], streams=["rgb"])
+
+    assert list(sizes) == [1, 2, 3]
+    assert sizes[1] == plan_download(index, [1], cameras=[5], streams=["rgb"]).size_bytes
 
 
 def test_a_camera_that_does_not_exist_is_refused(small_release, tmp_path):

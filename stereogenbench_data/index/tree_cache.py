@@ -1,0 +1,120 @@
+"""What was found out about trees without an index, kept in the user's cache folder.
+
+    <cache>/stereogenbench/trees/<digest of the root>/
+        presumed-<digest of the listing>.parquet   the rows, as an index file
+        scenes/ab/<digest of the key>.json         the row of a scene that was described
+
+The listing is the path, size and modification time of every file, so what is kept is used only for
+unchanged files. Any number of processes, of several machines too, may read and write: files are
+renamed into place, whole or not at all, and one that is damaged or cannot be written is as good as
+none.
+"""
+
+import hashlib
+import json
+import os
+import sys
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Final
+
+import pyarrow as pa
+
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.index.arrow import table_digest
+from stereogenbench_data.index.parquet import (
+    IndexHead,
+    read_index_file,
+    read_seek_tables,
+    write_index_file,
+)
+from stereogenbench_data.index.rows import SCHEMA, json_of, scene_of_json
+from stereogenbench_data.schema.records import Scene
+from stereogenbench_data.sources.files import write_atomic
+
+VARIABLE: Final = "STEREOGENBENCH_CACHE"
+"""The environment variable that names another folder for the cache, or is "off"."""
+
+_FORMAT: Final = 1
+_MOST_TABLES: Final = 8
+"""So many selections of a tree are kept: each has a table of its own."""
+
+
+def cache_folder() -> Path | None:
+    """Return the user's cache folder for this package, None where there is none or it is off."""
+    named = os.environ.get(VARIABLE)
+    if named is not None:
+        return None if named.strip().lower() in ("", "off") else Path(named)
+    places = {"darwin": "~/Library/Caches", "win32": os.environ.get("LOCALAPPDATA", "~")}
+    usual = os.environ.get("XDG_CACHE_HOME") or places.get(sys.platform, "~/.cache")
+    folder = Path(usual).expanduser()
+    return folder / "stereogenbench" if folder.is_absolute() else None
+
+
+class TreeCache:
+    """What is kept of one tree; nothing where there is no cache folder."""
+
+    def __init__(self, root: str | Path, read_as: str = "") -> None:
+        """Name the tree, and the conventions it is read by; nothing is read or written yet."""
+        base = cache_folder()
+        # What another version understood of the same files may differ.
+        made_by = ""
+        with suppress(PackageNotFoundError):  # of a checkout that is not installed
+            made_by = version("stereogenbench-data")
+        what = [_FORMAT, made_by, SCHEMA.names, os.path.realpath(root), read_as]
+        self._folder = None if base is None else base / "trees" / _digest(json.dumps(what))
+
+    def table(self, name: str) -> tuple[pa.Table, IndexHead, pa.BinaryArray | None] | None:
+        """Return the rows that were kept under a name, and what an index knows besides."""
+        if self._folder is None:
+            return None
+        path = self._folder / f"{name}.parquet"
+        try:
+            table, head = read_index_file(path, where=str(path))
+        except (StorageError, OSError):
+            return None
+        if head.digest != table_digest(table):
+            return None
+        with suppress(OSError):
+            os.utime(path)
+        return table, head, read_seek_tables(path)
+
+    def keep_table(
+        self, name: str, table: pa.Table, head: IndexHead, seek_tables: pa.BinaryArray | None
+    ) -> None:
+        """Keep rows under a name, in place of those that were used longest ago."""
+        if self._folder is None:
+            return
+        with suppress(StorageError, OSError):
+            write_index_file(self._folder / f"{name}.parquet", table, head, seek_tables=seek_tables)
+            tables = sorted(self._folder.glob("*.parquet"), key=lambda path: path.stat().st_mtime)
+            for old in tables[:-_MOST_TABLES]:
+                old.unlink(missing_ok=True)
+
+    def scene(self, key: str, *, stamp: str) -> Scene | None:
+        """Return the row of a scene that was described, None if its files have changed since."""
+        if self._folder is None:
+            return None
+        try:
+            kept = json.loads(self._place(key).read_bytes())
+            return scene_of_json(kept["row"]) if kept["stamp"] == stamp else None
+        except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError):
+            return None
+
+    def keep_scene(self, scene: Scene, *, stamp: str) -> None:
+        """Keep the row of a scene."""
+        if self._folder is None:
+            return
+        place = self._place(scene.id.key)
+        with suppress(OSError):
+            place.parent.mkdir(parents=True, exist_ok=True)
+            write_atomic(place, json.dumps({"stamp": stamp, "row": json_of(scene)}).encode())
+
+    def _place(self, key: str) -> Path:
+        name = _digest(key)
+        return Path(self._folder or "", "scenes", name[:2], f"{name}.json")
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
