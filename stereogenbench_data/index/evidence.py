@@ -56,11 +56,14 @@ class Understood:
         names: The readings that pass and move the cameras differently in the world, the one that
             was taken first.
         is_named: Whether the file itself names that one.
+        form: What the index keeps of it, for `poses_as`: None for the first form that the file
+            itself names, if it is the only one to pass.
     """
 
     poses: CameraPoses
     names: tuple[str, ...]
     is_named: bool
+    form: str | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,7 +107,7 @@ def understood_poses(
     with suppress(SchemaError):
         own = _fitting(readings(recorded), rig, where=where)
     if found is not None and (own is None or not own.is_named or _same(found.poses, own.poses)):
-        return found
+        return replace(found, form="|".join(found.names))
     reason = reason or "the file names another form, which fits as well and differs"
     fits = "" if own is None else f" What fits is: {shortened(own.names[0], 300)}."
     stated = ((name, getattr(named, name)) for name in ("rotation", "form", "axes", "unit"))
@@ -130,8 +133,10 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
     loose: list[_Passed] = []
     exact: list[_Passed] = []
     reversed_: list[_Passed] = []
+    first = None
     for _, tier in groupby(found, key=lambda each: each.tier):
         for reading in tier:
+            first = first or reading
             checked = _checked(reading, rig)
             if isinstance(checked, str):
                 failures.setdefault(checked, reading.name)
@@ -167,7 +172,14 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
         )
     worlds = [taken, *(each for each in passed[1:] if not _same_world(each.poses, taken.poses))]
     names = tuple(each.name for each in worlds)
-    return Understood(taken.poses, names, taken.reading.is_named and taken.reading.tier == 0)
+    own_units_m = (taken.reading.trajectory.unit_m, _UNREAL_M)
+    is_own = taken.reading is first and len(names) == 1 and taken.poses.unit_m in own_units_m
+    return Understood(
+        taken.poses,
+        names,
+        is_named=taken.reading.is_named and taken.reading.tier == 0,
+        form=None if is_own else "|".join(names),
+    )
 
 
 def agreed_forms(forms: Iterable[str]) -> dict[str, tuple[str, ...]]:
@@ -177,7 +189,7 @@ def agreed_forms(forms: Iterable[str]) -> dict[str, tuple[str, ...]]:
     never roll, does not fit the others.
 
     Args:
-        forms: `Scene.pose_form` of each scene.
+        forms: `Scene.pose_form` of each scene that has one.
 
     Returns:
         For each `shape_of`, the readings that fit the most scenes; () if not over half of them.

@@ -324,8 +324,8 @@ def _of_report(report: TreeReport) -> Opened:
 
 def _assumed_of(table: pa.Table, *, where: str) -> str:
     """Return what was taken for granted, by some of the scenes whose files were all read."""
-    was_read = table.filter(pc.is_valid(table.column("pose_form")))
-    scenes = (was_read if was_read.num_rows else table).slice(0, _LOOKED_AT).to_pylist()
+    is_odd = pc.or_(pc.is_valid(table.column("pose_form")), pc.is_valid(table.column("remarks")))
+    scenes = table.filter(is_odd).slice(0, _LOOKED_AT).to_pylist()
     return assumptions(map(scene_of, scenes), where=where)
 
 

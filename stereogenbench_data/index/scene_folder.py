@@ -421,7 +421,7 @@ def _poses(  # noqa: PLR0913 - what poses are judged by
                 f"doctor` tells by depth which is right",
             )
         )
-    return found.poses, "|".join(found.names)
+    return found.poses, found.form
 
 
 def _read_poses(

@@ -20,6 +20,7 @@ from stereogenbench_data import (
     StereoPairs,
     StorageError,
 )
+from stereogenbench_data.index.assumptions import AssumptionWarning
 from stereogenbench_data.index.open import IncompleteSceneWarning
 from stereogenbench_data.samples.checks import OddSceneWarning
 from stereogenbench_data.synthesis.produce import synthesise
@@ -140,7 +141,7 @@ DAMAGES = {
             lambda doc: [pair.update(baseline_cm=pair["baseline_cm"] * 2)
                          for pair in doc["pairwise_pairs"] + doc.get("adjacent_pairs", [])],
         ),
-        r"cameras 0 and 1 are .* cm apart, and by the poses",
+        r"cameras \d and \d are .* cm apart, and by the poses",
     ),
     "a file for a folder": (
         lambda scene: (shutil.rmtree(scene), scene.write_text("")),
@@ -173,11 +174,14 @@ def test_all_damages_of_a_tree_are_listed_at_once(scene):
     for camera in range(6):
         (scene / f"cam_{camera:02d}_rgb.mp4").unlink()
         (scene / f"cam_{camera:02d}_depth.mkv").write_bytes(b"")
-    rewrite(other / "baseline.json", lambda doc: doc.pop("primary_stereo_pair"))
+    rewrite(
+        other / "baseline.json",
+        lambda doc: [doc.pop("adjacent_pairs"), doc.pop("pairwise_pairs")],
+    )
 
     with pytest.raises(
         StorageError,
-        match=r"(?s)2 scenes cannot be used.*focal_length_mm.*none of its videos.*primary_stereo",
+        match=r"(?s)2 scenes cannot be used.*focal_length_mm.*none of its videos.*pairwise_pairs",
     ):
         StereoPairs(root_of(scene))
 
@@ -233,7 +237,8 @@ def test_a_depth_stream_with_fewer_frames_is_told_or_refused(tmp_path, missing):
     shutil.copy(tmp_path / "short" / key / "cam_04_depth.mkv", tmp_path / "long" / key)
 
     if missing == 1:
-        index = SceneIndex.open(tmp_path / "long")
+        with pytest.warns(AssumptionWarning, match="the frames that all videos have are used"):
+            index = SceneIndex.open(tmp_path / "long")
         assert index.scene(0).frames == 3
         assert "cam_04_depth.mkv has 3" in index.scene(0).remark("frames")
     else:
@@ -291,11 +296,17 @@ def retagged(scene, camera, *options):
     aside.replace(path)
 
 
-def test_a_tag_that_is_no_number_needs_the_users_unit(scene):
+def test_a_tag_in_millimetres_is_a_unit(scene):
     retagged(scene, 1, "-metadata", "DEPTH_SCALE=mm")
+
+    assert SceneIndex.open(root_of(scene)).scene(0).depth_unit_m[1] == 0.001
+
+
+def test_a_tag_that_is_no_number_needs_the_users_unit(scene):
+    retagged(scene, 1, "-metadata", "DEPTH_SCALE=seven")
     root = root_of(scene)
 
-    with pytest.raises(MediaError, match=r"cam_01_depth\.mkv: its tags .* DepthEncoding\(unit_m="):
+    with pytest.raises(MediaError, match=r"cam_01_depth\.mkv.*seven.*DepthEncoding\(unit_m="):
         StereoPairs(root, fields=("visible",))
     with pytest.warns(OddSceneWarning, match="other units of depth"):
         untouched = StereoPairs(root, fields=("disparity",))[0]
@@ -307,8 +318,12 @@ def test_a_tag_that_is_no_number_needs_the_users_unit(scene):
 def test_a_tag_that_one_camera_lacks_is_warned_of(scene):
     retagged(scene, 1)
 
-    with pytest.warns(OddSceneWarning, match="1 selected scenes state other units of depth"):
+    with pytest.warns(OddSceneWarning) as warned:
         StereoPairs(root_of(scene))
+
+    told = [str(each.message) for each in warned]
+    assert any("1 selected scenes state other units of depth" in text for text in told)
+    assert any("stereogenbench doctor" in text for text in told)
 
 
 def turn(scene, camera, **angles_deg):
@@ -373,7 +388,7 @@ def test_a_principal_point_outside_the_picture_holds_up_the_intrinsics_alone(sce
 
 @pytest.mark.parametrize("depth_format", ["gray16le", "gray12le", "gray10le"])
 def test_accepted_ten_and_twelve_bit_depth_is_read_in_its_own_numbers(tmp_path, depth_format):
-    meant = DepthEncoding(accept=frozenset({"10-bit", "12-bit"}))
+    meant = DepthEncoding(0.1, accept=frozenset({"10-bit", "12-bit"}))
     reference = ExportContract(depth_unit_m=0.1, depth_tag=None)
     request = SynthRequest(size_px=32, frames=2, seed=8, contract=reference)
     found = []

@@ -89,7 +89,8 @@ OTHERS = {
     ),
     "another size": (written(RGB, "-vf", "scale=48:48"), RGB, "48x48"),
     "colours as depth": (
-        written(DEPTH, "-c:v", "ffv1", "-pix_fmt", "gbrp16le"), DEPTH, "not one number",
+        written(DEPTH, "-c:v", "ffv1", "-pix_fmt", "gbrp16le"), DEPTH,
+        "holds colours|not one number",
     ),
     "depth with alpha": (
         written(DEPTH, "-c:v", "png", "-pix_fmt", "ya16be"), DEPTH, "not one number",
@@ -190,9 +191,7 @@ def test_what_no_header_refuses_is_refused_when_it_is_read(drawn, scene, case):
     require_refused(index_of_the_unaltered(drawn, scene), name, found)
 
 
-@pytest.mark.parametrize(
-    "case", ["another size later", "a turned picture", "ten bits of depth", "twelve bits of depth"]
-)
+@pytest.mark.parametrize("case", ["another size later", "a turned picture"])
 def test_loading_from_a_shard_and_a_deep_check_refuse_it_too(scene, tmp_path, case):
     alter, name, found = SEEN_IN_PICTURES[case]
     alter(scene)

@@ -46,6 +46,8 @@ def large_release(small_release: Path, tmp_path_factory: pytest.TempPathFactory)
 def _write_noise(path: Path, noise: np.random.Generator) -> None:
     is_depth = path.suffix == ".mkv"
     with av.open(str(path), "w") as container:
+        if is_depth:
+            container.metadata["DEPTH_SCALE"] = "0.1"
         stream = container.add_stream("ffv1" if is_depth else "libx264", rate=15)
         stream.height = stream.width = NOISE_PX
         stream.pix_fmt = "gray16le" if is_depth else "yuv420p"
