@@ -89,8 +89,8 @@ OTHERS = {
     ),
     "another size": (written(RGB, "-vf", "scale=48:48"), RGB, "48x48"),
     "colours as depth": (
-        written(DEPTH, "-c:v", "ffv1", "-pix_fmt", "gbrp16le"), DEPTH,
-        "holds colours|not one number",
+        written(DEPTH, "-c:v", "ffv1", "-pix_fmt", "gbrp16le", source=RGB), DEPTH,
+        "holds colours|channels",
     ),
     "depth with alpha": (
         written(DEPTH, "-c:v", "png", "-pix_fmt", "ya16be"), DEPTH, "not one number",

@@ -177,6 +177,7 @@ def test_pictures_of_another_size_are_read_at_their_own(tree, video):
             put(tree / ODD / f"cam_{camera:02d}_{kind}", video(kind, size=(48, 64)))
     with pytest.warns(AssumptionWarning, match="the videos' picture size counts"):
         pairs = StereoPairs(tree, scenes=ODD, fields=["left", "intrinsics"], size=(12, 16))
+    with pytest.warns(AssumptionWarning, match="the videos' picture size counts"):
         whole = StereoPairs(tree, split="train", map="Map_0", fields=["left"], size=(12, 16))
     assert pairs.index.presumption is None  # one scene is read whole
 
