@@ -192,7 +192,7 @@ AcceptOption = Annotated[
     typer.Option(
         "--accept",
         metavar="LOSS",
-        help="Accept depth with a loss: 8-bit ... 14-bit, lossy, chroma. May be repeated.",
+        help="Accept depth that is 8-bit ... 14-bit, lossy, chroma.",
         rich_help_panel=RARE,
         autocompletion=complete_from(
             ("8-bit", "9-bit", "10-bit", "12-bit", "14-bit", "lossy", "chroma")

@@ -308,7 +308,7 @@ _KINDS: Final[dict[str, Any]] = {
 def depth_of(scene: Scene) -> DepthEncoding:
     """Return the depth contract of a scene by its conventions; what these leave out is usual."""
     if scene.conventions is None:
-        return _USUAL
+        return DepthEncoding()
     shape = shape_of_text(scene.conventions)
     return _USUAL if shape.depth is None else shape.depth.encoding
 

@@ -10,6 +10,7 @@ from stereogenbench_data.audit.contract.worlds import explained_shares, judge_wo
 from stereogenbench_data.audit.scene_access import SceneAccess
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.pose_forms import readings
+from stereogenbench_data.index.assumptions import AssumptionWarning
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding
@@ -62,7 +63,8 @@ def test_depth_tells_which_way_a_camera_looks(tmp_path):
     del document["rotation_representation"]
     path.write_text(json.dumps(document | {"unit": "m"}))
 
-    index = SceneIndex.open(tmp_path)
+    with pytest.warns(AssumptionWarning, match="several readings of the poses fit"):
+        index = SceneIndex.open(tmp_path)
     scene = index.scene(0)
     source = SceneAccess.of(index, scene).source()
     with closing(Streams(source)) as streams:

@@ -13,7 +13,7 @@ from stereogenbench_data.selection.options import nearest_first, options_of, req
 from stereogenbench_data.synthesis.request import SynthRequest
 
 PAIRS_OPTIONS = [
-    "fields", "size", "transform", "depth", "seed", "cache", "check", "buffers",
+    "fields", "size", "transform", "depth", "conventions", "seed", "cache", "check", "buffers",
     "fetch_ahead_bytes",
     "split", "subset", "family", "map", "character", "animation", "scenes", "focal_mm",
     "valid_depth_ratio", "min_frames", "caption",
