@@ -290,7 +290,7 @@ def require_unit(rig: Rig, *, family: str, where: str) -> tuple[Remark, ...]:
     """Return a remark on baselines that the paper's family does not have.
 
     Raises:
-        SchemaError: If they would be those of the family in another unit of length.
+        SchemaError: If they are far off, and would be the family's in another unit of length.
     """
     low_cm, high_cm = ADJACENT_CM.get(family, (0.0, math.inf))
     adjacent_cm = [rig.baseline_cm(a, b) for a, b in ADJACENT_PAIRS]
@@ -301,13 +301,17 @@ def require_unit(rig: Rig, *, family: str, where: str) -> tuple[Remark, ...]:
         f"{where}: neighbouring cameras are {least_cm:.6g} to {most_cm:.6g} cm apart, and in the "
         f"paper's family {family} {low_cm:g} to {high_cm:g} cm"
     )
+    is_far = least_cm < low_cm * _NEARLY[0] or most_cm > high_cm * _FAR
     for unit, factor in (("m", 100.0), ("mm", 0.1)):
-        if low_cm <= least_cm * factor and most_cm * factor <= high_cm:
+        if is_far and low_cm <= least_cm * factor and most_cm * factor <= high_cm:
             raise SchemaError(f"{told}. In {unit} they would be: correct the unit.")
     return (Remark("unit", told),)
 
 
 _NEARLY: Final = (0.9, 1.1)
+_FAR: Final = 3.0
+"""How far above its family's largest baseline one must be for its unit to be refused: a rig may be
+somewhat wider than the paper's, and in the unit below it would be one of the family, too."""
 
 
 def _side(nodes: list[Node], quantity: str) -> int | None:

@@ -7,6 +7,7 @@ and an axis of frames; what they mean as poses is for `geometry.pose_forms` to s
 `index.evidence` to confirm.
 """
 
+import itertools
 import re
 from dataclasses import dataclass
 from typing import Any, Final
@@ -134,8 +135,18 @@ def record_poses(text: bytes, *, where: str) -> RecordedPoses:
     return RecordedPoses(tuple(blocks), _hints(document), _unit_m(document, where))
 
 
+def _first_of_lists(node: Any) -> Any:
+    """Return a document with the first element alone of each list, and of each long object."""
+    if isinstance(node, list):
+        return [_first_of_lists(each) for each in node[:1]]
+    if isinstance(node, dict):
+        items = itertools.islice(node.items(), 1 if len(node) > _MOST_HINTS else None)
+        return {key: _first_of_lists(value) for key, value in items}
+    return node
+
+
 def _unit_m(document: dict[str, Any], where: str) -> float | None:
-    nodes = nodes_of(document)
+    nodes = nodes_of(_first_of_lists(document))
     unit_m = length_unit_m(nodes)
     for each in stated(nodes, "unit"):
         if unit_m is None and isinstance(each.value, str):
