@@ -50,7 +50,7 @@ def open_data(
     more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
     if not report.scenes:
         raise StorageError(
-            f"{folder}: has no complete scene: {reasons[0]}{more}. `stereogenbench index {folder}` "
+            f"{folder}: has no complete scene: {reasons[0].rstrip('.')}{more}. `stereogenbench index {folder}` "
             f"lists them all."
         )
     counts = {"broken": len(report.broken), "incomplete": len(report.incomplete)}
