@@ -50,8 +50,8 @@ def open_data(
     more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
     if not report.scenes:
         raise StorageError(
-            f"{folder}: has no complete scene: {reasons[0].rstrip('.')}{more}. `stereogenbench index {folder}` "
-            f"lists them all."
+            f"{folder}: has no complete scene: {reasons[0].rstrip('.')}{more}. "
+            f"`stereogenbench index {folder}` lists them all."
         )
     counts = {"broken": len(report.broken), "incomplete": len(report.incomplete)}
     left_out = " and ".join(f"{count} {name}" for name, count in counts.items() if count)
