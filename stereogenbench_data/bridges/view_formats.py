@@ -8,6 +8,7 @@ back to the scene's world.
 
 import json
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -40,7 +41,7 @@ _POINT: Final = np.dtype(
 _COUNT_DIGITS: Final = 12
 
 
-class ViewWriter:
+class ViewWriter(ABC):
     """Fills a folder with pictures and what a format says of them.
 
     Attributes:
@@ -69,12 +70,12 @@ class ViewWriter:
         self._scene = ""
         self.begin()
 
-    def begin(self) -> None:
+    def begin(self) -> None:  # noqa: B027 - some formats begin with nothing
         """Make what is filled picture by picture."""
 
+    @abstractmethod
     def add(self, images: Sequence[PosedImage]) -> None:
         """Take the pictures of one moment."""
-        raise NotImplementedError
 
     def finish(self) -> None:
         """Write what needs all pictures."""

@@ -203,8 +203,8 @@ def _parsed(values: Sequence[Any], *, like: Rig) -> Parsed:
 
 def _unlearned(rig: Rig) -> Rig:
     """Return what of a rig must be the same in all files of a shape."""
-    nothing = dict.fromkeys(_NUMBERS, 0)
-    return replace(rig, baselines_cm=(), **nothing)  # type: ignore[arg-type]
+    nothing: dict[str, Any] = dict.fromkeys(_NUMBERS, 0)
+    return replace(rig, baselines_cm=(), **nothing)
 
 
 def _source(wanted: tuple[Any, ...], columns: dict[int, tuple[Any, ...]]) -> _Source | None:

@@ -6,6 +6,7 @@ What pictures say of depth is added by `audit.conventions`.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -156,11 +157,9 @@ def examine(root: str | Path, key: str, *, conventions: Conventions | None = Non
     except StereoGenBenchError as error:
         problem = str(error)
     shape, notes, unknown = Shape(numbers={}), Notes(), list[str]()
-    try:
+    with suppress(StereoGenBenchError, KeyError):  # `describe_scene` has told the problem
         seen = see_rig(folder.read(BASELINE_JSON), where=f"{key}/{BASELINE_JSON}")
         shape, notes, unknown = seen.shape, seen.found, seen.unknown
-    except (StereoGenBenchError, KeyError):
-        pass  # the problem says so
     if scene is not None:
         shape = _sized(shape, scene)
         _note_camera(scene, notes)

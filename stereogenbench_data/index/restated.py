@@ -6,7 +6,7 @@ some scenes are read again by the conventions. The depth contract is taken over 
 
 import math
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -16,7 +16,7 @@ from stereogenbench_data.index.parquet import IndexHead, made_again
 from stereogenbench_data.index.rows import SCHEMA, scene_of
 from stereogenbench_data.index.scene_folder import metadata_differences
 from stereogenbench_data.schema.conventions import Conventions, Shape
-from stereogenbench_data.schema.release import BASELINE_JSON, TRAJECTORY_JSON
+from stereogenbench_data.schema.release import BASELINE_JSON, CAMERA_COUNT, TRAJECTORY_JSON
 from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.members import MemberSource
 from stereogenbench_data.sources.retry import RetryPolicy
@@ -55,14 +55,16 @@ def restated(
                 f"{where}: {scene.id.key}/{name}: {difference}; so it is by {conventions.where}. "
                 f"Correct the conventions. If the index is wrong: {made_again(where)}"
             )
-    replaced = {"conventions": [texts[0]] * table.num_rows}
-    unit_m = None if shape.depth is None else shape.depth.encoding.unit_m
-    if shape.depth is not None and unit_m is not None:
+    replaced: dict[str, Any] = {"conventions": texts[0]}
+    encoding = None if shape.depth is None else shape.depth.encoding
+    if encoding is not None and encoding.unit_m is not None:
         _require_tags(table, shape, where=where)
-        replaced["depth_unit_m"] = [[unit_m] * 6] * table.num_rows  # type: ignore[list-item]
-        replaced["depth_unit_source"] = [["conventions"] * 6] * table.num_rows  # type: ignore[list-item]
-    for name, values in replaced.items():
-        column = pa.array(values, type=SCHEMA.field(name).type)
+        offset_m = encoding.offset_m
+        replaced["depth_unit_m"] = [encoding.unit_m] * CAMERA_COUNT
+        replaced["depth_unit_source"] = ["conventions"] * CAMERA_COUNT
+        replaced["depth_offset_m"] = [offset_m] * CAMERA_COUNT if offset_m else None
+    for name, value in replaced.items():
+        column = pa.array([value] * table.num_rows, type=SCHEMA.field(name).type)
         table = table.set_column(SCHEMA.get_field_index(name), SCHEMA.field(name), column)
     return table.combine_chunks()
 

@@ -17,7 +17,6 @@ files have the keys that it names.
 import difflib
 import functools
 import json
-import math
 import re
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -26,6 +25,7 @@ from pathlib import Path
 from typing import Any, Final, get_args
 
 from stereogenbench_data.errors import SchemaError, explain_os_errors
+from stereogenbench_data.schema.document import is_number
 from stereogenbench_data.schema.quantities import (
     OTHER_UNITS,
     UNITS_M,
@@ -466,9 +466,9 @@ def _paths(value: object, *, where: str) -> tuple[str, ...]:
 
 
 def _positive(value: object, *, where: str) -> float:
-    if type(value) not in (int, float) or not (math.isfinite(value) and value > 0):  # type: ignore[arg-type, operator]
+    if not is_number(value) or value <= 0:
         raise SchemaError(f"{where} must be a number above zero, found {_shown(value)}.")
-    return float(value)  # type: ignore[arg-type]
+    return float(value)
 
 
 def _unit(value: object, *, where: str) -> str:

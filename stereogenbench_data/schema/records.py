@@ -5,7 +5,7 @@ the recorded world axes and rotation representation, so that relative poses can 
 anything is rounded.
 """
 
-import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal, get_args
@@ -194,11 +194,11 @@ class DepthEncoding:
     def __post_init__(self) -> None:
         """Refuse values out of range."""
         unit_m: object = self.unit_m
-        is_number = isinstance(unit_m, int | float) and math.isfinite(unit_m) and unit_m > 0
+        is_number = isinstance(unit_m, int | float) and 0 < unit_m <= sys.float_info.max
         if unit_m is not None and not is_number:
             raise SchemaError(f"unit_m must be a positive number of metres, got {self.unit_m!r}.")
         offset_m: object = self.offset_m
-        if not (isinstance(offset_m, int | float) and math.isfinite(offset_m)):
+        if not (isinstance(offset_m, int | float) and abs(offset_m) <= sys.float_info.max):
             raise SchemaError(f"offset_m must be a number of metres, got {self.offset_m!r}.")
         if offset_m != 0 and (unit_m is None or self.form != "depth"):
             raise SchemaError(

@@ -253,3 +253,14 @@ def test_opening_says_in_a_line_what_it_took_for_granted(make_scene, root, rewri
     (warning,) = told
     assert re.search(rf"{root}.*2 scenes.*conventions", str(warning.message))
     assert "\n" not in str(warning.message)
+
+
+def test_rows_of_an_index_take_over_the_offset_of_depth(indexed_release, tmp_path):
+    stated_m = SceneIndex.open(indexed_release).scene(0).depth_unit_m[0]
+    file = tmp_path / "conventions.toml"
+    file.write_text(f"[depth]\nunit_m = {stated_m}\noffset_m = 0.5\n")
+
+    index = SceneIndex.open(indexed_release, conventions=file)
+
+    assert index.scene(0).depth_unit_source == ("conventions",) * 6
+    assert index.scene(0).depth_offset_m == (0.5,) * 6

@@ -168,3 +168,16 @@ def test_another_value_of_a_quantity_counts_unless_it_is_ignored(rig_document, d
     rig, _, _ = parse_rig(dumped(rig_document), where="b", shape=read(ignoring).shapes[0])
 
     assert rig.focal_mm == 32.5
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        f"[depth]\nunit_m = {'9' * 400}",
+        f"[depth]\nunit_m = 1\noffset_m = -{'9' * 400}",
+        f"[focal_length]\nvalue = {'9' * 400}",
+    ],
+)
+def test_a_number_that_no_float_holds_is_refused_by_its_name(statement):
+    with pytest.raises(SchemaError, match=r"unit_m|offset_m|focal_length"):
+        parse_conventions(statement.encode(), where="conventions.toml")
