@@ -86,10 +86,11 @@ class WorkerContext:
         """Return an error that names the worker that died; None if none did.
 
         Args:
-            noticed: What the loop met. What a worker raised, torch begins with "Caught": that is
-                no death.
+            noticed: What the loop met. Where torch says that a worker process raised it, that is no
+                death; where it says so of its thread that pins memory, that thread may have read
+                what a dead worker left behind.
         """
-        is_a_workers_own = str(noticed).startswith("Caught ")
+        is_a_workers_own = "in DataLoader worker process" in str(noticed).partition("\n")[0]
         if is_a_workers_own or not self._is_dead.wait(_NOTICED_AFTER_S) or self.dead is None:
             return None
         self.dead.join(_NOTICED_AFTER_S)
@@ -112,7 +113,7 @@ class WorkerContext:
     def _wait(self) -> None:
         sentinels = {process.sentinel: process for process in self.context.processes}
         ready = connection.wait([self._stop_reader, *sentinels])
-        if self._stop_reader in ready:
+        if self._stop_reader in ready or self.context.told_to_end():
             return
         self.dead = next(sentinels[each] for each in ready if isinstance(each, int))
         for process in self.context.processes:
@@ -223,6 +224,11 @@ def _watched(kind: Any) -> Any:
         def __init__(self) -> None:
             self.processes: list[BaseProcess] = []
             self.queues: list[_ClosableQueue] = []
+            self.events: list[_LocklessEvent] = []
+
+        def told_to_end(self) -> bool:
+            """Whether torch has told the workers to end, as it does after the last batch."""
+            return any(event.is_set() for event in self.events)
 
         def Process(self, *args: Any, **kwargs: Any) -> BaseProcess:
             make = kind.Process
@@ -238,6 +244,8 @@ def _watched(kind: Any) -> Any:
             return made
 
         def Event(self) -> _LocklessEvent:
-            return _LocklessEvent(self)
+            made = _LocklessEvent(self)
+            self.events.append(made)
+            return made
 
     return Watched

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 from stereogenbench_data import (
     PairsLoader,
@@ -24,6 +25,7 @@ from stereogenbench_data.datasets.open_videos import (
     RepeatedDecodingWarning,
     videos_per_scene,
 )
+from stereogenbench_data.datasets.workers import WorkerContext
 from stereogenbench_data.samples import streams
 from stereogenbench_data.samples.request import parse_request
 from stereogenbench_data.selection.order import OrderRule
@@ -478,6 +480,39 @@ def test_a_killed_worker_ends_the_loop_with_an_error_that_says_so(keyed):
     with pytest.raises(RuntimeError, match=rf"worker \(pid.* {victim.pid}\).* (killed|exited)"):
         list(batches)
     assert loader.state_dict()["batches_consumed"] < 140
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_a_worker_that_ends_after_the_last_batch_has_not_died(method):
+    context = WorkerContext(method)
+    loader = DataLoader(range(4), num_workers=2, multiprocessing_context=context.context)
+    batches = iter(loader)
+    context.watch()
+
+    assert len(list(batches)) == 4
+    assert context.error(RuntimeError("a worker ended")) is None
+    assert [process.exitcode for process in context.context.processes] == [0, 0]
+
+
+def test_a_death_is_named_though_the_thread_that_pins_memory_met_it_first():
+    context = WorkerContext("fork")
+    loader = DataLoader(range(400), num_workers=2, multiprocessing_context=context.context)
+    batches = iter(loader)
+    next(batches)
+    context.watch()
+    victim = context.context.processes[0]
+    victim.kill()
+    with pytest.raises(RuntimeError, match="Killed"):
+        list(batches)
+
+    of_a_worker = ConnectionResetError(
+        "Caught ConnectionResetError in DataLoader worker process 0."
+    )
+    of_the_thread = ConnectionResetError(
+        "Caught ConnectionResetError in pin memory thread for device 0."
+    )
+    assert context.error(of_a_worker) is None
+    assert f"pid {victim.pid}) was killed by SIGKILL" in str(context.error(of_the_thread))
 
 
 @pytest.fixture
