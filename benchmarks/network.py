@@ -301,7 +301,7 @@ def _run(name: str, job: Job, url: str, *, workers: int) -> Turn:
 
 def _loaders() -> dict[str, Callable[..., Any]]:
     def ours(job: Job, data: str | Path, **options: Any) -> Any:
-        return job.pairs(data).loader(job.workload.batch, tail="uneven", seed=SEED, **options)
+        return job.pairs(data).loader(job.workload.batch, drop_last=False, seed=SEED, **options)
 
     def theirs(job: Job, dataset: IterableDataset[Any], **options: Any) -> DataLoader[Any]:
         return DataLoader(dataset, batch_size=job.workload.batch, **options)

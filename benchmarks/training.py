@@ -159,7 +159,7 @@ def measure_training(
             "training": partial(limit.samples, job, job.of_scene, opened=_Shards(shards)),
             "ours, released": partial(ours.mapped, job, job.tree),
             "ours, training": partial(ours.mapped, job, shards),
-            "ours, in order": partial(ours.mapped, job, shards, order="sequential"),
+            "ours, in order": partial(ours.mapped, job, shards, shuffle=False),
         }
         found: dict[str, list[float]] = {name: [] for name in ways}
         for number in range(rounds):

@@ -30,7 +30,7 @@ class StereoData(LightningDataModule):
         return self.train.loader(batch_size=8, num_workers=1, seed=0)
 
     def val_dataloader(self) -> PairsLoader:
-        return self.eval.loader(batch_size=8, order="sequential", tail="uneven")
+        return self.eval.loader(batch_size=8, shuffle=False, drop_last=False)
 
 
 class Network(LightningModule):

@@ -12,10 +12,10 @@ from stereogenbench_data import StereoPairs, StereoPairStream
 def mapped(job: Job, data: str | Path, **options: Any) -> DataLoader[Any]:
     """Return the loader of `StereoPairs` with default options."""
     pairs = StereoPairs(data, **job.selection)
-    return pairs.loader(job.workload.batch, tail="uneven", seed=SEED, **options)
+    return pairs.loader(job.workload.batch, drop_last=False, seed=SEED, **options)
 
 
 def streamed(job: Job, data: str | Path, **options: Any) -> DataLoader[Any]:
     """Return torch's `DataLoader` of a `StereoPairStream` with the stream's own ``collate``."""
-    stream = StereoPairStream(data, job.workload.batch, tail="uneven", **job.selection)
+    stream = StereoPairStream(data, job.workload.batch, drop_last=False, **job.selection)
     return DataLoader(stream, batch_size=job.workload.batch, collate_fn=stream.collate, **options)

@@ -132,12 +132,12 @@ class AdaptedPairs(Dataset[Item], Generic[Item]):
 
         Raises:
             SelectionError: If there is no such option, it is out of its range, or every batch would
-                be dropped; or with tail="wrap", as items have no field that marks padding.
+                be dropped; or with drop_last="pad", as items have no field that marks padding.
         """
-        if options.get("tail") == "wrap":
+        if options.get("drop_last") == "pad":
             raise SelectionError(
-                f"tail='wrap' repeats samples, and items of {type(self).__name__} have no field "
-                "is_padding to tell which: use tail='drop' or 'uneven'."
+                f"drop_last='pad' repeats samples, and items of {type(self).__name__} have no "
+                "field is_padding to tell which: use drop_last=True or False."
             )
         collate = options.pop("collate_fn", None) or default_collate
         made = partial(_collated, adapt=self.adapt, collate=collate)

@@ -19,10 +19,9 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.order import (
     ORDER_VERSION,
+    DropLast,
     EpochOrder,
-    OrderKind,
     OrderRule,
-    Tail,
     last_batch,
     rank_share,
 )
@@ -44,15 +43,13 @@ class EpochOptions(TypedDict, total=False):
         rank: Whose batches these are, from 0. By default torch.distributed's rank, or 0 where it is
             not initialised.
         world_size: How many ranks there are. By default torch.distributed's world size, or 1.
-        drop_last: As in torch: True is ``tail="drop"``; False is ``tail="uneven"``, and refused for
-            several ranks, which must choose between "uneven" and "wrap".
-        shuffle: As in torch: True is ``order="shuffled"``, the default; False is "sequential".
-        tail: What happens to the epoch's last batches. "drop", the default of a shuffled order:
+        shuffle: Whether samples are shuffled, by default; False gives them by their numbers.
+        drop_last: What happens to the epoch's last batches. True, the default of a shuffled order:
             each rank gets as many batches, all of them full; what is left over is dropped (see
-            `EpochBatches.left_out`). "uneven", the default of a sequential order: every sample
-            exactly once; the last batch may be short, and ranks may differ by one batch. "wrap":
-            each rank gets as many full batches and no sample is left out; samples from the epoch's
-            start fill up, marked in the field ``is_padding`` (batch,) bool.
+            `EpochBatches.left_out`). False, the default otherwise: every sample exactly once; the
+            last batch may be short, and ranks may differ by one batch. "pad": each rank gets as
+            many full batches and no sample is left out; samples from the epoch's start fill up,
+            marked in the field ``is_padding`` (batch,) bool.
         shuffle_groups: How many groups of scenes are shuffled separately; batch n belongs to group
             n mod shuffle_groups. By default 4, but 2 where scenes are so large that a group has
             fewer than 16 open; selections too small for so many groups have fewer. Each video is
@@ -68,19 +65,16 @@ class EpochOptions(TypedDict, total=False):
             and depth stay in memory. If left out, as many as a batch has samples of an open scene,
             within 0.5 GB a group: 3 with all pairs of 1280x1280 pixels and a batch of 16, 1 with
             one pair a scene.
-        order: "shuffled" (the default) or "sequential".
     """
 
     seed: int
     rank: int
     world_size: int
-    drop_last: bool
     shuffle: bool
-    tail: Tail
+    drop_last: DropLast
     shuffle_groups: int
     open_scenes: int
     open_frames: int
-    order: OrderKind
 
 
 class Numbered(Protocol):
@@ -97,7 +91,7 @@ class EpochBatch(list[int]):
     Attributes:
         epoch: The epoch: of random frames and transforms, too, whatever epoch the dataset is at.
         is_padding: For each sample whether it fills up after the epoch's end; None where no sample
-            ever does (all tails but "wrap").
+            ever does (without ``drop_last="pad"``).
         ends_of_runs: The samples after which their videos are wanted no more for now.
         number: Its number among the batches of all ranks; None where it is none of an epoch's.
         group: The shuffle group that it is of.
@@ -142,7 +136,7 @@ class EpochBatches(Sampler[list[int]]):
 
     >>> from stereogenbench_data import EpochBatches, StereoPairs
     >>> pairs = StereoPairs(getfixture("small_release"), frames="all")
-    >>> shares = [EpochBatches(pairs, 4, rank=r, world_size=2, tail="uneven") for r in (0, 1)]
+    >>> shares = [EpochBatches(pairs, 4, rank=r, world_size=2, drop_last=False) for r in (0, 1)]
     >>> [len(share) for share in shares]
     [4, 3]
     >>> sorted(sum([*shares[0], *shares[1]], [])) == list(range(28))
@@ -153,7 +147,8 @@ class EpochBatches(Sampler[list[int]]):
         rule: What the order depends on.
         rank: Whose batches these are.
         world_size: How many ranks there are.
-        tail: What happens to the epoch's last batches.
+        drop_last: Whether what does not fill a batch of every rank is dropped.
+        is_padded: Whether samples from the epoch's start fill up the last batches.
         passes: Where its passes are: the position.
     """
 
@@ -178,7 +173,7 @@ class EpochBatches(Sampler[list[int]]):
         rule = OrderRule(
             batch_size=batch_size,
             seed=options.get("seed", dataset.plan.seed),
-            kind=_order_kind(options),
+            shuffle=options.get("shuffle", True),
         )
         rule = fitting_rule(
             rule, dataset.index, dataset.plan, open_scenes=options.get("open_scenes")
@@ -189,15 +184,16 @@ class EpochBatches(Sampler[list[int]]):
             open_frames=options.get("open_frames", rule.open_frames),
         )
         self.rank, self.world_size = _require_group(options.get("rank"), options.get("world_size"))
-        self.tail = _tail(options, kind=rule.kind, world_size=self.world_size)
+        self._drop_last = options.get("drop_last", rule.shuffle)
+        self.drop_last, self.is_padded = self._drop_last is True, self._drop_last == "pad"
         self._follows_the_group = "rank" not in options
         self._order: EpochOrder | None = None
         self.passes = Passes(dataset.shared_epoch, then="same epoch")
         if self.end() == 0:
             raise SelectionError(
-                f"tail='drop' drops all of {len(dataset.plan)} samples: they fill no batch of "
+                f"drop_last=True drops all of {len(dataset.plan)} samples: they fill no batch of "
                 f"{batch_size} for each of {self.world_size} ranks. Take a smaller batch_size, "
-                "tail='wrap' or tail='uneven'."
+                "drop_last='pad' or drop_last=False."
             )
 
     @property
@@ -206,18 +202,13 @@ class EpochBatches(Sampler[list[int]]):
         return self.rule.batch_size
 
     @property
-    def drop_last(self) -> bool:
-        """Whether a short last batch is dropped; Lightning asks."""
-        return self.tail == "drop"
-
-    @property
     def samples_of_epoch(self) -> int:
         """How many samples an epoch has, of all ranks."""
         return len(self.dataset.plan)
 
     @property
     def left_out(self) -> int:
-        """How many samples of an epoch no rank gets: of ``tail="drop"`` only."""
+        """How many samples of an epoch no rank gets: none without ``drop_last``."""
         return max(0, len(self.dataset.plan) - self.end() * self.rule.batch_size)
 
     def __len__(self) -> int:
@@ -226,10 +217,11 @@ class EpochBatches(Sampler[list[int]]):
 
     def __repr__(self) -> str:
         """Return a summary."""
-        kind = "sequential" if self.rule.kind == "sequential" else f"seed {self.rule.seed}"
+        order = f"seed {self.rule.seed}" if self.rule.shuffle else "not shuffled"
         return (
             f"<{type(self).__name__}: {self.rule.batch_size} of {self.samples_of_epoch} samples a "
-            f"batch, rank {self.rank} of {self.world_size}, {kind}, tail={self.tail!r}>"
+            f"batch, rank {self.rank} of {self.world_size}, {order}, "
+            f"drop_last={self._drop_last!r}>"
         )
 
     def __iter__(self) -> Iterator[list[int]]:
@@ -300,7 +292,7 @@ class EpochBatches(Sampler[list[int]]):
         return last_batch(
             len(self.dataset.plan),
             batch_size=self.rule.batch_size,
-            tail=self.tail,
+            drop_last=self._drop_last,
             world_size=self.world_size,
             start=start,
         )
@@ -362,13 +354,12 @@ class EpochBatches(Sampler[list[int]]):
 
     def batch(self, number: int, *, epoch: int) -> EpochBatch:
         """Return the samples of a global batch."""
-        is_wrapped = self.tail == "wrap"
         order = self.order(epoch)
-        samples, ends = batch_samples(order, number, tail=self.tail)
+        samples, ends = batch_samples(order, number, is_padded=self.is_padded)
         return EpochBatch(
             samples,
             epoch=epoch,
-            is_padding=self.is_padding(number).tolist() if is_wrapped else None,
+            is_padding=self.is_padding(number).tolist() if self.is_padded else None,
             ends_of_runs=ends,
             number=number,
             group=number % order.groups,
@@ -411,6 +402,7 @@ class EpochBatches(Sampler[list[int]]):
                 "version of the package that saved it."
             )
         own = {"version": ORDER_VERSION, **self._identity}
+        state = _in_present_words(state)
         if "start_of_streams" in state:
             # Of states that were saved while there was a choice.
             own["start_of_streams"] = "anywhere"
@@ -435,7 +427,7 @@ class EpochBatches(Sampler[list[int]]):
 
     @property
     def batches_of_all(self) -> int:
-        """How many batches hold all samples of an epoch, whatever ranks and tail there are."""
+        """How many batches hold all samples of an epoch, whatever ranks there are."""
         return -(-len(self.dataset.plan) // self.rule.batch_size)
 
     @cached_property
@@ -448,8 +440,8 @@ class EpochBatches(Sampler[list[int]]):
             "shuffle_groups": rule.shuffle_groups,
             "open_scenes": rule.open_scenes,
             "open_frames": rule.open_frames,
-            "order": rule.kind,
-            "tail": self.tail,
+            "shuffle": rule.shuffle,
+            "drop_last": self._drop_last,
             "selection": self.dataset.plan.digest,
             "index": self.dataset.index.digest,
         }
@@ -480,39 +472,24 @@ def _batches_behind(sampler: Sampler[Any]) -> EpochBatches:
     return batches
 
 
-def batch_samples(order: EpochOrder, number: int, *, tail: Tail) -> tuple[list[int], list[int]]:
+def _in_present_words(state: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a state in today's options: it may have been saved with ``order`` and ``tail``."""
+    if not {"order", "tail"} <= state.keys():
+        return state
+    shuffle = {"shuffled": True, "sequential": False}.get(str(state["order"]), state["order"])
+    drop_last = {"drop": True, "wrap": "pad", "uneven": False}.get(
+        str(state["tail"]), state["tail"]
+    )
+    return {**state, "shuffle": shuffle, "drop_last": drop_last}
+
+
+def batch_samples(
+    order: EpochOrder, number: int, *, is_padded: bool
+) -> tuple[list[int], list[int]]:
     """Return the samples of a global batch, and those of them that end a run."""
     samples = order.batch(number) if number < order.batches else np.empty(0, dtype=np.int64)
     ends: list[int] = samples[order.ends_run(number)].tolist() if len(samples) else []
-    return (order.full_batch(number) if tail == "wrap" else samples).tolist(), ends
-
-
-def _order_kind(options: EpochOptions) -> OrderKind:
-    if "shuffle" not in options:
-        return options.get("order", "shuffled")
-    _require_one_of_two(options, "shuffle", "order")
-    return "shuffled" if options["shuffle"] else "sequential"
-
-
-def _tail(options: EpochOptions, *, kind: OrderKind, world_size: int) -> Tail:
-    if "drop_last" not in options:
-        return options.get("tail", "drop" if kind == "shuffled" else "uneven")
-    _require_one_of_two(options, "drop_last", "tail")
-    if not options["drop_last"] and world_size > 1:
-        raise SelectionError(
-            f"drop_last=False of {world_size} ranks may mean two things: give tail='wrap' (samples "
-            "from the epoch's start fill up, as in DistributedSampler, and are marked) or "
-            "tail='uneven' (every sample exactly once; ranks may differ by one batch)."
-        )
-    return "drop" if options["drop_last"] else "uneven"
-
-
-def _require_one_of_two(options: EpochOptions, name: str, other: str) -> None:
-    value = dict(options)[name]
-    if not isinstance(value, bool):
-        raise SelectionError(f"{name} must be True or False, got {value!r}.")
-    if other in options:
-        raise SelectionError(f"{name}={value} and {other}= say the same thing: give one of them.")
+    return (order.full_batch(number) if is_padded else samples).tolist(), ends
 
 
 def require_count(state: Mapping[str, Any], name: str, *, most: int | None = None) -> int:

@@ -194,7 +194,7 @@ def planned_bytes(pairs: StereoPairs, batch_size: int, *, workers: int) -> tuple
     if not is_remote(index.root):
         index = copy.copy(index)
         index.root = "https://forecast.invalid"  # stands for their place, and is never asked
-    batches, plan = pairs.loader(batch_size, tail="uneven").batches, pairs.plan
+    batches, plan = pairs.loader(batch_size, drop_last=False).batches, pairs.plan
     videos = videos_to_keep(plan, batches.rule, streams=pairs._streams, processes=workers)
     requests = count = samples = 0
     for worker in range(workers):
@@ -214,7 +214,7 @@ def planned_bytes(pairs: StereoPairs, batch_size: int, *, workers: int) -> tuple
 def _steps(pairs: StereoPairs, batches: Any, numbers: Iterable[int]) -> Iterable[Step]:
     order = EpochOrder(pairs.plan.runs, batches.rule, epoch=0)
     for number in numbers:
-        samples, ends = batch_samples(order, number, tail=batches.tail)
+        samples, ends = batch_samples(order, number, is_padded=batches.is_padded)
         for each in samples:
             address = pairs.plan.locate(each, epoch=0, group=number % order.groups)
             yield Step(address, each in ends)
@@ -231,7 +231,7 @@ def _decoding_s(pairs: StereoPairs, batch_size: int, *, workers: int, seconds: f
     clock = time.process_time if is_far else time.perf_counter
     began_s, start_s, samples = time.perf_counter(), 0.0, 0
     loader = pairs.loader(
-        batch_size, num_workers=processes, persistent_workers=processes > 0, tail="uneven"
+        batch_size, num_workers=processes, persistent_workers=processes > 0, drop_last=False
     )
     with contextlib.closing(loader):
         while not samples or time.perf_counter() - began_s < seconds:

@@ -46,8 +46,7 @@ class OrderedShareSampler(ShareSampler, SequentialSampler):
 
 def share_sampler(batches: EpochBatches) -> ShareSampler:
     """Return the sampler that stands for these batches."""
-    is_in_order = batches.rule.kind == "sequential"
-    return OrderedShareSampler(batches) if is_in_order else ShareSampler(batches)
+    return ShareSampler(batches) if batches.rule.shuffle else OrderedShareSampler(batches)
 
 
 class AcceleratedLoader:
@@ -101,7 +100,7 @@ class AcceleratedLoader:
         """Tell Accelerate that a loop over this loader begins."""
         if self._gradient_state is not None:
             self.remainder = 0
-            if self.batches.tail != "drop":
+            if not self.batches.drop_last:
                 self.remainder = self.total_dataset_length % self.total_batch_size
             self._gradient_state._add_dataloader(self)
 

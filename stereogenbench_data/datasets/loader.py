@@ -44,9 +44,9 @@ _DESCRIBED: Final = 200
 
 _ORDERED: Final = "or torch's own DataLoader over the dataset"
 _INSTEAD: Final = {
-    "sampler": f"use seed= and order=, {_ORDERED}",
+    "sampler": f"use seed= and shuffle=, {_ORDERED}",
     "lanes": "use shuffle_groups",
-    "batch_sampler": f"use seed= and order=, {_ORDERED} with EpochBatches",
+    "batch_sampler": f"use seed= and shuffle=, {_ORDERED} with EpochBatches",
 }
 """Options that a loader does not take, and what to use instead."""
 

@@ -44,7 +44,7 @@ from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import SceneFilters, may_pass
 from stereogenbench_data.selection.options import options_of, require_options
-from stereogenbench_data.selection.order import EpochOrder, OrderRule, Runs, Tail
+from stereogenbench_data.selection.order import EpochOrder, OrderRule, Runs
 from stereogenbench_data.selection.plan import Address, Plan, Selection, plan_pairs, plan_views
 from stereogenbench_data.selection.windows import FramesSpec, Random
 from stereogenbench_data.sources.cache import ShardCache
@@ -173,8 +173,8 @@ class _MappedScenes(Dataset[Sample]):
         start goes back once.
 
         Samples of one shape lie side by side in memory, so that `collate` need not copy them. What
-        `EpochBatches` gives is drawn for its own epoch, and has the field ``is_padding`` where its
-        tail is "wrap".
+        `EpochBatches` gives is drawn for its own epoch, and has the field ``is_padding`` with
+        ``drop_last="pad"``.
         """
         arrays = self.buffers.allocate(len(numbers))
         batch = (
@@ -235,7 +235,7 @@ class _MappedScenes(Dataset[Sample]):
                 return
             number += known.step
             order = known.order(self.plan.runs, batch.epoch)
-            samples, ends = batch_samples(order, number, tail=known.tail)
+            samples, ends = batch_samples(order, number, is_padded=known.is_padded)
             group = number % order.groups
 
     def _address(self, number: int, epoch: int, *, group: int) -> Address:
@@ -288,9 +288,9 @@ class _MappedScenes(Dataset[Sample]):
         """Return a torch `DataLoader` whose order is the same for any number of ranks and workers.
 
         Shuffled, as by default, samples that do not fill a batch of every rank are dropped at the
-        end of an epoch (``tail="drop"``). With ``shuffle=False`` samples come in order and none is
-        dropped: the last batch may be short, and ranks may differ by one batch
-        (``tail="uneven"``). ``tail`` or ``drop_last`` chooses otherwise.
+        end of an epoch (``drop_last=True``). With ``shuffle=False`` samples come in order and none
+        is dropped: the last batch may be short, and ranks may differ by one batch
+        (``drop_last=False``).
 
         Each pass is of the next epoch, also after a loop that was left; see `PairsLoader`.
 
@@ -298,8 +298,8 @@ class _MappedScenes(Dataset[Sample]):
             batch_size: Samples in a batch of one rank.
             num_workers: How many processes load; 0 loads in this one.
             **options: How the epoch is ordered and shared out (`EpochOptions`: seed, rank,
-                world_size, drop_last or tail, shuffle or order, shuffle_groups, open_scenes); and
-                what `DataLoader` takes.
+                world_size, shuffle, drop_last, shuffle_groups, open_scenes); and what `DataLoader`
+                takes.
 
         Returns:
             A loader with an epoch and open videos of its own: any number of them can be used side
@@ -339,14 +339,14 @@ class _MappedScenes(Dataset[Sample]):
         Videos are kept open for as many runs as the batches interleave, and closed after a run's
         last sample.
         """
-        if batches.rule.kind == "shuffled":
+        if batches.rule.shuffle:
             videos = videos_to_keep(
                 self.plan, batches.rule, streams=self._streams, processes=processes
             )
             self._loader.keep_open(videos, frames=batches.rule.open_frames)
         self._access = "in order"
         self._known_order = KnownOrder(
-            batches.rule, batches.tail, step=processes, stop=batches.end()
+            batches.rule, is_padded=batches.is_padded, step=processes, stop=batches.end()
         )
         self._next_batch = None
 
@@ -379,9 +379,9 @@ class _MappedScenes(Dataset[Sample]):
 class KnownOrder:
     """The batches that a process gets after one of them, without the dataset that they are of."""
 
-    def __init__(self, rule: OrderRule, tail: Tail, *, step: int, stop: int) -> None:
+    def __init__(self, rule: OrderRule, *, is_padded: bool, step: int, stop: int) -> None:
         """Take every ``step``-th batch up to ``stop``."""
-        self.tail = tail
+        self.is_padded = is_padded
         self.step = step
         self.stop = stop
         self._rule = rule

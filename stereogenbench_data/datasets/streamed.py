@@ -45,11 +45,11 @@ class StereoPairStream(IterableDataset[Sample]):
     size of the stream, gives the batches that ``StereoPairs(...).loader(B, num_workers=W)`` gives:
     each rank and worker yields its own, without duplicates or holes, also where there are more
     workers than scenes. torch's own ``collate_fn`` gives the same, and copies more. With
-    ``tail="wrap"`` a sample has the field ``is_padding``, a bool. A stream holds one position: make
-    one for each `DataLoader` that is used side by side with others.
+    ``drop_last="pad"`` a sample has the field ``is_padding``, a bool. A stream holds one position:
+    make one for each `DataLoader` that is used side by side with others.
 
     >>> from stereogenbench_data import StereoPairStream
-    >>> stream = StereoPairStream(getfixture("small_release"), 2, tail="uneven")
+    >>> stream = StereoPairStream(getfixture("small_release"), 2, drop_last=False)
     >>> len(stream), len({sample["scene"] for sample in stream})
     (4, 4)
     """
@@ -60,8 +60,8 @@ class StereoPairStream(IterableDataset[Sample]):
         Args:
             data: As for `StereoPairs`.
             batch_size: Samples in a batch of one rank; give `DataLoader` the same.
-            **options: What `StereoPairs` takes; and `EpochOptions` (rank, world_size, tail,
-                shuffle_groups, open_scenes, order).
+            **options: What `StereoPairs` takes; and `EpochOptions` (rank, world_size, shuffle,
+                drop_last, shuffle_groups, open_scenes).
 
         Raises:
             SelectionError: If nothing matches, or an option is out of its range.
@@ -109,7 +109,8 @@ class StereoPairStream(IterableDataset[Sample]):
         batches = self.batches
         share, size = batches.share(0), batches.rule.batch_size
         short = len(self.pairs) % size
-        has_short = batches.tail == "uneven" and short > 0 and len(self.pairs) // size in share
+        is_uneven = not (batches.drop_last or batches.is_padded)
+        has_short = is_uneven and short > 0 and len(self.pairs) // size in share
         return len(share) * size - (size - short if has_short else 0)
 
     def __repr__(self) -> str:

@@ -53,8 +53,9 @@ _TAG: Final = 0x0D3B
 _MIX: Final = np.uint64(0x9E3779B97F4A7C15)
 """Fibonacci hashing: 2**64 over the golden ratio (Knuth, TAOCP 3, 6.4)."""
 
-OrderKind = Literal["shuffled", "sequential"]
-Tail = Literal["drop", "wrap", "uneven"]
+DropLast = bool | Literal["pad"]
+"""What happens to the last batches of an epoch: see `last_batch`."""
+
 Numbers = Int64[np.ndarray, " n"]
 
 
@@ -95,7 +96,7 @@ class OrderRule:
             than twice as many, so that its streams are equally long and batches equally mixed.
         open_frames: How many neighbouring moments of a run are interleaved, where several samples
             show a moment.
-        kind: "shuffled", or "sequential": by the samples' numbers.
+        shuffle: Whether the order is shuffled; otherwise it is that of the samples' numbers.
     """
 
     batch_size: int
@@ -103,10 +104,10 @@ class OrderRule:
     shuffle_groups: int = SHUFFLE_GROUPS
     open_scenes: int = OPEN_SCENES
     open_frames: int = 1
-    kind: OrderKind = "shuffled"
+    shuffle: bool = True
 
     def __post_init__(self) -> None:
-        """Require numbers in their ranges, and a known kind."""
+        """Require numbers in their ranges."""
         least_of = {
             "batch_size": 1,
             "seed": 0,
@@ -118,8 +119,8 @@ class OrderRule:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise SelectionError(f"{name} must be a whole number from {least}, got {value!r}.")
-        if self.kind not in ("shuffled", "sequential"):
-            raise SelectionError(f"order must be 'shuffled' or 'sequential', got {self.kind!r}.")
+        if not isinstance(self.shuffle, bool):
+            raise SelectionError(f"shuffle must be True or False, got {self.shuffle!r}.")
 
     def groups_of(self, lengths: Numbers) -> int:
         """Return into how many groups runs of so many samples are parted.
@@ -128,7 +129,7 @@ class OrderRule:
         runs each, so that two processes need not decode the same; and a divisor of
         ``shuffle_groups``, so that processes that share those out share these too.
         """
-        if self.kind == "sequential":
+        if not self.shuffle:
             return 1
         as_long_as_the_longest = round(int(lengths.sum()) / int(lengths.max()))
         shown = min(self.batch_size, self.open_scenes)
@@ -139,11 +140,11 @@ class OrderRule:
     def in_effect(self, runs: Runs) -> "OrderRule":
         """Return what the order of such runs depends on: equal for equal orders.
 
-        Few runs have fewer groups and open runs than requested; a sequential order depends on the
-        batch size alone.
+        Few runs have fewer groups and open runs than requested; an order that is not
+        shuffled depends on the batch size alone.
         """
-        if self.kind == "sequential":
-            return OrderRule(self.batch_size, shuffle_groups=1, open_scenes=1, kind="sequential")
+        if not self.shuffle:
+            return OrderRule(self.batch_size, shuffle_groups=1, open_scenes=1, shuffle=False)
         lengths = runs.lengths
         shares_moments = bool((runs.pairs > 1).any())
         has_later_moments = bool((lengths > runs.pairs).any())
@@ -232,7 +233,7 @@ class EpochOrder:
         if not 0 <= number < self.batches:
             raise IndexError(f"no batch {number}: the epoch has {self.batches}")
         size = self.rule.batch_size
-        if self.rule.kind == "sequential":
+        if not self.rule.shuffle:
             samples = np.arange(number * size, min(self.samples, (number + 1) * size))
             after = np.searchsorted(self.runs.first_sample, samples + 1)
             return samples, self.runs.first_sample[after] == samples + 1
@@ -426,30 +427,30 @@ class _Group:
 
 
 def last_batch(
-    samples: int, *, batch_size: int, tail: Tail, world_size: int, start: int = 0
+    samples: int, *, batch_size: int, drop_last: DropLast, world_size: int, start: int = 0
 ) -> int:
     """Return the number at which an epoch ends: that of its last batch, plus one.
 
     Args:
         samples: How many samples the epoch has.
         batch_size: Samples in a batch.
-        tail: "drop": whole batches only, equally many for each rank; "wrap": every sample, and
+        drop_last: True: whole batches only, equally many for each rank; "pad": every sample, and
             samples again from the epoch's start until the last batch is whole and ranks are even;
-            "uneven": every sample once.
+            False: every sample once.
         world_size: How many ranks share the batches.
         start: The batch from which these ranks go on.
 
     Raises:
-        SelectionError: If the tail is none of these.
+        SelectionError: If it is none of these.
     """
     whole, all_of_them = samples // batch_size, -(-samples // batch_size)
-    if tail == "drop":
+    if drop_last is True:
         return start + max(0, whole - start) // world_size * world_size
-    if tail == "wrap":
+    if drop_last == "pad":
         return start + -(-max(0, all_of_them - start) // world_size) * world_size
-    if tail == "uneven":
+    if drop_last is False:
         return max(start, all_of_them)
-    raise SelectionError(f"tail must be 'drop', 'wrap' or 'uneven', got {tail!r}.")
+    raise SelectionError(f"drop_last must be True, False or 'pad', got {drop_last!r}.")
 
 
 def rank_share(start: int, end: int, *, rank: int, world_size: int) -> range:

@@ -189,7 +189,7 @@ def test_torchs_own_loader_and_ours_give_the_same_items(indexed_release, adapter
         indexed_release, pairs="adjacent", transform=RandomCrop(32, 48), seed=3, **options
     )
 
-    ours = next(iter(dataset.loader(2, order="sequential")))
+    ours = next(iter(dataset.loader(2, shuffle=False)))
     torchs = next(iter(DataLoader(dataset, batch_size=2, num_workers=1)))
 
     assert flat(ours).keys() == flat(torchs).keys()
@@ -208,7 +208,7 @@ def flat(batch):
 @pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
 def test_a_pass_draws_other_transforms_than_the_one_before(indexed_release, adapter, options):
     dataset = adapter(indexed_release, transform=RandomCrop(16, 16), **options)
-    loader = dataset.loader(4, order="sequential", drop_last=False)
+    loader = dataset.loader(4, shuffle=False, drop_last=False)
 
     first, second = (flat(next(iter([*loader]))) for _ in range(2))
 
@@ -246,8 +246,8 @@ def test_what_the_project_cannot_take_is_refused(indexed_release, adapter, optio
         adapter(indexed_release, fields=("left",), **options)
     with pytest.raises(FieldError, match=f"{name} takes what StereoPairs takes, not the dataset"):
         adapter(StereoPairs(indexed_release), **options)
-    with pytest.raises(SelectionError, match=f"tail='wrap'.*{name}.*tail='drop'"):
-        adapter(indexed_release, **options).loader(2, tail="wrap")
+    with pytest.raises(SelectionError, match=f"drop_last='pad'.*{name}.*drop_last=True"):
+        adapter(indexed_release, **options).loader(2, drop_last="pad")
 
 
 @pytest.mark.parametrize(("adapter", "options"), ADAPTERS)

@@ -15,7 +15,7 @@ def main() -> None:
     torch.distributed.init_process_group("gloo")
     rank = torch.distributed.get_rank()
     pairs = StereoPairs(data, fields=("__key__",), pairs="adjacent", frames="all")
-    loader = pairs.loader(9, num_workers=1, tail="uneven")
+    loader = pairs.loader(9, num_workers=1, drop_last=False)
     loader.set_epoch(1)
     whole = [batch["__key__"] for batch in loader]
     loader.set_epoch(1)

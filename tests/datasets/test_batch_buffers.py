@@ -76,7 +76,7 @@ def test_every_field_of_a_batch_is_that_of_single_samples(small_index, fields):
 @pytest.mark.parametrize("workers", [0, 1, 2])
 def test_batches_that_a_loop_keeps_are_never_written_again(pairs, workers):
     expected = {sample["__key__"]: sample for sample in pairs}
-    kept = list(pairs.loader(9, num_workers=workers, tail="uneven"))
+    kept = list(pairs.loader(9, num_workers=workers, drop_last=False))
 
     assert len(kept) == 16
     for batch in kept:
@@ -157,7 +157,7 @@ def test_an_error_in_a_worker_that_persists_costs_no_memory(small_index):
     pairs = StereoPairs(
         small_index, fields=FIELDS, pairs="adjacent", frames="all", transform=refuse
     )
-    loader = pairs.loader(9, num_workers=1, persistent_workers=True, order="sequential")
+    loader = pairs.loader(9, num_workers=1, persistent_workers=True, shuffle=False)
     for _ in range(5):
         with pytest.raises(ArithmeticError, match="frame 3"):
             list(loader)
@@ -187,13 +187,14 @@ def test_a_collate_function_of_ones_own_gets_plain_samples(pairs):
 def test_fresh_buffers_give_each_batch_memory_of_its_own(small_index, workers):
     """While a batch is held its memory is not another's; so hold one and look at the others."""
     pairs = StereoPairs(small_index, fields=FIELDS, pairs="adjacent", frames="all", buffers="fresh")
-    held = list(pairs.loader(9, num_workers=workers, tail="uneven"))
+    held = list(pairs.loader(9, num_workers=workers, drop_last=False))
     expected = StereoPairs(small_index, fields=FIELDS, pairs="adjacent", frames="all")
     starts = [batch["left"].untyped_storage().data_ptr() for batch in held]
 
     assert len(set(starts)) == len(held) == 16
     assert all(
-        same(one, other) for one, other in zip(held, expected.loader(9, tail="uneven"), strict=True)
+        same(one, other)
+        for one, other in zip(held, expected.loader(9, drop_last=False), strict=True)
     )
 
 

@@ -17,12 +17,12 @@ from tests.datasets.conftest import flat, in_turn, keys_of
 def test_the_batches_of_all_ranks_are_the_epoch_exactly_once(keyed):
     for world in range(1, 6):
         shares = [
-            list(EpochBatches(keyed, 9, rank=rank, world_size=world, tail="uneven"))
+            list(EpochBatches(keyed, 9, rank=rank, world_size=world, drop_last=False))
             for rank in range(world)
         ]
 
         assert sorted(flat(in_turn(shares))) == list(range(140))
-        assert in_turn(shares) == list(EpochBatches(keyed, 9, tail="uneven"))
+        assert in_turn(shares) == list(EpochBatches(keyed, 9, drop_last=False))
 
 
 def test_drop_says_how_much_it_leaves_out(keyed):
@@ -30,8 +30,8 @@ def test_drop_says_how_much_it_leaves_out(keyed):
 
     assert [len(share) for share in shares] == [3, 3, 3, 3]
     assert [share.left_out for share in shares] == [140 - 12 * 9] * 4
-    assert EpochBatches(keyed, 9, tail="wrap").left_out == 0
-    assert EpochBatches(keyed, 9, tail="uneven").left_out == 0
+    assert EpochBatches(keyed, 9, drop_last="pad").left_out == 0
+    assert EpochBatches(keyed, 9, drop_last=False).left_out == 0
 
 
 def test_an_epoch_of_which_all_would_be_dropped_is_refused(keyed):
@@ -40,7 +40,7 @@ def test_an_epoch_of_which_all_would_be_dropped_is_refused(keyed):
 
 
 def test_wrapped_ranks_are_even_and_know_their_padding(keyed):
-    shares = [EpochBatches(keyed, 9, rank=r, world_size=3, tail="wrap") for r in range(3)]
+    shares = [EpochBatches(keyed, 9, rank=r, world_size=3, drop_last="pad") for r in range(3)]
     batches = in_turn([list(share) for share in shares])
     padding = flat(shares[0].is_padding(number).tolist() for number in range(18))
 
@@ -57,17 +57,6 @@ def test_the_seed_is_the_datasets_unless_another_is_given(small_index):
 
     assert list(EpochBatches(pairs, 4)) == list(EpochBatches(others, 4, seed=5))
     assert list(EpochBatches(pairs, 4)) != list(EpochBatches(others, 4))
-
-
-def test_torchs_words_for_tail_and_order_are_taken(keyed):
-    assert list(EpochBatches(keyed, 9, drop_last=True)) == list(EpochBatches(keyed, 9))
-    assert list(EpochBatches(keyed, 9, drop_last=False)) == list(
-        EpochBatches(keyed, 9, tail="uneven")
-    )
-    assert list(EpochBatches(keyed, 9, shuffle=True)) == list(EpochBatches(keyed, 9))
-    assert list(EpochBatches(keyed, 9, shuffle=False)) == list(
-        EpochBatches(keyed, 9, order="sequential")
-    )
 
 
 def test_the_epoch_is_the_datasets(keyed):
@@ -100,8 +89,8 @@ def test_a_position_is_flat_json_and_says_what_it_belongs_to(keyed):
         "shuffle_groups": 2,
         "open_scenes": 4,
         "open_frames": 1,
-        "order": "shuffled",
-        "tail": "drop",
+        "shuffle": True,
+        "drop_last": True,
         "selection": keyed.plan.digest,
         "index": keyed.index.digest,
     }
@@ -123,9 +112,9 @@ def test_what_is_loaded_goes_on_once_and_then_epochs_are_whole(keyed):
         ({"seed": 1}, "seed is 1 here and 0 there"),
         ({"batch_size": 1, "shuffle_groups": 2}, "shuffle_groups is 2 here and 4 there"),
         ({"batch_size": 1, "open_scenes": 1}, "open_scenes is 1 here and 4 there"),
-        ({"order": "sequential"}, "order is 'sequential' here and 'shuffled' there"),
-        ({"tail": "wrap"}, "tail is 'wrap' here and 'drop' there"),
-        ({"tail": "wrap", "seed": 2}, "seed is 2 here.*; tail is 'wrap' here"),
+        ({"shuffle": False}, "shuffle is False here and True there"),
+        ({"drop_last": "pad"}, "drop_last is 'pad' here and True there"),
+        ({"drop_last": "pad", "seed": 2}, "seed is 2 here.*; drop_last is 'pad' here"),
     ],
     ids=str,
 )
@@ -145,6 +134,24 @@ def test_a_position_of_an_earlier_version_is_read_unless_its_streams_started_oth
     assert batches.state_dict()["batches_consumed"] == 30
     with pytest.raises(StateError, match="start_of_streams is 'anywhere' here and 'beginning'"):
         batches.load_state_dict(batches.state_at(0, 30) | {"start_of_streams": "beginning"})
+
+
+@pytest.mark.parametrize(("shuffle", "order"), [(True, "shuffled"), (False, "sequential")], ids=str)
+@pytest.mark.parametrize(
+    ("drop_last", "tail"), [(True, "drop"), (False, "uneven"), ("pad", "wrap")], ids=str
+)
+def test_a_position_saved_with_order_and_tail_is_read(keyed, shuffle, order, drop_last, tail):
+    batches = EpochBatches(keyed, 4, shuffle=shuffle, drop_last=drop_last)
+    saved = batches.state_at(0, 30) | {"order": order, "tail": tail}
+    del saved["shuffle"], saved["drop_last"]
+    batches.load_state_dict(saved)
+
+    assert batches.state_dict()["batches_consumed"] == 30
+    others = EpochBatches(keyed, 4, shuffle=not shuffle, drop_last=drop_last)
+    with pytest.raises(StateError, match=f"shuffle is {not shuffle} here and {shuffle} there"):
+        others.load_state_dict(saved)
+    with pytest.raises(StateError, match=r"drop_last is .* here and \['drop'\] there"):
+        batches.load_state_dict(saved | {"tail": ["drop"]})
 
 
 def test_a_position_of_an_earlier_order_is_refused_by_its_version(keyed):
@@ -172,8 +179,8 @@ def test_options_that_few_scenes_leave_without_effect_are_the_same_order(keyed, 
 
 
 def test_a_sequential_position_goes_with_any_seed(keyed):
-    batches = EpochBatches(keyed, 4, order="sequential", seed=3, shuffle_groups=2)
-    batches.load_state_dict(EpochBatches(keyed, 4, order="sequential").state_at(0, 34))
+    batches = EpochBatches(keyed, 4, shuffle=False, seed=3, shuffle_groups=2)
+    batches.load_state_dict(EpochBatches(keyed, 4, shuffle=False).state_at(0, 34))
 
     assert list(batches) == [[136, 137, 138, 139]]
 
@@ -233,16 +240,10 @@ def test_something_else_than_a_position_is_refused(keyed):
     [
         ({"rank": 2, "world_size": 2}, "got rank=2, world_size=2"),
         ({"rank": 1}, "got rank=1, world_size=None"),
-        ({"tail": "keep"}, "tail must be"),
+        ({"drop_last": "keep"}, "drop_last must be True, False or 'pad', got 'keep'"),
         ({"drop": True}, "EpochBatches has no option 'drop'; did you mean 'drop_last'"),
-        ({"drop_last": 1}, "drop_last must be True or False, got 1"),
+        ({"drop_last": 1}, "drop_last must be True, False or 'pad', got 1"),
         ({"shuffle": "yes"}, "shuffle must be True or False, got 'yes'"),
-        ({"shuffle": True, "order": "shuffled"}, "shuffle=True and order= say the same"),
-        ({"drop_last": True, "tail": "wrap"}, "drop_last=True and tail= say the same"),
-        (
-            {"drop_last": False, "rank": 0, "world_size": 2},
-            "drop_last=False of 2 ranks .* tail='wrap' .* tail='uneven'",
-        ),
     ],
     ids=str,
 )
@@ -273,7 +274,7 @@ def test_batches_made_before_the_process_group_are_refused_in_it(keyed, tmp_path
 
 
 def test_a_pass_that_was_left_is_not_the_position_after_later_ones(keyed):
-    batches = EpochBatches(keyed, 9, tail="uneven")
+    batches = EpochBatches(keyed, 9, drop_last=False)
     loader = DataLoader(keyed, batch_sampler=batches)
     for _ in range(2):
         for number, _ in enumerate(loader):
@@ -286,7 +287,7 @@ def test_a_pass_that_was_left_is_not_the_position_after_later_ones(keyed):
 
 
 def test_ranks_whose_passes_are_over_are_all_at_the_end(keyed):
-    ranks = [EpochBatches(keyed, 9, rank=r, world_size=3, tail="uneven") for r in range(3)]
+    ranks = [EpochBatches(keyed, 9, rank=r, world_size=3, drop_last=False) for r in range(3)]
 
     assert [len(list(rank)) for rank in ranks] == [6, 5, 5]
     assert [rank.state_dict()["batches_consumed"] for rank in ranks] == [16, 16, 16]
@@ -294,7 +295,7 @@ def test_ranks_whose_passes_are_over_are_all_at_the_end(keyed):
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
 def test_a_pass_over_batches_is_not_copied_and_goes_on(keyed, copied):
-    numbers = iter(EpochBatches(keyed, 9, tail="uneven"))
+    numbers = iter(EpochBatches(keyed, 9, drop_last=False))
     next(numbers)
 
     with pytest.raises(TypeError, match="generator"):
@@ -304,7 +305,7 @@ def test_a_pass_over_batches_is_not_copied_and_goes_on(keyed, copied):
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_it_serves_torchs_own_loader(keyed, workers):
-    batches = EpochBatches(keyed, 16, tail="uneven")
+    batches = EpochBatches(keyed, 16, drop_last=False)
     loader = DataLoader(keyed, batch_sampler=batches, num_workers=workers)
 
     assert len(loader) == 9
@@ -318,7 +319,7 @@ def test_torchdatas_loader_saves_and_loads_its_position(keyed, workers, stop):
     keyed.set_epoch(2)
 
     def loader():
-        batches = EpochBatches(keyed, 16, tail="uneven")
+        batches = EpochBatches(keyed, 16, drop_last=False)
         return StatefulDataLoader(keyed, batch_sampler=batches, num_workers=workers)
 
     unbroken = keys_of(loader())
@@ -342,7 +343,7 @@ def test_a_state_of_torchdatas_loader_that_holds_the_position_twice_is_resumed(k
     """Passes over the batches had a state of their own before, the same as the sampler's."""
 
     def loader():
-        batches = EpochBatches(keyed, 16, tail="uneven")
+        batches = EpochBatches(keyed, 16, drop_last=False)
         return StatefulDataLoader(keyed, batch_sampler=batches)
 
     unbroken, broken, resumed = keys_of(loader()), loader(), loader()
@@ -358,7 +359,7 @@ def test_a_state_of_torchdatas_loader_that_holds_the_position_twice_is_resumed(k
 @pytest.mark.parametrize("workers", [0, 1])
 def test_torchdatas_loader_begins_a_whole_epoch_after_a_finished_one(keyed, workers):
     def loader():
-        batches = EpochBatches(keyed, 16, tail="uneven")
+        batches = EpochBatches(keyed, 16, drop_last=False)
         return StatefulDataLoader(keyed, batch_sampler=batches, num_workers=workers)
 
     finished = loader()

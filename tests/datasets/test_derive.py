@@ -472,7 +472,7 @@ def test_batches_of_a_loader_become_the_pairs_of_the_dataset(indexed_release, op
     )  # fmt: skip
     options |= {"split": "train", "family": "Uniform"}
     moments = SceneViews(indexed_release, fields=DERIVE_FIELDS, **options)
-    loader = moments.loader(batch_size=2, num_workers=1, order="sequential")
+    loader = moments.loader(batch_size=2, num_workers=1, shuffle=False)
 
     made = [derive(batch, fields=fields) for batch in loader]
 

@@ -122,8 +122,8 @@ def test_a_pass_gives_what_local_shards_give_in_few_requests(
     frames, workers, served, large_shards, alone
 ):
     options = {"fields": FIELDS, "frames": frames}
-    expected = StereoPairs(large_shards, **options).loader(2, tail="uneven")
-    loader = StereoPairs(served.url, **options).loader(2, num_workers=workers, tail="uneven")
+    expected = StereoPairs(large_shards, **options).loader(2, drop_last=False)
+    loader = StereoPairs(served.url, **options).loader(2, num_workers=workers, drop_last=False)
     served.asked.clear()
 
     for batch, other in zip(loader, expected, strict=True):
@@ -138,8 +138,8 @@ def test_a_pass_gives_what_local_shards_give_in_few_requests(
 
 
 def test_a_stream_of_samples_is_fetched_ahead_too(served, large_shards, alone):
-    expected = [*StereoPairStream(large_shards, 2, fields=FIELDS, frames="all", tail="uneven")]
-    stream = StereoPairStream(served.url, 2, fields=FIELDS, frames="all", tail="uneven")
+    expected = [*StereoPairStream(large_shards, 2, fields=FIELDS, frames="all", drop_last=False)]
+    stream = StereoPairStream(served.url, 2, fields=FIELDS, frames="all", drop_last=False)
     served.asked.clear()
 
     assert all(same(*each) for each in zip(stream, expected, strict=True))
@@ -162,7 +162,7 @@ def test_the_streams_of_a_sample_are_fetched_at_the_same_time(served, alone):
 def test_what_is_planned_stays_within_the_bound(served, monkeypatch, alone):
     bound = 100_000
     pairs = StereoPairs(served.url, fields=("left",), frames="all", fetch_ahead_bytes=bound)
-    loader = pairs.loader(1, tail="uneven")
+    loader = pairs.loader(1, drop_last=False)
     planned, add = [], FetchAhead.plan
 
     def noted(ahead, sample, wanted):
@@ -238,7 +238,7 @@ def test_a_fork_in_the_middle_of_a_pass_reads_for_itself(served, large_shards, a
     local = StereoPairs(large_shards, fields=("left",), frames="all")
     expected = local[3]["left"].numpy()
     pairs = StereoPairs(served.url, fields=("left",), frames="all")
-    loader = pairs.loader(1, tail="uneven")
+    loader = pairs.loader(1, drop_last=False)
     batches = iter(loader)
     next(batches)
     pid = os.fork()
@@ -268,7 +268,7 @@ def test_an_error_comes_at_the_sample_that_needs_the_bytes(small_shards, tmp_pat
     with serving(folder) as server:
         server.always = {shard: Answer(status=403)}
         pairs = StereoPairs(server.url, fields=("left", "__key__"))
-        loader = pairs.loader(1, order="sequential", tail="uneven")
+        loader = pairs.loader(1, shuffle=False, drop_last=False)
         batches = iter(loader)
         assert next(batches)["__key__"][0].startswith(first.id.key)
         with pytest.raises(StorageError, match=rf"{last.id.key}.*frames \(0,\).*{shard}.*403"):
@@ -280,8 +280,8 @@ def test_what_is_fetched_ahead_fills_a_cache(served, large_shards, tmp_path, alo
     cache = ShardCache(tmp_path / "cache", limit_bytes=10**9)
     options = {"fields": FIELDS, "frames": "all", "check": "opened"}
     for _ in range(2):
-        loader = StereoPairs(served.url, cache=cache, **options).loader(2, tail="uneven")
-        expected = StereoPairs(large_shards, **options).loader(2, tail="uneven")
+        loader = StereoPairs(served.url, cache=cache, **options).loader(2, drop_last=False)
+        expected = StereoPairs(large_shards, **options).loader(2, drop_last=False)
         assert all(same(*each) for each in zip(loader, expected, strict=True))
         loader.close()
         asked, served.asked[:] = parts_asked(served), []

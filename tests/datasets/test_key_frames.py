@@ -81,7 +81,7 @@ def test_the_index_has_the_key_frames_that_all_cameras_share(whole, keyed_releas
 
 
 def test_runs_are_shuffled_by_themselves_and_hold_the_right_frames(whole, keyed_release):
-    loader = StereoPairs(keyed_release, frames="all", fields=FIELDS).loader(4, tail="uneven")
+    loader = StereoPairs(keyed_release, frames="all", fields=FIELDS).loader(4, drop_last=False)
     expected = StereoPairs(whole, frames="all", fields=FIELDS)
     found = epoch_of(loader)
 
@@ -103,7 +103,7 @@ def test_a_run_begins_decoding_at_its_key_frame(keyed_release, monkeypatch):
 
     monkeypatch.setattr(streams, "VideoReader", Counting)
     loader = StereoPairs(keyed_release, frames="all", fields=("left",)).loader(
-        4, tail="uneven", shuffle_groups=1
+        4, drop_last=False, shuffle_groups=1
     )
     for _ in loader:
         pass
@@ -122,7 +122,7 @@ def test_interleaved_frames_of_all_pairs_are_decoded_once(keyed_release, monkeyp
 
     monkeypatch.setattr(streams, "VideoReader", Counting)
     pairs = StereoPairs(keyed_release, frames="all", pairs="all", fields=("left", "right"))
-    loader = pairs.loader(4, tail="uneven", shuffle_groups=1, open_frames=open_frames)
+    loader = pairs.loader(4, drop_last=False, shuffle_groups=1, open_frames=open_frames)
     for _ in loader:
         pass
 
@@ -135,7 +135,7 @@ def test_interleaved_frames_of_all_pairs_are_decoded_once(keyed_release, monkeyp
 def test_every_sample_comes_once_and_as_by_number(keyed_release, selection, workers):
     options = {"frames": "all", "fields": FIELDS} | selection
     pairs = StereoPairs(keyed_release, **options)
-    loader = pairs.loader(5, num_workers=workers, tail="uneven", open_frames=2)
+    loader = pairs.loader(5, num_workers=workers, drop_last=False, open_frames=2)
     found = epoch_of(loader)
 
     assert len(found) == len(pairs)
@@ -149,7 +149,7 @@ def test_frames_drawn_at_random_are_dealt_to_as_many_runs(keyed_release):
     pairs = StereoPairs(keyed_release, frames=("random", 5), fields=FIELDS)
 
     assert pairs.plan.runs.lengths.tolist() == [2, 3] * 3
-    assert len(epoch_of(pairs.loader(4, tail="uneven"))) == 15
+    assert len(epoch_of(pairs.loader(4, drop_last=False))) == 15
 
 
 def test_an_index_without_key_frames_opens_with_the_digest_it_had(whole, tmp_path):

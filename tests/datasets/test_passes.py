@@ -377,7 +377,7 @@ def test_a_worker_that_dies_ends_the_pass_whatever_it_held(
     loader = pairs.loader(
         2,
         num_workers=2,
-        order="sequential",
+        shuffle=False,
         persistent_workers=persistent,
         pin_memory=pin_memory,
         multiprocessing_context="fork",
@@ -393,7 +393,7 @@ def test_a_worker_that_dies_ends_the_pass_whatever_it_held(
 
 def test_an_error_ends_its_pass_and_says_so_to_who_asks_on(small_index):
     pairs = StereoPairs(small_index, fields=FIELDS, frames="all", transform=Refuse())
-    batches = iter(pairs.loader(2, num_workers=1, order="sequential"))
+    batches = iter(pairs.loader(2, num_workers=1, shuffle=False))
     next(batches)
     with pytest.raises(ArithmeticError, match="frame 3"):
         list(batches)

@@ -84,7 +84,7 @@ def test_a_copy_has_an_epoch_of_its_own(small_index):
 @pytest.mark.parametrize("how", COPIES)
 @pytest.mark.parametrize("persistent", [False, True])
 def test_a_copied_stream_goes_on_at_a_loaded_position_once(small_index, how, persistent):
-    options = {"fields": ("__key__",), "pairs": "adjacent", "frames": "all", "tail": "uneven"}
+    options = {"fields": ("__key__",), "pairs": "adjacent", "frames": "all", "drop_last": False}
     stream = StereoPairStream(small_index, 2, **options)
     stream.load_state_dict(stream.batches.state_at(0, 10))
     loader = DataLoader(
@@ -162,7 +162,7 @@ def test_an_epoch_that_was_set_again_may_be_repeated(small_index, ordered_by):
     pairs = StereoPairs(small_index, fields=("__key__",), transform=RandomCrop(32, 32))
     options = {"batch_size": 2}
     if ordered_by == "EpochBatches":
-        options = {"batch_sampler": EpochBatches(pairs, 3, tail="wrap")}
+        options = {"batch_sampler": EpochBatches(pairs, 3, drop_last="pad")}
     loader = DataLoader(pairs, **options)
     for _ in range(2):
         pairs.set_epoch(0)

@@ -24,7 +24,7 @@ SELECTION = {"fields": ("__key__",), "pairs": "adjacent", "frames": "all"}
 def stream_of(small_index):
     def made(batch_size=9, **options):
         return StereoPairStream(
-            small_index, batch_size, **({"tail": "uneven"} | SELECTION | options)
+            small_index, batch_size, **({"drop_last": False} | SELECTION | options)
         )
 
     return made
@@ -36,11 +36,11 @@ def loaded(stream, workers=0, **options):
     )
 
 
-@pytest.mark.parametrize("tail", ["drop", "wrap", "uneven"])
+@pytest.mark.parametrize("drop_last", [True, "pad", False])
 @pytest.mark.parametrize(("world", "workers"), [(1, 0), (1, 3), (2, 2), (3, 1)])
-def test_its_batches_are_those_of_the_loader(keyed, stream_of, world, workers, tail):
+def test_its_batches_are_those_of_the_loader(keyed, stream_of, world, workers, drop_last):
     for rank in range(world):
-        options = {"rank": rank, "world_size": world, "tail": tail}
+        options = {"rank": rank, "world_size": world, "drop_last": drop_last}
         stream = stream_of(**options)
         stream.set_epoch(1)
         keyed.set_epoch(1)
@@ -49,7 +49,7 @@ def test_its_batches_are_those_of_the_loader(keyed, stream_of, world, workers, t
 
         assert keys_of(found) == keys_of(expected)
         assert len(stream) == len(flat(keys_of(found)))
-        if tail == "wrap":
+        if drop_last == "pad":
             for one, other in zip(found, expected, strict=True):
                 assert torch.equal(one["is_padding"], other["is_padding"])
 
@@ -59,10 +59,10 @@ def test_its_batches_are_those_of_the_loader(keyed, stream_of, world, workers, t
 def test_batches_made_in_place_are_those_of_the_loader_and_stay_while_held(
     small_index, loader, context
 ):
-    options = {"pairs": "adjacent", "frames": range(3), "tail": "wrap"}
+    options = {"pairs": "adjacent", "frames": range(3), "drop_last": "pad"}
     stream = StereoPairStream(small_index, 4, **options)
-    del options["tail"]
-    expected = list(StereoPairs(small_index, **options).loader(4, tail="wrap"))
+    del options["drop_last"]
+    expected = list(StereoPairs(small_index, **options).loader(4, drop_last="pad"))
     held = {}
     found = loader(
         stream, batch_size=4, num_workers=2, collate_fn=stream.collate,
@@ -79,7 +79,7 @@ def test_batches_made_in_place_are_those_of_the_loader_and_stay_while_held(
 
 
 def test_streams_used_side_by_side_and_their_copies_send_their_own_batches(small_index):
-    options = {"pairs": "adjacent", "frames": range(3), "tail": "uneven"}
+    options = {"pairs": "adjacent", "frames": range(3), "drop_last": False}
     stream = StereoPairStream(small_index, 4, **options)
     streams = [stream, copy.deepcopy(stream), StereoPairStream(small_index, 4, seed=1, **options)]
     loaders = [loaded(each, 1, collate_fn=each.collate) for each in streams]
@@ -100,7 +100,7 @@ def same(one, other):
 
 
 def test_more_workers_than_batches_or_scenes_lose_and_repeat_nothing(small_index):
-    options = {"fields": ("__key__",), "tail": "uneven"}
+    options = {"fields": ("__key__",), "drop_last": False}
     for size in (1, 2, 3):
         stream = StereoPairStream(small_index, size, **options)
         keys = flat(keys_of(loaded(stream, 6)))
@@ -170,7 +170,7 @@ def test_a_stream_iterated_in_this_process_counts_by_itself(stream_of, keyed):
         next(batches)
         assert stream.state_dict()["batches_consumed"] == taken
 
-    loader = keyed.loader(9, tail="uneven")
+    loader = keyed.loader(9, drop_last=False)
     loader.load_state_dict(stream.state_dict())
     assert keys_of(loader) == keys_of(batches)
 
@@ -178,7 +178,7 @@ def test_a_stream_iterated_in_this_process_counts_by_itself(stream_of, keyed):
 def test_after_a_short_last_batch_the_next_epoch_begins(stream_of, keyed):
     stream = stream_of()
     assert len(list(loaded(stream))) == 16
-    loader = keyed.loader(9, tail="uneven")
+    loader = keyed.loader(9, drop_last=False)
     loader.load_state_dict(stream.state_dict())
 
     assert loader.epoch == 1

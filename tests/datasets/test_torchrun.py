@@ -29,7 +29,7 @@ def ranks(small_release, tmp_path_factory):
 
 def test_the_ranks_of_torchrun_share_the_epoch_exactly_once(ranks, keyed):
     keyed.set_epoch(1)
-    alone = keys_of(keyed.loader(9, tail="uneven"))
+    alone = keys_of(keyed.loader(9, drop_last=False))
     together = in_turn([rank["whole"] for rank in ranks])
 
     assert together == alone
@@ -39,7 +39,7 @@ def test_the_ranks_of_torchrun_share_the_epoch_exactly_once(ranks, keyed):
 def test_a_position_saved_under_torchrun_goes_on_in_one_process(ranks, keyed):
     states = ranks[0]["states"]
     assert states[0] == states[1] == ranks[1]["states"][0]
-    loader = keyed.loader(9, tail="uneven", num_workers=1)
+    loader = keyed.loader(9, drop_last=False, num_workers=1)
     loader.load_state_dict(states[0])
     taken = in_turn([rank["taken"] for rank in ranks])
 

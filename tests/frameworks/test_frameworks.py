@@ -149,7 +149,7 @@ def test_a_shuffled_loader_that_lightning_would_overfit_says_what_to_use(indexed
 @pytest.mark.parametrize("workers", [0, 1])
 def test_lightning_predicts_each_sample_once(indexed_release, workers):
     pairs = runs.random_frames(indexed_release)
-    keys = runs.predicted(pairs.loader(8, num_workers=workers, tail="uneven"))
+    keys = runs.predicted(pairs.loader(8, num_workers=workers, drop_last=False))
 
     assert len(keys) == len(set(keys)) == 60
 

@@ -19,7 +19,6 @@ from stereogenbench_data.selection.order import (
 )
 
 WORLDS, WORKERS = range(1, 6), range(5)
-KINDS = ("shuffled", "sequential")
 
 
 def runs_of(lengths, *, pairs=1, key_distance=1):
@@ -70,7 +69,7 @@ rules = st.fixed_dictionaries(
         "pairs": st.sampled_from([1, 1, 3, 15]),
         "seed": st.integers(0, 2**70),
         "epoch": st.integers(0, 9),
-        "kind": st.sampled_from(KINDS),
+        "shuffle": st.booleans(),
     }
 )
 
@@ -107,7 +106,7 @@ def parts_of(order, group, *, pairs):
 @given(lengths=lengths_of_scenes, rule=rules)
 @settings(deadline=None, max_examples=100)
 def test_moments_of_a_run_ascend_but_for_where_a_stream_starts(lengths, rule):
-    order = order_of(lengths, **(rule | {"kind": "shuffled", "open_frames": 1}))
+    order = order_of(lengths, **(rule | {"shuffle": True, "open_frames": 1}))
     parts, goes_back = 0, 0
     for group in range(order.groups):
         for run, numbers in pieces_of(order, group).items():
@@ -124,7 +123,7 @@ def test_moments_of_a_run_ascend_but_for_where_a_stream_starts(lengths, rule):
 @given(lengths=lengths_of_scenes, rule=rules)
 @settings(deadline=None, max_examples=60)
 def test_a_block_of_moments_is_finished_before_the_next_begins(lengths, rule):
-    order = order_of(lengths, **(rule | {"kind": "shuffled"}))
+    order = order_of(lengths, **(rule | {"shuffle": True}))
     for group in range(order.groups):
         parts = [run for run, _ in parts_of(order, group, pairs=rule["pairs"])]
 
@@ -138,7 +137,7 @@ def test_the_last_sample_of_each_part_of_a_run_is_marked(lengths, rule):
     seen, wanted = set(), set()
     for number in range(order.batches):
         seen |= set(order.batch(number)[order.ends_run(number)].tolist())
-    if order.rule.kind == "sequential":
+    if not order.rule.shuffle:
         wanted = set((order.runs.first_sample[1:] - 1).tolist())
     else:
         for group in range(order.groups):
@@ -151,7 +150,7 @@ def test_the_last_sample_of_each_part_of_a_run_is_marked(lengths, rule):
 @given(lengths=lengths_of_scenes, rule=rules)
 @settings(deadline=None, max_examples=100)
 def test_no_more_runs_are_open_in_a_group_than_announced(lengths, rule):
-    order = order_of([7] * len(lengths), **(rule | {"kind": "shuffled"}))
+    order = order_of([7] * len(lengths), **(rule | {"shuffle": True}))
     most = order.rule.most_open(order.runs.lengths)
     for group in range(order.groups):
         place = {number: place for place, number in enumerate(order.group(group).tolist())}
@@ -175,14 +174,14 @@ def test_a_small_number_of_open_runs_is_reached_and_never_exceeded(runs, open_sc
     assert (opened - closed).max() == min(runs, open_scenes)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("shuffle", [True, False])
 @pytest.mark.parametrize("batch_size", [1, 3, 8])
 @pytest.mark.parametrize("epoch", [0, 1, 5])
-def test_ranks_and_workers_share_the_same_global_batches_out(kind, batch_size, epoch):
-    order = order_of([5, 9, 2, 7, 7, 1, 12], batch_size=batch_size, epoch=epoch, kind=kind)
+def test_ranks_and_workers_share_the_same_global_batches_out(shuffle, batch_size, epoch):
+    order = order_of([5, 9, 2, 7, 7, 1, 12], batch_size=batch_size, epoch=epoch, shuffle=shuffle)
     expected = all_batches(order)
     for world, workers in itertools.product(WORLDS, WORKERS):
-        end = last_batch(43, batch_size=batch_size, tail="uneven", world_size=world)
+        end = last_batch(43, batch_size=batch_size, drop_last=False, world_size=world)
         seen = {}
         for rank in range(world):
             share = rank_share(0, end, rank=rank, world_size=world)
@@ -201,7 +200,7 @@ def test_a_run_stopped_at_any_batch_goes_on_under_any_other_world():
     for before, after in itertools.product(WORLDS, WORLDS):
         for steps in range(order.batches // before + 1):
             start = steps * before
-            end = last_batch(43, batch_size=3, tail="uneven", world_size=after, start=start)
+            end = last_batch(43, batch_size=3, drop_last=False, world_size=after, start=start)
             shares = [rank_share(start, end, rank=rank, world_size=after) for rank in range(after)]
             steps_after = [sorted(row) for row in rows_of(shares)]
 
@@ -211,7 +210,7 @@ def test_a_run_stopped_at_any_batch_goes_on_under_any_other_world():
 @pytest.mark.parametrize("start", [0, 1, 4, 7, 13, 14, 15])
 @pytest.mark.parametrize("world", WORLDS)
 def test_each_step_takes_the_next_batches_in_turn(world, start):
-    end = last_batch(43, batch_size=3, tail="uneven", world_size=world, start=start)
+    end = last_batch(43, batch_size=3, drop_last=False, world_size=world, start=start)
     shares = [rank_share(start, end, rank=rank, world_size=world) for rank in range(world)]
     rows = rows_of(shares)
 
@@ -223,25 +222,25 @@ def test_each_step_takes_the_next_batches_in_turn(world, start):
 
 @pytest.mark.parametrize("start", [0, 1, 4, 13, 14, 15])
 @pytest.mark.parametrize("world", WORLDS)
-def test_drop_and_wrap_give_every_rank_as_many_batches(world, start):
+def test_dropping_and_padding_give_every_rank_as_many_batches(world, start):
     ends = {
-        tail: last_batch(43, batch_size=3, tail=tail, world_size=world, start=start)
-        for tail in ("drop", "wrap", "uneven")
+        each: last_batch(43, batch_size=3, drop_last=each, world_size=world, start=start)
+        for each in (True, "pad", False)
     }
-    for tail in ("drop", "wrap"):
+    for each in (True, "pad"):
         shares = [
-            rank_share(start, ends[tail], rank=rank, world_size=world) for rank in range(world)
+            rank_share(start, ends[each], rank=rank, world_size=world) for rank in range(world)
         ]
         assert len(set(map(len, shares))) == 1
 
-    assert ends["drop"] <= max(start, 14)
-    assert max(start, 14) - ends["drop"] < world
-    assert 0 <= ends["wrap"] - ends["uneven"] < world
+    assert ends[True] <= max(start, 14)
+    assert max(start, 14) - ends[True] < world
+    assert 0 <= ends["pad"] - ends[False] < world
 
 
-def test_an_unknown_tail_is_refused():
-    with pytest.raises(SelectionError, match="tail must be 'drop', 'wrap' or 'uneven', got 'keep'"):
-        last_batch(1, batch_size=1, tail="keep", world_size=1)
+def test_an_unknown_drop_last_is_refused():
+    with pytest.raises(SelectionError, match="drop_last must be True, False or 'pad', got 'keep'"):
+        last_batch(1, batch_size=1, drop_last="keep", world_size=1)
 
 
 def test_wrapped_batches_go_on_from_the_epochs_start():
@@ -298,7 +297,7 @@ PINNED = [
 
 
 def test_a_sequential_order_is_that_of_the_numbers():
-    order = order_of([3, 5, 2], batch_size=4, kind="sequential")
+    order = order_of([3, 5, 2], batch_size=4, shuffle=False)
 
     assert all_batches(order) == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
 
@@ -387,7 +386,7 @@ def test_streams_start_where_decoding_can_begin(pairs, open_frames):
 @settings(deadline=None, max_examples=40)
 def test_in_a_block_each_pair_is_read_at_ascending_moments(lengths, rule):
     """Else a camera would go back to decode a moment that it had passed."""
-    order = order_of(lengths, **(rule | {"kind": "shuffled", "pairs": 3}))
+    order = order_of(lengths, **(rule | {"shuffle": True, "pairs": 3}))
     for group in range(order.groups):
         for run, numbers in parts_of(order, group, pairs=3):
             moments, pairs = np.divmod(numbers - order.runs.first_sample[run], 3)
@@ -437,7 +436,7 @@ def test_memory_grows_with_the_runs_and_not_with_the_samples():
         ({"open_scenes": 0}, "open_scenes must be a whole number from 1, got 0"),
         ({"seed": -1}, "seed must be a whole number from 0, got -1"),
         ({"open_frames": 0}, "open_frames must be a whole number from 1, got 0"),
-        ({"kind": "random"}, "order must be 'shuffled' or 'sequential', got 'random'"),
+        ({"shuffle": 1}, "shuffle must be True or False, got 1"),
     ],
     ids=str,
 )
@@ -461,13 +460,15 @@ def test_a_rule_that_orders_nothing_is_refused(rule, message):
         min_size=2,
         max_size=6,
     ),
-    kind=st.sampled_from(KINDS),
+    shuffle=st.booleans(),
 )
 @settings(deadline=None, max_examples=60)
-def test_rules_that_are_the_same_in_effect_give_the_same_order(lengths, pairs, size, asked, kind):
+def test_rules_that_are_the_same_in_effect_give_the_same_order(
+    lengths, pairs, size, asked, shuffle
+):
     runs, found = runs_of(lengths, pairs=pairs), {}
     for options in asked:
-        rule = OrderRule(batch_size=size, kind=kind, **options)
+        rule = OrderRule(batch_size=size, shuffle=shuffle, **options)
         batches = all_batches(EpochOrder(runs, rule, epoch=0))
 
         assert found.setdefault(rule.in_effect(runs), batches) == batches

@@ -120,8 +120,8 @@ def test_views_and_streams_are_the_same(packed, small_shards):
     for one, other in (
         (SceneViews(packed), SceneViews(small_shards)),
         (
-            StereoPairStream(packed, 3, fields=FIELDS, frames="all", tail="uneven"),
-            StereoPairStream(small_shards, 3, fields=FIELDS, frames="all", tail="uneven"),
+            StereoPairStream(packed, 3, fields=FIELDS, frames="all", drop_last=False),
+            StereoPairStream(small_shards, 3, fields=FIELDS, frames="all", drop_last=False),
         ),
     ):
         for left, right in zip(one, other, strict=True):
