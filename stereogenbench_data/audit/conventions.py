@@ -2,7 +2,7 @@
 
 `index.learning` finds where quantities stand; here the depth contract of each shape of files is
 tested on some scenes, changed where nothing states it and the pictures are sure, and tested again
-on other scenes.
+on other scenes. Where several readings of the poses fit the rigs, depth decides between them.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,8 @@ from stereogenbench_data.index.learning import (
 )
 from stereogenbench_data.index.scene_folder import IncompleteScene
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.conventions import Conventions, DepthAs, Shape, write_toml
+from stereogenbench_data.samples.fields import PAIR_FIELDS, VIEW_FIELDS
+from stereogenbench_data.schema.conventions import Conventions, DepthAs, PosesAs, Shape, write_toml
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.location import is_remote, shown
@@ -54,6 +55,7 @@ class Survey:
         learned: The conventions; None where those of the user were tested instead.
         problems: What is not understood, contradicts the conventions, or contradicts the pictures.
         verdicts: What the pictures say of each shape's depth, in a line each.
+        poses: What depth says of readings of the poses, where several fit.
         notes: The comments of the file, as `write_toml` takes them.
     """
 
@@ -62,6 +64,7 @@ class Survey:
     learned: Learned | None
     problems: list[str] = field(default_factory=list)
     verdicts: list[str] = field(default_factory=list)
+    poses: list[str] = field(default_factory=list)
     notes: dict[tuple[int, str], list[str]] = field(default_factory=dict)
 
     @property
@@ -121,13 +124,23 @@ def survey(  # noqa: PLR0913 - each names one thing that a user chooses
         )
     found.sort(key=lambda each: keys.index(each.key))
     how: dict[str, Any] = {"workers": workers, "engine": engine}
-    if conventions is not None:
-        tested = Survey(str(root), tuple(found), None)
-        tested.problems.extend(each.problem for each in found if each.problem)
-        usable = [each.scene for each in found if each.scene is not None]
-        if usable and pictured:
-            _test_depth(tested, _spread(usable, 2 * pictured), None, how)
-        return tested
+    if conventions is None:
+        return _learning(root, found, pictured, how)
+    tested = Survey(str(root), tuple(found), None)
+    tested.problems.extend(each.problem for each in found if each.problem)
+    usable = [each.scene for each in found if each.scene is not None]
+    if usable and pictured:
+        report = _tested(tested, _spread(usable, 2 * pictured), None, how)
+        for verdict in () if report is None else report.worlds:
+            told = f"{_SHARES}: {'; '.join(verdict.lines)}"
+            (tested.problems if verdict.is_wrong else tested.poses).append(f"poses: {told}")
+    return tested
+
+
+def _learning(
+    root: str | Path, found: Sequence[Examined], pictured: int, how: dict[str, Any]
+) -> Survey:
+    """Return the conventions of some scenes, tested by the pictures of some of them."""
     learned = learn(root, found)
     surveyed = Survey(str(root), tuple(found), learned, problems=learned.problems)
     surveyed.notes.update(tables_of_notes(learned))
@@ -139,9 +152,13 @@ def survey(  # noqa: PLR0913 - each names one thing that a user chooses
         keys_there = {each.keys for each in group}
         others = [each.scene for each in learned.verified if each.keys in keys_there and each.scene]
         lines, before = surveyed.notes.setdefault((number, "depth"), []), len(surveyed.verdicts)
+        report = None
         if pictured and teaching:
             teaching, others = _spread(teaching, pictured), _spread(others, pictured)
-            shape = _with_measured_depth(surveyed, shape, teaching, others, how)
+            shape, report = _with_measured_depth(surveyed, shape, teaching, others, how)
+        if shape.poses is None and teaching and teaching[0].remark("world"):
+            notes = surveyed.notes.setdefault((number, "poses"), [])
+            shape = _with_decided_poses(surveyed, shape, teaching[0], report, notes)
         lines += surveyed.verdicts[before:] or ["not compared with pictures"]
         shapes.append(shape)
     learned = replace(learned, conventions=Conventions(tuple(shapes), "the conventions learned"))
@@ -183,8 +200,10 @@ def _with_measured_depth(
     teaching: Sequence[Scene],
     others: Sequence[Scene],
     how: dict[str, Any],
-) -> Shape:
+) -> tuple[Shape, DoctorReport | None]:
     """Return a shape with the depth contract that pictures confirm, as far as they do.
+
+    The doctor's report by that contract comes with it.
 
     Args:
         surveyed: Takes what pictures say, and what is wrong.
@@ -199,19 +218,18 @@ def _with_measured_depth(
     except StereoGenBenchError as error:
         surveyed.problems.append(str(error))
         surveyed.verdicts.append(f"the pictures tell nothing: {error}")
-        return shape
+        return shape, None
     measured = _measured(report, stated, teaching)
     if measured == stated:
-        _test_depth(surveyed, [*teaching, *others], stated, how)
-        return shape
+        return shape, _tested(surveyed, [*teaching, *others], stated, how)
     trial = replace(surveyed, problems=[], verdicts=[])
-    if not _test_depth(trial, others or teaching, measured, how):
+    tested = _tested(trial, others or teaching, measured, how)
+    if tested is None or tested.is_wrong:
         surveyed.problems.append(
             f"depth: {encoding_line(measured)} was measured in {teaching[0].id.key}, and other "
             f"scenes do not have it. `stereogenbench doctor` says more."
         )
-        _test_depth(surveyed, teaching, stated, how)
-        return shape
+        return shape, _tested(surveyed, teaching, stated, how)
     declared = encoding_line(stated)
     what = f"measured: {encoding_line(measured)}, where the files say {declared}"
     if measured.unit_m != stated.unit_m:
@@ -219,7 +237,45 @@ def _with_measured_depth(
     surveyed.verdicts.extend([what, *trial.verdicts])
     if not others:
         surveyed.verdicts.append("there were no other scenes to verify it")
-    return replace(shape, depth=DepthAs(encoding=measured))
+    return replace(shape, depth=DepthAs(encoding=measured)), tested
+
+
+_SHARES: Final = "share of pixels whose depth is found in another frame"
+
+
+def _with_decided_poses(
+    surveyed: Survey, shape: Shape, scene: Scene, report: DoctorReport | None, notes: list[str]
+) -> Shape:
+    """Return a shape with the reading of poses that depth confirms, or as it is.
+
+    Args:
+        surveyed: Takes what depth says, and what stays undecided.
+        shape: Of files of which several readings of the poses fit the rigs.
+        scene: One of its scenes.
+        report: The doctor's, None where no pictures were compared.
+        notes: Of the table of poses.
+    """
+    worlds = () if report is None else report.worlds
+    figures = [f"{_SHARES}: {'; '.join(each.lines)}" for each in worlds]
+    surveyed.poses.extend(f"poses: {each}" for each in figures)
+    chosen = worlds[0].chosen if len(worlds) == 1 else ""
+    if chosen:
+        notes += figures
+        return replace(shape, poses=PosesAs.of_reading(chosen))
+    fields = (PAIR_FIELDS | VIEW_FIELDS).items()
+    refused = ", ".join(name for name, each in fields if "world" in each.held_up_by)
+    why = "" if figures else "no pictures were compared, and "
+    listed = "; ".join(each.partition(" @ ")[0] for each in str(scene.pose_form).split("|"))
+    notes += [
+        *figures,
+        f"NOT DECIDED: {why}these readings fit the rigs alike: {listed}",
+        f"refused until [poses] names one of them: {refused}",
+    ]
+    told = "; ".join(figures) or why.removesuffix(", and ")
+    surveyed.problems.append(
+        f"{scene.id.key}: poses are not decided: {told}. Fields that are refused: {refused}."
+    )
+    return shape
 
 
 def _measured(
@@ -244,15 +300,15 @@ def _measured(
     return replace(stated, **found)
 
 
-def _test_depth(
+def _tested(
     surveyed: Survey, scenes: Sequence[Scene], depth: DepthEncoding | None, how: dict[str, Any]
-) -> bool:
-    """Return whether pictures do not contradict a contract, and note what they say."""
+) -> DoctorReport | None:
+    """Return what pictures say of a contract and note it; None where they cannot be compared."""
     try:
         report = _diagnosed(surveyed.root, scenes, depth, how)
     except StereoGenBenchError as error:
         surveyed.problems.append(str(error))
-        return False
+        return None
     for verdict in report.verdicts:
         line = f"pictures of {counted(len(verdict.scenes), 'scene')}: {_in_words(verdict)}"
         surveyed.verdicts.append(line)
@@ -260,7 +316,7 @@ def _test_depth(
             surveyed.problems.append(f"depth, {', '.join(verdict.scenes[:3])}: {line}")
     if report.left_out:
         surveyed.verdicts.append(f"{len(report.left_out)} scenes have rigs that are not rectified")
-    return not report.is_wrong
+    return report
 
 
 def _in_words(verdict: Verdict) -> str:

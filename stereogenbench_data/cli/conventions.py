@@ -77,10 +77,9 @@ def conventions(  # noqa: PLR0913 - one parameter an option
     usable = sum(each.scene is not None for each in found.examined)
     verified = "" if found.learned is None else f", {len(found.learned.verified)} verified the rest"
     typer.echo(f"{counted(usable, 'scene')} of {len(found.examined)} read{verified}", err=True)
-    for line in found.verdicts:
-        typer.echo(f"depth: {plain_line(line)}", err=True)
-    for line in found.problems:
-        typer.echo(f"NOT SETTLED: {plain_line(line)}", err=True)
+    told = [f"depth: {line}" for line in found.verdicts] + found.poses
+    told += [f"NOT SETTLED: {line}" for line in found.problems]
+    typer.echo("".join(f"{plain_line(line)}\n" for line in told), err=True, nl=False)
     if check is not None:
         typer.echo(f"{check}: {'contradicted' if found.problems else 'fits'}", err=True)
     elif out is not None:

@@ -147,17 +147,8 @@ def _lines(report: "DoctorReport") -> list[str]:
 
 def _world_lines(report: "DoctorReport") -> list[str]:
     """Return which of several readings of the poses depth confirms from frame to frame."""
-    worlds = report.worlds
-    if worlds is None:
-        return []
-    verdict = f"right: {worlds.chosen}" if worlds.chosen else f"cannot tell: {worlds.reason}"
-    return [
-        "",
-        "Several readings of the poses fit the rigs. Depth of one frame is found in another for:",
-        *(f"  {one:.0%}, in other scenes {other:.0%}: {name}"
-          for name, (one, other) in worlds.shares.items()),
-        f"Poses, {verdict}",
-    ]  # fmt: skip
+    head = "Several readings of the poses fit the rigs; pixels whose depth is found in other frames"
+    return [line for each in report.worlds for line in ("", f"{head}:", *each.lines)]
 
 
 def _conclusion(verdict: "Verdict") -> list[str]:

@@ -106,7 +106,8 @@ def understood_poses(
         reason = str(error).removeprefix(f"{where}: ").rstrip(".?")
     with suppress(SchemaError):
         own = _fitting(readings(recorded), rig, where=where)
-    if found is not None and (own is None or not own.is_named or _same(found.poses, own.poses)):
+    own_poses = own.poses if own is not None and own.is_named else None
+    if found is not None and (own_poses is None or same_poses(found.poses, own_poses)):
         return replace(found, form="|".join(found.names))
     reason = reason or "the file names another form, which fits as well and differs"
     fits = "" if own is None else f" What fits is: {shortened(own.names[0], 300)}."
@@ -316,7 +317,8 @@ _ROUGH: Final = 0.1
 """How far the median of distances may be from a unit before they are compared one by one."""
 
 
-def _same(first: CameraPoses, other: CameraPoses) -> bool:
+def same_poses(first: CameraPoses, other: CameraPoses) -> bool:
+    """Return whether two readings are the same poses, seen from the first place of camera 0."""
     return _same_rig(first, other) and _same_world(first, other)
 
 

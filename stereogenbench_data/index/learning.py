@@ -31,7 +31,6 @@ from stereogenbench_data.schema.conventions import (
 )
 from stereogenbench_data.schema.document import parse_object
 from stereogenbench_data.schema.parse import parse_scene_key, see_rig
-from stereogenbench_data.schema.quantities import UNITS_M
 from stereogenbench_data.schema.records import (
     DepthEncoding,
     DepthUnitSource,
@@ -210,17 +209,15 @@ def _learned_poses(folder: SceneFolder, scene: Scene) -> tuple[PosesAs | None, l
         found = understood_poses(text, scene.rig, where=where)
     except SchemaError as error:
         return None, [f"not understood: {error}"]
-    name, _, unit_m = found.names[0].partition(" @ ")
+    name = found.names[0]
     notes = pose_evidence(found.poses, scene.rig)
     read = set(name.partition(": ")[0].split(" and "))
     others = [block.key for block in record_poses(text, where=where).blocks]
     if not_read := [each for each in dict.fromkeys(others) if each not in read]:
         notes.append(f"numbers of six cameras that are not read: {', '.join(not_read[:6])}")
     if scene.remark("world"):
-        listed = "; ".join(each.partition(" @ ")[0] for each in found.names)
-        return None, [*notes, f"not decided, name one of these: {listed}"]
-    unit = next(each for each, metres in UNITS_M.items() if np.isclose(metres, float(unit_m)))
-    return PosesAs.of_reading(name, unit=unit), notes
+        return None, notes
+    return PosesAs.of_reading(name), notes
 
 
 def pose_evidence(poses: CameraPoses, rig: Rig) -> list[str]:
@@ -308,7 +305,7 @@ def learn(root: str | Path, examined: Sequence[Examined]) -> Learned:
     problems += [
         f"{group[0].key}: poses: {group[0].notes['poses'][-1]}"
         for shape, group in shapes
-        if group[0].scene is not None and shape.poses is None
+        if group[0].scene is not None and shape.poses is None and not group[0].scene.remark("world")
     ]
     conventions = Conventions(tuple(shape for shape, _ in shapes), "the conventions learned")
     learned = Learned(conventions, [group for _, group in shapes], problems=problems)

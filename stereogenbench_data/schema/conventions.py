@@ -17,6 +17,7 @@ files have the keys that it names.
 import difflib
 import functools
 import json
+import math
 import re
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -114,17 +115,19 @@ class PosesAs:
     unit: str | None = None
 
     @classmethod
-    def of_reading(cls, name: str, *, unit: str) -> "PosesAs":
-        """Return what the name of a reading says."""
+    def of_reading(cls, name: str) -> "PosesAs":
+        """Return what the name of a reading says, with its metres in a unit or without."""
+        name, _, unit_m = name.partition(" @ ")
         places, _, rest = name.partition(": ")
         location, _, rotation = places.rpartition(" and ")
         form, axes = rest.split(", ")[:2]
-        return cls(location=location or None, rotation=rotation, form=form,
-                   axes=axes.removesuffix(" axes"), unit=unit)  # fmt: skip
+        known = (unit for unit, metres in UNITS_M.items() if math.isclose(metres, float(unit_m)))
+        unit, axes = next(known) if unit_m else None, axes.removesuffix(" axes")
+        return cls(location=location or None, rotation=rotation, form=form, axes=axes, unit=unit)
 
     def fits(self, name: str) -> bool:
         """Return whether the reading of a name is one of these."""
-        found = self.of_reading(name, unit="")
+        found = self.of_reading(name)
         return all(
             getattr(self, part) in (None, getattr(found, part))
             for part in ("location", "rotation", "form", "axes")

@@ -1,28 +1,34 @@
 """Which reading of the poses is right, by depth from frame to frame."""
 
 import json
+import re
+import shutil
 from contextlib import closing
 
 import pytest
+import torch
 
 from stereogenbench_data.audit.contract.matching import SceneFrames
 from stereogenbench_data.audit.contract.worlds import explained_shares, judge_worlds
 from stereogenbench_data.audit.scene_access import SceneAccess
+from stereogenbench_data.datasets.mapped import SceneViews
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.pose_forms import readings
 from stereogenbench_data.index.assumptions import AssumptionWarning
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.streams import Streams
+from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.trajectory import record_poses
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
+from tests.cli.command import invoke
 
 RIGHT, WRONG = "opencv", "opengl"
 
 
 def scenes(*shares):
-    return [{RIGHT: right, WRONG: wrong} for right, wrong in shares]
+    return [{RIGHT: (right, right), WRONG: (wrong, wrong)} for right, wrong in shares]
 
 
 def test_a_reading_that_explains_most_pixels_and_is_well_ahead_is_right():
@@ -35,11 +41,11 @@ def test_a_reading_that_explains_most_pixels_and_is_well_ahead_is_right():
 @pytest.mark.parametrize(
     ("shares", "reason"),
     [
-        ([(0.9, 0.5)], "fewer than two scenes"),
-        ([(0.5, 0.1), (0.5, 0.1)], "no reading explains 60% of the pixels of the scenes that cho"),
-        ([(0.95, 0.9), (0.95, 0.9)], "no reading is 20% ahead in the scenes that choose"),
-        ([(0.95, 0.3), (0.3, 0.95)], "no reading explains 60% of the pixels of the scenes that co"),
-        ([(0.95, 0.3), (0.95, 0.9)], "no reading is 20% ahead in the scenes that confirm"),
+        ([(0.9, 0.8)], "no reading is 20% ahead in the choosing camera"),
+        ([(0.5, 0.1), (0.5, 0.1)], "no reading explains 60% of the pixels of the choosing scenes"),
+        ([(0.95, 0.9), (0.95, 0.9)], "no reading is 20% ahead in the choosing scenes"),
+        ([(0.95, 0.3), (0.3, 0.95)], "no reading explains 60% of the pixels of the confirming sce"),
+        ([(0.95, 0.3), (0.95, 0.9)], "no reading is 20% ahead in the confirming scenes"),
     ],
 )
 def test_what_pictures_cannot_tell_stays_open(shares, reason):
@@ -49,22 +55,49 @@ def test_what_pictures_cannot_tell_stays_open(shares, reason):
     assert verdict.reason.startswith(reason)
 
 
-def test_depth_tells_which_way_a_camera_looks(tmp_path):
-    request = SynthRequest(family="Uniform", scenes=1, size_px=64, frames=9, seed=6)
-    synthesise(tmp_path, request)
-    (path,) = tmp_path.rglob("trajectory.json")
+def test_a_second_camera_must_confirm_what_one_camera_of_one_scene_chooses():
+    verdict = judge_worlds([{RIGHT: (0.9, 0.3), WRONG: (0.1, 0.9)}])
+
+    assert verdict.chosen == ""
+    assert "confirming camera" in verdict.reason
+    assert judge_worlds(scenes((0.9, 0.1))).chosen == RIGHT
+
+
+def test_a_reading_that_does_not_fit_all_scenes_is_none():
+    assert judge_worlds([{RIGHT: (0.9, 0.9)}, {WRONG: (0.1, 0.1)}]).chosen == ""
+
+
+def test_conventions_that_state_another_reading_are_wrong():
+    assert judge_worlds(scenes((0.9, 0.1), (0.9, 0.1)), stated=WRONG).is_wrong
+    assert not judge_worlds(scenes((0.9, 0.1), (0.9, 0.1)), stated=RIGHT).is_wrong
+    assert not judge_worlds(scenes((0.9, 0.8), (0.9, 0.8)), stated=WRONG).is_wrong
+
+
+def write_matrices(root, *, still=False):
+    """Write the poses of a tree's only scene as matrices, OpenCV's, which nothing says."""
+    (path,) = root.rglob("trajectory.json")
     document = json.loads(path.read_text())
     reading = next(readings(record_poses(path.read_bytes(), where="trajectory.json")))
     as_unreal = CameraPoses.from_trajectory(reading.trajectory)
     for frame, poses in enumerate(document["frames"]):
         for camera, pose in enumerate(poses["cameras"]):
             pose.pop("rotation"), pose.pop("location")
-            pose["pose"] = as_unreal.world_from_cam(frame, camera).tolist()
-    del document["rotation_representation"]
-    path.write_text(json.dumps(document | {"unit": "m"}))
+            pose["pose"] = as_unreal.world_from_cam(0 if still else frame, camera).tolist()
+    path.write_text(json.dumps({"frames": document["frames"], "unit": "m"}))
 
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A tree of one scene of matrices."""
+    root = tmp_path_factory.mktemp("small")
+    synthesise(root, SynthRequest(family="Uniform", scenes=1, size_px=64, frames=9, seed=6))
+    write_matrices(root)
+    return root
+
+
+def test_depth_tells_which_way_a_camera_looks(small):
     with pytest.warns(AssumptionWarning, match="several readings of the poses fit"):
-        index = SceneIndex.open(tmp_path)
+        index = SceneIndex.open(small)
     scene = index.scene(0)
     source = SceneAccess.of(index, scene).source()
     with closing(Streams(source)) as streams:
@@ -72,8 +105,53 @@ def test_depth_tells_which_way_a_camera_looks(tmp_path):
         text = source.read(scene, "trajectory.json")
         shares = explained_shares(views, text, scene.pose_form.split("|"))
 
-    (right, most), (wrong, least) = sorted(shares.items(), key=lambda each: -each[1])
+    (right, most), (wrong, least) = sorted(shares.items(), key=lambda each: -each[1][0])
     assert "opencv axes" in right
     assert "opengl axes" in wrong
-    assert most > 0.8
-    assert most - least > 0.1
+    assert min(most) > 0.8
+    assert most[0] - least[0] > 0.1
+
+
+def test_conventions_of_poses_that_depth_does_not_tell_stay_open_and_say_what_is_refused(
+    tmp_path,
+):
+    root, file = tmp_path / "still", tmp_path / "c.toml"
+    synthesise(root, SynthRequest(family="Uniform", scenes=1, size_px=64, frames=2, seed=6))
+    write_matrices(root, still=True)
+
+    result = invoke("conventions", root, "-o", file, "--pictures", 1, "--workers", 1)
+
+    assert result.exit_code == 1
+    assert Conventions.read(file).shapes[0].poses is None
+    for told in (result.stderr, file.read_text()):
+        assert "opencv axes" in told
+        assert "opengl axes" in told
+        assert "world_from_left" in told
+        assert re.search(r"\d%.*cannot tell", told)
+
+
+def moved(root, **options):
+    """The motion of camera 0 from the first frame to frame 40."""
+    views = SceneViews(root, cameras=(0,), fields=("world_from_cam",), frames=(0, 40), **options)
+    first, later = (views[row]["world_from_cam"] for row in (0, 1))
+    return torch.linalg.inv(first) @ later
+
+
+def test_conventions_take_the_reading_that_depth_confirms_and_refuse_another(
+    shared_scenes, tmp_path
+):
+    root, file, edited = (tmp_path / name for name in ("tree", "c.toml", "edited.toml"))
+    shutil.copytree(shared_scenes, root, copy_function=shutil.copyfile)
+    plain = moved(root)
+    write_matrices(root)
+    options = ("--pictures", 1, "--workers", 1)
+
+    learned = invoke("conventions", root, "-o", file, *options)
+    edited.write_text(file.read_text().replace('axes = "opencv"', 'axes = "opengl"'))
+    checked = invoke("conventions", root, "--check", edited, *options)
+
+    assert learned.exit_code == 0, learned.stderr
+    assert re.search(r"# .*78%.*opencv axes.*\n\[poses\]", file.read_text())
+    torch.testing.assert_close(moved(root, conventions=file), plain)
+    assert checked.exit_code == 1
+    assert re.search(r"78%.*opencv.*WRONG.*opengl", checked.stderr)

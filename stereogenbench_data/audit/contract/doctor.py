@@ -21,13 +21,17 @@ from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis, diagnos
 from stereogenbench_data.audit.contract.matching import SceneFrames
 from stereogenbench_data.audit.contract.verdict import Verdict, group_by_contract, judge
 from stereogenbench_data.audit.contract.worlds import (
+    Shares,
     WorldVerdict,
     explained_shares,
+    is_stated,
     judge_worlds,
+    rival_readings,
 )
 from stereogenbench_data.audit.scene_access import SceneAccess
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.index.evidence import shape_of
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.conventions import depth_of
@@ -48,19 +52,22 @@ class DoctorReport:
         scenes: Each scene's own diagnosis, sorted by key.
         verdicts: One for each group of scenes with the same contract, the largest group first.
         left_out: Maps the keys of scenes that cannot be judged to the reason.
-        worlds: Which of several readings of the poses is right; None where one alone fits the rigs.
+        worlds: Which of several readings of the poses is right, for each shape of files of which
+            not one alone fits the rigs.
     """
 
     data: str
     scenes: tuple[SceneDiagnosis, ...]
     verdicts: tuple[Verdict, ...]
     left_out: dict[str, str]
-    worlds: WorldVerdict | None = None
+    worlds: tuple[WorldVerdict, ...] = ()
 
     @property
     def is_wrong(self) -> bool:
-        """Whether another contract is clearly better, or a camera does not fit, in any scene."""
-        return any(verdict.is_wrong for verdict in self.verdicts)
+        """Whether another contract or reading of poses is clearly better, or a camera is odd."""
+        return any(each.is_wrong for each in self.verdicts) or any(
+            each.is_wrong for each in self.worlds
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,13 +134,14 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
         DiagnosisTask(SceneAccess.of(index, scene), frames, depth or depth_of(scene))
         for scene in (index.scene(int(row)) for row in chosen)
     ]
-    found, shares = [], []
+    found: list[SceneDiagnosis] = []
+    shares: dict[str, Shares] = {}
     contracts = {task.access.key: task.encoding for task in tasks}
     results = engine.map(_diagnose, tasks, name=lambda task: task.access.key, workers=workers)
     with closing(results):
         for diagnosis, explained in results:
             found.append(diagnosis)
-            shares += [explained] if explained else []
+            shares |= {diagnosis.key: explained} if explained else {}
             if progress is not None:
                 progress(len(found), len(tasks))
     found.sort(key=lambda diagnosis: diagnosis.key)
@@ -144,17 +152,24 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
     ]
     groups.sort(key=len, reverse=True)
     verdicts = tuple(judge(group, declared=contracts[group[0].key]) for group in groups)
-    worlds = judge_worlds(shares) if shares else None
-    return DoctorReport(index.where, tuple(found), verdicts, left_out, worlds)
+    worlds: dict[tuple[str, str], list[Shares]] = {}
+    for scene in (task.access.scene for task in tasks if task.access.key in shares):
+        taken = str(scene.pose_form)
+        is_one = is_stated(scene) and "|" not in taken
+        about = shape_of(taken), taken if is_one else ""
+        worlds.setdefault(about, []).append(shares[scene.id.key])
+    judged = tuple(judge_worlds(each, stated=stated) for (_, stated), each in worlds.items())
+    return DoctorReport(index.where, tuple(found), verdicts, left_out, judged)
 
 
-def _diagnose(task: DiagnosisTask, after_bytes: Advance) -> tuple[SceneDiagnosis, dict[str, float]]:
+def _diagnose(task: DiagnosisTask, after_bytes: Advance) -> tuple[SceneDiagnosis, Shares]:
     """Return a scene's diagnosis, and what each reading of its poses explains if several fit."""
     after_bytes(0)
     scene = task.access.scene
     with task.scene_frames() as views:
-        shares = {}
-        if scene.remark("world") and scene.pose_form:
+        shares: Shares = {}
+        if scene.pose_form and (scene.remark("world") or is_stated(scene)):
             text = task.access.source().read(scene, TRAJECTORY_JSON)
-            shares = explained_shares(views, text, scene.pose_form.split("|"))
+            names = rival_readings(scene, text)
+            shares = explained_shares(views, text, names) if len(names) > 1 else {}
         return diagnose_scene(views, frames=task.frames), shares

@@ -4,10 +4,11 @@ The rig alone does not tell a camera that looks ahead from one that looks back, 
 mirror image (`index.evidence`). Depth does: a pixel of one frame, taken by the poses to another
 frame of the same camera, must lie where that frame's depth says. The truth may not be among the
 readings, so the best must explain most pixels, be well ahead of the next, and do both in scenes
-that were not used to choose it.
+that were not used to choose it, or with a camera that was not, where there is one scene.
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -19,9 +20,12 @@ from stereogenbench_data.audit.geometry.reprojection import (
     MeasuredDepth,
     reproject,
 )
+from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.geometry.pose import CameraPoses
-from stereogenbench_data.index.evidence import poses_as
+from stereogenbench_data.index.evidence import poses_as, same_poses, understood_poses
 from stereogenbench_data.media.depth import depth_m_from_units
+from stereogenbench_data.schema.conventions import shape_of_text
+from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
 LEAST_SHARE: Final = 0.6
@@ -32,6 +36,11 @@ LEAST_MARGIN: Final = 0.2
 
 _LEAST_PIXELS: Final = 200
 _STEPS: Final = (8, 4, 2)
+_CAMERAS: Final = (0, CAMERA_COUNT - 1)
+
+Shares = Mapping[str, tuple[float, float]]
+"""For each reading, the share of pixels that it explains: where it is chosen, and where the choice
+is confirmed. Of one scene these are two cameras, of several scenes one half and the other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,18 +49,58 @@ class WorldVerdict:
 
     Attributes:
         chosen: The reading that is right; "" where the pictures cannot tell.
-        shares: For each reading, the share of pixels that it explains: of the scenes that chose it,
-            and of the others.
+        shares: What each reading explains.
         reason: Why the pictures cannot tell; "" where they do.
+        stated: The reading that conventions state; "" where they state none.
     """
 
     chosen: str
-    shares: Mapping[str, tuple[float, float]]
+    shares: Shares
     reason: str
+    stated: str = ""
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether another reading is right than the one that conventions state."""
+        return bool(self.stated and self.chosen) and self.stated != self.chosen
+
+    @property
+    def lines(self) -> list[str]:
+        """The figures of each reading, the best first, and the verdict."""
+        ranked = sorted(self.shares.items(), key=lambda each: each[1], reverse=True)
+        listed = [f"{one:.0%}, again {other:.0%}: {name}" for name, (one, other) in ranked]
+        verdict = f"right: {self.chosen}" if self.chosen else f"cannot tell: {self.reason}"
+        wrong = [f"WRONG: the conventions state {self.stated}"] if self.is_wrong else []
+        return [each.partition(" @ ")[0] for each in (*listed, verdict, *wrong)]
 
 
-def explained_shares(views: SceneFrames, text: bytes, names: Sequence[str]) -> dict[str, float]:
-    """Return the share of comparable pixels that each reading explains; 0 where they are few.
+def is_stated(scene: Scene) -> bool:
+    """Return whether conventions state how a scene's poses are read."""
+    return scene.conventions is not None and shape_of_text(scene.conventions).poses is not None
+
+
+def rival_readings(scene: Scene, text: bytes) -> tuple[str, ...]:
+    """Return the readings that fit a scene's rig and differ; that of its row comes first.
+
+    Args:
+        scene: The row.
+        text: Its ``trajectory.json``.
+    """
+    where = scene.id.key
+    names = scene.pose_form.split("|") if scene.pose_form else []
+    if names and is_stated(scene):
+        with suppress(SchemaError):  # what conventions state is all that fits
+            names += understood_poses(text, scene.rig, where=where).names
+    found: dict[str, CameraPoses] = {}
+    for name in names:
+        poses = poses_as(text, name, where=where)
+        if not any(same_poses(poses, other) for other in found.values()):
+            found[name] = poses
+    return tuple(found)
+
+
+def explained_shares(views: SceneFrames, text: bytes, names: Sequence[str]) -> Shares:
+    """Return the shares of comparable pixels that each reading explains; 0 where they are few.
 
     Args:
         views: The scene's depth.
@@ -66,18 +115,18 @@ def explained_shares(views: SceneFrames, text: bytes, names: Sequence[str]) -> d
     last = views.scene.frames - 1
     steps = sorted({max(1, last // step) for step in _STEPS} if last else ())
     moves = [(first, first + step) for step in steps for first in {0, last - step}]
-    cameras = (0, CAMERA_COUNT - 1)
     depths = {
         (frame, camera): _depth(views, frame, camera)
         for frame in sorted({frame for move in moves for frame in move})
-        for camera in cameras
+        for camera in _CAMERAS
     }
     found = {}
     for name in names:
         poses = poses_as(text, name, where=where)
-        counts = np.zeros(2, dtype=np.int64)
-        for first, later in moves:
-            for camera in cameras:
+        shares = []
+        for camera in _CAMERAS:
+            counts = np.zeros(2, dtype=np.int64)
+            for first, later in moves:
                 errors = reproject(
                     depths[first, camera],
                     depths[later, camera],
@@ -86,35 +135,44 @@ def explained_shares(views: SceneFrames, text: bytes, names: Sequence[str]) -> d
                     most_pixels=FEWER_PIXELS,
                 )
                 counts += (errors.agreeing, errors.unhidden)
-        agreeing, unhidden = counts.tolist()
-        found[name] = agreeing / unhidden if unhidden >= _LEAST_PIXELS else 0.0
+            agreeing, unhidden = counts.tolist()
+            shares.append(agreeing / unhidden if unhidden >= _LEAST_PIXELS else 0.0)
+        found[name] = shares[0], shares[1]
     return found
 
 
-def judge_worlds(scenes: Sequence[Mapping[str, float]]) -> WorldVerdict:
+def judge_worlds(scenes: Sequence[Shares], *, stated: str = "") -> WorldVerdict:
     """Return which reading is right, by `explained_shares` of some scenes.
 
-    Every other scene chooses, and those between must confirm the choice.
+    Every other scene chooses, and those between must confirm the choice; of one scene, one camera
+    chooses and another confirms.
+
+    Args:
+        scenes: At least one.
+        stated: The reading that conventions state.
     """
-    names = sorted(set.intersection(*(set(scene) for scene in scenes))) if scenes else []
-    shares = {name: (_mean(scenes[::2], name), _mean(scenes[1::2], name)) for name in names}
-    if len(scenes) < 2 or not names:
-        return WorldVerdict("", shares, "fewer than two scenes have these readings")
+    names = sorted(set.intersection(*map(set, scenes)))
+    if not names:
+        return WorldVerdict("", {}, "no reading fits all scenes", stated)
+    shares = scenes[0]
+    if len(scenes) > 1:
+        shares = {name: (_mean(scenes[::2], name), _mean(scenes[1::2], name)) for name in names}
     best = max(names, key=lambda name: shares[name][0])
-    for half, who in enumerate(("that choose", "that confirm")):
+    kind = "scenes" if len(scenes) > 1 else "camera"
+    for half, who in enumerate(("choosing", "confirming")):
         others = [shares[name][half] for name in names if name != best]
         if shares[best][half] < LEAST_SHARE:
-            reason = f"no reading explains {LEAST_SHARE:.0%} of the pixels of the scenes {who}"
+            reason = f"no reading explains {LEAST_SHARE:.0%} of the pixels of the {who} {kind}"
         elif others and shares[best][half] - max(others) < LEAST_MARGIN:
-            reason = f"no reading is {LEAST_MARGIN:.0%} ahead in the scenes {who}"
+            reason = f"no reading is {LEAST_MARGIN:.0%} ahead in the {who} {kind}"
         else:
             continue
-        return WorldVerdict("", shares, reason)
-    return WorldVerdict(best, shares, "")
+        return WorldVerdict("", shares, reason, stated)
+    return WorldVerdict(best, shares, "", stated)
 
 
-def _mean(scenes: Sequence[Mapping[str, float]], name: str) -> float:
-    return float(np.mean([scene[name] for scene in scenes])) if scenes else float("nan")
+def _mean(scenes: Sequence[Shares], name: str) -> float:
+    return float(np.mean([scene[name] for scene in scenes]))
 
 
 def _moved(poses: CameraPoses, camera: int, first: int, later: int) -> np.ndarray:
