@@ -5,6 +5,8 @@ tested on some scenes, changed where nothing states it and the pictures are sure
 on other scenes. Where several readings of the poses fit the rigs, depth decides between them.
 """
 
+import functools
+import re
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -163,8 +165,31 @@ def _learning(
         shapes.append(shape)
     learned = replace(learned, conventions=Conventions(tuple(shapes), "the conventions learned"))
     surveyed = replace(surveyed, learned=learned)
+    surveyed = replace(surveyed, problems=_alike_once(surveyed))
     surveyed.notes[-1, ""] = _head(surveyed)
     return surveyed
+
+
+def _alike_once(surveyed: Survey) -> list[str]:
+    """Return problems, one of those that are alike, and what may be stated about keys not read."""
+    keys = sorted((each.key for each in surveyed.examined), key=len, reverse=True)
+    alike: dict[str, list[str]] = {}
+    for problem in surveyed.problems:
+        plain = functools.reduce(lambda text, key: text.replace(key, ""), keys, problem)
+        alike.setdefault(re.sub(r"[0-9.]+", "#", plain), []).append(" ".join(problem.split()))
+    told = [
+        f"{group[0]}{f' ({len(group) - 1} alike)' if len(group) > 1 else ''}"
+        for group in alike.values()
+    ]
+    unread = sorted({key for each in surveyed.examined if each.scene is None
+                     for key in each.unknown})  # fmt: skip
+    if unread:
+        told.append(
+            f"nobody reads these keys of baseline.json: {', '.join(unread[:12])}. If one is what "
+            f"is missing, add its table to the file, such as [focal_length], [field_of_view] or "
+            f'[sensor_width] with place = "{unread[0]}", and test it with --check'
+        )
+    return told
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,7 +38,7 @@ _ROTATION: Final = {
 }  # fmt: skip
 _NO_POSE: Final = {
     "scale", "scale3d", "velocity", "forward", "up", "right", "target", "lookat", "color",
-    "relative", "local", "character", "subject", "intrinsics", "intrinsic", "k",
+    "relative", "local", "character", "subject", "intrinsics", "intrinsic", "k", "look", "focus",
 }  # fmt: skip
 
 AXES: Final[dict[str, tuple[tuple[int, int], ...]]] = {

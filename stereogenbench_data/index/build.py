@@ -41,6 +41,12 @@ from stereogenbench_data.sources.location import is_remote, shown
 _NAMED: Final = 6
 ALIKE: Final = 20
 """How many scenes that are broken for one reason show that it is the format."""
+FORMAT_CURE: Final = (
+    "Names that are understood stand in docs/formats.md. For others, write where a quantity stands "
+    "into a file of conventions: `stereogenbench conventions {root} -o c.toml` lists the keys that "
+    'nobody reads; add a table, such as [field_of_view] with place = "$.camera_intrinsics.angle", '
+    "and give the file as conventions= or --conventions."
+)
 POOL_FROM: Final = 64
 """How many scenes there must be for worker processes to be worth their start."""
 
@@ -166,8 +172,8 @@ def require_not_all_alike(root: str | Path, outcomes: Iterable[Outcome]) -> None
     if len(kinds) == 1 and first.kind == "broken":
         raise StorageError(
             f"{shown(root)}: the first {ALIKE} scenes cannot be used, all for one reason, so it is "
-            f"the format of the files and no single scene. The first: {first.reason}\nThe names "
-            f"that are understood stand in docs/formats.md; ask for others with this message."
+            f"the format of the files and no single scene. The first: {first.reason}\n"
+            f"{FORMAT_CURE.format(root=shown(root))}"
         )
 
 

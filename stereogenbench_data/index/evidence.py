@@ -44,7 +44,7 @@ _SHOWN: Final = 4
 
 
 class SidesError(SchemaError):
-    """Poses fit a rig, but for which camera is left: that is stated in two ways."""
+    """Poses fit a rig but for what baselines are, or which camera is left: that is stated twice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,6 +131,7 @@ def _readings_as(recorded: RecordedPoses, named: PosesAs) -> Iterator[Reading]:
 def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
     """Return the poses of the first tier of readings that fit a rig, as `understood_poses` says."""
     failures: dict[str, str] = {}
+    scaled: list[str] = []
     loose: list[_Passed] = []
     exact: list[_Passed] = []
     reversed_: list[_Passed] = []
@@ -141,6 +142,7 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
             checked = _checked(reading, rig)
             if isinstance(checked, str):
                 failures.setdefault(checked, reading.name)
+                scaled += [checked] if reading.tier == 0 and _IN_ANOTHER_UNIT in checked else []
             elif _is_reversed(checked.poses, rig):
                 reversed_.append(checked)
             else:
@@ -154,6 +156,8 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
             f"{where}: by its poses ({reversed_[0].reading.name}), camera {left} is to the right "
             f"of camera {right}, and by baseline.json it is the left one. Correct one of them."
         )
+    if scaled and not passed:
+        raise SidesError(f"{where}: {scaled[0]}. Correct the unit of one of them.")
     if not passed:
         tried = "; ".join(f"{reason} ({name})" for reason, name in list(failures.items())[:_SHOWN])
         raise SchemaError(
@@ -282,10 +286,13 @@ def _checked(reading: Reading, rig: Rig) -> _Passed | str:
         worst = int(np.argmax(away_cm - allowed_cm))
         frame, pair = divmod(worst, len(CAMERA_PAIRS))
         a, b = CAMERA_PAIRS[pair]
+        power = np.log10(ratio / unit_m) if 0 < ratio < np.inf else np.nan
+        scaled_cm = distances * unit_m * 100 * 10.0 ** np.round(power)
+        is_of_ten = bool((np.abs(scaled_cm - baselines_cm) <= allowed_cm).all())
         return (
             f"baseline.json says that cameras {a} and {b} are {baselines_cm[pair]:.6g} cm apart, "
             f"and by the poses they are {distances[frame, pair] * unit_m * 100:.6g} cm apart in "
-            f"frame {frame}"
+            f"frame {frame}{_IN_ANOTHER_UNIT if is_of_ten else ''}"
         )
     poses = replace(poses, unit_m=unit_m)
     lateral_m = lateral_offsets_m(poses)
@@ -313,6 +320,7 @@ def _unit_of(ratio: float, stated_m: float) -> float | None:
     return None
 
 
+_IN_ANOTHER_UNIT: Final = ", as if one of the two were in another unit"
 _ROUGH: Final = 0.1
 """How far the median of distances may be from a unit before they are compared one by one."""
 

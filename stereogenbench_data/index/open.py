@@ -23,7 +23,7 @@ import pyarrow.compute as pc
 from stereogenbench_data.errors import StorageError, describe_os_error, text_without_secrets
 from stereogenbench_data.index.arrow import table_digest
 from stereogenbench_data.index.assumptions import AssumptionWarning, assumptions
-from stereogenbench_data.index.build import TreeReport, walk
+from stereogenbench_data.index.build import FORMAT_CURE, TreeReport, walk
 from stereogenbench_data.index.parquet import (
     INDEX_NAME,
     IndexHead,
@@ -298,8 +298,9 @@ def _of_report(report: TreeReport) -> Opened:
     """
     where = shown(report.root)
     if not report.scenes:
+        cure = f"\n{FORMAT_CURE.format(root=where)}" if report.broken else ""
         raise StorageError(
-            f"{where}: no scene is complete: {_listed(report.broken | report.incomplete)}"
+            f"{where}: no scene is complete: {_listed(report.broken | report.incomplete)}{cure}"
         )
     found = len(report.scenes) + len(report.broken)
     if len(report.broken) > max(1, found * MOST_LEFT_OUT):

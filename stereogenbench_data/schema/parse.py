@@ -35,6 +35,7 @@ from stereogenbench_data.schema.quantities import (
     UNITS_M,
     Node,
     Stated,
+    as_stated,
     length_unit_m,
     nodes_of,
     numbers,
@@ -265,7 +266,7 @@ def parse_rig(
     baselines_cm, first_number = _baselines(document, nodes, findings)
     width, height = _side(nodes, "image_width"), _side(nodes, "image_height")
     width_px, height_px = width or IMAGE_SIZE_PX, height or width or IMAGE_SIZE_PX
-    focal_mm, sensor_width_mm = _lens(nodes, findings, width_px=width)
+    focal_mm, sensor_width_mm = _lens(nodes, findings, width_px=width, aspect=width_px / height_px)
     sensor_height_mm = _length_mm(nodes, "sensor_height", findings)
     for each in numbers(nodes, "focal_y_px"):
         if each.value > 0:
@@ -350,14 +351,16 @@ _LEAST_MM, _MOST_MM = 4.0, 150.0
 """Lengths of cameras whose unit is not written: the release's lenses have 18 to 85 mm."""
 
 
-def _lens(nodes: list[Node], findings: _Findings, *, width_px: int | None) -> tuple[float, float]:
+def _lens(
+    nodes: list[Node], findings: _Findings, *, width_px: int | None, aspect: float
+) -> tuple[float, float]:
     """Return focal length and sensor width in mm.
 
     One of them may follow from a field of view, or a focal length in pixels, which must agree where
     both are there. Where neither is recorded, the sensor is that of the release.
     """
     focal_mm, sensor_mm = (_length_mm(nodes, name, findings) for name in ("focal", "sensor_width"))
-    ratios = _focal_ratios(nodes, width_px=width_px)
+    ratios = _focal_ratios(nodes, width_px=width_px, aspect=aspect)
     if ratios and not findings.problems:
         if not (focal_mm or sensor_mm):
             sensor_mm = SENSOR_MM
@@ -377,19 +380,33 @@ def _lens(nodes: list[Node], findings: _Findings, *, width_px: int | None) -> tu
             findings.problems.append(
                 f"$.camera_intrinsics.{name} is missing; the keys are: {findings.keys}"
             )
-    if findings.shape is not None and focal_mm and sensor_mm:
-        _require_lens(focal_mm, sensor_mm, findings)
+    low, high = _LENSES if findings.shape is None else _FOCAL_LENGTHS
+    if focal_mm and sensor_mm and not low <= focal_mm / sensor_mm <= high:
+        angle = math.degrees(2 * math.atan(0.5 * sensor_mm / focal_mm))
+        findings.problems.append(
+            f"a focal length of {focal_mm:.6g} mm on a sensor {sensor_mm:.6g} mm wide, "
+            f"{focal_mm / sensor_mm:.3g} widths, would see {angle:.3g} degrees, and lenses have "
+            f"{low:g} to {high:g} widths. Correct its unit or its place"
+        )
     return focal_mm or 1.0, sensor_mm or 1.0
 
 
-def _focal_ratios(nodes: list[Node], *, width_px: int | None) -> list[tuple[Stated, float]]:
-    """Return the focal lengths a sensor width that follow from fields of view and pixels."""
+def _focal_ratios(
+    nodes: list[Node], *, width_px: int | None, aspect: float
+) -> list[tuple[Stated, float]]:
+    """Return the focal lengths a sensor width that follow from fields of view and pixels.
+
+    An angle of the height counts only where pixels may be taken to be square.
+    """
     ratios = []
     for each in numbers(nodes, "fov"):
-        is_rad = each.unit.startswith("rad") or (not each.unit and each.value < math.pi)
-        angle = each.value if is_rad else math.radians(each.value)
+        angle = each.value if _is_rad(each) else math.radians(each.value)
         if 0 < angle < math.pi:
             ratios.append((each, 0.5 / math.tan(angle / 2)))
+    for each in numbers(nodes, "fov_y"):
+        angle = each.value if _is_rad(each) else math.radians(each.value)
+        if 0 < angle < math.pi:
+            ratios.append((each, 0.5 / math.tan(angle / 2) / aspect))
     for each in numbers(nodes, "focal_px"):
         is_px = each.unit.startswith("p") or each.path.lower().endswith("x")
         if width_px and is_px and each.value > 0:
@@ -397,18 +414,14 @@ def _focal_ratios(nodes: list[Node], *, width_px: int | None) -> list[tuple[Stat
     return ratios
 
 
-def _require_lens(focal_mm: float, sensor_mm: float, findings: _Findings) -> None:
-    low, high = _FOCAL_LENGTHS
-    if not low <= focal_mm / sensor_mm <= high:
-        findings.problems.append(
-            f"by the conventions a focal length is {focal_mm:.6g} mm on a sensor {sensor_mm:.6g} "
-            f"mm wide, {focal_mm / sensor_mm:.3g} widths, and lenses have {low:g} to {high:g}. "
-            f"Correct the unit or the place"
-        )
+def _is_rad(angle: Stated) -> bool:
+    return angle.unit.startswith("rad") or (not angle.unit and angle.value < math.pi)
 
 
 _FOCAL_LENGTHS: Final = (0.4, 6.0)
 """Focal lengths in widths of the sensor that conventions may mean: the release has 0.76 to 3.6."""
+_LENSES: Final = (0.04, 60.0)
+"""Focal lengths in widths of the sensor that files may mean: 171 degrees to one."""
 _RATIO: Final = 1e-3
 """How far a field of view may be from focal length over sensor width: it is often rounded."""
 
@@ -474,7 +487,9 @@ def _primary_pair(
                 f"found {brief(value)}"
             )
             continue
-        left, right = left - first_number, right - first_number
+        is_named_from_0 = isinstance(value, dict) and _names_camera_0(nodes)
+        first = 0 if is_named_from_0 else first_number
+        left, right = left - first, right - first
         if left == right or not {left, right} <= set(range(CAMERA_COUNT)):
             odd.append(
                 f"{each.path}: names cameras {left} and {right}, and a pair is two of the "
@@ -495,6 +510,12 @@ def _primary_pair(
         )
         findings.remarks.append(Remark("primary pair", told))
     return 0, 1
+
+
+def _names_camera_0(nodes: list[Node]) -> bool:
+    """Return whether a text names camera 0: names may count from 0 beside numbers from 1."""
+    texts = (node.value for node in nodes if isinstance(node.value, str))
+    return any("cam" in text.lower() and camera_of(text) == 0 for text in texts)
 
 
 def _stated_pair(document: dict[str, Any], findings: _Findings) -> list[Stated]:
@@ -548,7 +569,7 @@ def _baselines(
     found = sorted(
         _recorded_lengths(document, nodes, findings),
         key=lambda each: not each[2].path.startswith("$.pairwise_pairs"),
-    )
+    ) or [*_offsets(nodes, length_unit_m(nodes) or 0.01, findings)]
     cameras = {camera for pair, _, each in found for camera in pair if each.unit != _BY_PLACE}
     first_number = 1 if cameras and min(cameras) == 1 and max(cameras) == CAMERA_COUNT else 0
     best: dict[Pair, tuple[float, float, Stated]] = {}
@@ -650,7 +671,7 @@ def _lengths_below(
         cameras = _cameras_of(node) if speaks_of_pairs and isinstance(node, dict) else None
         if cameras is not None and isinstance(node, dict):
             yield from _lengths_of(node, cameras, path, default_m, findings)
-        elif "adjacent" in name and isinstance(node, list) and node and all(map(is_number, node)):
+        elif isinstance(node, list) and _is_of_lengths(node, name):
             yield from _neighbours(node, name, path, default_m, findings)
         elif speaks_of_pairs or isinstance(node, dict):
             for key, value in node.items() if isinstance(node, dict) else enumerate(node):
@@ -677,6 +698,20 @@ def _of_pair(
         yield from _length(pair, value, unit_m, path, findings)
 
 
+def _is_of_lengths(node: list[Any], name: str) -> bool:
+    """Return whether a list is the baselines of neighbours, or two cameras and their baseline."""
+    return ("adjacent" in name and bool(node) and all(map(is_number, node))) or (
+        re.search(r"pair|baseline", name) is not None and _is_triple(node)
+    )
+
+
+def _is_triple(node: list[Any]) -> bool:
+    """Return whether a list is two cameras and their baseline."""
+    cameras = range(CAMERA_COUNT + 1)
+    is_pair = len(node) == 3 and all(type(each) is int and each in cameras for each in node[:2])
+    return is_pair and node[0] != node[1]
+
+
 def _is_row(value: Any, *, of: dict[str, Any] | list[Any]) -> bool:
     """Return whether a value is a row of a table with a number for each two cameras."""
     if isinstance(value, dict):
@@ -687,7 +722,11 @@ def _is_row(value: Any, *, of: dict[str, Any] | list[Any]) -> bool:
 def _neighbours(
     lengths: list[Any], name: str, path: str, default_m: float, findings: _Findings
 ) -> Iterable[_Recorded]:
-    """Yield the baselines of neighbours, of which a list has one each."""
+    """Yield the baselines of neighbours, of which a list has one each, or that of one pair."""
+    if _is_triple(lengths):
+        unit_m = UNITS_M.get(without_unit(name)[1], default_m)
+        yield from _length((lengths[0], lengths[1]), lengths[2], unit_m, path, findings)
+        return
     if len(lengths) != len(ADJACENT_PAIRS):
         findings.problems.append(
             f"{path}: must be a list of {len(ADJACENT_PAIRS)} baselines, found {brief(lengths)}"
@@ -748,10 +787,30 @@ def _lengths_of(
 def _length(
     cameras: Pair, value: object, unit_m: float, path: str, findings: _Findings
 ) -> Iterable[_Recorded]:
-    if not is_number(value) or value <= 0:
+    found = as_stated(value, "", path)
+    if not is_number(found.value) or found.value <= 0:
         findings.problems.append(f"{path}: must be a number above zero, found {brief(value)}")
         return
-    yield cameras, float(value) * (unit_m / 0.01), Stated(value, "", path)
+    unit_m = UNITS_M.get(found.unit, unit_m)
+    yield cameras, float(found.value) * (unit_m / 0.01), replace(found, unit="")
+
+
+def _offsets(nodes: list[Node], default_m: float, findings: _Findings) -> Iterable[_Recorded]:
+    """Yield all baselines by the places of the cameras along the rig, where these are listed."""
+    for node in nodes:
+        places = node.value
+        is_listed = isinstance(places, list) and len(places) == CAMERA_COUNT
+        if not (_PLACES.search(node.plain) and is_listed and all(map(is_number, places))):
+            continue
+        for a, b in CAMERA_PAIRS:
+            unit_m = UNITS_M.get(node.unit, default_m)
+            found = _length((a, b), abs(places[b] - places[a]), unit_m, node.path, findings)
+            for pair, length_cm, each in found:
+                yield pair, length_cm, replace(each, unit=_BY_PLACE)
+        return
+
+
+_PLACES: Final = re.compile(r"offset|lateral|along|(?:camera|rig)_(?:position|place)")
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,11 +21,12 @@ NAMES: Final[dict[str, str]] = {
     "focal": "focal_length current_focal_length focal lens_focal_length lens f_mm",
     "focal_px": "focal_length focal fx focal_length_x fl_x",
     "sensor_width": "sensor_width film_width filmback_width sensor_size_x film_back_width "
-    "horizontal_aperture",
+    "horizontal_aperture horizontal_film_aperture",
     "sensor_height": "sensor_height film_height filmback_height sensor_size_y "
-    "film_back_height vertical_aperture",
+    "film_back_height vertical_aperture vertical_film_aperture",
     "fov": "fov hfov fov_x horizontal_fov field_of_view horizontal_field_of_view fov_horizontal "
-    "fov_angle angle_of_view",
+    "fov_angle angle_of_view angle_x camera_angle_x",
+    "fov_y": "vfov fov_y vertical_fov vertical_field_of_view fov_vertical angle_y camera_angle_y",
     "focal_y_px": "fy focal_length_y fl_y",
     "image_width": "image_width image_size_x resolution_x resolution_width width_px render_width "
     "frame_width image_size_width",
@@ -230,11 +231,11 @@ def stated(nodes: list[Node], quantity: str) -> list[Stated]:
     for node in nodes:
         if node.means:
             if node.means == quantity:
-                found.append((-1, _stated(node.value, node.unit, node.path)))
+                found.append((-1, as_stated(node.value, node.unit, node.path)))
             continue
         for key in (node.plain, f"{node.parent}_{node.plain}", node.name):
             if key in names:
-                found.append((names.index(key), _stated(node.value, node.unit, node.path)))
+                found.append((names.index(key), as_stated(node.value, node.unit, node.path)))
                 break
         if quantity in PAIRS.get(node.plain, ()) and not isinstance(node.value, dict):
             at, value, path = PAIRS[node.plain].index(quantity), node.value, node.path
@@ -263,7 +264,10 @@ def length_unit_m(nodes: list[Node]) -> float | None:
     return None
 
 
-def _stated(value: Any, unit: str, path: str) -> Stated:
+def as_stated(value: Any, unit: str, path: str) -> Stated:
+    """Return a value with its unit, which may stand in it: "32.5 mm", or {"value", "unit"}."""
+    if isinstance(value, dict) and isinstance(value.get("unit"), str) and "value" in value:
+        value, unit = value["value"], words(value["unit"])
     if isinstance(value, list) and len(value) == CAMERA_COUNT and is_number(value[0]):
         value = value[0] if value.count(value[0]) == CAMERA_COUNT else value
     text = _TEXT_NUMBER.match(value) if isinstance(value, str) else None

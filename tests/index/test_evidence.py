@@ -241,6 +241,14 @@ def test_a_unit_that_the_distances_contradict_is_refused(unit):
         understood(json.dumps(document).encode())
 
 
+@pytest.mark.parametrize("unit", ["m", "mm"])
+def test_lengths_that_differ_by_a_unit_are_stated_in_two_ways(unit):
+    document = json.loads(written("rotator", *TURNED)) | {"unit": unit}
+
+    with pytest.raises(SidesError, match="as if one of the two were in another unit"):
+        understood(json.dumps(document).encode())
+
+
 def test_the_poses_of_another_rig_are_refused():
     rotators, places_cm = TURNED
 

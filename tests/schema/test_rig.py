@@ -278,6 +278,9 @@ def test_a_principal_point_that_is_not_understood_stops_no_disparity(rig_documen
         ({"focal_length_mm": [32.5] * 6, "sensor_width_mm": 23.76}, {}),
         ({"FOVAngle": 40.15832, "sensor_width_mm": 23.76}, {}),
         ({"horizontal_fov": 0.70089489, "sensor_width_mm": 23.76}, {}),
+        ({"camera_angle_x": 0.70089489, "sensor_width_mm": 23.76}, {}),
+        ({"vertical_fov_degrees": 30.66233813, "sensor_width_mm": 23.76}, {}),
+        ({"focal_length": {"value": 3.25, "unit": "cm"}, "sensor_width_mm": 23.76}, {}),
     ],
 )  # fmt: skip
 def test_a_lens_is_found_under_likely_keys(rig_document, dumped, intrinsics, size):
@@ -291,6 +294,21 @@ def test_a_lens_is_found_under_likely_keys(rig_document, dumped, intrinsics, siz
     assert rig.focal_mm / rig.sensor_width_mm == pytest.approx(32.5 / 23.76, rel=1e-5)
     assert rig.sensor_height_mm == pytest.approx(17.82)
     assert (rig.image_width_px, rig.image_height_px) == (640, 480)
+
+
+@pytest.mark.parametrize(
+    ("name", "metres", "angle"),
+    [("focal_length_mm", 0.0325, "180 degrees"), ("sensor_width_mm", 0.02376, "0.0419 degrees")],
+)
+def test_a_lens_that_no_camera_has_is_refused_with_its_angle(
+    rig_document, dumped, name, metres, angle
+):
+    rig_document["camera_intrinsics"][name] = metres
+
+    (problem,) = problems_of(rig_document, dumped)
+
+    assert f"{metres:g} mm" in problem
+    assert angle in problem
 
 
 def test_a_lens_that_is_stated_twice_must_agree(rig_document, dumped):
@@ -362,6 +380,18 @@ def pairs_as(document, write):
         pytest.param(
             lambda pairs: {"adjacent_baselines_cm": [cm for a, b, cm in pairs if b == a + 1]},
             id="neighbours alone"),
+        pytest.param(
+            lambda pairs: {"camera_offsets_m": [0.0, *(cm / 100 for a, _, cm in pairs if a == 0)]},
+            id="places along the rig"),
+        pytest.param(lambda pairs: {"pairwise_pairs": [*pairs]}, id="two cameras and a length"),
+        pytest.param(
+            lambda pairs: {"baselines": {f"{a}-{b}": f"{cm / 100!r} m" for a, b, cm in pairs}},
+            id="a unit behind the number"),
+        pytest.param(
+            lambda pairs: {"pairwise_pairs": [
+                {"camera_index_a": a + 1, "camera_index_b": b + 1, "baseline_cm": cm}
+                for a, b, cm in pairs
+            ]}, id="cameras from 1 and names from 0"),
     ],
 )  # fmt: skip
 def test_baselines_are_found_in_likely_forms(rig_document, dumped, write):
@@ -401,7 +431,7 @@ def test_a_camera_outside_the_rig_is_named(rig_document, dumped):
     )
 
 
-@pytest.mark.parametrize("pairs", [{}, [1], [], "x", None, [[0, 1, 6.5]]])
+@pytest.mark.parametrize("pairs", [{}, [1], [], "x", None, [[0, 0, 6.5]]])
 def test_pairs_that_are_not_understood_are_listed_as_missing(rig_document, dumped, pairs):
     rig_document["pairwise_pairs"] = pairs
 
