@@ -66,10 +66,11 @@ def test_keys_that_are_all_written_twice_are_counted_once():
         "    print(error)"
     )
 
-    assert told.startswith("a.json: $.k0 is written twice")
+    assert told.startswith("a.json: ")
+    assert "'k0' is written twice" in told
 
 
-def test_the_path_of_a_repeated_key_is_sought_without_the_paths_of_all_others():
+def test_a_key_written_twice_is_told_without_the_keys_around_it():
     told = run_bounded(
         "from stereogenbench_data.schema.document import parse_object\n"
         "text = '{\"' + 'k' * 4_000_000 + '\": [' + '[],' * 500_000 + '{\"a\":1,\"a\":2}]}'\n"
@@ -81,7 +82,7 @@ def test_the_path_of_a_repeated_key_is_sought_without_the_paths_of_all_others():
         memory_mb=1000,
     )
 
-    assert 'kkk..."][500000].a is written twice' in told
+    assert "'a' is written twice" in told
     assert len(told) < 300
 
 

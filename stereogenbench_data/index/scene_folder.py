@@ -121,8 +121,9 @@ _FILES: Final = frozenset(
 Difference = tuple[str, str]
 """The file's name, empty for the scene's own path, and how it contradicts the index."""
 
-_SAME_M: Final = 1e-6
-_SAME_PX: Final = 1e-3
+_Compared = tuple[str, str, object, object]
+"""A file, the name of a value, the value that the file has, and that of the index."""
+_ROUNDING: Final = {"lateral_m": 1e-6, "rig_residual_px": 1e-3}
 
 
 class IncompleteScene(StorageError):
@@ -831,16 +832,19 @@ def metadata_differences(scene: Scene, texts: Mapping[str, bytes]) -> list[Diffe
         texts: File name to bytes; missing files are not compared.
     """
     found = [*_differing_place(scene)]
-    for names, compare in (
-        ((BASELINE_JSON,), _differing_rig),
-        ((BASELINE_JSON, COMPLETE_JSON), _differing_labels),
-        ((TRAINING_JSON,), _differing_training),
-        ((TRAJECTORY_JSON,), _differing_poses),
-        ((), _differing_caption),
+    for names, values in (
+        ((BASELINE_JSON,), _recorded_rig),
+        ((TRAINING_JSON,), _recorded_derivation),
+        ((TRAJECTORY_JSON,), _recorded_poses),
+        ((), _recorded_caption),
     ):
         if all(name in texts for name in names):
             try:
-                found += compare(scene, texts)
+                found += [
+                    (name, _differs(what, now, indexed))
+                    for name, what, now, indexed in values(scene, texts)
+                    if not _same(now, indexed, within=_ROUNDING.get(what, 0.0))
+                ]
             except SchemaError as error:
                 message = str(error).removeprefix(f"{scene.id.key}/")
                 name, _, reason = message.partition(": ")
@@ -848,8 +852,8 @@ def metadata_differences(scene: Scene, texts: Mapping[str, bytes]) -> list[Diffe
     return list(dict.fromkeys(found))
 
 
-def _difference(name: str, what: str, found: object, indexed: object) -> Difference:
-    return name, f"tells {what} {brief(found)}, and by the index it is {brief(indexed)}"
+def _differs(what: str, found: object, indexed: object) -> str:
+    return f"tells {what} {brief(found)}, and by the index it is {brief(indexed)}"
 
 
 def _differing_place(scene: Scene) -> Iterator[Difference]:
@@ -866,112 +870,93 @@ def _differing_place(scene: Scene) -> Iterator[Difference]:
             yield "", f"{told}, and by the index it is {brief(indexed)}"
 
 
-def _stated_of(scene: Scene) -> Shape | None:
-    """Return what conventions state about a scene's files, by its row."""
-    return None if scene.conventions is None else shape_of_text(scene.conventions)
-
-
-def _differing_rig(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
-    where = f"{scene.id.key}/{BASELINE_JSON}"
-    rig, _, _ = parse_rig(texts[BASELINE_JSON], where=where, shape=_stated_of(scene))
+def _recorded_rig(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[_Compared]:
+    key, shape = scene.id.key, _stated_of(scene)
+    rig, labels, _ = parse_rig(texts[BASELINE_JSON], where=f"{key}/{BASELINE_JSON}", shape=shape)
     recorded = scene.rig
     if recorded.recorded_size_px is not None:
         width_px, height_px = recorded.recorded_size_px
         recorded = replace(
             recorded, image_width_px=width_px, image_height_px=height_px, recorded_size_px=None
         )
-    is_resized = (rig.image_width_px, rig.image_height_px) != _size_px(recorded)
+    is_resized = _size_px(rig) != _size_px(recorded)
+    if is_resized and (rig.image_size_source == "default" or scene.remark("size")):
+        size_px = _size_px(recorded)
+        rig = sized_as_videos(key, rig, size_px, document=None, remarks=[], shape=None)
     for each in fields(Rig):
-        of_size = each.name.startswith(("image_", "principal_", "sensor_height"))
-        if of_size and is_resized and (rig.image_size_source == "default" or scene.remark("size")):
-            continue
-        found, indexed = getattr(rig, each.name), getattr(recorded, each.name)
-        if not _same(found, indexed):
-            yield _difference(BASELINE_JSON, each.name, found, indexed)
+        yield BASELINE_JSON, each.name, getattr(rig, each.name), getattr(recorded, each.name)
+    if COMPLETE_JSON in texts:
+        marked, _ = parse_complete(texts[COMPLETE_JSON], where=f"{key}/{COMPLETE_JSON}")
+        merged = merged_labels(labels, marked)
+        for each in fields(SceneLabels):
+            now, indexed = getattr(merged, each.name), getattr(scene.labels, each.name)
+            is_marked = getattr(labels, each.name) is None and now is not None
+            yield COMPLETE_JSON if is_marked else BASELINE_JSON, each.name, now, indexed
 
 
-def _differing_labels(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
-    key = scene.id.key
-    where = f"{key}/{BASELINE_JSON}"
-    _, labels, _ = parse_rig(texts[BASELINE_JSON], where=where, shape=_stated_of(scene))
-    marked, _ = parse_complete(texts[COMPLETE_JSON], where=f"{key}/{COMPLETE_JSON}")
-    merged = merged_labels(labels, marked)
-    for each in fields(SceneLabels):
-        found, indexed = getattr(merged, each.name), getattr(scene.labels, each.name)
-        if found != indexed:
-            is_marked = getattr(labels, each.name) is None and found is not None
-            yield _difference(
-                COMPLETE_JSON if is_marked else BASELINE_JSON, each.name, found, indexed
-            )
-
-
-def _differing_training(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
-    where = f"{scene.id.key}/{TRAINING_JSON}"
-    document = parse_training(texts[TRAINING_JSON], where=where)
-    derived = derived_scene(scene, document)
-    for what, found, indexed in (
-        ("the key", document.key, scene.id.key),
-        ("the picture size", document.size_px, _size_px(scene.rig)),
-        ("the recorded size", document.source_size_px, scene.rig.recorded_size_px),
-        ("the key frames", document.key_frames, scene.key_frames),
-        *(
-            (name, getattr(derived.training, name), getattr(scene.training, name, None))
-            for name in (each.name for each in fields(TrainingFacts))
-        ),
-    ):
-        if not _same_text(found, indexed):
-            yield _difference(TRAINING_JSON, what, found, indexed)
-    for name, file in document.files.items():
-        member = scene.members.get(name)
-        if member is not None and (member.size, member.crc32) not in (
-            (file.size, file.crc32), (file.size, None),
-        ):  # fmt: skip
-            found = (file.size, file.crc32)
-            yield _difference(TRAINING_JSON, name, found, (member.size, member.crc32))
+def _stated_of(scene: Scene) -> Shape | None:
+    """Return what conventions state about a scene's files, by its row."""
+    return None if scene.conventions is None else shape_of_text(scene.conventions)
 
 
 def _size_px(rig: Rig) -> tuple[int, int]:
     return rig.image_width_px, rig.image_height_px
 
 
-def _same_text(found: object, indexed: object) -> bool:
-    """Return whether two values are equal; nan equals nan."""
-    return repr(found) == repr(indexed)
+def _recorded_derivation(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[_Compared]:
+    where = f"{scene.id.key}/{TRAINING_JSON}"
+    document = parse_training(texts[TRAINING_JSON], where=where)
+    values: dict[str, tuple[object, object]] = {
+        "the key": (document.key, scene.id.key),
+        "the picture size": (document.size_px, _size_px(scene.rig)),
+        "the recorded size": (document.source_size_px, scene.rig.recorded_size_px),
+        "the key frames": (document.key_frames, scene.key_frames),
+    }
+    for each in fields(TrainingFacts):
+        of_index = getattr(scene.training, each.name, None)
+        values[each.name] = getattr(document.facts, each.name), of_index
+    for name, file in document.files.items():
+        member = scene.members.get(name)
+        if member is not None:
+            crc32 = file.crc32 if member.crc32 is None else member.crc32
+            values[name] = (file.size, file.crc32), (member.size, crc32)
+    for what, (now, indexed) in values.items():
+        yield TRAINING_JSON, what, now, indexed
 
 
-def _differing_poses(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
+def _recorded_poses(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[_Compared]:
     if scene.remark("poses"):
         return
-    where = f"{scene.id.key}/{TRAJECTORY_JSON}"
-    shape = _stated_of(scene)
-    poses = poses_as(texts[TRAJECTORY_JSON], scene.pose_form, where=where)
+    text, where, shape = (
+        texts[TRAJECTORY_JSON],
+        f"{scene.id.key}/{TRAJECTORY_JSON}",
+        _stated_of(scene),
+    )
+    poses = poses_as(text, scene.pose_form, where=where)
     if shape is not None and shape.poses is not None:
-        named = shape.poses
-        poses = understood_poses(texts[TRAJECTORY_JSON], scene.rig, where=where, named=named).poses
+        poses = understood_poses(text, scene.rig, where=where, named=shape.poses).poses
     is_longer = poses.frame_count > scene.frames
     if poses.frame_count != scene.frames and not (is_longer and scene.remark("frames")):
-        yield _difference(TRAJECTORY_JSON, "frames", poses.frame_count, scene.frames)
+        yield TRAJECTORY_JSON, "frames", poses.frame_count, scene.frames
         return
-    lateral_m = lateral_offsets_m(poses)
-    if not np.allclose(lateral_m, scene.lateral_m, rtol=0, atol=_SAME_M):
-        places_m = tuple(map(float, lateral_m))
-        yield _difference(TRAJECTORY_JSON, "lateral_m", places_m, scene.lateral_m)
+    yield TRAJECTORY_JSON, "lateral_m", _places_m(poses), scene.lateral_m
     residual_px = rectification_residual_px(poses, recorded_intrinsics(scene.rig))
-    if not math.isclose(residual_px, scene.rig_residual_px, rel_tol=_SAME_PX, abs_tol=_SAME_PX):
-        yield _difference(TRAJECTORY_JSON, "rig_residual_px", residual_px, scene.rig_residual_px)
+    yield TRAJECTORY_JSON, "rig_residual_px", residual_px, scene.rig_residual_px
 
 
-def _differing_caption(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
-    names = [name for name in DESCRIPTIONS if name in texts]
+def _recorded_caption(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[_Compared]:
     caption, _ = caption_of(texts, key=scene.id.key)
-    if names and caption != scene.caption:
-        yield _difference(names[0], "the caption", caption, scene.caption)
+    for name in [name for name in DESCRIPTIONS if name in texts][:1]:
+        yield name, "the caption", caption, scene.caption
 
 
-def _same(found: Any, indexed: Any) -> bool:
-    """Return whether two values are equal; numbers may differ by rounding."""
+def _same(found: Any, indexed: Any, *, within: float = 0.0) -> bool:
+    """Return whether two values are equal; numbers may differ by rounding, and nan equals nan."""
     if isinstance(found, tuple) and isinstance(indexed, tuple):
-        return len(found) == len(indexed) and all(map(_same, found, indexed))
+        return len(found) == len(indexed) and all(
+            _same(one, other, within=within) for one, other in zip(found, indexed, strict=True)
+        )
     if isinstance(found, float) and isinstance(indexed, float):
-        return math.isclose(found, indexed, rel_tol=1e-9)
+        is_close = math.isclose(found, indexed, rel_tol=max(within, 1e-9), abs_tol=within)
+        return is_close or (math.isnan(found) and math.isnan(indexed))
     return bool(found == indexed)

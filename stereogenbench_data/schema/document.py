@@ -3,10 +3,10 @@
 What a document's values mean is found by `quantities`, and of poses by `trajectory`.
 """
 
-import functools
 import json
 import math
 import re
+from collections import Counter
 from typing import Any, Final, TypeGuard
 
 from stereogenbench_data.errors import SchemaError
@@ -83,16 +83,8 @@ def parse_document(text: bytes, *, where: str) -> Any:
     decoded = parse_text(text, where=where)
     if not decoded.strip():
         raise SchemaError(f"{where}: the file is empty. Copy it from the release again.")
-    repeated: list[tuple[dict[str, Any], str]] = []
-
-    def keep_pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        kept = dict(pairs)
-        if len(kept) != len(pairs):
-            repeated.append((kept, _first_repeated(pairs)))
-        return kept
-
     try:
-        document = json.loads(decoded, object_pairs_hook=keep_pairs)
+        return json.loads(decoded, object_pairs_hook=_unique)
     except RecursionError as error:
         raise SchemaError(
             f"{where}: lists or objects are nested hundreds of levels deep; the release's files "
@@ -110,41 +102,15 @@ def parse_document(text: bytes, *, where: str) -> Any:
         raise SchemaError(
             f"{where}: not valid JSON: {error}. Copy the file from the release again."
         ) from error
-    if repeated:
-        path = child_path(_path_of(document, repeated[0][0]), repeated[0][1])
-        raise SchemaError(
-            f"{where}: {path} is written {'twice' if len(repeated) == 1 else 'more than once'}, "
-            f"and only one of its values can be read. Remove the wrong one."
-        )
-    return document
 
 
-def _first_repeated(pairs: list[tuple[str, Any]]) -> str:
-    places = {key: place for place, (key, _) in enumerate(pairs)}
-    return next(key for place, (key, _) in enumerate(pairs) if places[key] != place)
-
-
-def _path_of(document: object, wanted: object) -> str:
-    """Return the JSON path of an element that is known to be in the document, by identity."""
-    parents: dict[int, tuple[int, str | int]] = {}
-    waiting = [document]
-    while waiting:
-        holder = waiting.pop()
-        if holder is wanted:
-            break
-        if isinstance(holder, dict | list):
-            children = holder.items() if isinstance(holder, dict) else enumerate(holder)
-            for key, child in children:
-                if isinstance(child, dict | list):
-                    parents[id(child)] = id(holder), key
-                    waiting.append(child)
-    else:
-        return "$..."
-    keys, place = [], id(wanted)
-    while place in parents:
-        place, key = parents[place]
-        keys.append(key)
-    return functools.reduce(child_path, reversed(keys), "$")
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object of JSON, of which only one of two values of a key could be read."""
+    kept = dict(pairs)
+    if len(kept) != len(pairs):
+        repeated = Counter(key for key, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"the key {shortened(repr(repeated))} is written twice in one object")
+    return kept
 
 
 def child_path(path: str, key: str | int) -> str:

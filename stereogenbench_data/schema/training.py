@@ -15,7 +15,7 @@ because it is stored without loss.
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -32,11 +32,6 @@ MOST_PSNR_DB: Final = 100.0
 """The PSNR that is stored for pictures without any error, and the largest."""
 
 _FORMAT: Final = 1
-_LARGEST_SIDE_PX: Final = 2**16
-_LARGEST_INT: Final = 2**53
-_DIGEST: Final = re.compile(r"[0-9a-f]{64}")
-_WORD: Final = re.compile(r"[A-Za-z0-9_.+-]{1,40}")
-_CRC32: Final = re.compile(r"[0-9a-f]{8}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,116 +130,119 @@ def parse_training(text: bytes, *, where: str) -> TrainingDocument:
     Raises:
         SchemaError: If the file is not what `TrainingDocument.text` writes; it names the place.
     """
-    root = _Object(parse_object(text, where=where), "$", where)
-    root.require_keys("format", "source", "derived", "pictures", "versions", "files")
-    if root.integer("format") != _FORMAT:
-        raise root.wrong("format", f"must be {_FORMAT}")
-    source, derived, pictures = (root.object(each) for each in ("source", "derived", "pictures"))
-    source.require_keys("key", "index_digest", "width_px", "height_px")
-    derived.require_keys("width_px", "height_px", "quality", "key_frames")
-    pictures.require_keys("codec", "pixel_format", "options", "key_frame_distance")
-    for place, name in ((pictures, "codec"), (pictures, "pixel_format"), (derived, "quality")):
-        if not _WORD.fullmatch(place.text(name)):
-            raise place.wrong(name, "must be a name of letters, digits and _ . + -")
-    pictures.integer("key_frame_distance", least=1)
-    for each in (pictures.object("options"), root.object("versions")):
-        for name in each.value:
-            each.text(name)
-    key_frames = derived.value["key_frames"]
-    is_ascending = (
-        isinstance(key_frames, list)
-        and all(type(each) is int and each < _LARGEST_INT for each in key_frames)
-        and key_frames[:1] == [0]
-        and key_frames == sorted(set(key_frames))
-    )
-    if not is_ascending:
-        raise derived.wrong("key_frames", "must be frames ascending from 0")
-    digest = source.text("index_digest")
-    if not _DIGEST.fullmatch(digest):
-        raise source.wrong("index_digest", "must be a sha256 in hex")
-    files = root.object("files")
-    known = {rgb_name(camera) for camera in range(CAMERA_COUNT)}
-    allowed = known | set(PACKED_DEPTH_NAMES.values())
-    if not files.value or not set(files.value) <= allowed:
-        raise root.wrong("files", f"must name some of {', '.join(sorted(allowed))}")
+    document = parse_object(text, where=where)
+    _require(document, _FORM, "$", where)
+    source, derived, pictures = document["source"], document["derived"], document["pictures"]
+    for name, file in document["files"].items():
+        is_picture = name in _PICTURES
+        _require(file, _PICTURE if is_picture else _FILE, f"$.files.{name}", where)
+        if is_picture and file["worst_psnr_db"] > file["psnr_db"]:
+            path = f"$.files.{name}.worst_psnr_db"
+            raise _wrong(file["worst_psnr_db"], "must not exceed psnr_db", path, where)
     return TrainingDocument(
-        key=source.text("key"),
-        source_digest=digest,
-        source_size_px=source.size(),
-        size_px=derived.size(),
-        quality=derived.text("quality"),
-        key_frames=tuple(key_frames),
-        pictures=pictures.value,
-        versions=root.object("versions").value,
+        key=source["key"],
+        source_digest=source["index_digest"],
+        source_size_px=(source["width_px"], source["height_px"]),
+        size_px=(derived["width_px"], derived["height_px"]),
+        quality=derived["quality"],
+        key_frames=tuple(derived["key_frames"]),
+        pictures=pictures,
+        versions=document["versions"],
         files={
-            name: _parse_file(files.object(name), is_picture=name in known) for name in files.value
+            name: DerivedFile(
+                file["bytes"], int(file["crc32"], 16), float(file.get("psnr_db", math.nan)),
+                float(file.get("worst_psnr_db", math.nan)), file.get("worst_frame", -1),
+            )
+            for name, file in document["files"].items()
         },
+    )  # fmt: skip
+
+
+_Check = tuple[Callable[[Any], bool], str]
+_Form = dict[str, Any]
+
+
+def _whole(least: int, most: int = 2**53) -> _Check:
+    what = f"must be a whole number of at least {least}"
+    return lambda value: type(value) is int and least <= value <= most, what
+
+
+def _like(pattern: str, what: str) -> _Check:
+    return lambda value: isinstance(value, str) and bool(re.fullmatch(pattern, value)), what
+
+
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, dict) and all(map(_is_text, value.values()))
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and value.isprintable()
+
+
+def _is_ascending(value: Any) -> bool:
+    return (
+        isinstance(value, list)
+        and all(type(each) is int and each < 2**53 for each in value)
+        and value[:1] == [0]
+        and value == sorted(set(value))
     )
 
 
-def _parse_file(file: "_Object", *, is_picture: bool) -> DerivedFile:
-    measured = ("psnr_db", "worst_psnr_db", "worst_frame") if is_picture else ()
-    file.require_keys("bytes", "crc32", *measured)
-    crc32 = file.text("crc32")
-    if not _CRC32.fullmatch(crc32):
-        raise file.wrong("crc32", "must be 8 hex digits")
-    size = file.integer("bytes", least=1)
-    if not is_picture:
-        return DerivedFile(size, int(crc32, 16))
-    mean_db, worst_db = (file.decibels(name) for name in measured[:2])
-    if worst_db > mean_db:
-        raise file.wrong("worst_psnr_db", "must not exceed psnr_db")
-    return DerivedFile(
-        size, int(crc32, 16), mean_db, worst_db, file.integer("worst_frame", least=0)
+_PICTURES: Final = {rgb_name(camera) for camera in range(CAMERA_COUNT)}
+_DERIVED: Final = _PICTURES | set(PACKED_DEPTH_NAMES.values())
+_SIZE: Final = {name: _whole(1, 2**16) for name in ("width_px", "height_px")}
+_WORD: Final = _like(r"[A-Za-z0-9_.+-]{1,40}", "must be a name of letters, digits and _ . + -")
+_TEXTS: Final = (_are_texts, "must be an object of printable texts")
+_DECIBELS: Final = (
+    lambda value: is_number(value) and 0 <= value <= MOST_PSNR_DB,
+    f"must be 0 to {MOST_PSNR_DB:g} dB",
+)
+_FORM: Final[_Form] = {
+    "format": (lambda value: type(value) is int and value == _FORMAT, f"must be {_FORMAT}"),
+    "source": {
+        "key": (_is_text, "must be a printable text"),
+        "index_digest": _like("[0-9a-f]{64}", "must be a sha256 in hex"),
+        **_SIZE,
+    },
+    "derived": {
+        **_SIZE,
+        "quality": _WORD,
+        "key_frames": (_is_ascending, "must be frames ascending from 0"),
+    },
+    "pictures": {
+        "codec": _WORD, "pixel_format": _WORD, "options": _TEXTS, "key_frame_distance": _whole(1),
+    },
+    "versions": _TEXTS,
+    "files": (
+        lambda value: isinstance(value, dict) and bool(value) and set(value) <= _DERIVED,
+        f"must name some of {', '.join(sorted(_DERIVED))}",
+    ),
+}  # fmt: skip
+"""What each value must be: a form of its own, or a check and what it asks for."""
+_FILE: Final[_Form] = {"bytes": _whole(1), "crc32": _like("[0-9a-f]{8}", "must be 8 hex digits")}
+_PICTURE: Final = _FILE | {
+    "psnr_db": _DECIBELS, "worst_psnr_db": _DECIBELS, "worst_frame": _whole(0),
+}  # fmt: skip
+
+
+def _require(value: Any, form: _Form | _Check, path: str, where: str) -> None:
+    """Refuse a value that does not have a form."""
+    if not isinstance(form, dict):
+        fits, what = form
+        if not fits(value):
+            raise _wrong(value, what, path, where)
+    elif not isinstance(value, dict):
+        raise _wrong(value, "must be an object", path, where)
+    elif odd := sorted(set(value) ^ set(form)):
+        what = f"must be there, and only {', '.join(form)}"
+        raise _wrong(value.get(odd[0]), what, f"{path}.{odd[0]}", where)
+    else:
+        for name, inner in form.items():
+            _require(value[name], inner, f"{path}.{name}", where)
+
+
+def _wrong(value: Any, what: str, path: str, where: str) -> SchemaError:
+    return SchemaError(
+        f"{where}: {path} {what}, found {brief(value)}. The file was altered: fetch it again, or "
+        f"run `stereogenbench pack` again."
     )
-
-
-@dataclass(frozen=True, slots=True)
-class _Object:
-    """An object of the file with its JSON path; each reader refuses what is not of its kind."""
-
-    value: dict[str, Any]
-    path: str
-    where: str
-
-    def wrong(self, name: str, what: str) -> SchemaError:
-        found = brief(self.value.get(name))
-        return SchemaError(
-            f"{self.where}: {self.path}.{name} {what}, found {found}. The file was altered: fetch "
-            f"it again, or run `stereogenbench pack` again."
-        )
-
-    def require_keys(self, *names: str) -> None:
-        if set(self.value) != set(names):
-            odd = sorted(set(self.value) ^ set(names))[0]
-            raise self.wrong(odd, f"must be there, and only {', '.join(names)}")
-
-    def object(self, name: str) -> "_Object":
-        value = self.value.get(name)
-        if not isinstance(value, dict):
-            raise self.wrong(name, "must be an object")
-        return _Object(value, f"{self.path}.{name}", self.where)
-
-    def text(self, name: str) -> str:
-        value = self.value[name]
-        if not isinstance(value, str) or not value.isprintable():
-            raise self.wrong(name, "must be a printable text")
-        return value
-
-    def integer(self, name: str, *, least: int = -_LARGEST_INT, most: int = _LARGEST_INT) -> int:
-        value = self.value[name]
-        if type(value) is not int or not least <= value <= most:
-            raise self.wrong(name, f"must be a whole number of at least {least}")
-        return int(value)
-
-    def decibels(self, name: str) -> float:
-        value = self.value[name]
-        if not is_number(value) or not 0 <= value <= MOST_PSNR_DB:
-            raise self.wrong(name, f"must be 0 to {MOST_PSNR_DB:g} dB")
-        return float(value)
-
-    def size(self) -> tuple[int, int]:
-        width_px, height_px = (
-            self.integer(name, least=1, most=_LARGEST_SIDE_PX) for name in ("width_px", "height_px")
-        )
-        return width_px, height_px
