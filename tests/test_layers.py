@@ -11,7 +11,7 @@ import stereogenbench_data
 
 PACKAGE = Path(stereogenbench_data.__file__).parent
 LAYERS = (
-    "errors", "schema", "geometry", "media", "engine", "sources", "index", "shards",
+    "errors", "schema", "geometry", "media", "engine", "sources", "jobs", "index", "shards",
     "selection", "samples", "datasets", "bridges", "audit", "evaluation", "synthesis", "cli",
     "__main__",
 )  # fmt: skip

@@ -30,16 +30,7 @@ from stereogenbench_data.bridges.clip_layouts import (
     LayoutName,
     lines,
 )
-from stereogenbench_data.bridges.exports import (
-    alone,
-    export_folder,
-    json_bytes,
-    named_errors,
-    read_json,
-    scene_filters,
-    training_selection,
-    write_all,
-)
+from stereogenbench_data.bridges.exports import alone, scene_filters, training_selection
 from stereogenbench_data.bridges.generation import Captions, describe_pair
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.engine import Advance, Progress
@@ -48,6 +39,13 @@ from stereogenbench_data.errors import (
     SelectionError,
 )
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.jobs import (
+    do_items,
+    job_folder,
+    json_bytes,
+    named_errors,
+    read_json,
+)
 from stereogenbench_data.media.encoder import Encoding, VideoEncoder
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.load import SampleLoader
@@ -221,10 +219,10 @@ def export_clips(
     }
     facts = StereoPairs(index, fields=_FACTS, **chosen)
     works = _works(facts, _Export(root, form, kinds, size, run.depth))
-    with export_folder(root, settings):
+    with job_folder(root, settings):
         due = [work for work in works if not _is_finished(work)]
         still, total = (sum(len(work.address.frames) for work in each) for each in (due, works))
-        write_all(
+        do_items(
             _write_clip,
             due,
             name=lambda work: work.name,
@@ -236,8 +234,9 @@ def export_clips(
         clips = [read_json(work.record) for work in works]
         texts = {_CLIPS_JSONL: lines(json.dumps(clip, ensure_ascii=False) for clip in clips)}
         texts |= rules.manifests(root, clips, control)
-        for name, text in texts.items():
-            write_atomic(root / name, text.encode())
+        with named_errors(root):
+            for name, text in texts.items():
+                write_atomic(root / name, text.encode())
     written = {work.name for work in due}
     return ClipReport(
         written=tuple(work.name for work in due),

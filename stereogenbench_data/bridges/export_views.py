@@ -9,27 +9,20 @@ Each of these folders is written beside its place and renamed, so that a stopped
 killed one leaves nothing that is incomplete. `view_formats` has what is in them.
 """
 
-import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, Unpack, get_args
 
-from stereogenbench_data.bridges.exports import (
-    alone,
-    export_folder,
-    named_errors,
-    scene_filters,
-    training_selection,
-    write_all,
-)
+from stereogenbench_data.bridges.exports import alone, scene_filters, training_selection
 from stereogenbench_data.bridges.posed_images import PosedImageReader, index_of
 from stereogenbench_data.bridges.view_formats import INDEX_TXT, WRITERS, Layout
 from stereogenbench_data.datasets.mapped import Data
 from stereogenbench_data.engine import Advance, Progress
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.jobs import atomic_folder, do_items, job_folder, named_errors
 from stereogenbench_data.samples.checks import check_samples
 from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding
@@ -134,7 +127,7 @@ def export_views(
     }
     if group == "scene":
         settings["frames"] = sorted({chosen for _, chosen in folders.values()})
-    with export_folder(root, settings):
+    with job_folder(root, settings):
         missing: dict[int, dict[Path, tuple[int, ...]]] = {}
         for folder, (row, chosen) in folders.items():
             if not folder.is_dir():
@@ -144,7 +137,7 @@ def export_views(
             for row, found in missing.items()
         ]
         total = len(cameras) * sum(len(chosen) for _, chosen in folders.values())
-        write_all(
+        do_items(
             _export_scene,
             works,
             name=lambda work: str(work.index.column("key")[0]),
@@ -154,7 +147,8 @@ def export_views(
             total=total,
         )
         if layout == "moge":
-            _list_pictures(root, [*folders], cameras)
+            with named_errors(root):
+                _list_pictures(root, [*folders], cameras)
     return [*folders]
 
 
@@ -218,21 +212,12 @@ def _export_scene(work: _SceneWork, advance: Advance) -> None:
     }
     with closing(PosedImageReader(work.index, size=work.size, depth=work.depth)) as reader:
         for folder, frames in work.frames_of.items():
-            unfinished = folder.with_name(f".{folder.name}.unfinished")
-            try:
-                with named_errors(folder):
-                    shutil.rmtree(unfinished, ignore_errors=True)
-                    unfinished.mkdir(parents=True)
-                    writer = WRITERS[work.layout](
-                        unfinished, points=work.points, encodings=encodings
-                    )
-                    for frame in frames:
-                        writer.add([reader.read(0, camera, frame) for camera in work.cameras])
-                        advance(len(work.cameras))
-                    writer.finish()
-                    unfinished.replace(folder)
-            finally:
-                shutil.rmtree(unfinished, ignore_errors=True)
+            with named_errors(folder), atomic_folder(folder) as unfinished:
+                writer = WRITERS[work.layout](unfinished, points=work.points, encodings=encodings)
+                for frame in frames:
+                    writer.add([reader.read(0, camera, frame) for camera in work.cameras])
+                    advance(len(work.cameras))
+                writer.finish()
 
 
 def _list_pictures(root: Path, folders: Sequence[Path], cameras: Sequence[int]) -> None:

@@ -86,7 +86,7 @@ class ProtocolOptions:
         str,
         typer.Option(
             metavar="NAME",
-            help="Of E_match: sift, or dedode (the paper's).",
+            help="Of E_match: sift, or FILE.py:Class of your own.",
             rich_help_panel=_METRICS,
         ),
     ] = "sift"
@@ -94,7 +94,7 @@ class ProtocolOptions:
         str,
         typer.Option(
             metavar="NAME",
-            help="Of SD: sgbm, or foundation-stereo (the paper's).",
+            help="Of SD: sgbm, or FILE.py:Class of your own.",
             rich_help_panel=_METRICS,
         ),
     ] = "sgbm"
@@ -114,14 +114,6 @@ class ProtocolOptions:
             "--checkpoint",
             metavar="DIR",
             help="Folder of weights [torch.hub's checkpoints].",
-            rich_help_panel=_METRICS,
-        ),
-    ] = None
-    checkout: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Clone of FoundationStereo's repository.",
             rich_help_panel=_METRICS,
         ),
     ] = None
@@ -146,7 +138,7 @@ class ProtocolOptions:
             keypoint_matcher=self.keypoint_matcher,
             stereo_matcher=self.stereo_matcher,
             fit=fit,
-            models=ModelOptions(device=self.device, weights=self.weights, checkout=self.checkout),
+            models=ModelOptions(device=self.device, weights=self.weights),
         )
 
 

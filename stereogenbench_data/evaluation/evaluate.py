@@ -5,13 +5,13 @@ Scenes are scored in parallel processes, and each is kept on disk as soon as it 
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, TypedDict, Unpack
 
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
-from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
+from stereogenbench_data.engine import LOCAL, Engine, Progress
 from stereogenbench_data.errors import EvaluationError, PredictionError, StorageError
 from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, group_by, tally
 from stereogenbench_data.evaluation.columns import IMAGE_DISTANCES, VIDEO_DISTANCES
@@ -21,7 +21,7 @@ from stereogenbench_data.evaluation.metrics.frechet import (
     FrechetDistance,
     frechet_distance,
 )
-from stereogenbench_data.evaluation.partial import PartialResults
+from stereogenbench_data.evaluation.partial import EVALUATION, FORMAT, PartialResults
 from stereogenbench_data.evaluation.predictions import (
     CalledMethod,
     Method,
@@ -30,8 +30,9 @@ from stereogenbench_data.evaluation.predictions import (
     PredictionSource,
 )
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, require_tier
-from stereogenbench_data.evaluation.scene_scores import SceneWork, score_scene
+from stereogenbench_data.evaluation.scene_scores import SceneScores, SceneWork, score_scene
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.jobs import do_items, job_folder
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import may_pass
@@ -273,6 +274,7 @@ def score_workload(
     try:
         settings = models_of(run.protocol).settings()
         state = {
+            "format": FORMAT,
             "tier": run.tier,
             "methods": [source.name for source in run.sources],
             "data": workload.index.digest,
@@ -286,7 +288,8 @@ def score_workload(
             out = options.get("out")
             if out is None:
                 out = stack.enter_context(tempfile.TemporaryDirectory(prefix="stereogenbench-"))
-            partial = PartialResults(Path(out), settings=state)
+            stack.enter_context(job_folder(Path(out), state, kind=EVALUATION))
+            partial = PartialResults(Path(out))
             _score_missing_scenes(workload, run, partial, options)
             results = []
             for source in run.sources:
@@ -348,24 +351,25 @@ def _score_missing_scenes(
             )
         )
     _require_few(missing, allowed=allowed)
-    total = workload.frames
-    advance = advance_of(options.get("progress"), done=done_frames, total=total)
-    advance(0)
     _require_few(problems, allowed=allowed)
-    with closing(
-        options.get("engine", LOCAL).map(
-            score_scene,
-            works,
-            name=lambda work: work.scene,
-            workers=options.get("workers"),
-            advance=advance,
-        )
-    ) as results:
-        for scene, scores in results:
-            partial.write(scene, scores, stamps=stamps[scene])
-            problems.extend(found.problem for found in scores.values() if found.problem)
-            _require_few(problems, allowed=allowed)
-    advance(total)  # never more than all is reported
+
+    def keep(result: tuple[str, SceneScores]) -> None:
+        scene, scores = result
+        partial.write(scene, scores, stamps=stamps[scene])
+        problems.extend(found.problem for found in scores.values() if found.problem)
+        _require_few(problems, allowed=allowed)
+
+    do_items(
+        score_scene,
+        works,
+        name=lambda work: work.scene,
+        keep=keep,
+        engine=options.get("engine", LOCAL),
+        workers=options.get("workers"),
+        progress=options.get("progress"),
+        done=done_frames,
+        total=workload.frames,
+    )
 
 
 def _require_few(problems: Sequence[str], *, allowed: int) -> None:

@@ -12,9 +12,7 @@ method makes of it takes the same name: ``PREDICTIONS/<item>/000.png ...`` or ``
 """
 
 import json
-import shutil
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Unpack
@@ -23,8 +21,8 @@ import numpy as np
 from PIL import Image
 
 from stereogenbench_data.datasets.mapped import Data
-from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
-from stereogenbench_data.errors import EvaluationError, StorageError, describe_os_error
+from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
+from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.evaluate import select_workload
 from stereogenbench_data.evaluation.predictions import PairFrames, frame_name, open_frames
 from stereogenbench_data.evaluation.protocol import (
@@ -34,15 +32,20 @@ from stereogenbench_data.evaluation.protocol import (
     require_tier,
 )
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.jobs import (
+    JobKind,
+    atomic_folder,
+    do_items,
+    job_folder,
+    named_errors,
+)
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import Selection
-from stereogenbench_data.sources.files import write_atomic
 
-INPUTS_JSON: Final = "inputs.json"
+INPUTS: Final = JobKind("inputs", "inputs.json", ".inputs.lock", EvaluationError)
 _FAST: Final = 1
 """zlib's level of the PNGs: three times as fast as the default, a tenth larger."""
-_ELSEWHERE: Final = "Choose another folder."
 
 
 class ExportOptions(Selection, total=False):
@@ -99,85 +102,45 @@ def export_inputs(
     protocol = EvaluationProtocol(metrics=("psnr",), size=size, depth=depth)
     workload = select_workload(data, protocol, inputs=known.inputs, options=options)
     wanted = [pair for pairs in workload.pairs for pair in pairs]
-    _begin(
-        root,
-        {
-            "tier": known.name,
-            "size": f"{size[1]}x{size[0]}",
-            "frames": [list(each) for each in sorted({each.frames for each in wanted})],
-            "data": workload.index.digest,
-        },
-    )
-    works = [
-        _ItemWork(workload.index_of([row]), pair, known, depth, root / pair.item)
-        for row, pairs in zip(workload.rows, workload.pairs, strict=True)
-        for pair in pairs
-        if not (root / pair.item).is_dir()
-    ]
-    total = workload.frames
-    done = total - sum(len(work.wanted.frames) for work in works)
-    advance = advance_of(options.get("progress"), done=done, total=total)
-    advance(0)
-    with closing(
-        options.get("engine", LOCAL).map(
+    settings = {
+        "tier": known.name,
+        "size": f"{size[1]}x{size[0]}",
+        "frames": sorted({each.frames for each in wanted}),
+        "data": workload.index.digest,
+    }
+    with job_folder(root, settings, kind=INPUTS):
+        works = [
+            _ItemWork(workload.index_of([row]), pair, known, depth, root / pair.item)
+            for row, pairs in zip(workload.rows, workload.pairs, strict=True)
+            for pair in pairs
+            if not (root / pair.item).is_dir()
+        ]
+        total = workload.frames
+        do_items(
             _write_item,
             works,
             name=lambda work: work.wanted.label,
+            engine=options.get("engine", LOCAL),
             workers=options.get("workers"),
-            advance=advance,
+            progress=options.get("progress"),
+            done=total - sum(len(work.wanted.frames) for work in works),
+            total=total,
         )
-    ) as written:
-        for _ in written:
-            advance(0)
     return [pair.item for pair in wanted]
-
-
-def _begin(root: Path, content: Mapping[str, Any]) -> None:
-    """Write what the folder holds, or refuse one that holds something else."""
-    path = root / INPUTS_JSON
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        if not path.exists():
-            if any(root.iterdir()):
-                raise EvaluationError(
-                    f"{root}: is not empty and holds no {INPUTS_JSON}: choose a new folder."
-                )
-            write_atomic(path, json.dumps(content).encode())
-        there = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        what = f"{path}: cannot be read or written"
-        raise StorageError(describe_os_error(what, error, _ELSEWHERE)) from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise StorageError(f"{path}: cannot be read ({error}). {_ELSEWHERE}") from error
-    differing = [
-        name for name in content if not isinstance(there, dict) or there.get(name) != content[name]
-    ]
-    if differing:
-        raise EvaluationError(
-            f"{root}: holds inputs of another {differing[0]}: choose another folder, or remove it."
-        )
 
 
 def _write_item(work: _ItemWork, after_frames: Advance) -> None:
     """Write one item, whole or not at all."""
-    temporary = work.folder.with_name(f".{work.folder.name}")
     fields, wanted = (*work.tier.inputs, "frame_index"), work.wanted
-    try:
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir()
-        with open_frames(work.index, fields, size=wanted.size, depth=work.depth) as load:
-            for frame in wanted.frames:
-                inputs = work.tier.inputs_of(load(0, wanted.pair, frame))
-                _write_frame(temporary, inputs, name=frame_name(frame))
-                after_frames(1)
-        temporary.replace(work.folder)
-    except OSError as error:
-        if isinstance(error, StorageError):
-            raise
-        what = f"{work.folder}: cannot be written"
-        raise StorageError(describe_os_error(what, error, _ELSEWHERE)) from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    with (
+        named_errors(work.folder),
+        atomic_folder(work.folder) as unfinished,
+        open_frames(work.index, fields, size=wanted.size, depth=work.depth) as load,
+    ):
+        for frame in wanted.frames:
+            inputs = work.tier.inputs_of(load(0, wanted.pair, frame))
+            _write_frame(unfinished, inputs, name=frame_name(frame))
+            after_frames(1)
 
 
 def _write_frame(folder: Path, inputs: Mapping[str, Any], *, name: str) -> None:

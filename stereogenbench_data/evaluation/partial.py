@@ -1,77 +1,44 @@
-"""Partial results on disk, one file a scene, from which a killed evaluation resumes.
+"""Scores on disk, one file a scene, from which a stopped evaluation goes on.
 
-A folder belongs to one evaluation: its settings, its data and its right views. Results of others
-are refused, naming what differs.
+    OUT/evaluation.json       all that scores depend on (`jobs`); other settings are refused
+    OUT/scenes/<digest>.json  a scene's scores, with what identified its right views
+    OUT/scenes/<digest>.npz   the statistics of its features, where a distance needs them
+
+Scores of right views that were changed since are refused, by name.
 """
 
 import hashlib
 import json
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from stereogenbench_data.errors import EvaluationError, StorageError, describe_os_error
+from stereogenbench_data.errors import EvaluationError, StorageError, explain_os_errors
 from stereogenbench_data.evaluation.metrics.frechet import FeatureStatistics
 from stereogenbench_data.evaluation.predictions import Pair, pair_name
 from stereogenbench_data.evaluation.scene_scores import PairScores, SceneScores
+from stereogenbench_data.jobs import JobKind, read_item
 from stereogenbench_data.sources.files import write_atomic
 
 Stamps = Mapping[tuple[str, Pair], str]
 
-STATE_JSON: Final = "evaluation.json"
-_FORMAT: Final = 3
+EVALUATION: Final = JobKind("scores", "evaluation.json", ".evaluation.lock", EvaluationError)
+FORMAT: Final = 3
+"""Of the files of scenes; other formats are refused."""
 _SCENES: Final = "scenes"
 _PARTS: Final = ("count", "mean", "root")
-_OTHER_OUT: Final = "Choose another folder with --out."
 
 
 class PartialResults:
     """The scenes of one evaluation that are scored so far."""
 
-    def __init__(self, folder: Path, *, settings: Mapping[str, Any]) -> None:
-        """Start in a folder, or resume an evaluation of the same settings.
-
-        Args:
-            folder: Where partial results are kept; it is made where it is missing.
-            settings: All that scores depend on, as plain values.
-
-        Raises:
-            EvaluationError: If the folder holds results of other settings, naming what differs.
-            StorageError: If the folder cannot be read or written.
-        """
+    def __init__(self, folder: Path) -> None:
+        """Take a folder that is held by `job_folder`."""
         self.folder = folder
-        ours = {"format": _FORMAT, **json.loads(json.dumps(settings))}
-        try:
-            (folder / _SCENES).mkdir(parents=True, exist_ok=True)
-            theirs = _read_json(folder / STATE_JSON)
-            if not any((folder / _SCENES).iterdir()):  # An evaluation may have failed at once.
-                write_atomic(folder / STATE_JSON, json.dumps(ours, indent=1).encode())
-                return
-            if theirs is None:
-                raise EvaluationError(
-                    f"{folder}: holds scenes without {STATE_JSON}, which says what they "
-                    f"belong to. Remove the folder, or choose another."
-                )
-        except OSError as error:
-            what = f"{folder}: partial results cannot be kept there"
-            raise StorageError(describe_os_error(what, error, _OTHER_OUT)) from error
-        if theirs.get("format") != _FORMAT:
-            raise EvaluationError(
-                f"{folder}: holds partial results of format {theirs.get('format')}, written by "
-                f"another version of this package, and this one writes format {_FORMAT}: SD by "
-                f"two fits, each in a column of its own. Choose another folder with --out, or "
-                f"remove this one."
-            )
-        if theirs != ours:
-            name, there, here = next(_differences(theirs, ours))
-            raise EvaluationError(
-                f"{folder}: holds results of another evaluation: {name} was {_shown(there)} there "
-                f"and is {_shown(here)} now. Choose another folder with --out, or remove this one."
-            )
 
     def write(self, scene: str, scores: SceneScores, *, stamps: Stamps) -> None:
         """Keep the scores of a scene, whole or not at all.
@@ -98,16 +65,15 @@ class PartialResults:
                     for part in _PARTS:
                         arrays[f"{_place_name(place)}/{side}/{name}/{part}"] = getattr(each, part)
         path = self._path(scene)
-        try:
+        what = f"{path}: the scores of {scene} cannot be written"
+        with explain_os_errors(what, "Choose another folder with --out."):
+            path.parent.mkdir(exist_ok=True)
             if arrays:
                 packed = BytesIO()
                 np.savez(packed, **arrays)
                 write_atomic(path.with_suffix(".npz"), packed.getvalue())
             text = json.dumps({"scene": scene, "pairs": pairs}, allow_nan=False)
             write_atomic(path, text.encode())
-        except OSError as error:
-            what = f"{path}: the scores of {scene} cannot be written"
-            raise StorageError(describe_os_error(what, error, _OTHER_OUT)) from error
 
     def problems(self, scene: str, *, stamps: Stamps, columns: Collection[str]) -> list[str] | None:
         """Return why pairs of a scene have no scores, if it was scored with these right views.
@@ -126,7 +92,7 @@ class PartialResults:
                 have other columns.
         """
         path = self._path(scene)
-        document = _read_json(path)
+        document = read_item(path)
         if document is None or document.get("scene") != scene:
             return None
         pairs = document["pairs"]
@@ -162,7 +128,7 @@ class PartialResults:
             StorageError: If they cannot be read.
         """
         path = self._path(scene)
-        document = _read_json(path)
+        document = read_item(path)
         if document is None:
             raise StorageError(f"{path}: the scores of {scene} are gone. Run the evaluation again.")
         arrays: dict[str, Any] = {}
@@ -194,29 +160,3 @@ def _pair_scores(pairs: Mapping[str, Any], arrays: Mapping[str, Any], place: str
 
 def _place_name(place: tuple[str, Pair]) -> str:
     return f"{place[0]}/{pair_name(place[1])}"
-
-
-def _read_json(path: Path) -> Any:
-    """Return a document; None if there is none, or if a kill cut it short."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
-        return None
-    return found if isinstance(found, dict) else None
-
-
-def _shown(value: Any) -> str:
-    """Return a setting for a message."""
-    if value is None:
-        return "not set"
-    return "set" if isinstance(value, dict) else str(value)
-
-
-def _differences(theirs: Any, ours: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield the name of each leaf that differs, with both values."""
-    if isinstance(theirs, dict) and isinstance(ours, dict):
-        for key in sorted({*theirs, *ours}):
-            inner = f"{name}.{key}" if name else key
-            yield from _differences(theirs.get(key), ours.get(key), inner)
-    elif theirs != ours:
-        yield name, theirs, ours

@@ -25,8 +25,8 @@ from stereogenbench_data.schema.records import DepthEncoding
 PAPER_SIZE: Final = (480, 832)
 """(height, width) at which the paper's frame-wise metrics are computed."""
 
-PAPER_BACKENDS: Final = {"keypoint_matcher": "dedode", "stereo_matcher": "foundation-stereo"}
-"""What the paper measures E_match and SD with."""
+PAPER_BACKENDS: Final = {"keypoint_matcher": "DeDoDe", "stereo_matcher": "FoundationStereo"}
+"""What the paper measures E_match and SD with: the classes of two plug-ins in ``examples/``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +82,9 @@ class EvaluationProtocol:
     Attributes:
         metrics: Names of `METRICS`.
         size: (height, width) in pixels at which everything is scored.
-        keypoint_matcher: What finds the matches of E_match.
-        stereo_matcher: What finds the disparity of SD.
+        keypoint_matcher: What finds the matches of E_match: "sift", or a model of your own
+            (`models.registry`).
+        stereo_matcher: What finds the disparity of SD: "sgbm", or a model of your own.
         fit: The fit of SD by which relations between controls are judged. Every report shows SD
             "filtered" and by "least_squares", whatever this is, and "theil_sen" if it is that.
         depth: A depth contract instead of the one that files and release state.
@@ -125,9 +126,14 @@ class EvaluationProtocol:
         known = COLUMNS[column]
         if not known.backend or self.is_papers(column):
             return known.label
-        return f"{known.label} ({getattr(self, known.backend)})"
+        return f"{known.label} ({self._backend(column)})"
 
     def is_papers(self, column: str) -> bool:
         """Return whether a column is measured with what the paper measures it with."""
         backend = COLUMNS[column].backend
-        return not backend or getattr(self, backend) == PAPER_BACKENDS[backend]
+        return not backend or self._backend(column) == PAPER_BACKENDS[backend]
+
+    def _backend(self, column: str) -> str:
+        """Return the name of what a column is measured with; of a model of one's own its class."""
+        name: str = getattr(self, COLUMNS[column].backend)
+        return name.rpartition(":")[2]

@@ -522,6 +522,7 @@ def test_a_folder_of_something_else_is_left_alone(indexed_release, tmp_path):
 
 def test_a_description_that_is_none_is_named(indexed_release, tmp_path):
     (tmp_path / "export.json").write_text("{")
+    (tmp_path / "a_picture.ply").write_text("")
 
     with pytest.raises(StorageError, match=r"export\.json: is not JSON"):
         exported(indexed_release, tmp_path, layout="ply")
@@ -532,7 +533,7 @@ def test_two_processes_do_not_export_into_one_folder(indexed_release, tmp_path):
 
     with try_locked(tmp_path / ".export.lock") as is_ours:
         assert is_ours
-        with pytest.raises(StorageError, match=r"another process exports into this folder"):
+        with pytest.raises(StorageError, match=r"another process works on this folder"):
             exported(indexed_release, tmp_path, layout="ply", size=(16, 16))
 
 

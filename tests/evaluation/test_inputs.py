@@ -38,7 +38,8 @@ def test_there_is_an_item_for_each_pair_and_a_picture_for_each_frame(scored_inde
     items = {item_name(key, (0, 1)) for key in scored_index.column("key")}
 
     for folder in exported.values():
-        assert {path.name for path in folder.iterdir()} == items | {"inputs.json"}
+        shown = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
+        assert shown == items | {"inputs.json"}
         for item in items:
             names = {path.name for path in (folder / item / "left").iterdir()}
 
@@ -75,6 +76,7 @@ def test_g1_holds_no_depth_and_no_right_view(exported):
 
 def test_g2_leaks_nothing_by_name_or_by_content(scored_index, exported):
     everything = files(exported["G2"])
+    assert everything.pop(".inputs.lock") == b""
     pictures = [name for name in everything if name != "inputs.json"]
     told = json.loads(everything["inputs.json"])
     forbidden = {b"baseline", b"depth", b"disparity", b"right", b"intrinsic", b"focal"}
@@ -121,15 +123,15 @@ def test_a_stopped_export_goes_on_and_keeps_what_is_whole(scored_index, tmp_path
 
     assert kept.stat().st_mtime_ns == before
     assert all(len(list((tmp_path / item / "left").iterdir())) == FRAMES for item in items)
-    assert not list(tmp_path.glob(".*"))
+    assert not list(tmp_path.glob(".*.unfinished"))
 
 
 def test_a_folder_of_other_inputs_is_refused_by_what_differs(scored_index, tmp_path):
     export(scored_index, tmp_path, "G2", frames=[0])
 
-    with pytest.raises(EvaluationError, match="holds inputs of another tier"):
+    with pytest.raises(EvaluationError, match="holds inputs of other tier"):
         export(scored_index, tmp_path, "G1", frames=[0])
-    with pytest.raises(EvaluationError, match="holds inputs of another frames"):
+    with pytest.raises(EvaluationError, match="holds inputs of other frames"):
         export(scored_index, tmp_path, "G2", frames=[1])
 
 

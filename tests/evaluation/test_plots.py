@@ -51,7 +51,9 @@ def test_a_metric_without_a_finite_number_has_no_plot(results, tmp_path):
 
 
 def test_the_papers_sd_is_drawn_beside_the_filtered_fit_alone(results, tmp_path, monkeypatch):
-    protocol = EvaluationProtocol(metrics=("sd",), size=SIZE, stereo_matcher="foundation-stereo")
+    protocol = EvaluationProtocol(
+        metrics=("sd",), size=SIZE, stereo_matcher="mine.py:FoundationStereo"
+    )
     with_sd = [
         replace(
             one,

@@ -151,7 +151,9 @@ def test_what_is_not_comparable_with_the_paper_is_said(scores):
 
 
 def test_the_papers_own_backends_are_not_marked(scores):
-    papers = EvaluationProtocol(keypoint_matcher="dedode", stereo_matcher="foundation-stereo")
+    papers = EvaluationProtocol(
+        keypoint_matcher="mine.py:DeDoDe", stereo_matcher="mine.py:FoundationStereo"
+    )
     text = markdown(branch_table([scores(protocol=papers)]))
 
     assert "| E_match↓ |" in text
@@ -175,7 +177,7 @@ def test_the_median_of_sd_stands_beside_its_mean(scores):
 
 @pytest.mark.parametrize("fit", ["filtered", "least_squares"])
 def test_the_papers_sd_stands_in_the_filtered_column_alone(scores, fit):
-    protocol = EvaluationProtocol(stereo_matcher="foundation-stereo", fit=fit)
+    protocol = EvaluationProtocol(stereo_matcher="mine.py:FoundationStereo", fit=fit)
     table = branch_table([scores(tier="G1", protocol=protocol)])
     paper = next(row for row in table.rows if row.is_papers)
     lines = markdown(table).splitlines()

@@ -1,16 +1,19 @@
 """The models that metrics are computed with, by name; each is imported when first used.
 
-To add a model, write a class with the members of its kind in `interfaces` and name it here. Of the
-`ModelOptions` it is given those that its constructor has a parameter for.
+Your own is a class with the members of its kind in `interfaces`, named as "module:Class" or
+"FILE.py:Class". Of the `ModelOptions` it is given those that its constructor has a parameter for.
+`examples/dedode_matcher.py` and `examples/foundation_stereo_matcher.py` are the paper's.
 """
 
 from dataclasses import asdict, dataclass
 from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
 from inspect import signature
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Final, Literal
 
-from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.errors import EvaluationError, ExtraError
 
 ModelKind = Literal[
     "keypoint matcher", "stereo matcher", "pair metric", "image features", "video features"
@@ -23,44 +26,55 @@ class ModelOptions:
 
     Attributes:
         device: As torch names it.
-        weights: The folder of weights files; None for that of torch.hub's checkpoints, and for
-            FoundationStereo that in its checkout.
-        checkout: The folder of FoundationStereo's repository.
+        weights: The folder of weights files; None for that of torch.hub's checkpoints.
     """
 
     device: str = "cpu"
     weights: Path | None = None
-    checkout: Path | None = None
 
 
 MODELS: Final[dict[ModelKind, dict[str, str]]] = {
-    "keypoint matcher": {
-        "sift": "opencv:Sift",
-        "dedode": "dedode:DeDoDeMatcher",
-    },
-    "stereo matcher": {
-        "sgbm": "opencv:Sgbm",
-        "foundation-stereo": "foundation_stereo:FoundationStereoMatcher",
-    },
-    "pair metric": {"lpips": "lpips:Lpips"},
-    "image features": {"inception": "inception:InceptionFeatures"},
-    "video features": {"i3d": "i3d:I3dFeatures"},
+    "keypoint matcher": {"sift": f"{__package__}.opencv:Sift"},
+    "stereo matcher": {"sgbm": f"{__package__}.opencv:Sgbm"},
+    "pair metric": {"lpips": f"{__package__}.lpips:Lpips"},
+    "image features": {"inception": f"{__package__}.inception:InceptionFeatures"},
+    "video features": {"i3d": f"{__package__}.i3d:I3dFeatures"},
 }
-"""The class of every model, by kind and name, as "module:class" of this folder."""
+"""The class of every model of this package, by kind and name, as "module:Class"."""
 
 
 def load_model(kind: ModelKind, name: str, options: ModelOptions | None = None) -> Any:
     """Return a model of a kind, as defined in `interfaces`.
+
+    Args:
+        kind: What the model does.
+        name: One of `MODELS`, or "module:Class" or "FILE.py:Class" for a model of your own.
+        options: Where it runs, and where its weights are.
 
     Raises:
         EvaluationError: If there is none of this name, or its weights are damaged.
         ExtraError: If a package or weights that it needs are missing.
     """
     known = MODELS[kind]
-    if name not in known:
-        raise EvaluationError(f"{kind} must be one of {', '.join(known)}, got {name!r}.")
-    module, _, class_name = known[name].partition(":")
-    model = getattr(import_module(f"{__package__}.{module}"), class_name)
+    place, _, class_name = known.get(name, name).rpartition(":")
+    if not place:
+        raise EvaluationError(
+            f"{kind} must be one of {', '.join(known)}, or module:Class or FILE.py:Class of your "
+            f"own, got {name!r}."
+        )
+    try:
+        module = _run(Path(place)) if place.endswith(".py") else import_module(place)
+        model = getattr(module, class_name)
+    except (ImportError, OSError, AttributeError) as error:
+        raise ExtraError(f"{kind} {name}: cannot be imported ({error}).") from error
     taken = signature(model).parameters
     given = asdict(options or ModelOptions())
     return model(**{option: value for option, value in given.items() if option in taken})
+
+
+def _run(path: Path) -> ModuleType:
+    """Return the module of a file."""
+    spec: Any = spec_from_file_location(path.stem, path)
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

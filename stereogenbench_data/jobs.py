@@ -1,0 +1,222 @@
+"""Work that goes into a folder item by item, and goes on where a stopped run ended.
+
+    FOLDER/export.json      the settings that all of the folder was made with; others are refused
+    FOLDER/.export.lock     locked by the process that works on the folder
+    FOLDER/...              items; each appears whole or not at all
+
+The lock is taken before the settings are read or written. So of two runs that begin at once, one is
+refused, and neither writes into the work of the other. Clips, views, inputs of methods and scores
+are such work; its items are written on one engine or another (`engine`).
+"""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import av
+
+from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
+from stereogenbench_data.errors import (
+    MediaError,
+    StereoGenBenchError,
+    StorageError,
+    describe_os_error,
+)
+from stereogenbench_data.sources.files import try_locked, write_atomic
+
+Work = TypeVar("Work")
+Result = TypeVar("Result")
+
+_CURE: Final = "Choose another folder, or remove it."
+
+
+@dataclass(frozen=True, slots=True)
+class JobKind:
+    """What files and messages call the work in a folder.
+
+    Attributes:
+        noun: What a folder holds, for messages: "an export".
+        settings: The file of the settings.
+        lock: The file that the working process locks.
+        error: What a folder of other work raises.
+    """
+
+    noun: str
+    settings: str
+    lock: str
+    error: type[StereoGenBenchError] = StorageError
+
+
+EXPORT: Final = JobKind("an export", "export.json", ".export.lock")
+
+
+@contextmanager
+def job_folder(
+    root: Path, settings: Mapping[str, Any], *, kind: JobKind = EXPORT
+) -> Iterator[None]:
+    """Hold a folder for one run while the block lasts.
+
+    Args:
+        root: A new or empty folder, or one of a run with the same settings. A run that ended before
+            its first item leaves a folder that others may take.
+        settings: All that the items depend on, as JSON holds it.
+        kind: What the work is called.
+
+    Raises:
+        StorageError: If another process works on the folder, or it cannot be written.
+        StereoGenBenchError: The kind's own error, if the folder holds something else, naming the
+            first setting that differs.
+    """
+    stated = root / kind.settings
+    with ExitStack() as held:
+        with named_errors(root):
+            root.mkdir(parents=True, exist_ok=True)
+            if not (root / kind.lock).exists():
+                _require_stated(root, kind)  # Nothing is left behind in a folder of something else.
+            if not held.enter_context(try_locked(root / kind.lock)):
+                raise StorageError(
+                    f"{root}: another process works on this folder. Wait for it, or choose another "
+                    "folder."
+                )
+            _require_stated(root, kind)
+            if stated.exists() and _has_items(root, kind):
+                _require_same(read_json(stated), settings, root=root, kind=kind)
+            else:
+                write_atomic(stated, json_bytes(settings))
+        yield
+
+
+def _require_stated(root: Path, kind: JobKind) -> None:
+    if not (root / kind.settings).exists() and _has_items(root, kind):
+        raise kind.error(f"{root}: is not empty and holds no {kind.settings}: choose a new folder.")
+
+
+def _require_same(
+    there: Mapping[str, Any], settings: Mapping[str, Any], *, root: Path, kind: JobKind
+) -> None:
+    here = json.loads(json_bytes(settings))
+    for name, theirs, ours in _differences(there, here):
+        raise kind.error(
+            f"{root}: holds {kind.noun} of other {name}: {_shown(theirs)}, where {_shown(ours)} is "
+            f"asked for. {_CURE}"
+        )
+
+
+def _has_items(root: Path, kind: JobKind) -> bool:
+    """Return whether a folder holds any file but those of the job itself."""
+    own = {root / kind.settings, root / kind.lock}
+    return any(path not in own and not path.is_dir() for path in root.rglob("*"))
+
+
+def _differences(theirs: Any, ours: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield the name of each setting that differs, with both values; None where it is not there."""
+    if isinstance(theirs, dict) and isinstance(ours, dict):
+        for key in dict.fromkeys([*ours, *theirs]):
+            inner = f"{name}.{key}" if name else key
+            yield from _differences(theirs.get(key), ours.get(key), inner)
+    elif theirs != ours:
+        yield name, theirs, ours
+
+
+def _shown(value: Any) -> str:
+    return "set" if isinstance(value, dict) else repr(value)
+
+
+@contextmanager
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """Yield an empty folder to write into, which takes its place when the block ends well.
+
+    Only the process that holds the job's folder may do so: the place beside it is always the same,
+    so that the next run removes what a killed one left.
+    """
+    unfinished = folder.with_name(f".{folder.name}.unfinished")
+    try:
+        shutil.rmtree(unfinished, ignore_errors=True)
+        unfinished.mkdir(parents=True)
+        yield unfinished
+        unfinished.replace(folder)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+
+
+@contextmanager
+def named_errors(place: Path) -> Iterator[None]:
+    """Turn errors of the operating system into a `StorageError` that names the place."""
+    try:
+        yield
+    except (OSError, av.FFmpegError) as error:
+        # PyAV says only that writing to the file object failed; why is what it came upon.
+        cause = error if isinstance(error, OSError) else error.__context__
+        if isinstance(error, StereoGenBenchError):
+            raise
+        if not isinstance(cause, OSError):
+            raise MediaError(f"{place}: cannot be encoded ({error}).") from error
+        what = f"{cause.filename or place}: cannot be written"
+        raise StorageError(describe_os_error(what, cause, "Choose another folder.")) from error
+
+
+def json_bytes(value: object) -> bytes:
+    """Return a value as the JSON files of jobs hold it."""
+    return (json.dumps(value, ensure_ascii=False, indent=1) + "\n").encode()
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file of a job.
+
+    Raises:
+        StorageError: If it is not a JSON object.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise StorageError(f"{path}: is not JSON ({error}). Remove it.") from error
+    if not isinstance(found, dict):
+        raise StorageError(f"{path}: is not a JSON object. Remove it.")
+    return found
+
+
+def read_item(path: Path) -> dict[str, Any] | None:
+    """Return the object in a JSON file of an item; None where it is missing or was cut short."""
+    try:
+        return read_json(path)
+    except (FileNotFoundError, StorageError):
+        return None
+
+
+def do_items(  # noqa: PLR0913 - what to do, how, and what is told of it
+    task: Callable[[Work, Advance], Result],
+    works: Sequence[Work],
+    *,
+    name: Callable[[Work], str],
+    keep: Callable[[Result], object] = lambda result: None,
+    engine: Engine = LOCAL,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    done: int = 0,
+    total: int,
+) -> None:
+    """Do a task for every item that is still missing.
+
+    Args:
+        task: Does one item, whole or not at all.
+        works: What is still to be done; it can be pickled.
+        name: Returns what errors call an item.
+        keep: Called in this process with each result as it comes.
+        engine: Where the items are done.
+        workers: How many processes, None for one a core.
+        progress: Called with (done, total).
+        done: How much was there before.
+        total: How much there is in all.
+    """
+    advance = advance_of(progress, done=done, total=total)
+    advance(0)
+    made = engine.map(task, works, name=name, workers=workers, advance=advance)
+    with closing(made) as results:
+        for result in results:
+            keep(result)
+            advance(0)
+    advance(total)  # never more than all is reported
