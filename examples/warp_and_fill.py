@@ -12,7 +12,7 @@ from PIL import Image
 
 from stereogenbench_data import evaluate, export_inputs
 from stereogenbench_data.evaluation.report import markdown
-from stereogenbench_data.evaluation.tables import bin_table
+from stereogenbench_data.evaluation.tables import table_of
 
 SHARDS = Path(__file__).parents[1] / "shards"
 FOLDER = Path("demo") / "warp_and_fill"
@@ -45,7 +45,7 @@ def main() -> None:
             right = warp_and_fill(views | {"hole": views["hole"] > 0})[0].permute(1, 2, 0)
             Image.fromarray(right.numpy()).save(target / f"{frame:03d}.png")
     written = evaluate(SHARDS, FOLDER / "predictions", tier="G0", split="eval", frames=FRAMES)
-    print(markdown(bin_table([called, written], "primary")))
+    print(markdown(table_of([called, written], "bins_primary")))
     same = repr(called.pairs) == repr(written.pairs)
     print("the same scores both ways" if same else "the scores differ")
 

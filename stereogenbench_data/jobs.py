@@ -164,7 +164,7 @@ def json_bytes(value: object) -> bytes:
     return (json.dumps(value, ensure_ascii=False, indent=1) + "\n").encode()
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path, *, cure: str = "Remove it.") -> dict[str, Any]:
     """Return the object in a JSON file of a job.
 
     Raises:
@@ -173,9 +173,9 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise StorageError(f"{path}: is not JSON ({error}). Remove it.") from error
+        raise StorageError(f"{path}: is not JSON ({error}). {cure}") from error
     if not isinstance(found, dict):
-        raise StorageError(f"{path}: is not a JSON object. Remove it.")
+        raise StorageError(f"{path}: is not a JSON object. {cure}")
     return found
 
 

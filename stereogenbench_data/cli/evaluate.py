@@ -49,6 +49,8 @@ def parse_strata(texts: list[str] | None) -> dict[str, tuple[float, ...]]:
     return strata
 
 
+_DIFFERENCES_SHOWN = 20
+_WHAT_IS_SAME = "the same data, protocol, weights, right views and numbers"
 _METRICS = "How metrics are computed"
 """Panel of the help for the options of metrics."""
 TierOption = Annotated[
@@ -78,7 +80,7 @@ class ProtocolOptions:
     metrics: Annotated[
         str,
         typer.Option(
-            help=f"Of {', '.join(METRICS)}.",
+            help=f"Of {', '.join(METRICS)}; or all.",
             metavar="NAMES",
         ),
     ] = ",".join(OFFLINE_METRICS)
@@ -155,6 +157,15 @@ class ReportOptions:
     plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Draw metric by baseline.")] = (
         True
     )
+    compare: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RESULTS.json",
+            exists=True,
+            dir_okay=False,
+            help="Scores to be reproduced; the exit status is 1 if these differ.",
+        ),
+    ] = None
     as_json: JsonOption = False
 
     def write(
@@ -165,11 +176,18 @@ class ReportOptions:
         *,
         found: "Sequence[Relation]" = (),
     ) -> None:
-        """Print the report as a page or as JSON, then write its files."""
-        from stereogenbench_data.evaluation.report import document, page, write_report
+        """Print the report as a page or as JSON, write its files, and compare it.
 
+        Raises:
+            typer.Exit: If it is not what it is compared with.
+        """
+        from stereogenbench_data.evaluation.compare import differences
+        from stereogenbench_data.evaluation.report import document, page, write_report
+        from stereogenbench_data.jobs import read_json
+
+        content = document(results, tables, found=found)
         if self.as_json:
-            typer.echo(json.dumps(document(results, tables, found=found), allow_nan=False))
+            typer.echo(json.dumps(content, allow_nan=False))
         else:
             typer.echo(page(results, tables, found=found).rstrip())
         files = write_report(
@@ -177,6 +195,16 @@ class ReportOptions:
         )
         names = ", ".join(str(path.relative_to(folder)) for path in files)
         typer.echo(f"{folder}: {names}", err=True)
+        if self.compare is None:
+            return
+        there = read_json(self.compare, cure="Give the results.json of an evaluation.")
+        differing = differences(json.loads(json.dumps(content)), there)
+        for text in differing[:_DIFFERENCES_SHOWN]:
+            typer.echo(f"differs: {text}", err=True)
+        if differing:
+            typer.echo(f"{self.compare}: {counted(len(differing), 'difference')}", err=True)
+            raise typer.Exit(FINDINGS)
+        typer.echo(f"{self.compare}: reproduced, {_WHAT_IS_SAME}", err=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,9 +284,8 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
 ) -> None:
     """Score a method's right views by the paper's protocol.
 
-    `stereogenbench export-inputs` writes what the method is given. The paper's own rows stand
-    beside the scores. PREDICTIONS holds, for each item, a
-    folder of PNGs or a video of the same name. The report (Markdown, LaTeX, CSV, JSON, plots) and
+    `stereogenbench export-inputs` writes what the method is given. PREDICTIONS holds, for each
+    item, a folder of PNGs or a video of the same name. The report (Markdown, LaTeX, CSV, JSON, plots) and
     partial results go to --out [evaluation/NAME-TIER]. To continue a stopped run, run it again.
     """
     from stereogenbench_data.evaluation.evaluate import evaluate as evaluated
@@ -308,7 +335,7 @@ def controls(
     [evaluation/controls]. To continue a stopped run, run it again.
     """
     from stereogenbench_data.evaluation.controls import relations, score_controls
-    from stereogenbench_data.evaluation.tables import branch_table, control_table, explaining_table
+    from stereogenbench_data.evaluation.tables import table_of
 
     protocol, selection = scoring.protocol(), chosen.selection()
     folder = report.out or Path("evaluation") / "controls"
@@ -326,7 +353,7 @@ def controls(
             **selection,
         )
     found = relations(results)
-    tables = [control_table(results), branch_table(results), explaining_table(results)]
+    tables = [table_of(results, name) for name in ("controls", "branches", "explanations")]
     report.write(folder, results, tables, found=found)
     if any(each.holds is False for each in found):
         raise typer.Exit(FINDINGS)

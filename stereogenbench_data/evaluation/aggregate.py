@@ -3,6 +3,7 @@
 Every scene counts once, whatever the number of its frames and pairs. Intervals are over scenes.
 """
 
+import hashlib
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
@@ -52,6 +53,7 @@ class PairMeans:
         frames: How many frames are scored.
         tallies: For each column.
         problem: "", or why there are no scores.
+        views_sha256: Of the pixels of the right views that were scored.
     """
 
     row: int
@@ -62,6 +64,7 @@ class PairMeans:
     frames: int
     tallies: Mapping[str, Tally]
     problem: str = ""
+    views_sha256: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,6 +233,12 @@ class Scores:
     index: SceneIndex
     pairs: tuple[PairMeans, ...]
     distances: Mapping[Labels, Mapping[str, FrechetDistance]] = field(default_factory=dict)
+
+    @property
+    def views_sha256(self) -> str:
+        """A sha256 of all right views that were scored, by scene and pair."""
+        lines = sorted(f"{each.scene} {each.pair} {each.views_sha256}\n" for each in self.pairs)
+        return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def require_comparable(results: Sequence[Scores]) -> None:

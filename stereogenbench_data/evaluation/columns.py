@@ -124,7 +124,7 @@ def require_metrics(names: Any) -> tuple[str, ...]:
     """Return metrics in the order of the tables.
 
     Args:
-        names: Names of `METRICS`, or one text that separates them by commas.
+        names: Names of `METRICS`, or one text that separates them by commas; "all" for all.
 
     Raises:
         EvaluationError: If one is unknown, or there is none.
@@ -132,6 +132,8 @@ def require_metrics(names: Any) -> tuple[str, ...]:
     >>> require_metrics("ssim,psnr")
     ('psnr', 'ssim')
     """
+    if names == "all":
+        return METRICS
     given = names.split(",") if isinstance(names, str) else list(names)
     wanted = {str(name).strip() for name in given}
     unknown = sorted(wanted - set(METRICS))

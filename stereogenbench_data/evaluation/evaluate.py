@@ -403,6 +403,7 @@ def _pair_means(workload: Workload, partial: PartialResults, name: str) -> tuple
                     frames=len(each.frames),
                     tallies={column: tally(numbers) for column, numbers in scores.columns.items()},
                     problem=scores.problem,
+                    views_sha256=scores.views_sha256,
                 )
             )
     return tuple(means)

@@ -22,7 +22,7 @@ from stereogenbench_data.evaluation.metrics import matching, pixels, scale
 from stereogenbench_data.evaluation.models import interfaces
 from stereogenbench_data.evaluation.models.registry import ModelKind, load_model
 from stereogenbench_data.evaluation.predictions import scaled_rgb
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol
+from stereogenbench_data.evaluation.protocol import PROTOCOL_VERSION, EvaluationProtocol
 from stereogenbench_data.samples.fields import Sample
 
 RESIZE: Final = (
@@ -96,6 +96,7 @@ class MetricModels:
         protocol = self.protocol
         height, width = protocol.size
         settings: dict[str, Any] = {
+            "protocol": PROTOCOL_VERSION,
             "size": f"{width}x{height}",
             "resize": RESIZE,
             "depth": "as the files state" if protocol.depth is None else repr(protocol.depth),

@@ -27,7 +27,7 @@ from stereogenbench_data.sources.files import write_atomic
 Stamps = Mapping[tuple[str, Pair], str]
 
 EVALUATION: Final = JobKind("scores", "evaluation.json", ".evaluation.lock", EvaluationError)
-FORMAT: Final = 3
+FORMAT: Final = 4
 """Of the files of scenes; other formats are refused."""
 _SCENES: Final = "scenes"
 _PARTS: Final = ("count", "mean", "root")
@@ -58,7 +58,8 @@ class PartialResults:
                 for name, numbers in found.columns.items()
             }
             pairs[_place_name(place)] = {
-                "stamp": stamps[place], "fault": found.problem, "columns": columns
+                "stamp": stamps[place], "fault": found.problem, "views_sha256": found.views_sha256,
+                "columns": columns,
             }  # fmt: skip
             for side, statistics in (("predicted", found.predicted), ("target", found.target)):
                 for name, each in statistics.items():
@@ -147,7 +148,7 @@ class PartialResults:
 def _pair_scores(pairs: Mapping[str, Any], arrays: Mapping[str, Any], place: str) -> PairScores:
     entry = pairs[place]
     columns = {name: list(map(float, numbers)) for name, numbers in entry["columns"].items()}
-    scores = PairScores(columns, problem=entry["fault"])
+    scores = PairScores(columns, problem=entry["fault"], views_sha256=entry["views_sha256"])
     for side, statistics in (("predicted", scores.predicted), ("target", scores.target)):
         start = f"{place}/{side}/"
         for key in arrays:

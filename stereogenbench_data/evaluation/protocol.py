@@ -22,6 +22,9 @@ from stereogenbench_data.evaluation.models.registry import ModelOptions
 from stereogenbench_data.samples.size import require_size
 from stereogenbench_data.schema.records import DepthEncoding
 
+PROTOCOL_VERSION: Final = 1
+"""Raised whenever the same right views get other scores under the same settings."""
+
 PAPER_SIZE: Final = (480, 832)
 """(height, width) at which the paper's frame-wise metrics are computed."""
 

@@ -15,13 +15,13 @@ from stereogenbench_data.evaluation.columns import COLUMNS, HEAVY_TAILED
 from stereogenbench_data.evaluation.controls import Relation
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.predictions import pair_name
-from stereogenbench_data.evaluation.protocol import TIERS
+from stereogenbench_data.evaluation.protocol import PROTOCOL_VERSION, TIERS
 from stereogenbench_data.evaluation.reference import DISCREPANCIES, PAPER
 from stereogenbench_data.evaluation.tables import Table, TableRow
 from stereogenbench_data.schema.text import counted, markdown_text
 from stereogenbench_data.sources.files import write_atomic
 
-FORMAT: Final = 2
+FORMAT: Final = 3
 _GAPS_SHOWN: Final = 20
 _VERDICTS: Final[Mapping[bool | None, str]] = {
     True: "holds",
@@ -48,6 +48,9 @@ def document(
     results: Sequence[Scores], tables: Sequence[Table], *, found: Sequence[Relation] = ()
 ) -> dict[str, Any]:
     """Return an evaluation as plain values, to be written as JSON; no number in it is nan.
+
+    It names what the scores are of: the data's digest, the protocol's version and every choice with
+    the hashes of weights, and a hash of each method's right views.
 
     Args:
         results: Each method's scores, of one tier.
@@ -79,13 +82,14 @@ def page(
     first = results[0]
     names = ", ".join(markdown_text(one.name) for one in results)
     tier = "" if first.tier == CONTROL else f", tier {first.tier}: {TIERS[first.tier].meaning}"
-    lines = [f"# {names}{tier}", ""]
+    lines = [f"# {names}{tier}", "", *(f"- {each}" for each in _provenance(first))]
     for one in results:
         covered = _coverage(one)
         missing = covered["missing"]
         lines.append(
             f"- {markdown_text(one.name)}: {counted(covered['pairs'], 'pair')} of "
-            f"{counted(covered['scenes'], 'scene')}, {counted(covered['frames'], 'frame')}"
+            f"{counted(covered['scenes'], 'scene')}, {counted(covered['frames'], 'frame')}, "
+            f"right views sha256 {one.views_sha256}"
             + (f", {counted(len(missing), 'pair')} missing" if missing else "")
         )
         lines += [f"  - missing: {markdown_text(each)}" for each in missing[:_GAPS_SHOWN]]
@@ -125,7 +129,7 @@ def write_report(
             document(results, tables, found=found), indent=1, allow_nan=False, ensure_ascii=False
         ),
         "report.md": page(results, tables, found=found),
-        "tables.tex": "\n".join(latex(table) for table in tables),
+        "tables.tex": "\n".join([*_tex_comments(results), *map(latex, tables)]),
         "tables.csv": csv_text(tables),
         "pairs.csv": pairs_csv(results),
     }
@@ -148,12 +152,13 @@ def write_report(
 def pairs_csv(results: Sequence[Scores]) -> str:
     """Return the scores of every pair of every scene as CSV, empty where there is no score."""
     columns = list(dict.fromkeys(name for one in results for p in one.pairs for name in p.tallies))
-    head = ["method", "scene", "cameras", "primary", "baseline_cm", "frames", "missing", *columns]
+    head = ["method", "scene", "cameras", "primary", "baseline_cm", "frames", "missing"]
+    head += ["views_sha256", *columns]
     lines = (
         [
             one.name, pair.scene, pair_name(pair.pair), int(pair.is_primary),
             repr(pair.baseline_cm), pair.frames, pair.problem,
-            *(_mean_text(pair, name) for name in columns),
+            pair.views_sha256, *(_mean_text(pair, name) for name in columns),
         ]
         for one in results
         for pair in one.pairs
@@ -168,6 +173,14 @@ def _mean_text(pair: PairMeans, column: str) -> str:
     return repr(found.mean)
 
 
+def _provenance(one: Scores) -> list[str]:
+    """Return what scores are of, but for the right views."""
+    return [
+        f"protocol: version {PROTOCOL_VERSION}",
+        f"data: sha256 {one.index.digest}, at {markdown_text(one.index.where)}",
+    ]
+
+
 def _coverage(one: Scores) -> dict[str, Any]:
     scored = [pair for pair in one.pairs if not pair.problem]
     return {
@@ -175,6 +188,7 @@ def _coverage(one: Scores) -> dict[str, Any]:
         "scenes": len({pair.scene for pair in scored}),
         "pairs": len(scored),
         "frames": sum(pair.frames for pair in scored),
+        "views_sha256": one.views_sha256,
         "missing": [pair.problem for pair in one.pairs if pair.problem],
     }
 
@@ -212,6 +226,11 @@ def latex(table: Table) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _tex_comments(results: Sequence[Scores]) -> list[str]:
+    views = [f"{one.name}: right views sha256 {one.views_sha256}" for one in results]
+    return [f"% {' '.join(text.split())}" for text in [*_provenance(results[0]), *views]]
+
+
 def csv_text(tables: Sequence[Table]) -> str:
     """Return tables as one CSV, a line for each row and column; empty where there is no number."""
     lines: list[list[Any]] = []
@@ -219,16 +238,17 @@ def csv_text(tables: Sequence[Table]) -> str:
         for row in table.rows:
             group = "; ".join(f"{k}={v}" for k, v in zip(table.keys, row.labels, strict=True))
             for name in table.columns:
-                start = [table.name, row.method, _source(row), group, heading(table, name)]
-                if row.is_papers:
-                    lines.append([*start, *[""] * 8, row.printed.get(name, "")])
-                elif name in row.distances:
-                    value = _plain_distance(row.distances[name])["value"]
-                    counts = [row.scenes, row.frames, "", "", row.missing, ""]
-                    lines.append([*start, value, "", "", *counts])
-                elif name in row.cells:
-                    cell = asdict(row.cells[name])
-                    lines.append([*start, *(cell[each] for each in _CSV_CELL), row.missing, ""])
+                start = [table.name, row.method, row.source, group, heading(table, name)]
+                match row.values.get(name):
+                    case FrechetDistance() as distance:
+                        value = _plain(distance)["value"]
+                        counts = [row.scenes, row.frames, "", "", row.missing, ""]
+                        lines.append([*start, value, "", "", *counts])
+                    case Cell() as found:
+                        numbers = [getattr(found, each) for each in _CSV_CELL]
+                        lines.append([*start, *numbers, row.missing, ""])
+                    case printed if row.source == "paper":
+                        lines.append([*start, *[""] * 8, printed or ""])
     return _csv(_CSV_HEAD, lines)
 
 
@@ -271,21 +291,24 @@ def _texts(table: Table) -> tuple[list[str], list[list[str]]]:
         texts = [row.method, *(label or ABSENT for label in row.labels)]
         texts += [ABSENT if count is None else str(count) for count in (row.scenes, row.frames)]
         if has_gaps:
-            texts.append(ABSENT if row.is_papers else str(row.missing))
+            texts.append(ABSENT if row.source == "paper" else str(row.missing))
         texts += [_cell_text(table, row, name) for name in table.columns]
         rows.append(texts)
     return head, rows
 
 
 def _cell_text(table: Table, row: TableRow, column: str) -> str:
-    if row.is_papers:
-        text = row.printed.get(column, ABSENT).replace("inf", "∞")
-        marked = column in COLUMNS and not table.protocol.is_papers(column) and text != ABSENT
-        return f"{text} †" if marked else text
-    if column in row.distances:
-        return _distance_text(row.distances[column])
-    found = row.cells.get(column)
-    return ABSENT if found is None else _number_text(found, column)
+    match row.values.get(column):
+        case None:
+            return ABSENT
+        case FrechetDistance() as distance:
+            return _distance_text(distance)
+        case Cell() as found:
+            return _number_text(found, column)
+        case printed:
+            text = printed.replace("inf", "∞")
+            marked = column in COLUMNS and not table.protocol.is_papers(column)
+            return f"{text} †" if marked else text
 
 
 def _number_text(found: Cell, column: str) -> str:
@@ -324,32 +347,27 @@ def _tex(text: str) -> str:
     return "---" if text == ABSENT else "".join(_LATEX.get(letter, letter) for letter in text)
 
 
-def _source(row: TableRow) -> str:
-    return "paper" if row.is_papers else "scored"
-
-
 def _plain_row(table: Table, row: TableRow) -> dict[str, Any]:
     plain_row: dict[str, Any] = {
         "method": row.method,
-        "source": _source(row),
+        "source": row.source,
         "group": dict(zip(table.keys, row.labels, strict=True)),
         "scenes": row.scenes,
         "frames": row.frames,
     }
-    if row.is_papers:
-        return plain_row | {"printed": dict(row.printed)}
-    cells = {name: asdict(row.cells[name]) for name in table.columns if name in row.cells}
+    if row.source == "paper":
+        return plain_row | {"printed": dict(row.values)}
+    shown = {name: row.values[name] for name in table.columns if name in row.values}
+    cells = {name: _plain(each) for name, each in shown.items() if isinstance(each, Cell)}
+    distances = {name: _plain(each) for name, each in shown.items() if name not in cells}
     plain_row |= {"missing_pairs": row.missing, "cells": cells}
-    if row.distances:
-        distances = {name: _plain_distance(each) for name, each in row.distances.items()}
-        plain_row["distances"] = distances
-    return plain_row
+    return plain_row | ({"distances": distances} if distances else {})
 
 
-def _plain_distance(found: FrechetDistance) -> dict[str, Any]:
-    return {
-        "value": found.value if math.isfinite(found.value) else None,
-        "samples": list(found.samples),
-        "dim": found.dim,
-        "underdetermined": found.underdetermined,
-    }
+def _plain(found: Any) -> dict[str, Any]:
+    """Return the numbers of a cell or of a distance; null where there is none."""
+    content = asdict(found)
+    if isinstance(found, FrechetDistance):
+        value = found.value if math.isfinite(found.value) else None
+        return content | {"value": value, "samples": list(found.samples)}
+    return content

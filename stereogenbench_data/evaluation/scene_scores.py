@@ -4,6 +4,7 @@ A few frames are in memory at a time, so that learned models get batches. Clips 
 their features need all frames of the scene.
 """
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -50,12 +51,14 @@ class PairScores:
         predicted: For each distance, the statistics of the features of the right views.
         target: The same of the rendered views.
         problem: "", or why there are no scores.
+        views_sha256: Of the right views' pixels as they were read, frame by frame.
     """
 
     columns: dict[str, list[float]] = field(default_factory=dict)
     predicted: dict[str, FeatureStatistics] = field(default_factory=dict)
     target: dict[str, FeatureStatistics] = field(default_factory=dict)
     problem: str = ""
+    views_sha256: str = ""
 
 
 SceneScores = dict[tuple[str, Pair], PairScores]
@@ -197,6 +200,7 @@ class PairScorer:
         self._on_problem = on_problem
         self._scores = PairScores({name: [] for name in models.protocol.columns})
         self._clip: list[tuple[Any, Any]] = []
+        self._read_pixels = hashlib.sha256()
 
     def add(self, frames: Sequence[TargetFrame]) -> None:
         """Read the right views of some frames, in order, and score them.
@@ -216,6 +220,9 @@ class PairScorer:
                 raise
             self._scores = PairScores(problem=str(problem))
             return
+        for picture in given:
+            self._read_pixels.update(f"{picture.shape}".encode())
+            self._read_pixels.update(np.ascontiguousarray(picture).data)
         with one_thread():
             self._score(given, frames)
 
@@ -253,6 +260,7 @@ class PairScorer:
             EvaluationError: If a clip has fewer frames than its features need.
         """
         if not self._scores.problem:
+            self._scores.views_sha256 = self._read_pixels.hexdigest()
             for name, features in self._models.video_features.items():
                 if len(self._clip) < features.min_frames:
                     raise EvaluationError(

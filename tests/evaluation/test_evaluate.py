@@ -300,9 +300,9 @@ def test_partial_results_of_an_earlier_version_are_refused_by_their_format(
 ):
     scored(scored_index, right_views, protocol, out=tmp_path)
     state = tmp_path / "evaluation.json"
-    state.write_text(json.dumps(json.loads(state.read_text()) | {"format": 2}))
+    state.write_text(json.dumps(json.loads(state.read_text()) | {"format": 3}))
 
-    with pytest.raises(EvaluationError, match="holds scores of other format: 2, where 3"):
+    with pytest.raises(EvaluationError, match="holds scores of other format: 3, where 4"):
         scored(scored_index, right_views, protocol, out=tmp_path)
 
 

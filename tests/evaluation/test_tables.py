@@ -13,7 +13,7 @@ from stereogenbench_data.evaluation.aggregate import PairMeans, Scores, tally
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.reference import release_difference
 from stereogenbench_data.evaluation.report import csv_text, document, latex, markdown
-from stereogenbench_data.evaluation.tables import bin_table, branch_table, stratum_table
+from stereogenbench_data.evaluation.tables import stratum_table, table_of
 
 PAPERS = EvaluationProtocol()
 INF, NAN = float("inf"), float("nan")
@@ -52,7 +52,7 @@ def rows(table):
 
 
 def test_branches_stand_beside_the_papers_rows_of_the_same_tier(scores):
-    table = branch_table([scores(tier="G1")])
+    table = table_of([scores(tier="G1")], "branches")
 
     assert rows(table) == [
         ("ours", "seen_map", "Uniform"),
@@ -60,13 +60,13 @@ def test_branches_stand_beside_the_papers_rows_of_the_same_tier(scores):
         ("ours", "unseen_map", "IPD_Gaussian"),
         ("StereoSpace (paper, other scenes)", "unseen_map", "IPD_Gaussian"),
     ]
-    assert table.rows[0].cells["psnr"].mean == (31 + 22) / 2
-    assert table.rows[1].printed["psnr"] == "19.71"
+    assert table.rows[0].values["psnr"].mean == (31 + 22) / 2
+    assert table.rows[1].values["psnr"] == "19.71"
     assert (table.rows[0].scenes, table.rows[0].frames) == (2, 4)
 
 
 def test_scores_of_other_scenes_than_the_papers_say_so_in_table_and_csv(scores):
-    table = branch_table([scores(tier="G1")])
+    table = table_of([scores(tier="G1")], "branches")
 
     assert "NOT COMPARABLE WITH THE PAPER" in markdown(table)
     assert "3 of 3 scenes on maps that the release does not have (SynthStage, SynthYard)" in latex(
@@ -96,7 +96,7 @@ def test_only_all_scenes_of_a_branch_are_those_of_the_paper():
 
 
 def test_bins_are_in_order_with_the_papers_beside(scores):
-    table = bin_table([scores(tier="G1")], "primary")
+    table = table_of([scores(tier="G1")], "bins_primary")
 
     assert rows(table) == [
         ("ours", "seen_map", "Uniform", "[1,10)"),
@@ -105,12 +105,12 @@ def test_bins_are_in_order_with_the_papers_beside(scores):
         ("StereoSpace (paper, other scenes)", "seen_map", "Uniform", "[10,30)"),
         ("ours", "unseen_map", "IPD_Gaussian", "[100,150]"),
     ]
-    assert table.rows[1].printed["psnr"] == "21.69 ± 1.04"
+    assert table.rows[1].values["psnr"] == "21.69 ± 1.04"
 
 
 def test_all_pairs_have_a_table_of_their_own(scores):
     names = [table.name for table in tables_of([scores()])]
-    table = bin_table([scores()], "all")
+    table = table_of([scores()], "bins_all")
 
     assert names == ["branches", "bins_primary", "bins_all", "explanations"]
     assert ("ours", "unseen_map", "IPD_Gaussian", "[10,30)") in rows(table)
@@ -127,9 +127,9 @@ def test_a_column_of_the_index_makes_strata(scores, scored_index):
 
 
 def test_methods_of_one_tier_share_a_table_and_those_of_two_do_not(scores):
-    both = branch_table([scores("one"), scores("two")])
+    both = table_of([scores("one"), scores("two")], "branches")
 
-    assert [row.method for row in both.rows if not row.is_papers] == ["one", "two"] * 2
+    assert [row.method for row in both.rows if row.source == "scored"] == ["one", "two"] * 2
     with pytest.raises(EvaluationError, match=r"their tier differs \(G0 and G2\)"):
         tables_of([scores("one"), scores("two", tier="G2")])
     for change in ({"size": (240, 416)}, {"fit": "least_squares"}):
@@ -139,7 +139,7 @@ def test_methods_of_one_tier_share_a_table_and_those_of_two_do_not(scores):
 
 
 def test_what_is_not_comparable_with_the_paper_is_said(scores):
-    table = branch_table([scores(protocol=EvaluationProtocol(size=(240, 416)))])
+    table = table_of([scores(protocol=EvaluationProtocol(size=(240, 416)))], "branches")
     text = markdown(table)
 
     assert "E_match (sift)↓" in text
@@ -154,14 +154,14 @@ def test_the_papers_own_backends_are_not_marked(scores):
     papers = EvaluationProtocol(
         keypoint_matcher="mine.py:DeDoDe", stereo_matcher="mine.py:FoundationStereo"
     )
-    text = markdown(branch_table([scores(protocol=papers)]))
+    text = markdown(table_of([scores(protocol=papers)], "branches"))
 
     assert "| E_match↓ |" in text
     assert "†" not in text
 
 
 def test_identical_and_undefined_frames_are_counted_in_the_cell(scores):
-    text = markdown(branch_table([scores(psnr=((INF, INF), (INF, INF), (10, INF)))]))
+    text = markdown(table_of([scores(psnr=((INF, INF), (INF, INF), (10, INF)))], "branches"))
 
     assert "∞ (4 identical)" in text
     assert "10.00 (1 identical)" in text
@@ -169,7 +169,7 @@ def test_identical_and_undefined_frames_are_counted_in_the_cell(scores):
 
 
 def test_the_median_of_sd_stands_beside_its_mean(scores):
-    text = markdown(branch_table([scores()]))
+    text = markdown(table_of([scores()], "branches"))
 
     assert "0.5000 ± 0.0000 [0.5000]" in text
     assert "1.0000 ± 0.0000 [1.0000]" in text
@@ -178,8 +178,8 @@ def test_the_median_of_sd_stands_beside_its_mean(scores):
 @pytest.mark.parametrize("fit", ["filtered", "least_squares"])
 def test_the_papers_sd_stands_in_the_filtered_column_alone(scores, fit):
     protocol = EvaluationProtocol(stereo_matcher="mine.py:FoundationStereo", fit=fit)
-    table = branch_table([scores(tier="G1", protocol=protocol)])
-    paper = next(row for row in table.rows if row.is_papers)
+    table = table_of([scores(tier="G1", protocol=protocol)], "branches")
+    paper = next(row for row in table.rows if row.source == "paper")
     lines = markdown(table).splitlines()
     head = [each.strip() for each in lines[2].split("|")]
     line = next(
@@ -187,14 +187,14 @@ def test_the_papers_sd_stands_in_the_filtered_column_alone(scores, fit):
     )
     cells = dict(zip(head, (each.strip() for each in line.split("|")), strict=True))
 
-    assert paper.printed["sd_filtered"] == "0.3951"
+    assert paper.values["sd_filtered"] == "0.3951"
     assert cells["SD filtered↓ [median]"] == "0.3951"
     assert cells["SD least squares↓ [median]"] == "-"
 
 
 def test_theil_sens_sd_is_a_third_column_where_it_is_requested(scores):
-    asked = branch_table([scores(protocol=EvaluationProtocol(fit="theil_sen"))])
-    plain = branch_table([scores()])
+    asked = table_of([scores(protocol=EvaluationProtocol(fit="theil_sen"))], "branches")
+    plain = table_of([scores()], "branches")
 
     assert [name for name in asked.columns if name.startswith("sd")] == [
         "sd_filtered", "sd_least_squares", "sd_theil_sen",
@@ -230,7 +230,7 @@ def test_every_form_of_a_report_has_sd_by_both_fits_and_says_why(scores, tmp_pat
 def test_a_table_without_sd_has_no_note_on_its_fits(scores):
     protocol = EvaluationProtocol(metrics=("psnr", "ssim"))
 
-    assert "rule for outliers" not in markdown(branch_table([scores(protocol=protocol)]))
+    assert "rule for outliers" not in markdown(table_of([scores(protocol=protocol)], "branches"))
 
 
 def test_an_unknown_fit_is_refused_when_the_protocol_is_made():
@@ -245,11 +245,11 @@ def test_a_gap_is_a_column_of_the_table(scores):
         frames=2, tallies={}, problem="has no prediction",
     )  # fmt: skip
     holed = Scores("ours", "G0", PAPERS, {}, whole.index, (whole.pairs[0], gap, *whole.pairs[2:]))
-    table = branch_table([holed])
+    table = table_of([holed], "branches")
 
     assert "| missing |" in markdown(table)
     assert (table.rows[0].missing, table.rows[0].scenes) == (1, 1)
-    assert "missing" not in markdown(branch_table([whole])).partition("\n\n")[2]
+    assert "missing" not in markdown(table_of([whole], "branches")).partition("\n\n")[2]
 
 
 def test_a_distance_says_its_sample_and_its_dimension(scores):
@@ -260,7 +260,7 @@ def test_a_distance_says_its_sample_and_its_dimension(scores):
         "ours", "G0", protocol, {}, one.index, one.pairs,
         {("seen_map", "Uniform"): {"fid": distance}},
     )  # fmt: skip
-    text = markdown(branch_table([told]))
+    text = markdown(table_of([told], "branches"))
 
     assert "FID↓" in text
     assert "12.50 (N 6 ≤ D 66) !" in text
@@ -301,7 +301,7 @@ def test_the_csv_has_a_line_for_each_row_and_column(scores, tmp_path):
 
 
 def test_latex_has_its_signs_escaped_and_its_columns_counted(scores):
-    text = latex(branch_table([scores("[50 % & more_{x} < y|")]))
+    text = latex(table_of([scores("[50 % & more_{x} < y|")], "branches"))
     rows_of_text = [line for line in text.splitlines() if line.endswith(r"\\")]
 
     assert r"{[}50 \% \& more\_\{x\} $<$ y$|$" in text

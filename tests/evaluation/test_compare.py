@@ -1,0 +1,72 @@
+"""An evaluation that is made twice is the same, and a report tells what differs where it is not."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.evaluation.compare import differences
+from stereogenbench_data.evaluation.predictions import frame_name, item_name
+from stereogenbench_data.evaluation.report import document, page
+from stereogenbench_data.evaluation.tables import tables_of
+from tests.evaluation.conftest import scored
+
+
+def reported(scores):
+    return json.loads(json.dumps(document([scores], tables_of([scores]))))
+
+
+@pytest.fixture(scope="module")
+def changed(other_views, scored_index, tmp_path_factory):
+    """The same right views encoded otherwise, one of them with another pixel."""
+    root = tmp_path_factory.mktemp("changed")
+    kept, pixel = root / "encoded" / "views", root / "pixel" / "views"
+    shutil.copytree(other_views, kept)
+    for path in kept.rglob("*.png"):
+        Image.open(path).save(path, compress_level=0)
+    shutil.copytree(kept, pixel)
+    path = pixel / item_name(scored_index.column("key")[0], (0, 1)) / frame_name(0)
+    picture = np.array(Image.open(path))
+    picture[3, 4, 0] ^= 1
+    Image.fromarray(picture).save(path)
+    return kept, pixel
+
+
+def test_the_same_right_views_give_the_same_report_however_they_are_encoded(
+    scored_index, other_views, changed, protocol
+):
+    first = scored(scored_index, other_views, protocol, name="a")
+    second = scored(scored_index, changed[0], protocol, name="a")
+
+    assert first.views_sha256 == second.views_sha256
+    assert differences(reported(first), reported(second)) == []
+
+
+def test_one_other_bit_is_found_in_the_right_views_and_in_the_scores(
+    scored_index, other_views, changed, protocol
+):
+    first = scored(scored_index, other_views, protocol, name="a")
+    second = scored(scored_index, changed[1], protocol, name="a")
+
+    found = differences(reported(first), reported(second))
+
+    assert first.views_sha256 != second.views_sha256
+    assert [each for each in found if each.startswith("coverage[a].views_sha256: ")]
+    assert [each for each in found if each.startswith("tables[branches].rows[a seen_map, Uniform]")]
+
+
+def test_what_scores_are_of_is_printed(scored_index, right_views, protocol):
+    scores = scored(scored_index, right_views, protocol)
+    text = page([scores], tables_of([scores]))
+
+    assert "- protocol: version 1\n" in text
+    for sha256 in (scores.views_sha256, scored_index.digest):
+        assert f"sha256 {sha256}" in text
+
+
+def test_only_a_report_of_this_format_is_compared():
+    with pytest.raises(EvaluationError, match="must have format 3, and this one has None"):
+        differences({"format": 3}, {})
