@@ -285,8 +285,9 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
     """Score a method's right views by the paper's protocol.
 
     `stereogenbench export-inputs` writes what the method is given. PREDICTIONS holds, for each
-    item, a folder of PNGs or a video of the same name. The report (Markdown, LaTeX, CSV, JSON, plots) and
-    partial results go to --out [evaluation/NAME-TIER]. To continue a stopped run, run it again.
+    item, a folder of PNGs or a video of the same name. The report (Markdown, LaTeX, CSV, JSON,
+    plots) and partial results go to --out [evaluation/NAME-TIER]. To continue a stopped run, run it
+    again.
     """
     from stereogenbench_data.evaluation.evaluate import evaluate as evaluated
     from stereogenbench_data.evaluation.tables import tables_of
