@@ -11,7 +11,7 @@ READY := $(VENV)/.ready
 SAMPLE := build/sample
 SYNTH := $(BIN)/stereogenbench synth $(SAMPLE)/release --size 72 --frames 81 --depth-unit-m 0.01
 
-.PHONY: demo test lint docs bench sample descriptors clean
+.PHONY: demo test test-blender lint docs bench sample descriptors clean
 .DELETE_ON_ERROR:
 
 # The sdist leaves out the sample.
@@ -27,6 +27,15 @@ demo: shards/index.parquet $(READY)
 # computes with one thread.
 test: shards/index.parquet lint
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST_ARGS) --numprocesses $$($(BIN)/python -c "import os; print(os.cpu_count() * 3 // 2)") --maxprocesses 8 --dist worksteal
+
+# Blender's wheels are for Python 3.13, so its tests have an environment of their own.
+BLENDER_PYTHON ?= python3.13
+test-blender:
+	$(BLENDER_PYTHON) -m venv .venv-blender
+	.venv-blender/bin/python -m pip install --quiet --disable-pip-version-check \
+		--constraint constraints/cpu.txt --editable ".[blender,blosc2,evaluation]" \
+		beartype embreex hypothesis pytest pytest-timeout trimesh
+	OMP_NUM_THREADS=1 .venv-blender/bin/python -m pytest tests/synthesis/test_blender.py
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -73,4 +82,4 @@ $(READY): pyproject.toml $(CONSTRAINTS)
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-blender demo build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -47,16 +47,13 @@ class RendererOptions:
     assets: Annotated[
         Path | None, typer.Option(help="The assets.toml of the renderer blender.")
     ] = None
-    blender_python: Annotated[
-        str, typer.Option(help="Python that has bpy 5.0, for the renderer blender [this one].")
-    ] = ""
 
     def renderer_of(self) -> "Renderer":
         """Return the renderer that the options name.
 
         Raises:
             SynthesisError: If the assets are missing, not wanted, or not as they should be.
-            ExtraError: If Blender cannot be started.
+            ExtraError: If Blender is not installed.
         """
         from stereogenbench_data.errors import SynthesisError
 
@@ -68,11 +65,11 @@ class RendererOptions:
                     "renderer blender: no assets are named. Name the maps, characters and "
                     "animations in an assets.toml, and give it by --assets."
                 )
-            return BlenderRenderer.from_file(self.assets, python=self.blender_python)
-        if self.assets is not None or self.blender_python:
+            return BlenderRenderer.from_file(self.assets)
+        if self.assets is not None:
             raise SynthesisError(
-                f"renderer {self.renderer}: it takes no --assets and no --blender-python. Choose "
-                f"--renderer blender, or leave them out."
+                f"renderer {self.renderer}: it takes no --assets. Choose --renderer blender, or "
+                f"leave them out."
             )
         from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING
 

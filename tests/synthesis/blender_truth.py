@@ -1,6 +1,6 @@
 """Write the triangles of a .blend file at a frame, as Blender evaluates it for its windows.
 
-Run it with a Python that has bpy: ``python blender_truth.py FILE FRAME OUT.npz``.
+Run it by ``python blender_truth.py FILE FRAME OUT.npz``.
 """
 
 import sys

@@ -1,7 +1,4 @@
-"""Scenes rendered by Blender, judged from what comes out. They are skipped where bpy is missing.
-
-Blender may be in another Python: name it by the environment variable BLENDER_PYTHON.
-"""
+"""Scenes rendered by Blender, judged from what comes out. They are skipped where bpy is missing."""
 
 import importlib.util
 import json
@@ -21,7 +18,7 @@ from typer.testing import CliRunner
 
 from stereogenbench_data import EvaluationProtocol, StereoPairs, score_controls
 from stereogenbench_data.cli.commands import app
-from stereogenbench_data.errors import ExtraError, SynthesisError
+from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.evaluation.controls import relations
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.synthesis.blender.assets import read_assets
@@ -37,11 +34,9 @@ from tests.synthesis.conftest import Drawn
 from tests.synthesis.test_pictures import psnr_db
 
 HERE = Path(__file__).parent
-PYTHON = os.environ.get("BLENDER_PYTHON", "")
-has_blender = PYTHON or importlib.util.find_spec("bpy") is not None
-needs_blender = pytest.mark.skipif(
-    not has_blender,
-    reason="needs bpy 5.0: install it, or name a Python that has it by BLENDER_PYTHON",
+pytestmark = pytest.mark.skipif(
+    importlib.util.find_spec("bpy") is None,
+    reason="needs the extra blender, whose bpy 5.2 needs Python 3.13",
 )
 
 
@@ -50,7 +45,7 @@ def assets(tmp_path_factory):
     """A folder with a yard, a room, a walking figure, and assets that have a fault each."""
     folder = tmp_path_factory.mktemp("blender") / "assets"
     made = subprocess.run(
-        [PYTHON or sys.executable, str(HERE / "make_blender_assets.py"), str(folder)],
+        [sys.executable, str(HERE / "make_blender_assets.py"), str(folder)],
         capture_output=True,
         text=True,
         check=False,
@@ -62,7 +57,7 @@ def assets(tmp_path_factory):
 @pytest.fixture(scope="session")
 def renderer(assets):
     """The renderer of the sound assets."""
-    return BlenderRenderer.from_file(assets / "assets.toml", python=PYTHON)
+    return BlenderRenderer.from_file(assets / "assets.toml")
 
 
 def proposal(*, on="Yard", take="Walk", frames=3, size_px=64, height_px=None, sensor_mm=SENSOR_MM):
@@ -115,32 +110,9 @@ def views(renderer, made, cameras=(0, 1, 2, 3, 4, 5)):
     return list(renderer.views(made, cameras=cameras))
 
 
-# Without Blender.
-
-
-def test_a_python_without_blender_is_refused_with_the_cure(tmp_path):
-    bare = tmp_path / "python"
-    bare.write_text(f"#!/bin/sh\nexec {sys.executable} -c 'import absent_bpy'\n")
-    bare.chmod(0o755)
-
-    with pytest.raises(ExtraError, match=r"cannot start Blender.*absent_bpy.*Python 3\.11 only"):
-        blender(str(bare))
-    with pytest.raises(ExtraError, match=r"no_python: this Python cannot be started"):
-        blender(str(tmp_path / "no_python"))
-
-
-@pytest.mark.skipif(importlib.util.find_spec("bpy") is not None, reason="bpy is installed here")
-def test_this_python_without_blender_names_the_way_to_get_it():
-    with pytest.raises(
-        ExtraError, match=r"bpy cannot be imported \(No module named 'bpy'\).*--blender-python"
-    ):
-        blender()
-
-
 # What a map and a subject answer.
 
 
-@needs_blender
 def test_it_is_a_renderer_whose_maps_are_worlds(renderer):
     assert isinstance(renderer, Renderer)
     assert renderer.maps == ("Room", "Yard")
@@ -149,7 +121,6 @@ def test_it_is_a_renderer_whose_maps_are_worlds(renderer):
     assert isinstance(renderer.world(proposal()), World)
 
 
-@needs_blender
 def test_rays_meet_the_walls_of_a_room_where_they_were_built(renderer):
     """The table stands at Blender's y = 2.2, so at y = -2.2 of a left-handed map."""
     world = renderer.world(proposal(on="Room"))
@@ -162,7 +133,6 @@ def test_rays_meet_the_walls_of_a_room_where_they_were_built(renderer):
     np.testing.assert_allclose(down_m, [3.0 - 1.35, 3.0], atol=1e-6)
 
 
-@needs_blender
 def test_a_ray_that_starts_in_a_solid_goes_nowhere_but_a_room_is_no_solid(renderer):
     world = renderer.world(proposal(on="Room"))
     origins = np.array([[2.4, -2.0, 0.3], [-4.2, -1.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 20.0]])
@@ -172,7 +142,6 @@ def test_a_ray_that_starts_in_a_solid_goes_nowhere_but_a_room_is_no_solid(render
     np.testing.assert_allclose(met_m, [0, 0, 2.2, np.inf], atol=1e-6)
 
 
-@needs_blender
 def test_cameras_stay_below_a_ceiling_and_may_rise_above_a_yard(renderer):
     room, yard = (renderer.world(proposal(on=name)) for name in ("Room", "Yard"))
 
@@ -182,7 +151,6 @@ def test_cameras_stay_below_a_ceiling_and_may_rise_above_a_yard(renderer):
     np.testing.assert_allclose(yard.spawn_bounds_m.high_m, [3, 3, 1])
 
 
-@needs_blender
 @pytest.mark.parametrize("yaw_deg", [0.0, 90.0, -30.0])
 def test_the_subject_stands_on_its_place_and_walks_where_it_faces(renderer, yaw_deg):
     world = renderer.world(proposal(frames=81))
@@ -209,7 +177,6 @@ def _changed(assets, before, after):
     return read_assets(path)
 
 
-@needs_blender
 def test_all_kinds_of_files_give_the_same_motion(assets):
     """A take of one file moves the mesh of another with the same bones."""
     found = []
@@ -221,7 +188,7 @@ def test_all_kinds_of_files_give_the_same_motion(assets):
             )
             path = assets / "kinds.toml"
             path.write_text(text)
-            world = BlenderRenderer(read_assets(path), PYTHON).world(proposal(frames=30))
+            world = BlenderRenderer(read_assets(path)).world(proposal(frames=30))
             spawn = Spawn(np.zeros(3), 0.0)
             points = np.stack([world.subject_points_m(spawn, frame=t) for t in range(30)])
             found.append(np.concatenate([points.min(axis=1), points.max(axis=1)]))
@@ -229,27 +196,25 @@ def test_all_kinds_of_files_give_the_same_motion(assets):
     np.testing.assert_allclose(found[1:], [found[0]] * 8, atol=4e-3)
 
 
-@needs_blender
 def test_only_what_hangs_on_the_armature_is_the_subject(assets):
     """Neither the plinth below it nor the shape of a handle, whose collection is excluded."""
     file = '[characters.Figure]\nfile = "figure.glb"'
     spawn = Spawn(np.zeros(3), 0.0)
-    alone = BlenderRenderer(_changed(assets, file, file), PYTHON).world(proposal())
+    alone = BlenderRenderer(_changed(assets, file, file)).world(proposal())
     changed = _changed(assets, file, file.replace("figure.glb", "figure_extra.blend"))
 
     with pytest.warns(BlenderAssetWarning, match=r"object 'plinth', hidden: bound to no armature"):
-        world = BlenderRenderer(changed, PYTHON).world(proposal())
+        world = BlenderRenderer(changed).world(proposal())
 
     for points in (each.subject_points_m(spawn, frame=0) for each in (alone, world)):
         np.testing.assert_allclose(points[:, 2].min(), 0, atol=0.02)
         np.testing.assert_allclose(np.ptp(points, axis=0), [0.46, 0.56, 1.7], atol=0.02)
 
 
-@needs_blender
 @pytest.mark.parametrize(("take", "repeat"), [("Lean", "onward"), ("Walk", "back")])
 def test_a_take_that_cannot_go_on_is_played_back(assets, take, repeat):
     changed = _changed(assets, 'take = "Walk"', f'take = "{take}"\nrepeat = "{repeat}"')
-    world = BlenderRenderer(changed, PYTHON).world(proposal(frames=32))
+    world = BlenderRenderer(changed).world(proposal(frames=32))
     spawn = Spawn(np.zeros(3), 0.0)
 
     points = np.stack([world.subject_points_m(spawn, frame=frame) for frame in range(32)])
@@ -263,7 +228,6 @@ def test_a_take_that_cannot_go_on_is_played_back(assets, take, repeat):
 # What is rendered.
 
 
-@needs_blender
 def test_depth_is_that_of_another_librarys_rays(renderer, assets, tmp_path):
     """Oblong pixels, and a fan that turns."""
     trimesh = pytest.importorskip("trimesh", reason="needs trimesh, and embreex to be fast")
@@ -281,7 +245,7 @@ def test_depth_is_that_of_another_librarys_rays(renderer, assets, tmp_path):
     out = tmp_path / "truth.npz"
     when = 1 + frame / 15 * 24
     script = [str(HERE / "blender_truth.py"), str(assets / "yard.blend"), str(when), str(out)]
-    subprocess.run([PYTHON or sys.executable, *script], check=True, capture_output=True)
+    subprocess.run([sys.executable, *script], check=True, capture_output=True)
     corners = np.load(out)["corners"] * [1, -1, 1]
     mesh = trimesh.Trimesh(
         corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False
@@ -303,7 +267,6 @@ def test_depth_is_that_of_another_librarys_rays(renderer, assets, tmp_path):
         assert np.isinf(truth_m).mean() > 0.05
 
 
-@needs_blender
 def test_pictures_have_sky_exactly_where_depth_has_none(renderer):
     """So intrinsics of pictures and depth agree, also with oblong pixels."""
     made = proposal(frames=1, size_px=96, height_px=64, sensor_mm=(23.76, 12.0))
@@ -320,11 +283,10 @@ def test_pictures_have_sky_exactly_where_depth_has_none(renderer):
         assert (is_sky == nothing).mean() > 0.985
 
 
-@needs_blender
 def test_depth_goes_through_holes_that_a_material_cuts(assets):
     """A red card with holes, before a blue wall on the left and nothing on the right."""
     changed = _changed(assets, "yard.blend", "screen.blend")
-    quick = fast(BlenderRenderer(changed, PYTHON), samples_per_pixel=4)
+    quick = fast(BlenderRenderer(changed), samples_per_pixel=4)
     made = plan(
         proposal(frames=1), eye=(-4.0, 0.0, 1.8), target=(2.0, 0.0, 1.8), place=(0.0, 100.0, 0.0)
     )
@@ -340,13 +302,12 @@ def test_depth_goes_through_holes_that_a_material_cuts(assets):
         assert np.isinf(view.depth_m[sky]).all()
 
 
-@needs_blender
 def test_the_same_plan_gives_the_same_bytes_in_another_blender(renderer):
     made = plan(proposal(frames=2))
     few = fast(renderer, samples_per_pixel=4, denoise=True)
 
     first = views(few, made)
-    blender(PYTHON, place=renderer.assets.maps["Yard"].file).close()
+    blender(renderer.assets.maps["Yard"].file).close()
     second = views(few, made)
 
     assert len(first) == 12
@@ -357,7 +318,6 @@ def test_the_same_plan_gives_the_same_bytes_in_another_blender(renderer):
     assert not np.array_equal(first[0].depth_m, first[6].depth_m)
 
 
-@needs_blender
 def test_the_command_renders_all_maps_of_the_assets(assets, tmp_path):
     quick = tmp_path / "assets"
     shutil.copytree(assets, quick)
@@ -365,11 +325,10 @@ def test_the_command_renders_all_maps_of_the_assets(assets, tmp_path):
     (quick / "assets.toml").write_text(text.replace("= 32", "= 1\ndenoise = false"))
     options = ["--size", "32", "--frames", "1", "--scenes", "2", "--seed", "5", "--workers", "1"]
     of_blender = ["--renderer", "blender", "--assets", str(quick / "assets.toml")]
-    python = ["--blender-python", PYTHON] if PYTHON else []
 
     result = CliRunner().invoke(
         app,
-        ["synth", str(tmp_path / "out"), *options, *of_blender, *python],
+        ["synth", str(tmp_path / "out"), *options, *of_blender],
         catch_exceptions=False,
     )
 
@@ -379,7 +338,6 @@ def test_the_command_renders_all_maps_of_the_assets(assets, tmp_path):
     assert "2 scenes in train/IPD_Gaussian/" in result.stdout
 
 
-@needs_blender
 def test_two_parts_write_the_files_of_one_run(renderer, tmp_path):
     request = SynthRequest(map_name=renderer.maps, scenes=2, size_px=32, frames=1, seed=5)
     quick = fast(renderer)
@@ -412,16 +370,14 @@ FAULTS = {
 }
 
 
-@needs_blender
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_faulty_map_is_refused_with_the_cure(assets, name):
     changed = _changed(assets, "yard.blend", name)
 
     with pytest.raises(SynthesisError, match=rf"maps\.Yard: .*{FAULTS[name]}"):
-        BlenderRenderer(changed, PYTHON).world(proposal())
+        BlenderRenderer(changed).world(proposal())
 
 
-@needs_blender
 @pytest.mark.parametrize(
     ("before", "after", "says"),
     [
@@ -444,10 +400,9 @@ def test_a_faulty_subject_is_refused_with_the_cure(assets, before, after, says):
     changed = _changed(assets, before, after)
 
     with pytest.raises(SynthesisError, match=says):
-        BlenderRenderer(changed, PYTHON).world(proposal())
+        BlenderRenderer(changed).world(proposal())
 
 
-@needs_blender
 def test_a_gpu_is_used_or_its_lack_is_told(renderer):
     on_gpu = fast(renderer, device="GPU")
     try:
@@ -458,18 +413,16 @@ def test_a_gpu_is_used_or_its_lack_is_told(renderer):
         assert view.picture.std() > 5
 
 
-@needs_blender
 def test_a_map_of_another_name_is_refused(renderer):
     with pytest.raises(SynthesisError, match=r"there is no map 'Moon'.*Room, Yard"):
         renderer.world(proposal(on="Moon"))
 
 
-@needs_blender
 def test_scripts_in_files_do_not_run_and_are_told(assets):
     changed = _changed(assets, "yard.blend", "scripted.blend")
 
     with pytest.warns(BlenderAssetWarning, match=r"harm\.py.*driver of 'floor', location"):
-        world = BlenderRenderer(changed, PYTHON).world(proposal())
+        world = BlenderRenderer(changed).world(proposal())
 
     assert not list((assets.parent / "outside").glob("was_*"))
     # The driver would have lifted the floor by 3 m.
@@ -477,10 +430,9 @@ def test_scripts_in_files_do_not_run_and_are_told(assets):
     assert fall_m == pytest.approx([2.0], abs=0.2)
 
 
-@needs_blender
 def test_a_crash_of_blender_is_an_error_and_the_next_call_starts_anew(renderer):
     world = renderer.world(proposal())
-    process = blender(PYTHON, place=renderer.assets.maps["Yard"].file)
+    process = blender(renderer.assets.maps["Yard"].file)
     os.kill(process.pid, signal.SIGSEGV)
     up = (np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, -1.0]]))
 
@@ -489,14 +441,13 @@ def test_a_crash_of_blender_is_an_error_and_the_next_call_starts_anew(renderer):
     np.testing.assert_allclose(world.cast(*up), [1.0], atol=1e-6)
 
 
-@needs_blender
 def test_a_scene_on_which_blender_crashed_is_rendered_by_the_next_run(renderer, tmp_path):
     request = SynthRequest(map_name=("Yard",), size_px=32, frames=2, seed=1)
     quick = fast(renderer)
 
     def kill(done, total):
         if done == 6:
-            os.kill(blender(PYTHON, place=renderer.assets.maps["Yard"].file).pid, signal.SIGSEGV)
+            os.kill(blender(renderer.assets.maps["Yard"].file).pid, signal.SIGSEGV)
 
     with pytest.raises(SynthesisError, match=r"scene_000000, frame 1: Blender crashed"):
         synthesise(tmp_path, request, renderer=quick, progress=kill)
@@ -531,7 +482,6 @@ def scenes(rendered):
     return [Drawn(marker.parent) for marker in sorted(rendered.rglob("_scene_complete.json"))]
 
 
-@needs_blender
 def test_visible_pixels_agree_when_warped_by_depth(scenes):
     for scene in scenes:
         for left in range(5):
@@ -542,14 +492,12 @@ def test_visible_pixels_agree_when_warped_by_depth(scenes):
         assert agreement_db > 28
 
 
-@needs_blender
 def test_the_subject_is_seen_and_moves(scenes):
     for scene in scenes:
         assert np.ptp(scene.pictures(0), axis=0).max() > 40
         assert scene.json("baseline.json")["character_mesh"] == "Figure"
 
 
-@needs_blender
 def test_the_doctor_confirms_the_contract_and_the_audit_finds_nothing(rendered):
     few = ("--frames", "2", "--workers", "1")
 
@@ -566,7 +514,6 @@ def test_the_doctor_confirms_the_contract_and_the_audit_finds_nothing(rendered):
     assert found["depth along"] == "confirmed"
 
 
-@needs_blender
 def test_pairs_and_evaluation_read_the_scenes(rendered):
     pairs = StereoPairs(rendered, pairs="all", frames="all")
     sample = pairs[0]

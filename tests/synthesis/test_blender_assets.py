@@ -1,15 +1,14 @@
 """``assets.toml``, without Blender: what is read, and what is refused in which words."""
 
-import io
+import importlib.util
 import json
 import struct
 
-import numpy as np
 import pytest
 
-from stereogenbench_data.errors import SynthesisError
+from stereogenbench_data.errors import ExtraError, SynthesisError
 from stereogenbench_data.synthesis.blender.assets import gltf_uris, read_assets
-from stereogenbench_data.synthesis.blender.worker import read_message, write_message
+from stereogenbench_data.synthesis.blender.renderer import BlenderRenderer
 
 COMPLETE = """\
 [maps.Yard]
@@ -206,22 +205,9 @@ def test_the_digest_follows_every_file(folder):
     assert read(folder, LEAST).digest != before
 
 
-def test_messages_arrive_as_they_were_sent():
-    stream = io.BytesIO()
-    arrays = [np.arange(6.0).reshape(2, 3), np.empty((0, 3)), np.array([[1, 2]], np.uint8)]
+@pytest.mark.skipif(importlib.util.find_spec("bpy") is not None, reason="bpy is installed here")
+def test_a_python_without_blender_names_the_extra(folder):
+    (folder / "assets.toml").write_text(LEAST)
 
-    write_message(stream, {"call": "cast"}, arrays)
-    stream.seek(0)
-    message, found = read_message(stream)
-
-    assert message == {"call": "cast"}
-    for sent, received in zip(arrays, found, strict=True):
-        np.testing.assert_array_equal(sent, received)
-
-
-def test_a_message_that_is_cut_short_is_an_end():
-    stream = io.BytesIO()
-    write_message(stream, {"call": "cast"}, [np.zeros(4)])
-
-    with pytest.raises(EOFError, match="8 bytes early"):
-        read_message(io.BytesIO(stream.getvalue()[:-8]))
+    with pytest.raises(ExtraError, match=r"Python 3\.13.*'stereogenbench-data\[blender\]'"):
+        BlenderRenderer.from_file(folder / "assets.toml")

@@ -55,7 +55,6 @@ def test_an_impossible_request_ends_the_command(tmp_path):
     [
         (["--renderer", "blender"], r"no assets are named.*--assets"),
         (["--assets", "assets.toml"], r"renderer ray-casting: it takes no --assets.*blender"),
-        (["--blender-python", "python3"], r"no --blender-python.*--renderer blender"),
         (["--renderer", "blender", "--assets", "absent.toml"], r"absent\.toml: cannot be read"),
     ],
 )

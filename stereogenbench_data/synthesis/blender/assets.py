@@ -1,7 +1,7 @@
 """``assets.toml``: the maps, characters, animations and sensors that Blender renders.
 
-The format is in ``docs/blender.md``. Files are named relative to the folder of ``assets.toml`` and
-stay inside it, links followed. Keys that are not known are refused.
+The format is in ``docs/generation.md``. Files are named relative to the folder of ``assets.toml``
+and stay inside it, links followed. Keys that are not known are refused.
 """
 
 import hashlib

@@ -1,13 +1,13 @@
 """One Blender in a process of its own, and what its end means.
 
-Blender holds one global scene, ends its process when it crashes, and needs its own versions of
-Python and NumPy. So it runs as a program (`worker.py`) in a Python that has bpy, and answers over
-pipes.
+Blender holds one global scene, and a crash of it ends its process. So each map has a process of its
+own, `worker.py`, that answers over pipes.
 """
 
 import atexit
 import contextlib
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -18,24 +18,16 @@ from typing import Any, BinaryIO, Final, cast
 
 import numpy as np
 
-from stereogenbench_data.errors import ExtraError, SynthesisError
-from stereogenbench_data.synthesis.blender.worker import read_message, write_message
+from stereogenbench_data.errors import SynthesisError
 
 _WORKER: Final = Path(__file__).with_name("worker.py")
-_VERSION: Final = [5, 0]
-_CURE: Final = (
-    "bpy 5.0 has wheels for Python 3.11 only, and asks for a NumPy below 2. Make an environment of "
-    "its own, `python3.11 -m venv blender && blender/bin/pip install 'bpy==5.0.*'`, and name its "
-    "Python by --blender-python blender/bin/python; or, under Python 3.11, add it to this one by "
-    "`pip install --no-deps 'bpy==5.0.*'`."
-)
 _LOG_LINES: Final = 6
 
 
 class BlenderProcess:
     """A running Blender. Ends with this process, or by `close`."""
 
-    def __init__(self, python: str) -> None:
+    def __init__(self) -> None:
         self._home = tempfile.TemporaryDirectory(prefix="stereogenbench_blender_")
         self.folder = Path(self._home.name)
         self._log = (self.folder / "log.txt").open("w+b")
@@ -44,39 +36,19 @@ class BlenderProcess:
             f"BLENDER_USER_{name}": str(self.folder / name.lower())
             for name in ("RESOURCES", "CONFIG", "SCRIPTS", "EXTENSIONS", "DATAFILES")
         }
-        try:
-            self._process = subprocess.Popen(
-                [python, "-P", str(_WORKER)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=self._log,
-                env=os.environ | places,
-            )
-        except OSError as error:
-            self._log.close()
-            self._home.cleanup()
-            raise ExtraError(
-                f"{python}: this Python cannot be started ({error}). {_CURE}"
-            ) from error
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", str(_WORKER)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._log,
+            env=os.environ | places,
+        )
         atexit.register(self.close)
-        version = self._version(python)
-        if version["number"] != _VERSION:
-            self.close()
-            raise ExtraError(
-                f"{python}: it has Blender {version['version']}, and 5.0 is needed. {_CURE}"
-            )
 
     @property
     def pid(self) -> int:
         """The number of the process."""
         return self._process.pid
-
-    def _version(self, python: str) -> dict[str, Any]:
-        try:
-            return self.call({"call": "version"}, what="this Python cannot start Blender")[0]
-        except SynthesisError as error:
-            self.close()
-            raise ExtraError(f"{python}: {error} {_CURE}") from error
 
     def call(
         self, request: dict[str, Any], arrays: Sequence[np.ndarray] = (), *, what: str
@@ -92,9 +64,11 @@ class BlenderProcess:
             SynthesisError: If Blender cannot use an asset, or its process ends.
         """
         try:
-            write_message(cast(BinaryIO, self._process.stdin), request, arrays)
-            answer, found = read_message(cast(BinaryIO, self._process.stdout))
-        except (EOFError, BrokenPipeError) as error:
+            requests = cast(BinaryIO, self._process.stdin)
+            pickle.dump((request, arrays), requests, protocol=5)
+            requests.flush()
+            answer, found = pickle.load(cast(BinaryIO, self._process.stdout))
+        except (EOFError, BrokenPipeError, pickle.UnpicklingError) as error:
             raise SynthesisError(f"{what}: {self._last_words()}") from error
         except BaseException:
             self.close()  # The answer is lost, so the next one would be taken for it.
@@ -146,26 +120,18 @@ class BlenderProcess:
 
 
 _KEPT: Final = 3
-_running: dict[tuple[str, str, int], BlenderProcess] = {}
+_running: dict[tuple[int, str], BlenderProcess] = {}
 
 
-def blender(python: str = "", *, place: str = "") -> BlenderProcess:
-    """Return this process's Blender for a map; it is started when it is first needed.
+def blender(place: str) -> BlenderProcess:
+    """Return this process's Blender for a map's file; it is started when it is first needed.
 
     The three that were used last are kept, because proposals go from map to map.
-
-    Args:
-        python: The Python that has bpy; "" for this one.
-        place: The map's file; "" for a Blender that waits for its first map.
-
-    Raises:
-        ExtraError: If there is no such Blender.
     """
-    key = (python or sys.executable, place, os.getpid())
-    found = _running.pop(key, None) or _running.pop((key[0], "", key[2]), None)
+    found = _running.pop((os.getpid(), place), None)
     if found is None or not found.is_running:
-        found = BlenderProcess(key[0])
-    _running[key] = found
-    for old in [each for each in _running if each[2] == os.getpid()][:-_KEPT]:
+        found = BlenderProcess()
+    _running[os.getpid(), place] = found
+    for old in [each for each in _running if each[0] == os.getpid()][:-_KEPT]:
         _running.pop(old).close()
     return found

@@ -6,6 +6,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import lru_cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 from PIL import Image
 
-from stereogenbench_data.errors import SynthesisError
+from stereogenbench_data.errors import SynthesisError, missing_extra
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.synthesis.blender.assets import Assets, read_assets
@@ -26,6 +27,17 @@ from stereogenbench_data.synthesis.world import Bounds, Spawn
 
 _VERSION: Final = 1
 """Goes up when the same assets give other scenes."""
+_LEAST_BLENDER: Final = (5, 2)
+
+
+def _require_blender() -> None:
+    try:
+        found = version("bpy")
+    except PackageNotFoundError:
+        found = "none"
+    if found == "none" or tuple(map(int, found.split(".")[:2])) < _LEAST_BLENDER:
+        why = f"bpy is {found}; at least 5.2 is needed, which needs Python 3.13"
+        raise missing_extra("the renderer blender", "blender", why)
 
 
 class BlenderAssetWarning(UserWarning):
@@ -38,22 +50,20 @@ class BlenderRenderer:
 
     Attributes:
         assets: What there is to render.
-        python: The Python that has bpy; "" for this one.
     """
 
     assets: Assets
-    python: str = ""
 
     @classmethod
-    def from_file(cls, path: str | Path, *, python: str = "") -> "BlenderRenderer":
+    def from_file(cls, path: str | Path) -> "BlenderRenderer":
         """Return the renderer of an ``assets.toml``.
 
         Raises:
             SynthesisError: If the file does not follow the format.
-            ExtraError: If Blender cannot be started.
+            ExtraError: If Blender is not installed, or too old.
         """
-        renderer = cls(read_assets(path), python)
-        blender(python)
+        renderer = cls(read_assets(path))
+        _require_blender()
         return renderer
 
     @property
@@ -100,7 +110,7 @@ class BlenderRenderer:
         settings = self.assets.settings
         for frame in range(len(plan.centres_m)):
             views = [plan.view(camera=camera, frame=frame) for camera in cameras]
-            process = blender(self.python, place=self.assets.maps[plan.proposal.map_name].file)
+            process = blender(self.assets.maps[plan.proposal.map_name].file)
             what = f"{plan.key}, frame {frame}"
             request = self.request(plan.proposal) | {
                 "call": "render",
@@ -195,12 +205,11 @@ class BlenderWorld:
         Raises:
             SynthesisError: If one of them cannot be opened or used.
         """
-        self._python = renderer.python
         self._request = renderer.request(proposal)
         self._what = f"{proposal.map_name}, {proposal.character}, {proposal.animation}"
         asset = renderer.assets.maps[proposal.map_name]
         bounds_m, spawn_bounds_m, self._points_m = _facts(
-            self._python, json.dumps(self._request), proposal.request.frames
+            json.dumps(self._request), proposal.request.frames
         )
         if asset.bounds_m is not None:
             bounds_m = spawn_bounds_m = np.array(asset.bounds_m)
@@ -227,7 +236,7 @@ class BlenderWorld:
         apart; so a room whose faces look outwards is not taken for a solid.
         """
         arrays = [np.asarray(each, np.float64) for each in (origins_m, directions)]
-        process = blender(self._python, place=self._request["map"]["path"])
+        process = blender(self._request["map"]["path"])
         _, (found_m,) = process.call(
             self._request | {"call": "cast"}, arrays, what=f"{self._what}: rays"
         )
@@ -241,15 +250,13 @@ class BlenderWorld:
 
 
 @lru_cache(maxsize=64)
-def _facts(
-    python: str, request_json: str, frames: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _facts(request_json: str, frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the bounds of a map, those of spawns, and a subject's points for a spawn at 0.
 
     Bounds are two corners, and points are (frames, p, 3).
     """
     request = json.loads(request_json)
-    process = blender(python, place=request["map"]["path"])
+    process = blender(request["map"]["path"])
     answer, (bounds_m, spawn_bounds_m, points_m) = process.call(
         request | {"call": "facts", "frames": frames}, what=request["map"]["where"]
     )

@@ -1,7 +1,7 @@
 """One scene inside Blender: it opens assets, answers rays, and renders frames with their depth.
 
-`worker.py` loads it by its path, in a Python that has bpy, so it imports only the standard library,
-NumPy and Blender's modules.
+`worker.py` loads it by its path, so it imports only the standard library, NumPy and Blender's
+modules.
 
 Axes here are Blender's: right-handed, x and y level, z up, in units of the map's file; `Mirror`
 turns map axes into them. Blender evaluates a scene anew for each render, and otherwise than for its
@@ -306,7 +306,7 @@ def pass_through(
     return depth
 
 
-class _GatherEngine(bpy.types.RenderEngine):  # type: ignore[misc]  # bpy ships no types
+class _GatherEngine(bpy.types.RenderEngine):
     """A render engine that draws nothing: Blender hands it the scene as evaluated for rendering."""
 
     bl_idname = _GATHER
@@ -440,7 +440,7 @@ def _add(path: str, where: str) -> tuple[list[Any], list[Any], float]:
                     wanted.objects = there.objects
         except (OSError, RuntimeError) as error:
             raise AssetError(
-                f"{where}: Blender cannot open it ({error}). Save it again with Blender 5.0."
+                f"{where}: Blender cannot open it ({error}). Save it again with Blender 5.2."
             ) from error
         rate_hz = 24.0
         here = bpy.context.scene.collection
@@ -830,7 +830,7 @@ class Stage:
             except RuntimeError as error:
                 raise AssetError(
                     f"{where}: Blender cannot open it ({str(error).strip()}). Save it again with "
-                    f"Blender 5.0."
+                    f"Blender 5.2."
                 ) from error
         else:
             _import(path, where)
@@ -1179,8 +1179,6 @@ class Server:
             AssetError: If an asset cannot be used.
         """
         name = call["call"]
-        if name == "version":
-            return {"version": bpy.app.version_string, "number": list(bpy.app.version[:2])}, []
         stage = self._stage
         if stage is None or call["map"] != self._spec:
             self._stage = None
