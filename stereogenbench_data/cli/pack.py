@@ -134,9 +134,8 @@ def pack(  # noqa: PLR0913 - one parameter an option
             for row in rows
         ]
         rows = share.rows(index, rows, sizes)
-    scenes = len(index) if rows is None else len(rows)
     if dry_run and training is not None:
-        _print_estimate(index, rows or range(scenes), training, as_json=as_json)
+        _print_estimate(index, rows or range(len(index)), training, as_json=as_json)
         return
     with progress_bar("packing", unit="MB") as progress:
         report = packed_by(
@@ -156,7 +155,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
             "packed": report.packed,
             "part": report.part,
             "missing": report.missing,
-            "scenes": scenes,
+            "scenes": report.scenes,
         }
         typer.echo(json.dumps(document, indent=2))
         return
@@ -171,7 +170,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
             f"{report.missing[0]} on: the part that packs the last one writes the index"
         )
     else:
-        typer.echo(f"{report.index}: {counted(scenes, 'scene')}")
+        typer.echo(f"{report.index}: {counted(report.scenes, 'scene')}")
 
 
 def _training(

@@ -60,12 +60,14 @@ class PackReport:
         packed: Names of those that this run packed, not an earlier or a concurrent one.
         missing: Names of the plan's shards that other parts have not finished yet.
         index: The index file; None while shards are missing.
+        scenes: How many scenes the plan has.
     """
 
     part: tuple[str, ...]
     packed: tuple[str, ...]
     missing: tuple[str, ...]
     index: Path | None
+    scenes: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +127,8 @@ def pack(  # noqa: PLR0913 - each is an option of the command
         What was packed. The part that finishes last writes the index.
 
     Raises:
-        StorageError: If the release cannot be read or scenes of it are broken, or a worker died.
+        StorageError: If the release cannot be read or many scenes of it are broken, or a worker
+            died.
         ShardError: If a shard cannot be packed; or the folder is in the release, or holds another
             plan, other shards, or shards that were packed from other files.
     """
@@ -178,7 +181,7 @@ def prepare(  # noqa: PLR0913 - what `pack` takes
     """Make the plan and claim the folder for it.
 
     Raises:
-        StorageError: If the release cannot be read or scenes of it are broken.
+        StorageError: If the release cannot be read or many scenes of it are broken.
         ShardError: As `pack` says of the folder; if no scene fits into a shard; or if the part is
             not one of 1 to N.
         ExtraError: If the codec needs a package that is not installed.
@@ -250,6 +253,7 @@ def _finish(job: PackJob, *, packed: set[str]) -> PackReport:
         packed=tuple(name for name in part if name in packed),
         missing=tuple(task.shard.name for task in job.tasks if task.shard.name not in here),
         index=None,
+        scenes=sum(len(task.shard.scenes) for task in job.tasks),
     )
     if report.missing:
         return report

@@ -7,6 +7,7 @@ release and target size always give the same plan.
 import hashlib
 import json
 import re
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -15,6 +16,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from stereogenbench_data.errors import ShardError
+from stereogenbench_data.index.open import MOST_LEFT_OUT, IncompleteSceneWarning
 from stereogenbench_data.index.rows import row_of
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Scene
@@ -124,7 +126,7 @@ def plan_shards(
     training: TrainingSettings | None = None,
     rows: Sequence[int] | None = None,
 ) -> ShardPlan:
-    """Return the plan that packs the scenes of an index.
+    """Return the plan that packs the scenes of an index, without a few that lack a file.
 
     Args:
         index: The data; a released folder, unless training shards are made.
@@ -135,8 +137,8 @@ def plan_shards(
 
     Raises:
         ShardError: If the data are packed already or remote (training shards may be made of such),
-            or derived already; scenes were left out of the index as broken; no scene is selected;
-            the target is below 1; or two shards would have the same name.
+            or derived already; no scene is selected, or many lack a file; the target is below 1; or
+            two shards would have the same name.
     """
     _require_released(index, training=training)
     if rows is not None and not len(rows):
@@ -144,7 +146,7 @@ def plan_shards(
     if target_bytes < 1:
         raise ShardError(f"the size of a shard must be at least 1 byte, got {target_bytes}.")
     scenes = sorted(
-        map(index.scene, range(len(index)) if rows is None else map(int, rows)),
+        map(index.scene, _whole_rows(index, rows)),
         key=lambda scene: (_group_of(scene), scene.id.key),
     )
 
@@ -244,22 +246,38 @@ def _require_released(index: SceneIndex, *, training: TrainingSettings | None) -
         )
     if "://" in index.root and training is None:
         raise ShardError(f"{index.where}: is remote. Download the release, and pass its folder.")
-    if index.broken:
-        names = ", ".join(sorted(index.broken)[:3])
-        raise ShardError(
-            f"{index.where}: its index leaves out {len(index.broken)} broken scenes ({names}). "
-            f"Repair or remove them, and run `stereogenbench index` again."
-        )
+
+
+def _whole_rows(index: SceneIndex, rows: Sequence[int] | None) -> list[int]:
+    """Return the rows without the few scenes that lack a file, which a warning names.
+
+    Raises:
+        ShardError: If no row is left, or more than a few scenes lack a file.
+    """
+    chosen = list(range(len(index))) if rows is None else list(map(int, rows))
+    reasons = {}
     for row in np.union1d(index.remarked("videos"), index.remarked("poses")).tolist():
         scene = index.scene(row)
         missing = scene.remark("videos")
         if TRAJECTORY_JSON not in scene.members:
             missing = missing or scene.remark("poses")
         if missing:
-            raise ShardError(
-                f"{index.where}: {missing.removesuffix('.')}. Shards hold whole scenes: fetch the "
-                f"scene again or remove it, and run `stereogenbench index` again."
-            )
+            reasons[row] = missing
+    lacking = [row for row in chosen if row in reasons]
+    if not lacking:
+        return chosen
+    told = (
+        f"{index.where}: shards hold whole scenes, and {len(lacking)} of {len(chosen)} "
+        f"{'lacks' if len(lacking) == 1 else 'lack'} a file. "
+        f"The first: {reasons[lacking[0]].removesuffix('.')}."
+    )
+    if len(lacking) == len(chosen) or len(lacking) > max(1, MOST_LEFT_OUT * len(chosen)):
+        raise ShardError(
+            f"{told} Fetch these scenes again or remove them, and run `stereogenbench index` again."
+        )
+    names = ", ".join(index.scene(row).id.key for row in lacking[:3])
+    warnings.warn(f"{told} Left out: {names}.", IncompleteSceneWarning, stacklevel=5)
+    return [row for row in chosen if row not in reasons]
 
 
 def _group_of(scene: Scene) -> str:

@@ -669,13 +669,30 @@ def test_the_command_lists_incomplete_scenes_and_leaves_them_out(tree, tmp_path)
         assert len(SceneIndex.open(tmp_path / "out")) == 3
 
 
-def test_the_command_refuses_a_release_with_broken_scenes(tree, tmp_path):
-    next(tree.glob("train/Uniform/*/scene_000001/trajectory.json")).unlink()
+@pytest.mark.parametrize("name", ["trajectory.json", "cam_03_depth.mkv"])
+def test_the_command_packs_the_others_and_names_one_scene_that_lacks_a_file(tree, tmp_path, name):
+    lacking = next(tree.glob("train/Uniform/*/scene_000001"))
+    (lacking / name).unlink()
+
+    with pytest.warns(IncompleteSceneWarning, match=rf"1 of 4 lacks .*scene_000001/{name}: is mis"):
+        result = command(tree, tmp_path / "out", "--workers", "1")
+
+    assert result.exit_code == 0, result.output
+    assert "index.parquet: 3 scenes" in result.stdout
+    keys = SceneIndex.open(tmp_path / "out").column("key").tolist()
+    assert len(keys) == 3
+    assert lacking.relative_to(tree).as_posix() not in keys
+
+
+def test_the_command_refuses_a_release_where_many_scenes_lack_a_file(tree, tmp_path):
+    for place in list(tree.glob("train/*/*/scene_*/trajectory.json"))[:2]:
+        place.unlink()
 
     result = command(tree, tmp_path / "out")
 
     assert result.exit_code == 2
-    assert "scene_000001/trajectory.json: is missing. Shards hold whole scenes" in result.stderr
+    assert "2 of 4 lack a file" in result.stderr
+    assert "trajectory.json: is missing. Fetch these scenes again" in result.stderr
     assert not (tmp_path / "out").exists()
 
 

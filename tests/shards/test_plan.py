@@ -122,14 +122,6 @@ def test_families_that_differ_in_case_alone_are_refused(index_of):
         plan_shards(index)
 
 
-def test_scenes_that_were_left_out_as_broken_are_not_left_out_in_silence(index_of):
-    index = index_of({key(0): 1})
-    index.broken = {key(1): "no rgb"}
-
-    with pytest.raises(ShardError, match=r"leaves out 1 broken scenes \(.*scene_000001\)"):
-        plan_shards(index)
-
-
 def test_a_file_of_8_gib_is_refused(index_of):
     with pytest.raises(ShardError, match="has 8589934592 bytes, and ustar holds"):
         plan_shards(index_of({key(0): 8 * 2**30}))

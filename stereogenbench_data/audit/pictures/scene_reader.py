@@ -6,12 +6,14 @@ from typing import Final, Literal
 import numpy as np
 from jaxtyping import UInt8
 
-from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.errors import MediaError, SelectionError
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.media.depth import DEPTH_CURES, NO_DEPTH_UNIT
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.samples.request import Request
-from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.schema.conventions import depth_of
+from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.pairs import require_pairs
 from stereogenbench_data.selection.plan import Address
@@ -46,7 +48,7 @@ class SceneReader:
         self.depth = depth
         self._cache = cache
         self._lock = threading.Lock()
-        self._loaders: dict[tuple[str, ...], tuple[SampleLoader, threading.Lock]] = {}
+        self._loaders: dict[tuple[str, ...], tuple[SampleLoader, threading.Lock, bool]] = {}
 
     def pair(
         self, row: int, *, pair: tuple[int, int], frame: int, fields: tuple[str, ...]
@@ -56,7 +58,8 @@ class SceneReader:
         Raises:
             SelectionError: If there is no such pair or frame.
             StorageError: If a file is missing or is not the one that was indexed.
-            MediaError: If a video does not decode to what the index says.
+            MediaError: If a video does not decode to what the index says, or the unit of depth that
+                a field needs is not known.
         """
         left, right = require_pairs([pair])[0]
         return self._read("pairs", fields, Address(row, left, (right,), (frame,)))
@@ -71,7 +74,7 @@ class SceneReader:
         """Close open videos; the reader can be used again."""
         with self._lock:
             loaders = list(self._loaders.values())
-        for loader, turn in loaders:
+        for loader, turn, _ in loaders:
             with turn:
                 loader.close()
 
@@ -90,7 +93,17 @@ class SceneReader:
                 request = Request(kind=kind, fields=fields, layout=layout, depth=self.depth)
                 loader = SampleLoader(self.index, request, cache=self._cache)
                 loader.keep_open(OPEN_VIDEOS)
-                self._loaders[fields] = (loader, threading.Lock())
-            loader, turn = self._loaders[fields]
+                needs_depth = not request.streams.isdisjoint({"source_depth", "target_depth"})
+                self._loaders[fields] = (loader, threading.Lock(), needs_depth)
+            loader, turn, needs_depth = self._loaders[fields]
+        if needs_depth:
+            self._require_depth_units(scene, (address.source, *address.targets))
         with turn:
             return loader.load(address, clip="frame")
+
+    def _require_depth_units(self, scene: Scene, cameras: tuple[int, ...]) -> None:
+        contract = self.depth or depth_of(scene)
+        if any(scene.depth_encoding(camera, contract).unit_m is None for camera in cameras):
+            raise MediaError(
+                scene.remark("depth") or f"{scene.id.key}: {NO_DEPTH_UNIT}. {DEPTH_CURES}"
+            )
