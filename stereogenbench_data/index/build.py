@@ -153,9 +153,11 @@ def find_scenes(
     *,
     wanted: Callable[[SceneId], bool] | None,
     if_none: Literal["refuse", "all"] = "refuse",
+    folders: FoundScenes | None = None,
 ) -> tuple[FoundScenes, bool]:
     """Return the wanted scenes of a tree, and whether they are a part of it; see `walk`."""
-    folders = find_remote_scenes(str(root)) if is_remote(root) else find_scene_folders(root)
+    if folders is None:
+        folders = find_remote_scenes(str(root)) if is_remote(root) else find_scene_folders(root)
     if wanted is not None and if_none == "all":
         wanted = wanted if any(wanted(parse_scene_key(key)) for key in folders.keys) else None
     if wanted is not None:

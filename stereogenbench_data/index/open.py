@@ -34,6 +34,7 @@ from stereogenbench_data.index.parquet import (
     table_of_scenes,
 )
 from stereogenbench_data.index.presumed import (
+    Baselines,
     ListedTree,
     Presumption,
     list_tree,
@@ -42,8 +43,6 @@ from stereogenbench_data.index.presumed import (
 from stereogenbench_data.index.restated import restated
 from stereogenbench_data.index.rows import scene_of
 from stereogenbench_data.index.stale import StaleIndexWarning, stale_message
-from stereogenbench_data.index.tree import find_remote_scenes
-from stereogenbench_data.index.tree_cache import TreeCache
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import SceneId
 from stereogenbench_data.schema.text import counted, shortened
@@ -123,7 +122,14 @@ def open_table(
     named_root = None if root is None else _require_root(root)
     if is_remote(data):
         where = shown(data)
-        opened = _open_url(str(data), root=named_root, retry=retry, conventions=conventions)
+        opened = _open_url(
+            str(data),
+            root=named_root,
+            retry=retry,
+            wanted=wanted,
+            conventions=conventions,
+            rows=rows,
+        )
     else:
         path = local_path(data)
         where = str(path)
@@ -186,7 +192,13 @@ def warn_if_stale(root: str | Path) -> None:
 
 
 def _open_url(
-    url: str, *, root: str | None, retry: RetryPolicy | None, conventions: Conventions | None
+    url: str,
+    *,
+    root: str | None,
+    retry: RetryPolicy | None,
+    wanted: Callable[[SceneId], bool] | None,
+    conventions: Conventions | None,
+    rows: Rows,
 ) -> Opened:
     """Fetch an index. Its data are beside it, unless the user names another root."""
     beside, name = split_name(url)
@@ -200,15 +212,7 @@ def _open_url(
         if not is_folder:
             raise
         _require_no_root(shown(beside), root)
-        count = len(find_remote_scenes(beside).keys)
-        if count > MOST_REMOTE_SCENES:
-            raise StorageError(
-                f"{shown(beside)}: has no {INDEX_NAME}, and {count} scenes are too many to fetch "
-                f"their headers each time. Index it once, or the part you need: `stereogenbench "
-                f"index {shown(beside)} -o index.parquet --split eval`, and open that file with "
-                f"--root {shown(beside)}, or SceneIndex.open('index.parquet', root=...)."
-            ) from None
-        return _open_tree(beside, None, rows="read", conventions=conventions)
+        return _open_tree(beside, wanted, rows=rows, conventions=conventions)
     if size > MAX_INDEX_BYTES:
         raise StorageError(
             f"{remote.where}: an index may have {MAX_INDEX_BYTES:,} bytes, this one has "
@@ -233,18 +237,15 @@ def _open_tree(
 
     Those of a large folder are kept in the user's cache, and presumed where that is possible.
     """
-    tree = None if is_remote(root) else list_tree(Path(root), wanted, conventions)
-    opened = None
+    tree = list_tree(root if is_remote(root) else Path(root), wanted, conventions)
     if tree is not None and rows == "presumed" and tree.has_one_shape:
-        opened = _kept(tree, "presumed")
-        if opened is None:
-            with _no_collection():
-                report = presumed_report(tree)
-                opened = None if report is None else _keep(tree, "presumed", _of_report(report))
+        opened = _open_presumed(tree, "when needed" if tree.is_remote else "read")
         if opened is not None:
-            return opened._replace(presumption=Presumption(tree, forms=_forms_in(opened.table)))
+            return opened
     opened = None if tree is None else _kept(tree, "read")
     if opened is None:
+        if tree is not None and tree.is_remote:
+            _require_few(tree)
         # In this process: a script without `if __name__ == "__main__"` could start no others.
         opened = _of_report(
             walk(root, workers=1, wanted=wanted, if_none="all", conventions=conventions)
@@ -252,6 +253,48 @@ def _open_tree(
         if tree is not None:
             _keep(tree, "read", opened)
     return opened
+
+
+def _open_presumed(tree: ListedTree, baselines: Baselines) -> Opened | None:
+    """Return the scenes of a tree, most of them presumed; None where nothing can be presumed."""
+    name: Literal["presumed", "listed"] = "presumed" if baselines == "read" else "listed"
+    opened = _kept(tree, name)
+    if opened is None:
+        with _no_collection():
+            report = presumed_report(tree, baselines)
+            opened = None if report is None else _keep(tree, name, _of_report(report))
+    if opened is None:
+        return None
+    presumption = Presumption(tree, forms=_forms_in(opened.table), baselines=baselines)
+    return opened._replace(presumption=presumption)
+
+
+def with_baselines(presumption: Presumption, table: pa.Table) -> tuple[pa.Table, Presumption]:
+    """Return presumed rows once each ``baseline.json`` was read.
+
+    Raises:
+        StorageError: If one of them cannot be used, or read.
+    """
+    opened = _open_presumed(presumption.tree, "read")
+    if opened is None or opened.presumption is None or opened.table["key"] != table["key"]:
+        why = "" if opened is None else _listed(opened.head.incomplete | opened.head.broken)
+        raise StorageError(
+            f"{shown(presumption.tree.root)}: not all scenes are as was presumed: {why}. "
+            f"{presumption.cures()}"
+        )
+    return opened.table, opened.presumption
+
+
+def _require_few(tree: ListedTree) -> None:
+    """Refuse to describe many scenes behind a URL each time they are opened."""
+    count, where = len(tree.folders.keys), shown(tree.root)
+    if count > MOST_REMOTE_SCENES:
+        raise StorageError(
+            f"{where}: has no {INDEX_NAME}, its scenes cannot be presumed to be alike, and {count} "
+            f"are too many to fetch their headers each time. Index it once, or the part you need: "
+            f"`stereogenbench index {where} -o index.parquet --split eval`, and open that file "
+            f"with --root {where}, or SceneIndex.open('index.parquet', root=...)."
+        )
 
 
 @contextmanager
@@ -266,9 +309,9 @@ def _no_collection() -> Iterator[None]:
             gc.enable()
 
 
-def _kept(tree: ListedTree, rows: Rows) -> Opened | None:
+def _kept(tree: ListedTree, rows: Rows | Literal["listed"]) -> Opened | None:
     """Return the rows of a tree that an earlier opening has kept."""
-    found = TreeCache(tree.root, tree.read_as).table(f"{rows}-{tree.stamp}")
+    found = tree.cache.table(f"{rows}-{tree.stamp}")
     if found is None:
         return None
     table, head, tables = found
@@ -281,12 +324,12 @@ def _kept(tree: ListedTree, rows: Rows) -> Opened | None:
     )
 
 
-def _keep(tree: ListedTree, rows: Rows, opened: Opened) -> Opened:
+def _keep(tree: ListedTree, rows: Rows | Literal["listed"], opened: Opened) -> Opened:
     """Keep the rows of a tree for later openings, and return them."""
     if not isinstance(opened.seek_tables, Path):
         head = replace(opened.head, digest=table_digest(opened.table))
         name = f"{rows}-{tree.stamp}"
-        TreeCache(tree.root, tree.read_as).keep_table(name, opened.table, head, opened.seek_tables)
+        tree.cache.keep_table(name, opened.table, head, opened.seek_tables)
     return opened
 
 

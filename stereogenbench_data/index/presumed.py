@@ -5,15 +5,21 @@ same files, a few are described in full; what these have alike (frames, key fram
 depth) the others are presumed to have, with cameras on a line as the baselines say. A scene's
 trajectory and the heads of its videos are read when its first sample is: length and order of an
 epoch rest on what was presumed, so a scene that is different ends the run.
+
+Behind a URL each ``baseline.json`` is read where a selection needs them (`OF_BASELINES`), and of a
+scene only the videos that its samples need are opened, ahead of them where the order is known.
 """
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from threading import Event
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -23,13 +29,13 @@ from stereogenbench_data.index.alike_rigs import Parsed, RigReader
 from stereogenbench_data.index.build import (
     ALIKE,
     POOL_FROM,
-    DescribeTask,
     Outcome,
     TreeReport,
     find_scenes,
     report_of,
 )
 from stereogenbench_data.index.evidence import agreed_forms
+from stereogenbench_data.index.remote_tree import Files, RemoteFolder, RemoteTree, in_parallel
 from stereogenbench_data.index.scene_folder import (
     DESCRIPTIONS,
     SceneFolder,
@@ -55,42 +61,99 @@ from stereogenbench_data.schema.release import (
     CAMERA_PAIRS,
     COMPLETE_JSON,
     TRAINING_JSON,
+    TRAJECTORY_JSON,
     VIDEO_FILES,
+    depth_name,
 )
 from stereogenbench_data.schema.text import shortened
+from stereogenbench_data.sources.fetch_ahead import FetchAhead, Wanted
+from stereogenbench_data.sources.location import shown
 
 _LOOKED_AT: Final = 20
 """How many scenes are described in full when a tree is opened, over all groups."""
 _LEAST_OF_A_GROUP: Final = 3
+FEW_REMOTE: Final = 8
+"""Fewer scenes behind a URL are all described."""
+_MOST_UNTOLD: Final = 2500
+"""More requests for ``baseline.json`` are told: the Hub answers 3,000 in five minutes."""
+_KEPT_SCENES: Final = 512
+"""Of how many scenes behind a URL what was described is kept in memory."""
+OF_BASELINES: Final = frozenset(
+    {
+        "baselines_cm", "focal_mm", "sensor_width_mm", "sensor_height_mm", "principal_x_px",
+        "principal_y_px", "lateral_m", "scene_label", "scene_index", "label_map_name", "map_path",
+        "character", "animation", "aperture_fstop",
+    }
+)  # fmt: skip
+"""Columns for which each ``baseline.json`` behind a URL is read."""
 _READERS: Final = 8
 _AT_A_TIME: Final = 128
 _LONGEST_TOLD: Final = 2000
 _OF_A_FORMAT: Final = ("poses", "world", "left")
 """Remarks that are presumed of all scenes of a group where each one that was read has them."""
 
-Files = Mapping[str, tuple[int, int]]
-"""Name of each file of a scene to its size in bytes and modification time in ns."""
-
 
 @dataclass(frozen=True, slots=True)
 class ListedTree:
-    """The scenes of a folder of this machine, and their files.
+    """The scenes of a folder or URL, and their files.
 
     Attributes:
-        root: The folder.
+        root: The folder, or the URL.
         folders: The keys of the scenes, and folders that are none.
         files: Key to files, or to why they cannot be listed.
         is_part: Whether the user chose only some of the scenes.
         stamp: A digest that changes when a file is added, removed or changed.
         conventions: How the files are read.
+        described: The outcomes of scenes behind a URL that were described in full.
     """
 
-    root: Path
+    root: Path | str
     folders: FoundScenes
     files: dict[str, Files | StorageError]
     is_part: bool
     stamp: str
     conventions: Conventions | None
+    described: dict[str, Outcome] = field(default_factory=dict)
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether it is behind a URL."""
+        return isinstance(self.root, str)
+
+    @property
+    def cache(self) -> TreeCache:
+        """Where what was found out about it is kept."""
+        return TreeCache(self.root, self.read_as)
+
+    def folder(self, key: str) -> SceneFolder:
+        """Return a scene's folder."""
+        files = self.files.get(key)
+        if isinstance(files, StorageError):
+            raise files
+        if isinstance(self.root, str) and files is not None:
+            return RemoteFolder(self.root, key, files, self.cache)
+        return SceneFolder(self.root, key)
+
+    def of_each(self, read: Callable[[str], Any], keys: Sequence[str]) -> Iterator[Any]:
+        """Yield what is read of each scene, in order; several wait at a time."""
+        return in_parallel(read, keys) if self.is_remote else _of_each(read, keys)
+
+    def describe(self, key: str) -> Outcome:
+        """Return what a scene is, whose files are all read."""
+        if key in self.described:
+            return self.described[key]
+        try:
+            folder = self.folder(key)
+            stamp = stamp_of(folder.stamps())
+            if isinstance(folder, RemoteFolder):
+                folder.fetch([BASELINE_JSON, COMPLETE_JSON, TRAJECTORY_JSON, *VIDEO_FILES])
+            scene = describe_scene(self.root, key, conventions=self.conventions, folder=folder)
+        except StereoGenBenchError as error:
+            return Outcome.of_error(key, error)
+        outcome = Outcome(key, "whole", scene, stamp)
+        if self.is_remote:
+            self.described[key] = outcome
+        return outcome
 
     @property
     def has_one_shape(self) -> bool:
@@ -105,13 +168,15 @@ class ListedTree:
 
 
 def list_tree(
-    root: Path,
+    root: Path | str,
     wanted: Callable[[SceneId], bool] | None,
     conventions: Conventions | None = None,
 ) -> ListedTree | None:
     """List the wanted scenes of a tree; None where they are few, which are better read whole."""
-    folders, is_part = find_scenes(root, wanted=wanted, if_none="all")
-    if len(folders.keys) < POOL_FROM:
+    tree = RemoteTree(root) if isinstance(root, str) else None
+    all_folders = None if tree is None else tree.scenes()
+    folders, is_part = find_scenes(root, wanted=wanted, if_none="all", folders=all_folders)
+    if len(folders.keys) < (POOL_FROM if tree is None else FEW_REMOTE):
         return None
 
     def listed(key: str) -> Files | StorageError:
@@ -120,7 +185,11 @@ def list_tree(
         except StorageError as error:
             return error
 
-    files = dict(zip(folders.keys, _of_each(listed, folders.keys), strict=True))
+    files: dict[str, Files | StorageError] = {}
+    if tree is None:
+        files |= zip(folders.keys, _of_each(listed, folders.keys), strict=True)
+    else:
+        files |= tree.files(folders.keys)
     digest = hashlib.sha256(repr((is_part, folders.refused)).encode())
     for key, found in files.items():
         digest.update(repr((key, found)).encode())
@@ -135,25 +204,37 @@ def _of_each(read: Callable[[str], Any], keys: Sequence[str]) -> Iterator[Any]:
             yield from part
 
 
+class ManyRequestsWarning(UserWarning):
+    """So many requests are made that a server may let them wait."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Metadata:
     """What the small JSON files of a scene say."""
 
     id: SceneId
     files: Files
-    parsed: Parsed
+    parsed: Parsed | None
     marked: SceneLabels
 
 
-def presumed_report(tree: ListedTree) -> TreeReport | None:
+Baselines = Literal["read", "when needed"]
+
+
+def presumed_report(tree: ListedTree, baselines: Baselines) -> TreeReport | None:
     """Return what a walk would find, of which most is presumed.
 
     None where nothing can be presumed: the first scenes are all broken or derived for training, or
     those that were read are not alike. Then all must be read.
+
+    Args:
+        tree: The tree.
+        baselines: Whether each ``baseline.json`` is read; if not, what it says is presumed, too,
+            unless the scenes that are read have different primary pairs.
     """
     outcomes: dict[str, Outcome] = {}
     groups: dict[tuple[object, ...], list[_Metadata]] = {}
-    for key, found in _metadata(tree):
+    for key, found in _metadata(tree) if baselines == "read" else _listed(tree):
         if isinstance(found, StereoGenBenchError):
             outcomes[key] = Outcome.of_error(key, found)
             if len(outcomes) == ALIKE and not groups:
@@ -163,22 +244,41 @@ def presumed_report(tree: ListedTree) -> TreeReport | None:
             return None
         videos = frozenset(name for name in found.files if name.startswith("cam_"))
         groups.setdefault((found.id.split, found.id.family, videos), []).append(found)
-    describe = DescribeTask(str(tree.root), conventions=tree.conventions)
     for group in groups.values():
-        count = max(_LEAST_OF_A_GROUP, _LOOKED_AT // len(groups))
+        count = _LEAST_OF_A_GROUP
+        if not tree.is_remote:
+            count = max(count, _LOOKED_AT // len(groups))
         places = np.unique(np.linspace(0, len(group) - 1, count).astype(int)).tolist()
-        looked_at = [describe(group[place].id.key) for place in places]
+        keys = [group[place].id.key for place in places]
+        looked_at = [*in_parallel(tree.describe, keys)] if tree.is_remote else [
+            tree.describe(key) for key in keys
+        ]  # fmt: skip
         outcomes |= {outcome.key: outcome for outcome in looked_at}
         models = [outcome.scene for outcome in looked_at if outcome.scene is not None]
         others = [each for each in group if each.id.key not in outcomes]
         if others and not _are_alike(models):
             return None
+        if others and baselines != "read" and len({each.rig.primary_pair for each in models}) > 1:
+            return presumed_report(tree, "read")
         for each in others:
             scene = _presumed(each, models, tree.conventions)
             key = each.id.key
-            outcomes[key] = describe(key) if scene is None else Outcome(key, "whole", scene)
+            outcomes[key] = tree.describe(key) if scene is None else Outcome(key, "whole", scene)
     in_order = [outcomes[key] for key in tree.folders.keys]
     return report_of(tree.root, tree.folders, in_order, is_part=tree.is_part)
+
+
+def _listed(tree: ListedTree) -> Iterator[tuple[str, _Metadata | StereoGenBenchError]]:
+    """Yield the scenes whose files the listing shows, or why one cannot be used."""
+    for key in tree.folders.keys:
+        files = tree.files[key]
+        try:
+            if isinstance(files, StorageError):
+                raise files
+            require_finished(key, files)
+            yield key, _Metadata(parse_scene_key(key), files, None, SceneLabels())
+        except StereoGenBenchError as error:
+            yield key, error
 
 
 def _metadata(tree: ListedTree) -> Iterator[tuple[str, _Metadata | StereoGenBenchError]]:
@@ -191,12 +291,19 @@ def _metadata(tree: ListedTree) -> Iterator[tuple[str, _Metadata | StereoGenBenc
             if isinstance(files, StorageError):
                 return files
             require_finished(key, files)
-            return files, SceneFolder(tree.root, key).read(BASELINE_JSON)
+            return files, tree.folder(key).read(BASELINE_JSON)
         except StereoGenBenchError as error:
             return error
 
     keys = tree.folders.keys
-    for key, read in zip(keys, _of_each(baseline_text, keys), strict=True):
+    if tree.is_remote and len(keys) > _MOST_UNTOLD:
+        message = (
+            f"{shown(tree.root)}: reads {BASELINE_JSON} of {len(keys)} scenes, a request each: on "
+            f"the Hub without a login some {len(keys) // 600} minutes. They are kept; an index "
+            f"holds them: `stereogenbench index {shown(tree.root)}`."
+        )
+        warnings.warn(message, ManyRequestsWarning, stacklevel=2)
+    for key, read in zip(keys, tree.of_each(baseline_text, keys), strict=True):
         if isinstance(read, StereoGenBenchError):
             yield key, read
             continue
@@ -206,7 +313,7 @@ def _metadata(tree: ListedTree) -> Iterator[tuple[str, _Metadata | StereoGenBenc
             parsed = rig, labels, (*odd, *require_unit(rig, family=scene_id.family, where=where))
             marked = SceneLabels()
             if labels.character is None or labels.animation is None:  # scenes are chosen by these
-                text = SceneFolder(tree.root, key).read(COMPLETE_JSON)
+                text = tree.folder(key).read(COMPLETE_JSON)
                 marked, _ = parse_complete(text, where=f"{key}/{COMPLETE_JSON}")
         except StereoGenBenchError as error:
             yield key, error
@@ -239,7 +346,7 @@ def _presumed(
 ) -> Scene | None:
     """Return a scene that is like others; None where its baselines are not those of a line."""
     key, like = each.id.key, models[0]
-    rig, labels, odd = each.parsed
+    rig, labels, odd = each.parsed or (like.rig, SceneLabels(), ())
     remarks = [*odd]
     size_px = like.rig.image_width_px, like.rig.image_height_px
     shape = None if conventions is None else conventions.shapes[0]
@@ -287,33 +394,119 @@ class Presumption:
 
     Attributes:
         was_told: Whether a scene that is odd, and can be used, was told in this process.
+        is_remote: Whether the scenes are behind a URL.
+        baselines: Whether each ``baseline.json`` was read.
     """
 
-    def __init__(self, tree: ListedTree, *, forms: Sequence[str]) -> None:
+    def __init__(
+        self, tree: ListedTree, *, forms: Sequence[str], baselines: Baselines = "read"
+    ) -> None:
         """Name the tree, and how the poses are read of the scenes that were read."""
         self.was_told = False
-        self._root = tree.root
-        self._conventions = tree.conventions
+        self.is_remote = tree.is_remote
+        self.baselines = baselines
+        # On a disk files are listed anew when a scene is needed, so they need not be kept.
+        self._tree = tree if tree.is_remote else replace(tree, files={}, described={})
         self._agreed = agreed_forms(forms)
-        self._cache = TreeCache(tree.root, tree.read_as)
+        self._ahead = FetchAhead()
+        self._planned: dict[str, int] = {}
+        self._count = 0
+        self._described: OrderedDict[str, tuple[Scene, frozenset[str]]] = OrderedDict()
 
-    def described(self, presumed: Scene) -> Scene:
+    @property
+    def stamp(self) -> str:
+        """A digest of the listing."""
+        return self._tree.stamp
+
+    @property
+    def tree(self) -> ListedTree:
+        """The tree; of a folder of this machine without its files."""
+        return self._tree
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for a copy in another process."""
+        return self.__dict__ | {"_planned": {}, "_described": OrderedDict()}
+
+    def expect(self, presumed: Scene, videos: Collection[str]) -> None:
+        """Describe a scene behind a URL in the background, as `described` will be asked for it."""
+        key = presumed.id.key
+        if not self.is_remote or key in self._planned or self._known(key, videos) is not None:
+            return
+
+        def fill(start: int, stop: int, cancellation: Event) -> bytes:
+            self._describe(presumed, videos)
+            return b""
+
+        self._count += 1
+        self._planned[key] = self._count
+        self._ahead.plan(self._count, [Wanted(key, 0, 1, fill, 0)])
+        self._ahead.begin(self._count)
+
+    def described(self, presumed: Scene, videos: Collection[str] = VIDEO_FILES) -> Scene:
         """Return a scene as its files say.
+
+        Args:
+            presumed: Its row.
+            videos: The videos that are needed. Behind a URL no others are opened, and of these the
+                row says what is presumed.
 
         Raises:
             StorageError: If it is not as presumed, or cannot be read.
         """
         key = presumed.id.key
+        if not self.is_remote:
+            return self._compared(presumed, self._read(key, videos=None))
+        planned = self._planned.pop(key, None)
         try:
-            stamp = stamp_of(SceneFolder(self._root, key).stamps())
-            scene = self._cache.scene(key, stamp=stamp)
+            if planned is not None:
+                self._ahead.read(key, 0)
+            known = self._known(key, videos)
+            # Another pair of the scene needs other videos: there will be more of them.
+            is_more = known is None and key in self._described
+            return known or self._describe(presumed, VIDEO_FILES if is_more else videos)
+        finally:
+            if planned is not None:
+                self._ahead.release(planned)
+
+    def _known(self, key: str, videos: Collection[str]) -> Scene | None:
+        scene, opened = self._described.get(key, (None, frozenset()))
+        return scene if opened.issuperset(videos) else None
+
+    def _describe(self, presumed: Scene, videos: Collection[str]) -> Scene:
+        """Return a scene behind a URL, of which some videos are opened, and keep it."""
+        opened = frozenset(videos)
+        scene = self._read(presumed.id.key, videos=opened)
+        if opened != frozenset(VIDEO_FILES):
+            scene = _with_presumed(scene, presumed, opened)
+        scene = self._compared(presumed, scene)
+        self._described[presumed.id.key] = scene, opened
+        while len(self._described) > _KEPT_SCENES:
+            self._described.popitem(last=False)
+        return scene
+
+    def _read(self, key: str, *, videos: frozenset[str] | None) -> Scene:
+        tree, part = self._tree, "" if videos is None else " ".join(sorted(videos))
+        try:
+            folder = tree.folder(key)
+            stamp = stamp_of(folder.stamps())
+            scene = tree.cache.scene(key, stamp=stamp, part=part)
             if scene is None:
-                scene = describe_scene(self._root, key, conventions=self._conventions)
-                self._cache.keep_scene(scene, stamp=stamp)
+                if isinstance(folder, RemoteFolder):
+                    texts = BASELINE_JSON, COMPLETE_JSON, TRAJECTORY_JSON, *DESCRIPTIONS
+                    folder.fetch([*texts, *(videos or ())])
+                scene = describe_scene(
+                    tree.root, key, conventions=tree.conventions, folder=folder, videos=videos
+                )
+                tree.cache.keep_scene(scene, stamp=stamp, part=part)
         except StereoGenBenchError as error:
             raise StorageError(self._contradicted(key, [str(error)])) from error
+        return scene
+
+    def _compared(self, presumed: Scene, scene: Scene) -> Scene:
+        """Return a scene that is as presumed."""
+        key = presumed.id.key
         scene = as_agreed(scene, self._agreed)
-        differences = list(_differences(presumed, scene))
+        differences = list(_differences(presumed, scene, baselines=self.baselines))
         if differences:
             raise StorageError(self._contradicted(key, differences))
         return replace(scene, id=presumed.id)
@@ -322,28 +515,54 @@ class Presumption:
         """Return the captions of scenes; one that cannot be read is empty."""
 
         def caption(key: str) -> str:
-            folder, texts = SceneFolder(self._root, key), dict[str, bytes]()
+            folder, texts = self._tree.folder(key), dict[str, bytes]()
             for name in DESCRIPTIONS:
                 with suppress(StereoGenBenchError):
                     texts[name] = folder.read(name)
             return caption_of(texts, key=key)[0]
 
-        return list(_of_each(caption, [*keys]))
+        return list(self._tree.of_each(caption, [*keys]))
 
     def cures(self) -> str:
         """Return what to do about a scene that is not as presumed."""
+        away = "select other scenes" if self.is_remote else "move this scene's folder away"
         return (
             f"A folder without an index is opened by a few of its scenes, and length and order of "
-            f"an epoch rest on that. Run `stereogenbench index {self._root}`, which reads all "
-            f"scenes and tells such ones beforehand, or move this scene's folder away."
+            f"an epoch rest on that. Run `stereogenbench index {shown(self._tree.root)}`, which "
+            f"reads all scenes and tells such ones beforehand, or {away}."
         )
 
     def _contradicted(self, key: str, found: list[str]) -> str:
         told = shortened("; ".join(found), _LONGEST_TOLD)
-        return f"{self._root}: {key} is not as was presumed of it: {told}. {self.cures()}"
+        return (
+            f"{shown(self._tree.root)}: {key} is not as was presumed of it: {told}. {self.cures()}"
+        )
 
 
-def _differences(presumed: Scene, found: Scene) -> Iterator[str]:
+def _with_presumed(found: Scene, presumed: Scene, opened: frozenset[str]) -> Scene:
+    """Return a scene with what is presumed of the videos that were not opened."""
+
+    def of_cameras(name: str) -> tuple[Any, ...]:
+        both = zip(getattr(found, name), getattr(presumed, name), strict=True)
+        return tuple(
+            own if depth_name(camera) in opened else other
+            for camera, (own, other) in enumerate(both)
+        )
+
+    are_keys = set(presumed.key_frames) <= set(found.key_frames)
+    has_pictures = any(name.endswith(".mp4") for name in opened)
+    return replace(
+        found,
+        key_frames=presumed.key_frames if are_keys or not has_pictures else found.key_frames,
+        depth_unit_m=of_cameras("depth_unit_m"),
+        depth_offset_m=of_cameras("depth_offset_m"),
+        depth_unit_source=of_cameras("depth_unit_source"),
+        depth_codec=of_cameras("depth_codec"),
+        depth_pixel_format=of_cameras("depth_pixel_format"),
+    )
+
+
+def _differences(presumed: Scene, found: Scene, *, baselines: Baselines) -> Iterator[str]:
     """Yield how a scene contradicts what selection, order and checks took from its row.
 
     A picture of another size is none: it is read at its own size, and scaled where that is wanted.
@@ -358,7 +577,8 @@ def _differences(presumed: Scene, found: Scene) -> Iterator[str]:
         yield "its files have changed since it was opened"
     if found.remark("left") and not presumed.remark("left"):
         yield found.remark("left")
-    for name in ("baselines_cm", "primary_pair", "focal_mm", "sensor_width_mm"):
+    own = ("baselines_cm", "focal_mm", "sensor_width_mm") if baselines == "read" else ()
+    for name in ("primary_pair", *own):
         value, there = getattr(presumed.rig, name), getattr(found.rig, name)
         if there != value:
             yield f"{name} of {BASELINE_JSON} read as {value}, and it is {there}"

@@ -9,7 +9,7 @@ import hashlib
 import math
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
@@ -113,7 +113,7 @@ _NO_DEPTH: Final = StreamFacts(CODEC_NAME, "gray16le", 0, 0, 0, 0.0, {})
 """What the index says of depth of a scene of training shards that has none."""
 _DEVIATION_CM: Final = 0.1
 _DEVIATION_SHARE: Final = 0.001
-_FILES: Final = frozenset(
+FILES: Final = frozenset(
     {*METADATA_FILES, TRAINING_JSON, *VIDEO_FILES, *PACKED_DEPTH_NAMES.values()}
 )
 """Files of a release; others in a scene's folder are ignored."""
@@ -151,7 +151,7 @@ class SceneFolder:
                 self._sizes = {
                     name: size
                     for name, size in sorted(listed.items())
-                    if name in _FILES and size is not None
+                    if name in FILES and size is not None
                 }
             return {name: (size, 0) for name, size in self._sizes.items()}
         folder = Path(self._root, self._key)
@@ -159,7 +159,7 @@ class SceneFolder:
             explain_os_errors(f"{folder}: cannot be read", "Fetch the scene again."),
             os.scandir(folder) as entries,
         ):
-            found = {entry.name: entry.stat() for entry in entries if entry.name in _FILES}
+            found = {entry.name: entry.stat() for entry in entries if entry.name in FILES}
         return {name: (found[name].st_size, found[name].st_mtime_ns) for name in sorted(found)}
 
     def read(self, name: str) -> bytes:
@@ -201,6 +201,8 @@ def describe_scene(
     *,
     valid_depth: ValidDepth = "skip",
     conventions: Conventions | None = None,
+    folder: SceneFolder | None = None,
+    videos: Collection[str] | None = None,
 ) -> Scene:
     """Return the index row of a finished scene.
 
@@ -213,6 +215,8 @@ def describe_scene(
         valid_depth: "sample" decodes the first, middle and last depth picture of each camera, for
             the share of pixels that have a depth.
         conventions: Where quantities stand and how they are read; what they do not state is found.
+        folder: Its folder, where that is listed already.
+        videos: Names of the videos to open; None is all. The row then holds for these alone.
 
     Raises:
         IncompleteScene: If the scene is not marked as complete or has no video at all.
@@ -220,13 +224,13 @@ def describe_scene(
             other or the conventions, or `SchemaError` or `MediaError` if one of them is not
             understood. All problems of all files are in one message.
     """
-    folder = SceneFolder(root, key)
+    folder = folder or SceneFolder(root, key)
     files = folder.stamps()
     document = None
     if TRAINING_JSON in files:
         document = parse_training(folder.read(TRAINING_JSON), where=f"{key}/{TRAINING_JSON}")
-    videos = _videos_of(document)
-    require_finished(key, files, videos=videos)
+    names = _videos_of(document)
+    require_finished(key, files, videos=names)
     problems: list[StereoGenBenchError] = []
     remarks: list[Remark] = []
     rig, labels, shape = None, SceneLabels(), None
@@ -243,7 +247,7 @@ def describe_scene(
     texts: dict[str, bytes] = {name: folder.read(name) for name in DESCRIPTIONS if name in files}
     caption, odd = caption_of(texts, key=key)
     remarks += odd
-    facts, tables, unread = _all_probed(folder, key, files, videos)
+    facts, tables, unread = _all_probed(folder, key, files, names, opened=videos)
     try:
         frames = _common_frames(key, facts, remarks)
         _require_one_size(key, facts)
@@ -346,7 +350,12 @@ def _all_of(key: str, problems: list[StereoGenBenchError]) -> StereoGenBenchErro
 
 
 def _all_probed(
-    folder: SceneFolder, key: str, files: Mapping[str, object], videos: tuple[str, ...]
+    folder: SceneFolder,
+    key: str,
+    files: Mapping[str, object],
+    videos: tuple[str, ...],
+    *,
+    opened: Collection[str] | None,
 ) -> tuple[dict[str, StreamFacts], dict[str, SeekTable], dict[str, str]]:
     """Return what videos are, where their packets lie, and why others cannot be opened.
 
@@ -357,6 +366,8 @@ def _all_probed(
         held = held_name(files, name)
         if held not in files:
             unread[name] = missing_video(key, name)
+            continue
+        if opened is not None and name not in opened:
             continue
         try:
             facts[name], table = _probed(folder, key, held)

@@ -4,7 +4,7 @@ On disk it is one Parquet file; in memory one Arrow table, sorted by key. Paths 
 data's root and never lead out of it.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.arrow import as_categories, as_numpy, one_array, table_digest
 from stereogenbench_data.index.build import TreeReport
-from stereogenbench_data.index.open import Rows, SeekTables, open_table
+from stereogenbench_data.index.open import Rows, SeekTables, open_table, with_baselines
 from stereogenbench_data.index.parquet import (
     IndexHead,
     read_seek_tables,
@@ -23,10 +23,11 @@ from stereogenbench_data.index.parquet import (
     table_of_scenes,
     write_index_file,
 )
-from stereogenbench_data.index.presumed import Presumption
+from stereogenbench_data.index.presumed import OF_BASELINES, Presumption
 from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, scene_of
 from stereogenbench_data.schema.conventions import Conventions, Shape, shape_of_text
 from stereogenbench_data.schema.records import Scene, SceneId, ShardFacts
+from stereogenbench_data.schema.release import VIDEO_FILES
 from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.retry import RetryPolicy
 
@@ -211,14 +212,19 @@ class SceneIndex:
         """The number of scenes."""
         return int(self._table.num_rows)
 
-    def scene(self, row: int) -> Scene:
+    def scene(self, row: int, *, videos: Collection[str] = VIDEO_FILES) -> Scene:
         """Return the scene of a row; where rows are presumed, as its files say.
+
+        Args:
+            row: The row.
+            videos: The videos that are needed; others of a presumed scene behind a URL are not
+                opened.
 
         Raises:
             StorageError: If there is no such row, or the scene is not as presumed.
         """
         scene = self.indexed_scene(row)
-        return scene if self.presumption is None else self.presumption.described(scene)
+        return scene if self.presumption is None else self.presumption.described(scene, videos)
 
     def indexed_scene(self, row: int) -> Scene:
         """Return what the index says of the scene of a row, presumed or not.
@@ -266,6 +272,8 @@ class SceneIndex:
             captions = self.presumption.captions(self.column("key"))
             self._columns[name] = np.array(captions, dtype=object)
             self._columns[name].setflags(write=False)
+        if name in OF_BASELINES:
+            self._read_baselines()
         if name not in self._columns:
             columns = [each for each in SCHEMA.names if each not in _LISTS]
             if name not in columns:
@@ -274,6 +282,11 @@ class SceneIndex:
             self._columns[name] = as_numpy(self._table.column(name))
             self._columns[name].setflags(write=False)
         return self._columns[name]
+
+    def _read_baselines(self) -> None:
+        """Read what each ``baseline.json`` says, if it is presumed."""
+        if self.presumption is not None and self.presumption.baselines != "read":
+            self._table, self.presumption = with_baselines(self.presumption, self._table)
 
     @property
     def shapes(self) -> tuple[Shape, ...]:
@@ -364,7 +377,12 @@ class SceneIndex:
     def digest(self) -> str:
         """A sha256 of the rows: the same wherever, and by whatever version, they were written."""
         if not self._digest:
-            self._digest = table_digest(self._table)
+            presumption = self.presumption
+            if presumption is not None and presumption.is_remote:
+                # Its rows change once baselines are read.
+                self._digest = presumption.stamp
+            else:
+                self._digest = table_digest(self._table)
         return self._digest
 
     def parted(self) -> tuple[pa.Table, dict[str, Any]]:

@@ -9,6 +9,7 @@
 
 import os
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -28,6 +29,8 @@ _LAYOUT: Final = "train/<family>/<map>/<scene> or eval/<subset>/<family>/<map>/<
 _SCENE_FILES: Final = frozenset({BASELINE_JSON, TRAJECTORY_JSON, COMPLETE_JSON, *VIDEO_FILES})
 _SCENE_DEPTH: Final = {"train": 4, "eval": 5}
 """How many parts a scene's path has, by its split."""
+_LISTERS: Final = 8
+"""Folders of a server that are listed at a time."""
 _DEEPEST: Final = 8
 """How many levels below the root are searched."""
 
@@ -152,10 +155,17 @@ def find_remote_scenes(url: str) -> FoundScenes:
 
     def folders(path: str) -> list[str]:
         entries = RemoteObject(joined(url, path) if path else url).entries()
-        return [name for name, size in entries.items() if size is None and not name.startswith(".")]
+        found = [name for name, size in entries.items() if size is None and name[0] != "."]
+        return [f"{path}/{name}" if path else name for name in found]
 
-    splits = [name for name in folders("") if name in _SCENE_DEPTH]
-    keys = [key for split in splits for key in _keys_of(split, lambda path, _: folders(path))]
+    keys: list[str] = []
+    with ThreadPoolExecutor(_LISTERS) as pool:
+        paths = [name for name in folders("") if name in _SCENE_DEPTH]
+        while paths:
+            below = [path for listed in pool.map(folders, paths) for path in listed]
+            depths = [(path, _SCENE_DEPTH[path.partition("/")[0]]) for path in below]
+            keys += [path for path, depth in depths if path.count("/") + 1 == depth]
+            paths = [path for path, depth in depths if path.count("/") + 1 < depth]
     if not keys:
         raise StorageError(
             f"{shown(url)}: holds no scene and no index.parquet; looked for folders {_LAYOUT}. "

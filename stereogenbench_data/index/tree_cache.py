@@ -3,6 +3,8 @@
     <cache>/stereogenbench/trees/<digest of the root>/
         presumed-<digest of the listing>.parquet   the rows, as an index file
         scenes/ab/<digest of the key>.json         the row of a scene that was described
+        listing/ab/<digest of the folder>.json     what a commit of the Hub holds
+        files/ab/<digest of path and ETag>.json    a small file of a scene behind a URL
 
 The listing is the path, size and modification time of every file, so what is kept is used only for
 unchanged files. Any number of processes, of several machines too, may read and write: files are
@@ -14,10 +16,11 @@ import hashlib
 import json
 import os
 import sys
+import zlib
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pyarrow as pa
 
@@ -32,6 +35,7 @@ from stereogenbench_data.index.parquet import (
 from stereogenbench_data.index.rows import SCHEMA, json_of, scene_of_json
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.sources.files import write_atomic
+from stereogenbench_data.sources.location import is_remote
 
 VARIABLE: Final = "STEREOGENBENCH_CACHE"
 """The environment variable that names another folder for the cache, or is "off"."""
@@ -62,7 +66,8 @@ class TreeCache:
         made_by = ""
         with suppress(PackageNotFoundError):  # of a checkout that is not installed
             made_by = version("stereogenbench-data")
-        what = [_FORMAT, made_by, SCHEMA.names, os.path.realpath(root), read_as]
+        place = str(root) if is_remote(root) else os.path.realpath(root)
+        what = [_FORMAT, made_by, SCHEMA.names, place, read_as]
         self._folder = None if base is None else base / "trees" / _digest(json.dumps(what))
 
     def table(self, name: str) -> tuple[pa.Table, IndexHead, pa.BinaryArray | None] | None:
@@ -92,28 +97,64 @@ class TreeCache:
             for old in tables[:-_MOST_TABLES]:
                 old.unlink(missing_ok=True)
 
-    def scene(self, key: str, *, stamp: str) -> Scene | None:
-        """Return the row of a scene that was described, None if its files have changed since."""
+    def scene(self, key: str, *, stamp: str, part: str = "") -> Scene | None:
+        """Return the row of a scene that was described, None if its files have changed since.
+
+        Args:
+            key: Its path.
+            stamp: The digest of its files.
+            part: Which part of its videos was opened, "" for all.
+        """
         if self._folder is None:
             return None
         try:
-            kept = json.loads(self._place(key).read_bytes())
+            kept = json.loads(self._place(f"{key}{part}").read_bytes())
             return scene_of_json(kept["row"]) if kept["stamp"] == stamp else None
         except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError):
             return None
 
-    def keep_scene(self, scene: Scene, *, stamp: str) -> None:
-        """Keep the row of a scene."""
-        if self._folder is None:
-            return
-        place = self._place(scene.id.key)
-        with suppress(OSError):
-            place.parent.mkdir(parents=True, exist_ok=True)
-            write_atomic(place, json.dumps({"stamp": stamp, "row": json_of(scene)}).encode())
+    def keep_scene(self, scene: Scene, *, stamp: str, part: str = "") -> None:
+        """Keep the row of a scene; see `scene`."""
+        row = json.dumps({"stamp": stamp, "row": json_of(scene)})
+        self._keep(self._place(f"{scene.id.key}{part}"), row.encode())
 
-    def _place(self, key: str) -> Path:
+    def document(self, name: str) -> Any:
+        """Return the JSON that was kept under a name; None if there is none."""
+        if self._folder is None:
+            return None
+        with suppress(OSError, ValueError, zlib.error):
+            return json.loads(zlib.decompress(self._place(name, kind="listing").read_bytes()))
+        return None
+
+    def keep_document(self, name: str, document: Any) -> None:
+        """Keep JSON under a name."""
+        self._keep(
+            self._place(name, kind="listing"), zlib.compress(json.dumps(document).encode(), 1)
+        )
+
+    def file(self, path: str, *, size: int, number: int) -> bytes | None:
+        """Return a small file that was kept; None if there is none of that size and number."""
+        if self._folder is None:
+            return None
+        try:
+            found = self._place(f"{path} {number}", kind="files").read_bytes()
+        except OSError:
+            return None
+        return found if len(found) == size else None
+
+    def keep_file(self, path: str, content: bytes, *, number: int) -> None:
+        """Keep a small file, under a number that changes with it."""
+        self._keep(self._place(f"{path} {number}", kind="files"), content)
+
+    def _keep(self, place: Path, content: bytes) -> None:
+        if self._folder is not None:
+            with suppress(OSError):
+                place.parent.mkdir(parents=True, exist_ok=True)
+                write_atomic(place, content)
+
+    def _place(self, key: str, *, kind: str = "scenes") -> Path:
         name = _digest(key)
-        return Path(self._folder or "", "scenes", name[:2], f"{name}.json")
+        return Path(self._folder or "", kind, name[:2], f"{name}.json")
 
 
 def _digest(text: str) -> str:

@@ -2,8 +2,8 @@
 
 import copy
 import warnings
-from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections import OrderedDict, deque
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, Literal, Self
@@ -33,6 +33,7 @@ from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import (
     TRAJECTORY_JSON,
+    VIDEO_FILES,
     depth_name,
     rgb_name,
 )
@@ -47,6 +48,12 @@ KEPT_POSES: Final = 32
 KEPT_SCENES: Final = 256
 """Of how many scenes what the index says is kept."""
 
+SCENES_AHEAD: Final = 8
+"""How many scenes behind a URL whose rows are presumed are described ahead of the order's steps."""
+
+STEPS_AHEAD: Final = 2048
+"""How many steps are looked ahead for such scenes."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _KnownScene:
@@ -56,11 +63,13 @@ class _KnownScene:
         scene: The row.
         intrinsics: Of its pictures, as large as they are wanted.
         encodings: The depth contract of each camera.
+        videos: The videos that were opened for it, where its row is presumed and behind a URL.
     """
 
     scene: Scene
     intrinsics: Intrinsics
     encodings: dict[int, DepthEncoding]
+    videos: frozenset[str]
 
 
 class SampleDecoder:
@@ -167,7 +176,8 @@ class SampleDecoder:
     def expect(self, steps: Iterable[Step]) -> None:
         """Take the samples that will be decoded next, so that their bytes are fetched ahead."""
         if self._coming is not None:
-            self._coming.expect(steps)
+            presumption = self._index.presumption
+            self._coming.expect(steps if presumption is None else self._described_soon(steps))
 
     def begin(self, address: Address) -> None:
         """Fetch what a sample needs, which is decoded next, and what those after it need."""
@@ -181,7 +191,7 @@ class SampleDecoder:
 
     def release(self, address: Address) -> None:
         """Close the videos of a run that has been read to its end."""
-        self._streams.release(self.scene(address.row), run=address.run)
+        self._streams.release(self.scene(address), run=address.run)
         for key in [key for key in self._depths if key[:2] == (address.row, address.run)]:
             del self._depths[key]
 
@@ -197,16 +207,47 @@ class SampleDecoder:
         self._scenes.clear()
         self._depths.clear()
 
-    def scene(self, row: int) -> Scene:
-        """Return a scene of the index; those of the last rows asked for are kept."""
-        return self._known_scene(row).scene
+    def scene(self, address: Address) -> Scene:
+        """Return the scene of a sample; those of the last rows asked for are kept."""
+        return self._known_scene(address).scene
 
-    def _known_scene(self, row: int) -> _KnownScene:
+    def _described_soon(self, steps: Iterable[Step]) -> Iterator[Step]:
+        """Yield steps; scenes behind a URL whose rows are presumed are described ahead of them."""
+        presumption = self._index.presumption
+        begun: set[int] = set()
+        waiting: deque[tuple[Step, bool]] = deque()
+        scenes = 0
+        for step in steps:
+            row = step.address.row
+            is_first = row not in begun
+            if is_first and presumption is not None:
+                begun.add(row)
+                videos = self._videos(step.address)
+                presumption.expect(self._index.indexed_scene(row), videos)
+            scenes += is_first
+            waiting.append((step, is_first))
+            while waiting and (scenes > SCENES_AHEAD or len(waiting) > STEPS_AHEAD):
+                next_step, is_first = waiting.popleft()
+                scenes -= is_first
+                yield next_step
+        yield from (step for step, _ in waiting)
+
+    def _videos(self, address: Address) -> tuple[str, ...]:
+        """Return the names of the videos that a sample needs."""
+        return (
+            *(rgb_name(camera) for camera in self._cameras(address, "rgb")),
+            *(depth_name(camera) for camera in self._cameras(address, "depth")),
+        )
+
+    def _known_scene(self, address: Address) -> _KnownScene:
+        row, presumption = address.row, self._index.presumption
         known = self._scenes.get(row)
-        if known is None:
-            scene = self._index.scene(row)
+        is_far = presumption is not None and presumption.is_remote
+        videos = self._videos(address) if is_far else ()
+        if known is None or not known.videos.issuperset(videos):
+            scene = self._index.scene(row, videos=videos or VIDEO_FILES)
             self._require_as_presumed(row, scene)
-            if self._coming is not None:
+            if self._coming is not None and not is_far:
                 scene = replace(scene, seek_tables=self._index.seek_tables(row))
             intrinsics = rig_intrinsics(scene.rig)
             if self._request.size is not None:
@@ -216,7 +257,8 @@ class SampleDecoder:
                 camera: scene.depth_encoding(camera, self._request.depth or depth_of(scene))
                 for camera in range(len(scene.depth_unit_m))
             }
-            known = self._scenes[row] = _KnownScene(scene, intrinsics, encodings)
+            opened = frozenset(videos) | (known.videos if known is not None else frozenset())
+            known = self._scenes[row] = _KnownScene(scene, intrinsics, encodings, opened)
             if len(self._scenes) > KEPT_SCENES:
                 self._scenes.popitem(last=False)
         return known
@@ -267,7 +309,7 @@ class SampleDecoder:
             MediaError: If a video does not decode to what the index says.
             SchemaError: If the trajectory does not follow the format.
         """
-        known = self._known_scene(address.row)
+        known = self._known_scene(address)
         try:
             return self._decode(known, address, frames=frames, out=out)
         except (MediaError, SchemaError, ShardError):
@@ -329,7 +371,7 @@ class SampleDecoder:
 
     def _needed_files(self, address: Address) -> NeededFiles:
         """Return what a sample is read from."""
-        known = self._known_scene(address.row)
+        known = self._known_scene(address)
         scene = known.scene
         frames = {rgb_name(camera): [*address.frames] for camera in self._cameras(address, "rgb")}
         for camera in self._cameras(address, "depth"):

@@ -34,7 +34,7 @@ class SampleLoader(SampleDecoder):
             MediaError: If a video does not decode to what the index says.
             SchemaError: If the trajectory does not follow the format.
         """
-        request, scene = self._request, self.scene(address.row)
+        request, scene = self._request, self.scene(address)
         size = request.size or (scene.rig.image_height_px, scene.rig.image_width_px)
         writer = SampleWriter(request, address, clip=clip, allocate=allocate)
         # One frame at a time, or all that a transform treats alike.

@@ -78,7 +78,7 @@ class FilesystemTransport:
 
     def size(self, timeout_s: float) -> int:
         """Return the size of the object in bytes."""
-        with self._named_errors():
+        with self.named_errors():
             files, path = self._open()
             if _is_s3(files):
                 size = self._s3_call("head_object", files, path, timeout_s)["ContentLength"]
@@ -91,7 +91,7 @@ class FilesystemTransport:
 
     def entries(self, timeout_s: float) -> dict[str, int | None]:
         """List a folder: name to size in bytes, None for a folder."""
-        with self._named_errors():
+        with self.named_errors():
             files, path = self._open()
             limit = {"timeout": timeout_s} if files.async_impl else {}
             listed = files.ls(path, detail=True, **limit)
@@ -103,9 +103,22 @@ class FilesystemTransport:
                 found[name.rpartition("/")[2]] = None if is_folder else int(entry["size"] or 0)
         return found
 
+    def files(self, timeout_s: float) -> dict[str, tuple[int, str]]:
+        """List all files below a folder: path to size in bytes and version."""
+        with self.named_errors():
+            files, path = self._open()
+            listed = files.find(path, detail=True)
+        return {
+            name.removeprefix(path).strip("/"): (
+                int(entry["size"] or 0),
+                str(entry.get("ETag") or entry.get("LastModified") or entry.get("mtime") or ""),
+            )
+            for name, entry in listed.items()
+        }
+
     def part(self, start: int, stop: int, timeout_s: float) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop, or the first of them."""
-        with self._named_errors():
+        with self.named_errors():
             files, path = self._open()
             if _is_s3(files):
                 yield from self._s3_part(start, stop, timeout_s, files, path)
@@ -176,7 +189,7 @@ class FilesystemTransport:
         return self._opened[1], self._opened[2]
 
     @contextmanager
-    def _named_errors(self) -> Iterator[None]:
+    def named_errors(self) -> Iterator[None]:
         """Raise errors of file systems as a `TransientError`, or an error that names the cure."""
         try:
             yield

@@ -35,12 +35,17 @@ _ADDRESS: Final = re.compile(
 )
 _COMMIT: Final = re.compile(r"[0-9a-f]{40}")
 _CHUNK: Final = 1024 * 1024
+_LIBRARY: Final = "stereogenbench-data"
 _LARGEST_IN_GIT: Final = 16 * 2**20
 """Bytes of the largest file that the Hub keeps in git, whole and without ranges."""
 
 _commits: Final[dict[tuple[str, str], str]] = {}
 """Commits by the Hub's address and branch, as this process or the one it was forked from resolved
 them."""
+
+_MOST_ADDRESSES: Final = 50_000
+_addresses: Final[dict[tuple[str, str], dict[str, str]]] = {}
+"""Where files of a commit lie, by URL and login, as the Hub has redirected this process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,15 +127,44 @@ class HubTransport:
 
     def entries(self, timeout_s: float) -> dict[str, int | None]:
         """List a folder: name to size in bytes, None for a folder."""
+        return {
+            entry.path.rpartition("/")[2]: getattr(entry, "size", None)
+            for entry in self._tree(timeout_s, depth="one level")
+        }
+
+    def files(self, timeout_s: float) -> dict[str, tuple[int, str]]:
+        """List all files below a folder: path to size in bytes and digest of the content."""
+        above = len(self._file.path.strip("/")) + 1 if self._file.path.strip("/") else 0
+        return {
+            entry.path[above:]: (entry.size, entry.lfs.sha256 if entry.lfs else entry.blob_id)
+            for entry in self._tree(timeout_s, depth="all levels")
+            if hasattr(entry, "size")
+        }
+
+    def pinned(self, timeout_s: float) -> str:
+        """Return the URL of a folder as of the commit that its branch is at now."""
+        file, commit = self._file, self._commit(timeout_s, of="folder")
+        kind = "" if file.kind == "models" else f"{file.kind}/"
+        return f"hf://{kind}{file.repository}@{quote(commit, safe='')}/{file.path}".rstrip("/")
+
+    def _tree(self, timeout_s: float, *, depth: Literal["one level", "all levels"]) -> list[Any]:
+        """Return the entries of a folder, of which the Hub lists a thousand a request."""
         if is_offline():
             raise StorageError(
                 f"{self._where}: HF_HUB_OFFLINE is set, and the Hub's cache does not hold whole "
                 f"folders. Unset it, or pass an index or a folder of this machine."
             )
-        file = self._file
+        with require_installed(self._where, extra="hub"):
+            from huggingface_hub import HfApi
+        file, (endpoint, token) = self._file, _settings()
         commit = self._commit(timeout_s, of="folder")
-        url = f"hf://{file.kind}/{file.repository}@{quote(commit, safe='')}/{file.path}"
-        return FilesystemTransport(url.replace("hf://models/", "hf://")).entries(timeout_s)
+        with FilesystemTransport(self._where).named_errors():
+            listed = HfApi(endpoint, token=token, library_name=_LIBRARY).list_repo_tree(
+                file.repository, file.path.strip("/") or None,
+                repo_type=file.kind.removesuffix("s"), revision=commit,
+                recursive=depth == "all levels",
+            )  # fmt: skip
+            return list(listed)
 
     def _open(self, timeout_s: float) -> WebTransport | Path:
         """Return the file in the Hub's cache, or else where it is on the Hub."""
@@ -184,7 +218,7 @@ class _HubWeb(WebTransport):
         with require_installed(where, extra="hub"):
             from huggingface_hub.utils import build_hf_headers
         endpoint, token = _settings()
-        headers = build_hf_headers(token=token, library_name="stereogenbench-data")
+        headers = build_hf_headers(token=token, library_name=_LIBRARY)
         place = file.repository if file.kind == "models" else f"{file.kind}/{file.repository}"
         url = f"{endpoint}/{place}/resolve/{quote(revision, safe='')}/{quote(file.path)}"
         super().__init__(url, expected_size=expected_size, headers=headers)
@@ -192,6 +226,10 @@ class _HubWeb(WebTransport):
         self._revision = revision
         # A commit does not change; ETags and dates of a content network's servers may differ.
         self._is_versioned = _COMMIT.fullmatch(revision) is None
+        if not self._is_versioned:  # all that reads the file asks the Hub once
+            if len(_addresses) >= _MOST_ADDRESSES:
+                _addresses.clear()
+            self._addresses = _addresses.setdefault((url, headers.get("authorization", "")), {})
         self._is_redirected = True  # so that threads do not all ask the Hub at first
 
     def commit(self, timeout_s: float) -> str:

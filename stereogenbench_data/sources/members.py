@@ -76,7 +76,7 @@ class MemberSource:
         self._check = check
         self._policy = retry
         self._ahead = ahead
-        self._tables: OrderedDict[str, dict[str, SeekTable]] = OrderedDict()
+        self._tables: OrderedDict[bytes, dict[str, SeekTable]] = OrderedDict()
         self._sound: set[tuple[str, int]] = set()
         self._objects: dict[str, RemoteObject] = {}
         self._requests = self._bytes = 0
@@ -183,7 +183,7 @@ class MemberSource:
         """Return the seek table of one of a scene's videos, if there is one that fits it."""
         if scene.seek_tables is None:
             return None
-        key = scene.id.key
+        key = scene.seek_tables
         if key not in self._tables:
             self._tables[key] = {
                 each: table

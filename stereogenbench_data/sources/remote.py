@@ -68,6 +68,28 @@ class RemoteObject:
         """
         return self._retried(self._transport.entries, doing="requesting its entries")
 
+    def files(self) -> dict[str, tuple[int, str]]:
+        """List all files below a folder, in few requests.
+
+        Returns:
+            Path below the folder to size in bytes, and what changes with the content (an ETag or
+            the digest of the Hub), "" if the store has none.
+
+        Raises:
+            StorageError: If it cannot be listed; plain web servers have no listings.
+        """
+        return self._retried(self._transport.files, doing="requesting its files")
+
+    def pinned(self) -> str:
+        """Return the URL of a folder that keeps its content: of the Hub, with its commit; else "".
+
+        Raises:
+            StorageError: If the Hub cannot be asked.
+        """
+        if not isinstance(self._transport, HubTransport):
+            return ""
+        return self._retried(self._transport.pinned, doing="requesting its commit")
+
     def read(self, start: int, stop: int, *, cancellation: threading.Event | None = None) -> bytes:
         """Return the bytes from start to stop; `chunks` describes arguments and errors."""
         return b"".join(self.chunks(start, stop, cancellation=cancellation))

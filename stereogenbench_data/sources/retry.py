@@ -72,6 +72,9 @@ class Transport(Protocol):
     def entries(self, timeout_s: float) -> dict[str, int | None]:
         """List a folder: name to size in bytes, None for a folder."""
 
+    def files(self, timeout_s: float) -> dict[str, tuple[int, str]]:
+        """List all files below a folder: path to size in bytes and version, "" if unknown."""
+
 
 @dataclass(frozen=True, slots=True)
 class RetryPolicy:

@@ -190,13 +190,13 @@ class WebTransport:
             self._headers |= urllib3.make_headers(basic_auth=unquote(login))
         self._first_seen: dict[str, _Version] = {}
         self._is_versioned = True
-        self._address = ""  # where the URL leads to, as far as it is known
+        self._addresses: dict[str, str] = {}  # where the URL leads to, as far as it is known
         self._is_redirected = False
         self._resolving = ProcessLock()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy in another process, without signed URLs."""
-        return self.__dict__ | {"_address": ""}
+        return self.__dict__ | {"_addresses": {}}
 
     def size(self, timeout_s: float) -> int:
         """Return how many bytes the object has, as the response for its first byte states."""
@@ -218,6 +218,11 @@ class WebTransport:
             f"{self._where}: a web server does not list its folders. Pass a folder with an "
             f"index.parquet, or an index and this URL as its root."
         )
+
+    def files(self, timeout_s: float) -> dict[str, tuple[int, str]]:
+        """Refuse to list a folder, as `entries`."""
+        self.entries(timeout_s)
+        return {}
 
     def part(self, start: int, stop: int, timeout_s: float) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop, or the first of them."""
@@ -272,19 +277,19 @@ class WebTransport:
         self, part: Mapping[str, str], limit: _Limit
     ) -> urllib3.BaseHTTPResponse | None:
         """Return a response from where the URL led to; None if that is not known or refuses."""
-        address = self._address
-        if not address:
+        address = self._addresses.get(self._url)
+        if address is None:
             return None
         try:
             response = self._ask(address, part, limit)
         except TransientError:
-            self._address = ""  # its server may be gone; another one may not
+            self._addresses.pop(self._url, None)  # its server may be gone; another one may not
             raise
         if response.status in _WITH_CONTENT or response.status in PASSING:
             return response
         _use_up(response)
-        if self._address == address:
-            self._address = ""
+        if self._addresses.get(self._url) == address:
+            self._addresses.pop(self._url, None)
         return None
 
     def _ask(
@@ -327,7 +332,7 @@ class WebTransport:
                 f"URL and the server, {_FETCH}."
             )
         if hops:
-            self._address, self._is_redirected = url, True
+            self._addresses[self._url], self._is_redirected = url, True
         return response
 
     def _condition(self) -> dict[str, str]:

@@ -7,7 +7,6 @@ from typer.testing import CliRunner
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.index import open as index_module
 from stereogenbench_data.index.tree import find_remote_scenes
 from tests.servers.hub import REPOSITORY, hub_serving
 
@@ -66,14 +65,6 @@ def test_a_part_is_indexed_under_a_name_of_its_own(small_release):
     assert done.exit_code == 2
     assert "--out FILE" in done.output
     assert not (small_release / "index.parquet").exists()
-
-
-@pytest.mark.usefixtures("hub_tree")
-def test_too_many_scenes_are_not_described_each_time(monkeypatch):
-    monkeypatch.setattr(index_module, "MOST_REMOTE_SCENES", 3)
-
-    with pytest.raises(StorageError, match=r"4 scenes are too many .*`stereogenbench index hf://"):
-        SceneIndex.open(HUB)
 
 
 @pytest.mark.usefixtures("hub")

@@ -4,9 +4,11 @@ One data set, `REPOSITORY`, with the branch main and one commit. Files are redir
 URL of another host, as the Hub sends large ones to its content network: it expires after
 ``signed_for_s`` of the server's ``facts``, may be withdrawn by clearing ``signatures``, and refuses
 logins. ``in_git`` names files that the Hub sends itself, whole. What is asked for with the token
-``expired`` is refused, as private data sets are; what is ``gated``, without any token.
+``expired`` is refused, as private data sets are; what is ``gated``, without any token. Folders are
+listed ``page`` entries at a time.
 """
 
+import hashlib
 import itertools
 import json
 import re
@@ -33,6 +35,8 @@ _numbers = itertools.count()
 
 class HubHandler(FileHandler):
     """Answers as the Hub does, below the server's folder."""
+
+    next_page = ""
 
     def do_HEAD(self) -> None:
         """Answer a question for a file's facts, which need no signature."""
@@ -77,13 +81,27 @@ class HubHandler(FileHandler):
             self._refuse(404, "RepoNotFound")
 
     def _tree(self, folder: str) -> list[dict[str, object]]:
-        below = sorted((self.server.folder / folder).iterdir())
-        return [self._entry(str(path.relative_to(self.server.folder))) for path in below]
+        """Return a page of a folder's entries, and say where the next one is."""
+        asked = parse_qs(urlsplit(self.path).query)
+        place = self.server.folder / folder
+        is_recursive = asked.get("recursive", ["false"])[0].lower() == "true"
+        names = sorted(
+            path.relative_to(self.server.folder).as_posix()
+            for path in (place.rglob("*") if is_recursive else place.iterdir())
+        )
+        start, count = int(asked.get("cursor", ["0"])[0]), self.server.facts.get("page", 1000)
+        self.server.facts.setdefault("listed", []).append((folder, start))
+        if start + count < len(names):
+            query = f"recursive={is_recursive}&cursor={start + count}"
+            self.next_page = f"{self.server.url}{urlsplit(self.path).path}?{query}"
+        return [self._entry(name) for name in names[start : start + count]]
 
     def _entry(self, name: str) -> dict[str, object]:
         path = self.server.folder / name
-        kind = "directory" if path.is_dir() else "file"
-        return {"type": kind, "oid": "0" * 40, "size": path.stat().st_size, "path": name}
+        if path.is_dir():
+            return {"type": "directory", "oid": "0" * 40, "size": 0, "path": name}
+        oid = hashlib.sha1(path.read_bytes(), usedforsecurity=False).hexdigest()
+        return {"type": "file", "oid": oid, "size": path.stat().st_size, "path": name}
 
     def _known(self, revision: str | None, answer: object) -> None:
         if revision in (None, *_REVISIONS):
@@ -154,6 +172,9 @@ class HubHandler(FileHandler):
         text = json.dumps(document).encode()
         self.send_response(200)
         self.send_header("Content-Type", "application/json")
+        if self.next_page:
+            self.send_header("Link", f'<{self.next_page}>; rel="next"')
+            self.next_page = ""
         self.send_header("Content-Length", str(len(text)))
         self.end_headers()
         self.wfile.write(text)

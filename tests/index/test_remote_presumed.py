@@ -1,0 +1,162 @@
+"""Many scenes on the Hub without an index: presumed by the listing, described when needed."""
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+
+from stereogenbench_data import SceneIndex, StereoPairs
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.index import open as open_module
+from stereogenbench_data.index.presumed import Presumption
+from stereogenbench_data.index.tree_cache import VARIABLE
+from tests.servers.hub import REPOSITORY, hub_serving
+
+HUB = f"hf://datasets/{REPOSITORY}@main"
+KEYS = [f"train/Uniform/Map_{number % 2}/scene_{number:06d}" for number in range(10)] + [
+    f"eval/MapSeenInTrain/Uniform/Map_0/scene_{number:06d}" for number in range(40)
+]
+ODD = "eval/MapSeenInTrain/Uniform/Map_0/scene_000007"
+"""A scene that opening the tree does not look at."""
+
+
+@pytest.fixture(scope="module")
+def whole_release(small_release, tmp_path_factory):
+    """Many scenes, each with the files of one drawn scene and baselines of its own."""
+    (drawn,) = small_release.glob("eval/*/Uniform/*/*")
+    root = tmp_path_factory.mktemp("many")
+    for number, key in enumerate(KEYS):
+        (root / key).mkdir(parents=True)
+        for file in drawn.iterdir():
+            if file.name != "baseline.json":
+                os.link(file, root / key / file.name)
+        baseline = json.loads((drawn / "baseline.json").read_text())
+        baseline["scene_label"] = f"Scene {number}"
+        (root / key / "baseline.json").write_text(json.dumps(baseline))
+    return root
+
+
+@pytest.fixture
+def release(whole_release, tmp_path):
+    """A release of its own, of which files may be replaced."""
+    return shutil.copytree(whole_release, tmp_path / "release", copy_function=os.link)
+
+
+@pytest.fixture
+def hub(release, tmp_path, monkeypatch):
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "cache"))
+    with hub_serving(release, monkeypatch) as server:
+        server.facts["page"] = 100
+        yield server
+
+
+def requests(server):
+    """Return how many requests a server has answered."""
+    facts = server.facts
+    return sum(len(each) for each in (facts.get("resolved", []), facts["listed"], server.asked))
+
+
+def read_names(server, key):
+    return {name.rpartition("/")[2] for _, name, _ in server.facts["resolved"] if key in name}
+
+
+def test_rows_come_from_the_listing_and_a_few_scenes(hub, release):
+    index = SceneIndex.open(HUB)
+    local = SceneIndex.open(release, rows="read")
+
+    assert index.presumption is not None
+    assert not read_names(hub, ODD)
+    for name in ("key", "subset", "frames", "primary_left", "depth_unit_m", "depth_codec"):
+        np.testing.assert_array_equal(index.column(name), local.column(name), err_msg=name)
+    assert requests(hub) < 300
+
+
+def test_baselines_are_read_where_a_selection_needs_them_and_the_digest_stays(hub, release):
+    index = SceneIndex.open(HUB)
+    digest, local = index.digest, SceneIndex.open(release, rows="read")
+
+    np.testing.assert_array_equal(index.column("scene_label"), local.column("scene_label"))
+    np.testing.assert_array_equal(index.column("baselines_cm"), local.column("baselines_cm"))
+    assert read_names(hub, ODD) == {"baseline.json"}
+    assert index.digest == digest
+
+
+def test_samples_are_those_of_the_folder_and_only_their_videos_are_opened(hub, release):
+    options = {"split": "eval", "fields": ["left", "disparity", "baseline_m"], "frames": [0, 3]}
+    remote, local = StereoPairs(HUB, **options), StereoPairs(release, **options)
+
+    number = local.index.column("key").tolist().index(ODD)
+    for each in (2 * number, 2 * number + 1):
+        a, b = local[each], remote[each]
+        assert a.keys() == b.keys()
+        for name in ("left", "disparity", "baseline_m"):
+            np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+    videos = {name for name in read_names(hub, ODD) if name.startswith("cam_")}
+    assert len(videos) == 2
+    assert all(key.startswith("eval") for key in remote.index.column("key"))
+
+
+def test_an_epoch_with_workers_is_that_of_the_folder(hub, release):
+    options = {"split": "eval", "fields": ["left", "scene"], "frames": [0], "size": (16, 16)}
+
+    def epoch(data):
+        loader = StereoPairs(data, **options).loader(8, num_workers=2, seed=3)
+        return [(batch["scene"], batch["left"].numpy()) for batch in loader]
+
+    for (keys, left), (other_keys, other_left) in zip(epoch(HUB), epoch(release), strict=True):
+        assert keys == other_keys
+        np.testing.assert_array_equal(left, other_left)
+
+
+def test_a_second_opening_asks_for_the_commit_alone(hub):
+    first = SceneIndex.open(HUB)
+    first.scene(0)
+    hub.facts["resolved"].clear()
+    hub.facts["listed"].clear()
+
+    second = SceneIndex.open(HUB)
+
+    assert second.scene(0) == first.scene(0)
+    assert not hub.facts["listed"]
+    assert {name.rpartition("/")[2] for _, name, _ in hub.facts["resolved"]} <= {"index.parquet"}
+
+
+@pytest.mark.parametrize("how", ["another pair", "no video"])
+def test_a_scene_that_contradicts_what_was_presumed_is_named(hub, release, how):
+    name = "baseline.json" if how == "another pair" else "cam_00_rgb.mp4"
+    place = release / ODD / name
+    text = place.read_bytes()
+    place.unlink()
+    if how == "another pair":
+        document = json.loads(text)
+        pair = document["primary_stereo_pair"]
+        pair["left_camera"], pair["right_camera"] = pair["right_camera"], pair["left_camera"]
+        place.write_text(json.dumps(document))
+    else:
+        place.write_bytes(b"no video")
+    pairs = StereoPairs(HUB, split="eval", fields=["left"], frames=[0])
+    number = pairs.index.column("key").tolist().index(ODD)
+
+    with pytest.raises(StorageError, match=rf"{ODD} is not as was presumed.*stereogenbench index"):
+        pairs[number]
+
+
+def test_another_pair_of_a_scene_opens_more_of_its_videos(hub):
+    cameras = {"pairs": [(0, 1), (0, 2)], "fields": ["right"]}
+    pairs = StereoPairs(HUB, scenes=KEYS[10:20], frames=[0], **cameras)
+    assert isinstance(pairs.index.presumption, Presumption)
+
+    pairs[0], pairs[1]
+
+    key = str(pairs.index.column("key")[0])
+    assert "cam_02_rgb.mp4" in read_names(hub, key)
+
+
+@pytest.mark.usefixtures("hub")
+def test_too_many_scenes_are_not_all_described_each_time(monkeypatch):
+    monkeypatch.setattr(open_module, "MOST_REMOTE_SCENES", 49)
+
+    with pytest.raises(StorageError, match=r" 50 are too many .*`stereogenbench index hf://"):
+        SceneIndex.open(HUB, rows="read")
