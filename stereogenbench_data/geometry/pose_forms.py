@@ -61,6 +61,7 @@ _FROM_CAMERA: Final = (
 _FROM_WORLD: Final = (
     "w2c", "world_to_camera", "world_to_cam", "cam_from_world", "world2cam", "world2camera",
     "extrinsic", "camera_from_world", "view_matrix", "colmap",
+    "tvec", "rvec", "qvec",
 )  # fmt: skip
 
 
@@ -244,7 +245,11 @@ def _all_readings(recorded: RecordedPoses) -> Iterator[_Form]:
 
 
 def _hints(recorded: RecordedPoses) -> frozenset[str]:
-    return recorded.hints | {_ALIASES[hint] for hint in recorded.hints if hint in _ALIASES}
+    found = recorded.hints | {_ALIASES[hint] for hint in recorded.hints if hint in _ALIASES}
+    is_of_rotators = any(block.components == ("pitch", "yaw", "roll") for block in recorded.blocks)
+    if is_of_rotators and any("right_hand" in hint for hint in found):
+        return (found | {"ros"}) - {"unreal"}  # as Unreal's, with y to the left
+    return found
 
 
 def _form(
@@ -274,6 +279,7 @@ def _kinds(block: Block) -> list[str]:
         kinds = [f"{_KINDS[0]} {unit}" for unit in units]
     elif shape == (3,) and (block.words & _ROTATION or names == ("rx", "ry", "rz")):
         kinds = [f"{kind} {unit}" for kind, unit in itertools.product(_KINDS[:4], units)]
+        kinds += [f"{_KINDS[3]} {unit} w2c" for unit in units]
     elif shape == (4,):
         kinds = [*_KINDS[4:5]] if names else [*_KINDS[4:6]]
         kinds += [f"{kind} w2c" for kind in kinds]
@@ -297,7 +303,8 @@ def _tier(block: Block, kind: list[str], axes: str, hints: frozenset[str]) -> in
     is_from_world = any(word in text for word in _FROM_WORLD) and not any(
         word in text for word in _FROM_CAMERA
     )
-    is_rad = block.unit.startswith("rad") or any(word.startswith("rad") for word in said)
+    is_vector = kind[0] == "vector" and not block.unit.startswith("deg")
+    is_rad = is_vector or block.unit.startswith("rad") or any(w.startswith("rad") for w in said)
     fits = is_from_world == ("w2c" in kind) and (
         kind[0] not in _ANGLES or ("rad" in kind) == is_rad
     )
@@ -313,7 +320,7 @@ def _tier(block: Block, kind: list[str], axes: str, hints: frozenset[str]) -> in
 
 def _form_tier(block: Block, kind: list[str], said: frozenset[str]) -> int:
     """Return whether a file names a form by its components, its order, or the word for it."""
-    said_orders = _ORDERS & said
+    said_orders = _ORDERS & said or ({"wxyz"} if said & {"qvec", "colmap"} else set())
     if kind[0] == "matrix":
         return 2 if kind[2] == "rows" else 0
     if block.components in (("pitch", "yaw", "roll"), ("qx", "qy", "qz", "qw")):

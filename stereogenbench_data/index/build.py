@@ -246,22 +246,23 @@ def report_of(
         else:
             scenes.append(scene)
         if scene.labels.map_name not in (None, scene.id.map_name):
-            labels.append(
-                f"{scene.id.key}: its files call the map {brief(scene.labels.map_name)}; the "
-                f"folder's name is used"
-            )
+            labels.append(f"{scene.id.key}: {brief(scene.labels.map_name)}")
     subsets = [
         f"eval/{folder} names no subset; a scene there counts as seen_map if its map occurs in "
         f"train, of this tree or of the release, else as unseen_map"
         for folder in sorted(unnamed)
     ]
+    named = [
+        f"files of {counted(len(labels), 'scene')} call the map otherwise than its folder, whose "
+        f"name is used, such as {labels[0]}"
+    ] if labels else []  # fmt: skip
     broken = {out.key: out.reason for out in outcomes if out.kind == "broken"}
     return TreeReport(
         root=str(root),
         scenes=tuple(scenes),
         incomplete={out.key: out.reason for out in outcomes if out.kind == "incomplete"},
         broken=dict(sorted((folders.refused | broken).items())),
-        notes=(*subsets, *labels, *_remarks(found), *_depth_notes(found)),
+        notes=(*subsets, *named, *_remarks(found), *_depth_notes(found)),
         is_part=is_part,
     )
 

@@ -147,7 +147,7 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
                 reversed_.append(checked)
             else:
                 (exact if checked.off <= _EXACT else loose).append(checked)
-        if exact or any(each.reading.is_named for each in reversed_):
+        if exact or any(each.reading.is_named and each.reading.tier == 0 for each in reversed_):
             break
     passed = exact or [each for each in loose if each.reading.tier == 0][:1]
     if reversed_ and not passed:

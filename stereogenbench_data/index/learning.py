@@ -263,7 +263,7 @@ def _depth_notes(facts: StreamFacts, scene: Scene | None) -> list[str]:
     if source == "default":
         where = "nothing states it, so this is the release's default"
     if source == "unreadable":
-        return [*notes, "the unit is not understood: the tags contradict each other"]
+        return [*notes, f"the unit is not understood: {scene.remark('depth')}"]
     return [*notes, f"{unit_m:g} m in a stored unit: {where}"]
 
 

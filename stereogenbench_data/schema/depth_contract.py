@@ -19,6 +19,7 @@ from typing import Any, Final, Literal
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.schema.document import is_number
 from stereogenbench_data.schema.quantities import UNITS_M, nodes_of, words
+from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.text import shortened
 
 About = Literal[
@@ -34,6 +35,8 @@ _LARGEST_FAR_M: Final = 10_000.0
 """Where the far end of a range of depth can be; it tells metres from cm where no unit stands."""
 _SAME: Final = 0.005
 """Two statements agree within the rounding of either, which is at most this share."""
+_EXACT: Final = 1e-4
+"""A unit that is stated beside a range which does not begin at 0 must be that of the range."""
 _MOST_SHOWN: Final = 4
 
 _U: Final = "|".join(sorted((name.replace("_", "[ _]") for name in UNITS_M), key=len, reverse=True))
@@ -203,10 +206,14 @@ def stated_in_json(document: dict[str, Any], *, name: str) -> list[Statement]:
         if "depth" not in place.split("_") or _OTHER_DEPTHS.search(place):
             continue
         value = node.value
-        if isinstance(value, dict) or (isinstance(value, list) and len(value) != 2):
-            continue
         source = _Source(f"{name}: {node.path} is", "metadata", path=place)
-        found += source.read(node.name, value)
+        if isinstance(value, list) and value[:1] * CAMERA_COUNT == value:
+            value = value[0]
+        if isinstance(value, list) and len(value) != 2:
+            is_scale = not _SCALES.isdisjoint(re.split("_|(?<=[a-z])s_", node.name))
+            found += [source.unclear(value)] if is_scale else []
+        elif not isinstance(value, dict):
+            found += source.read(node.name, value)
     return found
 
 
@@ -233,6 +240,12 @@ def agreed(statements: Sequence[Statement], *, largest: int) -> StatedDepth:
     units, names = about["unit"], about["length unit"]
     near_m, ranged = _of_range(about, largest=largest)
     if ranged is not None:
+        unit_m = ranged.values[0]
+        is_same = any(
+            abs(value - unit_m) <= _EXACT * unit_m for each in units for value in each.values
+        )
+        if near_m and units and not about["normalised"] and not is_same:
+            _refuse(_CONTRADICTION, [*units, ranged])  # ends of a range, or planes that clip
         units = [*units, ranged]
         if _is_only_of_range(about):
             names = []
@@ -263,6 +276,8 @@ def _of_units(units: Sequence[Statement], names: Sequence[Statement]) -> StatedD
     told = [each for each in names if each.values[0] != 1]
     numbers = [each for each in units if not (told and each.is_bare and each.values == (1.0,))]
     everything = [*numbers, *told]
+    if everything and all(each.is_bare and each.values == (1.0,) for each in everything):
+        _refuse("may mean a metre, or that stored numbers are not scaled", everything)
     if not everything:
         _refuse("does not tell how many metres a stored unit has", names)
         return StatedDepth()
@@ -337,6 +352,10 @@ class _Source:
     place: str
     origin: Origin
     path: str = ""
+
+    def unclear(self, value: object) -> Statement:
+        """Return that a value of a scale is not understood."""
+        return self._make("unclear", (), json.dumps(value))
 
     def read(self, name: str, value: object) -> list[Statement]:
         """Return what a value under a key, in snake_case, says."""
@@ -507,7 +526,7 @@ class _Source:
         if number > 0:
             if kind != "inverse":
                 readings.append(number * metre)
-            if kind != "metres":
+            if kind == "inverse" or (kind == "either" and _may_be_divisor(number)):
                 readings.append(metre / number)
         possible = (each for each in readings if LEAST_UNIT_M <= each <= LARGEST_UNIT_M)
         values = tuple(dict.fromkeys(possible))
@@ -530,6 +549,12 @@ class _Source:
         rounding = 0.5 * 10.0 ** (1 - digits) if number else 0.0
         shown = shortened(repr(text))
         return Statement(about, values, self.place, shown, self.origin, rounding=rounding, **facts)
+
+
+def _may_be_divisor(number: float) -> bool:
+    """Return whether a number may be stored units a metre: a round one, such as 1000 or 256."""
+    is_round = float(f"{number:.1e}") == number or math.log2(number).is_integer()
+    return number > 1 and number.is_integer() and is_round
 
 
 _TECHNICAL: Final = frozenset(

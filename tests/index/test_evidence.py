@@ -76,6 +76,8 @@ FORMS = {
     "inverse": lambda p: {"world_to_camera": np.linalg.inv(p.matrix).tolist()},
     "16 inverse": lambda p: {"w2c": np.linalg.inv(p.matrix).ravel().tolist()},
     "R and t": lambda p: {"world_to_camera": p.inverse_parts()},
+    "rvec": lambda p: p.vectors("rvec"),
+    "colmap": lambda p: p.vectors("qvec"),
 }
 ROTATORS_ONLY = {name for name in FORMS if name.startswith("ro") and name != "rows"}
 
@@ -102,6 +104,14 @@ class Written:
     def quaternion(self, names):
         parts = dict(zip("xyzw", quaternion_xyzw(self.turn).tolist(), strict=True))
         return {name: parts[name] for name in names}
+
+    def vectors(self, name):
+        inverse = np.linalg.inv(self.matrix)
+        x, y, z, w = quaternion_xyzw(inverse[:3, :3])
+        angle = 2 * np.arccos(np.clip(w, -1, 1))
+        vector = np.array([x, y, z]) * (angle / np.sin(angle / 2) if angle else 2.0)
+        turn = {"rvec": vector.tolist(), "qvec": [w, x, y, z]}[name]
+        return {name: turn, "tvec": inverse[:3, 3].tolist()}
 
     def inverse_parts(self):
         inverse = np.linalg.inv(self.matrix)
@@ -167,7 +177,18 @@ def test_right_handed_worlds_are_read_and_never_mirrored(form, axes):
     np.testing.assert_allclose(motions(found.poses), truth(*TURNED), atol=1e-9)
 
 
-@pytest.mark.parametrize("form", sorted(set(FORMS) - ROTATORS_ONLY - {"R and t"}))
+def test_rotators_of_a_world_that_is_called_right_handed_are_not_mirrored():
+    rotators, places_cm = TURNED
+    mirror = np.array([1.0, -1.0, 1.0])
+    text = written(
+        "rotator", rotators * [1.0, -1.0, -1.0], places_cm * mirror,
+        coordinate_system="right-handed z-up",
+    )  # fmt: skip
+
+    np.testing.assert_allclose(motions(understood(text).poses), truth(*TURNED), atol=1e-9)
+
+
+@pytest.mark.parametrize("form", sorted(set(FORMS) - ROTATORS_ONLY - {"R and t", "rvec", "colmap"}))
 def test_where_no_axes_are_named_cameras_stand_upright_in_a_world_whose_z_is_up(form):
     found = understood(written(form, *TURNED, axes="opengl", unit="m"))
 

@@ -123,7 +123,7 @@ def test_a_contradiction_that_is_not_fatal_is_reported(make_scene, root, run):
 
     assert result.exit_code == 0
     assert "1 note:" in result.stderr
-    assert "its files call the map 'Car_Dealer'" in result.stderr
+    assert "such as train/Uniform/Downtown_West/scene_000000: 'Car_Dealer'" in result.stderr
 
 
 def test_a_tree_that_cannot_be_written_asks_for_a_file_elsewhere(

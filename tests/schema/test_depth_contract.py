@@ -51,6 +51,7 @@ def test_a_tag_of_millimetres_is_understood(tag):
     [
         {"depth_scale": 0.001},
         {"depth_scale": 1000},
+        {"depth_scales_m": [0.001] * 6},
         {"depth_unit": "mm"},
         {"depthUnitMeters": 0.001},
         {"depth_units_per_meter": 1000},
@@ -134,6 +135,8 @@ def test_a_range_gives_unit_and_offset(statements):
         {"scale": "0.1", "DEPTH_UNIT": "mm"}, {"scale": "0.1", "unit": "cm"},
         {"depth_scale": "0.001", "scale": "0.002"},
         {"depth_scale": "0.1", "near": "0.5 m", "far": "80.5 m"},
+        {"depth_scale": "0.001", "near": "0.1", "far": "65.535"}, {"DEPTH_SCALE": "65.535"},
+        {"DEPTH_SCALE": "1"}, {"scale": "1.0"},
         {"depth_encoding": "inverse", "scale": "655"}, {"encoding": "log", "scale": "0.001"},
         {"depth_type": "euclidean", "scale": "0.001"}, {"disparity_scale": "16"},
         {"scale": "0.001", "offset": "0.5"}, {"max_depth": "100"}, {"normalized": "1"},
