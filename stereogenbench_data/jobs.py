@@ -6,13 +6,14 @@
 
 The lock is taken before the settings are read or written. So of two runs that begin at once, one is
 refused, and neither writes into the work of the other. Clips, views, inputs of methods and scores
-are such work; its items are written on one engine or another (`engine`).
+are such work; its items are written on one engine or another (`engine`). Synthetic scenes keep
+their decisions as such items, and lock each part of a request by itself (`synthesis`).
 """
 
 import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -181,10 +182,9 @@ def read_json(path: Path, *, cure: str = "Remove it.") -> dict[str, Any]:
 
 def read_item(path: Path) -> dict[str, Any] | None:
     """Return the object in a JSON file of an item; None where it is missing or was cut short."""
-    try:
+    with suppress(FileNotFoundError, StorageError):
         return read_json(path)
-    except (FileNotFoundError, StorageError):
-        return None
+    return None
 
 
 def do_items(  # noqa: PLR0913 - what to do, how, and what is told of it

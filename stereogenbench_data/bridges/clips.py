@@ -33,7 +33,7 @@ from stereogenbench_data.bridges.clip_layouts import (
 from stereogenbench_data.bridges.exports import alone, scene_filters, training_selection
 from stereogenbench_data.bridges.generation import Captions, describe_pair
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
-from stereogenbench_data.engine import Advance, Progress
+from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import (
     MediaError,
     SelectionError,
@@ -124,11 +124,13 @@ class ExportRun:
     Attributes:
         depth: A depth contract instead of the one that files and release state.
         workers: How many processes write, None for one a core.
+        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called with (frames written, frames in all).
     """
 
     depth: DepthEncoding | None = None
     workers: int | None = None
+    engine: Engine = LOCAL
     progress: Progress | None = None
 
 
@@ -227,6 +229,7 @@ def export_clips(
             due,
             name=lambda work: work.name,
             workers=run.workers,
+            engine=run.engine,
             progress=run.progress,
             done=total - still,
             total=total,

@@ -19,7 +19,7 @@ from stereogenbench_data.bridges.exports import alone, scene_filters, training_s
 from stereogenbench_data.bridges.posed_images import PosedImageReader, index_of
 from stereogenbench_data.bridges.view_formats import INDEX_TXT, WRITERS, Layout
 from stereogenbench_data.datasets.mapped import Data
-from stereogenbench_data.engine import Advance, Progress
+from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import atomic_folder, do_items, job_folder, named_errors
@@ -51,6 +51,7 @@ class ViewExportOptions(SceneFilters, total=False):
             for `USUAL_POINTS`.
         depth: A depth contract instead of the one that files and release state.
         workers: How many processes, None for one a core.
+        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called with (pictures done, pictures in all).
     """
 
@@ -61,6 +62,7 @@ class ViewExportOptions(SceneFilters, total=False):
     points: int | Literal["all"] | None
     depth: DepthEncoding | None
     workers: int | None
+    engine: Engine
     progress: Progress | None
 
 
@@ -142,6 +144,7 @@ def export_views(
             works,
             name=lambda work: str(work.index.column("key")[0]),
             workers=options.get("workers"),
+            engine=options.get("engine", LOCAL),
             progress=options.get("progress"),
             done=total - sum(work.pictures for work in works),
             total=total,

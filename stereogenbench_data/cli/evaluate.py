@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -100,13 +100,6 @@ class ProtocolOptions:
             rich_help_panel=_METRICS,
         ),
     ] = "sgbm"
-    fit: Annotated[
-        str,
-        typer.Option(
-            help="Of SD, for relations: filtered, least_squares, theil_sen.",
-            rich_help_panel=_METRICS,
-        ),
-    ] = "filtered"
     depth_unit_m: DepthUnitOption = None
     accept: AcceptOption = None
     weights: Annotated[
@@ -128,18 +121,16 @@ class ProtocolOptions:
 
         Raises:
             typer.BadParameter: If the size is not WIDTHxHEIGHT.
-            EvaluationError: If a metric, a matcher or a fit is unknown.
+            EvaluationError: If a metric is unknown.
         """
         from stereogenbench_data.evaluation.models.registry import ModelOptions
         from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 
-        fit: Any = self.fit
         return EvaluationProtocol(
             metrics=require_metrics(self.metrics),
             size=parse_picture_size(self.size),
             keypoint_matcher=self.keypoint_matcher,
             stereo_matcher=self.stereo_matcher,
-            fit=fit,
             models=ModelOptions(device=self.device, weights=self.weights),
         )
 

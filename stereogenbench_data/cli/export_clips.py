@@ -14,7 +14,7 @@ from stereogenbench_data.cli.options import (
     DataOptions,
     DepthUnitOption,
     JsonOption,
-    WorkersOption,
+    WorkOptions,
     complete_from,
     depth_of,
     grouped,
@@ -182,7 +182,7 @@ def export_clips(  # noqa: PLR0913 - one parameter an option
     clip: ClipOptions,
     depth_unit_m: DepthUnitOption = None,
     accept: AcceptOption = None,
-    workers: WorkersOption = None,
+    work: WorkOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Write stereo clips with captions and manifest for video trainers.
@@ -204,8 +204,8 @@ def export_clips(  # noqa: PLR0913 - one parameter an option
             form=form,
             run=ExportRun(
                 depth=depth_of(index, unit_m=depth_unit_m, accept=accept),
-                workers=workers,
                 progress=progress,
+                **work.options(),
             ),
             **selection,
         )

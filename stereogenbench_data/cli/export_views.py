@@ -13,7 +13,7 @@ from stereogenbench_data.cli.options import (
     AcceptOption,
     DataOptions,
     DepthUnitOption,
-    WorkersOption,
+    WorkOptions,
     depth_of,
     grouped,
     out_folder,
@@ -47,7 +47,6 @@ class ViewOptions(ExportedSceneOptions):
     ] = None
     depth_unit_m: DepthUnitOption = None
     accept: AcceptOption = None
-    workers: WorkersOption = None
 
     def selection(self) -> dict[str, Any]:
         """Return the options of `export_views` that were given.
@@ -66,7 +65,6 @@ class ViewOptions(ExportedSceneOptions):
             "cameras": cameras,
             "frames": frames_option(self.frames),
             "size": None if self.size is None else parse_picture_size(self.size),
-            "workers": self.workers,
         }
 
 
@@ -107,48 +105,56 @@ class FolderOptions(ViewOptions):
 
 @grouped
 @resumable()
-def export_colmap(source: DataOptions, out: OutArgument, *, chosen: FolderOptions) -> None:
+def export_colmap(
+    source: DataOptions, out: OutArgument, *, chosen: FolderOptions, work: WorkOptions
+) -> None:
     """Write COLMAP's text model with points from depth.
 
     COLMAP, gsplat and 3D Gaussians read it. In each folder: images/ and sparse/0/ (cameras.txt,
     images.txt, points3D.txt), poses and points in metres, exact; the world's origin is the first
     camera. A stopped run goes on if it is run again.
     """
-    _export(source, out, chosen, layout="colmap")
+    _export(source, out, chosen, work, layout="colmap")
 
 
 @grouped
 @resumable()
-def export_transforms(source: DataOptions, out: OutArgument, *, chosen: FolderOptions) -> None:
+def export_transforms(
+    source: DataOptions, out: OutArgument, *, chosen: FolderOptions, work: WorkOptions
+) -> None:
     """Write transforms.json for nerfstudio, with depth and points.
 
     Cameras have OpenGL's axes, the world's z points up, depth is in millimetres in .npy files. A
     stopped run goes on if it is run again.
     """
-    _export(source, out, chosen, layout="transforms")
+    _export(source, out, chosen, work, layout="transforms")
 
 
 @grouped
 @resumable()
-def export_ply(source: DataOptions, out: OutArgument, *, chosen: FolderOptions) -> None:
+def export_ply(
+    source: DataOptions, out: OutArgument, *, chosen: FolderOptions, work: WorkOptions
+) -> None:
     """Write coloured point clouds from depth as PLY.
 
     Points are in metres, x right, y down, z forward. Each folder has points.ply, and
     stereogenbench.json with the cameras. A stopped run goes on if it is run again.
     """
-    _export(source, out, chosen, layout="ply")
+    _export(source, out, chosen, work, layout="ply")
 
 
 @grouped
 @resumable()
-def export_moge(source: DataOptions, out: OutArgument, *, chosen: ViewOptions) -> None:
+def export_moge(
+    source: DataOptions, out: OutArgument, *, chosen: ViewOptions, work: WorkOptions
+) -> None:
     """Write the training folders of MoGe.
 
     Each holds image.jpg, depth.png and meta.json; .index.txt lists them. In MoGe's configuration of
     this dataset set "depth_unit": 1.0, as depth is metric, and "finite_depth_mask": "only_known". A
     stopped run goes on if it is run again.
     """
-    _export(source, out, chosen, layout="moge")
+    _export(source, out, chosen, work, layout="moge")
 
 
 EXPORTS: Final[tuple[tuple[str, Callable[..., None], str], ...]] = (
@@ -160,7 +166,9 @@ EXPORTS: Final[tuple[tuple[str, Callable[..., None], str], ...]] = (
 """Name, function and example of each command of the group ``export``."""
 
 
-def _export(source: DataOptions, out: Path, chosen: ViewOptions, *, layout: Any) -> None:
+def _export(
+    source: DataOptions, out: Path, chosen: ViewOptions, work: WorkOptions, *, layout: Any
+) -> None:
     from stereogenbench_data.bridges.export_views import export_views
     from stereogenbench_data.bridges.exports import training_selection
 
@@ -173,6 +181,7 @@ def _export(source: DataOptions, out: Path, chosen: ViewOptions, *, layout: Any)
             progress=progress,
             depth=depth_of(index, unit_m=chosen.depth_unit_m, accept=chosen.accept),
             **chosen.selection(),
+            **work.options(),
         )
     _, for_evaluation = training_selection(index, chosen.filters())
     if for_evaluation:

@@ -16,7 +16,6 @@ class Column:
         digits: Decimals in tables.
         meaning: What it is, with its unit.
         backend: Which of a protocol's backends it was measured with, "" for none.
-        fit: Of SD, the fit that it is of; "" for what does not depend on one.
     """
 
     label: str
@@ -24,14 +23,9 @@ class Column:
     digits: int
     meaning: str
     backend: Literal["", "keypoint_matcher", "stereo_matcher"] = ""
-    fit: str = ""
 
 
-_SD_FITS: Final = {
-    "filtered": "filtered",
-    "least_squares": "least squares",
-    "theil_sen": "Theil-Sen",
-}
+_SD_FITS: Final = {"filtered": "filtered", "least_squares": "least squares"}
 """The fits of SD and what tables call them; the first is the one beside the paper's numbers."""
 
 
@@ -59,7 +53,6 @@ COLUMNS: Final[dict[str, Column]] = {
             4,
             "|slope - 1| of disparity, true on found",
             "stereo_matcher",
-            fit,
         )
         for fit, words in _SD_FITS.items()
     },
@@ -78,9 +71,7 @@ COLUMNS: Final[dict[str, Column]] = {
         "answered", "neither", 3, "share of visible pixels with a found disparity", "stereo_matcher"
     ),
     **{
-        f"sd_{fit}_{name}": Column(
-            f"{label} {words}", "neither", digits, meaning, "stereo_matcher", fit
-        )
+        f"sd_{fit}_{name}": Column(f"{label} {words}", "neither", digits, meaning, "stereo_matcher")
         for fit, words in _SD_FITS.items()
         for name, (label, digits, meaning) in _EXPLAIN_A_FIT.items()
     },

@@ -229,9 +229,8 @@ def relations(results: Sequence[Scores]) -> list[Relation]:
             judged.append(Relation(what, holds, _means_text("e_match", [one])))
         judged.append(_ordered("e_match", [target, copied, wrong], below=[random]))
     if "sd" in metrics:
-        sd = f"sd_{target.protocol.fit}"
-        judged.append(_ordered(sd, [target], below=[copied]))
-        judged.append(_ordered(sd, [target], below=[wrong]))
+        judged.append(_ordered("sd_filtered", [target], below=[copied]))
+        judged.append(_ordered("sd_filtered", [target], below=[wrong]))
         judged.append(_slope(wrong))
     return judged
 
@@ -249,13 +248,11 @@ def _ordered(column: str, lower: Sequence[Scores], *, below: Sequence[Scores]) -
 
 def _slope(wrong: Scores) -> Relation:
     """Judge whether the wrong camera's disparity is too large by the ratio of the baselines."""
-    sd = f"sd_{wrong.protocol.fit}"
-    what = (
-        f"the slope {_label(f'{sd}_slope')} of {WRONG_BASELINE} is the ratio of the two baselines"
-    )
+    label = _label("sd_filtered_slope")
+    what = f"the slope {label} of {WRONG_BASELINE} is the ratio of the two baselines"
     off = []
     for pair in wrong.pairs:
-        slope, r2 = pair.tallies[f"{sd}_slope"], pair.tallies[f"{sd}_r2"]
+        slope, r2 = pair.tallies["sd_filtered_slope"], pair.tallies["sd_filtered_r2"]
         if slope.finite and r2.mean >= _TRUSTED_R2:
             rig = wrong.index.scene(pair.row).rig
             other_cm = rig.baseline_cm(pair.pair[0], wrong_camera(*pair.pair))

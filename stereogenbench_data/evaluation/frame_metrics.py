@@ -220,7 +220,7 @@ def _sd(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, fl
     """Return SD by each fit of the protocol, all of one disparity map."""
     estimated_px = models.stereo_matcher(target.left, picture)
     found: dict[str, float] = {}
-    for method in models.protocol.fits:
+    for method in scale.FITS:
         fit = scale.fit_scale(
             estimated_px,
             target.sample["disparity"][0],
@@ -270,7 +270,7 @@ FRAME_METRIC_ROWS: Final[dict[str, FrameMetric]] = {
     "p_psnr": FrameMetric(_p_psnr, lambda models: pixels.PATCH_SETTINGS, ("disparity", "valid")),
     "sd": FrameMetric(
         _sd,
-        lambda models: scale.scale_settings(models.stereo_matcher, method=models.protocol.fit),
+        lambda models: scale.scale_settings(models.stereo_matcher),
         ("disparity", "visible"),
     ),
 }

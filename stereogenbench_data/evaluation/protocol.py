@@ -17,7 +17,6 @@ from stereogenbench_data.evaluation.columns import (
     OFFLINE_METRICS,
     require_metrics,
 )
-from stereogenbench_data.evaluation.metrics.scale import FitMethod, fits_of, require_fit
 from stereogenbench_data.evaluation.models.registry import ModelOptions
 from stereogenbench_data.samples.size import require_size
 from stereogenbench_data.schema.records import DepthEncoding
@@ -88,8 +87,6 @@ class EvaluationProtocol:
         keypoint_matcher: What finds the matches of E_match: "sift", or a model of your own
             (`models.registry`).
         stereo_matcher: What finds the disparity of SD: "sgbm", or a model of your own.
-        fit: The fit of SD by which relations between controls are judged. Every report shows SD
-            "filtered" and by "least_squares", whatever this is, and "theil_sen" if it is that.
         depth: A depth contract instead of the one that files and release state.
         models: Where learned models run and where their weights are.
         batch_frames: How many frames are held, and given to learned parts, at a time.
@@ -99,7 +96,6 @@ class EvaluationProtocol:
     size: tuple[int, int] = PAPER_SIZE
     keypoint_matcher: str = "sift"
     stereo_matcher: str = "sgbm"
-    fit: FitMethod = "filtered"
     depth: DepthEncoding | None = None
     models: ModelOptions = field(default_factory=ModelOptions)
     batch_frames: int = 8
@@ -108,21 +104,14 @@ class EvaluationProtocol:
         """Put the metrics in order and check the values."""
         object.__setattr__(self, "metrics", require_metrics(self.metrics))
         object.__setattr__(self, "size", require_size(self.size))
-        require_fit(self.fit)
         if self.batch_frames < 1:
             raise EvaluationError(f"batch_frames must be at least 1, got {self.batch_frames}.")
-
-    @property
-    def fits(self) -> tuple[FitMethod, ...]:
-        """The fits that SD is computed by."""
-        return fits_of(self.fit)
 
     @property
     def columns(self) -> tuple[str, ...]:
         """The columns of every frame, in the order of `COLUMNS`."""
         filled = {name for metric in self.metrics for name in FRAME_METRICS.get(metric, ())}
-        fits = ("", *self.fits)
-        return tuple(name for name in COLUMNS if name in filled and COLUMNS[name].fit in fits)
+        return tuple(name for name in COLUMNS if name in filled)
 
     def label(self, column: str) -> str:
         """Return what tables call a column: with the backend, where it is not the paper's."""

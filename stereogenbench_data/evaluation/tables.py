@@ -318,7 +318,7 @@ def _notes(
     """Return the notes of a table: its sources, and what is not comparable."""
     protocol, of_frames = results[0].protocol, [each for each in columns if each in COLUMNS]
     notes = []
-    if any(COLUMNS[column].fit for column in of_frames):
+    if any(column.startswith("sd_filtered") for column in of_frames):
         notes.append(f"SD: {SD_OF_THE_PAPER}.")
     if any(row.source == "paper" for row in rows):
         if differs:

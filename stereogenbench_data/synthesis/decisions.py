@@ -19,7 +19,8 @@ import numpy as np
 
 from stereogenbench_data.errors import SynthesisError, cure_of
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
-from stereogenbench_data.sources.files import open_output
+from stereogenbench_data.jobs import json_bytes, read_json
+from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.synthesis.filters import Limits, ProposedRig, Refusal
 from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.planning import PlanSearch
@@ -194,8 +195,8 @@ class Decisions:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             if not (self.folder / _REQUEST).exists():
-                _write(self.folder / _REQUEST, self.asked)
-            _write(self._path(decision.index), asdict(decision))
+                write_atomic(self.folder / _REQUEST, json_bytes(self.asked))
+            write_atomic(self._path(decision.index), json_bytes(asdict(decision)))
         except OSError as error:
             raise SynthesisError(
                 f"{self.folder}: cannot write there ({error}). "
@@ -248,14 +249,9 @@ def all_decisions(out: Path) -> Iterator[tuple[dict[str, Any], list[Decision]]]:
             ) from error
 
 
-def _write(path: Path, document: dict[str, Any]) -> None:
-    with open_output(path) as file:
-        file.write(json.dumps(document).encode())
-
-
 def _read(path: Path) -> Decision | None:
     with suppress(OSError, ValueError, KeyError, TypeError):
-        return _parsed(json.loads(path.read_text()))
+        return _parsed(read_json(path))
     return None
 
 

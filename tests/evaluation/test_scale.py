@@ -18,7 +18,7 @@ from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.evaluation.scene_scores import PairScorer
 from tests.evaluation.conftest import photograph
 
-METHODS = ("filtered", "least_squares", "theil_sen")
+METHODS = ("filtered", "least_squares")
 SIZE = (20, 30)
 EVERYWHERE = np.ones(SIZE, dtype=bool)
 
@@ -72,11 +72,9 @@ def test_few_gross_outliers_ruin_least_squares_and_are_left_out_by_the_filter(tr
 
     plain = fit_scale(estimated, truth, scored=EVERYWHERE, method="least_squares")
     filtered = fit_scale(estimated, truth, scored=EVERYWHERE)
-    median = fit_scale(estimated, truth, scored=EVERYWHERE, method="theil_sen")
 
     assert plain.drift > 0.7
     assert filtered.drift == pytest.approx(0.5, abs=1e-3)
-    assert median.drift == pytest.approx(0.5, abs=0.01)
     assert (filtered.pixels, filtered.outliers) == (588, 12)
     assert filtered.outlier_ratio == 12 / 600
     assert filtered.valid_ratio == pytest.approx(588 / 600)
@@ -196,8 +194,6 @@ def test_a_few_answers_of_a_large_picture_are_no_scale():
 
 
 def test_wrong_questions_are_refused(truth):
-    with pytest.raises(EvaluationError, match="least_squares, theil_sen, filtered, got 'ransac'"):
-        fit_scale(truth, truth, scored=EVERYWHERE, method="ransac")
     with pytest.raises(EvaluationError, match=r"\(20, 30\), \(20, 29\) and \(20, 30\)"):
         fit_scale(truth, truth[:, 1:], scored=EVERYWHERE)
 
@@ -209,7 +205,7 @@ def test_a_frames_record_has_sd_by_every_fit_of_one_estimate(
     estimated = 2 * truth
     estimated.reshape(-1)[:outliers] += 900
     calls = []
-    models = MetricModels(EvaluationProtocol(metrics=("sd",), fit="theil_sen"))
+    models = MetricModels(EvaluationProtocol(metrics=("sd",)))
     models.stereo_matcher = lambda left, right: calls.append(1) or estimated
     picture = np.zeros((3, *SIZE), dtype=np.uint8)
     sample = {
@@ -223,7 +219,6 @@ def test_a_frames_record_has_sd_by_every_fit_of_one_estimate(
 
     assert tuple(columns) == models.protocol.columns
     assert columns["sd_filtered"] == [pytest.approx(filtered, abs=1e-3)]
-    assert columns["sd_theil_sen"] == [pytest.approx(0.5, abs=0.02)]
     assert columns["sd_least_squares"] == [pytest.approx(least_squares, abs=0.02)]
     assert columns["sd_filtered_outliers"] == [outliers / 600]
     assert columns["sd_least_squares_outliers"] == [0]
@@ -284,24 +279,14 @@ def test_sgbm_also_gives_a_small_negative_shift(sgbm):
 
 
 def test_sgbm_is_a_stereo_matcher_and_the_settings_name_the_choices(sgbm):
-    settings = scale_settings(sgbm, method="theil_sen")
+    settings = scale_settings(sgbm)
 
     assert isinstance(sgbm, StereoMatcher)
     assert settings["matcher"].startswith("SGBM (OpenCV ")
-    assert (settings["fit"], settings["disparities"]) == ("theil_sen", 128)
-    assert "median slope" in settings["sd_theil_sen"]
+    assert settings["disparities"] == 128
     assert settings["sd_least_squares"] == "least squares of all answered pixels"
     assert "3 robust standard deviations and 1 px" in settings["sd_filtered"]
     assert "does not state its rule for outliers" in settings["paper"]
-
-
-def test_two_fits_are_reported_whichever_judges_relations(sgbm):
-    by_filter, by_least_squares = (
-        {name for name in scale_settings(sgbm, method=method) if name.startswith("sd_")}
-        for method in ("filtered", "least_squares")
-    )
-
-    assert by_filter == by_least_squares == {"sd_filtered", "sd_least_squares"}
 
 
 def test_pictures_narrower_than_the_search_are_refused():

@@ -132,7 +132,7 @@ def test_methods_of_one_tier_share_a_table_and_those_of_two_do_not(scores):
     assert [row.method for row in both.rows if row.source == "scored"] == ["one", "two"] * 2
     with pytest.raises(EvaluationError, match=r"their tier differs \(G0 and G2\)"):
         tables_of([scores("one"), scores("two", tier="G2")])
-    for change in ({"size": (240, 416)}, {"fit": "least_squares"}):
+    for change in ({"size": (240, 416)}, {"metrics": ("psnr",)}):
         other = EvaluationProtocol(**change)
         with pytest.raises(EvaluationError, match="their protocol differs"):
             tables_of([scores("one"), scores("two", protocol=other)])
@@ -175,9 +175,8 @@ def test_the_median_of_sd_stands_beside_its_mean(scores):
     assert "1.0000 ± 0.0000 [1.0000]" in text
 
 
-@pytest.mark.parametrize("fit", ["filtered", "least_squares"])
-def test_the_papers_sd_stands_in_the_filtered_column_alone(scores, fit):
-    protocol = EvaluationProtocol(stereo_matcher="mine.py:FoundationStereo", fit=fit)
+def test_the_papers_sd_stands_in_the_filtered_column_alone(scores):
+    protocol = EvaluationProtocol(stereo_matcher="mine.py:FoundationStereo")
     table = table_of([scores(tier="G1", protocol=protocol)], "branches")
     paper = next(row for row in table.rows if row.source == "paper")
     lines = markdown(table).splitlines()
@@ -190,18 +189,6 @@ def test_the_papers_sd_stands_in_the_filtered_column_alone(scores, fit):
     assert paper.values["sd_filtered"] == "0.3951"
     assert cells["SD filtered↓ [median]"] == "0.3951"
     assert cells["SD least squares↓ [median]"] == "-"
-
-
-def test_theil_sens_sd_is_a_third_column_where_it_is_requested(scores):
-    asked = table_of([scores(protocol=EvaluationProtocol(fit="theil_sen"))], "branches")
-    plain = table_of([scores()], "branches")
-
-    assert [name for name in asked.columns if name.startswith("sd")] == [
-        "sd_filtered", "sd_least_squares", "sd_theil_sen",
-    ]  # fmt: skip
-    assert [name for name in plain.columns if name.startswith("sd")] == [
-        "sd_filtered", "sd_least_squares",
-    ]  # fmt: skip
 
 
 def test_every_form_of_a_report_has_sd_by_both_fits_and_says_why(scores, tmp_path):
@@ -231,11 +218,6 @@ def test_a_table_without_sd_has_no_note_on_its_fits(scores):
     protocol = EvaluationProtocol(metrics=("psnr", "ssim"))
 
     assert "rule for outliers" not in markdown(table_of([scores(protocol=protocol)], "branches"))
-
-
-def test_an_unknown_fit_is_refused_when_the_protocol_is_made():
-    with pytest.raises(EvaluationError, match=r"fit method must be one of .* got 'ransac'"):
-        EvaluationProtocol(fit="ransac")
 
 
 def test_a_gap_is_a_column_of_the_table(scores):

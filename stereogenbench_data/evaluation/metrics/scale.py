@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Float64
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.models.interfaces import Settings, StereoMatcher
 
-FitMethod = Literal["filtered", "least_squares", "theil_sen"]
+FitMethod = Literal["filtered", "least_squares"]
 
 _OUTLIER_SIGMAS: Final = 3.0
 _OUTLIER_PX: Final = 1.0
@@ -19,12 +19,6 @@ _FEWEST_PIXELS: Final = 100
 _FEWEST_SHARE: Final = 0.01
 _MEDIAN_PIXELS: Final = 20_000
 """About how many pixels, evenly spaced in reading order, the medians of a fit are taken of."""
-
-REPORTED_FITS: Final[tuple[FitMethod, ...]] = ("filtered", "least_squares")
-"""The fits that every report shows, because SD depends on the choice and the paper leaves it open.
-
-The first stands beside the paper's numbers.
-"""
 
 SD_OF_THE_PAPER: Final = (
     "the paper fits after 'outlier and occlusion filtering' and does not state its rule for "
@@ -35,13 +29,16 @@ SD_OF_THE_PAPER: Final = (
 )
 """What to know when SD is compared with the paper's."""
 
-_METHODS: Final[dict[FitMethod, str]] = {
+FITS: Final[dict[FitMethod, str]] = {
+    "filtered": "least squares without outliers: those farther from a median line (Theil's "
+    f"incomplete method, of about {_MEDIAN_PIXELS} pixels) than {_OUTLIER_SIGMAS:g} robust "
+    f"standard deviations and {_OUTLIER_PX:g} px",
     "least_squares": "least squares of all answered pixels",
-    "theil_sen": "median slope of half-range pairs (Theil's incomplete method) of every n-th "
-    f"answered pixel, n so that about {_MEDIAN_PIXELS} remain",
-    "filtered": "least squares without outliers: those farther from the theil_sen line than "
-    f"{_OUTLIER_SIGMAS:g} robust standard deviations and {_OUTLIER_PX:g} px",
 }
+"""The fits of SD: reports show both, because SD depends on the choice and the paper leaves it open.
+
+The first stands beside the paper's numbers, and relations between controls are judged by it.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +94,11 @@ def fit_scale(
         estimated_px: A matcher's disparity of (left, predicted right); nan where it has none.
         true_px: The true disparity at the same resolution.
         scored: Where the truth is known and the point is seen by both cameras.
-        method: How to fit; `scale_settings` says what each does.
+        method: How to fit; `FITS` says what each does.
 
     Raises:
-        EvaluationError: If the maps differ in size, or there is no such method.
+        EvaluationError: If the maps differ in size.
     """
-    require_fit(method)
     if not estimated_px.shape == true_px.shape == scored.shape:
         raise EvaluationError(
             "estimated disparity, true disparity and where to score must have the same size, "
@@ -114,23 +110,20 @@ def fit_scale(
     )
     wanted = int(np.count_nonzero(scored))
     kept = np.ones(true.size, dtype=bool)
-    line = None
     reason = _no_line(estimated, wanted=wanted)
-    if not reason and method != "least_squares":
+    if not reason and method == "filtered":
         some = slice(None, None, max(1, len(answered) // _MEDIAN_PIXELS))
         if estimated[some].min() == estimated[some].max():
             some = slice(None)
-        line = _median_line(estimated[some], true[some])
-        if method == "filtered":
-            apart = np.abs(true - line[0] * estimated - line[1])
-            sigma = _MAD_TO_SIGMA * float(np.median(apart[some]))
-            kept = apart <= max(_OUTLIER_SIGMAS * sigma, _OUTLIER_PX)
-            reason = _no_line(estimated[kept], wanted=wanted)
-            line = None
+        slope, offset = _median_line(estimated[some], true[some])
+        apart = np.abs(true - slope * estimated - offset)
+        sigma = _MAD_TO_SIGMA * float(np.median(apart[some]))
+        kept = apart <= max(_OUTLIER_SIGMAS * sigma, _OUTLIER_PX)
+        reason = _no_line(estimated[kept], wanted=wanted)
     answered_ratio = estimated.size / wanted if wanted else math.nan
     if reason:
         return ScaleFit(answered_ratio=answered_ratio, reason=reason)
-    slope, offset = line or _least_squares(estimated[kept], true[kept])
+    slope, offset = _least_squares(estimated[kept], true[kept])
     residual = (true - slope * estimated - offset)[kept]
     pixels = int(np.count_nonzero(kept))
     variance = float(np.var(true[kept]))
@@ -148,32 +141,11 @@ def fit_scale(
     )
 
 
-def require_fit(method: str) -> None:
-    """Refuse a fit method that does not exist.
-
-    Raises:
-        EvaluationError: Naming those that do.
-    """
-    if method not in _METHODS:
-        raise EvaluationError(f"fit method must be one of {', '.join(_METHODS)}, got {method!r}.")
-
-
-def fits_of(method: FitMethod) -> tuple[FitMethod, ...]:
-    """Return the fits that are reported where relations are judged by the given one."""
-    return tuple(dict.fromkeys((*REPORTED_FITS, method)))
-
-
-def scale_settings(matcher: StereoMatcher, *, method: FitMethod = "filtered") -> Settings:
-    """Return every choice that SD depends on, and what each of its columns is.
-
-    Args:
-        matcher: What finds the disparity.
-        method: The fit that relations between the controls are judged by, "fit" of the settings.
-    """
+def scale_settings(matcher: StereoMatcher) -> Settings:
+    """Return every choice that SD depends on, and what each of its columns is."""
     return {
         "matcher": matcher.name,
-        "fit": method,
-        **{f"sd_{each}": _METHODS[each] for each in fits_of(method)},
+        **{f"sd_{method}": what for method, what in FITS.items()},
         "paper": SD_OF_THE_PAPER,
         "occlusion": "pixels that the right camera does not see are not scored, by true depth",
         "direction": "true over estimated disparity",
