@@ -176,6 +176,9 @@ class ReportOptions:
         from stereogenbench_data.evaluation.report import document, page, write_report
         from stereogenbench_data.jobs import read_json
 
+        there = None
+        if self.compare is not None:  # The files that are written next may replace it.
+            there = read_json(self.compare, cure="Give the results.json of an evaluation.")
         content = document(results, tables, found=found)
         if self.as_json:
             typer.echo(json.dumps(content, allow_nan=False))
@@ -186,9 +189,8 @@ class ReportOptions:
         )
         names = ", ".join(str(path.relative_to(folder)) for path in files)
         typer.echo(f"{folder}: {names}", err=True)
-        if self.compare is None:
+        if there is None:
             return
-        there = read_json(self.compare, cure="Give the results.json of an evaluation.")
         differing = differences(json.loads(json.dumps(content)), there)
         for text in differing[:_DIFFERENCES_SHOWN]:
             typer.echo(f"differs: {text}", err=True)
