@@ -12,6 +12,7 @@ from stereogenbench_data.evaluation.aggregate import cell
 from stereogenbench_data.evaluation.controls import CONTROLS, derangement, relations, wrong_camera
 from stereogenbench_data.evaluation.models.opencv import Sgbm
 from stereogenbench_data.evaluation.predictions import open_frames
+from stereogenbench_data.evaluation.protocol import PROTOCOL_VERSION
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from tests.evaluation.conftest import SIZE, numbers, scored
 
@@ -69,6 +70,17 @@ def test_the_targets_scores_are_those_of_identity(on_the_sample):
     assert cell(target.pairs, "ssim").mean == pytest.approx(1, abs=1e-12)
     assert cell(target.pairs, "e_match").mean == 0
     assert cell(target.pairs, "sd_filtered").median < 0.2
+
+
+def test_version_1_of_the_protocol_gives_these_scores(on_the_sample):
+    """If a number changes on purpose, PROTOCOL_VERSION must be raised with it."""
+    wrong = on_the_sample[2]
+    expected = {"psnr": 19.835750, "ssim": 0.643907, "p_psnr": 32.174968}
+
+    assert PROTOCOL_VERSION == 1
+    assert {name: cell(wrong.pairs, name).mean for name in expected} == pytest.approx(
+        expected, abs=1e-6
+    )
 
 
 def test_both_fits_of_a_frame_are_of_the_one_disparity_that_the_matcher_found(on_the_sample):

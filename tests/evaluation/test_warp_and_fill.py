@@ -42,7 +42,7 @@ def test_scores_fall_from_bin_to_bin_of_baseline(warp_and_fill):
     table = next(table for table in tables_of([scores]) if table.name == "bins_all")
     for subset, bins in (("seen_map", 5), ("unseen_map", 5)):
         for column in ("psnr", "ssim"):
-            means = [row.cells[column].mean for row in table.rows if row.labels[0] == subset]
+            means = [row.values[column].mean for row in table.rows if row.labels[0] == subset]
 
             assert len(means) == bins
             assert means == sorted(means, reverse=True), (subset, column)
@@ -54,7 +54,7 @@ def test_scores_fall_with_the_baseline_on_a_scene_rendered_elsewhere(warp_and_fi
         protocol=EvaluationProtocol(metrics=("psnr", "ssim"), size=(320, 320)),
     )  # fmt: skip
     table = next(table for table in tables_of([scores]) if table.name == "bins_all")
-    means = [row.cells["psnr"].mean for row in table.rows]
+    means = [row.values["psnr"].mean for row in table.rows]
 
     assert len(means) == 6
     assert means == sorted(means, reverse=True)
