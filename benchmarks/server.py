@@ -22,11 +22,11 @@ import sys
 import urllib.request
 from asyncio import sleep
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import monotonic
-from typing import Final
-from urllib.parse import unquote, urlsplit
+from typing import Final, Literal
+from urllib.parse import parse_qs, quote, unquote, urlsplit
 
 _COUNTS: Final = "/-/counts"
 """The path at which the delayed server tells what it counted."""
@@ -35,6 +35,13 @@ _PIECE_S: Final = 0.01
 """Where the bandwidth is limited, bytes are sent in pieces of so many seconds."""
 
 _LARGEST_HEAD: Final = 64 * 1024
+
+REPOSITORY: Final = "some-group/some-data"
+"""The data set of a server that answers as the Hub."""
+
+COMMIT: Final = "0123456789abcdef0123456789abcdef01234567"
+_PAGE: Final = 1000
+"""Entries of a folder that the Hub lists in one answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +90,12 @@ class WebServer:
 
 
 @contextlib.contextmanager
-def serving(folder: Path, *, network: Network, to: str = "") -> Iterator[WebServer]:
+def serving(
+    folder: Path, *, network: Network, to: str = "", kind: Literal["plain", "hub"] = "plain"
+) -> Iterator[WebServer]:
     """Serve a folder on a free port of this machine through a network, or stand before a server."""
     command = [sys.executable, "-m", "benchmarks.server", str(folder), f"--to={to}"]
+    command += ["--hub"] if kind == "hub" else []
     command += network.words()
     place = Path(__file__).parents[1]
     with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=place) as running:
@@ -134,6 +144,7 @@ class _Server:
     """Answers requests for files of a folder, as if they came through a network."""
 
     def __init__(self, folder: Path, network: Network) -> None:
+        self.url = ""
         self._folder = folder.resolve()
         self._network = network
         self._total = _Line(network.total_mb_s)
@@ -213,10 +224,74 @@ class _Server:
                 start += count
 
 
+class _Hub(_Server):
+    """Answers as the Hub does for one data set, whose commit is always the same.
+
+    Folders are listed a thousand entries at a time. Small texts are sent whole, other files after a
+    redirect.
+    """
+
+    def __init__(self, folder: Path, network: Network) -> None:
+        super().__init__(folder, network)
+        self._entries: dict[str, list[tuple[str, int]]] = {"": []}
+        for place, folders, files in os.walk(self._folder):
+            below = Path(place).relative_to(self._folder).as_posix().removeprefix(".")
+            own = [(name, -1) for name in folders]
+            own += [(name, Path(place, name).stat().st_size) for name in files]
+            self._entries[below] = [(f"{below}/{name}".lstrip("/"), size) for name, size in own]
+
+    async def _send(self, asked: _Asked, writer: asyncio.StreamWriter, line: _Line) -> bool:
+        """Send a response; return whether the connection is to be kept."""
+        parts = urlsplit(asked.path)
+        path, commit = unquote(parts.path), f"X-Repo-Commit: {COMMIT}\r\n"
+        if path.startswith(f"/api/datasets/{REPOSITORY}/tree/"):
+            folder = path.split("/", 7)[7:]
+            text, more = self._page(folder[0] if folder else "", parse_qs(parts.query), parts.path)
+            writer.write(_head(200, "OK", len(text), more) + text)
+            return True
+        name = path.removeprefix(f"/datasets/{REPOSITORY}/resolve/").partition("/")[2]
+        if path.startswith("/files/"):
+            asked = replace(asked, path=parts.path.removeprefix("/files"))
+        elif not (self._folder / name).is_file():
+            missing = f"X-Error-Code: EntryNotFound\r\n{commit}"
+            writer.write(_head(404, "Not Found", 0, missing))
+            return True
+        elif name.endswith((".json", ".txt")):
+            text = (self._folder / name).read_bytes()
+            writer.write(_head(200, "OK", len(text), commit) + text)
+            return True
+        else:
+            place = f"Location: /files/{quote(name)}?signature=1\r\n{commit}"
+            writer.write(_head(302, "Found", 0, place))
+            return True
+        return await super()._send(asked, writer, line)
+
+    def _page(self, folder: str, query: dict[str, list[str]], path: str) -> tuple[bytes, str]:
+        """Return a page of a folder's listing, and the header that says where the next one is."""
+        names = list(self._entries.get(folder, ()))
+        is_recursive = query.get("recursive", [""])[0].lower() == "true"
+        for name, size in names if is_recursive else ():
+            names += self._entries.get(name, ()) if size < 0 else ()
+        start = int(query.get("cursor", ["0"])[0])
+        page = sorted(names)[start : start + _PAGE]
+        entries = [
+            {"type": "directory", "oid": COMMIT, "size": 0, "path": name}
+            if size < 0
+            else {"type": "file", "oid": f"{hash(name) % 16**15:015x}", "size": size, "path": name}
+            for name, size in page
+        ]
+        more = "Content-Type: application/json\r\n"
+        if start + _PAGE < len(names):
+            following = f"{self.url}{path}?recursive={is_recursive}&cursor={start + _PAGE}"
+            more += f'Link: <{following}>; rel="next"\r\n'
+        return json.dumps(entries).encode(), more
+
+
 class _Proxy:
     """Passes connections on to another server, as if through a network."""
 
     def __init__(self, url: str, network: Network) -> None:
+        self.url = ""
         parts = urlsplit(url)
         self._host, self._port = str(parts.hostname), parts.port or 80
         self._network = network
@@ -291,12 +366,17 @@ def _head(status: int, reason: str, length: int, more: str) -> bytes:
 
 
 async def _serve(options: argparse.Namespace, network: Network) -> None:
-    server = _Proxy(options.to, network) if options.to else _Server(options.folder, network)
+    server: _Proxy | _Server
+    if options.to:
+        server = _Proxy(options.to, network)
+    else:
+        server = (_Hub if options.hub else _Server)(options.folder, network)
     listening = await asyncio.start_server(
         server.answer, "127.0.0.1", options.port, limit=_LARGEST_HEAD, backlog=512
     )
     host, port = listening.sockets[0].getsockname()[:2]
-    print(f"http://{host}:{port}", flush=True)  # noqa: T201 - whoever started it reads this
+    server.url = f"http://{host}:{port}"
+    print(server.url, flush=True)  # noqa: T201 - whoever started it reads this
     stopped = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
@@ -312,6 +392,7 @@ def main() -> None:
     )  # fmt: skip
     parser.add_argument("folder", type=Path, help="what to serve")
     parser.add_argument("--to", default="", help="the URL of a server to stand before")
+    parser.add_argument("--hub", action="store_true", help=f"answer as the Hub, for {REPOSITORY}")
     parser.add_argument("--port", type=int, default=0, help="0 is a free one [0]")
     parser.add_argument("--delay-s", type=float, default=0.0, help=argparse.SUPPRESS)
     parser.add_argument("--delay-ms", type=float, default=0.0, help="before each first byte")

@@ -3,7 +3,7 @@
 import copy
 import warnings
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, Literal, Self
@@ -49,7 +49,8 @@ KEPT_SCENES: Final = 256
 """Of how many scenes what the index says is kept."""
 
 SCENES_AHEAD: Final = 8
-"""How many scenes behind a URL whose rows are presumed are described ahead of the order's steps."""
+"""How many presumed scenes behind a URL are planned ahead of the one that is read, and how many are
+described ahead of these."""
 
 STEPS_AHEAD: Final = 2048
 """How many steps are looked ahead for such scenes."""
@@ -70,6 +71,47 @@ class _KnownScene:
     intrinsics: Intrinsics
     encodings: dict[int, DepthEncoding]
     videos: frozenset[str]
+
+
+class _DescribedAhead:
+    """The steps of an order over presumed scenes behind a URL, which are described ahead of them.
+
+    It ends for now where too many scenes are given that were not begun: describing costs requests.
+    """
+
+    def __init__(self, steps: Iterable[Step], describe: Callable[[Address], None]) -> None:
+        self._steps, self._describe = iter(steps), describe
+        self._waiting: deque[Step] = deque()
+        self._soon: set[int] = set()
+        self._given: set[int] = set()
+        self._ahead: set[int] = set()
+
+    def begin(self, row: int) -> None:
+        """Take a scene as begun."""
+        self._given.add(row)
+        self._ahead.discard(row)
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Step:
+        while len(self._soon) < SCENES_AHEAD and len(self._waiting) < STEPS_AHEAD:
+            step = next(self._steps, None)
+            if step is None:
+                break
+            self._waiting.append(step)
+            row = step.address.row
+            if row not in self._given and row not in self._soon:
+                self._soon.add(row)
+                self._describe(step.address)
+        row = self._waiting[0].address.row if self._waiting else -1
+        if row < 0 or (row not in self._given and len(self._ahead) >= SCENES_AHEAD):
+            raise StopIteration
+        if row not in self._given:
+            self._given.add(row)
+            self._ahead.add(row)
+        self._soon.discard(row)
+        return self._waiting.popleft()
 
 
 class SampleDecoder:
@@ -122,6 +164,7 @@ class SampleDecoder:
         self._most_depths, self._kept_frames = OPEN_STREAMS, 1
         self._streams = Streams(self._source)
         self._coming = self._new_coming()
+        self._described: _DescribedAhead | None = None
         if self._coming is not None:
             self._coming.keep(OPEN_STREAMS, frames=1)
         self._scenes: OrderedDict[int, _KnownScene] = OrderedDict()
@@ -145,7 +188,7 @@ class SampleDecoder:
             twin._ahead = FetchAhead(limit_bytes=self._ahead.limit_bytes)
             twin._source = self._source.fetching_by(twin._ahead)
         twin._streams = Streams(twin._source)
-        twin._coming = twin._new_coming()
+        twin._coming, twin._described = twin._new_coming(), None
         if twin._coming is not None:
             twin._coming.keep(OPEN_STREAMS, frames=1)
         twin._scenes, twin._depths, twin._poses = OrderedDict(), OrderedDict(), OrderedDict()
@@ -177,11 +220,15 @@ class SampleDecoder:
         """Take the samples that will be decoded next, so that their bytes are fetched ahead."""
         if self._coming is not None:
             presumption = self._index.presumption
-            self._coming.expect(steps if presumption is None else self._described_soon(steps))
+            if presumption is not None:
+                self._described = steps = _DescribedAhead(steps, self._describe_soon)
+            self._coming.expect(steps)
 
     def begin(self, address: Address) -> None:
         """Fetch what a sample needs, which is decoded next, and what those after it need."""
         if self._coming is not None:
+            if self._described is not None:
+                self._described.begin(address.row)
             self._coming.begin(address, self._needed_files)
 
     def end(self, address: Address) -> None:
@@ -211,26 +258,11 @@ class SampleDecoder:
         """Return the scene of a sample; those of the last rows asked for are kept."""
         return self._known_scene(address).scene
 
-    def _described_soon(self, steps: Iterable[Step]) -> Iterator[Step]:
-        """Yield steps; scenes behind a URL whose rows are presumed are described ahead of them."""
-        presumption = self._index.presumption
-        begun: set[int] = set()
-        waiting: deque[tuple[Step, bool]] = deque()
-        scenes = 0
-        for step in steps:
-            row = step.address.row
-            is_first = row not in begun
-            if is_first and presumption is not None:
-                begun.add(row)
-                videos = self._videos(step.address)
-                presumption.expect(self._index.indexed_scene(row), videos)
-            scenes += is_first
-            waiting.append((step, is_first))
-            while waiting and (scenes > SCENES_AHEAD or len(waiting) > STEPS_AHEAD):
-                next_step, is_first = waiting.popleft()
-                scenes -= is_first
-                yield next_step
-        yield from (step for step, _ in waiting)
+    def _describe_soon(self, address: Address) -> None:
+        """Describe a sample's scene in the background, where its row is presumed."""
+        if self._index.presumption is not None:
+            presumed = self._index.indexed_scene(address.row)
+            self._index.presumption.expect(presumed, self._videos(address))
 
     def _videos(self, address: Address) -> tuple[str, ...]:
         """Return the names of the videos that a sample needs."""
@@ -360,7 +392,7 @@ class SampleDecoder:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs."""
-        return self.__dict__ | {"_coming": None}
+        return self.__dict__ | {"_coming": None, "_described": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Become a copy."""
