@@ -15,7 +15,7 @@ from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.scene_folder import FILES, SceneFolder
 from stereogenbench_data.index.tree import FoundScenes, find_remote_scenes
 from stereogenbench_data.index.tree_cache import TreeCache
-from stereogenbench_data.schema.document import require_text_size
+from stereogenbench_data.schema.document import MAX_TEXT_BYTES, require_text_size
 from stereogenbench_data.sources.location import joined
 from stereogenbench_data.sources.ranged_file import FIRST_BLOCK, RangedFile
 from stereogenbench_data.sources.remote import RemoteObject
@@ -26,7 +26,9 @@ _Item = TypeVar("_Item")
 Files = Mapping[str, tuple[int, int]]
 """Name of each file of a scene to its size in bytes, and a number that changes with the file."""
 
-_AT_A_TIME: Final = 8
+_AT_A_TIME: Final = 12
+_READ_WHOLE: Final = 4 * FIRST_BLOCK
+"""Videos of so many bytes are fetched whole when a scene is described, of larger ones both ends."""
 _FEW: Final = 32
 """Of fewer scenes of a folder each is listed by itself."""
 
@@ -110,21 +112,33 @@ class RemoteFolder(SceneFolder):
         super().__init__(root, key)
         self._files = files
         self._kept = kept
-        self._starts: dict[str, bytes] = {}
+        self._objects: dict[str, RemoteObject] = {}
+        self._parts: dict[str, list[tuple[int, bytes]]] = {}
 
     def stamps(self) -> dict[str, tuple[int, int]]:
         """Return the size in bytes of each file, and a number that changes with it."""
         return dict(self._files)
 
     def fetch(self, names: Iterable[str]) -> None:
-        """Fetch small files, and the starts of videos, at a time.
+        """Fetch small files, and both ends of videos, at a time.
 
         Raises:
             StorageError: If one cannot be read.
-            SchemaError: If a metadata file is too large for one.
         """
-        names = [name for name in names if name in self._files and name not in self._starts]
-        self._starts |= zip(names, in_parallel(self._start, names), strict=True)
+        parts: list[tuple[str, int, int]] = []
+        for name in names:
+            is_video = name.startswith("cam_")
+            is_read = is_video or self._files.get(name, (0, 0))[0] <= MAX_TEXT_BYTES
+            if name in self._files and name not in self._objects and is_read:
+                size, _ = self._files[name]
+                url = joined(str(self._root), f"{self._key}/{name}")
+                self._objects[name] = RemoteObject(url, expected_size=size)
+                if is_video and size > _READ_WHOLE:
+                    parts += (name, 0, FIRST_BLOCK), (name, size - FIRST_BLOCK, size)
+                else:
+                    parts.append((name, 0, size))
+        for part, data in zip(parts, in_parallel(self._part, parts), strict=True):
+            self._parts.setdefault(part[0], []).append((part[1], data))
 
     def read(self, name: str) -> bytes:
         """Return a metadata file, whole.
@@ -135,31 +149,34 @@ class RemoteFolder(SceneFolder):
         """
         if name not in self._files:
             raise StorageError(f"{self._key}/{name}: is missing.")
+        require_text_size(self._files[name][0], where=f"{self._key}/{name}")
         self.fetch([name])
-        return self._starts[name]
+        return self._parts[name][0][1]
 
     def video(self, name: str) -> RangedFile:
-        """Return a video, an open file that the caller closes."""
-        size, _ = self._files[name]
-        remote, first = self._object(name), self._starts.get(name, b"")
+        """Return a video, an open file that the caller closes.
+
+        Raises:
+            StorageError: If it cannot be read.
+        """
+        self.fetch([name])
+        remote, parts = self._objects[name], self._parts[name]
 
         def fetch(start: int, stop: int) -> bytes:
-            return first[start:stop] if stop <= len(first) else remote.read(start, stop)
+            for first, data in parts:
+                if first <= start and stop <= first + len(data):
+                    return data[start - first : stop - first]
+            return remote.read(start, stop)
 
-        return RangedFile(fetch, size=size)
+        return RangedFile(fetch, size=self._files[name][0])
 
-    def _start(self, name: str) -> bytes:
-        size, number = self._files[name]
-        where = f"{self._key}/{name}"
+    def _part(self, part: tuple[str, int, int]) -> bytes:
+        name, start, stop = part
         if name.startswith("cam_"):
-            return self._object(name).read(0, min(size, FIRST_BLOCK))
-        require_text_size(size, where=where)
-        kept = self._kept.file(where, size=size, number=number)
+            return self._objects[name].read(start, stop)
+        where, number = f"{self._key}/{name}", self._files[name][1]
+        kept = self._kept.file(where, size=stop, number=number)
         if kept is None:
-            kept = self._object(name).read(0, size)
+            kept = self._objects[name].read(start, stop)
             self._kept.keep_file(where, kept, number=number)
         return kept
-
-    def _object(self, name: str) -> RemoteObject:
-        size, _ = self._files[name]
-        return RemoteObject(joined(str(self._root), f"{self._key}/{name}"), expected_size=size)
