@@ -15,6 +15,7 @@ from stereogenbench_data.schema.text import counted, shortened
 _PHRASES: Final = {
     "size": "the videos' picture size counts, where baseline.json has another",
     "baselines": "baselines that are not recorded are sums of their neighbours",
+    "pair": "the primary pair of baseline.json counts, where trajectory.json has another",
     "frames": "the frames that all videos have are used",
     "world": "several readings of the poses fit the baselines, and fields that depend on the "
     "reading are refused",

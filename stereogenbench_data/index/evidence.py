@@ -56,6 +56,7 @@ class Understood:
         names: The readings that pass and move the cameras differently in the world, the one that
             was taken first.
         is_named: Whether the file itself names that one.
+        other_pair: Where the file states another primary pair than the rig has; "" if nowhere.
         form: What the index keeps of it, for `poses_as`: None for the first form that the file
             itself names, if it is the only one to pass.
     """
@@ -64,6 +65,7 @@ class Understood:
     names: tuple[str, ...]
     is_named: bool
     form: str | None
+    other_pair: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,8 +99,13 @@ def understood_poses(
         SidesError: If its own form fits but for the side of the primary pair's left camera.
     """
     recorded = record_poses(text, where=where)
+    other = "; ".join(
+        f"{where}: {path} states cameras {pair[0]} and {pair[1]}"
+        for path, pair in recorded.primary_pairs
+        if rig.primary_pair not in (pair, (pair[0] - 1, pair[1] - 1))
+    )
     if named is None:
-        return _fitting(readings(recorded), rig, where=where)
+        return replace(_fitting(readings(recorded), rig, where=where), other_pair=other)
     found, own, reason = None, None, ""
     try:
         found = _fitting(_readings_as(recorded, named), rig, where=where)
@@ -108,7 +115,7 @@ def understood_poses(
         own = _fitting(readings(recorded), rig, where=where)
     own_poses = own.poses if own is not None and own.is_named else None
     if found is not None and (own_poses is None or same_poses(found.poses, own_poses)):
-        return replace(found, form="|".join(found.names))
+        return replace(found, form="|".join(found.names), other_pair=other)
     reason = reason or "the file names another form, which fits as well and differs"
     fits = "" if own is None else f" What fits is: {shortened(own.names[0], 300)}."
     stated = ((name, getattr(named, name)) for name in ("rotation", "form", "axes", "unit"))

@@ -424,6 +424,10 @@ def _poses(  # noqa: PLR0913 - what poses are judged by
             f"{where}: has poses of {found.poses.frame_count} frames, and the videos have {frames}"
         )
         remarks.append(Remark("frames", f"{told}. The first {frames} are used"))
+    if found.other_pair:
+        left, right = rig.primary_pair
+        told = f"{found.other_pair}, and {BASELINE_JSON} cameras {left} and {right}, which count"
+        remarks.append(Remark("pair", told))
     if len(found.names) > 1:
         listed = ", ".join(name.partition(" @ ")[0] for name in found.names)
         remarks.append(

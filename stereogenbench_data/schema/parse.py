@@ -473,15 +473,8 @@ def _primary_pair(
     odd: list[str] = []
     for each in [*_stated_pair(document, findings), *stated(nodes, "primary_pair")]:
         value = each.value
-        if isinstance(value, dict):
-            left, right = (_end(value, side) for side in ("left", "right"))
-            if left is None and right is None:
-                left, right = _cameras_of(value) or (None, None)
-        elif isinstance(value, list) and len(value) == 2:
-            left, right = map(_camera, value)
-        else:
-            left, right = (isinstance(value, str) and _pair_of(value)) or (None, None)
-        if left is None or right is None:
+        named = named_pair(value)
+        if named is None:
             odd.append(
                 f"{each.path}: must be {{left_camera, right_camera}} or a list of two cameras, "
                 f"found {brief(value)}"
@@ -489,7 +482,7 @@ def _primary_pair(
             continue
         is_named_from_0 = isinstance(value, dict) and _names_camera_0(nodes)
         first = 0 if is_named_from_0 else first_number
-        left, right = left - first, right - first
+        left, right = named[0] - first, named[1] - first
         if left == right or not {left, right} <= set(range(CAMERA_COUNT)):
             odd.append(
                 f"{each.path}: names cameras {left} and {right}, and a pair is two of the "
@@ -510,6 +503,20 @@ def _primary_pair(
         )
         findings.remarks.append(Remark("primary pair", told))
     return 0, 1
+
+
+def named_pair(value: object) -> Pair | None:
+    """Return the left and the right camera that a value names, None where it names no two."""
+    left = right = None
+    if isinstance(value, dict):
+        left, right = (_end(value, side) for side in ("left", "right"))
+        if left is None and right is None:
+            return _cameras_of(value)
+    elif isinstance(value, list) and len(value) == 2:
+        left, right = map(_camera, value)
+    elif isinstance(value, str):
+        return _pair_of(value)
+    return None if left is None or right is None else (left, right)
 
 
 def _names_camera_0(nodes: list[Node]) -> bool:

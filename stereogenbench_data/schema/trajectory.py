@@ -16,6 +16,7 @@ import numpy as np
 
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.schema.document import brief, camera_of, is_number, parse_document
+from stereogenbench_data.schema.parse import named_pair
 from stereogenbench_data.schema.quantities import (
     length_unit_m,
     nodes_of,
@@ -85,11 +86,13 @@ class RecordedPoses:
         blocks: The numbers that may be part of poses.
         hints: The words of the texts in which a file says how they are to be read.
         unit_m: Metres in the unit that the file names for lengths, None without one.
+        primary_pairs: The places where it names the primary pair, and the cameras there.
     """
 
     blocks: tuple[Block, ...]
     hints: frozenset[str]
     unit_m: float | None
+    primary_pairs: tuple[tuple[str, tuple[int, int]], ...] = ()
 
     @property
     def shape(self) -> str:
@@ -132,7 +135,10 @@ def record_poses(text: bytes, *, where: str) -> RecordedPoses:
             f"{', '.join(sorted(document)[:20])}"
         )
         raise SchemaError(f"{where}: {reason}.")
-    return RecordedPoses(tuple(blocks), _hints(document), _unit_m(document, where))
+    head = {key: value for key, value in document.items() if "pair" in words(key)}
+    pairs = [(each.path, named_pair(each.value)) for each in stated(nodes_of(head), "primary_pair")]
+    known = tuple((path, pair) for path, pair in pairs if pair is not None)
+    return RecordedPoses(tuple(blocks), _hints(document), _unit_m(document, where), known)
 
 
 def _first_of_lists(node: Any) -> Any:

@@ -270,6 +270,16 @@ def test_lengths_that_differ_by_a_unit_are_stated_in_two_ways(unit):
         understood(json.dumps(document).encode())
 
 
+@pytest.mark.parametrize(
+    ("pair", "is_other"),
+    [([0, 1], False), ([1, 2], False), ([2, 3], True), ("Cam_01-Cam_00", True)],
+)
+def test_another_primary_pair_than_that_of_the_rig_is_told_with_its_place(pair, is_other):
+    found = understood(written("rotator", *TURNED, primary_stereo_pair=pair))
+
+    assert ("trajectory.json: $.primary_stereo_pair states cameras" in found.other_pair) == is_other
+
+
 def test_the_poses_of_another_rig_are_refused():
     rotators, places_cm = TURNED
 
