@@ -15,6 +15,8 @@ import pytest
 
 from stereogenbench_data.audit.contract.doctor import diagnose
 from stereogenbench_data.audit.geometry.audit import AuditRequest, audit
+from stereogenbench_data.bridges.clips import ClipForm, ExportRun, export_clips
+from stereogenbench_data.bridges.export_views import export_views
 from stereogenbench_data.engine import Engine, RayCluster
 from stereogenbench_data.errors import ExtraError, ShardError, StorageError
 from stereogenbench_data.evaluation.evaluate import evaluate
@@ -22,6 +24,7 @@ from stereogenbench_data.evaluation.inputs import export_inputs
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.media.encoder import Encoding
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.training import TrainingSettings
 from stereogenbench_data.shards.unpack import unpack
@@ -172,6 +175,18 @@ def export_inputs_(data, **how):
     return bytes_of(data.out)
 
 
+def export_clips_(data, **how):
+    form = ClipForm(length=1, size=(48, 64), encoding=Encoding(preset="ultrafast"))
+    run = ExportRun(**how)
+    export_clips(data.release, data.out, layout="diffsynth", form=form, run=run)
+    return bytes_of(data.out)
+
+
+def export_views_(data, **how):
+    export_views(data.release, data.out, layout="ply", size=(48, 64), **how)
+    return bytes_of(data.out)
+
+
 @pytest.fixture(scope="module")
 def material(small_release, tmp_path_factory):
     place = tmp_path_factory.mktemp("material")
@@ -186,7 +201,7 @@ def material(small_release, tmp_path_factory):
     "command",
     [
         index_, pack_, pack_training_, verify_, audit_, evaluate_, synth_, unpack_, doctor_,
-        export_inputs_,
+        export_inputs_, export_clips_, export_views_,
     ],
     ids=lambda command: command.__name__.rstrip("_"),
 )  # fmt: skip
