@@ -96,7 +96,8 @@ def parse_document(text: bytes, *, where: str) -> Any:
         guess = "The file looks truncated: c" if truncated else "C"
         raise SchemaError(
             f"{where}: not valid JSON: {error.msg} at line {error.lineno}, column {error.colno} "
-            f"(character {error.pos} of {length}). {guess}opy it from the release again."
+            f"(character {min(error.pos, length)} of {length}). {guess}opy it from the release "
+            f"again."
         ) from error
     except ValueError as error:
         raise SchemaError(

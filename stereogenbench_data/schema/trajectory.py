@@ -94,12 +94,6 @@ class RecordedPoses:
     unit_m: float | None
     primary_pairs: tuple[tuple[str, tuple[int, int]], ...] = ()
 
-    @property
-    def shape(self) -> str:
-        """What the scenes of one writer have in common: the keys of the numbers, and the hints."""
-        keys = sorted(f"{block.key}({','.join(block.components)})" for block in self.blocks)
-        return " ".join([*keys, *sorted(self.hints)])
-
 
 def record_poses(text: bytes, *, where: str) -> RecordedPoses:
     """Return the numbers of a ``trajectory.json`` that belong to six cameras in each frame.
