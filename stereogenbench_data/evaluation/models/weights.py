@@ -38,11 +38,6 @@ class Weights:
         """Return where to fetch the file, under which terms, and where to put it."""
         return f"fetch {self.source} (licence: {self.licence}) and put it at {self.path(folder)}"
 
-    @property
-    def how_to_install(self) -> str:
-        """The command that installs the extra that the network needs."""
-        return f"`pip install 'stereogenbench-data[{self.extra}]'`"
-
 
 def weights_path(weights: Weights, *, folder: Path | None) -> Path:
     """Return where the file of weights is.
@@ -55,7 +50,7 @@ def weights_path(weights: Weights, *, folder: Path | None) -> Path:
         raise ExtraError(
             f"the weights of {weights.what} are not at {path}: {weights.how_to_fetch(folder)}, or "
             f"name the folder that it is in (--weights). It needs the extra {weights.extra!r}: "
-            f"{weights.how_to_install}."
+            f"`pip install 'stereogenbench-data[{weights.extra}]'`."
         )
     return path
 
