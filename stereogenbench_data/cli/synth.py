@@ -1,7 +1,6 @@
 """``stereogenbench synth``: generate scenes in the released layout, without Unreal."""
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -30,50 +29,9 @@ if TYPE_CHECKING:
     from stereogenbench_data.synthesis.renderer import Renderer
     from stereogenbench_data.synthesis.report import Acceptance
 
-RendererName = Literal["ray-casting", "blender"]
 RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
 """The same as in `synthesis.request`, which the help does not import."""
 _ALL: str = "all"
-
-
-@dataclass(frozen=True, kw_only=True)
-class RendererOptions:
-    """What draws the scenes of a command."""
-
-    renderer: Annotated[
-        RendererName,
-        typer.Option(help="ray-casting: built-in maps; blender: your own assets, by Cycles."),
-    ] = "ray-casting"
-    assets: Annotated[
-        Path | None, typer.Option(help="The assets.toml of the renderer blender.")
-    ] = None
-
-    def renderer_of(self) -> "Renderer":
-        """Return the renderer that the options name.
-
-        Raises:
-            SynthesisError: If the assets are missing, not wanted, or not as they should be.
-            ExtraError: If Blender is not installed.
-        """
-        from stereogenbench_data.errors import SynthesisError
-
-        if self.renderer == "blender":
-            from stereogenbench_data.synthesis.blender.renderer import BlenderRenderer
-
-            if self.assets is None:
-                raise SynthesisError(
-                    "renderer blender: no assets are named. Name the maps, characters and "
-                    "animations in an assets.toml, and give it by --assets."
-                )
-            return BlenderRenderer.from_file(self.assets)
-        if self.assets is not None:
-            raise SynthesisError(
-                f"renderer {self.renderer}: it takes no --assets. Choose --renderer blender, or "
-                f"leave them out."
-            )
-        from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING
-
-        return RAY_CASTING
 
 
 @grouped
@@ -114,7 +72,12 @@ def synth(  # noqa: PLR0913 - one parameter an option
     rotation: Annotated[
         RotationForm, typer.Option(help="How trajectory.json records rotations.")
     ] = "rotator",
-    drawn_by: RendererOptions,
+    assets: Annotated[
+        Path | None,
+        typer.Option(
+            help="assets.toml of your own maps and characters, for Blender [the built-in maps]."
+        ),
+    ] = None,
     part: Annotated[
         str, typer.Option(help="I/N: the I-th of N parts, for N machines.", metavar="I/N")
     ] = "1/1",
@@ -147,7 +110,8 @@ def synth(  # noqa: PLR0913 - one parameter an option
     of the same request. Scene i is the same for any number of scenes, workers and parts.
     """
     from stereogenbench_data.synthesis.produce import hold_out, plan_scenes, synthesise
-    from stereogenbench_data.synthesis.report import report_of, report_of_tree
+    from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING
+    from stereogenbench_data.synthesis.report import json_of, markdown_of, report_of, report_of_tree
     from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
     _require_options_agree(
@@ -165,8 +129,12 @@ def synth(  # noqa: PLR0913 - one parameter an option
         raise typer.BadParameter(
             f"'{_ALL}' is all maps: give it alone, or name maps without it.", param_hint="--map"
         )
-    chosen = drawn_by.renderer_of()
-    everywhere = map_name == [_ALL] or (map_name is None and drawn_by.assets is not None)
+    chosen: Renderer = RAY_CASTING
+    if assets is not None:
+        from stereogenbench_data.synthesis.blender.renderer import BlenderRenderer
+
+        chosen = BlenderRenderer.from_file(assets)
+    everywhere = map_name == [_ALL] or (map_name is None and assets is not None)
     request = SynthRequest(
         family=family,
         scenes=scenes,
@@ -192,12 +160,23 @@ def synth(  # noqa: PLR0913 - one parameter an option
         from stereogenbench_data.synthesis.sheets import write_sheets
 
         with progress_bar("contact sheets", unit="scenes") as progress:
-            write_sheets(out, keys, folder=contact_sheets, progress=progress, **work.options())
+            write_sheets(
+                out,
+                keys,
+                folder=contact_sheets,
+                unit_m=depth_unit_m,
+                progress=progress,
+                **work.options(),
+            )
     if report is not None:
-        write_report(report, _report_text(report_of_tree(out), suffix=report.suffix))
+        found = report_of_tree(out)
+        is_json = report.suffix == ".json"
+        write_report(
+            report, json.dumps(json_of(found), indent=2) if is_json else markdown_of(found)
+        )
     if plan_only:
         shown = report_of([(request.family, decisions)])
-        _print(_report_json(shown), _table(shown), as_json=as_json)
+        _print(json_of(shown), _table(shown), as_json=as_json)
         return
     folders = sorted({key.rpartition("/")[0] for key in keys})
     where = (
@@ -255,18 +234,6 @@ def _part_of(text: str) -> tuple[int, int]:
 
 def _print(document: Any, text: str, *, as_json: bool) -> None:
     typer.echo(json.dumps(document, indent=2) if as_json else text)
-
-
-def _report_json(report: "list[Acceptance]") -> Any:
-    from stereogenbench_data.synthesis.report import json_of
-
-    return json_of(report)
-
-
-def _report_text(report: "list[Acceptance]", *, suffix: str) -> str:
-    from stereogenbench_data.synthesis.report import markdown_of
-
-    return json.dumps(_report_json(report), indent=2) if suffix == ".json" else markdown_of(report)
 
 
 def _table(report: "list[Acceptance]") -> str:

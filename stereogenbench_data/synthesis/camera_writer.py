@@ -7,7 +7,6 @@ same bytes on any number of processors.
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Final
 
 import av
@@ -20,7 +19,7 @@ from stereogenbench_data.schema.release import FRAME_RATE_HZ, depth_name, rgb_na
 from stereogenbench_data.synthesis.checks import CameraStatistics, FrameStatistics
 from stereogenbench_data.synthesis.filters import Limits
 from stereogenbench_data.synthesis.plan import ScenePlan
-from stereogenbench_data.synthesis.renderer import RenderedView, Renderer
+from stereogenbench_data.synthesis.renderer import Renderer
 from stereogenbench_data.synthesis.request import LARGEST_UNITS, ExportContract
 
 _H264: Final = {"crf": "18", "x264-params": "cpu-independent=1"}
@@ -48,52 +47,27 @@ def write_cameras(
         limits: Limits of near occluders and of depth.
         after_frame: Called after each frame of each camera; an exception from it ends the work.
     """
+    contract = plan.request.contract
     statistics = [FrameStatistics(plan, camera=camera, limits=limits) for camera in cameras]
     with ExitStack() as stack:
-        writers = [
-            stack.enter_context(_CameraWriter(plan, camera=camera, folder=folder))
+        videos = [
+            (
+                stack.enter_context(picture_video(folder / rgb_name(camera))),
+                stack.enter_context(depth_video(folder / depth_name(camera), contract)),
+            )
             for camera in cameras
         ]
         views = renderer.views(plan, cameras=cameras)
         for _ in range(plan.request.frames):
-            for writer, seen in zip(writers, statistics, strict=True):
+            for (rgb, depth), seen in zip(videos, statistics, strict=True):
                 view = next(views)
-                writer.write(view)
+                shown = av.VideoFrame.from_ndarray(view.picture, format="rgb24")
+                rgb.write(shown.reformat(format="yuv420p", threads=1))
+                units = depth_units(view.depth_m, unit_m=contract.depth_unit_m)
+                depth.write(grey_frame(units, pixel_format=DEPTH_FORMAT))
                 seen.add(view)
                 after_frame()
     return [seen.check() for seen in statistics]
-
-
-class _CameraWriter:
-    """The two videos of a camera, as a context manager."""
-
-    def __init__(self, plan: ScenePlan, *, camera: int, folder: Path) -> None:
-        self._contract = plan.request.contract
-        with ExitStack() as stack:
-            self._rgb = stack.enter_context(picture_video(folder / rgb_name(camera)))
-            depth = depth_video(folder / depth_name(camera), self._contract)
-            self._depth = stack.enter_context(depth)
-            self._files = stack.pop_all()
-
-    def write(self, view: RenderedView) -> None:
-        """Append a picture and its depth."""
-        shown = av.VideoFrame.from_ndarray(view.picture, format="rgb24")
-        self._rgb.write(shown.reformat(format="yuv420p", threads=1))
-        units = depth_units(view.depth_m, unit_m=self._contract.depth_unit_m)
-        self._depth.write(grey_frame(units, pixel_format=DEPTH_FORMAT))
-
-    def __enter__(self) -> "_CameraWriter":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        with self._files:
-            if error is not None:
-                raise error
 
 
 def picture_video(path: Path) -> VideoWriter:

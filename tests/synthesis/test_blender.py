@@ -324,7 +324,7 @@ def test_the_command_renders_all_maps_of_the_assets(assets, tmp_path):
     text = (quick / "assets.toml").read_text()
     (quick / "assets.toml").write_text(text.replace("= 32", "= 1\ndenoise = false"))
     options = ["--size", "32", "--frames", "1", "--scenes", "2", "--seed", "5", "--workers", "1"]
-    of_blender = ["--renderer", "blender", "--assets", str(quick / "assets.toml")]
+    of_blender = ["--assets", str(quick / "assets.toml")]
 
     result = CliRunner().invoke(
         app,

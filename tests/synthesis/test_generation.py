@@ -323,14 +323,17 @@ def test_the_report_counts_acceptance_by_map_and_reason_and_wide_rigs_are_refuse
 def test_contact_sheets_show_every_scene_once(tmp_path):
     keys = synthesise(tmp_path, SynthRequest(**SMALL))
 
-    (path,) = write_sheets(tmp_path, keys, folder=tmp_path / "sheets")
+    def sheets():
+        return write_sheets(tmp_path, keys, folder=tmp_path / "sheets", unit_m=0.001)
+
+    (path,) = sheets()
 
     assert path.name == "train__IPD_Gaussian__SynthStage__scene_000000.png"
     before = path.stat().st_mtime_ns
-    assert write_sheets(tmp_path, keys, folder=tmp_path / "sheets") == [path]
+    assert sheets() == [path]
     assert path.stat().st_mtime_ns == before
     os.utime(path, ns=(0, 0))  # As of a scene that was there before this one.
-    write_sheets(tmp_path, keys, folder=tmp_path / "sheets")
+    sheets()
     assert path.stat().st_mtime_ns >= before
 
 
