@@ -13,7 +13,7 @@ from stereogenbench_data.audit.geometry.audit import AuditRequest, audit, open_f
 from stereogenbench_data.errors import StereoGenBenchError
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_COUNT, depth_name, rgb_name
-from stereogenbench_data.synthesis.filters import Limits, Refusal
+from stereogenbench_data.synthesis.filters import Limits, Reason, Refusal
 from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.renderer import RenderedView
 
@@ -86,27 +86,19 @@ class FrameStatistics:
 def check_pictures(checks: Sequence[CameraStatistics], *, limits: Limits) -> Refusal | None:
     """Return why the pictures or depths of a scene are refused, if they are."""
     for each in sorted(checks, key=lambda check: check.camera):
-        where = f"camera {each.camera}"
-        if each.invalid_share > limits.invalid_share:
-            return Refusal(
-                "invalid_depth", each.invalid_share, limits.invalid_share,
-                f"{where}: {each.invalid_share:.0%} of its pixels have no depth",
-            )  # fmt: skip
-        if each.dark_mean < limits.dark_mean:
-            return Refusal(
-                "dark", each.dark_mean, limits.dark_mean,
-                f"{where}: a frame has the mean brightness {each.dark_mean:.3g} of 255",
-            )  # fmt: skip
-        if each.flat_sd < limits.flat_sd:
-            return Refusal(
-                "flat", each.flat_sd, limits.flat_sd,
-                f"{where}: the brightness of a frame varies by {each.flat_sd:.3g} of 255",
-            )  # fmt: skip
-        if each.border_share > limits.border_share:
-            return Refusal(
-                "border_occluder", each.border_share, limits.border_share,
-                f"{where}: near things cover {each.border_share:.0%} of a frame's border",
-            )  # fmt: skip
+        found: list[tuple[Reason, float, float, bool, str]] = [
+            ("invalid_depth", each.invalid_share, limits.invalid_share, True,
+             f"{each.invalid_share:.0%} of its pixels have no depth"),
+            ("dark", each.dark_mean, limits.dark_mean, False,
+             f"a frame has the mean brightness {each.dark_mean:.3g} of 255"),
+            ("flat", each.flat_sd, limits.flat_sd, False,
+             f"the brightness of a frame varies by {each.flat_sd:.3g} of 255"),
+            ("border_occluder", each.border_share, limits.border_share, True,
+             f"near things cover {each.border_share:.0%} of a frame's border"),
+        ]  # fmt: skip
+        for reason, value, limit, is_most, text in found:
+            if (value > limit) if is_most else (value < limit):
+                return Refusal(reason, value, limit, f"camera {each.camera}: {text}")
     return None
 
 

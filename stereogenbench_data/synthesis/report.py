@@ -1,42 +1,33 @@
 """What became of proposals: acceptance, reasons, realised baselines, focal lengths, motion."""
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.synthesis.decisions import Decision, Drawn, Motion, all_decisions
 
+ALL_MAPS: Final = "all maps"
+
 
 @dataclass(frozen=True, slots=True)
-class Spread:
-    """The distribution of a number."""
+class Average:
+    """Mean and median of a number."""
 
-    count: int
-    least: float
-    median: float
     mean: float
-    sd: float
-    largest: float
+    median: float
 
-    @classmethod
-    def of(cls, values: Sequence[float]) -> "Spread | None":
-        """Return the distribution of values; None if there are none."""
-        if not len(values):
-            return None
-        array = np.array(values, np.float64)
-        return cls(
-            len(array),
-            float(array.min()),
-            float(np.median(array)),
-            float(array.mean()),
-            float(array.std()),
-            float(array.max()),
-        )
+
+def _average(values: Sequence[float]) -> Average | None:
+    return Average(float(np.mean(values)), float(np.median(values))) if values else None
+
+
+def _text(average: Average | None, digits: int) -> str:
+    return "-" if average is None else f"{average.mean:.{digits}f} / {average.median:.{digits}f}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,21 +54,13 @@ class Acceptance:
     proposals: int
     accepted: int
     reasons: dict[str, int]
-    proposed_cm: Spread | None
-    realised_cm: Spread | None
-    proposed_mm: Spread | None
-    realised_mm: Spread | None
-    step_m: Spread | None
-    turn_deg: Spread | None
+    proposed_cm: Average | None
+    realised_cm: Average | None
+    proposed_mm: Average | None
+    realised_mm: Average | None
+    step_m: Average | None
+    turn_deg: Average | None
     splices: int
-
-    @property
-    def share(self) -> float:
-        """Share of proposals that were accepted."""
-        return self.accepted / self.proposals if self.proposals else 0.0
-
-
-ALL_MAPS = "all maps"
 
 
 def report_of(requests: Iterable[tuple[str, Sequence[Decision]]]) -> list[Acceptance]:
@@ -86,18 +69,17 @@ def report_of(requests: Iterable[tuple[str, Sequence[Decision]]]) -> list[Accept
     Args:
         requests: The family of each request, and its decisions.
     """
-    refused: dict[tuple[str, str], list[Drawn]] = {}
-    accepted: dict[tuple[str, str], list[tuple[Drawn, Motion]]] = {}
+    drawn: dict[tuple[str, str], list[Drawn]] = defaultdict(list)
+    motions: dict[tuple[str, str], list[Motion]] = defaultdict(list)
     for family, decisions in requests:
         for decision in decisions:
-            for place in (ALL_MAPS, decision.accepted.map_name):
-                passed = accepted.setdefault((family, place), [])
-                passed.append((decision.accepted, decision.motion))
-            for drawn in decision.refused:
-                for place in (ALL_MAPS, drawn.map_name):
-                    refused.setdefault((family, place), []).append(drawn)
-    places = sorted({*refused, *accepted}, key=lambda each: (each[0], each[1] == ALL_MAPS, each[1]))
-    return [_acceptance(place, refused.get(place, []), accepted.get(place, [])) for place in places]
+            for each in (*decision.refused, decision.accepted):
+                for name in (ALL_MAPS, each.map_name):
+                    drawn[family, name].append(each)
+            for name in (ALL_MAPS, decision.accepted.map_name):
+                motions[family, name].append(decision.motion)
+    places = sorted(drawn, key=lambda each: (each[0], each[1] == ALL_MAPS, each[1]))
+    return [_acceptance(*place, drawn[place], motions[place]) for place in places]
 
 
 def report_of_tree(out: Path) -> list[Acceptance]:
@@ -110,94 +92,68 @@ def report_of_tree(out: Path) -> list[Acceptance]:
 
 
 def _acceptance(
-    place: tuple[str, str], refused: list[Drawn], accepted: list[tuple[Drawn, Motion]]
+    family: str, map_name: str, drawn: list[Drawn], motions: list[Motion]
 ) -> Acceptance:
-    passed = [drawn for drawn, _ in accepted]
-    motions = [motion for _, motion in accepted]
-    everything = [*refused, *passed]
-    reasons = Counter(drawn.refusal.reason for drawn in refused if drawn.refusal is not None)
+    passed = [each for each in drawn if each.refusal is None]
+    reasons = Counter(str(each.refusal.reason) for each in drawn if each.refusal is not None)
     return Acceptance(
-        family=place[0],
-        map_name=place[1],
-        proposals=len(everything),
+        family=family,
+        map_name=map_name,
+        proposals=len(drawn),
         accepted=len(passed),
-        reasons={str(reason): count for reason, count in reasons.most_common()},
-        proposed_cm=Spread.of([gap for drawn in everything for gap in drawn.gaps_cm]),
-        realised_cm=Spread.of([gap for drawn in passed for gap in drawn.gaps_cm]),
-        proposed_mm=Spread.of([drawn.focal_mm for drawn in everything]),
-        realised_mm=Spread.of([drawn.focal_mm for drawn in passed]),
-        step_m=Spread.of([motion.step_m for motion in motions]),
-        turn_deg=Spread.of([motion.turn_deg for motion in motions]),
+        reasons=dict(reasons.most_common()),
+        proposed_cm=_average([gap for each in drawn for gap in each.gaps_cm]),
+        realised_cm=_average([gap for each in passed for gap in each.gaps_cm]),
+        proposed_mm=_average([each.focal_mm for each in drawn]),
+        realised_mm=_average([each.focal_mm for each in passed]),
+        step_m=_average([motion.step_m for motion in motions]),
+        turn_deg=_average([motion.turn_deg for motion in motions]),
         splices=sum(motion.splices for motion in motions),
     )
 
 
-_HEAD = (
-    "family", "map", "proposals", "accepted", "gaps proposed, cm", "gaps realised, cm",
-    "focal proposed, mm", "focal realised, mm", "m a frame", "degrees a frame", "splices",
-    "refused for",
-)  # fmt: skip
-
-
-def _median(spread: Spread | None, digits: int) -> str:
-    return "-" if spread is None else f"{spread.median:.{digits}f}"
-
-
 def rows_of(report: Sequence[Acceptance]) -> list[tuple[str, ...]]:
-    """Return the report as rows of texts, medians of spreads; the first row has names."""
-    rows: list[tuple[str, ...]] = [_HEAD]
-    for each in report:
-        reasons = ", ".join(f"{reason} {count:,}" for reason, count in each.reasons.items())
-        rows.append(
-            (
-                each.family,
-                each.map_name,
-                f"{each.proposals:,}",
-                f"{each.accepted:,} ({each.share:.1%})",
-                _median(each.proposed_cm, 1),
-                _median(each.realised_cm, 1),
-                _median(each.proposed_mm, 1),
-                _median(each.realised_mm, 1),
-                _median(each.step_m, 3),
-                _median(each.turn_deg, 2),
-                f"{each.splices:,}",
-                reasons or "-",
-            )
+    """Return the report as rows of texts, means and medians; the first row has names."""
+    head = (
+        "family", "map", "proposals", "accepted", "gaps proposed, cm", "gaps realised, cm",
+        "focal proposed, mm", "focal realised, mm", "m a frame", "degrees a frame", "splices",
+        "refused for",
+    )  # fmt: skip
+    body = [
+        (
+            each.family,
+            each.map_name,
+            f"{each.proposals:,}",
+            f"{each.accepted:,} ({each.accepted / each.proposals:.1%})",
+            _text(each.proposed_cm, 1),
+            _text(each.realised_cm, 1),
+            _text(each.proposed_mm, 1),
+            _text(each.realised_mm, 1),
+            _text(each.step_m, 3),
+            _text(each.turn_deg, 2),
+            f"{each.splices:,}",
+            ", ".join(f"{reason} {count:,}" for reason, count in each.reasons.items()) or "-",
         )
-    return rows
+        for each in report
+    ]
+    return [head, *body]
 
 
 def markdown_of(report: Sequence[Acceptance]) -> str:
-    """Return the report as Markdown: a table by family and map, and one of realised baselines."""
+    """Return the report as a table in Markdown."""
     head, *body = rows_of(report)
-    lines = ["# Proposals and what became of them", ""]
     total, passed = (
         sum(getattr(each, name) for each in report if each.map_name == ALL_MAPS)
         for name in ("proposals", "accepted")
     )
-    lines += [f"{counted(total, 'proposal')}, {counted(passed, 'scene')} accepted. Medians.", ""]
-    lines += [_markdown_row(head), _markdown_row(["---"] * len(head))]
-    lines += [_markdown_row(row) for row in body]
-    lines += ["", "## Gaps between neighbouring cameras, cm", ""]
-    columns = ["family", "map", "", "count", "least", "median", "mean", "sd", "largest"]
-    lines += [_markdown_row(columns), _markdown_row(["---"] * len(columns))]
-    for each in report:
-        for name, spread in (("proposed", each.proposed_cm), ("realised", each.realised_cm)):
-            if spread is not None:
-                count, *figures = asdict(spread).values()
-                lines.append(
-                    _markdown_row(
-                        [each.family, each.map_name, name, f"{count:,}"]
-                        + [f"{figure:.2f}" for figure in figures]
-                    )
-                )
-    return "\n".join(lines) + "\n"
-
-
-def _markdown_row(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
+    rows = [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *body)]
+    title = (
+        "# Proposals and what became of them\n\n"
+        f"{counted(total, 'proposal')}, {counted(passed, 'scene')} accepted. Means / medians.\n"
+    )
+    return "\n".join([title, *rows]) + "\n"
 
 
 def json_of(report: Sequence[Acceptance]) -> list[dict[str, Any]]:
     """Return the report as values for `json.dumps`."""
-    return [asdict(each) | {"share": each.share} for each in report]
+    return [asdict(each) for each in report]

@@ -9,8 +9,9 @@ import json
 import os
 import struct
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal, NoReturn, TypeGuard, get_args
 from urllib.parse import unquote
@@ -23,8 +24,8 @@ Forward = Literal["-y", "+y", "-x", "+x"]
 Repeat = Literal["onward", "back"]
 
 SUFFIXES: Final = (".blend", ".glb", ".gltf", ".fbx")
+_NO_FILE: Final = f"must name a file ({', '.join(SUFFIXES)})"
 _GLB_MAGIC: Final = b"glTF"
-_CHUNK_BYTES: Final = 1 << 20
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
@@ -139,35 +140,124 @@ def read_assets(path: str | Path) -> Assets:
     except tomllib.TOMLDecodeError as error:
         raise SynthesisError(f"{path}: is not TOML ({error}). Correct that line.") from error
     reader = _Reader(path)
-    reader.require_known(document, _TABLES, place="")
-    maps = {
-        name: reader.map(table, place=f"maps.{name}")
-        for name, table in reader.entries(document, "maps").items()
+    reader.require_known(document, (*_ASSETS, "sensors", "render"), place="")
+    found: dict[str, dict[str, Any]] = {
+        kind: {
+            name: made(**reader.asset(table, rules, place=f"{kind}.{name}"))
+            for name, table in reader.entries(document, kind).items()
+        }
+        for kind, (made, rules) in _ASSETS.items()
     }
-    characters = {
-        name: reader.character(table, place=f"characters.{name}")
-        for name, table in reader.entries(document, "characters").items()
-    }
-    animations = {
-        name: reader.animation(table, place=f"animations.{name}")
-        for name, table in reader.entries(document, "animations").items()
-    }
-    sensors = document.get("sensors", {})
-    if not isinstance(sensors, dict):
-        reader.refuse("sensors", sensors, "must be a table of NAME = [width, height] in mm")
-    sensors_mm = tuple(
-        reader.sensor(sensors[name], place=f"sensors.{name}") for name in sorted(sensors)
-    )
-    settings = reader.settings(document.get("render", {}))
+    sensors = reader.table(document.get("sensors", {}), place="sensors")
+    sizes_mm = reader.values(sensors, dict.fromkeys(sensors, _size), place="sensors")
+    settings = reader.table(document.get("render", {}), place="render")
     digest = hashlib.sha256(text)
-    for file in sorted(
-        {each.file for kind in (maps, characters, animations) for each in kind.values()}
-    ):
+    for file in sorted({each.file for assets in found.values() for each in assets.values()}):
         digest.update(os.path.relpath(file, path.parent).encode() + _digest_of(Path(file)))
-    return Assets(path, maps, characters, animations, sensors_mm, settings, digest.hexdigest())
+    return Assets(
+        path,
+        **found,
+        sensors_mm=tuple(sizes_mm[name] for name in sorted(sizes_mm)),
+        settings=RenderSettings(**reader.values(settings, _RENDER, place="render")),
+        digest=digest.hexdigest(),
+    )
 
 
-_TABLES: Final = ("maps", "characters", "animations", "sensors", "render")
+# Each rule returns a value as it is used, or raises ValueError with what it must be.
+
+
+def _positive(value: object) -> float:
+    if not _is_positive(value):
+        raise ValueError("must be a positive number")
+    return float(value)
+
+
+def _size(value: object) -> tuple[float, float]:
+    if not (isinstance(value, list) and len(value) == 2 and all(map(_is_positive, value))):
+        raise ValueError("must be [width, height] in mm, both positive")
+    return float(value[0]), float(value[1])
+
+
+def _box(value: object) -> Box:
+    match value:
+        case [[x, y, z], [far_x, far_y, far_z]]:
+            numbers = (x, y, z, far_x, far_y, far_z)
+            if all(map(_is_number, numbers)) and x < far_x and y < far_y and z < far_z:
+                return (float(x), float(y), float(z)), (float(far_x), float(far_y), float(far_z))
+    raise ValueError(
+        "must be [[x, y, z], [x, y, z]] in metres of map axes, the smaller corner first"
+    )
+
+
+def _file_name(value: object) -> str:
+    if not (isinstance(value, str) and value):
+        raise ValueError(_NO_FILE)
+    if Path(value).suffix.lower() not in SUFFIXES:
+        raise ValueError(f"must end in {', '.join(SUFFIXES)}; convert it with Blender")
+    return value
+
+
+def _text(value: object) -> str:
+    if not (isinstance(value, str) and value):
+        raise ValueError("must be the name of a take of the file")
+    return value
+
+
+def _truth(value: object) -> bool:
+    if value is True or value is False:
+        return value
+    raise ValueError("must be true or false")
+
+
+def _whole(value: object, *, low: int) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or value < low:
+        raise ValueError(f"must be a whole number of at least {low}")
+    return value
+
+
+def _choice(value: object, *, among: tuple[str, ...]) -> object:
+    if value not in among:
+        raise ValueError(f"must be one of {', '.join(among)}")
+    return value
+
+
+_Rules = Mapping[str, Callable[[Any], Any]]
+
+_ASSETS: Final[dict[str, tuple[Callable[..., Any], _Rules]]] = {
+    "maps": (
+        MapAsset,
+        {
+            "file": _file_name,
+            "scale": _positive,
+            "light": partial(_choice, among=get_args(Light)),
+            "bounds_m": _box,
+            "spawn_bounds_m": _box,
+        },
+    ),
+    "characters": (
+        CharacterAsset,
+        {
+            "file": _file_name,
+            "scale": _positive,
+            "forward": partial(_choice, among=get_args(Forward)),
+        },
+    ),
+    "animations": (
+        AnimationAsset,
+        {
+            "file": _file_name,
+            "take": _text,
+            "rate_hz": _positive,
+            "repeat": partial(_choice, among=get_args(Repeat)),
+        },
+    ),
+}
+_RENDER: Final[_Rules] = {
+    "samples_per_pixel": partial(_whole, low=1),
+    "device": partial(_choice, among=get_args(Device)),
+    "denoise": _truth,
+    "threads": partial(_whole, low=0),
+}
 
 
 class _Reader:
@@ -181,9 +271,7 @@ class _Reader:
         """Raise the error of one value."""
         raise SynthesisError(f"{self._path}: {place}: found {found!r}. It {cure}.")
 
-    def require_known(
-        self, table: Mapping[str, Any], known: tuple[str, ...], *, place: str
-    ) -> None:
+    def require_known(self, table: Mapping[str, Any], known: Iterable[str], *, place: str) -> None:
         """Refuse keys that mean nothing, such as a misspelt one."""
         for key in table:
             if key not in known:
@@ -193,138 +281,53 @@ class _Reader:
                     f"{', '.join(known)}, or remove it."
                 )
 
-    def entries(self, document: Mapping[str, Any], kind: str) -> Mapping[str, Any]:
+    def table(self, found: object, *, place: str) -> dict[str, Any]:
+        """Return a table."""
+        if not isinstance(found, dict):
+            self.refuse(place, found, f"must be a table, [{place}]")
+        return found
+
+    def entries(self, document: Mapping[str, Any], kind: str) -> dict[str, dict[str, Any]]:
         """Return the tables of a kind by name; there must be one at least."""
-        found = document.get(kind, {})
-        if not isinstance(found, dict) or not found:
+        found = self.table(document.get(kind, {}), place=kind)
+        if not found:
             self.refuse(kind, found, f"must have one table at least, such as [{kind}.Name]")
-        for name, table in found.items():
+        for name in found:
             if not (name.isascii() and name.replace("_", "").isalnum()):
                 self.refuse(
                     f"{kind}.{name}", name, "must be named by letters, digits and underscores"
                 )
-            if not isinstance(table, dict):
-                self.refuse(f"{kind}.{name}", table, f"must be a table, [{kind}.{name}]")
-        return dict(found)
+        return {name: self.table(each, place=f"{kind}.{name}") for name, each in found.items()}
 
-    def map(self, table: dict[str, Any], *, place: str) -> MapAsset:
-        """Read a table of maps."""
-        known = ("file", "scale", "light", "bounds_m", "spawn_bounds_m")
-        self.require_known(table, known, place=place)
-        return MapAsset(
-            file=self._file(table, place=place),
-            scale=self._positive(table, "scale", place=place, default=1.0),
-            light=self._choice(table, "light", place=place, choices=get_args(Light)),
-            bounds_m=self._box(table, "bounds_m", place=place),
-            spawn_bounds_m=self._box(table, "spawn_bounds_m", place=place),
-        )
+    def values(self, table: Mapping[str, Any], rules: _Rules, *, place: str) -> dict[str, Any]:
+        """Return the values of a table that has only keys with a rule, in their types."""
+        self.require_known(table, rules, place=place)
+        values = {}
+        for key, value in table.items():
+            try:
+                values[key] = rules[key](value)
+            except ValueError as error:
+                self.refuse(f"{place}.{key}", value, str(error))
+        return values
 
-    def character(self, table: dict[str, Any], *, place: str) -> CharacterAsset:
-        """Read a table of characters."""
-        self.require_known(table, ("file", "scale", "forward"), place=place)
-        return CharacterAsset(
-            file=self._file(table, place=place),
-            scale=self._positive(table, "scale", place=place, default=1.0),
-            forward=self._choice(table, "forward", place=place, choices=get_args(Forward)),
-        )
+    def asset(self, table: Mapping[str, Any], rules: _Rules, *, place: str) -> dict[str, Any]:
+        """Return the values of a table that names a file, by its absolute path."""
+        values = self.values(table, rules, place=place)
+        if "file" not in values:
+            self.refuse(f"{place}.file", None, _NO_FILE)
+        return values | {"file": self._file(values["file"], place=f"{place}.file")}
 
-    def animation(self, table: dict[str, Any], *, place: str) -> AnimationAsset:
-        """Read a table of animations."""
-        self.require_known(table, ("file", "take", "rate_hz", "repeat"), place=place)
-        take = table.get("take")
-        if take is not None and not (isinstance(take, str) and take):
-            self.refuse(f"{place}.take", take, "must be the name of a take of the file")
-        return AnimationAsset(
-            file=self._file(table, place=place),
-            take=take,
-            rate_hz=(
-                self._positive(table, "rate_hz", place=place, default=0.0)
-                if "rate_hz" in table
-                else None
-            ),
-            repeat=self._choice(table, "repeat", place=place, choices=get_args(Repeat)),
-        )
-
-    def sensor(self, value: object, *, place: str) -> tuple[float, float]:
-        """Read the width and the height of a sensor."""
-        if not (isinstance(value, list) and len(value) == 2 and all(map(_is_positive, value))):
-            self.refuse(place, value, "must be [width, height] in mm, both positive")
-        return float(value[0]), float(value[1])
-
-    def settings(self, table: object) -> RenderSettings:
-        """Read the table of Cycles."""
-        if not isinstance(table, dict):
-            self.refuse("render", table, "must be a table, [render]")
-        known = ("samples_per_pixel", "device", "denoise", "threads")
-        self.require_known(table, known, place="render")
-        denoise = table.get("denoise", True)
-        if not isinstance(denoise, bool):
-            self.refuse("render.denoise", denoise, "must be true or false")
-        return RenderSettings(
-            samples_per_pixel=self._integer(table, "samples_per_pixel", default=64, low=1),
-            device=self._choice(table, "device", place="render", choices=get_args(Device)),
-            denoise=denoise,
-            threads=self._integer(table, "threads", default=0, low=0),
-        )
-
-    def _integer(self, table: Mapping[str, Any], key: str, *, default: int, low: int) -> int:
-        value = table.get(key, default)
-        if not isinstance(value, int) or isinstance(value, bool) or value < low:
-            self.refuse(f"render.{key}", value, f"must be a whole number of at least {low}")
-        return int(value)
-
-    def _choice(
-        self, table: Mapping[str, Any], key: str, *, place: str, choices: tuple[Any, ...]
-    ) -> Any:
-        value = table.get(key, choices[0])
-        if value not in choices:
-            self.refuse(f"{place}.{key}", value, f"must be one of {', '.join(choices)}")
-        return value
-
-    def _positive(self, table: Mapping[str, Any], key: str, *, place: str, default: float) -> float:
-        value = table.get(key, default)
-        if key in table and not _is_positive(value):
-            self.refuse(f"{place}.{key}", value, "must be a positive number")
-        return float(value)
-
-    def _box(self, table: Mapping[str, Any], key: str, *, place: str) -> Box | None:
-        value = table.get(key)
-        if value is None:
-            return None
-        is_box = (
-            isinstance(value, list)
-            and len(value) == 2
-            and all(
-                isinstance(corner, list) and len(corner) == 3 and all(map(_is_number, corner))
-                for corner in value
-            )
-        )
-        if not is_box or not all(low < high for low, high in zip(*value, strict=True)):
-            self.refuse(
-                f"{place}.{key}",
-                value,
-                "must be [[x, y, z], [x, y, z]] in metres of map axes, the smaller corner first",
-            )
-        low, high = (tuple(map(float, corner)) for corner in value)
-        return (low[0], low[1], low[2]), (high[0], high[1], high[2])
-
-    def _file(self, table: Mapping[str, Any], *, place: str) -> str:
+    def _file(self, name: str, *, place: str) -> str:
         """Return the absolute path of a file that exists inside the folder."""
-        name = table.get("file")
-        where = f"{place}.file"
-        if not isinstance(name, str) or not name:
-            self.refuse(where, name, f"must name a file ({', '.join(SUFFIXES)})")
-        if Path(name).suffix.lower() not in SUFFIXES:
-            self.refuse(where, name, f"must end in {', '.join(SUFFIXES)}; convert it with Blender")
-        path = self._inside(name, where=where)
+        path = self._inside(name, where=place)
         if not path.is_file():
-            self.refuse(where, name, f"must exist; there is no file {path}")
+            self.refuse(place, name, f"must exist; there is no file {path}")
         if path.suffix.lower() in (".glb", ".gltf"):
             for uri in gltf_uris(path):
-                referred = self._inside(str(path.parent / unquote(uri)), where=f"{where}: {name}")
+                referred = self._inside(str(path.parent / unquote(uri)), where=f"{place}: {name}")
                 if not referred.is_file():
                     raise SynthesisError(
-                        f"{self._path}: {where}: {name} refers to {uri!r}, which is missing. Copy "
+                        f"{self._path}: {place}: {name} refers to {uri!r}, which is missing. Copy "
                         f"it beside {name}, or export one .glb file."
                     )
         return str(path)
@@ -361,16 +364,13 @@ def gltf_uris(path: Path) -> list[str]:
 
 
 def _digest_of(path: Path) -> bytes:
-    digest = hashlib.sha256()
     with path.open("rb") as file:
-        while block := file.read(_CHUNK_BYTES):
-            digest.update(block)
-    return digest.digest()
+        return hashlib.file_digest(file, "sha256").digest()
 
 
 def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e9
 
 
-def _is_positive(value: object) -> bool:
+def _is_positive(value: object) -> TypeGuard[float]:
     return _is_number(value) and value > 0
