@@ -18,7 +18,6 @@ from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
 
 _CLIPS = (".mp4", ".gif")
-_RECORDINGS = (".rrd",)
 
 
 @grouped
@@ -37,7 +36,7 @@ def show(  # noqa: PLR0913 - one parameter an option
         typer.Option(
             "--out",
             "-o",
-            help="File to write: .png, .mp4, .gif, or .rrd [KEY.png].",
+            help="File to write: .png a sheet, .mp4 or .gif a clip, .rrd for Rerun [KEY.png].",
         ),
     ] = None,
     pair: Annotated[
@@ -48,16 +47,6 @@ def show(  # noqa: PLR0913 - one parameter an option
         int | None,
         typer.Option(min=1, max=2048, help="Width of each drawn picture, px [320]."),
     ] = None,
-    clip: Annotated[
-        bool, typer.Option("--clip", help="Write all frames as a clip [KEY.mp4].")
-    ] = False,
-    rerun: Annotated[
-        bool,
-        typer.Option(
-            "--rerun",
-            help="Write a recording for Rerun's viewer [KEY.rrd].",
-        ),
-    ] = False,
     live: Annotated[
         bool, typer.Option("--live", help="Open Rerun's viewer; write no file.")
     ] = False,
@@ -76,25 +65,26 @@ def show(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.selection.filters import find_scene
 
     cameras = None if pair is None else pair_of(pair, option="--pair")
-    if rerun or live or (out is not None and out.suffix.lower() in _RECORDINGS):
+    ending = ".png" if out is None else out.suffix.lower()
+    if live or ending == ".rrd":
         shown: dict[str, Any] = {
             "pair": cameras,
             "depth": {"unit_m": depth_unit_m, "accept": accept},
         }
         _show_in_rerun(source, scene, out, width_px=size, is_live=live, **shown)
         return
-    clip = clip or (out is not None and out.suffix.lower() in _CLIPS)
-    if out is not None and out.suffix.lower() not in (_CLIPS if clip else (".png",)):
-        wanted = "a clip is .mp4 or .gif" if clip else "a sheet is .png"
-        raise typer.BadParameter(f"{out}: {wanted}, by its ending.", param_hint="--out")
+    if ending not in (".png", *_CLIPS):
+        raise typer.BadParameter(
+            f"{out}: a sheet is .png, a clip .mp4 or .gif, a recording .rrd.", param_hint="--out"
+        )
     index = source.open()
     row = 0 if scene is None else find_scene(index, scene)
     recorded = index.scene(row)
     key = recorded.id.key
-    target = out or Path(key.replace("/", "_") + (".mp4" if clip else ".png"))
+    target = out or Path(key.replace("/", "_") + ".png")
     reader = SceneReader(index, depth=depth_of(index, unit_m=depth_unit_m, accept=accept))
     with writing(target):
-        if clip:
+        if ending in _CLIPS:
             with progress_bar("drawing", unit="frames") as progress:
                 scene_pictures.write_clip(
                     target,
@@ -122,9 +112,8 @@ def _show_in_rerun(
     from stereogenbench_data.bridges.rerun import view_live, write_recording
     from stereogenbench_data.selection.filters import find_scene
 
-    if out is not None and (is_live or out.suffix.lower() not in _RECORDINGS):
-        wanted = "--live writes no file" if is_live else "a recording is .rrd, by its ending"
-        raise typer.BadParameter(f"{out}: {wanted}.", param_hint="--out")
+    if is_live and out is not None:
+        raise typer.BadParameter(f"{out}: --live writes no file.", param_hint="--out")
     index = source.open()
     found = index.scene(0 if scene is None else find_scene(index, scene))
     key, rig = found.id.key, found.rig
