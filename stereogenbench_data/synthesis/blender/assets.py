@@ -178,7 +178,7 @@ def _size(value: object) -> tuple[float, float]:
     return float(value[0]), float(value[1])
 
 
-def _box(value: object) -> Box:
+def _box(value: Any) -> Box:
     match value:
         case [[x, y, z], [far_x, far_y, far_z]]:
             numbers = (x, y, z, far_x, far_y, far_z)
