@@ -114,13 +114,12 @@ def _lines(report: "DoctorReport") -> list[str]:
     matches = sum(scene.matches for scene in report.scenes)
     views = sum(scene.views for scene in report.scenes)
     lines = [
+        _headline(report),
         f"{report.data}: {counted(len(report.scenes), 'scene')}, {counted(views, 'view')}, "
-        f"{matches:,} pixels found in both pictures"
+        f"{matches:,} pixels found in both pictures",
     ]
     for key, reason in report.left_out.items():
         lines.append(f"left out: {key}: {reason}")
-    if not report.verdicts:
-        lines.append("NOT TESTED: no scene could be judged. Run `stereogenbench audit`.")
     if len(report.verdicts) > 1:
         lines.append(
             f"SCENES DIFFER: {len(report.verdicts)} verdicts follow."
@@ -143,6 +142,24 @@ def _lines(report: "DoctorReport") -> list[str]:
     if any(math.isfinite(scene.gain.mean_db) for scene in report.scenes):
         lines += ["", QUOTIENT_MEANS, _DB_NOTE]
     return lines + _world_lines(report)
+
+
+def _headline(report: "DoctorReport") -> str:
+    """Return the verdict on all scenes in one line."""
+    if not report.verdicts:
+        return "NOT TESTED: no scene could be judged. Run `stereogenbench audit`."
+    if report.is_wrong:
+        keys = {key for verdict in report.verdicts if verdict.is_wrong for key in verdict.scenes}
+        return (
+            f"WRONG: pictures contradict the declared contract or a camera's files in {len(keys)} "
+            f"of {counted(len(report.scenes), 'scene')}."
+        )
+    if all(verdict.fits for verdict in report.verdicts):
+        return "FITS: pictures confirm the declared contract, with all cameras tested."
+    problems = {scene.problem for scene in report.scenes}
+    if "" not in problems:
+        return f"CANNOT TELL: {'; '.join(sorted(problems))}."
+    return "CANNOT TELL everything: nothing contradicts the declared contract."
 
 
 def _world_lines(report: "DoctorReport") -> list[str]:
@@ -217,9 +234,7 @@ def _row(answer: "Answer") -> tuple[str, str, str, str, str]:
 
 
 def _gain_words(gain: "Gain") -> str:
-    return (
-        f"{gain.mean_db:.2f} dB (95 %: {gain.low_db:.2f} to {gain.high_db:.2f}, over {gain.over})"
-    )
+    return f"{gain.mean_db:.2f} dB (95 %: {gain.low_db:.2f} to {gain.high_db:.2f})"
 
 
 def _json(report: "DoctorReport") -> str:

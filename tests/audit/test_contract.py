@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from stereogenbench_data.audit.contract.cameras import CameraCheck, CameraFigures
 from stereogenbench_data.audit.contract.diagnosis import Rival, SceneDiagnosis
@@ -13,7 +15,7 @@ from stereogenbench_data.audit.contract.doctor import diagnose
 from stereogenbench_data.audit.contract.fitting import RayPower
 from stereogenbench_data.audit.contract.hypotheses import LAGS, Hypothesis
 from stereogenbench_data.audit.contract.matching import match_rows, relative_step
-from stereogenbench_data.audit.contract.scoring import Evidence, interval, pooled
+from stereogenbench_data.audit.contract.scoring import Evidence, pooled
 from stereogenbench_data.audit.contract.verdict import (
     QUOTIENT,
     TOPICS,
@@ -831,12 +833,15 @@ def test_every_exchange_of_two_cameras_is_requested_about():
             assert f"{words} {a} and {b} exchanged" in orders
 
 
-def test_an_interval_is_students():
-    mean, low, high = interval([1.0, 2.0, 3.0])
+@given(scenes=st.lists(st.tuples(st.floats(-9, 9), st.floats(0.01, 9)), min_size=1, max_size=5))
+def test_what_is_pooled_is_at_least_as_sure_as_each_part(scenes):
+    parts = [pooled([Evidence(*scene)]) for scene in scenes]
 
-    assert mean == 2.0
-    assert high - mean == pytest.approx(4.303 / math.sqrt(3))
-    assert mean - low == pytest.approx(high - mean)
+    gain = pooled([Evidence(*scene) for scene in scenes])
+
+    narrowest = min(part.high_db - part.low_db for part in parts)
+    assert gain.high_db - gain.low_db <= narrowest * (1 + 1e-9)
+    assert gain.low_db > 0 or not all(part.low_db > 0 for part in parts)
 
 
 @pytest.mark.parametrize(

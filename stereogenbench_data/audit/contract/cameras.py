@@ -31,12 +31,16 @@ MOST_COLUMNS_PX: Final = 0.4
 """Limits beyond which a camera differs from the others: scale of its depth, rows, columns."""
 _LEAST_DEFICIT: Final = 0.12
 """Least share of matches that a camera's pairs lack, compared with other pairs as wide."""
-_LEAST_ASYMMETRY: Final = 0.03
+_LEAST_ASYMMETRY: Final = 0.1
+"""Where rigs are wide, right depth of a camera explains up to 5 % less than that of the other."""
 _LEAST_GAIN: Final = 0.01
+_LEAST_CLOSED: Final = 1 / 3
+"""Least share of the points lacking that another reading of a camera's depth must explain."""
 _LEAST_LATER: Final = 0.03
 _LEAST_AWAY: Final = 0.25
 """Two depths of a point agree if their disparities differ by fewer pixels."""
-_GAIN_ERRORS: Final = 3.0
+_GAIN_ERRORS: Final = 5.0
+"""About 90 readings are tried in a scene, so 3 standard errors occur by chance."""
 _FEWEST_MATCHES: Final = 100
 _NARROWEST: Final = 2
 _ROWS_BESIDE: Final = 2
@@ -596,4 +600,5 @@ def _gain(
     if len(gains) < _NARROWEST + 1:
         return 0.0, False
     mean, error = float(gains.mean()), float(gains.std(ddof=1)) / math.sqrt(len(gains))
-    return mean, mean > max(_LEAST_GAIN, _GAIN_ERRORS * error)
+    lacking = 1 - float(np.nanmean(worse))
+    return mean, mean > max(_LEAST_GAIN, _LEAST_CLOSED * lacking, _GAIN_ERRORS * error)

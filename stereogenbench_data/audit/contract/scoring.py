@@ -7,7 +7,7 @@ scores in one scene; `pooled` takes several scenes together.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -27,13 +27,11 @@ LEAST_DB_ELSEWHERE: Final = 0.4
 """The same between contracts that read depth elsewhere (lag, order, flip) or in another form: with
 small disparities interpolation alone causes 0.3 dB between neighbouring lags."""
 LEAST_ERRORS: Final = 3.0
-_NORMAL_975: Final = 1.96
-_T_975: Final = (
-    12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160,
-    2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086, 2.080, 2.074, 2.069, 2.064, 2.060, 2.056,
-    2.052, 2.048, 2.045,
-)  # fmt: skip
-"""The 97.5 % point of Student's t for 1 to 29 degrees of freedom; 1.96 + 2.5 / n beyond."""
+NORMAL_975: Final = 1.96
+_FEW_VIEWS: Final = 1.8
+"""A standard error from n views counts 1 + 1.8 / (n - 1) times, as Student's t does within 10 % for
+4 views or more."""
+_LEAST_ERROR_DB: Final = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,13 +65,12 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class Gain:
-    """A mean difference in dB with its 95 % confidence interval.
+    """The difference in dB of one scene or of several, with its 95 % confidence interval.
 
     Attributes:
-        mean_db: The mean; nan if there is nothing to compare.
+        mean_db: The mean, weighted by how certain each scene is; nan for nothing to compare.
         low_db: Lower end.
         high_db: Upper end.
-        over: What varies in the interval: scenes or, for one scene, parts of its pictures.
         count: How many scenes were compared.
         is_clear: Whether the difference may be believed.
         by_shape: Whether the shape of disparity decides, however few dB it makes.
@@ -84,7 +81,6 @@ class Gain:
     mean_db: float
     low_db: float
     high_db: float
-    over: Literal["scenes", "parts of the pictures"]
     count: int
     is_clear: bool
     by_shape: bool = False
@@ -97,44 +93,49 @@ class Gain:
         return self.by_shape or self.low_db >= self.margin_db
 
 
-def t_975(freedom: int) -> float:
-    """Return the 97.5 % point of Student's t distribution."""
-    return _T_975[freedom - 1] if freedom <= len(_T_975) else _NORMAL_975 + 2.5 / freedom
+def weighted_mean(
+    values: Sequence[float], errors: Sequence[float], *, least: float
+) -> tuple[float, float]:
+    """Return the mean weighted by 1 / error^2, and its standard error; nan and inf for no values.
 
-
-def interval(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the mean of two values or more, and the ends of its 95 % interval by Student's t."""
-    array = np.asarray(values, dtype=np.float64)
-    mean = float(array.mean())
-    half = t_975(len(array) - 1) * float(array.std(ddof=1)) / math.sqrt(len(array))
-    return mean, mean - half, mean + half
+    It is at least as certain as each of its parts. Smaller errors count as ``least``.
+    """
+    if not len(values):
+        return math.nan, math.inf
+    floored = np.maximum(errors, least)
+    # Relative weights, so that errors that are all infinite still give the mean.
+    precision = (
+        (floored.min() / floored) ** 2 if np.isfinite(floored).any() else np.ones(len(values))
+    )
+    mean = float(precision @ np.asarray(values) / precision.sum())
+    return mean, float(floored.min() / math.sqrt(precision.sum()))
 
 
 def pooled(scenes: Sequence[Evidence]) -> Gain:
     """Return the mean over scenes.
 
-    It is clear if the interval over scenes is, or if it is clear in some scene and its opposite in
-    none: one scene rules out an answer for all with the same contract, even if the others show
-    nothing (such as a lag where nothing moves).
+    It is clear if it is clear in some scene and its opposite in none, or if the mean is: one scene
+    rules out an answer for all with the same contract, even if the others show nothing (such as a
+    lag where nothing moves).
     """
     tested = [scene for scene in scenes if math.isfinite(scene.mean_db)]
-    by_shape = any(scene.by_shape for scene in tested)
-    if len(tested) <= 1:
-        scene = tested[0] if tested else Evidence(math.nan, math.inf)
-        half = _NORMAL_975 * (scene.error_db if scene.wide_db is None else scene.wide_db)
-        ends = (scene.mean_db - half, scene.mean_db + half)
-        return Gain(
-            scene.mean_db, *ends, "parts of the pictures", len(tested), scene.is_clear(),
-            by_shape, scene.shape, scene.least_db,
-        )  # fmt: skip
-    mean, low, high = interval([scene.mean_db for scene in tested])
-    against = (replace(scene, mean_db=-scene.mean_db) for scene in tested if scene.by_shape is None)
-    opposed = any(scene.is_clear() for scene in against)
-    least_db = max(scene.least_db for scene in tested)
-    clear = (mean >= least_db and low > 0) or (
-        not opposed and any(scene.is_clear() for scene in tested)
+    wide_db = [scene.error_db if scene.wide_db is None else scene.wide_db for scene in tested]
+    mean_db, error_db = weighted_mean(
+        [scene.mean_db for scene in tested], wide_db, least=_LEAST_ERROR_DB
     )
-    return Gain(mean, low, high, "scenes", len(tested), clear, by_shape, margin_db=least_db)
+    low_db, high_db = mean_db - NORMAL_975 * error_db, mean_db + NORMAL_975 * error_db
+    least_db = max((scene.least_db for scene in tested), default=LEAST_DB)
+    against = (replace(scene, mean_db=-scene.mean_db) for scene in tested if scene.by_shape is None)
+    is_clear = any(scene.is_clear() for scene in tested) or (
+        len(tested) > 1 and mean_db >= least_db and low_db > 0
+    )
+    is_opposed = any(scene.is_clear() for scene in against)
+    return Gain(
+        mean_db, low_db, high_db, len(tested), is_clear and not is_opposed,
+        by_shape=any(scene.by_shape for scene in tested),
+        shape=next((scene.shape for scene in tested if scene.by_shape), None),
+        margin_db=least_db,
+    )  # fmt: skip
 
 
 _FEWEST_POINTS = 40
@@ -282,7 +283,8 @@ def evidence(
         errors.append(math.sqrt((parts - 1) * float(without.var())))
     if views >= 2:
         each = _mean_db(ours[None, :, 0], theirs[None, :, 0])
-        errors.append(float(each.std(ddof=1)) / math.sqrt(views) * t_975(views - 1) / t_975(99))
+        few = 1 + _FEW_VIEWS / (views - 1)
+        errors.append(few * float(each.std(ddof=1)) / math.sqrt(views))
     least_db = LEAST_DB if same_places else LEAST_DB_ELSEWHERE
     finite = [error for error in errors if math.isfinite(error)]
     return Evidence(

@@ -23,7 +23,13 @@ from stereogenbench_data.audit.contract.diagnosis import (
 )
 from stereogenbench_data.audit.contract.fitting import Free
 from stereogenbench_data.audit.contract.hypotheses import LAGS, QUESTIONS, Hypothesis, Question
-from stereogenbench_data.audit.contract.scoring import LEAST_ERRORS, Gain, interval, pooled
+from stereogenbench_data.audit.contract.scoring import (
+    LEAST_ERRORS,
+    NORMAL_975,
+    Gain,
+    pooled,
+    weighted_mean,
+)
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
@@ -286,14 +292,9 @@ def _common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
     bias = coarse if coarse > LEAST_LOG_SCALE else max(_BIAS, BIAS_PX / seen_px)
     if not fitted:
         return Unit(scenes[0].unit_m / scenes[0].scale, math.inf)
-    logs = np.array([math.log(scene.unit_m / scene.scale) for scene in fitted])
-    errors = np.array([max(scene.scale_error, 1e-4) for scene in fitted])
-    weights = errors**-2.0 / (errors**-2.0).sum()
-    half = 1.96 * float(np.sqrt((weights**2 * errors**2).sum()))
-    if len(fitted) > 2:
-        _, low, high = interval([float(log) for log in logs])
-        half = max(half, (high - low) / 2)
-    return Unit(math.exp(float(weights @ logs)), math.hypot(half, bias))
+    logs = [math.log(scene.unit_m / scene.scale) for scene in fitted]
+    log, error = weighted_mean(logs, [scene.scale_error for scene in fitted], least=1e-4)
+    return Unit(math.exp(log), math.hypot(NORMAL_975 * error, bias))
 
 
 def _length_answers(scenes: Sequence[SceneDiagnosis], unit: Unit) -> tuple[Answer, ...]:
@@ -403,7 +404,7 @@ def _kind_explains_scale(scenes: Sequence[SceneDiagnosis]) -> bool:
 def _focal_reading(scenes: Sequence[SceneDiagnosis], unit: Unit) -> str | None:
     """Return the reading of the sensor that gives the quotient found, None if there is none."""
     first = scenes[0]
-    tolerance = max(LEAST_ERRORS * unit.uncertainty / 1.96, _LEAST_TOLERANCE)
+    tolerance = max(LEAST_ERRORS * unit.uncertainty / NORMAL_975, _LEAST_TOLERANCE)
     may_be = [
         words
         for words in first.focal_ratios
