@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import warnings
 
@@ -328,7 +329,8 @@ def test_what_the_content_does_not_tell_is_said_to_be_not_testable(
 ):
     report = made_wrong(indexed_release, tmp_path, change)
 
-    told = {each["check"] for each in report.to_json()["untested"] if each["of"] == ""}
+    told = {each["check"] for each in report.to_json()["untested"]
+            if not re.search(r"camera \d", each["found"])}  # fmt: skip
     rows = {row.check for row in report.rows if "not testable" in row.ours}
     assert checks <= told
     assert checks <= rows

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt16
 from numpy.lib.stride_tricks import sliding_window_view
 
 from stereogenbench_data.audit.contract.hypotheses import LAGS, Flip, Hypothesis
-from stereogenbench_data.audit.geometry.picture_check import Luma, luma_of
+from stereogenbench_data.audit.geometry.picture_check import Luma, band_passed, luma_of
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.samples.streams import Streams
@@ -191,8 +191,6 @@ _Prediction = tuple[Points, Bool[np.ndarray, " n"]]
 _Numbers = tuple[UInt16[np.ndarray, " n"], Bool[np.ndarray, " n"]]
 
 
-_BLUR: Final = np.array([1, 4, 6, 4, 1], dtype=np.float32) / 16
-_MEAN_RADIUS_PX: Final = 6
 _MOST_POINTS: Final = 2000
 _MOST_DEPTH_BYTES: Final = 96 * 2**20
 """How much decoded depth is kept: every lag of every camera for small pictures."""
@@ -504,30 +502,6 @@ def relative_step(numbers: UInt16[np.ndarray, " n"]) -> float:
     shares = np.where(np.isfinite(nearest), nearest, 1.0) / np.maximum(values, 1)
     order = shares.argsort()
     return float(shares[order][np.searchsorted(counts[order].cumsum(), 0.75 * len(numbers))])
-
-
-def band_passed(luma: Luma) -> Luma:
-    """Return grey levels blurred a little, less their mean over 13 x 13 pixels."""
-    blurred, mean = luma, luma
-    box = np.full(2 * _MEAN_RADIUS_PX + 1, 1 / (2 * _MEAN_RADIUS_PX + 1), dtype=np.float32)
-    for axis in (0, 1):
-        blurred = _along(blurred, _BLUR, axis=axis)
-        mean = _along(mean, box, axis=axis)
-    band: Luma = blurred - mean
-    return band
-
-
-def _along(picture: Luma, taps: Float32[np.ndarray, " k"], *, axis: int) -> Luma:
-    """Return a picture convolved along one axis, with its border repeated."""
-    radius = len(taps) // 2
-    margins = [(radius, radius) if each == axis else (0, 0) for each in (0, 1)]
-    padded = np.pad(picture, margins, mode="edge")
-    length = picture.shape[axis]
-    moved = (padded.take(range(start, start + length), axis=axis) for start in range(len(taps)))
-    total: Luma = np.zeros_like(picture)
-    for tap, shifted in zip(taps, moved, strict=True):
-        total += tap * shifted
-    return total
 
 
 def _require_size(found: Sequence[int], expected: tuple[int, int], *, where: str) -> None:

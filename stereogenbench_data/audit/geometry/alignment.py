@@ -25,7 +25,6 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float, Float64
 
-from stereogenbench_data.audit.geometry.picture_check import luma_of
 from stereogenbench_data.audit.geometry.records import Alignment, Estimate, PairFit
 from stereogenbench_data.audit.geometry.reprojection import MeasuredDepth
 from stereogenbench_data.geometry.camera import Intrinsics
@@ -317,6 +316,7 @@ class _Fit:
             value=value,
             error=float(np.sqrt((scores**2).sum())) / total,
             explained=float((before - after).sum()),
+            share=1 - float(after.sum()) / max(float(before.sum()), 1e-12),
         )
 
 
@@ -406,7 +406,7 @@ class AlignmentCheck:
         columns["focal"] = (across + down, none)
         if check == "motion":
             columns |= {"focal_x": (across, none), "focal_y": (down, none)}
-            del columns["shift_x"], columns["shift_y"]
+            del columns["shift_x"], columns["shift_y"], columns["ray"]
         # Coarse steps make a point count less; rounding moves it by 0.3 of one.
         weight = 1 / (1 + (landed.steps[keep] / _TOLERANCE) ** 2)
         sums.add(landed.off[keep], weight, self._cells(landed, keep), columns)
@@ -490,9 +490,7 @@ class AlignmentCheck:
             self._depth, "depth", of_cameras=("scale", "ray", "shift_x", "shift_y"),
             of_all=("ray", "focal"),
         )  # fmt: skip
-        motion = _explained(
-            self._motion, "motion", of_all=("scale", "ray", "focal", "focal_x", "focal_y")
-        )
+        motion = _explained(self._motion, "motion", of_all=("scale", "focal", "focal_x", "focal_y"))
         faulty = {each.camera for each in depth if each.is_first}
         clean = {pair: sums for pair, sums in self._pictures.items() if not faulty & set(pair)}
         pictures = _explained(
@@ -540,7 +538,12 @@ def _explained(
         if not certain:
             break
         best = max(certain, key=lambda each: each.explained)
-        first.append(replace(best, is_first=True))
+        others = [each for each in certain if each is not best and each.explained > 0]
+        next_best = max(
+            (each.explained for each in others if not _is_part(best, each)), default=0.0
+        )
+        best = replace(best, is_first=True, next_best=next_best / best.explained)
+        first.append(best)
         if best.camera == _OF_ALL:
             break
         left = {pair: each for pair, each in left.items() if best.camera not in pair}
@@ -548,21 +551,10 @@ def _explained(
     return first + [each for each in estimates if (each.what, each.camera) not in known]
 
 
-def band(picture: Any) -> Float[np.ndarray, "h w"]:
-    """Return grey levels of a (3, h, w) picture, slightly blurred, less their mean over 13 px."""
-    blurred = mean = luma_of(picture)
-    for _ in range(2):
-        # Each turn filters down the columns, and transposes.
-        size = len(blurred)
-        padded = np.pad(blurred, ((2, 2), (0, 0)), mode="edge")
-        near, far = padded[1:-3] + padded[3:-1], padded[:-4] + padded[4:]
-        blurred = np.ascontiguousarray((padded[2:-2] * 6 + near * 4 + far).T)
-        ones = np.pad(mean, ((6, 6), (0, 0)), mode="edge")
-        twos = ones[:-1] + ones[1:]
-        fours = twos[:-2] + twos[2:]
-        eights = fours[:-4] + fours[4:]
-        mean = np.ascontiguousarray((eights[:size] + fours[8 : 8 + size] + ones[12:]).T)
-    return blurred / np.float32(16**2) - mean / np.float32(13**2)
+def _is_part(best: Estimate, other: Estimate) -> bool:
+    """Tell whether an estimate explains only what it has in common with a better one."""
+    whats = {best.what, other.what}
+    return whats <= {"focal", "focal_x", "focal_y"} and "focal" in whats
 
 
 def _sampled(picture: Any, u_px: Points, v_px: Points) -> tuple[Points, Points, Points]:

@@ -41,7 +41,7 @@ from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import MissingObject
 
 DEFAULT_FRAMES: Final = 5
-_FORMAT: Final = 3
+_FORMAT: Final = 4
 _KEY_FILTERS: Final = {"split": "split", "subset": "subset", "family": "family",
                        "map": "map_name", "scenes": "key"}  # fmt: skip
 

@@ -15,9 +15,8 @@ from stereogenbench_data.audit.geometry.records import (
     Finding,
     PairFit,
     SceneAudit,
-    Untested,
 )
-from stereogenbench_data.schema.release import ADJACENT_PAIRS, CAMERA_COUNT, depth_name, rgb_name
+from stereogenbench_data.schema.release import CAMERA_COUNT, depth_name, rgb_name
 
 
 def findings_of(scene: SceneAudit, limits: AuditLimits) -> list[Finding]:
@@ -59,12 +58,19 @@ def _rig_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
         if value > limit:
             text = f"{what} {value:.3g} {unit} (limit {limit:g})"
             yield Finding(scene.key, "", check, text)
+    through = {
+        (fit.left, fit.right) for fit in scene.alignment.pairs
+        if fit.see_through > limits.see_through
+    }  # fmt: skip
     for pair in scene.pairs:
-        limit = limits.agreement
-        if pair is not primary and (pair.left, pair.right) not in ADJACENT_PAIRS:
-            narrow = max(1.0, _NARROW_PX / scene.alignment.width_px)
-            limit = 1 - (1 - limits.agreement_long) * narrow
-        if pair.agreement < limit:
+        cameras = min(pair.left, pair.right), max(pair.left, pair.right)
+        is_long = cameras == (0, CAMERA_COUNT - 1)
+        name = "agreement_long" if is_long else "agreement"
+        limit = getattr(limits, name)
+        # Depths also disagree at edges, of which small pictures and wide rigs have many: alone that
+        # breaks only a limit that the user has set.
+        is_set = limit != getattr(AuditLimits(), name)
+        if pair.agreement < limit and (cameras in through or is_set):
             text = (
                 f"the two depths agree at {pair.agreement:.1%} of the pixels of camera {pair.left} "
                 f"that nothing hides from camera {pair.right} (limit {limit:.0%})"
@@ -72,8 +78,15 @@ def _rig_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
             yield Finding(scene.key, "", "agreement", text)
 
 
-_NARROW_PX: Final = 128
-"""In narrower pictures a larger share of the pixels lies at edges."""
+_LEAST_EXPLAINED: Final = 0.35
+"""Least share of the squares that a cause must explain."""
+_GROSS: Final = 0.2
+"""A factor of a length and a share of the squares that moving things do not cause."""
+_NEXT_BEST: Final = 0.85
+"""A cause is named if no other one explains this share of what it explains."""
+_MOST_FACTOR: Final = 0.5
+"""Larger factors explain depth that has nothing to do with the poses or baselines."""
+_FITS: Final = "from frame to frame, depth and poses fit if"
 _SHARP_PX: Final = 256
 """In narrower pictures, sampling between pixels is less accurate."""
 _OWN_MOTION_PX: Final = 0.03
@@ -100,13 +113,20 @@ def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Find
             f"at {moved:.0%} of its points (limit {limits.moved_through:.0%})"
         )
         yield Finding(scene.key, "", "motion", text)
+    first = [each for each in found.estimates if each.is_first]
     has_wrong_depth = bool(through) or any(
-        each.is_first and each.check == "depth" and each.what != "focal" for each in found.estimates
+        each.check == "depth" and each.what != "focal" for each in first
     )
-    for each in found.estimates:
-        # Depth that contradicts itself cannot confirm a focal length.
-        if each.is_first and not (has_wrong_depth and each.check == "motion"):
-            yield from _estimate_findings(scene, each, limits)
+    all_late = any(camera < 0 and gain > limits.picture_lag for camera, _, gain in found.lags)
+    for each in first:
+        # Depth that contradicts itself or the poses cannot confirm a length, nor can pictures of
+        # another moment.
+        is_explained = (
+            each.check == "motion" and (has_wrong_depth or moved > limits.moved_through)
+        ) or (each.check == "pictures" and each.what == "scale" and all_late)
+        limit = limit_of(scene, each, limits)
+        if not is_explained and abs(each.value) > max(limit, CERTAIN * each.error):
+            yield from _estimate_finding(scene, each, limit)
     for camera, lag, gained in found.lags:
         if gained > limits.picture_lag:
             of = "all cameras" if camera < 0 else f"camera {camera}"
@@ -168,8 +188,6 @@ def limit_of(scene: SceneAudit, each: Estimate, limits: AuditLimits) -> float:
         }  # fmt: skip
         return by_name.get(each.what, limits.depth_shift_px)
     if each.check == "motion":
-        if each.what == "ray":
-            return limits.depth_ray
         # The less the camera moves, the more do moving objects disturb the estimate.
         return max(limits.focal, _OWN_MOTION_PX / max(scene.alignment.moved_px, 1e-6))
     if each.what == "shift_y":
@@ -184,23 +202,22 @@ _STILL_PX: Final = 1.0
 _ENOUGH: Final = 1000
 
 
-def untested_of(scene: SceneAudit, limits: AuditLimits) -> list[Untested]:
+def untested_of(scene: SceneAudit, limits: AuditLimits) -> list[Finding]:
     """Return the checks of `alignment` that the content of a scene does not allow."""
     found = scene.alignment
-    untested: list[tuple[str, str, str, str]] = []
+    untested: list[tuple[str, str]] = []
     blind = _cameras_without(found.pairs, "see_through")
     if blind:
-        untested.append(
-            ("depth consistency", "", _cameras(blind), "too few points of smooth surfaces")
-        )
+        why = f"{_cameras(blind)}: too few points of smooth surfaces"
+        untested.append(("depth consistency", why))
     if found.moved_smooth < _ENOUGH:
-        untested.append(("motion", "", "", "too few points of smooth surfaces, or one frame"))
+        untested.append(("motion", "too few points of smooth surfaces, or one frame"))
     elif found.moved_px < _STILL_PX:
         why = f"points move by {found.moved_px:.2f} px from one audited frame to the next"
-        untested.append(("motion", "", "", why))
+        untested.append(("motion", why))
     blind = _cameras_without(found.pairs, "correlation")
     if blind:
-        untested.append(("picture content", "", _cameras(blind), "no texture, or no depth"))
+        untested.append(("picture content", f"{_cameras(blind)}: no texture, or no depth"))
     late = [
         camera for camera in range(CAMERA_COUNT)
         if min((gain for of, _, gain in found.lags if of == camera), default=0.0)
@@ -208,19 +225,18 @@ def untested_of(scene: SceneAudit, limits: AuditLimits) -> list[Untested]:
     ]  # fmt: skip
     if late:
         why = "pictures of the neighbouring frames fit as well, or there are none"
-        untested.append(("picture time", "", _cameras(late), why))
+        untested.append(("picture time", f"{_cameras(late)}: {why}"))
     untested += _untested_fits(scene, limits)
-    return [Untested(scene.key, *each) for each in untested]
+    return [Finding(scene.key, "", *each) for each in untested]
 
 
-def _untested_fits(scene: SceneAudit, limits: AuditLimits) -> Iterator[tuple[str, str, str, str]]:
-    """Yield the quantities whose limit is below what can be seen in this scene."""
+def _untested_fits(scene: SceneAudit, limits: AuditLimits) -> Iterator[tuple[str, str]]:
+    """Yield the quantities of which an error as large as the limit would not be certain."""
     for check, whats in (
         ("depth", ("scale", "ray", "shift_x", "shift_y")),
         ("motion", ("scale", "focal", "focal_x", "focal_y")),
         ("pictures", ("scale", "shift_x", "shift_y")),
     ):
-        of_check = [each for each in scene.alignment.estimates if each.check == check]
         for what in whats:
             limit = least = limit_of(scene, Estimate(check, what, -1), limits)
             if (check, what) == ("pictures", "scale"):
@@ -229,15 +245,18 @@ def _untested_fits(scene: SceneAudit, limits: AuditLimits) -> Iterator[tuple[str
                 limit = limits.focal
             seen = {
                 each.camera: max(least, CERTAIN * each.error)
-                for each in of_check if each.what == what and not math.isnan(each.error)
-            }  # fmt: skip
-            wanted = {each.camera for each in of_check if each.what == what} or {-1}
-            blind = sorted(camera for camera in wanted if not seen.get(camera, math.inf) <= limit)
-            if blind:
-                from_on = max(seen.get(camera, math.inf) for camera in blind)
-                why = "no estimate" if math.isinf(from_on) else f"seen from {from_on:.2g} on"
+                if math.isfinite(each.error)
+                else math.inf
+                for each in scene.alignment.estimates
+                if (each.check, each.what) == (check, what)
+            }
+            blind = [camera for camera, size in seen.items() if not size <= limit]
+            if blind or not seen:
+                from_on = max((seen[camera] for camera in blind), default=math.inf)
+                why = f"seen from {from_on:.2g} on" if math.isfinite(from_on) else "no estimate"
                 of = _cameras([camera for camera in blind if camera >= 0])
-                yield f"{check} fit", QUANTITIES[what], of, f"{why} (limit {limit:.2g})"
+                subject = f"{QUANTITIES[what]}{f' of {of}' if of else ''}"
+                yield f"{check} fit", f"{subject}: {why} (limit {limit:.2g})"
 
 
 def _cameras_without(pairs: tuple[PairFit, ...], figure: str) -> list[int]:
@@ -249,48 +268,55 @@ def _cameras_without(pairs: tuple[PairFit, ...], figure: str) -> list[int]:
 
 
 def _cameras(numbers: list[int]) -> str:
-    some = 0 < len(numbers) < CAMERA_COUNT
-    return f"camera {', '.join(map(str, numbers))}" if some else ""
+    if len(numbers) == CAMERA_COUNT:
+        return "all cameras"
+    return f"camera {', '.join(map(str, sorted(numbers)))}" if numbers else ""
 
 
-def _estimate_findings(scene: SceneAudit, each: Estimate, limits: AuditLimits) -> Iterator[Finding]:
-    of, name = "all cameras", ""
-    if each.camera >= 0:
-        of = f"camera {each.camera}"
-        name = depth_name(each.camera) if each.check == "depth" else rgb_name(each.camera)
-    if each.check == "depth":
-        what = {
-            "scale": f"differs from that of the others by {each.value:+.2%}",
-            "ray": f"is {each.value:.0%} of the way from the axis to along the ray",
-        }.get(
-            each.what,
-            f"is {each.value:+.2f} px {_SHIFTS.get(each.what, '')} of where the others see it",
-        )
-        text = f"depth of {of} {what}"
-        if each.what == "focal":
-            text = (
-                f"between cameras, depth fits if the focal length, or all baselines, are corrected "
-                f"{-each.value:+.2%}"
-            )
-    elif each.check == "motion":
-        what = {
-            "scale": "the unit of depth or of poses",
-            "ray": "depth along the ray, by",
-            "focal": "the focal length",
-            "focal_x": "the horizontal focal length (sensor width)",
-            "focal_y": "the vertical focal length (sensor height)",
-        }[each.what]
-        text = f"from frame to frame, depth and poses fit if {what} is corrected {-each.value:+.2%}"
-    else:
-        text = (
-            f"pictures of {of} are {each.value * scene.alignment.picture_px:+.2f} px "
-            f"{_SHIFTS[each.what]} of where depth and the others put them"
-            if each.what in _SHIFTS
-            else f"disparity of the pictures differs from that of depth by {each.value:+.2%}"
-        )
-    limit = limit_of(scene, each, limits)
-    if abs(each.value) > limit and abs(each.value) > CERTAIN * each.error:
-        yield Finding(scene.key, name, f"{each.check} fit", f"{text} (limit {limit:.3g})")
+def _estimate_finding(scene: SceneAudit, each: Estimate, limit: float) -> Iterator[Finding]:
+    """Yield the finding of an estimate that explains what it is blamed for, with its interval."""
+    is_gross = each.check == "motion" and min(abs(each.value), each.share) > _GROSS
+    is_explained = each.check == "pictures" or each.share >= _LEAST_EXPLAINED
+    if not (is_explained or is_gross):
+        return
+    of = "all cameras" if each.camera < 0 else f"camera {each.camera}"
+    name_of = rgb_name if each.check == "pictures" else depth_name
+    name = "" if each.camera < 0 else name_of(each.camera)
+    half = 1.96 * each.error
+    factor = f"{-each.value:+.2%} ± {half:.2%}"
+    px = scene.alignment.picture_px if each.check == "pictures" else 1.0
+    pixels = f"{each.value * px:+.2f} ± {half * px:.2f} px"
+    cause = {
+        ("depth", "scale"): f"depth of {of} differs from that of the others by "
+        f"{each.value:+.2%} ± {half:.2%}",
+        ("depth", "ray"): f"depth of {of} is {each.value:.0%} ± {half:.0%} of the way from the "
+        f"axis to along the ray",
+        ("depth", "shift_x"): f"depth of {of} is {pixels} to the right of where the others see it",
+        ("depth", "shift_y"): f"depth of {of} is {pixels} down of where the others see it",
+        ("depth", "focal"): f"between cameras, depth fits if the focal length, or all baselines, "
+        f"are corrected {factor}",
+        ("motion", "scale"): f"{_FITS} the unit of depth or of poses is corrected {factor}",
+        ("motion", "focal"): f"{_FITS} the focal length is corrected {factor}",
+        ("motion", "focal_x"): f"{_FITS} the horizontal focal length (sensor width) is corrected "
+        f"{factor}",
+        ("motion", "focal_y"): f"{_FITS} the vertical focal length (sensor height) is corrected "
+        f"{factor}",
+        ("pictures", "scale"): f"disparity of the pictures differs from that of depth by "
+        f"{each.value:+.2%} ± {half:.2%}",
+        ("pictures", "shift_x"): f"pictures of {of} are {pixels} to the right of where depth and "
+        f"the others put them",
+        ("pictures", "shift_y"): f"pictures of {of} are {pixels} down of where depth and the "
+        f"others put them",
+    }[each.check, each.what]  # fmt: skip
+    excess = abs(each.value)
+    if each.what == "ray":
+        excess = abs(each.value - 1)
+    elif each.what.startswith("shift") or (each.check == "depth" and each.what == "scale"):
+        excess = 0.0
+    if not is_explained or each.next_best > _NEXT_BEST or excess > _MOST_FACTOR:
+        where = "audited frames" if each.check == "motion" else "cameras"
+        cause = f"{each.check} does not fit between {where}, and no single cause explains it"
+    yield Finding(scene.key, name, f"{each.check} fit", f"{cause} (limit {limit:.3g})")
 
 
 def _rgb_findings(

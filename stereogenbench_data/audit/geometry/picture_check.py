@@ -32,6 +32,24 @@ def luma_of(picture: UInt8[np.ndarray, "3 h w"]) -> Luma:
     return luma
 
 
+def band_passed(luma: Luma) -> Luma:
+    """Return grey levels blurred a little, less their mean over 13 x 13 pixels."""
+    blurred = mean = luma
+    for _ in range(2):
+        # Each turn filters down the columns, and transposes.
+        size = len(blurred)
+        padded = np.pad(blurred, ((2, 2), (0, 0)), mode="edge")
+        near, far = padded[1:-3] + padded[3:-1], padded[:-4] + padded[4:]
+        blurred = np.ascontiguousarray((padded[2:-2] * 6 + near * 4 + far).T)
+        ones = np.pad(mean, ((6, 6), (0, 0)), mode="edge")
+        twos = ones[:-1] + ones[1:]
+        fours = twos[:-2] + twos[2:]
+        eights = fours[:-4] + fours[4:]
+        mean = np.ascontiguousarray((eights[:size] + fours[8 : 8 + size] + ones[12:]).T)
+    band: Luma = blurred / np.float32(16**2) - mean / np.float32(13**2)
+    return band
+
+
 @dataclass(slots=True)
 class Least:
     """The least of some figures, and its frame."""

@@ -232,7 +232,9 @@ class Estimate:
         value: The estimate, nan if it cannot be estimated.
         error: Its standard error.
         explained: The weighted sum of squares that it explains.
+        share: The share of all squares at these points.
         is_first: Whether it explained most in its round of `alignment`.
+        next_best: What the next best parameter explains alone, over what this one does.
     """
 
     check: str
@@ -241,7 +243,9 @@ class Estimate:
     value: float = math.nan
     error: float = math.nan
     explained: float = math.nan
+    share: float = math.nan
     is_first: bool = False
+    next_best: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,7 +337,14 @@ class SceneAudit:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A figure beyond its limit, or a file that cannot be read."""
+    """A figure beyond its limit, a file that cannot be read, or a check that was not testable.
+
+    Attributes:
+        scene: The scene's key.
+        member: The file; empty for none.
+        check: The check.
+        found: What was found, or why the scene's content does not allow the check.
+    """
 
     scene: str
     member: str
@@ -353,34 +364,6 @@ QUANTITIES: Final = {
     "focal_x": "the sensor's width", "focal_y": "the sensor's height",
 }  # fmt: skip
 """What an `Estimate` estimates, in words."""
-
-
-@dataclass(frozen=True, slots=True)
-class Untested:
-    """A check that the content of a scene does not allow.
-
-    Attributes:
-        scene: The scene's key.
-        check: The check.
-        quantity: Which of `QUANTITIES` cannot be estimated; empty for the whole check.
-        of: The cameras concerned; empty for all.
-        why: The reason, or the smallest value that would be seen.
-    """
-
-    scene: str
-    check: str
-    quantity: str
-    of: str
-    why: str
-
-    @property
-    def what(self) -> str:
-        """The quantity and the cameras that were not tested."""
-        return " of ".join(part for part in (self.quantity, self.of) if part) or "all cameras"
-
-    def __str__(self) -> str:
-        """Return it as one line."""
-        return f"{self.scene}: {self.check}: {self.what}: {self.why}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -420,7 +403,7 @@ class AuditReport:
     limits: AuditLimits
     rows: tuple[AuditRow, ...]
     findings: tuple[Finding, ...]
-    untested: tuple[Untested, ...]
+    untested: tuple[Finding, ...]
     notes: tuple[str, ...]
     scenes: tuple[SceneAudit, ...]
 

@@ -11,12 +11,14 @@ from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 
-from stereogenbench_data.audit.geometry.alignment import AlignmentCheck, band
+from stereogenbench_data.audit.geometry.alignment import AlignmentCheck
 from stereogenbench_data.audit.geometry.picture_check import (
     MOVED_SHARE,
     LightCheck,
     PayloadCheck,
+    band_passed,
     border_occluder,
+    luma_of,
     reduced_size,
     subject_m,
 )
@@ -317,7 +319,7 @@ class _SceneCheck:
             found = kept[at]
             if found is None:
                 picture = self.files.attempt(rgb_name(camera), self.files.picture, camera, at)
-                found = None if picture is None else (picture, band(picture))
+                found = None if picture is None else (picture, band_passed(luma_of(picture)))
             if found is not None:
                 self.seen[camera, at] = found
         shown = self.seen.get((camera, frame))

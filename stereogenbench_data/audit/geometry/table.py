@@ -18,7 +18,6 @@ from stereogenbench_data.audit.geometry.records import (
     PairAudit,
     SceneAudit,
     ToleranceAudit,
-    Untested,
 )
 from stereogenbench_data.audit.geometry.reprojection import TOLERANCES
 from stereogenbench_data.audit.geometry.scene_audit import LONG_PAIR
@@ -38,7 +37,7 @@ def table_rows(
     limits: AuditLimits,
     *,
     findings: Sequence[Finding],
-    untested: Sequence[Untested],
+    untested: Sequence[Finding],
 ) -> tuple[AuditRow, ...]:
     """Return the table of an audit over scenes."""
     return (
@@ -161,7 +160,7 @@ _SIZES: Final = (
 
 
 def _alignment_rows(
-    scenes: Sequence[SceneAudit], limits: AuditLimits, untested: Sequence[Untested]
+    scenes: Sequence[SceneAudit], limits: AuditLimits, untested: Sequence[Finding]
 ) -> Iterator[AuditRow]:
     found = [scene.alignment for scene in scenes]
     pairs = [pair for each in found for pair in each.pairs]
@@ -171,13 +170,13 @@ def _alignment_rows(
     def row(
         check: str, quantity: str, ours: str, limit: str, whats: Sequence[str] = ()
     ) -> AuditRow:
-        names = {QUANTITIES[what] for what in whats} or {""}
-        blind = [each for each in untested if each.check == check and each.quantity in names]
-        if blind and len(scenes) == 1:
-            ours = f"{ours}; not testable: {', '.join(each.what for each in blind)}"
-        elif blind:
-            keys = {each.scene for each in blind}
-            ours = f"{ours}; not testable in {len(keys)} of {counted(len(scenes), 'scene')}"
+        names = tuple(QUANTITIES[what] for what in whats) or ("",)
+        blind = {
+            each.scene for each in untested
+            if each.check == check and each.found.startswith(names)
+        }  # fmt: skip
+        if blind:
+            ours = f"{ours}; not testable in {len(blind)} of {counted(len(scenes), 'scene')}"
         return AuditRow(check, quantity, ours, "", limit)
 
     yield row(
@@ -186,10 +185,11 @@ def _alignment_rows(
     )  # fmt: skip
     for check, kind, quantity, whats, name in _SIZES:
         sizes = [
-            abs(each.value) for of_scene in found for each in of_scene.estimates
+            (abs(each.value), each.error) for of_scene in found for each in of_scene.estimates
             if each.check == kind and each.what in whats and abs(each.value) > CERTAIN * each.error
         ]  # fmt: skip
-        ours = f"{max(sizes, default=0.0):.2g}"
+        size, error = max(sizes, default=(0.0, 0.0))
+        ours = f"{size:.2g} ± {1.96 * error:.2g}" if sizes else "none"
         limit = f"{getattr(limits, name):g}"
         yield row(check, f"{quantity}, largest that is certain", ours, limit, whats)
     yield row(
