@@ -239,6 +239,7 @@ def _gain_words(gain: "Gain") -> str:
 
 def _json(report: "DoctorReport") -> str:
     from stereogenbench_data.audit.contract.verdict import encoding_line
+    from stereogenbench_data.audit.geometry.records import plain
 
     verdicts = []
     for verdict in report.verdicts:
@@ -257,15 +258,4 @@ def _json(report: "DoctorReport") -> str:
         "scenes": scenes,
         "left_out": report.left_out,
     }
-    return json.dumps(_plain(document), indent=2)
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON has it; numbers that are not finite become null."""
-    if isinstance(value, dict):
-        return {str(name): _plain(each) for name, each in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [_plain(each) for each in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return json.dumps(plain(document), indent=2)

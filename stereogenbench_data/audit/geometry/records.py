@@ -414,10 +414,10 @@ class AuditReport:
 
 
 def plain(value: Any) -> Any:
-    """Return a value with None in place of every nan and infinity in it."""
+    """Return a value as JSON has it, with None in place of every nan and infinity in it."""
     if isinstance(value, dict):
-        return {key: plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
+        return {str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple | frozenset):
         return [plain(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
