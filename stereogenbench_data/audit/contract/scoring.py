@@ -28,9 +28,8 @@ LEAST_DB_ELSEWHERE: Final = 0.4
 small disparities interpolation alone causes 0.3 dB between neighbouring lags."""
 LEAST_ERRORS: Final = 3.0
 NORMAL_975: Final = 1.96
-_FEW_VIEWS: Final = 1.8
-"""A standard error from n views counts 1 + 1.8 / (n - 1) times, as Student's t does within 10 % for
-4 views or more."""
+_FEW_VIEWS: Final = 1.2
+"""A standard error from n views counts 1 + 1.2 / (n - 2) times, which is Student's t to 2 %."""
 _LEAST_ERROR_DB: Final = 1e-3
 
 
@@ -281,9 +280,9 @@ def evidence(
     if parts >= _FEWEST_CELLS:
         without = _mean_db(ours - sums[0][:, used], theirs - sums[1][:, used])
         errors.append(math.sqrt((parts - 1) * float(without.var())))
-    if views >= 2:
+    if views >= 3:
         each = _mean_db(ours[None, :, 0], theirs[None, :, 0])
-        few = 1 + _FEW_VIEWS / (views - 1)
+        few = 1 + _FEW_VIEWS / (views - 2)
         errors.append(few * float(each.std(ddof=1)) / math.sqrt(views))
     least_db = LEAST_DB if same_places else LEAST_DB_ELSEWHERE
     finite = [error for error in errors if math.isfinite(error)]
