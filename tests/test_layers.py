@@ -80,6 +80,19 @@ def test_a_module_that_does_not_need_torch_starts_without_it(module):
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def test_what_no_first_sample_needs_is_not_imported_with_the_package():
+    unneeded = {
+        "pyarrow.compute", "pyarrow.dataset", "pyarrow.fs", "pyarrow.parquet", "urllib3", "fsspec",
+        "huggingface_hub", "pandas", "PIL", "rich", "typer", "blosc2",
+        "stereogenbench_data.index.build", "stereogenbench_data.sources.web",
+    }  # fmt: skip
+    code = "import sys; from stereogenbench_data import StereoPairs; print(*sys.modules)"
+
+    imported = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True).stdout
+
+    assert unneeded.isdisjoint(imported.decode().split())
+
+
 def test_every_public_name_can_be_imported_and_has_a_docstring():
     for name in stereogenbench_data.__all__:
         public = getattr(stereogenbench_data, name)

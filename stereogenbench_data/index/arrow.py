@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
+from stereogenbench_data.index import compute as pc
 from stereogenbench_data.index.rows import ADDED
 
 

@@ -15,15 +15,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from stereogenbench_data.errors import StorageError, describe_os_error, text_without_secrets
+from stereogenbench_data.index import compute as pc
 from stereogenbench_data.index.arrow import table_digest
 from stereogenbench_data.index.assumptions import AssumptionWarning, assumptions
-from stereogenbench_data.index.build import FORMAT_CURE, TreeReport, walk
 from stereogenbench_data.index.parquet import (
     INDEX_NAME,
     IndexHead,
@@ -33,14 +32,6 @@ from stereogenbench_data.index.parquet import (
     seek_tables_of,
     table_of_scenes,
 )
-from stereogenbench_data.index.presumed import (
-    Baselines,
-    ListedTree,
-    Presumption,
-    list_tree,
-    presumed_report,
-)
-from stereogenbench_data.index.restated import restated
 from stereogenbench_data.index.rows import scene_of
 from stereogenbench_data.index.stale import StaleIndexWarning, stale_message
 from stereogenbench_data.schema.conventions import Conventions
@@ -55,6 +46,10 @@ from stereogenbench_data.sources.location import (
 )
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import MissingObject, RetryPolicy
+
+if TYPE_CHECKING:
+    from stereogenbench_data.index.build import TreeReport
+    from stereogenbench_data.index.presumed import Baselines, ListedTree, Presumption
 
 MAX_INDEX_BYTES: Final = 256 * 2**20
 """The largest index that is fetched. One of 8,493 scenes has a few megabytes."""
@@ -102,7 +97,7 @@ class Opened(NamedTuple):
     stale: str = ""
     seek_tables: SeekTables = None
     assumed: str = ""
-    presumption: Presumption | None = None
+    presumption: "Presumption | None" = None
 
 
 def open_table(
@@ -150,6 +145,8 @@ def open_table(
                 f"a folder in the released layout."
             )
     if conventions is not None:
+        from stereogenbench_data.index.restated import restated
+
         stated = restated(opened.table, opened.head, conventions, retry=retry)
         if stated is not opened.table:
             head = replace(opened.head, digest=table_digest(stated))
@@ -237,6 +234,10 @@ def _open_tree(
 
     Those of a large folder are kept in the user's cache, and presumed where that is possible.
     """
+    # What describes files takes long to import, and an index needs none of it.
+    from stereogenbench_data.index.build import walk
+    from stereogenbench_data.index.presumed import list_tree
+
     tree = list_tree(root if is_remote(root) else Path(root), wanted, conventions)
     if tree is not None and rows == "presumed" and tree.has_one_shape:
         opened = _open_presumed(tree, "when needed" if tree.is_remote else "read")
@@ -255,8 +256,10 @@ def _open_tree(
     return opened
 
 
-def _open_presumed(tree: ListedTree, baselines: Baselines) -> Opened | None:
+def _open_presumed(tree: "ListedTree", baselines: "Baselines") -> Opened | None:
     """Return the scenes of a tree, most of them presumed; None where nothing can be presumed."""
+    from stereogenbench_data.index.presumed import Presumption, presumed_report
+
     name: Literal["presumed", "listed"] = "presumed" if baselines == "read" else "listed"
     opened = _kept(tree, name)
     if opened is None:
@@ -269,7 +272,7 @@ def _open_presumed(tree: ListedTree, baselines: Baselines) -> Opened | None:
     return opened._replace(presumption=presumption)
 
 
-def with_baselines(presumption: Presumption, table: pa.Table) -> tuple[pa.Table, Presumption]:
+def with_baselines(presumption: "Presumption", table: pa.Table) -> "tuple[pa.Table, Presumption]":
     """Return presumed rows once each ``baseline.json`` was read.
 
     Raises:
@@ -285,7 +288,7 @@ def with_baselines(presumption: Presumption, table: pa.Table) -> tuple[pa.Table,
     return opened.table, opened.presumption
 
 
-def _require_few(tree: ListedTree) -> None:
+def _require_few(tree: "ListedTree") -> None:
     """Refuse to describe many scenes behind a URL each time they are opened."""
     count, where = len(tree.folders.keys), shown(tree.root)
     if count > MOST_REMOTE_SCENES:
@@ -309,7 +312,7 @@ def _no_collection() -> Iterator[None]:
             gc.enable()
 
 
-def _kept(tree: ListedTree, rows: Rows | Literal["listed"]) -> Opened | None:
+def _kept(tree: "ListedTree", rows: Rows | Literal["listed"]) -> Opened | None:
     """Return the rows of a tree that an earlier opening has kept."""
     found = tree.cache.table(f"{rows}-{tree.stamp}")
     if found is None:
@@ -324,7 +327,7 @@ def _kept(tree: ListedTree, rows: Rows | Literal["listed"]) -> Opened | None:
     )
 
 
-def _keep(tree: ListedTree, rows: Rows | Literal["listed"], opened: Opened) -> Opened:
+def _keep(tree: "ListedTree", rows: Rows | Literal["listed"], opened: Opened) -> Opened:
     """Keep the rows of a tree for later openings, and return them."""
     if not isinstance(opened.seek_tables, Path):
         head = replace(opened.head, digest=table_digest(opened.table))
@@ -333,12 +336,14 @@ def _keep(tree: ListedTree, rows: Rows | Literal["listed"], opened: Opened) -> O
     return opened
 
 
-def _of_report(report: TreeReport) -> Opened:
+def _of_report(report: "TreeReport") -> Opened:
     """Return the scenes that a walk found.
 
     Raises:
         StorageError: If there is none, or more than a few are broken.
     """
+    from stereogenbench_data.index.build import FORMAT_CURE
+
     where = shown(report.root)
     if not report.scenes:
         cure = f"\n{FORMAT_CURE.format(root=where)}" if report.broken else ""

@@ -17,8 +17,6 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from stereogenbench_data.errors import (
     SchemaError,
@@ -27,6 +25,7 @@ from stereogenbench_data.errors import (
     describe_os_error,
     explain_os_errors,
 )
+from stereogenbench_data.index import compute as pc
 from stereogenbench_data.index.arrow import as_numpy, one_array
 from stereogenbench_data.index.rows import ADDED, SCHEMA, SEEK_COLUMN, TRAINING_COLUMNS, row_of
 from stereogenbench_data.schema.conventions import shape_of_text
@@ -88,6 +87,8 @@ def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Tab
     Raises:
         StorageError: If it is not an index of this version, or was altered.
     """
+    import pyarrow.parquet as pq
+
     try:
         with pq.ParquetFile(file) as parquet:
             schema, footer = parquet.schema_arrow, parquet.metadata
@@ -116,6 +117,8 @@ def read_seek_tables(file: Path | pa.BufferReader) -> pa.BinaryArray | None:
 
     They only speed up reading, so a column that is something else is as good as none.
     """
+    import pyarrow.parquet as pq
+
     try:
         with pq.ParquetFile(file) as parquet:
             schema, footer = parquet.schema_arrow, parquet.metadata
@@ -146,7 +149,7 @@ def _require_columns(schema: pa.Schema, names: list[str], *, where: str) -> None
 
 def _read_bounded(
     file: Path | pa.BufferReader,
-    footer: pq.FileMetaData,
+    footer: Any,
     schema: pa.Schema,
     names: list[str],
     *,
@@ -161,6 +164,8 @@ def _read_bounded(
     Raises:
         StorageError: If they take more than a fixed allowance and a multiple of the file's size.
     """
+    import pyarrow.parquet as pq
+
     size = file.size() if isinstance(file, pa.BufferReader) else file.stat().st_size
     most = _FREE_BYTES + _BYTES_A_BYTE * size
     texts: dict[str, None] = {}
@@ -238,6 +243,8 @@ def write_index_file(
         table = table.append_column(pa.field(SEEK_COLUMN, pa.binary()), seek_tables)
     described = table.replace_schema_metadata({_METADATA_KEY: json.dumps(description)})
     what = f"{path}: the index cannot be written"
+    import pyarrow.parquet as pq
+
     with explain_os_errors(what, "Choose another place with --out."):
         path.parent.mkdir(parents=True, exist_ok=True)
         with open_atomic(path) as file:

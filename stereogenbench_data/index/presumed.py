@@ -6,8 +6,8 @@ depth) the others are presumed to have, with cameras on a line as the baselines 
 trajectory and the heads of its videos are read when its first sample is: length and order of an
 epoch rest on what was presumed, so a scene that is different ends the run.
 
-Behind a URL each ``baseline.json`` is read where a selection needs them (`OF_BASELINES`), and of a
-scene only the videos that its samples need are opened, ahead of them where the order is known.
+Behind a URL each ``baseline.json`` is read where a selection needs them (`SceneIndex.column`), and
+of a scene only the videos that its samples need are opened, ahead of them where the order is known.
 """
 
 import hashlib
@@ -78,14 +78,6 @@ _MOST_UNTOLD: Final = 2500
 """More requests for ``baseline.json`` are told: the Hub answers 3,000 in five minutes."""
 _KEPT_SCENES: Final = 512
 """Of how many scenes behind a URL what was described is kept in memory."""
-OF_BASELINES: Final = frozenset(
-    {
-        "baselines_cm", "focal_mm", "sensor_width_mm", "sensor_height_mm", "principal_x_px",
-        "principal_y_px", "lateral_m", "scene_label", "scene_index", "label_map_name", "map_path",
-        "character", "animation", "aperture_fstop",
-    }
-)  # fmt: skip
-"""Columns for which each ``baseline.json`` behind a URL is read."""
 _READERS: Final = 8
 _AT_A_TIME: Final = 128
 _LONGEST_TOLD: Final = 2000

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Final
 
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from stereogenbench_data.errors import SchemaError
+from stereogenbench_data.index import compute as pc
 from stereogenbench_data.index.arrow import one_array
 from stereogenbench_data.index.parquet import IndexHead
 from stereogenbench_data.index.tree import ListedTree

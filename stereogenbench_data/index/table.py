@@ -6,15 +6,14 @@ data's root and never lead out of it.
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from stereogenbench_data.errors import StorageError
+from stereogenbench_data.index import compute as pc
 from stereogenbench_data.index.arrow import as_categories, as_numpy, one_array, table_digest
-from stereogenbench_data.index.build import TreeReport
 from stereogenbench_data.index.open import Rows, SeekTables, open_table, with_baselines
 from stereogenbench_data.index.parquet import (
     IndexHead,
@@ -23,13 +22,25 @@ from stereogenbench_data.index.parquet import (
     table_of_scenes,
     write_index_file,
 )
-from stereogenbench_data.index.presumed import OF_BASELINES, Presumption
 from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, scene_of
 from stereogenbench_data.schema.conventions import Conventions, Shape, shape_of_text
 from stereogenbench_data.schema.records import Scene, SceneId, ShardFacts
 from stereogenbench_data.schema.release import VIDEO_FILES
 from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.retry import RetryPolicy
+
+if TYPE_CHECKING:
+    from stereogenbench_data.index.build import TreeReport
+    from stereogenbench_data.index.presumed import Presumption
+
+_OF_BASELINES: Final = frozenset(
+    {
+        "baselines_cm", "focal_mm", "sensor_width_mm", "sensor_height_mm", "principal_x_px",
+        "principal_y_px", "lateral_m", "scene_label", "scene_index", "label_map_name", "map_path",
+        "character", "animation", "aperture_fstop",
+    }
+)  # fmt: skip
+"""Columns for which each ``baseline.json`` behind a URL is read."""
 
 _LISTS: Final = ("members", "remarks", "key_frames", "psnr_db", "worst_psnr_db")
 
@@ -61,7 +72,7 @@ class SceneIndex:
         retry: RetryPolicy | None = None,
         stale: str = "",
         seek_tables: SeekTables = None,
-        presumption: Presumption | None = None,
+        presumption: "Presumption | None" = None,
     ) -> None:
         """Take a checked table; use `open` or `from_scenes` to make an index."""
         self.root = head.root
@@ -163,7 +174,7 @@ class SceneIndex:
         return cls(table, head, retry=retry, seek_tables=seek_tables_of(scenes))
 
     @classmethod
-    def from_report(cls, report: TreeReport) -> "SceneIndex":
+    def from_report(cls, report: "TreeReport") -> "SceneIndex":
         """Return the index of the scenes that a walk found, and of those that it left out."""
         head = IndexHead(
             report.root, incomplete=report.incomplete, broken=report.broken, is_part=report.is_part
@@ -272,7 +283,7 @@ class SceneIndex:
             captions = self.presumption.captions(self.column("key"))
             self._columns[name] = np.array(captions, dtype=object)
             self._columns[name].setflags(write=False)
-        if name in OF_BASELINES:
+        if name in _OF_BASELINES:
             self._read_baselines()
         if name not in self._columns:
             columns = [each for each in SCHEMA.names if each not in _LISTS]

@@ -5,28 +5,24 @@ FFmpeg: its conversion to 8 bits drops the low byte, and one between 10, 12 and 
 """
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Final, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float32, Shaped, UInt16
 
-from stereogenbench_data.errors import MediaError, SchemaError
+from stereogenbench_data.errors import MediaError
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import planar_from_ray
 from stereogenbench_data.media.container import (
     LOSSLESS_SUFFIX,
-    StreamFacts,
     VideoFile,
     depth_coding,
 )
 from stereogenbench_data.media.depth_frames import CODEC_NAME, PACKED_SUFFIX, DepthFrames
 from stereogenbench_data.media.video import VideoReader, plane_numbers
-from stereogenbench_data.schema.depth_contract import Statement, agreed, stated_in_tags
 from stereogenbench_data.schema.records import DepthEncoding, DepthRisk
-from stereogenbench_data.schema.release import DEFAULT_DEPTH_UNIT_M
 
 _LOSSLESS_CODECS: Final = frozenset(
     {CODEC_NAME, "ffv1", "ffvhuff", "huffyuv", "png", "rawvideo", "utvideo"}
@@ -53,43 +49,6 @@ _COLOUR_FORMAT: Final = re.compile(
 _PLANES_OF_GBR: Final = ((2, 0), (0, 0), (1, 0))
 _DECIDED: Final = 4.0
 """By how much the smoother of two orders of bytes must be smoother, to be the right one."""
-
-
-def resolve_encoding(
-    facts: StreamFacts,
-    *,
-    name: str,
-    override: DepthEncoding | None = None,
-    stated: Sequence[Statement] = (),
-) -> DepthEncoding:
-    """Return how a depth stream's numbers become metres: as the user says, else as files state.
-
-    Tags of the container and the stream and the scene's JSON are read as `depth_contract` reads
-    them; all must agree. Where nothing is stated the release's default holds, 0.1 m.
-
-    Args:
-        facts: What `probe` found.
-        name: What messages call the file.
-        override: The user's contract, which holds whatever files say if it has a unit.
-        stated: What the scene's JSON says.
-
-    Raises:
-        MediaError: If what is stated is not understood, or contradicts itself.
-
-    Source: the paper's appendix on the file schema.
-    """
-    if override is not None and override.unit_m is not None:
-        return replace(override, source="user")
-    contract = override or DepthEncoding()
-    layout = _layout(facts.pixel_format)
-    largest = (1 << (16 if layout is None else layout.bits)) - 1
-    try:
-        found = agreed([*stated_in_tags(facts.tags, name=name), *stated], largest=largest)
-    except SchemaError as error:
-        raise MediaError(f"{error}. {DEPTH_CURES}") from error
-    if found.unit_m is None:
-        return contract.with_file_unit(DEFAULT_DEPTH_UNIT_M, source="default")
-    return contract.with_file_unit(found.unit_m, source=found.origin, offset_m=found.offset_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +100,12 @@ def _layout(pixel_format: str) -> DepthLayout | None:
 
 def _dtype(bits: str | None, order: str | None) -> str:
     return "u1" if bits is None else ">u2" if order == "be" else "<u2"
+
+
+def largest_number(pixel_format: str) -> int | None:
+    """Return the largest number that a pixel format stores, None if it stores no numbers."""
+    layout = _layout(pixel_format)
+    return None if layout is None else (1 << layout.bits) - 1
 
 
 def grey_format(pixel_format: str) -> str:
@@ -331,8 +296,7 @@ def measured(
         encoding: The depth contract.
         pixel_format: FFmpeg's name of the stored pixel format: "max" is its largest number.
     """
-    layout = _layout(pixel_format)
-    largest = None if layout is None else (1 << layout.bits) - 1
+    largest = largest_number(pixel_format)
     answer = np.ones(units.shape, dtype=np.bool_)
     for number in encoding.no_depth:
         answer &= units != (largest if number == "max" else number)

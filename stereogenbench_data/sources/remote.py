@@ -10,13 +10,25 @@ from contextlib import closing
 from typing import TypeVar
 
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.sources.filesystems import FilesystemTransport
-from stereogenbench_data.sources.hub import HubTransport, is_hub_file
 from stereogenbench_data.sources.location import is_web, shown
 from stereogenbench_data.sources.retry import Attempts, RetryPolicy, TransientError, Transport
-from stereogenbench_data.sources.web import WebTransport
 
 _T = TypeVar("_T")
+
+
+def _transport(url: str, *, expected_size: int | None) -> Transport:
+    """Return what makes the requests; only its library is imported."""
+    if is_web(url):
+        from stereogenbench_data.sources.web import WebTransport
+
+        return WebTransport(url, expected_size=expected_size)
+    from stereogenbench_data.sources.hub import HubTransport, is_hub_file
+
+    if is_hub_file(url):
+        return HubTransport(url, expected_size=expected_size)
+    from stereogenbench_data.sources.filesystems import FilesystemTransport
+
+    return FilesystemTransport(url, expected_size=expected_size)
 
 
 class RemoteObject:
@@ -41,12 +53,7 @@ class RemoteObject:
         """
         self.where = shown(url)
         self._policy = retry or RetryPolicy()
-        make: type[WebTransport] | type[HubTransport] | type[FilesystemTransport]
-        if is_web(url):
-            make = WebTransport
-        else:
-            make = HubTransport if is_hub_file(url) else FilesystemTransport
-        self._transport: Transport = make(url, expected_size=expected_size)
+        self._transport = _transport(url, expected_size=expected_size)
 
     def __repr__(self) -> str:
         """Return the URL, without login and query."""
@@ -86,6 +93,8 @@ class RemoteObject:
         Raises:
             StorageError: If the Hub cannot be asked.
         """
+        from stereogenbench_data.sources.hub import HubTransport
+
         if not isinstance(self._transport, HubTransport):
             return ""
         return self._retried(self._transport.pinned, doing="requesting its commit")

@@ -9,9 +9,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import ClassVar, Final, Protocol
 
-from urllib3 import Retry
-from urllib3.exceptions import InvalidHeader
-
 from stereogenbench_data.errors import ShardError, StorageError
 
 MISSING: Final = "Check the URL, and that the index and its shards lie in one folder."
@@ -238,6 +235,9 @@ class ProcessLock:
 
 def retry_after_s(header: str) -> float:
     """Return how many seconds a Retry-After header asks to wait, 0 if it is not valid."""
+    from urllib3 import Retry
+    from urllib3.exceptions import InvalidHeader
+
     try:
         return Retry().parse_retry_after(header)
     except (InvalidHeader, ValueError, OverflowError):

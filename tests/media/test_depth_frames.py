@@ -14,7 +14,7 @@ import pytest
 
 from stereogenbench_data.errors import ExtraError, MediaError
 from stereogenbench_data.media import depth_frames
-from stereogenbench_data.media.depth import open_depth, read_depth_units, resolve_encoding
+from stereogenbench_data.media.depth import open_depth, read_depth_units
 from stereogenbench_data.media.depth_frames import (
     LAYER,
     DepthFrames,
@@ -23,6 +23,7 @@ from stereogenbench_data.media.depth_frames import (
     parse_header,
     require_chunk,
 )
+from stereogenbench_data.media.depth_meaning import resolve_encoding
 from stereogenbench_data.media.depth_packing import packed_depth, write_depth_video
 from stereogenbench_data.media.video import VideoReader, probe
 from stereogenbench_data.schema.records import DepthEncoding
