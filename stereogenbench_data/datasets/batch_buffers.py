@@ -317,7 +317,7 @@ class _OpenedSlots(NamedTuple):
     memory: dict[int, torch.Tensor]
 
 
-class _HeldBatch(NamedTuple):
+class _OpenBatch(NamedTuple):
     """A batch that this process, or the one that it was forked from, has opened."""
 
     pid: int
@@ -328,7 +328,7 @@ class _HeldBatch(NamedTuple):
 _opened: Final[dict[SlotOwner, _OpenedSlots]] = {}
 """The slots that this process has batches from."""
 
-_held: Final[dict[int, _HeldBatch]] = {}
+_open_batches: Final[dict[int, _OpenBatch]] = {}
 """The open batches. Who takes one out of here decides what becomes of its slot."""
 
 _count: Final = itertools.count()
@@ -352,7 +352,7 @@ def _open_batch(
     # The array lives as long as any tensor over it does, however it was sliced.
     array = slots.memory[slot].numpy()
     number = next(_count)
-    _held[number] = _HeldBatch(os.getpid(), slots.status, slot)
+    _open_batches[number] = _OpenBatch(os.getpid(), slots.status, slot)
     weakref.finalize(array, _release, number).atexit = False
     whole = torch.from_numpy(array)
     return {
@@ -365,21 +365,21 @@ def _open_batch(
 
 def _release(number: int) -> None:
     """Give the slot of a batch back to its worker, if this process opened the batch."""
-    held = _held.pop(number, None)
+    held = _open_batches.pop(number, None)
     if held is not None and held.pid == os.getpid():
         held.status[held.slot] = _WORKERS
 
 
-def _retire_held() -> None:
+def _retire_slots_of_open_batches() -> None:
     """Keep the slots of all open batches for good: a child is about to be forked that has them."""
-    for number in tuple(_held):
-        held = _held.pop(number, None)
+    for number in tuple(_open_batches):
+        held = _open_batches.pop(number, None)
         if held is not None and held.pid == os.getpid():
             held.status[held.slot] = _RETIRED
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=_retire_held)
+    os.register_at_fork(before=_retire_slots_of_open_batches)
 
 
 def held_batches(pids: set[int]) -> int:
@@ -387,7 +387,7 @@ def held_batches(pids: set[int]) -> int:
     statuses = [slots.status for owner, slots in tuple(_opened.items()) if owner.pid in pids]
     return sum(
         any(held.status is status for status in statuses)
-        for held in tuple(_held.values())
+        for held in tuple(_open_batches.values())
         if held.pid == os.getpid()
     )
 

@@ -1,19 +1,22 @@
-"""The batches of an epoch for one rank, as a torch sampler, and saved positions in them."""
+"""The batches of an epoch for one rank, as a torch sampler; passes over them, and their position.
+
+A position is an epoch and how many of its batches are consumed, counted over all ranks. Each `Pass`
+counts what was taken of it. `Passes` says where the next one begins and which one a state is of.
+"""
 
 import copy
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
-from functools import cached_property, partial
-from typing import Any, Final, Protocol, TypedDict, Unpack
+from functools import cached_property
+from typing import Any, Final, Literal, Protocol, TypedDict, Unpack
 
 import numpy as np
 import torch.distributed
 from torch.utils.data import Sampler
 
 from stereogenbench_data.datasets.open_videos import fitting_rule
-from stereogenbench_data.datasets.passes import Pass, Passes, Position
-from stereogenbench_data.datasets.shared_epoch import SharedEpoch
+from stereogenbench_data.datasets.shared_epoch import SharedEpoch, require_epoch
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.selection.options import require_options
@@ -22,6 +25,7 @@ from stereogenbench_data.selection.order import (
     DropLast,
     EpochOrder,
     OrderRule,
+    Runs,
     last_batch,
     rank_share,
 )
@@ -33,6 +37,10 @@ State = dict[str, Any]
 _STATES: Final = (
     "Pass what state_dict() of a loader, of EpochBatches or of a stream returned, unchanged."
 )
+
+
+Position = tuple[int, int]
+"""An epoch, and how many of its global batches are consumed."""
 
 
 class EpochOptions(TypedDict, total=False):
@@ -115,13 +123,181 @@ class EpochBatch(list[int]):
         self.number = number
         self.group = group
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Return what a worker process makes the same batch from."""
-        options = {name: getattr(self, name) for name in _BATCH_OPTIONS}
-        return partial(EpochBatch, **options), (list(self),)
+
+class Pass:
+    """One pass over batches of an epoch, and how many were taken.
+
+    Attributes:
+        epoch: The epoch.
+        start: The global batch at which all ranks began.
+        share: The global numbers of its batches.
+        taken: How many of them were taken.
+        part: How many samples of the next one were taken, where samples are taken one by one.
+        is_read_ahead: Whether "taken" counts what was given out to another `DataLoader`, whose
+            workers read ahead of its loop.
+    """
+
+    is_read_ahead = False
+
+    def __init__(self, epoch: int, share: range, *, start: int, end: int, world_size: int) -> None:
+        """Begin before the first batch.
+
+        Args:
+            epoch: The epoch.
+            share: The global numbers of its batches.
+            start: The global batch at which all ranks begin.
+            end: The global batch at which the epoch ends.
+            world_size: How many ranks take turns.
+        """
+        self.epoch = epoch
+        self.start = start
+        self.share = share
+        self.taken = self.part = 0
+        self._end, self._world_size = end, world_size
+        self._is_exhausted = False
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all of its batches were taken."""
+        return self.taken >= len(self.share)
+
+    def exhaust(self) -> None:
+        """Record that its loop is over: the epoch is, for ranks with fewer batches, too."""
+        self._is_exhausted = True
+
+    @property
+    def position(self) -> Position:
+        """The position after the batch taken last."""
+        if self._is_exhausted:
+            return self.epoch, self._end
+        return self.epoch, min(self.start + self.taken * self._world_size, self._end)
 
 
-_BATCH_OPTIONS: Final = ("epoch", "is_padding", "ends_of_runs", "number", "group")
+class Passes:
+    """The passes over a rank's batches, one after another, or one within another.
+
+    A pass ends with its last batch, or when its loop is left. The next one is then of the next
+    epoch (a loader's), or of the same until another is set (a sampler's, as torch's samplers do).
+    A pass that begins while another runs is of the same epoch.
+
+    Attributes:
+        latest: The pass whose position counts: of those that run the one begun last, or else the
+            one that ended last; None where none has begun since the position was set.
+    """
+
+    latest: Pass | None
+
+    def __init__(self, epoch: SharedEpoch, *, then: Literal["same epoch", "next epoch"]) -> None:
+        """Begin with the epoch of a dataset.
+
+        Args:
+            epoch: The dataset's. A sampler sets it, too. A loader follows it until an epoch of its
+                own is set.
+            then: Which epoch follows a pass.
+        """
+        self._dataset_epoch = epoch
+        self._then = then
+        self._follows = True
+        self.go_to(epoch.value, 0)
+
+    def go_to(self, epoch: int, start: int) -> None:
+        """Let the next pass begin at a global batch of an epoch; passes that run count no more."""
+        self._next: Position = (epoch, start)
+        self._times_set = self._dataset_epoch.times_set
+        self._running: list[Pass] = []
+        self.latest = None
+
+    def set(self, epoch: int, start: int = 0) -> None:
+        """Go to a position at the user's request.
+
+        Raises:
+            SelectionError: If the epoch is not a whole number from 0.
+        """
+        epoch = require_epoch(epoch)
+        if self._then == "same epoch":
+            self._dataset_epoch.set(epoch)
+        else:
+            self._follows = False
+        self.go_to(epoch, start)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Go to the beginning of an epoch; where a state was loaded, stay in its epoch.
+
+        Raises:
+            SelectionError: If it is not a whole number from 0.
+        """
+        is_there = self.latest is None and self.next_position[0] == epoch
+        self.set(epoch, self.next_position[1] if is_there else 0)
+
+    @property
+    def next_position(self) -> Position:
+        """Where the next pass begins."""
+        return (self._dataset_epoch.value, 0) if self._is_behind else self._next
+
+    @property
+    def position(self) -> Position:
+        """The position that a state holds."""
+        is_of_pass = self.latest is not None and not self._is_behind
+        return self.latest.position if self.latest and is_of_pass else self.next_position
+
+    @property
+    def _is_behind(self) -> bool:
+        """Whether the dataset was set an epoch that these passes have not followed."""
+        return self._follows and self._times_set != self._dataset_epoch.times_set
+
+    def begin(self, begun: Pass) -> None:
+        """Record that a pass begins."""
+        if self._is_behind:
+            self.go_to(begun.epoch, 0)
+        self._next = begun.epoch, 0
+        self._running.append(begun)
+        self.latest = begun
+
+    def end(self, ended: Pass) -> None:
+        """Record that a pass is over, whole or not."""
+        if ended not in self._running:
+            return
+        self._running.remove(ended)
+        if self._running:
+            self.latest = self._running[-1]
+        elif self._then == "next epoch":
+            self._next = ended.epoch + 1, 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy needs: none of these passes is its own."""
+        return self.__dict__ | {"_running": [], "latest": None}
+
+
+class KnownOrder:
+    """What the batches of all ranks are, without the dataset that they are of."""
+
+    def __init__(self, rule: OrderRule, *, is_padded: bool) -> None:
+        """Take what the order depends on, and whether the last batches are filled up."""
+        self.rule = rule
+        self.is_padded = is_padded
+        self._order: EpochOrder | None = None
+
+    def order(self, runs: Runs, epoch: int) -> EpochOrder:
+        """Return the order of an epoch; the last one is kept."""
+        if self._order is None or self._order.epoch != epoch:
+            self._order = EpochOrder(runs, self.rule, epoch=epoch)
+        return self._order
+
+    def batch(self, runs: Runs, number: int, *, epoch: int) -> EpochBatch:
+        """Return the samples of a global batch, without saying which of them are padding."""
+        order = self.order(runs, epoch)
+        samples = order.batch(number) if number < order.batches else np.empty(0, dtype=np.int64)
+        return EpochBatch(
+            (order.full_batch(number) if self.is_padded else samples).tolist(),
+            epoch=epoch,
+            ends_of_runs=samples[order.ends_run(number)].tolist() if len(samples) else (),
+            number=number,
+            group=number % order.groups,
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy in another process needs; it computes the order itself."""
+        return self.__dict__ | {"_order": None}
 
 
 class EpochBatches(Sampler[list[int]]):
@@ -167,7 +343,7 @@ class EpochBatches(Sampler[list[int]]):
         require_options(EpochBatches, options)
         if isinstance(dataset, Sampler):
             # So Lightning makes batches again. To predict, it takes the sampler of our loader.
-            self.__setstate__(_batches_behind(dataset).__getstate__())
+            self.__setstate__(_batches_behind(dataset).__dict__)
             return
         self.dataset = dataset
         rule = OrderRule(
@@ -187,7 +363,7 @@ class EpochBatches(Sampler[list[int]]):
         self._drop_last = options.get("drop_last", rule.shuffle)
         self.drop_last, self.is_padded = self._drop_last is True, self._drop_last == "pad"
         self._follows_the_group = "rank" not in options
-        self._order: EpochOrder | None = None
+        self.known_order = KnownOrder(self.rule, is_padded=self.is_padded)
         self.passes = Passes(dataset.shared_epoch, then="same epoch")
         if self.end() == 0:
             raise SelectionError(
@@ -354,16 +530,10 @@ class EpochBatches(Sampler[list[int]]):
 
     def batch(self, number: int, *, epoch: int) -> EpochBatch:
         """Return the samples of a global batch."""
-        order = self.order(epoch)
-        samples, ends = batch_samples(order, number, is_padded=self.is_padded)
-        return EpochBatch(
-            samples,
-            epoch=epoch,
-            is_padding=self.is_padding(number).tolist() if self.is_padded else None,
-            ends_of_runs=ends,
-            number=number,
-            group=number % order.groups,
-        )
+        batch = self.known_order.batch(self.dataset.plan.runs, number, epoch=epoch)
+        if self.is_padded:
+            batch.is_padding = self.is_padding(number).tolist()
+        return batch
 
     def is_padding(self, number: int) -> np.ndarray:
         """Return, for each sample of a global batch, whether it fills up after the epoch's end."""
@@ -372,9 +542,7 @@ class EpochBatches(Sampler[list[int]]):
 
     def order(self, epoch: int) -> EpochOrder:
         """Return the order of an epoch; the last one is kept."""
-        if self._order is None or self._order.epoch != epoch:
-            self._order = EpochOrder(self.dataset.plan.runs, self.rule, epoch=epoch)
-        return self._order
+        return self.known_order.order(self.dataset.plan.runs, epoch)
 
     def state_at(self, epoch: int, batches: int) -> State:
         """Return the state after so many global batches of an epoch."""
@@ -446,10 +614,6 @@ class EpochBatches(Sampler[list[int]]):
             "index": self.dataset.index.digest,
         }
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy in another process needs; it computes the order itself."""
-        return self.__dict__ | {"_order": None}
-
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Become a copy, with passes of its own."""
         self.__dict__.update(state)
@@ -481,15 +645,6 @@ def _in_present_words(state: Mapping[str, Any]) -> Mapping[str, Any]:
         str(state["tail"]), state["tail"]
     )
     return {**state, "shuffle": shuffle, "drop_last": drop_last}
-
-
-def batch_samples(
-    order: EpochOrder, number: int, *, is_padded: bool
-) -> tuple[list[int], list[int]]:
-    """Return the samples of a global batch, and those of them that end a run."""
-    samples = order.batch(number) if number < order.batches else np.empty(0, dtype=np.int64)
-    ends: list[int] = samples[order.ends_run(number)].tolist() if len(samples) else []
-    return (order.full_batch(number) if is_padded else samples).tolist(), ends
 
 
 def require_count(state: Mapping[str, Any], name: str, *, most: int | None = None) -> int:

@@ -21,18 +21,18 @@ import statistics
 import time
 import timeit
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from stereogenbench_data.datasets.batches import batch_samples
+from stereogenbench_data.datasets.batches import EpochBatches
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.datasets.open_videos import videos_to_keep
 from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.coming import Step
 from stereogenbench_data.samples.load import SampleLoader
-from stereogenbench_data.selection.order import EpochOrder
+from stereogenbench_data.selection.plan import Plan
 from stereogenbench_data.sources.fetch_ahead import CONNECTIONS, PlannedFetches
 from stereogenbench_data.sources.location import is_remote, joined
 from stereogenbench_data.sources.remote import RemoteObject
@@ -202,8 +202,8 @@ def planned_bytes(pairs: StereoPairs, batch_size: int, *, workers: int) -> tuple
         decoder = SampleLoader(index, pairs.request, check="metadata", frames="shared", ahead=ahead)
         decoder.keep_open(videos, frames=batches.rule.open_frames)
         numbers = range(worker, batches.end(), workers)
-        decoder.expect(_steps(pairs, batches, numbers))
-        for step in itertools.islice(_steps(pairs, batches, numbers), _MOST_PLANNED - samples):
+        decoder.expect(_steps(plan, batches, numbers))
+        for step in itertools.islice(_steps(plan, batches, numbers), _MOST_PLANNED - samples):
             decoder.begin(step.address)
             decoder.end(step.address)
             samples += 1
@@ -211,13 +211,12 @@ def planned_bytes(pairs: StereoPairs, batch_size: int, *, workers: int) -> tuple
     return requests / samples, count / samples
 
 
-def _steps(pairs: StereoPairs, batches: Any, numbers: Iterable[int]) -> Iterable[Step]:
-    order = EpochOrder(pairs.plan.runs, batches.rule, epoch=0)
+def _steps(plan: Plan, batches: EpochBatches, numbers: Iterable[int]) -> Iterator[Step]:
     for number in numbers:
-        samples, ends = batch_samples(order, number, is_padded=batches.is_padded)
-        for each in samples:
-            address = pairs.plan.locate(each, epoch=0, group=number % order.groups)
-            yield Step(address, each in ends)
+        batch = batches.batch(number, epoch=0)
+        for each in batch:
+            address = plan.locate(each, epoch=0, group=batch.group)
+            yield Step(address, each in batch.ends_of_runs)
 
 
 def _decoding_s(pairs: StereoPairs, batch_size: int, *, workers: int, seconds: float) -> float:
@@ -226,9 +225,9 @@ def _decoding_s(pairs: StereoPairs, batch_size: int, *, workers: int, seconds: f
     Local data are loaded by a worker on each core, since workers share memory and caches. Of data
     behind a URL only the processor time is counted, of this process.
     """
-    is_far = is_remote(pairs.index.root)
-    processes = 0 if is_far else min(workers, -(-len(pairs) // batch_size))
-    clock = time.process_time if is_far else time.perf_counter
+    reads_url = is_remote(pairs.index.root)
+    processes = 0 if reads_url else min(workers, -(-len(pairs) // batch_size))
+    clock = time.process_time if reads_url else time.perf_counter
     began_s, start_s, samples = time.perf_counter(), 0.0, 0
     loader = pairs.loader(
         batch_size, num_workers=processes, persistent_workers=processes > 0, drop_last=False

@@ -10,9 +10,10 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property, partial
-from typing import Any, Final, NamedTuple, Protocol, Self, SupportsIndex, cast
+from typing import Any, Final, NamedTuple, Protocol, SupportsIndex, cast
 from weakref import WeakSet
 
+import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
@@ -22,10 +23,10 @@ from stereogenbench_data.datasets.batches import (
     EpochBatches,
     EpochOptions,
     Numbered,
+    Pass,
     State,
 )
 from stereogenbench_data.datasets.frameworks import AcceleratedLoader, share_sampler
-from stereogenbench_data.datasets.passes import Pass
 from stereogenbench_data.datasets.shared_epoch import FetchedCounts
 from stereogenbench_data.datasets.workers import WorkerContext
 from stereogenbench_data.errors import (
@@ -36,11 +37,12 @@ from stereogenbench_data.errors import (
     WorkerError,
 )
 from stereogenbench_data.samples.streams import StreamStats
-from stereogenbench_data.selection.order import EpochOrder
-from stereogenbench_data.selection.quality import order_quality
+from stereogenbench_data.selection.order import EpochOrder, Numbers
+from stereogenbench_data.selection.plan import Plan
 
-_DESCRIBED: Final = 200
-"""From so many batches `LoaderStats.shows` is computed."""
+_DESCRIBED_SAMPLES: Final = 100_000
+_DESCRIBED_BATCHES: Final = 200
+"""`LoaderStats.mixing` is computed for so many samples at most, from so many batches."""
 
 _ORDERED: Final = "or torch's own DataLoader over the dataset"
 _INSTEAD: Final = {
@@ -97,8 +99,8 @@ class LoaderStats(NamedTuple):
         requests: How many ranges its processes have fetched from a URL, as far as their batches
             have arrived; what went into a cache is not counted.
         bytes_fetched: How many bytes these had.
-        shows: What a batch shows, beside one of a fully shuffled sampler, in one line: scenes,
-            moments, the spread of frame numbers (of the first batches of epoch 0).
+        mixing: How many scenes and moments a batch shows, beside one of a fully shuffled sampler,
+            in one line (of the first batches of epoch 0); empty of more than 100,000 samples.
     """
 
     epoch: int
@@ -109,7 +111,7 @@ class LoaderStats(NamedTuple):
     batches_held: int
     requests: int
     bytes_fetched: int
-    shows: str
+    mixing: str
 
 
 class PairsLoader(AcceleratedLoader, DataLoader[Any]):
@@ -252,15 +254,22 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
             batches_held=held_batches(pids),
             requests=requests,
             bytes_fetched=bytes_fetched,
-            shows=self._shows,
+            mixing=self._mixing,
         )
 
     @cached_property
-    def _shows(self) -> str:
+    def _mixing(self) -> str:
         # Epochs differ little, and the order of the current one stays as it is kept.
-        batches = self.batches
-        order = EpochOrder(batches.dataset.plan.runs, batches.rule, epoch=0)
-        return str(order_quality(order, batches.dataset.plan, batches=_DESCRIBED))
+        batches, plan = self.batches, self.batches.dataset.plan
+        if len(plan) > _DESCRIBED_SAMPLES:
+            return ""
+        order = EpochOrder(plan.runs, batches.rule, epoch=0)
+        found = [order.batch(number) for number in range(order.batches)[:_DESCRIBED_BATCHES]]
+        drawn = np.random.default_rng(0).integers(0, len(plan), (len(found), len(found[0])))
+        return (
+            f"a batch of {batches.batch_size} shows {_scenes_and_moments(found, plan)} "
+            f"({_scenes_and_moments([*drawn], plan)} fully shuffled)"
+        )
 
     def __repr__(self) -> str:
         """Return a summary."""
@@ -318,7 +327,15 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
             self._leave_loop()
 
 
-_NOTHING: Final = object()
+def _scenes_and_moments(batches: list[Numbers], plan: Plan) -> str:
+    """Return how many different scenes and moments a batch shows on average."""
+    scenes = [plan.scenes_of(batch) for batch in batches]
+    moments = [
+        of * len(plan) + (batch - plan.first_sample[of]) // plan.pairs_of(of)
+        for of, batch in zip(scenes, batches, strict=True)
+    ]
+    counts = [np.mean([len(np.unique(each)) for each in kind]) for kind in (scenes, moments)]
+    return f"{counts[0]:.1f} scenes and {counts[1]:.1f} moments"
 
 
 class LoaderPass(Iterator[Any]):
@@ -455,8 +472,8 @@ class LoaderPass(Iterator[Any]):
         if workers is not self._loader._persistent:
             workers.end()
 
-    def __copy__(self) -> Self:
-        """Refuse: two passes would take batches from the same workers.
+    def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
+        """Refuse to be copied or pickled: two passes would take batches from the same workers.
 
         Raises:
             PassError: Always.
@@ -465,14 +482,6 @@ class LoaderPass(Iterator[Any]):
             f"{self!r} cannot be copied: its workers serve one loop. Call iter(loader) for "
             "another pass, or copy the loader."
         )
-
-    def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
-        """Refuse, as `copy.copy` is: for `copy.deepcopy` and pickle.
-
-        Raises:
-            PassError: Always.
-        """
-        return self.__copy__()
 
     def __del__(self) -> None:
         """End the pass when no reference is left."""

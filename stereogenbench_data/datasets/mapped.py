@@ -4,7 +4,7 @@ import copy
 import multiprocessing
 import operator
 import warnings
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, Self, Unpack, get_args
 
@@ -13,7 +13,7 @@ import torch
 from torch.utils.data import Dataset, get_worker_info
 
 from stereogenbench_data.datasets.batch_buffers import BatchArrays, BatchBuffers, Buffers
-from stereogenbench_data.datasets.batches import EpochBatch, EpochBatches, batch_samples
+from stereogenbench_data.datasets.batches import EpochBatch, EpochBatches, KnownOrder, Passes
 from stereogenbench_data.datasets.frameworks import accelerates_epoch
 from stereogenbench_data.datasets.loader import (
     LoaderOptions,
@@ -22,7 +22,6 @@ from stereogenbench_data.datasets.loader import (
     split_options,
 )
 from stereogenbench_data.datasets.open_videos import videos_to_keep
-from stereogenbench_data.datasets.passes import Passes
 from stereogenbench_data.datasets.shared_epoch import DrawnSamples, FetchedCounts, SharedEpoch
 from stereogenbench_data.datasets.tensors import to_tensors
 from stereogenbench_data.errors import FieldError, SelectionError, text_without_secrets
@@ -44,7 +43,6 @@ from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import SceneFilters, may_pass
 from stereogenbench_data.selection.options import options_of, require_options
-from stereogenbench_data.selection.order import EpochOrder, OrderRule, Runs
 from stereogenbench_data.selection.plan import Address, Plan, Selection, plan_pairs, plan_views
 from stereogenbench_data.selection.windows import FramesSpec, Random
 from stereogenbench_data.sources.cache import ShardCache
@@ -122,6 +120,7 @@ class _MappedScenes(Dataset[Sample]):
         self.shared_epoch = SharedEpoch()
         self._drawn = DrawnSamples(len(plan)) if _is_random(plan, request) else None
         self._known_order: KnownOrder | None = None
+        self._step = self._stop = 0
         self._next_batch: tuple[int, int] | None = None
         self.fetched = FetchedCounts()
 
@@ -217,26 +216,22 @@ class _MappedScenes(Dataset[Sample]):
             self._loader.expect(self._steps(batch, read=read))
         self._next_batch = None
         if batch.number is not None and self._known_order is not None:
-            self._next_batch = (batch.epoch, batch.number + self._known_order.step)
+            self._next_batch = (batch.epoch, batch.number + self._step)
 
     def _steps(
         self, batch: EpochBatch, *, read: Literal["by number", "as they come"]
     ) -> Iterator[Step]:
         """Yield the samples of a batch, and of those that this process gets after it."""
         known, number = self._known_order, batch.number
-        samples: Sequence[int] = batch
-        ends: Collection[int] = batch.ends_of_runs
-        group = batch.group
         while True:
-            for each in sorted(samples) if read == "by number" else samples:
+            for each in sorted(batch) if read == "by number" else batch:
                 if -len(self.plan) <= each < len(self.plan):
-                    yield Step(self._address(each, batch.epoch, group=group), each in ends)
-            if number is None or known is None or number + known.step >= known.stop:
+                    address = self._address(each, batch.epoch, group=batch.group)
+                    yield Step(address, each in batch.ends_of_runs)
+            if number is None or known is None or number + self._step >= self._stop:
                 return
-            number += known.step
-            order = known.order(self.plan.runs, batch.epoch)
-            samples, ends = batch_samples(order, number, is_padded=known.is_padded)
-            group = number % order.groups
+            number += self._step
+            batch = known.batch(self.plan.runs, number, epoch=batch.epoch)
 
     def _address(self, number: int, epoch: int, *, group: int) -> Address:
         address = self.plan.locate(number % len(self.plan), epoch=epoch, group=group)
@@ -345,9 +340,7 @@ class _MappedScenes(Dataset[Sample]):
             )
             self._loader.keep_open(videos, frames=batches.rule.open_frames)
         self._access = "in order"
-        self._known_order = KnownOrder(
-            batches.rule, is_padded=batches.is_padded, step=processes, stop=batches.end()
-        )
+        self._known_order, self._step, self._stop = batches.known_order, processes, batches.end()
         self._next_batch = None
 
     def stop_fetching(self) -> None:
@@ -374,28 +367,6 @@ class _MappedScenes(Dataset[Sample]):
         """Return a summary."""
         samples, scenes = counted(len(self), "sample"), counted(len(self.plan.scene_rows), "scene")
         return f"<{type(self).__name__}: {samples} of {scenes}, {self.index.where}>"
-
-
-class KnownOrder:
-    """The batches that a process gets after one of them, without the dataset that they are of."""
-
-    def __init__(self, rule: OrderRule, *, is_padded: bool, step: int, stop: int) -> None:
-        """Take every ``step``-th batch up to ``stop``."""
-        self.is_padded = is_padded
-        self.step = step
-        self.stop = stop
-        self._rule = rule
-        self._order: EpochOrder | None = None
-
-    def order(self, runs: Runs, epoch: int) -> EpochOrder:
-        """Return the order of an epoch; the last one is kept."""
-        if self._order is None or self._order.epoch != epoch:
-            self._order = EpochOrder(runs, self._rule, epoch=epoch)
-        return self._order
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy in another process needs."""
-        return self.__dict__ | {"_order": None}
 
 
 class StereoPairs(_MappedScenes):

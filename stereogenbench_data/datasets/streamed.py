@@ -4,16 +4,27 @@ import os
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Unpack, cast
+from typing import Any, Final, Unpack, cast
 
 from torch.utils.data import IterableDataset, get_worker_info
 
 from stereogenbench_data.datasets.batch_buffers import Buffers
-from stereogenbench_data.datasets.batches import EpochBatches, EpochOptions, State, require_count
+from stereogenbench_data.datasets.batches import (
+    EpochBatches,
+    EpochOptions,
+    Pass,
+    Passes,
+    Position,
+    State,
+    require_count,
+)
 from stereogenbench_data.datasets.loader import split_options
 from stereogenbench_data.datasets.mapped import Check, Data, StereoPairs
-from stereogenbench_data.datasets.passes import Pass, StreamPasses
-from stereogenbench_data.datasets.shared_epoch import RepeatedEpochWarning
+from stereogenbench_data.datasets.shared_epoch import (
+    RepeatedEpochWarning,
+    SharedEpoch,
+    SharedNumbers,
+)
 from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.request import Transform
@@ -22,6 +33,9 @@ from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import Selection
 from stereogenbench_data.sources.cache import ShardCache
+
+_MOST_WORKERS: Final = 4096
+"""Workers with a number of their own in `StreamPasses`."""
 
 
 class StreamOptions(Selection, EpochOptions, total=False):
@@ -36,6 +50,64 @@ class StreamOptions(Selection, EpochOptions, total=False):
     check: Check
     buffers: Buffers
     fetch_ahead_bytes: int
+
+
+class StreamPasses(Passes):
+    """The passes of a stream. Worker processes begin them, so all processes see where."""
+
+    def __init__(self, epoch: SharedEpoch) -> None:
+        """Begin with the epoch of a dataset; a stream sets it, too."""
+        self._set_to = SharedNumbers([epoch.value, 0])
+        self._begun_by_worker = SharedNumbers([0] * _MOST_WORKERS)
+        super().__init__(epoch, then="same epoch")
+
+    def go_to(self, epoch: int, start: int) -> None:
+        """Let the next pass of each worker begin at a global batch of an epoch."""
+        self.latest = None
+        self._set_to[0], self._set_to[1] = epoch, start
+        self._begun_by_worker.tensor.zero_()
+
+    @property
+    def first_position(self) -> Position:
+        """Where the first pass began since the position was set; workers may have begun it."""
+        epoch = self._dataset_epoch.value
+        return epoch, self._set_to[1] if self._set_to[0] == epoch else 0
+
+    @property
+    def next_position(self) -> Position:
+        """Where the next pass of this process begins."""
+        return (self._dataset_epoch.value, 0) if self._times_begun else self.first_position
+
+    @property
+    def position(self) -> Position:
+        """The position after what this process has taken."""
+        epoch = self._dataset_epoch.value
+        is_of_pass = self.latest is not None and self.latest.epoch == epoch
+        return self.latest.position if self.latest and is_of_pass else self.next_position
+
+    @property
+    def are_begun_by_workers(self) -> bool:
+        """Whether worker processes alone have begun passes since the position was set."""
+        return self.latest is None and bool(self._begun_by_worker.tensor.any())
+
+    @property
+    def is_second_of_unset_epoch(self) -> bool:
+        """Whether the next pass would be the first one to repeat an epoch that nobody chose."""
+        return self._times_begun == 1 and self._dataset_epoch.times_set == 0
+
+    def begin(self, begun: Pass) -> None:
+        """Record that a pass begins in this process."""
+        self._begun_by_worker[_worker_number()] += 1
+        self.latest = begun
+
+    @property
+    def _times_begun(self) -> int:
+        return self._begun_by_worker[_worker_number()]
+
+
+def _worker_number() -> int:
+    info = get_worker_info()
+    return 0 if info is None else info.id % _MOST_WORKERS
 
 
 class StereoPairStream(IterableDataset[Sample]):

@@ -180,13 +180,13 @@ def _forked(kind: Any) -> Any:
     """Return a class of forked processes that are sure to have begun once they were started."""
 
     class Forked(kind):  # type: ignore[misc]  # the class depends on the context
-        _begun: Any
+        _begun_signal: Any
         _target: Any
         _args: Any
         _kwargs: Any
 
         def run(self) -> None:
-            self._begun.send_bytes(b"begun")
+            self._begun_signal.send_bytes(b"begun")
             super().run()
 
         def start(self) -> None:
@@ -198,10 +198,10 @@ def _forked(kind: Any) -> Any:
             work = (self._target, self._args, self._kwargs)
             for _ in range(_MOST_FORKS):
                 self._target, self._args, self._kwargs = work  # a start drops them
-                heard, self._begun = connection.Pipe(duplex=False)
-                with heard, self._begun:
+                begun, self._begun_signal = connection.Pipe(duplex=False)
+                with begun, self._begun_signal:
                     super().start()
-                    if heard.poll(_BEGUN_WITHIN_S):
+                    if begun.poll(_BEGUN_WITHIN_S):
                         return
                 self.kill()
                 self.join()

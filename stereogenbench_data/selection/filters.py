@@ -85,11 +85,11 @@ def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray,
         if not keep.any():
             before = f" of those left by {', '.join(applied)}" if applied else ""
             raise SelectionError(
-                f"{typed(name, wanted)} matches none of {counted(len(rows), 'scene')}{before}; "
-                f"found {there()}{stale_note(index)}"
+                f"{filter_text(name, wanted)} matches none of {counted(len(rows), 'scene')}"
+                f"{before}; found {there()}{stale_note(index)}"
             )
         rows = rows[keep]
-        applied.append(typed(name, wanted))
+        applied.append(filter_text(name, wanted))
     if len(rows) == 0:
         raise SelectionError(f"{index.where}: the index holds no scene at all.")
     return rows
@@ -135,8 +135,8 @@ def _apply(
         nowhere = sorted(set(names) - set(column.tolist()))
         if nowhere and len(nowhere) < len(set(names)):
             raise SelectionError(
-                f"{typed(name, nowhere[0])} matches none of {counted(len(column), 'scene')} of the "
-                f"index; found {_listed(column, near=nowhere)}{stale_note(index)}"
+                f"{filter_text(name, nowhere[0])} matches none of {counted(len(column), 'scene')} "
+                f"of the index; found {_listed(column, near=nowhere)}{stale_note(index)}"
             )
         return np.isin(values.astype(str), names), lambda: _listed(values, near=nowhere)
     if name in _RANGE_COLUMNS:
@@ -144,7 +144,7 @@ def _apply(
         low, high = require_range(name, wanted)
         if np.isnan(numbers).all():
             raise SelectionError(
-                f"{typed(name, wanted)}: the index does not know it for any of "
+                f"{filter_text(name, wanted)}: the index does not know it for any of "
                 f"{counted(len(rows), 'scene')}. "
                 "Make the index with `stereogenbench index ROOT --valid-depth`."
             )
@@ -163,10 +163,10 @@ def _apply(
     )
 
 
-def typed(name: str, wanted: Any) -> str:
+def filter_text(name: str, wanted: Any) -> str:
     """Return a filter in the words in which it is typed, in Python and on a command line alike.
 
-    >>> typed("family", ["Uniform", "IPD_Gaussian"]), typed("focal_mm", (18, 35))
+    >>> filter_text("family", ["Uniform", "IPD_Gaussian"]), filter_text("focal_mm", (18, 35))
     ('family Uniform or IPD_Gaussian', 'focal_mm 18 to 35')
     """
     if isinstance(wanted, str) or not isinstance(wanted, Iterable):

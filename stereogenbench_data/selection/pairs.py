@@ -22,7 +22,7 @@ from stereogenbench_data.schema.release import (
     baseline_bin,
 )
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.selection.filters import Range, require_range, typed
+from stereogenbench_data.selection.filters import Range, filter_text, require_range
 
 PairsSpec = (
     Literal["primary", "adjacent", "all", "sweep"]
@@ -243,7 +243,7 @@ def _within(index: SceneIndex, pairs: PairList, wanted: BaselineSpec) -> PairLis
     if not keep.any():
         bins = sorted({baseline_bin(value) for value in found[~np.isnan(found)]})
         raise SelectionError(
-            f"{typed('baseline_cm', wanted)} matches none of {counted(len(pairs), 'pair')}; "
+            f"{filter_text('baseline_cm', wanted)} matches none of {counted(len(pairs), 'pair')}; "
             f"found {np.nanmin(found):g} to {np.nanmax(found):g} cm, in the bins "
             f"{', '.join(bins)}."
         )

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from benchmarks.order_quality import order_quality
 from stereogenbench_data import EpochBatches, StereoPairs
-from stereogenbench_data.selection.quality import order_quality
 
 
 @pytest.fixture(scope="module")
