@@ -280,9 +280,9 @@ def _finish(job: PackJob, *, packed: set[str]) -> PackReport:
 def _scenes_in(task: ShardTask, shard: ShardManifest) -> Iterator[Scene]:
     """Yield scenes of the release with the places of their files in a shard, as they are there."""
     places: dict[str, dict[str, Member]] = {scene.id.key: {} for scene in task.shard.scenes}
-    for member, crc32 in zip(shard.tar_members, shard.crc32s, strict=True):
-        key, _, name = member.name.partition(".")
-        places[key][name] = Member(shard.name, member.offset, member.size, crc32)
+    for member, place in shard.places.items():
+        key, _, name = member.partition(".")
+        places[key][name] = place
     tables = {key: base64.b64decode(text) for key, text in shard.seek_tables.items()}
     for each in task.shard.scenes:
         scene = replace(each, seek_tables=tables.get(each.id.key))

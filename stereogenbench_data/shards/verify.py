@@ -3,8 +3,10 @@
 A damaged shard does not stop the others: all problems are listed, each with its cure.
 """
 
+import hashlib
 import io
 import warnings
+import zlib
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -43,7 +45,12 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.shards.open import open_shards
 from stereogenbench_data.shards.plan import SCENE_TEXTS
-from stereogenbench_data.shards.tar import FETCH_AGAIN, TarMember, read_checksums, read_members
+from stereogenbench_data.shards.tar import (
+    BLOCK_BYTES,
+    END_OF_ARCHIVE,
+    member_header,
+    read_chunks,
+)
 from stereogenbench_data.shards.training import (
     Derivation,
     TrainingSettings,
@@ -52,7 +59,9 @@ from stereogenbench_data.shards.training import (
     source_pictures,
 )
 from stereogenbench_data.shards.writer import TEMPORARY_SUFFIX
+from stereogenbench_data.sources.files import copy_with_crc32
 
+_FETCH_AGAIN: Final = "Fetch the shard again, or pack it again."
 _WRONG_INDEX: Final = "Put the index beside the shards that it was packed with."
 _FETCH_BOTH: Final = "Fetch the shard and its index again, or pack them again."
 _SHOWN: Final = 3
@@ -86,7 +95,7 @@ class _ExpectedShard:
     scenes: list[Scene] = field(default_factory=list)
     members: dict[str, Member] = field(default_factory=dict)
 
-    def problem(self, name: str, found: str, cure: str = FETCH_AGAIN) -> Problem:
+    def problem(self, name: str, found: str, cure: str = _FETCH_AGAIN) -> Problem:
         """Return a problem of a member by its whole name, or of the shard for an empty name."""
         scene, _, member = name.partition(".")
         return Problem(self.shard, scene, member, found, cure)
@@ -247,62 +256,96 @@ def _check_shard(expected: _ExpectedShard, after_bytes: Advance) -> tuple[list[P
             return _check_contents(expected, file, expected.path.stat().st_size, after_bytes)
     except OSError as error:
         found = f"cannot be read ({error.strerror or error})"
-        return [expected.problem("", found, cure_of(error, FETCH_AGAIN))], set()
+        return [expected.problem("", found, cure_of(error, _FETCH_AGAIN))], set()
 
 
 def _check_contents(
     expected: _ExpectedShard, file: io.FileIO, size: int, after_bytes: Advance
 ) -> tuple[list[Problem], set[str]]:
-    members = expected.members
-    try:
-        found = {each.name: each for each in read_members(file, size, where=expected.shard)}
-    except ShardError as error:
-        reason = str(error).removeprefix(f"{expected.shard}: ").removesuffix(f" {FETCH_AGAIN}")
-        problems = [expected.problem("", reason.rstrip(".")), *_cut_off(expected, size)]
-        placed = {name: each for name, each in members.items() if each.offset + each.size <= size}
-    else:
-        problems = list(_differing(expected, found))
-        placed = {
-            name: each
-            for name, each in members.items()
-            if found.get(name) == TarMember(name, each.offset, each.size)
-        }
-    parts = _apart(placed)
-    checksums = read_checksums(
-        file,
-        size,
-        parts=[(each.offset, each.size) for each in parts.values()],
-        after_bytes=after_bytes,
-    )
-    sound = set()
-    for (name, member), crc32 in zip(parts.items(), checksums.crc32s, strict=True):
-        if crc32 == member.crc32:
-            sound.add(name)
-            continue
-        indexed = "has none" if member.crc32 is None else f"says {member.crc32:08x}"
-        problems.append(
-            expected.problem(name, f"its bytes have crc32 {crc32:08x}, and the index {indexed}")
-        )
-    problems += _misindexed(expected, file, sound)
+    members = _apart(expected.members, size)
+    found = _read_through(members, file, size, after_bytes)
+    sound = {name for name, member in members.items() if found.crc32s[name] == member.crc32}
+    if members and not sound and found.headless == members.keys():
+        text = "holds other files than the index says; shard and index are of different packs"
+        return [expected.problem("", text, _WRONG_INDEX)], set()
+    problems = [*_differing(expected, found, size), *_misindexed(expected, file, sound)]
     facts = expected.facts
-    if not problems and (size, checksums.sha256) != (facts.size, facts.sha256):
-        differing = (
+    if not problems and (size, found.sha256) != (facts.size, facts.sha256):
+        text = (
             f"all members are sound, but the file has {size} bytes with sha256 "
-            f"{checksums.sha256[:16]}..., and the index says {facts.size} with "
-            f"{facts.sha256[:16]}..."
+            f"{found.sha256[:16]}..., and the index says {facts.size} with {facts.sha256[:16]}..."
         )
-        problems.append(expected.problem("", differing))
+        problems.append(expected.problem("", text))
     return problems, sound
 
 
-def _cut_off(expected: _ExpectedShard, size: int) -> Iterator[Problem]:
-    """Yield a problem for each scene with members beyond the end of the file."""
-    of_scene = defaultdict(list)
-    for name, member in expected.members.items():
-        if member.offset + member.size > size:
-            of_scene[name.partition(".")[0]].append(name.partition(".")[2])
-    for scene, names in of_scene.items():
-        yield expected.problem(scene, f"{len(names)} of its files are cut off ({_few(names)})")
+@dataclass(frozen=True, slots=True)
+class _Contents:
+    """What a shard holds at the places of the index.
+
+    Attributes:
+        crc32s: Of the bytes of each member.
+        headless: Members without their own header before them.
+        odd_bytes: How many bytes there are between and behind where zeros should be.
+    """
+
+    sha256: str
+    crc32s: dict[str, int]
+    headless: set[str]
+    odd_bytes: int
+
+
+def _read_through(
+    members: dict[str, Member], file: io.FileIO, size: int, after_bytes: Advance
+) -> _Contents:
+    """Read a shard once, from its start to its end."""
+    sha256, at, odd_bytes = hashlib.sha256(), 0, 0
+    crc32s: dict[str, int] = {}
+    headless: set[str] = set()
+
+    def crc32_up_to(end: int) -> int:
+        nonlocal at
+        chunks = read_chunks(file, end - at, after_bytes=after_bytes)
+        at = end
+        return copy_with_crc32(chunks, sha256.update)
+
+    def count_odd_bytes(end: int, zeros: int) -> None:
+        nonlocal odd_bytes
+        between = end - at
+        if crc32_up_to(end) != zlib.crc32(bytes(zeros)) or between != zeros:
+            odd_bytes += between
+
+    for name, member in members.items():
+        count_odd_bytes(member.offset - BLOCK_BYTES, -at % BLOCK_BYTES)
+        if crc32_up_to(member.offset) != zlib.crc32(member_header(name, member.size)):
+            headless.add(name)
+        crc32s[name] = crc32_up_to(member.offset + member.size)
+    count_odd_bytes(size, -at % BLOCK_BYTES + len(END_OF_ARCHIVE))
+    return _Contents(sha256.hexdigest(), crc32s, headless, odd_bytes)
+
+
+def _differing(expected: _ExpectedShard, found: _Contents, size: int) -> Iterator[Problem]:
+    """Yield what differs between a shard and what the index says of it."""
+    lost = defaultdict(list)
+    for name, member in sorted(expected.members.items()):
+        if name not in found.crc32s:
+            scene, _, file = name.partition(".")
+            lost[scene].append(file)
+        elif found.crc32s[name] != member.crc32:
+            indexed = "has none" if member.crc32 is None else f"says {member.crc32:08x}"
+            text = f"its bytes have crc32 {found.crc32s[name]:08x}, and the index {indexed}"
+            yield expected.problem(name, text)
+        elif name in found.headless:
+            yield expected.problem(name, "its header in the tar is damaged or of another")
+    for scene, names in lost.items():
+        yield expected.problem(scene, f"{len(names)} of its files are not whole ({_few(names)})")
+    if size != expected.facts.size:
+        what = "it is cut short" if size < expected.facts.size else "something was added"
+        text = f"has {size} bytes, and the index says {expected.facts.size}: {what}"
+        yield expected.problem("", text)
+    if found.odd_bytes and size >= expected.facts.size:
+        text = f"holds {found.odd_bytes} bytes between and behind its files that no shard has there"
+        yield expected.problem("", text)
 
 
 def _misindexed(expected: _ExpectedShard, file: io.FileIO, sound: set[str]) -> Iterator[Problem]:
@@ -322,57 +365,18 @@ def _few(names: list[str]) -> str:
     return ", ".join([*names[:_SHOWN], "..."] if len(names) > _SHOWN else names)
 
 
-def _differing(expected: _ExpectedShard, found: dict[str, TarMember]) -> Iterator[Problem]:
-    """Yield what differs between the members of the tar and those of the index."""
-    scenes, indexed = (
-        {name.partition(".")[0] for name in names} for names in (found, expected.members)
-    )
-    if indexed < scenes:
-        added = sorted(found.keys() - expected.members.keys())
-        text = (
-            f"holds {counted(len(added), 'member')} that the index does not place in it "
-            f"({_few(added)}): something was appended, or the index is of another pack"
-        )
-        yield expected.problem("", text, _FETCH_BOTH)
-        return
-    if scenes != indexed:
-        text = (
-            f"holds other scenes than the index says: {len(scenes - indexed)} unknown, "
-            f"{len(indexed - scenes)} missing ({_few(sorted(scenes ^ indexed))}); shard and "
-            f"index are of different packs"
-        )
-        yield expected.problem("", text, _WRONG_INDEX)
-        return
-    for name in sorted(found.keys() | expected.members.keys()):
-        here, member = found.get(name), expected.members.get(name)
-        if here is None:
-            yield expected.problem(name, "is missing")
-        elif member is None:
-            yield expected.problem(name, "is not in the index")
-        elif (here.offset, here.size) != (member.offset, member.size):
-            text = (
-                f"has {here.size} bytes from byte {here.offset}, and the index says "
-                f"{member.size} from byte {member.offset}"
-            )
-            yield expected.problem(name, text)
+def _apart(members: dict[str, Member], size: int) -> dict[str, Member]:
+    """Return members in the order of their bytes, as far as they lie in a shard of this size.
 
-
-def _apart(members: dict[str, Member]) -> dict[str, Member]:
-    """Return members in the order of their bytes, without any that begins inside another.
-
-    Only an altered index has such members, and only an unreadable tar, which is reported, lets them
-    come this far.
+    None begins inside another, which only an altered index says.
     """
     apart: dict[str, Member] = {}
     end = 0
     for name, member in sorted(members.items(), key=lambda item: item[1].offset):
-        if member.offset >= end:
+        if end <= member.offset - BLOCK_BYTES and member.offset + member.size <= size:
             apart[name] = member
             end = member.offset + member.size
     return apart
-
-
-# The videos of one scene: every frame is decoded.
 
 
 def _decode_scene(task: _DecodeTask, after_bytes: Advance) -> list[Problem]:

@@ -33,7 +33,6 @@ from stereogenbench_data.shards.plan import SCENE_TEXTS, PlannedMember, PlannedS
 from stereogenbench_data.shards.tar import (
     BLOCK_BYTES,
     END_OF_ARCHIVE,
-    TarMember,
     member_header,
     padded,
     read_chunks,
@@ -102,9 +101,10 @@ class ShardManifest:
     seek_tables: dict[str, str] = field(default_factory=dict)
 
     @property
-    def tar_members(self) -> list[TarMember]:
-        """The members and their places in the shard."""
-        return list(map(TarMember, self.members, self.offsets, self.sizes))
+    def places(self) -> dict[str, Member]:
+        """Where each member lies in the shard, by its whole name."""
+        found = zip(self.members, self.offsets, self.sizes, self.crc32s, strict=True)
+        return {name: Member(self.name, *place) for name, *place in found}
 
 
 def find_packed(task: ShardTask) -> ShardManifest | None:
@@ -360,11 +360,10 @@ def _seek_tables(task: ShardTask, manifest: ShardManifest) -> dict[str, bytes]:
     A video that cannot be read has none; whoever reads it is told why.
     """
     tables: dict[str, dict[str, SeekTable]] = {key: {} for key in task.shard.keys}
-    for member in manifest.tar_members:
-        key, _, name = member.name.partition(".")
+    for member, place in manifest.places.items():
+        key, _, name = member.partition(".")
         if key not in tables or name not in SEEKABLE:
             continue
-        place = Member(task.temporary.name, member.offset, member.size)
         with suppress(MediaError), FileSlice(task.temporary, place) as video:
             table = read_seek_table(video, name=name)
             if table is not None:
