@@ -314,7 +314,7 @@ def _measured(
     best = next(each.best for each in report.scenes if each.key in verdict.scenes)
     found = {
         question: getattr(best, question)
-        for question in ("kind", "form", "frame_lag")
+        for question in ("kind", "frame_lag", *(() if stated.offset_m else ("form",)))
         if by_topic[TOPICS[question]].status == "wrong" and by_topic[TOPICS[question]].is_sure
     }
     sources = {source for scene in scenes for source in scene.depth_unit_source}

@@ -25,6 +25,7 @@ from stereogenbench_data.datasets.open_videos import videos_to_keep
 from stereogenbench_data.datasets.shared_epoch import DrawnSamples, FetchedCounts, SharedEpoch
 from stereogenbench_data.datasets.tensors import to_tensors
 from stereogenbench_data.errors import FieldError, SelectionError, text_without_secrets
+from stereogenbench_data.index.open import Rows
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.checks import check_samples, without_odd_scenes
 from stereogenbench_data.samples.coming import Step
@@ -438,7 +439,7 @@ class StereoPairs(_MappedScenes):
         """
         of_loader = options_of(self.loader)
         require_options(StereoPairs, selection, elsewhere={"loader": of_loader})
-        index = _opened(data, selection, conventions)
+        index = opened(data, selection, conventions)
         plan = plan_pairs(index, seed=seed, **selection)
         _warn_of_mixed_splits(index, plan, selection)
         request = parse_request(
@@ -521,7 +522,7 @@ class SceneViews(_MappedScenes):
             depth=depth,
             transform=transform,
         )
-        index = _opened(data, filters, conventions)
+        index = opened(data, filters, conventions)
         plan = plan_views(index, cameras=cameras, frames=frames, seed=seed, filters=filters)
         _warn_of_mixed_splits(index, plan, filters)
         super().__init__(
@@ -535,8 +536,12 @@ class SceneViews(_MappedScenes):
         )
 
 
-def _opened(
-    data: Data, filters: Mapping[str, Any], conventions: str | Path | Conventions | None
+def opened(
+    data: Data,
+    filters: Mapping[str, Any],
+    conventions: str | Path | Conventions | None,
+    *,
+    rows: Rows = "presumed",
 ) -> SceneIndex:
     """Return the index of some data; of a folder without one, of the scenes that may be chosen.
 
@@ -550,7 +555,7 @@ def _opened(
                 "to SceneIndex.open(..., conventions=...)."
             )
         return data
-    return SceneIndex.open(data, wanted=may_pass(filters), conventions=conventions)
+    return SceneIndex.open(data, wanted=may_pass(filters), conventions=conventions, rows=rows)
 
 
 def _warn_of_mixed_splits(index: SceneIndex, plan: Plan, filters: SceneFilters) -> None:

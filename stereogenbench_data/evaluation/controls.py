@@ -9,6 +9,7 @@ Source: the StereoGenBench paper, appendix on metric definitions and calibration
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Final, Unpack
 
 import numpy as np
@@ -27,6 +28,7 @@ from stereogenbench_data.evaluation.predictions import PairFrames, Read, open_fr
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Sample
+from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.options import require_options
 
@@ -146,6 +148,7 @@ def score_controls(
     *,
     protocol: EvaluationProtocol | None = None,
     seed: int = 0,
+    conventions: str | Path | Conventions | None = None,
     **options: Unpack[EvaluationOptions],
 ) -> list[Scores]:
     """Return the scores of the four controls, in the order of `CONTROLS`.
@@ -154,6 +157,7 @@ def score_controls(
         data: What `StereoPairs` takes.
         protocol: Which metrics and how; the paper's with what needs no weights unless given.
         seed: Decides which scene's right view stands in for which.
+        conventions: How the files of a folder are read, as for `StereoPairs`.
         **options: How it is run (`RunOptions`) and what is scored (`Selection`).
 
     Raises:
@@ -161,7 +165,7 @@ def score_controls(
     """
     require_options(score_controls, options)
     protocol = protocol or EvaluationProtocol()
-    workload = select_workload(data, protocol, inputs=(), options=options)
+    workload = select_workload(data, protocol, inputs=(), options=options, conventions=conventions)
     donors = derangement([pairs[0].scene for pairs in workload.pairs], seed=seed)
     run = Run(
         protocol=protocol,

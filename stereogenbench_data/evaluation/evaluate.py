@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, TypedDict, Unpack
 
-from stereogenbench_data.datasets.mapped import Data, StereoPairs
+from stereogenbench_data.datasets.mapped import Data, StereoPairs, opened
 from stereogenbench_data.engine import LOCAL, Engine, Progress
 from stereogenbench_data.errors import EvaluationError, PredictionError, StorageError
 from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, group_by, tally
@@ -33,6 +33,7 @@ from stereogenbench_data.evaluation.protocol import EvaluationProtocol, require_
 from stereogenbench_data.evaluation.scene_scores import SceneScores, SceneWork, score_scene
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import do_items, job_folder
+from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import may_pass
@@ -80,6 +81,7 @@ def evaluate(
     tier: str,
     name: str | None = None,
     protocol: EvaluationProtocol | None = None,
+    conventions: str | Path | Conventions | None = None,
     **options: Unpack[EvaluationOptions],
 ) -> Scores:
     """Score a method and return its scores.
@@ -92,6 +94,7 @@ def evaluate(
         tier: "G0", "G1" or "G2": what the method was given.
         name: What tables call the method; else the folder's or the callable's name.
         protocol: Which metrics and how; the paper's with what needs no weights unless given.
+        conventions: How the files of a folder are read, as for `StereoPairs`.
         **options: How it is run (`RunOptions`) and what is scored (`Selection`).
 
     Raises:
@@ -116,7 +119,9 @@ def evaluate(
                 f"ITEM/000.png ... or ITEM.mp4."
             )
         source = PredictionFolder(name or root.resolve().name, root.resolve())
-    workload = select_workload(data, protocol, inputs=source.inputs, options=options)
+    workload = select_workload(
+        data, protocol, inputs=source.inputs, options=options, conventions=conventions
+    )
     (scores,) = score_workload(workload, Run(protocol, (source,), known.name), options)
     return scores
 
@@ -156,6 +161,7 @@ def select_workload(
     *,
     inputs: Sequence[str],
     options: Mapping[str, Any],
+    conventions: str | Path | Conventions | None = None,
 ) -> Workload:
     """Return the workload of a selection, after checking that its data can be read.
 
@@ -164,6 +170,7 @@ def select_workload(
         protocol: Which fields, at which size.
         inputs: Fields that are needed besides those of the protocol.
         options: The selection; `RunOptions` among it are ignored.
+        conventions: As for `StereoPairs`.
 
     Raises:
         SelectionError: If nothing matches.
@@ -176,8 +183,7 @@ def select_workload(
     }
     selection.setdefault("frames", "all")
     wanted = may_pass(selection)
-    if not isinstance(data, SceneIndex):
-        data = SceneIndex.open(data, wanted=wanted, rows="read")
+    data = opened(data, selection, conventions, rows="read")
     lost = [] if data.is_from_file else [
         key for key in data.broken if wanted is None or wanted(parse_scene_key(key))
     ]  # fmt: skip
@@ -189,9 +195,11 @@ def select_workload(
             f"of the others (`stereogenbench index`)."
         )
     data.require_released("The evaluation")
+    # Tables group pairs by their baselines, whatever metrics and inputs need.
+    needed = (*fields_of(protocol), *inputs, "baseline_m")
     dataset = StereoPairs(
         data,
-        fields=tuple(dict.fromkeys((*fields_of(protocol), *inputs))),
+        fields=tuple(dict.fromkeys(needed)),
         size=protocol.size,
         depth=protocol.depth,
         **selection,

@@ -39,6 +39,7 @@ from stereogenbench_data.jobs import (
     job_folder,
     named_errors,
 )
+from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import Selection
@@ -78,6 +79,7 @@ def export_inputs(
     tier: str,
     size: tuple[int, int] = PAPER_SIZE,
     depth: DepthEncoding | None = None,
+    conventions: str | Path | Conventions | None = None,
     **options: Unpack[ExportOptions],
 ) -> list[str]:
     """Write what methods of a tier are given, and return the items' names.
@@ -90,6 +92,7 @@ def export_inputs(
         tier: "G0", "G1" or "G2".
         size: (height, width) in pixels.
         depth: A depth contract instead of the one that files and release state.
+        conventions: How the files of a folder are read, as for `StereoPairs`.
         **options: Which scenes, pairs and frames, and how they are written (`ExportOptions`).
 
     Raises:
@@ -100,7 +103,9 @@ def export_inputs(
     require_options(export_inputs, options)
     known, root = require_tier(tier), Path(out)
     protocol = EvaluationProtocol(metrics=("psnr",), size=size, depth=depth)
-    workload = select_workload(data, protocol, inputs=known.inputs, options=options)
+    workload = select_workload(
+        data, protocol, inputs=known.inputs, options=options, conventions=conventions
+    )
     wanted = [pair for pairs in workload.pairs for pair in pairs]
     settings = {
         "tier": known.name,

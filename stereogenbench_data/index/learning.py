@@ -314,20 +314,22 @@ def learn(root: str | Path, examined: Sequence[Examined]) -> Learned:
 
 
 def _stated_depth(group: Sequence[Examined]) -> DepthAs | None:
-    """Return the unit that all files of some scenes state; None where none or several do."""
-    units = {
-        (unit_m, source)
+    """Return unit and offset that all files of some scenes state; None where they state several."""
+    stated = {
+        lengths
         for each in group if each.scene is not None
-        for unit_m, source in zip(
-            each.scene.depth_unit_m, each.scene.depth_unit_source, strict=True
+        for lengths in zip(
+            each.scene.depth_unit_m, each.scene.depth_offset_m, each.scene.depth_unit_source,
+            strict=True,
         )
     }  # fmt: skip
-    if len(units) != 1:
+    if len(stated) != 1:
         return None
-    ((unit_m, source),) = units
+    ((unit_m, offset_m, source),) = stated
     if source in ("default", "unreadable"):
         return None
-    return DepthAs(encoding=DepthEncoding(unit_m=unit_m, source="conventions"))
+    encoding = DepthEncoding(unit_m=unit_m, offset_m=offset_m, source="conventions")
+    return DepthAs(encoding=encoding)
 
 
 def verify(root: str | Path, learned: Learned, scenes: Iterable[Examined]) -> None:

@@ -113,6 +113,7 @@ _NO_DEPTH: Final = StreamFacts(CODEC_NAME, "gray16le", 0, 0, 0, 0.0, {})
 """What the index says of depth of a scene of training shards that has none."""
 _DEVIATION_CM: Final = 0.1
 _DEVIATION_SHARE: Final = 0.001
+_LEAST_OFFSET_M: Final = 1e-4
 FILES: Final = frozenset(
     {*METADATA_FILES, TRAINING_JSON, *VIDEO_FILES, *PACKED_DEPTH_NAMES.values()}
 )
@@ -774,12 +775,23 @@ def _depth_encodings(
     if depth is not None and depth.encoding.unit_m is not None:
         known_m = depth.instead_of_tag_m or depth.encoding.unit_m
         for (name, _), each in zip(depths, found, strict=True):
-            is_told = each is not None and each.source in ("tag", "metadata")
-            if each is not None and is_told and not math.isclose(each.known_unit_m, known_m):
+            if each is None or each.source not in ("tag", "metadata"):
+                continue
+            if not math.isclose(each.known_unit_m, known_m):
                 raise MediaError(
                     f"{key}/{name}: its tag states {each.known_unit_m:g} m in a stored unit of "
                     f"depth, and the conventions expect {known_m:g} m. Correct unit_m in [depth]; "
                     f"or, if the tag is known to be wrong, add "
+                    f"instead_of_tag_m = {each.known_unit_m:g}."
+                )
+            offset_m = depth.encoding.offset_m
+            if depth.instead_of_tag_m is None and not math.isclose(
+                each.offset_m, offset_m, abs_tol=_LEAST_OFFSET_M
+            ):
+                raise MediaError(
+                    f"{key}/{name}: states a range that begins at {each.offset_m:g} m, and by the "
+                    f"conventions the stored number 0 is {offset_m:g} m. Correct offset_m in "
+                    f"[depth]; or, if the range is known to be wrong, add "
                     f"instead_of_tag_m = {each.known_unit_m:g}."
                 )
         return [depth.encoding] * len(found)

@@ -36,9 +36,7 @@ def without_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> Plan:
     reasons: dict[int, str] = {}
     selected = set(plan.scene_rows.tolist())
     for name in request.fields:
-        known = request.known[name]
-        sides = () if known.needs_poses == "never" else ("left",)
-        for about in (*known.held_up_by, *sides):
+        for about in request.known[name].stopped_by:
             for row in selected.intersection(index.remarked(about).tolist()):
                 text = index.indexed_scene(row).remark(about).rstrip(".")
                 reasons.setdefault(row, f"{name!r} needs {text}")

@@ -305,7 +305,7 @@ class SampleDecoder:
         if presumption is None:
             return
         for name in request.fields:
-            for about in request.known[name].held_up_by:
+            for about in request.known[name].stopped_by:
                 if reason := scene.remark(about):
                     raise StorageError(
                         f"{self._index.where}: {scene.id.key} cannot give {name!r}: {reason}. "

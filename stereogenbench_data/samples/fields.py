@@ -58,6 +58,11 @@ class Field:
     per_frame: bool = True
     picture_of: Literal["source", "target"] | None = None
 
+    @property
+    def stopped_by(self) -> tuple[str, ...]:
+        """All remarks that make it impossible: what needs a rig needs its sides, too."""
+        return (*self.held_up_by, *(() if self.needs_poses == "never" else ("left",)))
+
 
 def _table(*fields: Field) -> dict[str, Field]:
     return {each.name: each for each in fields}

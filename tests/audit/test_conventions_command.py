@@ -3,11 +3,13 @@
 import re
 import shutil
 
+import numpy as np
 import pytest
 
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
+from tests.audit.corruption import read_depth, write_depth
 from tests.cli.command import invoke
 
 
@@ -64,6 +66,27 @@ def test_conventions_that_files_contradict_end_with_1_and_the_figures(small_rele
 
     assert result.exit_code == 1
     assert re.search(r"cam_00_depth\.mkv.*0\.001 m.*0\.01 m", result.stderr)
+
+
+def test_the_range_of_tags_is_learned_with_its_offset(detailed_release, tmp_path):
+    root, out = tmp_path / "ranged", tmp_path / "conventions.toml"
+    shutil.copytree(detailed_release, root, copy_function=shutil.copyfile)
+    for folder in root.glob("*/*/*/scene_*"):
+        for camera in range(6):
+            units, _ = read_depth(folder, camera)
+            numbers = np.rint((np.clip(units * 0.001, 0.5, 70) - 0.5) / 69.5 * 65535)
+            write_depth(folder, camera, numbers, {"depth_near": "0.5 m", "depth_far": "70 m"})
+
+    result = invoke("conventions", root, "-o", out, "--workers", 1)
+
+    assert result.exit_code == 0, result.output
+    (shape,) = Conventions.read(out).shapes
+    assert shape.depth.encoding.offset_m == 0.5
+    assert shape.depth.encoding.unit_m == pytest.approx(69.5 / 65535)
+    out.write_text(f"[depth]\nunit_m = {shape.depth.encoding.unit_m!r}\n")
+    assert re.search(
+        r"begins at 0\.5 m.* is 0 m", invoke("conventions", root, "--check", out).stderr
+    )
 
 
 def test_a_report_has_structure_and_no_content(shared_scenes, tmp_path):

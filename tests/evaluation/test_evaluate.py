@@ -16,7 +16,7 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from stereogenbench_data import EvaluationError, EvaluationProtocol
-from stereogenbench_data.errors import PredictionError
+from stereogenbench_data.errors import FieldError, PredictionError, StorageError
 from stereogenbench_data.evaluation.models import i3d, inception
 from stereogenbench_data.evaluation.models.interfaces import NamedModel
 from stereogenbench_data.evaluation.predictions import frame_name, item_name
@@ -485,3 +485,35 @@ def test_packed_depth_and_a_url_score_as_the_tree(scored_index, right_views, tmp
         results = [scored(place, right_views, protocol, frames=[0, 3]) for place in places]
 
     assert numbers(results[0]) == numbers(results[1]) == numbers(results[2])
+
+
+def test_baselines_that_poses_contradict_are_not_scored_by_any_metric(
+    scored_index, right_views, tmp_path, rewrite
+):
+    key = keys(scored_index)[0]
+    folder = tmp_path / "tree" / key
+    shutil.copytree(Path(scored_index.root, key), folder, copy_function=shutil.copyfile)
+
+    def move(document):
+        for frame in document["frames"]:
+            for pose in frame["cameras"]:
+                pose["location"] = {axis: 10 * cm for axis, cm in pose["location"].items()}
+
+    rewrite(folder / "trajectory.json", move)
+
+    protocol = EvaluationProtocol(metrics=("psnr",), size=SIZE)
+    with pytest.raises(StorageError, match=r"baseline_m.* cm apart"):
+        scored(tmp_path / "tree", right_views, protocol, tier="G2")
+
+
+def test_conventions_are_taken_where_a_folder_is_opened(
+    scored_index, right_views, protocol, tmp_path
+):
+    file = tmp_path / "conventions.toml"
+    file.write_text("[depth]\nunit_m = 0.001\n")
+
+    scores = scored(scored_index.root, right_views, protocol, frames=[0], conventions=file)
+
+    assert all(scores.index.scene(row).conventions for row in range(3))
+    with pytest.raises(FieldError, match="open already"):
+        scored(scored_index, right_views, protocol, conventions=file)
