@@ -34,6 +34,8 @@ def assumptions(scenes: Iterable[Scene], *, where: str) -> str:
         if scene.conventions is not None:
             continue
         counts.update({_PHRASES[each.about] for each in scene.remarks if each.about in _PHRASES})
+        pixels = scene.remark("pixels").partition(": ")[2]
+        counts.update([f"{pixels}; disparity follows from the sensor's width"] if pixels else [])
         form = (scene.pose_form or "").split("|")[0].partition(" @ ")[0]
         if form and _PLAIN not in form and not scene.remark("world"):
             counts[f"poses are read as {shortened(form, 200)}: measured, the cameras' distances "

@@ -192,7 +192,8 @@ def _note_camera(scene: Scene, notes: Notes) -> None:
     )
     videos = f"the videos have {rig.image_width_px}x{rig.image_height_px} pixels, which counts"
     notes.setdefault("image_width", []).append(videos)
-    for about, table in (("size", "image_width"), ("principal point", "principal_x"),
+    for about, table in (("size", "image_width"), ("pixels", "sensor_height"),
+                         ("principal point", "principal_x"),
                          ("baselines", "baselines"), ("left", "primary_pair")):  # fmt: skip
         if scene.remark(about):
             notes.setdefault(table, []).append(scene.remark(about).removeprefix(f"{scene.id.key}/"))

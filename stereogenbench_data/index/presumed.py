@@ -23,7 +23,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from stereogenbench_data.errors import StereoGenBenchError, StorageError
+from stereogenbench_data.errors import SchemaError, StereoGenBenchError, StorageError
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
 from stereogenbench_data.index.alike_rigs import Parsed, RigReader
 from stereogenbench_data.index.build import (
@@ -228,7 +228,9 @@ def presumed_report(tree: ListedTree, baselines: Baselines) -> TreeReport | None
     groups: dict[tuple[object, ...], list[_Metadata]] = {}
     for key, found in _metadata(tree) if baselines == "read" else _listed(tree):
         if isinstance(found, StereoGenBenchError):
-            outcomes[key] = Outcome.of_error(key, found)
+            # A focal length in pixels may need the size of the videos.
+            is_of_rig = isinstance(found, SchemaError)
+            outcomes[key] = tree.describe(key) if is_of_rig else Outcome.of_error(key, found)
             if len(outcomes) == ALIKE and not groups:
                 return None
             continue

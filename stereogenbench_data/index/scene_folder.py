@@ -114,6 +114,8 @@ _NO_DEPTH: Final = StreamFacts(CODEC_NAME, "gray16le", 0, 0, 0, 0.0, {})
 _DEVIATION_CM: Final = 0.1
 _DEVIATION_SHARE: Final = 0.001
 _LEAST_OFFSET_M: Final = 1e-4
+_SQUARE: Final = 0.01
+"""How far the sides of a pixel may differ, as a share: lengths of a sensor are rounded."""
 FILES: Final = frozenset(
     {*METADATA_FILES, TRAINING_JSON, *VIDEO_FILES, *PACKED_DEPTH_NAMES.values()}
 )
@@ -235,10 +237,12 @@ def describe_scene(
     problems: list[StereoGenBenchError] = []
     remarks: list[Remark] = []
     rig, labels, shape = None, SceneLabels(), None
+    facts, tables, unread = _all_probed(folder, key, files, names, opened=videos)
     try:
         where = f"{key}/{BASELINE_JSON}"
         shape = _shape_of(folder, key, files, conventions)
-        rig, labels, odd = parse_rig(folder.read(BASELINE_JSON), where=where, shape=shape)
+        text, size_px = folder.read(BASELINE_JSON), _source_size_px(facts, document)
+        rig, labels, odd = parse_rig(text, where=where, shape=shape, size_px=size_px)
         family = parse_scene_key(key).family
         remarks += (*odd, *require_unit(rig, family=family, where=where))
     except StereoGenBenchError as error:
@@ -248,7 +252,6 @@ def describe_scene(
     texts: dict[str, bytes] = {name: folder.read(name) for name in DESCRIPTIONS if name in files}
     caption, odd = caption_of(texts, key=key)
     remarks += odd
-    facts, tables, unread = _all_probed(folder, key, files, names, opened=videos)
     try:
         frames = _common_frames(key, facts, remarks)
         _require_one_size(key, facts)
@@ -299,6 +302,15 @@ def describe_scene(
         seek_tables=packed_tables(tables),
     )
     return scene if document is None else _of_training(scene, document)
+
+
+def _source_size_px(
+    facts: Mapping[str, StreamFacts], document: TrainingDocument | None
+) -> tuple[int, int] | None:
+    """Return the size of the pictures that ``baseline.json`` is of, by all else."""
+    if document is not None:
+        return document.source_size_px
+    return next(((each.width_px, each.height_px) for each in facts.values()), None)
 
 
 def as_kept(remarks: list[Remark]) -> tuple[Remark, ...]:
@@ -695,6 +707,16 @@ def sized_as_videos(
     if height_mm == rig.sensor_width_mm * known_px[1] / known_px[0]:
         # Recorded pixels are square, and Unreal renders square pixels at any size.
         height_mm = rig.sensor_width_mm * recorded_px[1] / recorded_px[0]
+    aspect = rig.sensor_width_mm / height_mm * recorded_px[1] / recorded_px[0]
+    if abs(aspect - 1) > _SQUARE:
+        remarks.append(
+            Remark(
+                "pixels",
+                f"{key}: a sensor of {rig.sensor_width_mm:.6g} x {height_mm:.6g} mm and pictures "
+                f"of {recorded_px[0]}x{recorded_px[1]} pixels have pixels that are not square "
+                f"({aspect:.4g} times as wide as high)",
+            )
+        )
     return replace(
         rig,
         principal_point_px=point_px,
@@ -899,16 +921,16 @@ def _differing_place(scene: Scene) -> Iterator[Difference]:
 
 def _recorded_rig(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[_Compared]:
     key, shape = scene.id.key, _stated_of(scene)
-    rig, labels, _ = parse_rig(texts[BASELINE_JSON], where=f"{key}/{BASELINE_JSON}", shape=shape)
     recorded = scene.rig
     if recorded.recorded_size_px is not None:
         width_px, height_px = recorded.recorded_size_px
         recorded = replace(
             recorded, image_width_px=width_px, image_height_px=height_px, recorded_size_px=None
         )
+    text, where, size_px = texts[BASELINE_JSON], f"{key}/{BASELINE_JSON}", _size_px(recorded)
+    rig, labels, _ = parse_rig(text, where=where, shape=shape, size_px=size_px)
     is_resized = _size_px(rig) != _size_px(recorded)
     if is_resized and (rig.image_size_source == "default" or scene.remark("size")):
-        size_px = _size_px(recorded)
         rig = sized_as_videos(key, rig, size_px, document=None, remarks=[], shape=None)
     for each in fields(Rig):
         yield BASELINE_JSON, each.name, getattr(rig, each.name), getattr(recorded, each.name)

@@ -238,11 +238,12 @@ def parse_description(text: bytes, *, where: str) -> tuple[Description, tuple[Re
 
 
 def parse_rig(
-    text: bytes, *, where: str, shape: Shape | None = None
+    text: bytes, *, where: str, shape: Shape | None = None, size_px: Pair | None = None
 ) -> tuple[Rig, SceneLabels, tuple[Remark, ...]]:
     """Return the rig and the identifiers that a ``baseline.json`` records, and what is odd.
 
-    Without an image size, the release's 1280 x 1280 is assumed (``image_size_source`` says so).
+    Without an image size, that of the videos is taken, or else the release's 1280 x 1280
+    (``image_size_source`` says so).
     Without a sensor height, pixels are square, as in the paper's loading example. A principal
     point is in pixels of the recorded image, with the centre of the top-left pixel at (0.5, 0.5);
     one within a pixel of the centre is the centre. A value that is stated again and agrees within
@@ -252,6 +253,7 @@ def parse_rig(
         text: The file's bytes.
         where: The file's path, for messages.
         shape: What conventions state about such files.
+        size_px: (width, height) of the videos, where these were opened.
 
     Raises:
         SchemaError: If focal length, sensor width, a baseline or the primary pair is missing, not
@@ -265,8 +267,12 @@ def parse_rig(
     findings = _Findings(where, keys=_keys(document), shape=shape)
     baselines_cm, first_number = _baselines(document, nodes, findings)
     width, height = _side(nodes, "image_width"), _side(nodes, "image_height")
-    width_px, height_px = width or IMAGE_SIZE_PX, height or width or IMAGE_SIZE_PX
-    focal_mm, sensor_width_mm = _lens(nodes, findings, width_px=width, aspect=width_px / height_px)
+    like_px = size_px or (IMAGE_SIZE_PX, IMAGE_SIZE_PX)
+    width_px, height_px = width or like_px[0], height or width or like_px[1]
+    known_px = width if size_px is None else width_px
+    focal_mm, sensor_width_mm = _lens(
+        nodes, findings, width_px=known_px, aspect=width_px / height_px
+    )
     sensor_height_mm = _length_mm(nodes, "sensor_height", findings)
     for each in numbers(nodes, "focal_y_px"):
         if each.value > 0:

@@ -96,6 +96,7 @@ REMARKS: Final = {
     "frames": "nothing: frames that all files have are used",
     "depth": "depth, unless you pass a DepthEncoding with its unit_m",
     "size": "nothing: the videos' size is used",
+    "pixels": "nothing: disparity follows from the sensor's width",
     "baselines": "nothing",
     "unit": "nothing: baselines lie outside of the family's range",
     "labels": "nothing",

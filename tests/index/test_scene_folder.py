@@ -7,10 +7,12 @@ import shutil
 import pytest
 
 from stereogenbench_data.errors import SchemaError, StorageError
+from stereogenbench_data.index.assumptions import assumptions
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
     SceneFolder,
     describe_scene,
+    metadata_differences,
     stamp_of,
 )
 from stereogenbench_data.schema.records import Member
@@ -205,6 +207,43 @@ def test_where_no_size_is_recorded_the_rig_is_for_the_videos(make_scene, root, r
     rig = describe_scene(root, KEY).rig
 
     assert (rig.image_width_px, rig.image_height_px) == (32, 24)
+
+
+@pytest.mark.parametrize(
+    "size", [{}, {"resolution": "32x24"}, {"image_width": "32"}, {"resolution": {"a": 32}}]
+)
+def test_a_focal_length_in_pixels_is_one_of_the_videos_where_the_file_has_no_size(
+    make_scene, root, rewrite, size
+):
+    def in_pixels(document):
+        del document["image_width"], document["image_height"]
+        document["camera_intrinsics"] = {"fx_px": 40, "sensor_width_mm": 24.0, "cx_px": 15.5}
+        document.update(size)
+
+    folder = make_scene()
+    rewrite(folder / "baseline.json", in_pixels)
+
+    scene = describe_scene(root, KEY)
+
+    assert scene.rig.focal_mm == pytest.approx(40 / 32 * 24)
+    texts = {"baseline.json": (folder / "baseline.json").read_bytes()}
+    assert metadata_differences(scene, texts) == []
+
+
+def test_a_sensor_of_another_shape_than_the_pictures_is_remarked_with_both(
+    make_scene, root, rewrite
+):
+    folder = make_scene()
+    assert describe_scene(root, KEY).remark("pixels") == ""
+
+    def widen(document):
+        document["camera_intrinsics"]["sensor_height_mm"] = 24.0
+
+    rewrite(folder / "baseline.json", widen)
+    scene = describe_scene(root, KEY)
+
+    assert re.search(r"24 x 24 mm .* 32x24 pixels .*0\.75 times", scene.remark("pixels"))
+    assert "32x24" in assumptions([scene], where="ROOT")
 
 
 def test_a_baseline_that_the_poses_contradict_is_reported_with_both_numbers(
