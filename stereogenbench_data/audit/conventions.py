@@ -119,6 +119,8 @@ def survey(  # noqa: PLR0913 - each names one thing that a user chooses
             found += [] if each is None else [each]
             if progress is not None:
                 progress(len(found), len(keys))
+    if any(not each.lacks_mark for each in found):
+        found = [each for each in found if not each.lacks_mark]
     if not found:
         raise StorageError(
             f"{shown(root)}: none of the {counted(len(keys), 'scene')} that were looked at is "

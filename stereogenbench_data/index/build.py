@@ -5,7 +5,7 @@ A `Journal` keeps the described scenes, so a killed run continues where it stopp
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +27,7 @@ from stereogenbench_data.index.scene_folder import (
     as_agreed,
     describe_scene,
     stamp_of,
+    unfinished,
 )
 from stereogenbench_data.index.tree import FoundScenes, find_remote_scenes, find_scene_folders
 from stereogenbench_data.media.depth import require_depth_stream
@@ -34,7 +35,7 @@ from stereogenbench_data.schema.conventions import Conventions, depth_of
 from stereogenbench_data.schema.document import brief
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import REMARKS, Scene, SceneId
-from stereogenbench_data.schema.release import TRAIN_MAPS, Subset, depth_name
+from stereogenbench_data.schema.release import COMPLETE_JSON, TRAIN_MAPS, Subset, depth_name
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.location import is_remote, shown
 
@@ -81,12 +82,23 @@ class Outcome:
     scene: Scene | None = None
     stamp: str = ""
     reason: str = ""
+    has_mark: bool = True
 
     @classmethod
-    def of_error(cls, key: str, error: StereoGenBenchError) -> "Outcome":
-        """Return the outcome of a scene that cannot be described."""
-        is_incomplete = isinstance(error, IncompleteScene)
-        return cls(key, "incomplete" if is_incomplete else "broken", reason=str(error))
+    def of_error(
+        cls, key: str, error: StereoGenBenchError, *, files: Collection[str] = ()
+    ) -> "Outcome":
+        """Return the outcome of a scene that cannot be described; () if its files are not known."""
+        kind: Literal["incomplete", "broken"] = (
+            "incomplete" if isinstance(error, IncompleteScene) else "broken"
+        )
+        return cls(key, kind, reason=str(error), has_mark=not files or COMPLETE_JSON in files)
+
+    @classmethod
+    def of_scene(cls, scene: Scene, stamp: str = "") -> "Outcome":
+        """Return the outcome of a scene that was described."""
+        key, has_mark = scene.id.key, COMPLETE_JSON in scene.members
+        return cls(key, "whole", scene, stamp, has_mark=has_mark)
 
 
 def scene_journal(path: Path, *, walk: str) -> Journal:
@@ -190,7 +202,7 @@ def _chosen(
             f"{shown(root)}: none of its {counted(len(folders.keys), 'scene')} is asked for; "
             f"there are scenes in {', '.join(there[:_NAMED])}{more}. Check the filters' spelling."
         )
-    return FoundScenes(keys, folders.refused)
+    return replace(folders, keys=keys)
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,14 +216,15 @@ class DescribeTask:
     def __call__(self, key: str, advance: Advance = no_advance) -> Outcome:
         """Return what the scene is."""
         advance(0)
+        files: dict[str, tuple[int, int]] = {}
         try:
-            stamp = stamp_of(SceneFolder(self.root, key).stamps())
+            files = SceneFolder(self.root, key).stamps()
             scene = describe_scene(
                 self.root, key, valid_depth=self.valid_depth, conventions=self.conventions
             )
         except StereoGenBenchError as error:
-            return Outcome.of_error(key, error)
-        return Outcome(key, "whole", scene, stamp)
+            return Outcome.of_error(key, error, files=files)
+        return Outcome.of_scene(scene, stamp_of(files))
 
 
 def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> dict[str, Outcome]:
@@ -224,14 +237,22 @@ def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> d
             stamp = stamp_of(SceneFolder(root, key).stamps())
             row = None if journal is None else journal.value(key, stamp=stamp)
             if row is not None:
-                outcomes[key] = Outcome(key, "whole", scene_of_json(row), stamp)
+                outcomes[key] = Outcome.of_scene(scene_of_json(row), stamp)
     return outcomes
 
 
 def report_of(
     root: str | Path, folders: FoundScenes, outcomes: list[Outcome], *, is_part: bool
 ) -> TreeReport:
-    """Return the report of a walk that had these outcomes, one a scene in the order of keys."""
+    """Return the report of a walk that had these outcomes, one a scene in the order of keys.
+
+    Scenes without their completion mark are not finished, unless no scene of the tree has one.
+    """
+    if folders.is_marked or any(out.has_mark and out.kind != "incomplete" for out in outcomes):
+        outcomes = [
+            out if out.has_mark else Outcome.of_error(out.key, unfinished(out.key))
+            for out in outcomes
+        ]
     ids = [parse_scene_key(key) for key in folders.keys]
     maps = {scene.map_name for scene in ids if scene.split == "train"} | TRAIN_MAPS
     found = [outcome.scene for outcome in outcomes if outcome.scene is not None]

@@ -42,6 +42,7 @@ from stereogenbench_data.schema.release import (
     BASELINE_JSON,
     CAMERA_COUNT,
     CAMERA_PAIRS,
+    COMPLETE_JSON,
     TRAJECTORY_JSON,
     depth_name,
 )
@@ -71,6 +72,7 @@ class Examined:
         depth: What the first depth video is; None where none can be opened.
         scene: Its row; None where it cannot be used.
         problem: Why not; "" where it can.
+        lacks_mark: Whether it has no completion mark.
     """
 
     key: str
@@ -81,6 +83,7 @@ class Examined:
     depth: StreamFacts | None
     scene: Scene | None
     problem: str = ""
+    lacks_mark: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,7 +146,7 @@ def examine(root: str | Path, key: str, *, conventions: Conventions | None = Non
     """Return what a scene's files say, also where it cannot be used.
 
     Raises:
-        IncompleteScene: If it is not finished.
+        IncompleteScene: If it has no videos.
         StorageError: If its folder cannot be read.
     """
     folder = SceneFolder(root, key)
@@ -167,7 +170,10 @@ def examine(root: str | Path, key: str, *, conventions: Conventions | None = Non
     depth = _depth_facts(folder, key, files)
     notes["depth"] = [] if depth is None else _depth_notes(depth, scene)
     names = [name for name in (BASELINE_JSON, TRAJECTORY_JSON) if name in files]
-    return Examined(key, _keys(folder, names), shape, notes, unknown, depth, scene, problem)
+    return Examined(
+        key, _keys(folder, names), shape, notes, unknown, depth, scene, problem,
+        lacks_mark=COMPLETE_JSON not in files,
+    )  # fmt: skip
 
 
 def _sized(shape: Shape, scene: Scene) -> Shape:

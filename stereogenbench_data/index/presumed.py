@@ -50,6 +50,7 @@ from stereogenbench_data.index.scene_folder import (
     require_finished,
     sized_as_videos,
     stamp_of,
+    unfinished,
 )
 from stereogenbench_data.index.tree import FoundScenes
 from stereogenbench_data.index.tree_cache import TreeCache
@@ -126,6 +127,20 @@ class ListedTree:
             return RemoteFolder(self.root, key, files, self.cache)
         return SceneFolder(self.root, key)
 
+    def finished(self, key: str) -> Files:
+        """Return a scene's files, by whose names it is finished.
+
+        Raises:
+            StorageError: If they cannot be listed, or the scene cannot be used.
+        """
+        files = self.files[key]
+        if isinstance(files, StorageError):
+            raise files
+        require_finished(key, files)
+        if self.folders.is_marked and COMPLETE_JSON not in files:
+            raise unfinished(key)
+        return files
+
     def of_each(self, read: Callable[[str], Any], keys: Sequence[str]) -> Iterator[Any]:
         """Yield what is read of each scene, in order; several wait at a time."""
         return in_parallel(read, keys) if self.is_remote else _of_each(read, keys)
@@ -134,15 +149,16 @@ class ListedTree:
         """Return what a scene is, whose files are all read."""
         if key in self.described:
             return self.described[key]
+        files: dict[str, tuple[int, int]] = {}
         try:
             folder = self.folder(key)
-            stamp = stamp_of(folder.stamps())
+            files = folder.stamps()
             if isinstance(folder, RemoteFolder):
                 folder.fetch([BASELINE_JSON, COMPLETE_JSON, TRAJECTORY_JSON, *VIDEO_FILES])
             scene = describe_scene(self.root, key, conventions=self.conventions, folder=folder)
         except StereoGenBenchError as error:
-            return Outcome.of_error(key, error)
-        outcome = Outcome(key, "whole", scene, stamp)
+            return Outcome.of_error(key, error, files=files)
+        outcome = Outcome.of_scene(scene, stamp_of(files))
         if self.is_remote:
             self.described[key] = outcome
         return outcome
@@ -182,7 +198,10 @@ def list_tree(
         files |= zip(folders.keys, _of_each(listed, folders.keys), strict=True)
     else:
         files |= tree.files(folders.keys)
-    digest = hashlib.sha256(repr((is_part, folders.refused)).encode())
+        listings = (found for found in files.values() if not isinstance(found, StorageError))
+        is_marked = any(COMPLETE_JSON in found for found in listings)
+        folders = replace(folders, is_marked=is_marked)
+    digest = hashlib.sha256(repr((is_part, folders.is_marked, folders.refused)).encode())
     for key, found in files.items():
         digest.update(repr((key, found)).encode())
     return ListedTree(root, folders, files, is_part, digest.hexdigest()[:32], conventions)
@@ -257,7 +276,7 @@ def presumed_report(tree: ListedTree, baselines: Baselines) -> TreeReport | None
         for each in others:
             scene = _presumed(each, models, tree.conventions)
             key = each.id.key
-            outcomes[key] = tree.describe(key) if scene is None else Outcome(key, "whole", scene)
+            outcomes[key] = tree.describe(key) if scene is None else Outcome.of_scene(scene)
     in_order = [outcomes[key] for key in tree.folders.keys]
     return report_of(tree.root, tree.folders, in_order, is_part=tree.is_part)
 
@@ -265,11 +284,8 @@ def presumed_report(tree: ListedTree, baselines: Baselines) -> TreeReport | None
 def _listed(tree: ListedTree) -> Iterator[tuple[str, _Metadata | StereoGenBenchError]]:
     """Yield the scenes whose files the listing shows, or why one cannot be used."""
     for key in tree.folders.keys:
-        files = tree.files[key]
         try:
-            if isinstance(files, StorageError):
-                raise files
-            require_finished(key, files)
+            files = tree.finished(key)
             yield key, _Metadata(parse_scene_key(key), files, None, SceneLabels())
         except StereoGenBenchError as error:
             yield key, error
@@ -280,11 +296,8 @@ def _metadata(tree: ListedTree) -> Iterator[tuple[str, _Metadata | StereoGenBenc
     rigs = RigReader(None if tree.conventions is None else tree.conventions.shapes[0])
 
     def baseline_text(key: str) -> tuple[Files, bytes] | StereoGenBenchError:
-        files = tree.files[key]
         try:
-            if isinstance(files, StorageError):
-                return files
-            require_finished(key, files)
+            files = tree.finished(key)
             return files, tree.folder(key).read(BASELINE_JSON)
         except StereoGenBenchError as error:
             return error
@@ -306,7 +319,8 @@ def _metadata(tree: ListedTree) -> Iterator[tuple[str, _Metadata | StereoGenBenc
             rig, labels, odd = rigs.read(read[1], where=where)
             parsed = rig, labels, (*odd, *require_unit(rig, family=scene_id.family, where=where))
             marked = SceneLabels()
-            if labels.character is None or labels.animation is None:  # scenes are chosen by these
+            is_lacking = labels.character is None or labels.animation is None
+            if is_lacking and COMPLETE_JSON in read[0]:  # scenes are chosen by these
                 text = tree.folder(key).read(COMPLETE_JSON)
                 marked, _ = parse_complete(text, where=f"{key}/{COMPLETE_JSON}")
         except StereoGenBenchError as error:
@@ -357,6 +371,8 @@ def _presumed(
     ]
     if missing:
         remarks.append(Remark("videos", "; ".join(missing)))
+    if COMPLETE_JSON not in each.files:
+        remarks.append(Remark("marker", f"{key}: has no {COMPLETE_JSON}"))
     for about in _OF_A_FORMAT:
         if all(model.remark(about) for model in models):
             text = f"{key} is presumed to be like other scenes: {like.remark(about)}"

@@ -222,7 +222,7 @@ def describe_scene(
         videos: Names of the videos to open; None is all. The row then holds for these alone.
 
     Raises:
-        IncompleteScene: If the scene is not marked as complete or has no video at all.
+        IncompleteScene: If the scene has no video at all.
         StorageError: If files that every sample needs are missing, unreadable or contradict each
             other or the conventions, or `SchemaError` or `MediaError` if one of them is not
             understood. All problems of all files are in one message.
@@ -247,7 +247,9 @@ def describe_scene(
         remarks += (*odd, *require_unit(rig, family=family, where=where))
     except StereoGenBenchError as error:
         problems.append(error)
-    marked, odd = parse_complete(folder.read(COMPLETE_JSON), where=f"{key}/{COMPLETE_JSON}")
+    marked, odd = SceneLabels(), (Remark("marker", f"{key}: has no {COMPLETE_JSON}"),)
+    if COMPLETE_JSON in files:
+        marked, odd = parse_complete(folder.read(COMPLETE_JSON), where=f"{key}/{COMPLETE_JSON}")
     remarks += odd
     texts: dict[str, bytes] = {name: folder.read(name) for name in DESCRIPTIONS if name in files}
     caption, odd = caption_of(texts, key=key)
@@ -571,25 +573,27 @@ def _probed(folder: SceneFolder, key: str, name: str) -> tuple[StreamFacts, Seek
             video.close()
 
 
+def unfinished(key: str) -> IncompleteScene:
+    """Return the error of a scene without its completion mark, in a tree that has such marks."""
+    return IncompleteScene(f"{key}: has no {COMPLETE_JSON}, so it was never finished")
+
+
 def require_finished(
     key: str, files: Mapping[str, object], *, videos: tuple[str, ...] = VIDEO_FILES
 ) -> None:
     """Refuse a scene of which the listing of its files shows that it cannot be used.
 
     Raises:
-        IncompleteScene: If it is not marked as complete or has no video at all.
+        IncompleteScene: If it has no video at all.
         StorageError: If it has no ``baseline.json``.
     """
     if not files:
         raise IncompleteScene(f"{key}: the folder is empty")
-    if COMPLETE_JSON not in files:
-        raise IncompleteScene(f"{key}: has no {COMPLETE_JSON}, so it was never finished")
     if not any(held_name(files, name) in files for name in videos):
         raise IncompleteScene(f"{key}: has metadata only, and none of its {len(videos)} videos")
     if BASELINE_JSON not in files:
         raise StorageError(
-            f"{key}: is marked as complete and has no {BASELINE_JSON} "
-            f"(it has {', '.join(files)}). Fetch what is missing."
+            f"{key}: has no {BASELINE_JSON} (it has {', '.join(files)}). Fetch what is missing."
         )
 
 

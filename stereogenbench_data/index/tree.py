@@ -37,10 +37,14 @@ _DEEPEST: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class FoundScenes:
-    """The keys of scenes, and for other folders path to reason and cure."""
+    """The keys of scenes, and for other folders path to reason and cure.
+
+    ``is_marked`` is whether a scene is known to have its completion mark; a URL does not tell it.
+    """
 
     keys: tuple[str, ...]
     refused: dict[str, str]
+    is_marked: bool = False
 
 
 def find_scene_folders(root: str | Path) -> FoundScenes:
@@ -62,22 +66,24 @@ def find_scene_folders(root: str | Path) -> FoundScenes:
         )
     keys: list[str] = []
     refused: dict[str, str] = {}
-    for folder, complaint in _search(root):
+    is_marked = False
+    for folder, complaint, names in _search(root):
         key = folder.relative_to(root).as_posix()
         if complaint:
             refused[key] = complaint
             continue
         try:
             keys.append(parse_scene_key(key).key)
+            is_marked = is_marked or COMPLETE_JSON in names
         except SchemaError as error:
             refused[key] = f"{error}{_where_to_point(folder, root=root)}"
     if not keys:
         raise StorageError(_nothing_found(root, refused))
-    return FoundScenes(tuple(sorted(keys)), dict(sorted(refused.items())))
+    return FoundScenes(tuple(sorted(keys)), dict(sorted(refused.items())), is_marked)
 
 
-def _search(root: Path) -> Iterator[tuple[Path, str]]:
-    """Yield each scene's folder, and with a complaint each folder that cannot be searched."""
+def _search(root: Path) -> Iterator[tuple[Path, str, set[str]]]:
+    """Yield each scene's folder and its files, and each folder that cannot be searched and why."""
     waiting: list[tuple[Path, tuple[str, ...], frozenset[tuple[int, int]]]] = [
         (root, (), frozenset())
     ]
@@ -88,7 +94,7 @@ def _search(root: Path) -> Iterator[tuple[Path, str]]:
             status = folder.stat()
             identity = (status.st_dev, status.st_ino)
             if identity in above:
-                yield folder, "is a link to a folder above itself. Remove the link."
+                yield folder, "is a link to a folder above itself. Remove the link.", set()
                 continue
             with os.scandir(folder) as entries:
                 listed = list(entries)
@@ -96,10 +102,10 @@ def _search(root: Path) -> Iterator[tuple[Path, str]]:
             folders = [e.name for e in listed if not e.name.startswith(".") and _is_folder(e)]
         except OSError as error:
             cure = "Check the disk, then run it again."
-            yield folder, describe_os_error("cannot be searched", error, cure)
+            yield folder, describe_os_error("cannot be searched", error, cure), set()
             continue
         if files & _SCENE_FILES or (is_place_of_scene and not folders):
-            yield folder, ""
+            yield folder, "", files
         elif len(parts) < _DEEPEST:
             below = above | {identity}
             waiting += [(folder / name, (*parts, name), below) for name in folders]

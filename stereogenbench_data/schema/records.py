@@ -97,6 +97,7 @@ REMARKS: Final = {
     "depth": "depth, unless you pass a DepthEncoding with its unit_m",
     "size": "nothing: the videos' size is used",
     "pixels": "nothing: disparity follows from the sensor's width",
+    "marker": "nothing: no scene of the tree has its completion mark",
     "baselines": "nothing",
     "unit": "nothing: baselines lie outside of the family's range",
     "labels": "nothing",

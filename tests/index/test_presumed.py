@@ -210,6 +210,17 @@ def test_what_the_listing_and_baseline_json_show_is_told_at_opening(tree):
     assert "cam_05_rgb.mp4" in index.indexed_scene(row_of(index, KEYS[3])).remark("videos")
 
 
+def test_where_no_scene_has_its_mark_all_are_presumed_and_that_is_told(tree):
+    for key in KEYS:
+        (tree / key / "_scene_complete.json").unlink()
+
+    with pytest.warns(AssumptionWarning, match="_scene_complete"):
+        index = SceneIndex.open(tree)
+
+    assert index.presumption is not None
+    assert len(index) == len(KEYS)
+
+
 def test_more_than_a_few_broken_scenes_are_refused(tree):
     for key in KEYS[:10]:
         put(tree / key / "baseline.json", b"{")

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import open as index_module
 from stereogenbench_data.index.arrow import table_digest
+from stereogenbench_data.index.assumptions import AssumptionWarning
 from stereogenbench_data.index.open import IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Member, Rig, Scene, SceneId, SceneLabels
@@ -564,7 +565,7 @@ def test_broken_scenes_of_a_tree_are_an_error_that_lists_them(make_scene, root):
         SceneIndex.open(root)
 
     lines = str(caught.value).splitlines()
-    assert "scene_000009: is marked as complete and has no baseline.json" in lines[10]
+    assert "scene_000009: has no baseline.json" in lines[10]
     assert lines[11].strip() == "and 2 more"
 
 
@@ -600,8 +601,23 @@ def test_scenes_that_are_not_wanted_are_not_described(make_scene, root):
     assert index.column("split").tolist() == ["train"]
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_where_no_scene_has_its_mark_all_are_opened_and_that_is_told(make_scene, root, count):
+    for number in range(count):
+        (make_scene(f"train/a/b/scene_{number}") / "_scene_complete.json").unlink()
+
+    with pytest.warns(AssumptionWarning, match=rf"_scene_complete.*\({count} scene") as told:
+        index = SceneIndex.open(root)
+
+    assert (len(index), len(told)) == (count, 1)
+    make_scene("eval/MapSeenInTrain/a/b/scene_9")
+    with pytest.raises(StorageError, match="scene_0: has no _scene_complete"):
+        SceneIndex.open(root, wanted=lambda scene: scene.split == "train")
+
+
 def test_a_tree_of_unfinished_scenes_is_an_error(make_scene, root):
-    (make_scene() / "_scene_complete.json").unlink()
+    for video in make_scene().glob("cam_*"):
+        video.unlink()
 
     with pytest.raises(StorageError, match="no scene is complete: 1 scene cannot be used"):
         SceneIndex.open(root)
