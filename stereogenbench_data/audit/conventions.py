@@ -6,8 +6,9 @@ on other scenes. Where several readings of the poses fit the rigs, depth decides
 """
 
 import functools
+import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -45,6 +46,11 @@ FRAMES: Final = 3
 """Of how many frames of a scene the pictures are compared."""
 PICTURED: Final = 3
 """How many scenes of a shape are measured by their pictures, and how many others verify it."""
+_TOPICS: Final = {
+    "unit_m": QUOTIENT, "kind": TOPICS["kind"], "form": TOPICS["form"],
+    "frame_lag": TOPICS["frame_lag"],
+}  # fmt: skip
+"""The questions that pictures answer about what [depth] states."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +65,7 @@ class Survey:
         verdicts: What the pictures say of each shape's depth, in a line each.
         poses: What depth says of readings of the poses, where several fit.
         notes: The comments of the file, as `write_toml` takes them.
+        untested: What the user's conventions state of depth and no picture could test.
     """
 
     root: str
@@ -68,6 +75,7 @@ class Survey:
     verdicts: list[str] = field(default_factory=list)
     poses: list[str] = field(default_factory=list)
     notes: dict[tuple[int, str], list[str]] = field(default_factory=dict)
+    untested: tuple[str, ...] = ()
 
     @property
     def toml(self) -> str:
@@ -133,12 +141,33 @@ def survey(  # noqa: PLR0913 - each names one thing that a user chooses
     tested = Survey(str(root), tuple(found), None)
     tested.problems.extend(each.problem for each in found if each.problem)
     usable = [each.scene for each in found if each.scene is not None]
+    tested.problems.extend(scene.remark("left") for scene in usable if scene.remark("left"))
     if usable and pictured:
         report = _tested(tested, _spread(usable, 2 * pictured), None, how)
         for verdict in () if report is None else report.worlds:
             told = f"{_SHARES}: {'; '.join(verdict.lines)}"
             (tested.problems if verdict.is_wrong else tested.poses).append(f"poses: {told}")
-    return tested
+        untested = {} if report is None else dict.fromkeys(_untested(report))
+        tested = replace(tested, untested=tuple(untested))
+    return replace(tested, problems=_alike_once(tested))
+
+
+def _untested(report: DoctorReport) -> Iterator[str]:
+    """Yield what conventions state of depth and no picture could test, as they state it."""
+    for verdict in report.verdicts:
+        status = {answer.topic: answer.status for answer in verdict.answers}
+        for name, value in _changed(verdict.declared).items():
+            if status[_TOPICS[name]] == "cannot tell":
+                yield f"{name} = {value}"
+
+
+def _changed(encoding: DepthEncoding) -> dict[str, str]:
+    """Return what pictures may test of a contract and is not usual, as a file states it."""
+    return {
+        name: json.dumps(getattr(encoding, name))
+        for name in _TOPICS
+        if getattr(encoding, name) != getattr(DepthEncoding(), name)
+    }
 
 
 def _learning(
@@ -336,9 +365,13 @@ def _tested(
     except StereoGenBenchError as error:
         surveyed.problems.append(str(error))
         return None
+    written = _changed(_measured(report, DepthEncoding(), scenes)) if depth is None else {}
     for verdict in report.verdicts:
         line = f"pictures of {counted(len(verdict.scenes), 'scene')}: {_in_words(verdict)}"
         surveyed.verdicts.append(line)
+        if verdict.is_wrong and "unit_m" in written:
+            cure = ", ".join(f"{name} = {value}" for name, value in written.items())
+            line = f"no unit that is understood is stated; by pictures, write {cure} below [depth]"
         if verdict.is_wrong:
             surveyed.problems.append(f"depth, {', '.join(verdict.scenes[:3])}: {line}")
     if report.left_out:

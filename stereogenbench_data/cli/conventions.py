@@ -81,7 +81,8 @@ def conventions(  # noqa: PLR0913 - one parameter an option
     told += [f"NOT SETTLED: {line}" for line in found.problems]
     typer.echo("".join(f"{plain_line(line)}\n" for line in told), err=True, nl=False)
     if check is not None:
-        typer.echo(f"{check}: {'contradicted' if found.problems else 'fits'}", err=True)
+        untested = f"; no picture could test {', '.join(found.untested)}" if found.untested else ""
+        typer.echo(f"{check}: {'contradicted' if found.problems else 'fits'}{untested}", err=True)
     elif out is not None:
         typer.echo(f"{out}: use it with --conventions, or StereoPairs(..., conventions=)", err=True)
     if found.problems:

@@ -74,6 +74,8 @@ _NAMES_A_CAMERA: Final = re.compile(
 _FLOAT32: Final = 1e-6
 
 Pair = tuple[int, int]
+_NO_LENGTH: Final = "baseline_cm is missing"
+
 _Recorded = tuple[Pair, float, Stated]
 """The cameras of a pair as they are written, their baseline in cm, and where it stands."""
 _Waiting = tuple[Any, str, str, int | None]
@@ -784,9 +786,15 @@ def _lengths_of(
         if re.search(r"baseline|distance|length|separation", words(key))
         and not re.search(r"target|request|nominal|desired|min|max|mean|std|range", words(key))
     ]
-    if not keys:
+    at = None if findings.shape is None else findings.shape.baselines
+    if not keys and at is not None and path.startswith((f"{at.place}.", f"{at.place}[")):
+        # Where conventions say that baselines stand, the only number beside two cameras is one.
+        keys = [key for key, value in entry.items()
+                if is_number(value) and not _NAMES_A_CAMERA.search(words(key))]  # fmt: skip
+        keys = keys if len(keys) == 1 else []
+    if not keys and not any(_NO_LENGTH in problem for problem in findings.problems):
         findings.problems.append(
-            f"{path}: baseline_cm is missing; the keys here are: {', '.join(sorted(entry))}"
+            f"{path}: {_NO_LENGTH}; the keys here are: {', '.join(sorted(entry))}"
         )
     for key in keys:
         _, unit = without_unit(words(key))

@@ -58,6 +58,52 @@ def test_conventions_that_pictures_contradict_end_with_1_and_the_figures(
     assert f"{file}: contradicted" in result.stderr
 
 
+def test_scenes_that_conventions_leave_alike_unread_are_told_once_with_the_cure(untagged, tmp_path):
+    file, root = tmp_path / "edited.toml", tmp_path / "tagged"
+    shutil.copytree(untagged, root, copy_function=shutil.copyfile)
+    for folder in root.glob("*/*/*/scene_*"):
+        for camera in range(6):
+            units, _ = read_depth(folder, camera)
+            write_depth(folder, camera, units, {"DEPTH_Q": "7"})
+    file.write_text('[baselines]\nplace = "$.pairwise_pairs"\n')
+
+    silent = invoke("conventions", root, "--check", file, "--workers", 1)
+    file.write_text('[baselines]\nplace = "$.gaps"\n')
+    wrong = invoke("conventions", root, "--check", file, "--workers", 1)
+
+    assert (silent.exit_code, wrong.exit_code) == (1, 1)
+    (unit_m,) = re.findall(r"write unit_m = ([0-9.]+) below \[depth\]", silent.stderr)
+    assert float(unit_m) == pytest.approx(0.001, rel=0.005)
+    assert wrong.stderr.count("$.gaps is not in the file") == 1
+    assert "(1 alike)" in wrong.stderr
+
+
+def test_what_no_picture_can_test_is_told_beside_the_verdict(tmp_path):
+    file, root = tmp_path / "edited.toml", tmp_path / "still"
+    synthesise(root, SynthRequest(family="Uniform", size_px=96, frames=1, seed=3), workers=1)
+    file.write_text("[depth]\nunit_m = 0.001\nframe_lag = 2\n")
+
+    result = invoke("conventions", root, "--check", file, "--workers", 1)
+
+    assert re.search(rf"{file}: .*no picture could test .*frame_lag = 2", result.stderr)
+
+
+def test_baselines_in_another_unit_than_the_poses_are_told_with_both_lengths(
+    detailed_release, tmp_path
+):
+    file = tmp_path / "edited.toml"
+    file.write_text('[baselines]\nplace = "$.pairwise_pairs"\nunit = "mm"\n')
+    root = tmp_path / "bare"
+    shutil.copytree(detailed_release, root, copy_function=shutil.copyfile)
+    for path in root.rglob("baseline.json"):
+        path.write_text(path.read_text().replace("baseline_cm", "baseline"))
+
+    result = invoke("conventions", root, "--check", file, "--pictures", 0)
+
+    assert result.exit_code == 1
+    assert re.search(r"[0-9.]+ cm apart.* [0-9.]+ cm", result.stderr)
+
+
 def test_conventions_that_files_contradict_end_with_1_and_the_figures(small_release, tmp_path):
     file = tmp_path / "edited.toml"
     file.write_text("[depth]\nunit_m = 0.01\n")

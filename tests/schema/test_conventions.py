@@ -158,6 +158,25 @@ def test_quantities_under_unknown_names_are_read_where_conventions_say(rig_docum
     assert parse_rig(dumped(rig_document), where="b", shape=shape)[0] == expected
 
 
+def test_the_only_number_beside_two_cameras_is_a_baseline_where_conventions_say(
+    rig_document, dumped
+):
+    expected = parse_rig(dumped(rig_document), where="b")[0]
+    pairs = rig_document.pop("pairwise_pairs")
+    rig_document["gaps"] = [
+        {"i": each["camera_index_a"], "j": each["camera_index_b"], "d": each["baseline_cm"]}
+        for each in pairs
+    ]
+    (shape,) = read(b'[baselines]\nplace = "$.gaps"\nunit = "cm"\n').shapes
+
+    assert parse_rig(dumped(rig_document), where="b", shape=shape)[0] == expected
+    for each in rig_document["gaps"]:
+        each["e"] = 1.0
+    with pytest.raises(SchemaError, match="the keys here are: d, e, i, j") as caught:
+        parse_rig(dumped(rig_document), where="b", shape=shape)
+    assert str(caught.value).count("the keys here are: d") == 1
+
+
 def test_another_value_of_a_quantity_counts_unless_it_is_ignored(rig_document, dumped):
     rig_document["camera_intrinsics"]["focal_length"] = 50.0
     stated = b'[focal_length]\nplace = "$.camera_intrinsics.focal_length_mm"\n'
