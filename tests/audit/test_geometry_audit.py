@@ -564,7 +564,8 @@ def test_data_that_are_not_there_are_an_error(tmp_path):
 
 
 def test_opening_for_an_audit_does_not_warn_of_what_becomes_a_finding(indexed_release, tmp_path):
-    (copied(indexed_release / SCENE, tmp_path) / "_scene_complete.json").unlink()
+    folder = copied(indexed_release / SCENE, tmp_path)
+    (shutil.copytree(folder, folder.with_name("scene_99")) / "_scene_complete.json").unlink()
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
