@@ -1,7 +1,7 @@
 """Train a small network on the sample shards in plain PyTorch, and show that it learned.
 
 `make demo` runs it. Validation is on freshly drawn scenes of the eval split, at more than twice
-the size of the training pictures. The curve and three predictions go to demo/training.png.
+the size of the training pictures. The curve and a prediction for each scene go to demo/training.png.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from stereogenbench_data.synthesis.request import SynthRequest
 
 DEMO, SHARDS = Path("demo"), Path(__file__).parents[1] / "shards"
 MAPS = ("SynthPark", "SynthStage", "SynthYard")
-FIELDS = ("left", "right", "disparity", "valid", "visible", "scene")
+FIELDS = ("left", "right", "disparity", "valid", "visible", "baseline_m", "scene")
 MAX_DISPARITY, BATCH, STEPS_BETWEEN_VALIDATIONS = 32, 8, 60
 
 
@@ -41,16 +41,16 @@ def draw(curve: dict[int, float], network: SmallStereo, held_out: StereoPairs) -
     axes = top.subplots()
     axes.plot(list(curve), list(curve.values()), marker="o")
     axes.set(xlabel="training step", ylabel="held-out error, px", ylim=(0, None))
-    of_each_scene = {sample["scene"]: sample for sample in held_out}.values()
+    by_baseline = sorted(held_out, key=lambda sample: float(sample["baseline_m"]))
+    of_each_scene = {sample["scene"]: sample for sample in by_baseline}.values()  # the widest
     for row, sample in zip(below.subplots(len(of_each_scene), 4), of_each_scene, strict=True):
         truth, largest = sample["disparity"][0], float(sample["disparity"][sample["valid"]].max())
         with torch.no_grad():
-            views = (torch.as_tensor(sample[name])[None] for name in ("left", "right"))
-            predicted = network(*views)[0, 0].numpy()
-        row[0].imshow(sample["left"].transpose(1, 2, 0))
+            predicted = network(sample["left"][None], sample["right"][None])[0, 0]
+        row[0].imshow(sample["left"].permute(1, 2, 0))
         row[1].imshow(truth, vmin=0, vmax=largest, cmap="turbo")
         row[2].imshow(predicted, vmin=0, vmax=largest, cmap="turbo")
-        row[3].imshow(abs(predicted - truth), vmin=0, vmax=3, cmap="magma")
+        row[3].imshow((predicted - truth).abs(), vmin=0, vmax=3, cmap="magma")
         titles = ("left view", f"truth, 0 to {largest:.0f} px", "prediction", "error, 0 to 3 px")
         for tile, title in zip(row, titles, strict=True):
             tile.set_title(title, fontsize=9)
@@ -68,7 +68,9 @@ def main() -> None:
         family="IPD_Gaussian", split="eval", map_name=MAPS, scenes=3, size_px=160, frames=2, seed=7
     )
     synthesise(DEMO / "scenes", request)
-    held_out = StereoPairs(DEMO / "scenes", pairs="all", frames=[0], fields=FIELDS)
+    held_out = StereoPairs(
+        DEMO / "scenes", pairs="all", baseline_cm=(10, 40), frames=[0], fields=FIELDS
+    )
     validation = held_out.loader(BATCH, shuffle=False)
     pairs = StereoPairs(
         SHARDS, split="train", pairs="all", baseline_cm=(8, 60), frames=("every", 4),
