@@ -1,7 +1,7 @@
 """Train a small network on the sample shards in plain PyTorch, and show that it learned.
 
 `make demo` runs it. Validation is on freshly drawn scenes of the eval split, at more than twice
-the size of the training pictures. The curve and a prediction for each scene go to demo/training.png.
+the size of the training pictures. The curve and three predictions go to demo/training.png.
 """
 
 import argparse
