@@ -42,6 +42,23 @@ def rewrite_depth(folder: Path, change, *, unit_factor: float = 1.0) -> None:
         rewrite_one_depth(folder, camera, change, unit_factor=unit_factor)
 
 
+def rewrite_tags(folder: Path, tags: dict[str, str], change=lambda units: units) -> None:
+    """Replace every camera's depth by change(units), and its tags by others."""
+    for camera in CAMERAS:
+        units, _ = read_depth(folder, camera)
+        write_depth(folder, camera, change(units), tags)
+
+
+def as_range(near_m: float, far_m: float, *, unit_m: float):
+    """Return the change to numbers of which 0 is near_m and 65,535 is far_m."""
+
+    def change(units):
+        depth_m = np.clip(units * unit_m, near_m, far_m)
+        return np.rint((depth_m - near_m) / (far_m - near_m) * 65535)
+
+    return change
+
+
 def rewrite_one_depth(folder: Path, camera: int, change, *, unit_factor: float = 1.0) -> None:
     """Replace one camera's depth by change(units), and multiply what its tag says."""
     units, tags = read_depth(folder, camera)

@@ -33,19 +33,19 @@ from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING, RayCasting
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 from tests.audit.corruption import (
     as_inverse,
+    as_range,
     as_ray,
     copied,
     edit_baseline,
     exchange,
     late,
     place_cameras,
-    read_depth,
     rewrite_depth,
     rewrite_one_depth,
     rewrite_rgb,
+    rewrite_tags,
     scale_camera,
     scaled,
-    write_depth,
 )
 
 UNIT_M = 0.001
@@ -764,12 +764,8 @@ def test_scenes_of_different_units_are_confirmed_each_by_itself(right_scene, tmp
 
 def test_depth_of_a_stated_range_is_confirmed(verdict_on):
     def normalise(folder):
-        for camera in range(6):
-            units, _ = read_depth(folder, camera)
-            depth_m = np.clip(units * UNIT_M, 0.5, 60.5)
-            numbers = np.rint((depth_m - 0.5) / 60 * 65535)
-            tags = {"depth_near": "0.5 m", "depth_far": "60.5 m"}
-            write_depth(folder, camera, numbers.astype(np.uint16), tags)
+        tags = {"depth_near": "0.5 m", "depth_far": "60.5 m"}
+        rewrite_tags(folder, tags, as_range(0.5, 60.5, unit_m=UNIT_M))
 
     verdict = verdict_on(normalise)
 
@@ -778,12 +774,7 @@ def test_depth_of_a_stated_range_is_confirmed(verdict_on):
 
 
 def test_a_unit_that_files_do_not_tell_is_measured(verdict_on):
-    def untold(folder):
-        for camera in range(6):
-            units, _ = read_depth(folder, camera)
-            write_depth(folder, camera, units, {"DEPTH_FOO": "0.001"})
-
-    verdict = verdict_on(untold)
+    verdict = verdict_on(lambda folder: rewrite_tags(folder, {"DEPTH_FOO": "0.001"}))
 
     unit_m = float(verdict.choices[0].rpartition("unit_m=")[2].removesuffix(")"))
     assert unit_m == pytest.approx(UNIT_M, rel=0.005)

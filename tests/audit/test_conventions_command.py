@@ -3,13 +3,12 @@
 import re
 import shutil
 
-import numpy as np
 import pytest
 
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
-from tests.audit.corruption import read_depth, write_depth
+from tests.audit.corruption import as_range, rewrite_tags
 from tests.cli.command import invoke
 
 
@@ -62,9 +61,7 @@ def test_scenes_that_conventions_leave_alike_unread_are_told_once_with_the_cure(
     file, root = tmp_path / "edited.toml", tmp_path / "tagged"
     shutil.copytree(untagged, root, copy_function=shutil.copyfile)
     for folder in root.glob("*/*/*/scene_*"):
-        for camera in range(6):
-            units, _ = read_depth(folder, camera)
-            write_depth(folder, camera, units, {"DEPTH_Q": "7"})
+        rewrite_tags(folder, {"DEPTH_Q": "7"})
     file.write_text('[baselines]\nplace = "$.pairwise_pairs"\n')
 
     silent = invoke("conventions", root, "--check", file, "--workers", 1)
@@ -118,10 +115,8 @@ def test_the_range_of_tags_is_learned_with_its_offset(detailed_release, tmp_path
     root, out = tmp_path / "ranged", tmp_path / "conventions.toml"
     shutil.copytree(detailed_release, root, copy_function=shutil.copyfile)
     for folder in root.glob("*/*/*/scene_*"):
-        for camera in range(6):
-            units, _ = read_depth(folder, camera)
-            numbers = np.rint((np.clip(units * 0.001, 0.5, 70) - 0.5) / 69.5 * 65535)
-            write_depth(folder, camera, numbers, {"depth_near": "0.5 m", "depth_far": "70 m"})
+        tags = {"depth_near": "0.5 m", "depth_far": "70 m"}
+        rewrite_tags(folder, tags, as_range(0.5, 70, unit_m=0.001))
 
     result = invoke("conventions", root, "-o", out, "--workers", 1)
 
