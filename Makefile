@@ -70,10 +70,10 @@ sample: $(READY)
 # croissant/, from the sample and the paper. The day is that of the sample.
 descriptors: $(READY)
 	rm -rf croissant
-	$(BIN)/stereogenbench croissant shards -o croissant/sample.json \
+	$(BIN)/stereogenbench publish croissant shards -o croissant/sample.json \
 		--name "StereoGenBench sample" --published 2026-11-21
-	$(BIN)/stereogenbench croissant -o croissant/release.json
-	$(BIN)/stereogenbench croissant --template -o croissant/template.json
+	$(BIN)/stereogenbench publish croissant -o croissant/release.json
+	$(BIN)/stereogenbench publish croissant --template -o croissant/template.json
 
 $(READY): pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv $(VENV)

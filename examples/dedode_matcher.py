@@ -1,7 +1,7 @@
-"""The paper's keypoint matcher for E_match: DeDoDe, as a plug-in of `stereogenbench evaluate`.
+"""The paper's keypoint matcher for E_match: DeDoDe, as a plug-in of `stereogenbench eval score`.
 
     pip install kornia
-    stereogenbench evaluate shards/ predictions/ --tier G1 --weights WEIGHTS \
+    stereogenbench eval score shards/ predictions/ --tier G1 --weights WEIGHTS \
         --keypoint-matcher dedode_matcher.py:DeDoDe
 
 WEIGHTS holds the two files of https://github.com/Parskatt/DeDoDe/releases (licence: MIT):

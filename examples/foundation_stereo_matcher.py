@@ -1,7 +1,7 @@
-"""The paper's stereo matcher for SD: FoundationStereo, as a plug-in of `stereogenbench evaluate`.
+"""The paper's stereo matcher for SD: FoundationStereo, as a plug-in of `stereogenbench eval score`.
 
     git clone https://github.com/NVlabs/FoundationStereo && pip install omegaconf ...
-    PYTHONPATH=FoundationStereo stereogenbench evaluate shards/ predictions/ --tier G1 \
+    PYTHONPATH=FoundationStereo stereogenbench eval score shards/ predictions/ --tier G1 \
         --stereo-matcher foundation_stereo_matcher.py:FoundationStereo \
         --weights FoundationStereo/pretrained_models/23-51-11
 

@@ -26,7 +26,7 @@ from stereogenbench_data.schema.text import counted, markdown_text
 from stereogenbench_data.sources.files import write_atomic
 
 CARD_NAME: Final = "README.md"
-MARK: Final = "<!-- made by stereogenbench card -->"
+MARK: Final = "<!-- made by stereogenbench publish card -->"
 """Marks a card that this package wrote. A README.md without it is never overwritten."""
 _SCENES: Final = "scenes"
 _TASKS: Final = ("depth-estimation", "image-to-image", "image-to-video", "image-to-3d")

@@ -113,8 +113,8 @@ def _stated(about: Path) -> Facts:
         facts = json.loads(about.read_bytes())
     except (OSError, ValueError) as error:
         raise DescriptorError(
-            f"{about}: cannot be read as JSON ({error}). Write one with `stereogenbench croissant "
-            "--template -o about.json`."
+            f"{about}: cannot be read as JSON ({error}). Write one with `stereogenbench publish "
+            "croissant --template -o about.json`."
         ) from error
     if not isinstance(facts, dict):
         raise DescriptorError(f"{about}: must be a JSON object, found a {type(facts).__name__}.")

@@ -16,7 +16,7 @@ from stereogenbench_data.cli.conventions import conventions
 from stereogenbench_data.cli.doctor import doctor
 from stereogenbench_data.cli.download import download
 from stereogenbench_data.cli.errors import ErrorsReported
-from stereogenbench_data.cli.evaluate import controls, evaluate, export_inputs
+from stereogenbench_data.cli.evaluate import controls, inputs, score
 from stereogenbench_data.cli.forecast import forecast
 from stereogenbench_data.cli.help import HelpedCommand, HelpedGroup
 from stereogenbench_data.cli.index import index
@@ -40,9 +40,6 @@ _COMMANDS: Final[dict[str, dict[Callable[..., None], str]]] = {
     "Pack them": {
         pack: "pack scenes/ packed/ --shard-size 2GB",
         unpack: "unpack shards/ scenes/",
-        croissant: "croissant shards/ -o croissant/sample.json",
-        card: "card packed/ ORG/NAME -o packed/",
-        upload: "upload packed/ ORG/NAME",
     },
     "Check them": {
         stats: "stats shards/ --plots plots/",
@@ -52,13 +49,28 @@ _COMMANDS: Final[dict[str, dict[Callable[..., None], str]]] = {
         verify: "verify shards/ --deep",
         forecast: "forecast shards/ --samples-s 100 --delay-ms 60",
     },
-    "Score with them": {
-        export_inputs: "export-inputs shards/ inputs/ --tier G1 --split eval",
-        evaluate: "evaluate shards/ predictions/ --tier G1 --split eval",
-        controls: "controls shards/ --frames every:20",
-    },
 }
 """Panel of the help to its commands, each with a call that works."""
+
+_EVALUATE: Final = (
+    ("inputs", inputs, "eval inputs shards/ inputs/ --tier G1 --split eval"),
+    ("score", score, "eval score shards/ predictions/ --tier G1 --split eval"),
+    ("controls", controls, "eval controls shards/ --frames every:20"),
+)
+_PUBLISH: Final = (
+    ("croissant", croissant, "publish croissant shards/ -o croissant/sample.json"),
+    ("card", card, "publish card packed/ ORG/NAME -o packed/"),
+    ("upload", upload, "publish upload packed/ ORG/NAME"),
+)
+_GROUPS: Final[dict[str, tuple[str, tuple[tuple[str, Callable[..., None], str], ...]]]] = {
+    "export": (
+        "Write scenes in the layouts of other projects.",
+        (*export_clips.EXPORTS, *export_views.EXPORTS),
+    ),
+    "eval": ("Score a method by the paper's protocol.", _EVALUATE),
+    "publish": ("Describe shards and put them on the Hub.", _PUBLISH),
+}
+"""Groups of commands: what they do, and the name, function and example of each command."""
 
 _DEBUG: Final = "--debug"
 _HELP_OPTIONS: Final = {"help_option_names": ["-h", "--help"]}
@@ -109,22 +121,23 @@ for _panel, _examples in _COMMANDS.items():
             context_settings=_HELP_OPTIONS,
         )(_function)
 
-export = typer.Typer(cls=HelpedGroup, no_args_is_help=True)
-app.add_typer(
-    export,
-    name="export",
-    rich_help_panel="Take them elsewhere",
-    epilog=f"Example: `stereogenbench {export_clips.EXPORTS[0][2]}`",
-    help="Write scenes in the layouts of other projects.",
-    context_settings=_HELP_OPTIONS,
-)
-for _name, _function, _example in (*export_clips.EXPORTS, *export_views.EXPORTS):
-    export.command(
-        _name,
-        cls=HelpedCommand,
-        epilog=f"Example: `stereogenbench {_example}`",
+for _group, (_help, _inner) in _GROUPS.items():
+    _typer = typer.Typer(cls=HelpedGroup, no_args_is_help=True)
+    app.add_typer(
+        _typer,
+        name=_group,
+        rich_help_panel="Take them elsewhere",
+        epilog=f"Example: `stereogenbench {_inner[0][2]}`",
+        help=_help,
         context_settings=_HELP_OPTIONS,
-    )(_function)
+    )
+    for _name, _function, _example in _inner:
+        _typer.command(
+            _name,
+            cls=HelpedCommand,
+            epilog=f"Example: `stereogenbench {_example}`",
+            context_settings=_HELP_OPTIONS,
+        )(_function)
 
 
 def _print_version(value: bool) -> None:

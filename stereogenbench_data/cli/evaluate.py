@@ -1,4 +1,4 @@
-"""``stereogenbench evaluate``, ``export-inputs``, ``controls``: scores by the paper's protocol.
+"""``stereogenbench eval inputs``, ``score``, ``controls``: scores by the paper's protocol.
 
 They share their options: scenes, pairs and frames, metrics and models, the report.
 """
@@ -211,7 +211,7 @@ class ControlsReportOptions(ReportOptions):
 
 @grouped
 @resumable()
-def export_inputs(  # noqa: PLR0913 - one parameter an option
+def inputs(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
     out: Annotated[Path, typer.Argument(parser=out_folder, help="Folder to write into.")],
     *,
@@ -226,15 +226,15 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
 
     Left views are PNG; tier G0 adds the target's geometry, G1 the camera, G2 nothing. An item is
     one pair of one scene; its folder's name reveals neither. Write the output of the method as
-    PREDICTIONS/ITEM/000.png ... or PREDICTIONS/ITEM.mp4, then run `stereogenbench evaluate` with
+    PREDICTIONS/ITEM/000.png ... or PREDICTIONS/ITEM.mp4, then run `stereogenbench eval score` with
     the same selection. To continue a stopped run, run it again.
     """
-    from stereogenbench_data.evaluation.inputs import export_inputs as exported
+    from stereogenbench_data.evaluation.inputs import export_inputs
 
     size_px, selection = parse_picture_size(size), chosen.selection()
     index = source.open()
     with progress_bar("writing", unit="frames") as progress:
-        items = exported(
+        items = export_inputs(
             index,
             out,
             tier=tier,
@@ -249,7 +249,7 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
 
 @grouped
 @resumable()
-def evaluate(  # noqa: PLR0913 - one parameter an option
+def score(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
     predictions: Annotated[
         Path, typer.Argument(help="Folder of right views, ITEM/000.png ... or ITEM.mp4.")
@@ -277,12 +277,12 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
 ) -> None:
     """Score a method's right views by the paper's protocol.
 
-    `stereogenbench export-inputs` writes what the method is given. PREDICTIONS holds, for each
+    `stereogenbench eval inputs` writes what the method is given. PREDICTIONS holds, for each
     item, a folder of PNGs or a video of the same name. The report (Markdown, LaTeX, CSV, JSON,
     plots) and partial results go to --out [evaluation/NAME-TIER]. To continue a stopped run, run it
     again.
     """
-    from stereogenbench_data.evaluation.evaluate import evaluate as evaluated
+    from stereogenbench_data.evaluation.evaluate import evaluate
     from stereogenbench_data.evaluation.tables import tables_of
 
     protocol, selection = scoring.protocol(), chosen.selection()
@@ -295,7 +295,7 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
     for column in strata:
         index.column(column)  # refuses an unknown one before the work
     with progress_bar("scoring", unit="frames") as progress:
-        scores = evaluated(
+        scores = evaluate(
             index,
             predictions,
             tier=tier,

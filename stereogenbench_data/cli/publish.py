@@ -1,4 +1,4 @@
-"""``stereogenbench croissant``, ``card``, ``upload``: describe and publish shards."""
+"""``stereogenbench publish croissant``, ``card``, ``upload``: describe shards and upload them."""
 
 import json
 import re
@@ -34,8 +34,8 @@ AboutOption = Annotated[
     typer.Option(
         "--about",
         metavar="FILE|release",
-        help="Authors, licence, provenance: answers to `croissant --template`, or release for the "
-        "paper's scenes.",
+        help="Authors, licence, provenance: answers to `publish croissant --template`, or "
+        "release for the paper's scenes.",
     ),
 ]
 

@@ -199,12 +199,12 @@ def test_a_file_that_is_not_json_is_refused(tmp_path):
 def test_the_command_writes_and_checks(small_shards, tmp_path):
     path = tmp_path / "out" / "data.json"
 
-    written = invoke("croissant", small_shards, "-o", path)
-    checked = invoke("croissant", "--check", path, "--json")
+    written = invoke("publish", "croissant", small_shards, "-o", path)
+    checked = invoke("publish", "croissant", "--check", path, "--json")
     document = json.loads(path.read_text())
     del document["rai:dataBiases"]
     path.write_text(json.dumps(document))
-    found = invoke("croissant", "--check", path)
+    found = invoke("publish", "croissant", "--check", path)
 
     assert written.exit_code == 0, written.output
     assert json.loads(checked.output)["problems"] == []

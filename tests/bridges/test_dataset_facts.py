@@ -66,11 +66,13 @@ def test_drawn_scenes_cannot_be_said_to_be_the_papers(small_shards):
 def test_the_command_takes_the_users_word_for_the_release(elsewhere, tmp_path):
     path = tmp_path / "data.json"
 
-    told = invoke("croissant", elsewhere.root, "-o", path, "--about", "release")
+    told = invoke("publish", "croissant", elsewhere.root, "-o", path, "--about", "release")
 
     assert told.exit_code == 0, told.output
     assert "Yangzhi Cui" in path.read_text()
-    assert "cc-by-4.0" in invoke("card", elsewhere.root, "a/b", "--about", "release").stdout
+    assert (
+        "cc-by-4.0" in invoke("publish", "card", elsewhere.root, "a/b", "--about", "release").stdout
+    )
 
 
 def test_without_data_the_release_is_meant():
@@ -140,8 +142,10 @@ def test_a_maker_may_state_only_what_differs(small_shards, tmp_path):
 def test_the_template_is_written_and_refused_while_it_has_blanks(elsewhere, tmp_path):
     path = tmp_path / "about.json"
 
-    written = invoke("croissant", "--template", "-o", path)
-    refused = invoke("croissant", elsewhere.root, "-o", tmp_path / "a.json", "--about", path)
+    written = invoke("publish", "croissant", "--template", "-o", path)
+    refused = invoke(
+        "publish", "croissant", elsewhere.root, "-o", tmp_path / "a.json", "--about", path
+    )
 
     assert written.exit_code == 0, written.output
     assert refused.exit_code == 2

@@ -36,7 +36,7 @@ def uploaded(folder, hub, home, *, token=TOKEN, **more):
         "HF_ENDPOINT": hub.url, "HF_HOME": str(home), "HF_HUB_DISABLE_XET": "1",
         "HF_HUB_DISABLE_TELEMETRY": "1", **({"HF_TOKEN": token} if token else {}), **more,
     }  # fmt: skip
-    return run("upload", folder, REPOSITORY, "--json", env=os.environ | settings)
+    return run("publish", "upload", folder, REPOSITORY, "--json", env=os.environ | settings)
 
 
 def test_shards_index_card_and_descriptor_arrive_whole(folder, upload_hub, tmp_path):

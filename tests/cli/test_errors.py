@@ -188,14 +188,15 @@ def test_an_empty_path_is_refused_and_nothing_is_written(words, tmp_path, monkey
         (["synth", "out", "--size", "128x128"], "'128x128' is not a valid integer"),
         (["synth", "out", "--split", "test"], "'test' is not one of 'train', 'eval'"),
         (["stats", "data", "--focal-mm", "wide", "35"], "'wide' is not a valid"),
-        (["croissant", "data", "--published", "today"], "'today' does not match"),
+        (["publish", "croissant", "data", "--published", "today"], "'today' does not match"),
     ],
 )
 def test_a_value_of_another_type_is_quoted_as_it_was_typed(words, quoted):
     ended = invoke(*words)
+    option = next(word for word in words if word.startswith("--"))
 
     assert ended.exit_code == 2
-    assert f"Invalid value for '{words[2]}': {quoted}" in one_line(ended.stderr)
+    assert f"Invalid value for '{option}': {quoted}" in one_line(ended.stderr)
 
 
 def test_a_name_of_300_letters_is_refused_with_a_cure(tmp_path):

@@ -24,7 +24,7 @@ def shown(*arguments):
 
 def test_help_groups_the_commands_in_the_order_of_use():
     text = shown("--help")
-    panels = ("Have scenes", "Look at them", "Pack them", "Check them", "Score with them")
+    panels = ("Have scenes", "Look at them", "Pack them", "Check them", "Take them elsewhere")
     places = [text.index(f"{panel}:") for panel in panels]
 
     assert places == sorted(places)
@@ -48,13 +48,16 @@ def test_the_help_of_every_command_has_an_example_that_parses(name):
     COMMANDS[name].make_context(name, words[1:], resilient_parsing=False)
 
 
-PATHS = [(name,) for name in COMMANDS] + [("export", name) for name in COMMANDS["export"].commands]
+PATHS = [
+    *((name,) for name in COMMANDS),
+    *((name, inner) for name, each in COMMANDS.items() for inner in getattr(each, "commands", ())),
+]
 
 
 @pytest.mark.parametrize("path", PATHS, ids=" ".join)
 def test_help_at_80_columns_cuts_no_option_and_fits_the_screen(path):
     page = invoke(*path, "--help", env={"COLUMNS": "80"}).stdout
-    command = COMMANDS[path[0]] if len(path) == 1 else COMMANDS["export"].commands[path[1]]
+    command = COMMANDS[path[0]] if len(path) == 1 else COMMANDS[path[0]].commands[path[1]]
     lines = page.rstrip().splitlines()
 
     assert max(map(len, lines)) <= 80
@@ -69,7 +72,7 @@ def test_help_at_80_columns_cuts_no_option_and_fits_the_screen(path):
 
 
 def test_help_shows_a_flag_without_a_value_and_a_range_as_it_is_typed():
-    page = invoke("evaluate", "--help", env={"COLUMNS": "80"}).stdout
+    page = invoke("eval", "score", "--help", env={"COLUMNS": "80"}).stdout
 
     assert "\n  --json         " in page
     assert "--plots/--no-plots  " in page
@@ -78,9 +81,9 @@ def test_help_shows_a_flag_without_a_value_and_a_range_as_it_is_typed():
 
 
 def test_the_usage_line_has_what_must_be_given():
-    page = invoke("export-inputs", "--help", env={"COLUMNS": "80"}).stdout
+    page = invoke("eval", "inputs", "--help", env={"COLUMNS": "80"}).stdout
 
-    assert page.startswith("Usage: stereogenbench export-inputs DATA OUT --tier G0|G1|G2 [OPTIONS]")
+    assert page.startswith("Usage: stereogenbench eval inputs DATA OUT --tier G0|G1|G2 [OPTIONS]")
 
 
 def test_help_lists_rarely_used_options_last():

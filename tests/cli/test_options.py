@@ -65,18 +65,18 @@ def refused(*words):
 @pytest.mark.parametrize(
     ("words", "option", "value", "cure"),
     [
-        (["evaluate", "d", "p", "--tier", "G1"], "--size", "480,832", "WIDTHxHEIGHT"),
-        (["evaluate", "d", "p", "--tier", "G1"], "--size", "832x0", "1 to 16384"),
-        (["export-inputs", "d", "o", "--tier", "G1"], "--size", "480,832", "832x480"),
-        (["controls", "d"], "--size", "480", "WIDTHxHEIGHT"),
-        (["controls", "d"], "--pairs", "0:1", "0-1,0-5"),
-        (["controls", "d"], "--frames", "some", "every:K"),
-        (["evaluate", "d", "p", "--tier", "G1"], "--by", "focal_mm:wide", "18,35"),
+        (["eval", "score", "d", "p", "--tier", "G1"], "--size", "480,832", "WIDTHxHEIGHT"),
+        (["eval", "score", "d", "p", "--tier", "G1"], "--size", "832x0", "1 to 16384"),
+        (["eval", "inputs", "d", "o", "--tier", "G1"], "--size", "480,832", "832x480"),
+        (["eval", "controls", "d"], "--size", "480", "WIDTHxHEIGHT"),
+        (["eval", "controls", "d"], "--pairs", "0:1", "0-1,0-5"),
+        (["eval", "controls", "d"], "--frames", "some", "every:K"),
+        (["eval", "score", "d", "p", "--tier", "G1"], "--by", "focal_mm:wide", "18,35"),
         (["audit", "d"], "--frames", "0", "'all'"),
         (["show", "d"], "--pair", "left", "0-5"),
         (["show", "d"], "--pair", "5-0", "write it as 0-5"),
         (["show", "d"], "--pair", "2-2", "two different cameras"),
-        (["controls", "d"], "--pairs", "5-2", "write it as 2-5"),
+        (["eval", "controls", "d"], "--pairs", "5-2", "write it as 2-5"),
         (["download", "d", "--dest", "o"], "--cameras", "6", "0 to 5"),
         (["pack", "d", "o"], "--part", "first", "I/N"),
     ],
@@ -95,13 +95,13 @@ def test_one_pair_is_taken_however_it_is_typed(typed):
 @pytest.mark.parametrize("command", ["card", "upload"])
 @pytest.mark.parametrize("repository", ["name", "a/b/c", "https://huggingface.co/a/b", ""])
 def test_card_and_upload_take_a_repository_alike(command, repository, small_shards):
-    message = refused(command, small_shards, repository)
+    message = refused("publish", command, small_shards, repository)
 
     assert f"{repository!r} is not a repository: write ORG/NAME" in message
 
 
 def test_the_card_of_shards_names_the_repository(small_shards):
-    shown = invoke("card", small_shards, "my-lab/stereo.scenes")
+    shown = invoke("publish", "card", small_shards, "my-lab/stereo.scenes")
 
     assert shown.exit_code == 0
     assert "my-lab/stereo.scenes" in shown.stdout
@@ -112,7 +112,7 @@ def test_synth_takes_one_number_for_width_and_height_and_names_the_option_of_ano
 
 
 def test_a_size_that_looks_swapped_gives_a_warning_that_names_the_option(small_shards, tmp_path):
-    words = ["export-inputs", small_shards, tmp_path / "in", "--tier", "G2", "--frames", "first"]
+    words = ["eval", "inputs", small_shards, tmp_path / "in", "--tier", "G2", "--frames", "first"]
     with pytest.warns(SwappedSizeWarning, match="--size 52x30"):
         shown = invoke(*words, "--size", "30x52", "--workers", "1")
 

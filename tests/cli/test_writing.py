@@ -146,7 +146,7 @@ def test_a_command_whose_stdout_was_closed_does_its_work(small_shards):
 
 
 def test_a_descriptor_is_reported_as_json(small_shards, tmp_path):
-    shown = invoke("croissant", small_shards, "-o", tmp_path / "c.json", "--json")
+    shown = invoke("publish", "croissant", small_shards, "-o", tmp_path / "c.json", "--json")
 
     assert shown.exit_code == 0
     assert json.loads(shown.stdout) == {
@@ -205,18 +205,18 @@ def test_a_bar_that_counted_nothing_is_taken_off_the_terminal(monkeypatch, capsy
         "index nowhere -o out/index.parquet",
         "pack nowhere out",
         "verify nowhere",
-        "croissant nowhere -o out/croissant.json",
-        "card nowhere a/b -o out",
-        "upload nowhere a/b",
+        "publish croissant nowhere -o out/croissant.json",
+        "publish card nowhere a/b -o out",
+        "publish upload nowhere a/b",
         "download nowhere --dest out",
         "show nowhere -o out/sheet.png",
         "browse nowhere --no-open",
         "stats nowhere -o out/stats.md --plots plots",
         "audit nowhere -o out/audit.md",
         "doctor nowhere -o out/doctor.png",
-        "export-inputs nowhere out --tier G1",
-        "evaluate nowhere nothing --tier G1 -o out",
-        "controls nowhere -o out",
+        "eval inputs nowhere out --tier G1",
+        "eval score nowhere nothing --tier G1 -o out",
+        "eval controls nowhere -o out",
         "export clips nowhere out --layout musubi",
         "export ply nowhere out",
     ],
@@ -236,8 +236,8 @@ def test_a_mistyped_path_is_reported_and_makes_no_folder(words, tmp_path, monkey
         "index nowhere",
         "unpack nowhere out",
         "audit nowhere",
-        "evaluate SHARDS nowhere --tier G1",
-        "export-inputs SHARDS out --tier G1 --scene nowhere",
+        "eval score SHARDS nowhere --tier G1",
+        "eval inputs SHARDS out --tier G1 --scene nowhere",
         "audit SHARDS --family Pairwise_Uniform --map Nowhere",
     ],
 )

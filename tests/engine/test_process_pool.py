@@ -103,7 +103,7 @@ def test_an_unknown_engine_is_refused_with_those_there_are():
     ["index {release} -o {out}/index.parquet", "pack {release} {out}/shards",
      "audit {release} -o {out}/audit.md", "evaluate {release} {out} --tier G1",
      "synth {out}/scenes", "verify {shards}", "unpack {shards} {out}/scenes",
-     "doctor {shards}", "export-inputs {shards} {out}/inputs --tier G1"],
+     "doctor {shards}", "eval inputs {shards} {out}/inputs --tier G1"],
     ids=lambda command: command.partition(" ")[0],
 )  # fmt: skip
 def test_each_batch_command_takes_an_engine(command, small_release, small_shards, tmp_path):

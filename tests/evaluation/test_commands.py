@@ -22,7 +22,8 @@ def scenes(scored_index):
 def test_predictions_are_scored_and_reported(scenes, other_views, tmp_path):
     out = tmp_path / "report"
     shown = run(
-        "evaluate", scenes, other_views, "--tier", "G1", "--split", "eval", "--subset", "seen_map",
+        "eval", "score", scenes, other_views, "--tier", "G1", "--split", "eval",
+        "--subset", "seen_map",
         "--name", "next camera", "--by", "map_name", "--out", out, *SMALL,
     )  # fmt: skip
 
@@ -40,7 +41,7 @@ def test_predictions_are_scored_and_reported(scenes, other_views, tmp_path):
 
 def test_json_is_one_document_alone_on_stdout(scenes, right_views, tmp_path):
     shown = run(
-        "evaluate", scenes, right_views, "--tier", "G2", "--json", "--no-plots",
+        "eval", "score", scenes, right_views, "--tier", "G2", "--json", "--no-plots",
         "--out", tmp_path, *SMALL,
     )  # fmt: skip
     told = json.loads(shown.stdout)
@@ -52,7 +53,17 @@ def test_json_is_one_document_alone_on_stdout(scenes, right_views, tmp_path):
 
 
 def test_a_second_run_says_whether_it_reproduces_the_first(scenes, other_views, tmp_path):
-    command = ("evaluate", scenes, other_views, "--tier", "G1", "--no-plots", "--out", tmp_path)
+    command = (
+        "eval",
+        "score",
+        scenes,
+        other_views,
+        "--tier",
+        "G1",
+        "--no-plots",
+        "--out",
+        tmp_path,
+    )
     first = run(*command, *SMALL)
     results = tmp_path / "results.json"
     same = run(*command, *SMALL, "--compare", results)
@@ -72,7 +83,15 @@ def test_a_second_run_says_whether_it_reproduces_the_first(scenes, other_views, 
 def test_a_missing_prediction_ends_with_2_and_is_named(scenes, tmp_path):
     (tmp_path / "none").mkdir()
     shown = run(
-        "evaluate", scenes, tmp_path / "none", "--tier", "G0", "--out", tmp_path / "out", *SMALL
+        "eval",
+        "score",
+        scenes,
+        tmp_path / "none",
+        "--tier",
+        "G0",
+        "--out",
+        tmp_path / "out",
+        *SMALL,
     )
 
     assert shown.exit_code == 2
@@ -84,8 +103,8 @@ def test_an_evaluation_that_scored_nothing_does_not_hinder_another_one(
 ):
     (tmp_path / "none").mkdir()
     out = ("--name", "views", "--tier", "G0", "--no-plots", "--out", tmp_path / "out")
-    failed = run("evaluate", scenes, tmp_path / "none", *out, *SMALL)
-    again = run("evaluate", scenes, right_views, *out, "--metrics", "psnr", *SMALL[2:])
+    failed = run("eval", "score", scenes, tmp_path / "none", *out, *SMALL)
+    again = run("eval", "score", scenes, right_views, *out, "--metrics", "psnr", *SMALL[2:])
 
     assert (failed.exit_code, again.exit_code) == (2, 0), again.output
 
@@ -111,14 +130,16 @@ def test_an_option_that_is_off_is_reported(
     value,
     message,
 ):
-    shown = run("evaluate", scenes, right_views, "--tier", "G0", "--out", tmp_path, option, value)
+    shown = run(
+        "eval", "score", scenes, right_views, "--tier", "G0", "--out", tmp_path, option, value
+    )
 
     assert shown.exit_code == 2
     assert message in " ".join(shown.stderr.replace("│", " ").split())
 
 
 def test_inputs_are_exported(scenes, tmp_path):
-    shown = run("export-inputs", scenes, tmp_path / "in", "--tier", "G2", "--size", "64x48",
+    shown = run("eval", "inputs", scenes, tmp_path / "in", "--tier", "G2", "--size", "64x48",
                 "--frames", "0,2", "--workers", "1")  # fmt: skip
 
     assert shown.exit_code == 0, shown.output
@@ -127,7 +148,7 @@ def test_inputs_are_exported(scenes, tmp_path):
 
 
 def test_controls_that_hold_end_with_0(scenes, tmp_path):
-    shown = run("controls", scenes, "--frames", "first", "--out", tmp_path, *SMALL)
+    shown = run("eval", "controls", scenes, "--frames", "first", "--out", tmp_path, *SMALL)
 
     assert shown.exit_code == 0, shown.output
     assert "- holds: every frame of the rendered target is identical (3 of 3)" in shown.stdout
@@ -139,7 +160,7 @@ def test_controls_that_do_not_hold_end_with_1(scenes, tmp_path, monkeypatch):
 
     broken = relations.Relation("up is up", False, "down")  # noqa: FBT003
     monkeypatch.setattr(relations, "relations", lambda results: [broken])
-    shown = run("controls", scenes, "--frames", "first", "--out", tmp_path, *SMALL)
+    shown = run("eval", "controls", scenes, "--frames", "first", "--out", tmp_path, *SMALL)
 
     assert shown.exit_code == 1
     assert "DOES NOT HOLD: up is up (down)" in shown.stdout
@@ -152,7 +173,7 @@ def test_a_stop_says_how_to_go_on(scenes, right_views, tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(evaluate, "evaluate", stopped)
-    shown = run("evaluate", scenes, right_views, "--tier", "G0", "--out", tmp_path, *SMALL)
+    shown = run("eval", "score", scenes, right_views, "--tier", "G0", "--out", tmp_path, *SMALL)
 
     assert shown.exit_code == 130
     assert "run the same command again to go on from here" in shown.stderr

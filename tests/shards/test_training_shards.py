@@ -483,7 +483,7 @@ def test_a_smaller_size_works_on_top_and_a_larger_one_warns(packed):
         lambda data, out: diagnose(data),
         lambda data, out: pack(data, out, training=TrainingSettings((12, 16)), workers=1),
     ],
-    ids=["evaluate", "export-inputs", "controls", "audit", "doctor", "pack"],
+    ids=["eval score", "eval inputs", "eval controls", "audit", "doctor", "pack"],
 )
 def test_what_needs_released_pictures_refuses_derived_ones(packed, tmp_path, work):
     (tmp_path / "out").mkdir()
