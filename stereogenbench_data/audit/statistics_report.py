@@ -36,7 +36,7 @@ from stereogenbench_data.audit.statistics import (
 )
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import SCENE_COUNTS
-from stereogenbench_data.schema.text import markdown_text
+from stereogenbench_data.schema.text import markdown_table, markdown_text
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.sources.files import open_atomic
 
@@ -196,10 +196,7 @@ def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
 
 
 def _section(title: str, rows: Iterable[Sequence[str]]) -> list[str]:
-    """Return a title and a table, whose first row is its head."""
-    head, *body = rows
-    lines = [f"| {' | '.join(map(markdown_text, row))} |" for row in (head, *body)]
-    return ["", f"## {title}", "", lines[0], "|" + "---|" * len(head), *lines[1:]]
+    return ["", f"## {title}", "", *markdown_table(*rows)]
 
 
 def _count_rows(found: Statistics) -> Iterator[Sequence[str]]:

@@ -1,5 +1,7 @@
 """Text for messages, terminals and Markdown."""
 
+from collections.abc import Sequence
+
 
 def counted(count: int, noun: str) -> str:
     """Return a number with its noun.
@@ -43,3 +45,13 @@ def plain_line(text: str) -> str:
     return "".join(
         each if each.isprintable() else each.encode("unicode_escape").decode() for each in text
     )
+
+
+def markdown_table(*rows: Sequence[str]) -> list[str]:
+    """Return the lines of a Markdown table, the first row its head; empty cells become a dash.
+
+    >>> markdown_table(("here", "paper"), ("7", ""))
+    ['| here | paper |', '|---|---|', '| 7 | - |']
+    """
+    head, *body = (f"| {' | '.join(markdown_text(cell) or '-' for cell in row)} |" for row in rows)
+    return [head, "|" + "---|" * len(rows[0]), *body]

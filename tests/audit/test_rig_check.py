@@ -83,7 +83,7 @@ def test_intrinsics_in_pixels_are_found_at_any_depth_and_in_any_spelling():
     document = {
         "camera_intrinsics": {"focal_length_mm": 50.0, "fx": 200.0, "principalPointX": 50.0},
         "frames": [{"cameras": [{"K": [[201.0, 0, 49.5], [0, 200.0, 40.0], [0, 0, 1]]}]}],
-        "scene": {"f_y": 200.5, "cx_px": True, "intrinsics": "none"},
+        "scene": {"fy": 200.5, "cx_px": True, "intrinsics": "none"},
     }
 
     found = sorted(recorded_px(document))

@@ -15,11 +15,7 @@ from typing import Final
 import numpy as np
 
 from stereogenbench_data.audit.contract.matching import SceneFrames
-from stereogenbench_data.audit.geometry.reprojection import (
-    FEWER_PIXELS,
-    MeasuredDepth,
-    reproject,
-)
+from stereogenbench_data.audit.geometry.reprojection import MeasuredDepth, reproject
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.index.evidence import poses_as, same_poses, understood_poses
@@ -132,7 +128,6 @@ def explained_shares(views: SceneFrames, text: bytes, names: Sequence[str]) -> S
                     depths[later, camera],
                     intrinsics=views.intrinsics,
                     right_from_left=_moved(poses, camera, first, later),
-                    most_pixels=FEWER_PIXELS,
                 )
                 counts += (errors.agreeing, errors.unhidden)
             agreeing, unhidden = counts.tolist()

@@ -5,9 +5,12 @@ their depth and the recorded poses. On a plane 1 / depth is linear in the pixel,
 inverse depth, interpolated at that place, equals the expected one but for rounding. The residual
 is fitted by one parameter at a time (least squares, Tukey's weights): depth of one camera that is
 shifted, scaled or along the ray; a wrong focal length, which shifts the depth of every camera by
-its disparity. In the same way the difference of two pictures is fitted by a shift of one of them
-(Lucas and Kanade, 1981), or by a factor of every disparity. The parameter that explains most is
-kept, its camera is left out, and the rest is fitted again.
+its disparity. The parameter that explains most is kept, its camera is left out, and the rest is
+fitted again.
+
+Pictures are only correlated, at the points that depth puts in the same place, and those of the
+frames beside with them: whether each camera shows its own view and moment. What pictures say of
+depth itself is the doctor's (`audit.contract`).
 
 A point is seen through if the target sees something behind it. An occluder never causes that: it
 hides what is behind it. In correct data the share of such points is 0 to 0.1 % between cameras at
@@ -57,6 +60,11 @@ _COARSE: Final = 0.05
 """Depth whose stored steps are a larger share of it is too coarse to compare."""
 _WINDOW: Final = {"depth": 0.05, "motion": 0.1}
 """Relative differences of depth beyond which a point has no weight."""
+_OF_CAMERAS: Final = {"depth": ("scale", "ray", "shift_x", "shift_y"), "motion": ()}
+_OF_ALL_CAMERAS: Final = {
+    "depth": ("ray", "focal"), "motion": ("scale", "focal", "focal_x", "focal_y"),
+}  # fmt: skip
+"""The parameters that are fitted, of each camera and of all."""
 CERTAIN: Final = 6.0
 """How many standard errors an estimate must be away from 0. Among the 30 parameters of each of
 8,000 scenes, 4 or 5 occur by chance, and parts of a picture are not quite independent."""
@@ -92,20 +100,22 @@ class _Landed:
     log_ray: tuple[Points, Points]
     slope: tuple[tuple[Points, Points], tuple[Points, Points]]
 
-    def depth_columns(self) -> dict[str, tuple[Points, Points]]:
+    def by_parameter(self, check: str) -> dict[str, tuple[Points, Points]]:
         """Return d(off) for each parameter: of the source's depth, and of the target's."""
         by_depth = self._seen(self.by_depth)
+        scale = (-by_depth, -(1 + self.off))
+        across, down = (self._seen(moved) for moved in self.by_focal)
+        none = np.zeros_like(across)
+        focal = {"focal": (across + down, none)}
+        if check == "motion":
+            return focal | {"scale": scale, "focal_x": (across, none), "focal_y": (down, none)}
         (source_x, source_y), (target_x, target_y) = self.slope
-        return {
-            "scale": (-by_depth, -(1 + self.off)),
+        return focal | {
+            "scale": scale,
             "ray": (-self.log_ray[0] * by_depth, -self.log_ray[1]),
             "shift_x": (-source_x * by_depth, -target_x),
             "shift_y": (-source_y * by_depth, -target_y),
         }
-
-    def focal_columns(self) -> tuple[Points, Points]:
-        """Return d(off) for the horizontal and for the vertical focal length."""
-        return self._seen(self.by_focal[0]), self._seen(self.by_focal[1])
 
     def _seen(self, moved: tuple[Points, Points, Points]) -> Points:
         target_x, target_y = self.slope[1]
@@ -246,17 +256,13 @@ _OF_ALL: Final = -1
 
 
 class _Fit:
-    """One-parameter fits over directed pairs.
+    """One-parameter fits of a check's residuals over directed pairs."""
 
-    ``window`` is the residual beyond which a point has no weight; infinite to keep the points' own
-    weights.
-    """
-
-    def __init__(self, sums: Mapping[tuple[int, int], _Sums], *, window: float) -> None:
+    def __init__(self, sums: Mapping[tuple[int, int], _Sums], check: str) -> None:
         pairs = [pair for pair, each in sums.items() if each.differences]
         parts = [sums[pair] for pair in pairs]
         sizes = [sum(map(len, each.differences)) for each in parts]
-        self.window = window
+        self.check, self.window = check, _WINDOW[check]
         self.is_empty = sum(sizes) < _FEWEST_POINTS
         if self.is_empty:
             return
@@ -274,50 +280,42 @@ class _Fit:
             for name in parts[0].columns[0]
         }
 
-    def estimates(
-        self, check: str, *, of_cameras: Iterable[str], of_all: Iterable[str]
-    ) -> Iterator[Estimate]:
+    def estimates(self) -> Iterator[Estimate]:
         """Yield an estimate of each parameter of each camera, and of each that all share."""
         if self.is_empty:
             return
-        for name in of_cameras:
+        for name in _OF_CAMERAS[self.check]:
             source, target = self.columns[name]
             for camera in range(CAMERA_COUNT):
                 column = source * (self.source == camera) + target * (self.target == camera)
-                yield self._one(check, name, camera, column)
-        for name in of_all:
+                yield self._one(name, camera, column)
+        for name in _OF_ALL_CAMERAS[self.check]:
             source, target = self.columns[name]
-            yield self._one(check, name, _OF_ALL, source + target)
+            yield self._one(name, _OF_ALL, source + target)
 
-    def _one(self, check: str, name: str, camera: int, column: Points) -> Estimate:
+    def _one(self, name: str, camera: int, column: Points) -> Estimate:
         used = np.flatnonzero(column)
         column, off = column[used].astype(np.float64), self.off[used].astype(np.float64)
+        untold = Estimate(self.check, name, camera)
         if len(used) < _FEWEST_POINTS:
-            return Estimate(check, name, camera)
+            return untold
         value, total, weight, rest = 0.0, 0.0, self.weight[used], off
-        for _ in range(3 if np.isfinite(self.window) else 1):
+        for _ in range(3):
             weight = self.weight[used] * np.clip(1 - (rest / self.window) ** 2, 0, None) ** 2
             total = float((weight * column**2).sum())
             if total <= 0:
-                return Estimate(check, name, camera)
+                return untold
             value = float((weight * column * off).sum()) / total
             rest = off - value * column
         scores = np.bincount(self.cell[used], weights=weight * column * rest)
         before, after = (
-            self.weight[used] * np.minimum((each / self.window) ** 2, 1)
-            if np.isfinite(self.window)
-            else weight * each**2
+            float((self.weight[used] * np.minimum((each / self.window) ** 2, 1)).sum())
             for each in (off, rest)
         )
-        return Estimate(
-            check,
-            name,
-            camera,
-            value=value,
-            error=float(np.sqrt((scores**2).sum())) / total,
-            explained=float((before - after).sum()),
-            share=1 - float(after.sum()) / max(float(before.sum()), 1e-12),
-        )
+        return replace(
+            untold, value=value, error=float(np.sqrt((scores**2).sum())) / total,
+            explained=before - after, share=1 - after / max(before, 1e-12),
+        )  # fmt: skip
 
 
 class AlignmentCheck:
@@ -330,12 +328,8 @@ class AlignmentCheck:
         self._frames_a_moment = -(-frames // _MOMENTS)
         self._depth = {pair: _Sums() for pair in ALIGNED_PAIRS}
         self._motion = {(camera, camera): _Sums() for camera in range(CAMERA_COUNT)}
-        self._pictures = {pair: _Sums() for pair in ALIGNED_PAIRS}
-        self._fits: dict[tuple[int, int], list[float]] = {}
-        self._contrast: dict[tuple[int, int], list[float]] = {}
+        self._correlations: dict[tuple[int, int], list[float]] = {}
         self._lags: dict[tuple[int, int], list[float]] = {}
-        self._factor = 1.0
-        self._disparity_px: dict[tuple[int, int], list[float]] = {}
         self._moved_px: list[float] = []
         self._frames = 0
         self._last: tuple[int, dict[int, MeasuredDepth]] | None = None
@@ -400,22 +394,11 @@ class AlignmentCheck:
         sums.through += int((smooth & (landed.off < -tolerance)).sum())
         window = _WINDOW[check]
         keep = smooth & (np.abs(landed.off) < window + 2 * landed.steps)
-        columns = {name: (a[keep], b[keep]) for name, (a, b) in landed.depth_columns().items()}
-        across, down = (column[keep] for column in landed.focal_columns())
-        none = np.zeros_like(across)
-        columns["focal"] = (across + down, none)
-        if check == "motion":
-            columns |= {"focal_x": (across, none), "focal_y": (down, none)}
-            del columns["shift_x"], columns["shift_y"], columns["ray"]
+        columns = {name: (a[keep], b[keep]) for name, (a, b) in landed.by_parameter(check).items()}
         # Coarse steps make a point count less; rounding moves it by 0.3 of one.
         weight = 1 / (1 + (landed.steps[keep] / _TOLERANCE) ** 2)
-        sums.add(landed.off[keep], weight, self._cells(landed, keep), columns)
-
-    def _cells(self, landed: _Landed, keep: np.ndarray) -> np.ndarray:
-        """Return the part of the picture and the moment of each point."""
         moment = self._frames // self._frames_a_moment
-        cells: np.ndarray = landed.cell[keep] + _CELLS**2 * moment
-        return cells
+        sums.add(landed.off[keep], weight, landed.cell[keep] + _CELLS**2 * moment, columns)
 
     def _add_pictures(
         self,
@@ -424,51 +407,34 @@ class AlignmentCheck:
         landed: _Landed,
         bands: Mapping[tuple[int, int], Float[np.ndarray, "h w"]],
     ) -> None:
-        source, target = pair
-        if (source, frame) not in bands or (target, frame) not in bands:
-            return
-        here, there = bands[source, frame], bands[target, frame]
-        factor = self.intrinsics.width_px / here.shape[1]
-        factor_y = self.intrinsics.height_px / here.shape[0]
-        self._factor = factor
+        """Correlate two cameras' pictures at the same points, and those of the frames beside."""
         seen = np.abs(landed.off) < _VISIBLE + 2 * landed.steps
-        if seen.sum() < _FEWEST_POINTS:
+        if not {(camera, frame) for camera in pair} <= bands.keys() or seen.sum() < _FEWEST_POINTS:
             return
-        from_px = ((landed.columns[seen] + 0.5) / factor, (landed.rows[seen] + 0.5) / factor_y)
-        to_px = (landed.u_px[seen] / factor, landed.v_px[seen] / factor_y)
-        (first, *slope), (second, *other) = _sampled(here, *from_px), _sampled(there, *to_px)
-        slope_x, slope_y = ((a + b) / 2 for a, b in zip(slope, other, strict=True))
-        contrast = float(min(first.std(), second.std()))
-        self._contrast.setdefault(pair, []).append(contrast)
-        if contrast < LEAST_CONTRAST:
-            return
-        self._fits.setdefault(pair, []).append(_correlation(first, second))
-        disparity_px = float(np.abs(landed.by_depth[0][seen]).mean()) / factor
-        self._disparity_px.setdefault(pair, []).append(disparity_px)
-        for lag in (-1, 1):
-            beside = bands.get((source, frame + lag)), bands.get((target, frame + lag))
-            early = None if beside[0] is None else _value(beside[0], *from_px)
-            late = None if beside[1] is None else _value(beside[1], *to_px)
-            for camera, one, two in (
-                (source, early, second), (target, first, late), (_OF_ALL, early, late),
-            ):  # fmt: skip
-                if one is not None and two is not None:
-                    gained = _correlation(one, two) - _correlation(first, second)
-                    self._lags.setdefault((camera, lag), []).append(gained)
-        gain = float((first * second).sum() / max(float((first * first).sum()), 1e-9))
-        off = second - np.clip(gain, 0.5, 2.0) * first
-        spread = 1.4826 * float(np.median(np.abs(off)))
-        # A picture that is off by a pixel differs by its slope: that counts in full.
-        cut = max(6 * spread, 3 * float(np.sqrt((slope_x**2 + slope_y**2).mean())))
-        weight = np.clip(1 - (off / cut) ** 2, 0, None) ** 2 / max(spread, 1.0) ** 2
-        by_depth_x, by_depth_y = landed.by_depth[0][seen], landed.by_depth[1][seen]
-        by_scale = slope_x * by_depth_x / factor + slope_y * by_depth_y / factor_y
-        columns = {
-            "shift_x": (slope_x, -slope_x),
-            "shift_y": (slope_y, -slope_y),
-            "scale": (-by_scale, np.zeros_like(by_scale)),
+        height, width = bands[pair[0], frame].shape
+        across, down = width / self.intrinsics.width_px, height / self.intrinsics.height_px
+        places = (
+            ((landed.columns[seen] + 0.5) * across, (landed.rows[seen] + 0.5) * down),
+            (landed.u_px[seen] * across, landed.v_px[seen] * down),
+        )
+        values = {
+            (camera, lag): _value(bands[camera, frame + lag], *place)
+            for camera, place in zip(pair, places, strict=True)
+            for lag in (-1, 0, 1)
+            if (camera, frame + lag) in bands
         }
-        self._pictures[pair].add(off, weight, self._cells(landed, seen), columns)
+        source, target = pair
+        if min(values[source, 0].std(), values[target, 0].std()) < LEAST_CONTRAST:
+            return
+        now = _correlation(values[source, 0], values[target, 0])
+        self._correlations.setdefault(pair, []).append(now)
+        for lag in (-1, 1):
+            for camera, one, two in (
+                (source, lag, 0), (target, 0, lag), (_OF_ALL, lag, lag),
+            ):  # fmt: skip
+                if (source, one) in values and (target, two) in values:
+                    then = _correlation(values[source, one], values[target, two])
+                    self._lags.setdefault((camera, lag), []).append(then - now)
 
     def result(self) -> Alignment:
         """Return what all frames show."""
@@ -478,59 +444,35 @@ class AlignmentCheck:
                 right=right,
                 smooth=sum(self._depth[pair].smooth for pair in both),
                 through=sum(self._depth[pair].through for pair in both),
-                contrast=_mean(self._contrast.get(pair, []) for pair in both),
-                correlation=_mean(self._fits.get(pair, []) for pair in both),
-                disparity_px=_mean(self._disparity_px.get(pair, []) for pair in both),
+                correlation=_mean(self._correlations.get(pair, []) for pair in both),
             )
             for left, right in ALIGNED_PAIRS
             if left < right
             for both in [((left, right), (right, left))]
         )
-        depth = _explained(
-            self._depth, "depth", of_cameras=("scale", "ray", "shift_x", "shift_y"),
-            of_all=("ray", "focal"),
-        )  # fmt: skip
-        motion = _explained(self._motion, "motion", of_all=("scale", "focal", "focal_x", "focal_y"))
-        faulty = {each.camera for each in depth if each.is_first}
-        clean = {pair: sums for pair, sums in self._pictures.items() if not faulty & set(pair)}
-        pictures = _explained(
-            clean, "pictures", of_cameras=("shift_x", "shift_y"), of_all=("scale",)
-        )
         return Alignment(
             pairs=pairs,
-            estimates=(*depth, *motion, *pictures),
+            estimates=(*_explained(self._depth, "depth"), *_explained(self._motion, "motion")),
             lags=tuple(
                 (camera, lag, float(np.mean(gained)))
                 for (camera, lag), gained in sorted(self._lags.items())
             ),
             moved_smooth=sum(each.smooth for each in self._motion.values()),
             moved_through=sum(each.through for each in self._motion.values()),
-            picture_px=self._factor,
-            width_px=self.intrinsics.width_px / self._factor,
             moved_px=_mean([self._moved_px]),
-            disparity_px=_mean(self._disparity_px.values()),
         )
 
 
-def _explained(
-    sums: Mapping[tuple[int, int], _Sums],
-    check: str,
-    *,
-    of_cameras: tuple[str, ...] = (),
-    of_all: tuple[str, ...] = (),
-) -> list[Estimate]:
+def _explained(sums: Mapping[tuple[int, int], _Sums], check: str) -> list[Estimate]:
     """Return all estimates, those that explained most in a round first and marked.
 
     The camera of a round's best estimate is left out of the next round.
     """
     left, first = dict(sums), []
     estimates: list[Estimate] = []
-    window = _WINDOW.get(check, np.inf)
-    for turn in range(CAMERA_COUNT - 1):
-        fit = _Fit(left, window=window)
-        found = list(fit.estimates(check, of_cameras=of_cameras, of_all=of_all))
-        if turn == 0:
-            estimates = found
+    for _ in range(CAMERA_COUNT - 1):
+        found = list(_Fit(left, check).estimates())
+        estimates = estimates or found
         certain = [
             each for each in found
             if abs(each.value) > max(_NOTED[each.what.split("_")[0]], CERTAIN * each.error)
@@ -555,21 +497,6 @@ def _is_part(best: Estimate, other: Estimate) -> bool:
     """Tell whether an estimate explains only what it has in common with a better one."""
     whats = {best.what, other.what}
     return whats <= {"focal", "focal_x", "focal_y"} and "focal" in whats
-
-
-def _sampled(picture: Any, u_px: Points, v_px: Points) -> tuple[Points, Points, Points]:
-    """Return a picture's values and slopes between its pixels."""
-    height, width = picture.shape
-    x, y = np.clip(u_px - 0.5, 1, width - 3.001), np.clip(v_px - 0.5, 1, height - 3.001)
-    left, top = x.astype(np.intp), y.astype(np.intp)
-    steps = np.arange(-1, 3)
-    patch = picture[top + steps[:, None, None], left + steps[:, None]]
-    part_x, part_y = x - left, y - top
-    return (
-        _between(patch[1:3, 1:3], part_x, part_y),
-        _between(patch[1:3, 2:] - patch[1:3, :2], part_x, part_y) / 2,
-        _between(patch[2:, 1:3] - patch[:2, 1:3], part_x, part_y) / 2,
-    )
 
 
 def _value(picture: Any, u_px: Points, v_px: Points) -> Points:

@@ -58,24 +58,6 @@ def _rig_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
         if value > limit:
             text = f"{what} {value:.3g} {unit} (limit {limit:g})"
             yield Finding(scene.key, "", check, text)
-    through = {
-        (fit.left, fit.right) for fit in scene.alignment.pairs
-        if fit.see_through > limits.see_through
-    }  # fmt: skip
-    for pair in scene.pairs:
-        cameras = min(pair.left, pair.right), max(pair.left, pair.right)
-        is_long = cameras == (0, CAMERA_COUNT - 1)
-        name = "agreement_long" if is_long else "agreement"
-        limit = getattr(limits, name)
-        # Depths also disagree at edges, of which small pictures and wide rigs have many: alone that
-        # breaks only a limit that the user has set.
-        is_set = limit != getattr(AuditLimits(), name)
-        if pair.agreement < limit and (cameras in through or is_set):
-            text = (
-                f"the two depths agree at {pair.agreement:.1%} of the pixels of camera {pair.left} "
-                f"that nothing hides from camera {pair.right} (limit {limit:.0%})"
-            )
-            yield Finding(scene.key, "", "agreement", text)
 
 
 _LEAST_EXPLAINED: Final = 0.35
@@ -87,10 +69,22 @@ _NEXT_BEST: Final = 0.85
 _MOST_FACTOR: Final = 0.5
 """Larger factors explain depth that has nothing to do with the poses or baselines."""
 _FITS: Final = "from frame to frame, depth and poses fit if"
-_SHARP_PX: Final = 256
-"""In narrower pictures, sampling between pixels is less accurate."""
 _OWN_MOTION_PX: Final = 0.03
-_SHIFTS: Final = {"shift_x": "to the right", "shift_y": "down"}
+_CAUSES: Final = {
+    ("depth", "scale"): "depth of {of} differs from that of the others by {share}",
+    ("depth", "ray"): "depth of {of} is {part} of the way from the axis to along the ray",
+    ("depth", "shift_x"): "depth of {of} is {pixels} to the right of where the others see it",
+    ("depth", "shift_y"): "depth of {of} is {pixels} down of where the others see it",
+    ("depth", "focal"): "between cameras, depth fits if the focal length, or all baselines, are "
+    "corrected {factor}",
+    ("motion", "scale"): f"{_FITS} the unit of depth or of poses is corrected {{factor}}",
+    ("motion", "focal"): f"{_FITS} the focal length is corrected {{factor}}",
+    ("motion", "focal_x"): f"{_FITS} the horizontal focal length (sensor width) is corrected "
+    "{factor}",
+    ("motion", "focal_y"): f"{_FITS} the vertical focal length (sensor height) is corrected "
+    "{factor}",
+}  # fmt: skip
+"""What an estimate says, by its check and parameter."""
 
 
 def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
@@ -117,13 +111,9 @@ def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Find
     has_wrong_depth = bool(through) or any(
         each.check == "depth" and each.what != "focal" for each in first
     )
-    all_late = any(camera < 0 and gain > limits.picture_lag for camera, _, gain in found.lags)
     for each in first:
-        # Depth that contradicts itself or the poses cannot confirm a length, nor can pictures of
-        # another moment.
-        is_explained = (
-            each.check == "motion" and (has_wrong_depth or moved > limits.moved_through)
-        ) or (each.check == "pictures" and each.what == "scale" and all_late)
+        # Depth that contradicts itself or the poses cannot confirm a length.
+        is_explained = each.check == "motion" and (has_wrong_depth or moved > limits.moved_through)
         limit = limit_of(scene, each, limits)
         if not is_explained and abs(each.value) > max(limit, CERTAIN * each.error):
             yield from _estimate_finding(scene, each, limit)
@@ -137,65 +127,26 @@ def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Find
             )
             name = "" if camera < 0 else rgb_name(camera)
             yield Finding(scene.key, name, "picture time", text)
-    yield from _content_findings(scene, limits)
-
-
-def _content_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
-    """Yield the cameras whose pictures show something else than the others do."""
-    found = scene.alignment
+    seen = [pair for pair in found.pairs if not math.isnan(pair.correlation)]
     for camera in range(CAMERA_COUNT):
-        fits = [pair.correlation for pair in found.pairs if camera in (pair.left, pair.right)
-                and not math.isnan(pair.correlation)]  # fmt: skip
-        if fits and max(fits) < limits.picture_fit:
-            text = (
-                f"pictures of camera {camera}, warped by depth to any other camera, have a "
-                f"correlation of {max(fits):.2f} or less with its pictures "
-                f"(limit {limits.picture_fit:g})"
-            )
-            yield Finding(scene.key, rgb_name(camera), "picture content", text)
-        elif (less := _correlated_less(scene, camera)) > limits.picture_odd:
+        own = [pair.correlation for pair in seen if camera in (pair.left, pair.right)]
+        others = [pair.correlation for pair in seen if camera not in (pair.left, pair.right)]
+        if own and others and median(others) - max(own) > limits.picture_odd:
             text = (
                 f"pictures of camera {camera}, warped by depth to the others, have a correlation "
-                f"with theirs that is at least {less:.2f} less than that of the others with each "
-                f"other (limit {limits.picture_odd:g})"
+                f"with theirs of {max(own):.2f} or less, and the others {median(others):.2f} with "
+                f"each other (limit {limits.picture_odd:g} less)"
             )
             yield Finding(scene.key, rgb_name(camera), "picture content", text)
-
-
-def _correlated_less(scene: SceneAudit, camera: int) -> float:
-    """Return the least by which a camera's pairs correlate less than other pairs.
-
-    Each is compared with pairs of at least its disparity, because wider pairs differ more. 0 if
-    fewer than two of the camera's pairs can be compared.
-    """
-    pairs = [pair for pair in scene.alignment.pairs if not math.isnan(pair.correlation)]
-    less = []
-    for pair in pairs:
-        others = [
-            each.correlation for each in pairs
-            if camera not in (each.left, each.right) and each.disparity_px >= pair.disparity_px
-        ]  # fmt: skip
-        if camera in (pair.left, pair.right) and others:
-            less.append(median(others) - pair.correlation)
-    return min(less) if len(less) > 1 else 0.0
 
 
 def limit_of(scene: SceneAudit, each: Estimate, limits: AuditLimits) -> float:
     """Return the size beyond which an estimate is a finding."""
-    if each.check == "depth":
-        by_name = {
-            "scale": limits.depth_scale, "ray": limits.depth_ray, "focal": limits.focal,
-        }  # fmt: skip
-        return by_name.get(each.what, limits.depth_shift_px)
     if each.check == "motion":
         # The less the camera moves, the more do moving objects disturb the estimate.
         return max(limits.focal, _OWN_MOTION_PX / max(scene.alignment.moved_px, 1e-6))
-    if each.what == "shift_y":
-        return limits.picture_shift_px
-    shift_px = limits.picture_shift_px * max(1.0, _SHARP_PX / scene.alignment.width_px)
-    # A factor cannot be known better than the shift that it causes.
-    least = shift_px / max(scene.alignment.disparity_px, 1e-6)
-    return shift_px if each.what == "shift_x" else max(limits.picture_scale, least)
+    by_name = {"scale": limits.depth_scale, "ray": limits.depth_ray, "focal": limits.focal}
+    return by_name.get(each.what, limits.depth_shift_px)
 
 
 _STILL_PX: Final = 1.0
@@ -232,31 +183,23 @@ def untested_of(scene: SceneAudit, limits: AuditLimits) -> list[Finding]:
 
 def _untested_fits(scene: SceneAudit, limits: AuditLimits) -> Iterator[tuple[str, str]]:
     """Yield the quantities of which an error as large as the limit would not be certain."""
-    for check, whats in (
-        ("depth", ("scale", "ray", "shift_x", "shift_y")),
-        ("motion", ("scale", "focal", "focal_x", "focal_y")),
-        ("pictures", ("scale", "shift_x", "shift_y")),
-    ):
-        for what in whats:
-            limit = least = limit_of(scene, Estimate(check, what, -1), limits)
-            if (check, what) == ("pictures", "scale"):
-                limit = limits.picture_scale
-            if check == "motion":
-                limit = limits.focal
-            seen = {
-                each.camera: max(least, CERTAIN * each.error)
-                if math.isfinite(each.error)
-                else math.inf
-                for each in scene.alignment.estimates
-                if (each.check, each.what) == (check, what)
-            }
-            blind = [camera for camera, size in seen.items() if not size <= limit]
-            if blind or not seen:
-                from_on = max((seen[camera] for camera in blind), default=math.inf)
-                why = f"seen from {from_on:.2g} on" if math.isfinite(from_on) else "no estimate"
-                of = _cameras([camera for camera in blind if camera >= 0])
-                subject = f"{QUANTITIES[what]}{f' of {of}' if of else ''}"
-                yield f"{check} fit", f"{subject}: {why} (limit {limit:.2g})"
+    for check, what in _CAUSES:
+        if (check, what) == ("depth", "focal"):
+            continue
+        least = limit_of(scene, Estimate(check, what, -1), limits)
+        limit = limits.focal if check == "motion" else least
+        seen = {
+            each.camera: max(least, math.inf if math.isnan(each.error) else CERTAIN * each.error)
+            for each in scene.alignment.estimates
+            if (each.check, each.what) == (check, what)
+        }
+        blind = [camera for camera, size in seen.items() if size > limit]
+        if blind or not seen:
+            from_on = max((seen[camera] for camera in blind), default=math.inf)
+            why = f"seen from {from_on:.2g} on" if math.isfinite(from_on) else "no estimate"
+            of = _cameras([camera for camera in blind if camera >= 0])
+            subject = f"{QUANTITIES[what]}{f' of {of}' if of else ''}"
+            yield f"{check} fit", f"{subject}: {why} (limit {limit:.2g})"
 
 
 def _cameras_without(pairs: tuple[PairFit, ...], figure: str) -> list[int]:
@@ -276,46 +219,24 @@ def _cameras(numbers: list[int]) -> str:
 def _estimate_finding(scene: SceneAudit, each: Estimate, limit: float) -> Iterator[Finding]:
     """Yield the finding of an estimate that explains what it is blamed for, with its interval."""
     is_gross = each.check == "motion" and min(abs(each.value), each.share) > _GROSS
-    is_explained = each.check == "pictures" or each.share >= _LEAST_EXPLAINED
+    is_explained = each.share >= _LEAST_EXPLAINED
     if not (is_explained or is_gross):
         return
-    of = "all cameras" if each.camera < 0 else f"camera {each.camera}"
-    name_of = rgb_name if each.check == "pictures" else depth_name
-    name = "" if each.camera < 0 else name_of(each.camera)
     half = 1.96 * each.error
-    factor = f"{-each.value:+.2%} ± {half:.2%}"
-    px = scene.alignment.picture_px if each.check == "pictures" else 1.0
-    pixels = f"{each.value * px:+.2f} ± {half * px:.2f} px"
-    cause = {
-        ("depth", "scale"): f"depth of {of} differs from that of the others by "
-        f"{each.value:+.2%} ± {half:.2%}",
-        ("depth", "ray"): f"depth of {of} is {each.value:.0%} ± {half:.0%} of the way from the "
-        f"axis to along the ray",
-        ("depth", "shift_x"): f"depth of {of} is {pixels} to the right of where the others see it",
-        ("depth", "shift_y"): f"depth of {of} is {pixels} down of where the others see it",
-        ("depth", "focal"): f"between cameras, depth fits if the focal length, or all baselines, "
-        f"are corrected {factor}",
-        ("motion", "scale"): f"{_FITS} the unit of depth or of poses is corrected {factor}",
-        ("motion", "focal"): f"{_FITS} the focal length is corrected {factor}",
-        ("motion", "focal_x"): f"{_FITS} the horizontal focal length (sensor width) is corrected "
-        f"{factor}",
-        ("motion", "focal_y"): f"{_FITS} the vertical focal length (sensor height) is corrected "
-        f"{factor}",
-        ("pictures", "scale"): f"disparity of the pictures differs from that of depth by "
-        f"{each.value:+.2%} ± {half:.2%}",
-        ("pictures", "shift_x"): f"pictures of {of} are {pixels} to the right of where depth and "
-        f"the others put them",
-        ("pictures", "shift_y"): f"pictures of {of} are {pixels} down of where depth and the "
-        f"others put them",
-    }[each.check, each.what]  # fmt: skip
-    excess = abs(each.value)
-    if each.what == "ray":
-        excess = abs(each.value - 1)
-    elif each.what.startswith("shift") or (each.check == "depth" and each.what == "scale"):
+    excess = abs(each.value - 1) if each.what == "ray" else abs(each.value)
+    if each.what.startswith("shift") or (each.check == "depth" and each.what == "scale"):
         excess = 0.0
+    cause = _CAUSES[each.check, each.what].format(
+        of="all cameras" if each.camera < 0 else f"camera {each.camera}",
+        share=f"{each.value:+.2%} ± {half:.2%}",
+        factor=f"{-each.value:+.2%} ± {half:.2%}",
+        part=f"{each.value:.0%} ± {half:.0%}",
+        pixels=f"{each.value:+.2f} ± {half:.2f} px",
+    )
     if not is_explained or each.next_best > _NEXT_BEST or excess > _MOST_FACTOR:
         where = "audited frames" if each.check == "motion" else "cameras"
         cause = f"{each.check} does not fit between {where}, and no single cause explains it"
+    name = "" if each.camera < 0 else depth_name(each.camera)
     yield Finding(scene.key, name, f"{each.check} fit", f"{cause} (limit {limit:.3g})")
 
 

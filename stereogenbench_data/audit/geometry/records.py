@@ -23,10 +23,6 @@ class AuditLimits:
         baseline_cm: Largest difference between recorded and pose-derived baselines.
         rectified_px: Largest displacement by unequal rotations, or by cameras off the line.
         reprojection_px: Largest median error of the primary pair, at the widest tolerance.
-        agreement: Least share of unhidden pixels whose depths agree, in the primary pair and in
-            any adjacent pair.
-        agreement_long: The same for cameras 0 and 5. In pictures narrower than 128 px, where more
-            pixels lie at edges, the share that may disagree grows.
         frames: Frames that every video must have; 0 for as many as the scene has poses.
         valid_depth: Least share of measured pixels in any depth picture.
         depth_levels: Least number of different depths in a camera's pictures.
@@ -44,14 +40,8 @@ class AuditLimits:
         depth_ray: Largest deviation from depth along the axis (0) towards depth along the ray (1).
         focal: Largest factor, less 1, by which a focal length or the unit of depth differs from
             what depth shows while the cameras move.
-        picture_shift_px: Largest shift of one camera's pictures against the others, in pixels of
-            a picture reduced to at most 320 a side. Along the rows the limit grows for pictures
-            narrower than 256 px: 0.3 px at 128.
-        picture_scale: Largest factor, less 1, between disparity in the pictures and by depth.
-        picture_fit: Least correlation of a camera's pictures with those of the camera that they
-            fit best, after a warp by depth.
-        picture_odd: Largest difference of that correlation between all of a camera's pairs and
-            pairs of other cameras with as much disparity.
+        picture_odd: Largest difference between the median correlation of other cameras' pictures
+            and the best of a camera's, after a warp by depth.
         picture_lag: Largest gain of that correlation by pictures of another frame.
     """
 
@@ -59,8 +49,6 @@ class AuditLimits:
     baseline_cm: float = 1e-3
     rectified_px: float = 0.05
     reprojection_px: float = 0.5
-    agreement: float = 0.85
-    agreement_long: float = 0.7
     frames: float = 0
     valid_depth: float = 0.1
     depth_levels: float = 8
@@ -75,9 +63,6 @@ class AuditLimits:
     depth_scale: float = 0.005
     depth_ray: float = 0.25
     focal: float = 0.01
-    picture_shift_px: float = 0.15
-    picture_scale: float = 0.01
-    picture_fit: float = 0.5
     picture_odd: float = 0.15
     picture_lag: float = 0.02
 
@@ -170,7 +155,7 @@ class PairAudit:
 
     ``comparable`` pixels land inside the right picture where depth was measured. Of these, nothing
     in the left view hides the ``unhidden`` ones; of these, the two depths agree at the ``agreeing``
-    ones. Errors are kept for the primary and the long pair.
+    ones.
     """
 
     left: int
@@ -225,7 +210,7 @@ class Estimate:
     """The estimate of one parameter that explains residuals between cameras, frames or pictures.
 
     Attributes:
-        check: "depth" (cameras at one moment), "motion" (one camera over time) or "pictures".
+        check: "depth" (cameras at one moment) or "motion" (one camera over time).
         what: "scale", "ray", "shift_x", "shift_y", "focal", "focal_x" or "focal_y"; factors are
             less 1, shifts in pixels to the right or down of what was compared.
         camera: The camera; -1 for all.
@@ -257,18 +242,14 @@ class PairFit:
         right: The other camera.
         smooth: Number of points on smooth surfaces that land on smooth surfaces.
         through: How many of them lie in front of what the other camera sees there.
-        contrast: Standard deviation of the compared pictures in grey levels; nan for none.
         correlation: Correlation of the pictures at the same points; nan without texture.
-        disparity_px: Mean disparity of these points, in pixels of the compared pictures.
     """
 
     left: int
     right: int
     smooth: int
     through: int
-    contrast: float
     correlation: float
-    disparity_px: float
 
     @property
     def see_through(self) -> float:
@@ -288,9 +269,6 @@ class Alignment:
         moved_smooth: Number of points on smooth surfaces taken from one audited frame to the next.
         moved_through: How many of them are seen through there.
         moved_px: How far these points move, the mean of the frames' medians.
-        picture_px: Pixels of the scene's pictures in one pixel of the compared pictures.
-        width_px: Width of the compared pictures; nan for none.
-        disparity_px: Mean disparity of compared points, in pixels of the compared pictures.
     """
 
     pairs: tuple[PairFit, ...] = ()
@@ -299,9 +277,6 @@ class Alignment:
     moved_smooth: int = 0
     moved_through: int = 0
     moved_px: float = math.nan
-    picture_px: float = 1.0
-    width_px: float = math.nan
-    disparity_px: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -314,8 +289,7 @@ class SceneAudit:
         audited_frames: The frames that were decoded.
         rig: Figures of the metadata.
         cameras: Figures of each camera.
-        pairs: Reprojection of the primary pair, of cameras 0 and 5, and, with fewer pixels, of
-            the other adjacent pairs.
+        pairs: Reprojection of the primary pair and of cameras 0 and 5.
         problems: (file, reason) of files that could not be read.
         alignment: How well pictures, depth, poses and focal length fit together.
     """

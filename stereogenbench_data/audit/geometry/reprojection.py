@@ -17,7 +17,7 @@ derivation. The paper does not state its tolerance; ours are `TOLERANCES`.
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -34,9 +34,6 @@ Mask = Bool[np.ndarray, "h w"]
 
 MOST_PIXELS: Final = 250_000
 """How many pixels of a picture are projected: every k-th row of a larger one."""
-
-FEWER_PIXELS: Final = 32_000
-"""The same if only the agreement of depths is wanted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,18 +97,12 @@ class PairErrors:
     agreeing: int
 
 
-def row_step(height_px: int, width_px: int, *, most_pixels: int) -> int:
-    """Return k so that every k-th row of a picture has about ``most_pixels`` at most."""
-    return max(1, math.ceil(height_px * width_px / most_pixels))
-
-
 def reproject(
     left: MeasuredDepth,
     right: MeasuredDepth,
     *,
     intrinsics: Intrinsics,
     right_from_left: Float64[np.ndarray, "4 4"],
-    most_pixels: int = MOST_PIXELS,
 ) -> PairErrors:
     """Return the reprojection errors of a left camera's pixels, all in float64.
 
@@ -120,10 +111,9 @@ def reproject(
         right: Depth of the camera to which they go and from which they come back.
         intrinsics: The intrinsics of both pictures.
         right_from_left: The motion between the cameras' axes, in metres.
-        most_pixels: How many pixels to take, whole rows evenly spread.
     """
     height_px, width_px = left.depth_m.shape
-    step = row_step(height_px, width_px, most_pixels=most_pixels)
+    step = max(1, math.ceil(height_px * width_px / MOST_PIXELS))
     first = step // 2
     depth_m, measured = left.depth_m[first::step], left.measured[first::step]
     u_px = np.broadcast_to(np.arange(width_px) + 0.5, depth_m.shape)
@@ -181,12 +171,10 @@ def _moved(
     )
 
 
-def pair_audit(
-    pair: tuple[int, int], found: list[PairErrors], *, keep: Literal["errors", "agreement"]
-) -> PairAudit:
-    """Return the figures of a pair over all audited frames, with or without its errors."""
+def pair_audit(pair: tuple[int, int], found: list[PairErrors]) -> PairAudit:
+    """Return the figures of a pair over all audited frames."""
     tolerances = []
-    for place, tolerance in enumerate(TOLERANCES if keep == "errors" else ()):
+    for place, tolerance in enumerate(TOLERANCES):
         errors_px = np.concatenate([np.empty(0), *(each.errors_px[place] for each in found)])
         quantiles = np.quantile(errors_px, QUANTILES).tolist() if len(errors_px) else []
         rounded = tuple(float(f"{each:.{_SIGNIFICANT}g}") for each in quantiles)

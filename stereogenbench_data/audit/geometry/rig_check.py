@@ -1,12 +1,10 @@
 """Consistency of what a scene's metadata records of its cameras; no picture is needed.
 
-Intrinsics recorded in pixels are compared with the paper's equation. The release's files record
-millimetres. Pixels, of the rig, a camera or a frame, are found by name at any depth of the
-document: ``fx``, ``fy``, ``cx``, ``cy`` and their longer spellings, and 3x3 camera matrices.
+Intrinsics recorded in pixels, of the rig, a camera or a frame, are compared with the paper's
+equation. The release's files record millimetres; `schema.quantities` finds pixels by their names.
 """
 
 import math
-import re
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, Final
@@ -17,48 +15,23 @@ from stereogenbench_data.audit.geometry.records import RigAudit
 from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses, rotation_angle_rad
 from stereogenbench_data.geometry.rig import rectification_residual_px
+from stereogenbench_data.schema.quantities import nodes_of, numbers
 from stereogenbench_data.schema.records import Rig
 from stereogenbench_data.schema.release import ADJACENT_PAIRS, CAMERA_PAIRS
 
-_NAMES: Final = {
-    "fx_px": re.compile(r"(fx|f_x|focal(_length)?_(x|px)|focal(_length)?_x_px|fx_px)"),
-    "fy_px": re.compile(r"(fy|f_y|focal(_length)?_y|focal(_length)?_y_px|fy_px)"),
-    "cx_px": re.compile(r"(cx|c_x|principal(_point)?_x|principal(_point)?_x_px|cx_px)"),
-    "cy_px": re.compile(r"(cy|c_y|principal(_point)?_y|principal(_point)?_y_px|cy_px)"),
-}
-_MATRIX: Final = re.compile(r"(k|k_matrix|camera_matrix|intrinsics?(_matrix)?|k_px)")
-_PLACES: Final = {"fx_px": (0, 0), "fy_px": (1, 1), "cx_px": (0, 2), "cy_px": (1, 2)}
+_QUANTITIES: Final = {
+    "fx_px": "focal_px", "fy_px": "focal_y_px", "cx_px": "principal_x", "cy_px": "principal_y",
+}  # fmt: skip
 
 
-def recorded_px(node: Any) -> Iterator[tuple[str, float]]:
+def recorded_px(document: dict[str, Any]) -> Iterator[tuple[str, float]]:
     """Yield the name (of `Intrinsics`) and value of each number in pixels, at any depth."""
-    if isinstance(node, list):
-        for each in node:
-            if isinstance(each, dict | list):
-                yield from recorded_px(each)
-        return
-    if not isinstance(node, dict):
-        return
-    for key, value in node.items():
-        spelled = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", str(key)).lower()
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            yield from (
-                (name, float(value)) for name, spelling in _NAMES.items()
-                if spelling.fullmatch(spelled)
-            )  # fmt: skip
-        elif _MATRIX.fullmatch(spelled) and (matrix := _matrix(value)) is not None:
-            yield from ((name, float(matrix[place])) for name, place in _PLACES.items())
-        elif isinstance(value, dict | list):
-            yield from recorded_px(value)
-
-
-def _matrix(value: Any) -> Any:
-    """Return a value as a 3x3 array of numbers, None if it is not one."""
-    try:
-        matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        return None
-    return matrix if matrix.shape == (3, 3) else None
+    nodes = nodes_of(document)
+    for name, quantity in _QUANTITIES.items():
+        for each in numbers(nodes, quantity):
+            # A focal length without a unit may be in millimetres.
+            if each.unit == "px" or (not each.unit and "focal" not in each.path.lower()):
+                yield name, float(each.value)
 
 
 def rig_audit(rig: Rig, poses: CameraPoses, documents: list[dict[str, Any]]) -> RigAudit:

@@ -24,8 +24,6 @@ from stereogenbench_data.audit.geometry.picture_check import (
 )
 from stereogenbench_data.audit.geometry.records import At, CameraAudit, RigAudit, SceneAudit
 from stereogenbench_data.audit.geometry.reprojection import (
-    FEWER_PIXELS,
-    MOST_PIXELS,
     MeasuredDepth,
     PairErrors,
     pair_audit,
@@ -45,7 +43,6 @@ from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.document import parse_document
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import (
-    ADJACENT_PAIRS,
     BASELINE_JSON,
     CAMERA_COUNT,
     TRAJECTORY_JSON,
@@ -213,9 +210,9 @@ class _SceneCheck:
         self.payload = [PayloadCheck() for _ in range(CAMERA_COUNT)]
         self.occluders = [(At(0.0), "")] * CAMERA_COUNT
         self.same: dict[tuple[int, int], bool] = {}
-        self.measured_pairs = (self.scene.rig.primary_pair, LONG_PAIR)
-        pairs = dict.fromkeys([*self.measured_pairs, *ADJACENT_PAIRS])
-        self.errors: dict[tuple[int, int], list[PairErrors]] = {pair: [] for pair in pairs}
+        self.errors: dict[tuple[int, int], list[PairErrors]] = {
+            self.scene.rig.primary_pair: [], LONG_PAIR: [],
+        }  # fmt: skip
         self.alignment = AlignmentCheck(self.intrinsics, frames=len(self.frames))
         self.seen: dict[tuple[int, int], tuple[Any, Any]] = {}
 
@@ -237,12 +234,7 @@ class _SceneCheck:
             audited_frames=self.frames,
             rig=rig,
             cameras=tuple(self._camera(camera, counts[camera]) for camera in range(CAMERA_COUNT)),
-            pairs=tuple(
-                pair_audit(
-                    pair, found, keep="errors" if pair in self.measured_pairs else "agreement"
-                )
-                for pair, found in self.errors.items()
-            ),
+            pairs=tuple(pair_audit(pair, found) for pair, found in self.errors.items()),
             problems=tuple(sorted(self.files.problems.items())),
             alignment=self.alignment.result(),
         )
@@ -274,9 +266,9 @@ class _SceneCheck:
         stored: dict[int, Any] = {}
         for camera in range(CAMERA_COUNT):
             name = depth_name(camera)
-            found = self.files.attempt(name, self.files.depth, camera, frame)
-            if found is not None:
-                stored[camera], depths[camera] = found
+            read = self.files.attempt(name, self.files.depth, camera, frame)
+            if read is not None:
+                stored[camera], depths[camera] = read
         far_m = subject_m([(each.depth_m, each.measured) for each in depths.values()])
         pictures: dict[int, np.ndarray] = {}
         for camera in range(CAMERA_COUNT):
@@ -327,18 +319,10 @@ class _SceneCheck:
 
     def _reproject(self, frame: int, depths: dict[int, MeasuredDepth], poses: CameraPoses) -> None:
         for (left, right), found in self.errors.items():
-            is_measured = (left, right) in self.measured_pairs
             if left in depths and right in depths:
                 motion = poses.cam_from_cam(frame, target=right, source=left)
-                found.append(
-                    reproject(
-                        depths[left],
-                        depths[right],
-                        intrinsics=self.intrinsics,
-                        right_from_left=motion,
-                        most_pixels=MOST_PIXELS if is_measured else FEWER_PIXELS,
-                    )
-                )
+                both, camera = (depths[left], depths[right]), self.intrinsics
+                found.append(reproject(*both, intrinsics=camera, right_from_left=motion))
 
     def _camera(self, camera: int, counts: tuple[int, int]) -> CameraAudit:
         light, payload = self.light[camera], self.payload[camera]

@@ -1,9 +1,9 @@
 """The audit's table, and the report as Markdown: our figures, the paper's, and the limits."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from operator import attrgetter
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -14,16 +14,16 @@ from stereogenbench_data.audit.geometry.records import (
     AuditLimits,
     AuditReport,
     AuditRow,
+    CameraAudit,
     Finding,
-    PairAudit,
+    RigAudit,
     SceneAudit,
     ToleranceAudit,
 )
 from stereogenbench_data.audit.geometry.reprojection import TOLERANCES
 from stereogenbench_data.audit.geometry.scene_audit import LONG_PAIR
 from stereogenbench_data.audit.paper_numbers import AUDIT, AUDIT_TABLE, FRAMES_A_SCENE
-from stereogenbench_data.schema.release import ADJACENT_PAIRS
-from stereogenbench_data.schema.text import counted, markdown_text
+from stereogenbench_data.schema.text import counted, markdown_table, markdown_text
 
 _LISTED: Final = 500
 _CHECKS: Final = (
@@ -40,79 +40,61 @@ def table_rows(
     untested: Sequence[Finding],
 ) -> tuple[AuditRow, ...]:
     """Return the table of an audit over scenes."""
+    checks = dict.fromkeys([*_CHECKS, *(finding.check for finding in findings)])
+    counts = [
+        f"{check} {count}"
+        for check in checks
+        if (count := len({each.scene for each in findings if each.check == check}))
+    ]
     return (
-        *_rig_rows(scenes, limits),
-        *_depth_rows(scenes, limits),
+        *_rig_rows([scene.rig for scene in scenes], limits),
         *_reprojection_rows(scenes, limits),
         *_alignment_rows(scenes, limits, untested),
         *_frame_rows(scenes, limits),
-        *_picture_rows(scenes, limits),
-        *_finding_rows(findings),
+        *_camera_rows([camera for scene in scenes for camera in scene.cameras], limits),
+        AuditRow("findings", "scenes with", ", ".join(counts) or "none", "none", "none"),
     )
 
 
-def _rig_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
-    rigs = [scene.rig for scene in scenes]
+def _rig_rows(rigs: Sequence[RigAudit], limits: AuditLimits) -> Iterator[AuditRow]:
+    def most(name: str, unit: str) -> str:
+        return f"{_number(_over(max, map(attrgetter(name), rigs)))} {unit}"
+
+    def mean_cm(name: str) -> str:
+        return f"{_number(_over(np.mean, map(attrgetter(name), rigs)))} cm"
+
     recorded = sum(rig.intrinsics_recorded for rig in rigs)
     source = f"{recorded} numbers recorded in px" if recorded else "none recorded in px"
+    baseline, rectified = f"{limits.baseline_cm:g} cm", f"{limits.rectified_px:g} px"
+    between = "pose-derived less recorded"
     yield AuditRow(
-        "intrinsics",
-        f"largest deviation of fx, fy, cx, cy from f / s W ({source})",
-        f"{_number(_largest(rig.intrinsics_px for rig in rigs))} px",
-        AUDIT["intrinsics"],
-        f"{limits.intrinsics_px:g} px",
-    )
-    for name, mean, most, paper in (
-        ("adjacent", "adjacent_mean_cm", "adjacent_max_cm", ""),
-        ("all 15 pairs", "pairs_mean_cm", "pairs_max_cm", AUDIT["baseline"]),
-    ):
-        mean_cm = _mean(getattr(rig, mean) for rig in rigs)
-        largest_cm = _largest(getattr(rig, most) for rig in rigs)
-        yield AuditRow(
-            "pose/baseline",
-            f"pose-derived less recorded, {name}: mean / largest",
-            f"{_number(mean_cm)} cm / {_number(largest_cm)} cm",
-            paper,
-            f"{limits.baseline_cm:g} cm",
-        )
-    turned_deg = _number(_largest(rig.rotation_deg for rig in rigs))
-    turned_px = _number(_largest(rig.rotation_px for rig in rigs))
-    lateral_px = _number(_largest(rig.lateral_px for rig in rigs))
-    for check, quantity, ours in (
-        ("rig rotation", "largest turn of a camera against camera 0, and what it moves",
-         f"{turned_deg} deg / {turned_px} px"),
-        ("lateral residual", "largest shift by cameras off the rig's line", f"{lateral_px} px"),
-    ):  # fmt: skip
-        yield AuditRow(check, quantity, ours, "", f"{limits.rectified_px:g} px")
-
-
-def _depth_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
-    cameras = [camera for scene in scenes for camera in scene.cameras]
-    valid = _mean(camera.valid_depth for camera in cameras)
-    least = _least(camera.least_valid_depth.value for camera in cameras)
+        "intrinsics", f"largest deviation of fx, fy, cx, cy from f / s W ({source})",
+        most("intrinsics_px", "px"), AUDIT["intrinsics"], f"{limits.intrinsics_px:g} px",
+    )  # fmt: skip
     yield AuditRow(
-        "depth validity",
-        "mean valid-depth ratio over audited frames and cameras (least of a picture)",
-        f"{_percent(valid)} ({_percent(least)})",
-        AUDIT["valid_depth"],
-        _percent(limits.valid_depth),
-    )
-    units = _distinct(camera.depth_unit_m for camera in cameras)
-    steps = _distinct(camera.depth_step_units * camera.depth_unit_m for camera in cameras)
+        "pose/baseline", f"{between}, adjacent: mean / largest",
+        f"{mean_cm('adjacent_mean_cm')} / {most('adjacent_max_cm', 'cm')}", "", baseline,
+    )  # fmt: skip
     yield AuditRow(
-        "depth quantum",
-        f"step of stored depth, estimated from the numbers (unit: {units})",
-        steps,
-        "0.1 m without a tag",
-    )
+        "pose/baseline", f"{between}, all 15 pairs: mean / largest",
+        f"{mean_cm('pairs_mean_cm')} / {most('pairs_max_cm', 'cm')}", AUDIT["baseline"], baseline,
+    )  # fmt: skip
+    yield AuditRow(
+        "rig rotation", "largest turn of a camera against camera 0, and what it moves",
+        f"{most('rotation_deg', 'deg')} / {most('rotation_px', 'px')}", "", rectified,
+    )  # fmt: skip
+    yield AuditRow(
+        "lateral residual", "largest shift by cameras off the rig's line",
+        most("lateral_px", "px"), "", rectified,
+    )  # fmt: skip
 
 
 def _reprojection_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
     primary = [scene.pairs[0] for scene in scenes]
-    long = _named_pairs(scenes, [LONG_PAIR])
-    long_name = f"{LONG_PAIR[0]}-{LONG_PAIR[1]}"
-    both = [pair for scene in scenes for pair in scene.pairs if pair.tolerances]
-    for name, pairs in (("both pairs", both), ("primary pair", primary), (long_name, long)):
+    long = [scene.pairs[-1] for scene in scenes]
+    both = [pair for scene in scenes for pair in scene.pairs]
+    of = {"both pairs": both, "primary pair": primary, f"{LONG_PAIR[0]}-{LONG_PAIR[1]}": long}
+    for name, pairs in of.items():
         comparable = sum(pair.comparable for pair in pairs)
         for place, tolerance in enumerate(TOLERANCES):
             audits = [pair.tolerances[place] for pair in pairs]
@@ -126,36 +108,22 @@ def _reprojection_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Ite
                 AUDIT["reprojection"] if name == "both pairs" else "",
                 f"median {limits.reprojection_px:g} px" if is_limited else "",
             )
-    adjacent = _named_pairs(scenes, ADJACENT_PAIRS)
-    for name, pairs in (("primary pair", primary), ("adjacent pairs", adjacent), (long_name, long)):
+    for name, pairs in of.items():
         agreement = _ratio(sum(p.agreeing for p in pairs), sum(p.unhidden for p in pairs))
         yield AuditRow(
             "agreement",
             f"{name}: pixels that nothing hides whose two depths agree (least of a scene)",
-            f"{_percent(agreement)} ({_percent(_least(p.agreement for p in pairs))})",
-            "",
-            _percent(limits.agreement_long if pairs is long else limits.agreement),
+            f"{_percent(agreement)} ({_percent(_over(min, (p.agreement for p in pairs)))})",
         )
 
 
-def _named_pairs(
-    scenes: Sequence[SceneAudit], cameras: Sequence[tuple[int, int]]
-) -> list[PairAudit]:
-    return [pair for scene in scenes for pair in scene.pairs if (pair.left, pair.right) in cameras]
-
-
 _SIZES: Final = (
-    ("depth fit", "depth", "of one camera against the others: factor", ("scale",), "depth_scale"),
-    ("depth fit", "depth", "of one camera: shift, px", ("shift_x", "shift_y"), "depth_shift_px"),
-    ("depth fit", "depth", "share of the way to depth along the ray", ("ray",), "depth_ray"),
-    ("depth fit", "depth", "focal length or all baselines between cameras: factor", ("focal",),
-     "focal"),
-    ("motion fit", "motion", "focal length or unit of depth from frame to frame: factor",
+    ("depth", "of one camera against the others: factor", ("scale",), "depth_scale"),
+    ("depth", "of one camera: shift, px", ("shift_x", "shift_y"), "depth_shift_px"),
+    ("depth", "share of the way to depth along the ray", ("ray",), "depth_ray"),
+    ("depth", "focal length or all baselines between cameras: factor", ("focal",), "focal"),
+    ("motion", "focal length or unit of depth from frame to frame: factor",
      ("scale", "focal", "focal_x", "focal_y"), "focal"),
-    ("pictures fit", "pictures", "of one camera: shift, px", ("shift_x", "shift_y"),
-     "picture_shift_px"),
-    ("pictures fit", "pictures", "disparity of pictures against that of depth: factor",
-     ("scale",), "picture_scale"),
 )  # fmt: skip
 
 
@@ -164,8 +132,6 @@ def _alignment_rows(
 ) -> Iterator[AuditRow]:
     found = [scene.alignment for scene in scenes]
     pairs = [pair for each in found for pair in each.pairs]
-    moved = [_ratio(each.moved_through, each.moved_smooth) for each in found]
-    gains = [gain for each in found for _, _, gain in each.lags]
 
     def row(
         check: str, quantity: str, ours: str, limit: str, whats: Sequence[str] = ()
@@ -181,45 +147,43 @@ def _alignment_rows(
 
     yield row(
         "depth consistency", "points of smooth surfaces that another camera sees through, most",
-        _percent(_largest(pair.see_through for pair in pairs)), _percent(limits.see_through),
+        _percent(_over(max, (pair.see_through for pair in pairs))), _percent(limits.see_through),
     )  # fmt: skip
-    for check, kind, quantity, whats, name in _SIZES:
+    for check, quantity, whats, name in _SIZES:
         sizes = [
             (abs(each.value), each.error) for of_scene in found for each in of_scene.estimates
-            if each.check == kind and each.what in whats and abs(each.value) > CERTAIN * each.error
+            if each.check == check and each.what in whats and abs(each.value) > CERTAIN * each.error
         ]  # fmt: skip
         size, error = max(sizes, default=(0.0, 0.0))
         ours = f"{size:.2g} ± {1.96 * error:.2g}" if sizes else "none"
         limit = f"{getattr(limits, name):g}"
-        yield row(check, f"{quantity}, largest that is certain", ours, limit, whats)
+        yield row(f"{check} fit", f"{quantity}, largest that is certain", ours, limit, whats)
+    moved = _over(max, (_ratio(each.moved_through, each.moved_smooth) for each in found))
     yield row(
         "motion", "the same share from one audited frame to the next, most",
-        _percent(_largest(moved)), _percent(limits.moved_through),
+        _percent(moved), _percent(limits.moved_through),
     )  # fmt: skip
     yield row(
         "picture time", "gain of correlation by pictures of a frame beside, most",
-        _number(_largest(gains)), f"{limits.picture_lag:g}",
+        _number(_over(max, (gain for each in found for _, _, gain in each.lags))),
+        f"{limits.picture_lag:g}",
     )  # fmt: skip
     yield row(
         "picture content", "correlation of two cameras' pictures, taken there by depth, least",
-        _number(_least(pair.correlation for pair in pairs)),
-        f"{limits.picture_fit:g} of a camera's best",
+        _number(_over(min, (pair.correlation for pair in pairs))),
+        f"{limits.picture_odd:g} less than others",
     )  # fmt: skip
 
 
 def _frame_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
     expected = [int(limits.frames) or scene.frames for scene in scenes for _ in scene.cameras]
-    for name, count_of in (
-        ("RGB", attrgetter("rgb_frames")),
-        ("depth", attrgetter("depth_frames")),
-    ):
+    for name in ("RGB", "depth"):
+        count_of = attrgetter(f"{name.lower()}_frames")
         found = [count_of(camera) for scene in scenes for camera in scene.cameras]
-        counts = [count for count in found if count >= 0]
+        counts = [count for count in found if count >= 0] or [0]
         missing = sum(max(0, most - max(0, got)) for most, got in zip(expected, found, strict=True))
-        span = "-"
-        if counts:
-            low, high = min(counts), max(counts)
-            span = f"{low}" if low == high else f"{low} to {high}"
+        low, high = min(counts), max(counts)
+        span = f"{low}" if low == high else f"{low} to {high}"
         yield AuditRow(
             "frames",
             f"{name} frames in all (of a video), missing",
@@ -229,30 +193,33 @@ def _frame_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[A
         )
 
 
-def _picture_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
-    cameras = [camera for scene in scenes for camera in scene.cameras]
-    for check, what, figure, limit in (
-        ("too dark", "least 95th percentile of luma", "brightness", limits.brightness),
-        ("flat", "least span of luma (5th to 95th percentile)", "contrast", limits.contrast),
-        ("frozen", "least mean change of luma while the camera moves", "change", limits.change),
+def _camera_rows(cameras: Sequence[CameraAudit], limits: AuditLimits) -> Iterator[AuditRow]:
+    valid = _percent(_over(np.mean, (camera.valid_depth for camera in cameras)))
+    least = _percent(_over(min, (camera.least_valid_depth.value for camera in cameras)))
+    yield AuditRow(
+        "depth validity",
+        "mean valid-depth ratio over audited frames and cameras (least of a picture)",
+        f"{valid} ({least})", AUDIT["valid_depth"], _percent(limits.valid_depth),
+    )  # fmt: skip
+    units = _distinct(camera.depth_unit_m for camera in cameras)
+    steps = _distinct(camera.depth_step_units * camera.depth_unit_m for camera in cameras)
+    yield AuditRow(
+        "depth quantum", f"step of stored depth, estimated from the numbers (unit: {units})",
+        steps, "0.1 m without a tag",
+    )  # fmt: skip
+    for check, what, figure in (
+        ("too dark", "least 95th percentile of luma", "brightness"),
+        ("flat", "least span of luma (5th to 95th percentile)", "contrast"),
+        ("frozen", "least mean change of luma while the camera moves", "change"),
     ):
-        value = _number(_least(getattr(camera, figure).value for camera in cameras))
-        yield AuditRow("pictures", f"{check}: {what}", f"{value} of 255", "", f"{limit:g}")
+        value = _number(_over(min, (getattr(camera, figure).value for camera in cameras)))
+        limit = f"{getattr(limits, figure):g}"
+        yield AuditRow("pictures", f"{check}: {what}", f"{value} of 255", "", limit)
     yield AuditRow(
         "pictures", "occluder: largest share of a picture hidden from its border",
-        _percent(_largest(camera.occluder.value for camera in cameras)), "",
+        _percent(_over(max, (camera.occluder.value for camera in cameras))), "",
         _percent(limits.occluder),
     )  # fmt: skip
-
-
-def _finding_rows(findings: Sequence[Finding]) -> Iterator[AuditRow]:
-    checks = dict.fromkeys([*_CHECKS, *(finding.check for finding in findings)])
-    counts = [
-        f"{check} {count}"
-        for check in checks
-        if (count := len({each.scene for each in findings if each.check == check}))
-    ]
-    yield AuditRow("findings", "scenes with", ", ".join(counts) or "none", "none", "none")
 
 
 def pooled_px(audits: Iterable[ToleranceAudit], share: float) -> float:
@@ -283,13 +250,12 @@ def audit_markdown(report: AuditReport) -> str:
         f"{report.scenes_audited} of {counted(report.scenes_there, 'scene')}, {frames} of "
         f"each. Under paper: {AUDIT_TABLE}.",
         "",
-        "| check | quantity | here | paper | limit |",
-        "|---|---|---|---|---|",
-        *(
-            f"| {row.check} | {row.quantity} | {row.ours} | {row.paper or '-'} "
-            f"| {row.limit or '-'} |"
-            for row in report.rows
+        *markdown_table(
+            ("check", "quantity", "here", "paper", "limit"),
+            *((row.check, row.quantity, row.ours, row.paper, row.limit) for row in report.rows),
         ),
+        "",
+        "What pictures say of depth: `stereogenbench doctor`.",
         "",
         "Reprojection: left depth to the right camera, and back by the right depth; pixels whose "
         "two depths differ by more than the tolerance (share of depth + steps of stored depth) "
@@ -325,21 +291,10 @@ def _listed(title: str, texts: list[str]) -> list[str]:
     ]
 
 
-def _finite(values: Iterable[float]) -> list[float]:
-    return [value for value in values if not math.isnan(value)]
-
-
-def _largest(values: Iterable[float]) -> float:
-    return max(_finite(values), default=math.nan)
-
-
-def _least(values: Iterable[float]) -> float:
-    return min(_finite(values), default=math.nan)
-
-
-def _mean(values: Iterable[float]) -> float:
-    finite = _finite(values)
-    return float(np.mean(finite)) if finite else math.nan
+def _over(which: Callable[[list[float]], Any], values: Iterable[float]) -> float:
+    """Return the largest, the least or the mean of values that are known, nan for none."""
+    known = [value for value in values if not math.isnan(value)]
+    return float(which(known)) if known else math.nan
 
 
 def _ratio(part: int, whole: int) -> float:
@@ -357,7 +312,7 @@ def _percent(value: float) -> str:
 
 def _distinct(values: Iterable[float]) -> str:
     """Return lengths in m, each once; their range if they are many."""
-    found = sorted({float(f"{value:.6g}") for value in _finite(values)})
+    found = sorted({float(f"{value:.6g}") for value in values if not math.isnan(value)})
     if not found:
         return "-"
     if len(found) > 4:
