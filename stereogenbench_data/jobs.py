@@ -6,8 +6,8 @@
 
 The lock is taken before the settings are read or written. So of two runs that begin at once, one is
 refused, and neither writes into the work of the other. Clips, views, inputs of methods and scores
-are such work; its items are written on one engine or another (`engine`). Synthetic scenes keep
-their decisions as such items, and lock each part of a request by itself (`synthesis`).
+are such work; its items are written on one engine or another (`engine`). Synthetic scenes go into
+one tree from many requests, so each part of a request has a lock of its own there (`synthesis`).
 """
 
 import json

@@ -27,7 +27,6 @@ from stereogenbench_data.schema.text import counted
 
 if TYPE_CHECKING:
     from stereogenbench_data.synthesis.renderer import Renderer
-    from stereogenbench_data.synthesis.report import Acceptance
 
 RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
 """The same as in `synthesis.request`, which the help does not import."""
@@ -109,10 +108,15 @@ def synth(  # noqa: PLR0913 - one parameter an option
     rendered and checked. To continue a stopped run, run it again: it keeps the scenes and decisions
     of the same request. Scene i is the same for any number of scenes, workers and parts.
     """
-    from stereogenbench_data.synthesis.produce import hold_out, plan_scenes, synthesise
+    from stereogenbench_data.synthesis.decisions import (
+        all_decisions,
+        report_markdown,
+        report_of,
+    )
+    from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
     from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING
-    from stereogenbench_data.synthesis.report import json_of, markdown_of, report_of, report_of_tree
     from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
+    from stereogenbench_data.synthesis.review import hold_out, write_sheets
 
     _require_options_agree(
         plan_only=plan_only, report=report, contact_sheets=contact_sheets, holdout=holdout
@@ -148,6 +152,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
         contract=ExportContract(
             rotation=rotation, depth_unit_m=depth_unit_m, depth_tag=depth_tag or None
         ),
+        check=check,
     )
     how: Any = {"renderer": chosen, "part": _part_of(part), **work.options()}
     with progress_bar("proposing", unit="scenes") as progress:
@@ -155,10 +160,8 @@ def synth(  # noqa: PLR0913 - one parameter an option
     keys: list[str] = []
     if not plan_only:
         with progress_bar("drawing", unit="frames") as progress:
-            keys = synthesise(out, request, check=check, progress=progress, **how)
+            keys = synthesise(out, request, progress=progress, **how)
     if contact_sheets is not None and keys:
-        from stereogenbench_data.synthesis.sheets import write_sheets
-
         with progress_bar("contact sheets", unit="scenes") as progress:
             write_sheets(
                 out,
@@ -169,14 +172,12 @@ def synth(  # noqa: PLR0913 - one parameter an option
                 **work.options(),
             )
     if report is not None:
-        found = report_of_tree(out)
+        found = report_of(all_decisions(out))
         is_json = report.suffix == ".json"
-        write_report(
-            report, json.dumps(json_of(found), indent=2) if is_json else markdown_of(found)
-        )
+        write_report(report, json.dumps(found, indent=2) if is_json else report_markdown(found))
     if plan_only:
         shown = report_of([(request.family, decisions)])
-        _print(json_of(shown), _table(shown), as_json=as_json)
+        _print(shown, report_markdown(shown).rstrip(), as_json=as_json)
         return
     folders = sorted({key.rpartition("/")[0] for key in keys})
     where = (
@@ -234,12 +235,3 @@ def _part_of(text: str) -> tuple[int, int]:
 
 def _print(document: Any, text: str, *, as_json: bool) -> None:
     typer.echo(json.dumps(document, indent=2) if as_json else text)
-
-
-def _table(report: "list[Acceptance]") -> str:
-    from stereogenbench_data.synthesis.report import rows_of
-
-    rows = rows_of(report)
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
-    return "\n".join(lines)

@@ -1,40 +1,38 @@
-"""What was decided about proposals, on disk beside the scenes, so that a stopped run goes on.
+"""What was decided about proposals: on disk beside the scenes, and as a report.
 
     OUT/.generation/<request>/request.json       what was asked for, and of which renderer
     OUT/.generation/<request>/scene_000012.json  what scene 12 refused, and what it accepted
-    OUT/.generation/<folder>.1_of_2.lock         a process is drawing this part of a map's scenes
+    OUT/.generation/<request>/1_of_2.lock        locked by the process that draws this part
 
 Each file is written whole or not at all, and by one machine: the parts of a request share a folder.
+A stopped run goes on from its decisions.
 """
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 
-from stereogenbench_data.errors import SynthesisError, cure_of
+from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.jobs import json_bytes, read_json
 from stereogenbench_data.sources.files import write_atomic
-from stereogenbench_data.synthesis.filters import Limits, ProposedRig, Refusal
-from stereogenbench_data.synthesis.plan import ScenePlan
-from stereogenbench_data.synthesis.planning import PlanSearch
+from stereogenbench_data.synthesis.filters import LIMITS, Refusal
 from stereogenbench_data.synthesis.proposal import Proposal
-from stereogenbench_data.synthesis.renderer import Renderer
+from stereogenbench_data.synthesis.renderer import Renderer, ScenePlan
 from stereogenbench_data.synthesis.request import SynthRequest
 from stereogenbench_data.synthesis.trajectory import steps
 
 FOLDER: Final = ".generation"
+ALL_MAPS: Final = "all maps"
 _REQUEST: Final = "request.json"
-Check = Literal["pictures", "audit"]
-"""What rendered scenes must pass."""
-
-_VERSION: Final = 2
+_VERSION: Final = 3
 """Raise it when the same request comes to other decisions."""
 
 
@@ -45,8 +43,6 @@ class Drawn:
     Attributes:
         number: The proposal's number among those of its scene.
         map_name: Its map.
-        character: Its subject.
-        animation: Its motion.
         focal_mm: Its focal length.
         gaps_cm: The five gaps between neighbouring cameras.
         refusal: Why it was refused; None if it was accepted.
@@ -54,10 +50,8 @@ class Drawn:
 
     number: int
     map_name: str
-    character: str
-    animation: str
     focal_mm: float
-    gaps_cm: tuple[float, ...]
+    gaps_cm: list[float]
     refusal: Refusal | None
 
     @classmethod
@@ -66,87 +60,56 @@ class Drawn:
         return cls(
             number=proposal.number,
             map_name=proposal.map_name,
-            character=proposal.character,
-            animation=proposal.animation,
             focal_mm=proposal.focal_mm,
-            gaps_cm=tuple(np.diff(proposal.places_cm).tolist()),
+            gaps_cm=np.diff(proposal.places_cm).tolist(),
             refusal=refusal,
         )
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
-    """How the cameras of an accepted proposal move.
-
-    Attributes:
-        step_m: Mean way of the fastest camera from frame to frame.
-        turn_deg: Mean rotation from frame to frame.
-        largest_step_m: The largest such way.
-        largest_turn_deg: The largest such rotation.
-        splices: How often a part of the path was thrown away and connected anew.
-    """
-
-    step_m: float
-    turn_deg: float
-    largest_step_m: float
-    largest_turn_deg: float
-    splices: int
-
-    @classmethod
-    def of(cls, plan: ScenePlan) -> "Motion":
-        """Return the motion of a plan."""
-        axes = rotation_from_rotator_deg(plan.rotators_deg)
-        step_m, turn_deg = steps(ProposedRig.of(plan.proposal).eyes(plan.centres_m, axes), axes)
-        if not len(step_m):
-            return cls(0.0, 0.0, 0.0, 0.0, plan.splices)
-        return cls(
-            float(step_m.mean()),
-            float(turn_deg.mean()),
-            float(step_m.max()),
-            float(turn_deg.max()),
-            plan.splices,
-        )
-
-
-@dataclass(frozen=True, slots=True)
 class Decision:
-    """All proposals of one scene up to the accepted one.
+    """The proposals of one scene up to the accepted one.
 
     Attributes:
         index: The scene's number.
-        refused: The proposals that were refused, in order.
-        accepted: The one that was not.
-        motion: How its cameras move.
-        check: What its pictures had to pass; "" as long as none were drawn.
+        proposals: The proposals in order. The last was accepted, unless what was rendered of it
+            was refused and its successor is not found yet.
+        step_m: Mean way of the fastest camera of the last one from frame to frame.
+        turn_deg: Its mean rotation from frame to frame.
+        splices: How often a part of its path was thrown away and connected anew.
     """
 
     index: int
-    refused: tuple[Drawn, ...]
-    accepted: Drawn
-    motion: Motion
-    check: Check | Literal[""] = ""
+    proposals: list[Drawn]
+    step_m: float
+    turn_deg: float
+    splices: int
 
     @classmethod
-    def of(
-        cls,
-        search: PlanSearch,
-        *,
-        before: tuple[Drawn, ...] = (),
-        check: Check | Literal[""] = "",
-    ) -> "Decision":
-        """Return the decision of a search, given what was refused before it by what check."""
-        plan = search.plan
-        refused = [Drawn.of(each.proposal, each.refusal) for each in search.refused]
+    def of(cls, plan: ScenePlan, refused: list[Drawn]) -> "Decision":
+        """Return the decision for a plan, after the proposals that were refused before it."""
+        axes = rotation_from_rotator_deg(plan.rotators_deg)
+        step_m, turn_deg = steps(plan.proposal.rig.eyes(plan.centres_m, axes), axes)
+        moved = len(step_m) > 0
         return cls(
             index=plan.proposal.index,
-            refused=(*before, *refused),
-            accepted=Drawn.of(plan.proposal, None),
-            motion=Motion.of(plan),
-            check=check,
+            proposals=[*refused, Drawn.of(plan.proposal, None)],
+            step_m=float(step_m.mean()) if moved else 0.0,
+            turn_deg=float(turn_deg.mean()) if moved else 0.0,
+            splices=plan.splices,
         )
 
+    @property
+    def refused(self) -> list[Drawn]:
+        """The proposals that were refused."""
+        return [each for each in self.proposals if each.refusal is not None]
 
-@dataclass(frozen=True, slots=True)
+    @property
+    def is_accepted(self) -> bool:
+        """Whether the last proposal was accepted."""
+        return self.proposals[-1].refusal is None
+
+
 class Decisions:
     """The decisions of one request.
 
@@ -155,15 +118,9 @@ class Decisions:
         asked: The request, as reports show it.
     """
 
-    folder: Path
-    asked: dict[str, Any]
-
-    @classmethod
-    def at(
-        cls, out: Path, request: SynthRequest, *, renderer: Renderer, limits: Limits
-    ) -> "Decisions":
-        """Return the decisions of a request in a tree. Scenes can be added to a request."""
-        asked = {
+    def __init__(self, out: Path, request: SynthRequest, *, renderer: Renderer) -> None:
+        """Name the folder of a request's decisions in a tree. Scenes can be added to a request."""
+        self.asked = {
             "version": _VERSION,
             "family": request.family,
             "split": request.split,
@@ -173,104 +130,137 @@ class Decisions:
             "frames": request.frames,
             "picture_px": list(request.picture_px),
             "focal_mm": request.focal_mm,
-            "world_offset_cm": request.world_offset_cm,
+            "check": request.check,
             "sensors_mm": [list(sensor_mm) for sensor_mm in renderer.sensors_mm],
             "renderer": renderer.name,
             "fingerprint": renderer.fingerprint,
-            "limits": asdict(limits),
+            "limits": asdict(LIMITS),
         }
-        digest = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
-        return cls(out / FOLDER / f"{request.family}_{digest[:16]}", asked)
+        digest = hashlib.sha256(json.dumps(self.asked, sort_keys=True).encode()).hexdigest()
+        self.folder = out / FOLDER / f"{request.family}_{digest[:16]}"
 
     def read(self, index: int) -> Decision | None:
         """Return a scene's decision; None if there is none, or it was cut short."""
-        return _read(self._path(index))
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            return _parsed(read_json(self._path(index)))
+        return None
 
     def write(self, decision: Decision) -> None:
-        """Write a scene's decision.
-
-        Raises:
-            SynthesisError: If it cannot be written.
-        """
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            if not (self.folder / _REQUEST).exists():
-                write_atomic(self.folder / _REQUEST, json_bytes(self.asked))
-            write_atomic(self._path(decision.index), json_bytes(asdict(decision)))
-        except OSError as error:
-            raise SynthesisError(
-                f"{self.folder}: cannot write there ({error}). "
-                + cure_of(error, "Choose an output that you may write to.")
-            ) from error
-
-    def remove(self, indices: Iterable[int]) -> None:
-        """Remove the decisions on scenes, and the folders if they hold nothing else.
-
-        What cannot be removed stays.
-        """
-        with suppress(OSError):
-            for index in indices:
-                self._path(index).unlink(missing_ok=True)
-            if not any(self.folder.glob("scene_*.json")):
-                (self.folder / _REQUEST).unlink(missing_ok=True)
-                self.folder.rmdir()
-                self.folder.parent.rmdir()
-
-    def require_check(self, check: Check) -> None:
-        """Refuse another check than the one that the request's scenes passed so far.
-
-        Raises:
-            SynthesisError: If there is a scene that had to pass another one.
-        """
-        for path in sorted(self.folder.glob("scene_*.json")):
-            decision = _read(path)
-            if decision is not None and decision.check not in ("", check):
-                raise SynthesisError(
-                    f"{path}: this scene had to pass the check {decision.check!r}, and others of "
-                    f"the same request would have to pass {check!r}. Give the check "
-                    f"{decision.check!r} again, or choose another output."
-                )
+        """Write a scene's decision."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if not (self.folder / _REQUEST).exists():
+            write_atomic(self.folder / _REQUEST, json_bytes(self.asked))
+        write_atomic(self._path(decision.index), json_bytes(asdict(decision)))
 
     def _path(self, index: int) -> Path:
         return self.folder / f"scene_{index:06d}.json"
 
 
-def all_decisions(out: Path) -> Iterator[tuple[dict[str, Any], list[Decision]]]:
-    """Yield each request that a tree has decisions of, with its decisions."""
+def all_decisions(out: Path) -> Iterator[tuple[str, list[Decision]]]:
+    """Yield the family of each request that a tree has decisions of, with its decisions.
+
+    Raises:
+        SynthesisError: If they cannot be read.
+    """
     for folder in sorted((out / FOLDER).glob("*/")):
         try:
-            asked = json.loads((folder / _REQUEST).read_text())
-            texts = [path.read_text() for path in sorted(folder.glob("scene_*.json"))]
-            yield asked, [_parsed(json.loads(text)) for text in texts]
+            decisions = [_parsed(read_json(path)) for path in sorted(folder.glob("scene_*.json"))]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise SynthesisError(
                 f"{folder}: its decisions cannot be read ({error!r}). Remove this folder: the next "
                 f"run of the same request comes to the same decisions."
             ) from error
+        yield folder.name.rpartition("_")[0], decisions
 
 
-def _read(path: Path) -> Decision | None:
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        return _parsed(read_json(path))
-    return None
+def _parsed(document: dict[str, Any]) -> Decision:
+    proposals = [
+        Drawn(**each | {"refusal": each["refusal"] and Refusal(**each["refusal"])})
+        for each in document["proposals"]
+    ]
+    return Decision(**document | {"proposals": proposals})
 
 
-def _parsed(document: Any) -> Decision:
-    return Decision(
-        index=int(document["index"]),
-        refused=tuple(_drawn(each) for each in document["refused"]),
-        accepted=_drawn(document["accepted"]),
-        motion=Motion(**document["motion"]),
-        check=document.get("check", ""),
-    )
+# The report.
 
 
-def _drawn(document: Any) -> Drawn:
-    refusal = document["refusal"]
-    return Drawn(
-        **document
-        | {
-            "gaps_cm": tuple(map(float, document["gaps_cm"])),
-            "refusal": None if refusal is None else Refusal(**refusal),
-        }
-    )
+def report_of(requests: Iterable[tuple[str, Sequence[Decision]]]) -> list[dict[str, Any]]:
+    """Return what became of proposals, by family and map, and by family over all its maps.
+
+    Args:
+        requests: The family of each request, and its decisions.
+
+    Returns:
+        Rows for JSON: the numbers of proposals and accepted ones, how many were refused for each
+        reason, and mean and median of gaps (cm) and focal lengths (mm), proposed and realised, and
+        of the accepted cameras' motion a frame (m and degrees).
+    """
+    groups: dict[tuple[str, str], list[tuple[Decision, Drawn]]] = defaultdict(list)
+    for family, decisions in requests:
+        for decision in decisions:
+            for drawn in decision.proposals:
+                for name in (ALL_MAPS, drawn.map_name):
+                    groups[family, name].append((decision, drawn))
+    rows = []
+    for family, name in sorted(groups, key=lambda each: (each[0], each[1] == ALL_MAPS, each[1])):
+        proposed = [drawn for _, drawn in groups[family, name]]
+        passed = [pair for pair in groups[family, name] if pair[1].refusal is None]
+        reasons = Counter(str(each.refusal.reason) for each in proposed if each.refusal)
+        rows.append(
+            {
+                "family": family,
+                "map_name": name,
+                "proposals": len(proposed),
+                "accepted": len(passed),
+                "reasons": dict(reasons.most_common()),
+                "proposed_cm": _average([gap for each in proposed for gap in each.gaps_cm]),
+                "realised_cm": _average([gap for _, each in passed for gap in each.gaps_cm]),
+                "proposed_mm": _average([each.focal_mm for each in proposed]),
+                "realised_mm": _average([each.focal_mm for _, each in passed]),
+                "step_m": _average([decision.step_m for decision, _ in passed]),
+                "turn_deg": _average([decision.turn_deg for decision, _ in passed]),
+                "splices": sum(decision.splices for decision, _ in passed),
+            }
+        )
+    return rows
+
+
+def _average(values: Sequence[float]) -> dict[str, float] | None:
+    if not values:
+        return None
+    return {"mean": float(np.mean(values)), "median": float(np.median(values))}
+
+
+_COLUMNS: Final = {
+    "proposed_cm": ("gaps proposed, cm", 1),
+    "realised_cm": ("gaps realised, cm", 1),
+    "proposed_mm": ("focal proposed, mm", 1),
+    "realised_mm": ("focal realised, mm", 1),
+    "step_m": ("m a frame", 3),
+    "turn_deg": ("degrees a frame", 2),
+}
+"""The heading of each average, and its digits."""
+
+
+def report_markdown(report: Sequence[dict[str, Any]]) -> str:
+    """Return the report as an aligned table in Markdown; averages are means / medians."""
+    headings = [heading for heading, _ in _COLUMNS.values()]
+    rows = [["family", "map", "proposals", "accepted", *headings, "splices", "refused for"]]
+    for each in report:
+        averages = [
+            f"{each[name]['mean']:.{digits}f} / {each[name]['median']:.{digits}f}"
+            if each[name]
+            else "-"
+            for name, (_, digits) in _COLUMNS.items()
+        ]
+        reasons = ", ".join(f"{reason} {count:,}" for reason, count in each["reasons"].items())
+        accepted = f"{each['accepted']:,} ({each['accepted'] / each['proposals']:.1%})"
+        rows.append(
+            [
+                each["family"], each["map_name"], f"{each['proposals']:,}", accepted,
+                *averages, f"{each['splices']:,}", reasons or "-",
+            ]
+        )  # fmt: skip
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    rows.insert(1, ["-" * width for width in widths])
+    return "".join(f"| {' | '.join(map(str.ljust, row, widths))} |\n" for row in rows)

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
-from stereogenbench_data.synthesis.proposal import Proposal
-from stereogenbench_data.synthesis.world import Spawn, World
+from stereogenbench_data.synthesis.proposal import Proposal, Rig
+from stereogenbench_data.synthesis.renderer import Spawn, World
 
 Reason = Literal[
     "spawn_support",
@@ -26,14 +26,13 @@ Reason = Literal[
     "transition",
     "motion",
     "subject_motion",
-    "missing_frames",
     "invalid_depth",
     "dark",
     "flat",
     "audit",
     "doctor",
 ]
-"""Why a proposal is refused. The last six are found in what was rendered."""
+"""Why a proposal is refused. The last five are found in what was rendered."""
 
 Array = Any
 
@@ -92,7 +91,7 @@ class Limits:
     flat_sd: float = 4.0
 
 
-DEFAULT_LIMITS: Final = Limits()
+LIMITS: Final = Limits()
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +123,7 @@ _REACH_M: Final = 0.5
 """How far above a sole the search for ground beneath it begins."""
 
 
-def find_spawn(proposal: Proposal, *, world: World, limits: Limits) -> Spawn | Refusal:
+def find_spawn(proposal: Proposal, *, world: World) -> Spawn | Refusal:
     """Draw a place and a direction, and put it on one of the floors there.
 
     The floors are found from above; each must have headroom.
@@ -144,7 +143,7 @@ def find_spawn(proposal: Proposal, *, world: World, limits: Limits) -> Spawn | R
             z -= _STEP_DOWN_M
             continue
         z -= fall
-        if z >= low[2] - limits.support_gap_m:
+        if z >= low[2] - LIMITS.support_gap_m:
             floors.append(z)
         z -= _STEP_DOWN_M
     if not floors:
@@ -155,10 +154,10 @@ def find_spawn(proposal: Proposal, *, world: World, limits: Limits) -> Spawn | R
             f"no floor at ({x:.2f}, {y:.2f}) between {low[2]:g} and {high[2]:g} m",
         )
     rooms = [_cast_one(world, (x, y, floor + 0.05), (0.0, 0.0, 1.0)) + 0.05 for floor in floors]
-    high_enough = [z for z, room in zip(floors, rooms, strict=True) if room >= limits.headroom_m]
+    high_enough = [z for z, room in zip(floors, rooms, strict=True) if room >= LIMITS.headroom_m]
     if not high_enough:
         return Refusal(
-            "spawn_space", max(rooms), limits.headroom_m,
+            "spawn_space", max(rooms), LIMITS.headroom_m,
             f"{max(rooms):.2f} m of headroom at ({x:.2f}, {y:.2f})",
         )  # fmt: skip
     floor = high_enough[int(pick * len(high_enough))]
@@ -170,15 +169,12 @@ def _cast_one(world: World, origin: Sequence[float], direction: Sequence[float])
     return float(world.cast(origins, directions)[0])
 
 
-def check_spawn(
-    body_m: Float64[np.ndarray, "frames p 3"], *, world: World, limits: Limits
-) -> Refusal | None:
-    """Refuse a subject that at some frame meets the map, floats or sinks.
+def check_spawn(body_m: Float64[np.ndarray, "frames p 3"], *, world: World) -> Refusal | None:
+    """Refuse a subject that at some frame meets the map, floats or sinks, or that jumps.
 
     Args:
-        body_m: Points of the subject's body at frames.
+        body_m: Points of the subject's body at consecutive frames.
         world: The map.
-        limits: The limits of the filters.
     """
     frames, _, _ = body_m.shape
     lowest = body_m[..., 2].min(axis=1)
@@ -194,13 +190,13 @@ def check_spawn(
     directions = np.broadcast_to(around, origins.shape)
     space = world.cast(origins.reshape(-1, 3), directions.reshape(-1, 3)).reshape(frames, -1)
     least = space.min(axis=1)
-    if least.min() < limits.body_space_m:
+    if least.min() < LIMITS.body_space_m:
         return Refusal(
-            "spawn_space", float(least.min()), limits.body_space_m,
+            "spawn_space", float(least.min()), LIMITS.body_space_m,
             f"the map is {least.min():.2f} m from the subject at frame {int(least.argmin())}",
         )  # fmt: skip
     # The soles may sink as far as the filter of support allows.
-    low = body_m[..., 2] <= lowest[:, None] + limits.support_gap_m
+    low = body_m[..., 2] <= lowest[:, None] + LIMITS.support_gap_m
     seen = _sight(world, middle[:, None], body_m) | low
     if not seen.all():
         share = float(seen.mean(axis=1).min())
@@ -215,34 +211,18 @@ def check_spawn(
     above[:, 2] += _REACH_M
     fall = world.cast(above, np.tile([0.0, 0.0, -1.0], (len(above), 1)))
     gap = np.where(np.isfinite(fall), np.abs(fall - _REACH_M), np.inf)
-    if gap.max() > limits.support_gap_m:
+    if gap.max() > LIMITS.support_gap_m:
         return Refusal(
-            "spawn_support", float(gap.max()), limits.support_gap_m,
-            f"the ground is {gap.max():.2f} m from the soles at frame {_frame(gap, frames)}",
+            "spawn_support", float(gap.max()), LIMITS.support_gap_m,
+            f"the ground is {gap.max():.2f} m from the soles at frame {int(gap.argmax()) % frames}",
         )  # fmt: skip
-    return None
-
-
-def check_subject_motion(
-    body_m: Float64[np.ndarray, "frames p 3"], *, limits: Limits
-) -> Refusal | None:
-    """Refuse a subject that jumps from one frame to the next.
-
-    Args:
-        body_m: Points of the subject's body at consecutive frames.
-        limits: The limits of the filters.
-    """
-    way_m = np.linalg.norm(np.diff(body_m.mean(axis=1), axis=0), axis=1)
-    if way_m.max(initial=0) > limits.subject_step_m:
+    way_m = np.linalg.norm(np.diff(middle, axis=0), axis=1)
+    if way_m.max(initial=0) > LIMITS.subject_step_m:
         return Refusal(
-            "subject_motion", float(way_m.max()), limits.subject_step_m,
+            "subject_motion", float(way_m.max()), LIMITS.subject_step_m,
             f"the subject moves {way_m.max():.2f} m from frame {int(way_m.argmax())} to the next",
         )  # fmt: skip
     return None
-
-
-def _frame(values: Array, frames: int) -> int:
-    return int(values.argmax()) % frames
 
 
 def _sight(world: World, start: Array, end: Array) -> Array:
@@ -265,42 +245,6 @@ _AROUND: Final = np.array(
     + [np.array([x, y, z]) / np.sqrt(3) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
 )
 """Unit directions to the faces and corners of a cube."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ProposedRig:
-    """The six cameras of a proposal, as filters need them.
-
-    Attributes:
-        lateral_m: The distance of each camera to the right of the rig's middle.
-        picture_at_1m: Width and height of what a camera sees one metre away, around its axis.
-    """
-
-    lateral_m: Float64[np.ndarray, "6"]
-    picture_at_1m: tuple[float, float]
-
-    @classmethod
-    def of(cls, proposal: Proposal) -> "ProposedRig":
-        """Return the rig of a proposal."""
-        lateral_m = (proposal.places_cm - proposal.places_cm[-1] / 2) / 100
-        return cls(lateral_m, proposal.picture_at_1m)
-
-    def eyes(
-        self, centres_m: Float64[np.ndarray, "n 3"], axes: Float64[np.ndarray, "n 3 3"]
-    ) -> Float64[np.ndarray, "n 6 3"]:
-        """Return the six camera centres of poses."""
-        eyes: Float64[np.ndarray, "n 6 3"] = (
-            centres_m[:, None] + self.lateral_m[:, None] * axes[:, None, :, 1]
-        )
-        return eyes
-
-    def grid_directions(self) -> tuple[Float64[np.ndarray, "r 3"], Bool[np.ndarray, " r"]]:
-        """Return rays (ahead, right, up; 1 ahead) over the picture, and which are at its border."""
-        place = np.linspace(-_BORDER, _BORDER, _GRID)
-        across, up = (each.ravel() for each in np.meshgrid(place, place))
-        width, height = self.picture_at_1m
-        at_border = np.maximum(np.abs(across), np.abs(up)) >= _BORDER
-        return np.column_stack([np.ones(_GRID**2), across * width / 2, up * height / 2]), at_border
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -334,9 +278,8 @@ def check_poses(
     rotators_deg: Float64[np.ndarray, "n 3"],
     *,
     body_m: Float64[np.ndarray, "n p 3"],
-    rig: ProposedRig,
+    rig: Rig,
     world: World,
-    limits: Limits,
 ) -> PoseChecks:
     """Ask all filters of poses about all six cameras of a rig.
 
@@ -346,7 +289,6 @@ def check_poses(
         body_m: The subject's points at the moment of each pose.
         rig: The cameras.
         world: The map.
-        limits: The limits of the filters.
     """
     count = len(centres_m)
     result = PoseChecks(np.full(count, "", object), np.full(count, np.nan), np.full(count, np.nan))
@@ -357,7 +299,7 @@ def check_poses(
         if not len(left):
             break
         poses = _Poses(eyes[left], axes[left], body_m[left], rig)
-        for reason, measured, allowed, sense in measure(poses, world, limits):
+        for reason, measured, allowed, sense in measure(poses, world):
             refused = (measured < allowed) if sense == "least" else (measured > allowed)
             refused &= result.passed[left]
             result.reasons[left[refused]] = reason
@@ -375,7 +317,7 @@ class _Poses:
     eyes: Array
     axes: Array
     body_m: Array
-    rig: ProposedRig
+    rig: Rig
 
     def projected(self) -> tuple[Array, Array, Array]:
         """Return depth of the subject's points, and their place, -1..1 across and up the pictures.
@@ -394,22 +336,22 @@ class _Poses:
         return (ahead > 1e-6) & (np.abs(across) <= 1) & (np.abs(up) <= 1)
 
 
-def _framing(poses: _Poses, world: World, limits: Limits) -> list[Measured]:
+def _framing(poses: _Poses, world: World) -> list[Measured]:
     height = np.ptp(poses.projected()[2], axis=2) / 2
     share = poses.framed().mean(axis=2).min(axis=1)
     return [
-        ("framing", share, limits.framed_share, "least"),
-        ("framing", height.min(axis=1), limits.least_height, "least"),
-        ("framing", height.max(axis=1), limits.largest_height, "most"),
+        ("framing", share, LIMITS.framed_share, "least"),
+        ("framing", height.min(axis=1), LIMITS.least_height, "least"),
+        ("framing", height.max(axis=1), LIMITS.largest_height, "most"),
     ]
 
 
-def _collision(poses: _Poses, world: World, limits: Limits) -> list[Measured]:
+def _collision(poses: _Poses, world: World) -> list[Measured]:
     low, high = world.bounds_m.low_m, world.bounds_m.high_m
     margin = np.minimum(poses.eyes - low, high - poses.eyes).min(axis=(1, 2))
     apart = poses.body_m[:, None] - poses.eyes[:, :, None]
     to_subject = np.sqrt((apart * apart).sum(axis=-1)).min(axis=(1, 2))
-    inside = margin >= limits.clearance_m
+    inside = margin >= LIMITS.clearance_m
     eyes = poses.eyes[inside]
     shape = (*eyes.shape[:2], len(_AROUND), 3)
     origins = np.broadcast_to(eyes[:, :, None], shape).reshape(-1, 3)
@@ -417,23 +359,32 @@ def _collision(poses: _Poses, world: World, limits: Limits) -> list[Measured]:
     clearance = np.full(len(inside), np.inf)
     clearance[inside] = met.reshape(len(eyes), shape[1] * shape[2]).min(axis=1)
     return [
-        ("collision", margin, limits.clearance_m, "least"),
-        ("collision", clearance, limits.clearance_m, "least"),
-        ("collision", to_subject, limits.subject_clearance_m, "least"),
+        ("collision", margin, LIMITS.clearance_m, "least"),
+        ("collision", clearance, LIMITS.clearance_m, "least"),
+        ("collision", to_subject, LIMITS.subject_clearance_m, "least"),
     ]
 
 
-def _visibility(poses: _Poses, world: World, limits: Limits) -> list[Measured]:
+def _visibility(poses: _Poses, world: World) -> list[Measured]:
     points = poses.body_m.shape[1]
     chosen = np.unique(np.arange(_SIGHT_POINTS) * (points - 1) // (_SIGHT_POINTS - 1))
     # From the subject to the camera, so that a camera inside a solid sees nothing.
     seen = _sight(world, poses.body_m[:, None, chosen], poses.eyes[:, :, None])
     seen &= poses.framed()[:, :, chosen]
-    return [("visibility", seen.mean(axis=2).min(axis=1), limits.visible_share, "least")]
+    return [("visibility", seen.mean(axis=2).min(axis=1), LIMITS.visible_share, "least")]
 
 
-def _depth(poses: _Poses, world: World, limits: Limits) -> list[Measured]:
-    rays, at_border = poses.rig.grid_directions()
+def _grid_directions(rig: Rig) -> tuple[Array, Array]:
+    """Return rays (ahead, right, up; 1 ahead) over the picture, and which are at its border."""
+    place = np.linspace(-_BORDER, _BORDER, _GRID)
+    across, up = (each.ravel() for each in np.meshgrid(place, place))
+    width, height = rig.picture_at_1m
+    at_border = np.maximum(np.abs(across), np.abs(up)) >= _BORDER
+    return np.column_stack([np.ones(_GRID**2), across * width / 2, up * height / 2]), at_border
+
+
+def _depth(poses: _Poses, world: World) -> list[Measured]:
+    rays, at_border = _grid_directions(poses.rig)
     length = np.sqrt((rays * rays).sum(axis=1))
     directions = np.einsum("nij,rj->nri", poses.axes, rays / length[:, None])
     count, cameras, _ = poses.eyes.shape
@@ -441,12 +392,12 @@ def _depth(poses: _Poses, world: World, limits: Limits) -> list[Measured]:
     origins = np.broadcast_to(poses.eyes[:, :, None], shape).reshape(-1, 3)
     met = world.cast(origins, np.broadcast_to(directions[:, None], shape).reshape(-1, 3))
     depth_m = met.reshape(count, cameras, -1) / length
-    valid = (depth_m < limits.farthest_m).mean(axis=2).min(axis=1)
+    valid = (depth_m < LIMITS.farthest_m).mean(axis=2).min(axis=1)
     subject_m = poses.projected()[0].mean(axis=2)
-    near = depth_m[..., at_border] < limits.near_share * subject_m[..., None]
+    near = depth_m[..., at_border] < LIMITS.near_share * subject_m[..., None]
     return [
-        ("valid_depth", valid, limits.valid_share, "least"),
-        ("border_occluder", near.mean(axis=2).max(axis=1), limits.border_share, "most"),
+        ("valid_depth", valid, LIMITS.valid_share, "least"),
+        ("border_occluder", near.mean(axis=2).max(axis=1), LIMITS.border_share, "most"),
     ]
 
 

@@ -17,9 +17,8 @@ from jaxtyping import Float64
 
 from stereogenbench_data.schema.release import FRAME_RATE_HZ, TRAIN_MAPS, UNSEEN_MAPS
 from stereogenbench_data.synthesis.proposal import Proposal
-from stereogenbench_data.synthesis.renderer import unknown_map
+from stereogenbench_data.synthesis.renderer import Bounds, Spawn, unknown_map
 from stereogenbench_data.synthesis.scene import Figure, Material, SceneModel, Shape
-from stereogenbench_data.synthesis.world import Bounds, Spawn
 
 STAGE: Final = "SynthStage"
 CHARACTERS: Final = tuple(f"SK_Synth{number:02d}" for number in range(1, 20))
@@ -175,7 +174,7 @@ def _around(rng: np.random.Generator, radius_m: float) -> tuple[float, float]:
 
 def _stage(proposal: Proposal) -> tuple[SceneModel, Bounds, Bounds]:
     rng = proposal.rng("map")
-    width_m, height_m = proposal.picture_at_1m
+    width_m, height_m = proposal.rig.picture_at_1m
     framing = _Framing(
         distance_m=max(
             _SUBJECT_M / _SUBJECT_PART / height_m, 1.2 * (proposal.span_m + 0.6) / width_m, 1.5

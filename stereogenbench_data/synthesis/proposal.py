@@ -11,15 +11,85 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from stereogenbench_data.synthesis.cameras import (
-    FOCAL_RANGE_MM,
-    lateral_places_cm,
-    random_gaps_cm,
-)
+from stereogenbench_data.schema.release import CAMERA_COUNT, CAMERA_PAIRS
 from stereogenbench_data.synthesis.request import SynthRequest
 
 _FIRST_LABEL: Final = 1000
 _PARTS: Final = ("draw", "map", "spawn", "path")
+_IPD_CM: Final = {"loc": 6.38, "scale": 0.5}
+_IPD_RANGE_CM: Final = (4.5, 8.5)
+_UNIFORM_RANGE_CM: Final = (1.0, 150.0)
+_PAIRWISE_RANGE_CM: Final = (5.0, 200.0)
+_PAIRWISE_SPAN_CM: Final = (180.0, 200.0)
+_PAIRWISE_CANDIDATES: Final = 48
+_GAPS: Final = CAMERA_COUNT - 1
+
+Gaps = Float64[np.ndarray, "5"]
+
+
+def random_gaps_cm(family: str, *, rng: np.random.Generator) -> Gaps:
+    """Return five random gaps between neighbouring cameras, from left to right, in cm.
+
+    - ``IPD_Gaussian``: each from a normal (6.38, 0.5) truncated to [4.5, 8.5] cm.
+    - ``Uniform``: each from U[1, 150] cm, with median 75.5 cm. Wide rigs fail the filters more
+      often, so the gaps of accepted scenes are smaller; in the release's train split their median
+      is 43 cm.
+    - ``Pairwise_Uniform``: of 48 rigs the one whose 15 sorted distances are closest to evenly
+      spaced ones in [5, 200] cm.
+
+    Source: the StereoGenBench paper, section 3 and its appendix on realised baselines.
+    """
+    if family == "IPD_Gaussian":
+        low, high = _IPD_RANGE_CM
+        kept = np.empty(0)
+        while len(kept) < _GAPS:
+            sampled = rng.normal(**_IPD_CM, size=_GAPS)
+            kept = np.concatenate([kept, sampled[(sampled >= low) & (sampled <= high)]])
+        return kept[:_GAPS]
+    if family == "Uniform":
+        return rng.uniform(*_UNIFORM_RANGE_CM, _GAPS)
+    low, high = _PAIRWISE_RANGE_CM
+    even = low + (high - low) * (np.arange(len(CAMERA_PAIRS)) + 0.5) / len(CAMERA_PAIRS)
+    rigs = []
+    for _ in range(_PAIRWISE_CANDIDATES):
+        span = rng.uniform(*_PAIRWISE_SPAN_CM)
+        rigs.append(low + rng.dirichlet(np.ones(_GAPS)) * (span - _GAPS * low))
+    return min(rigs, key=lambda gaps: np.abs(np.sort(pair_distances_cm(gaps)) - even).max())
+
+
+def pair_distances_cm(gaps_cm: Gaps) -> Float64[np.ndarray, "15"]:
+    """Return the distance of every pair of `CAMERA_PAIRS`, in that order."""
+    places = lateral_places_cm(gaps_cm)
+    left, right = np.array(CAMERA_PAIRS).T
+    distances_cm: Float64[np.ndarray, 15] = places[right] - places[left]
+    return distances_cm
+
+
+def lateral_places_cm(gaps_cm: Gaps) -> Float64[np.ndarray, "6"]:
+    """Return the distance in cm of each camera to the right of camera 0."""
+    return np.concatenate([[0.0], np.cumsum(gaps_cm)])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rig:
+    """Six cameras side by side.
+
+    Attributes:
+        lateral_m: The distance of each camera to the right of the rig's middle.
+        picture_at_1m: Width and height of what a camera sees one metre away, around its axis.
+    """
+
+    lateral_m: Float64[np.ndarray, "6"]
+    picture_at_1m: tuple[float, float]
+
+    def eyes(
+        self, centres_m: Float64[np.ndarray, "n 3"], axes: Float64[np.ndarray, "n 3 3"]
+    ) -> Float64[np.ndarray, "n 6 3"]:
+        """Return the six camera centres of poses."""
+        eyes: Float64[np.ndarray, "n 6 3"] = (
+            centres_m[:, None] + self.lateral_m[:, None] * axes[:, None, :, 1]
+        )
+        return eyes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,9 +142,13 @@ class Proposal:
         return self.focal_mm / width_mm * width_px, self.focal_mm / height_mm * height_px
 
     @property
-    def picture_at_1m(self) -> tuple[float, float]:
-        """Width and height in metres of what a camera sees one metre away."""
-        return self.sensor_mm[0] / self.focal_mm, self.sensor_mm[1] / self.focal_mm
+    def rig(self) -> Rig:
+        """The six cameras, as filters and paths need them."""
+        width_mm, height_mm = self.sensor_mm
+        return Rig(
+            (self.places_cm - self.places_cm[-1] / 2) / 100,
+            (width_mm / self.focal_mm, height_mm / self.focal_mm),
+        )
 
     @property
     def span_m(self) -> float:
@@ -83,45 +157,12 @@ class Proposal:
 
     def rng(self, part: str) -> np.random.Generator:
         """Return the random stream of a part: "map", "spawn" or "path"."""
-        return _rng(self.request, index=self.index, number=self.number, part=part)
+        return random_stream(self.request, index=self.index, number=self.number, part=part)
 
 
-def draw_proposal(
-    request: SynthRequest,
-    *,
-    index: int,
-    number: int,
-    characters: tuple[str, ...],
-    animations: tuple[str, ...],
-    sensors_mm: tuple[tuple[float, float], ...],
-) -> Proposal:
-    """Draw a proposal.
-
-    Args:
-        request: The scenes; its maps are drawn from with equal probability.
-        index: The scene's number.
-        number: The proposal's number.
-        characters: Subjects to draw from.
-        animations: Motions to draw from.
-        sensors_mm: Sensors to draw from.
-    """
-    rng = _rng(request, index=index, number=number, part="draw")
-    places_cm = lateral_places_cm(random_gaps_cm(request.family, rng=rng))
-    focal_mm = float(rng.uniform(*FOCAL_RANGE_MM))
-    return Proposal(
-        request=request,
-        index=index,
-        number=number,
-        map_name=request.maps[int(rng.integers(len(request.maps)))],
-        character=characters[int(rng.integers(len(characters)))],
-        animation=animations[int(rng.integers(len(animations)))],
-        sensor_mm=sensors_mm[int(rng.integers(len(sensors_mm)))],
-        focal_mm=focal_mm if request.focal_mm is None else request.focal_mm,
-        places_cm=places_cm,
-        offset_cm=rng.uniform(-1, 1, 3) * request.world_offset_cm,
-    )
-
-
-def _rng(request: SynthRequest, *, index: int, number: int, part: str) -> np.random.Generator:
+def random_stream(
+    request: SynthRequest, *, index: int, number: int, part: str
+) -> np.random.Generator:
+    """Return the random stream of a part of a proposal: "draw", "map", "spawn" or "path"."""
     entropy = (request.seed, zlib.crc32(request.stream.encode()), index, number)
     return np.random.default_rng(np.random.SeedSequence((*entropy, _PARTS.index(part))))

@@ -10,12 +10,12 @@ like a polygon, without dividing, and one buffer of inverse depths keeps the nea
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int32
 
+from stereogenbench_data.synthesis.renderer import View
 from stereogenbench_data.synthesis.scene import Shape
 
 Array = Any
@@ -30,44 +30,10 @@ _BLOCK_PX: Final = 1 << 16
 """Pixels that are drawn at a time, so that they stay in the processor's cache."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """The view of one pinhole camera in a scene.
-
-    Attributes:
-        eye: (3,) the camera's centre.
-        axes: (3, 3) whose columns are the camera's forward, right and up axes.
-        focal_px: Focal lengths along the picture's width and height.
-        centre_px: Principal point.
-        size_px: Width and height of the picture.
-    """
-
-    eye: Float64[np.ndarray, "3"]
-    axes: Float64[np.ndarray, "3 3"]
-    focal_px: tuple[float, float]
-    centre_px: tuple[float, float]
-    size_px: tuple[int, int]
-
-    def right_of_axis(self, u_px: Array) -> Array:
-        """Return the distance of a column to the right of the optical axis, at depth 1."""
-        return (u_px - self.centre_px[0]) / self.focal_px[0]
-
-    def below_axis(self, v_px: Array) -> Array:
-        """Return the distance of a row below the optical axis, at depth 1."""
-        return (v_px - self.centre_px[1]) / self.focal_px[1]
-
-    def in_unit_solid(self, shape: Shape) -> tuple[Array, Array]:
-        """Return the eye, and the ray's coefficients as columns, in the unit solid's coordinates.
-
-        The coefficients are those of 1, r and b.
-        """
-        from_map = shape.axes / shape.half_m[:, None]
-        return from_map @ (self.eye - shape.centre), from_map @ self.ray
-
-    @property
-    def ray(self) -> Float64[np.ndarray, "3 3"]:
-        """The coefficients of 1, r and b in the directions of rays, as columns."""
-        return self.axes * (1.0, 1.0, -1.0)
+def in_unit_solid(view: View, shape: Shape) -> tuple[Array, Array]:
+    """Return the eye, and the ray's coefficients as columns, in the unit solid's coordinates."""
+    from_map = shape.axes / shape.half_m[:, None]
+    return from_map @ (view.eye - shape.centre), from_map @ view.ray
 
 
 def face_id(shape: int, *, axis: int = 0, sign: float = -1.0) -> int:
@@ -112,7 +78,7 @@ def ground_plane(view: View, *, slope: Float64[np.ndarray, "2"]) -> Plane:
 
 def visible_parts(view: View, *, number: int, shape: Shape) -> Iterator[Plane | Ball]:
     """Yield the faces of a box that are turned to the camera, or the ellipsoid."""
-    eye, ray = view.in_unit_solid(shape)
+    eye, ray = in_unit_solid(view, shape)
     if shape.kind == "ellipsoid":
         if eye @ eye > 1:
             yield Ball(face_id(number), eye, ray, shape)
@@ -196,7 +162,7 @@ def _draw_plane(picture: _Picture, plane: Plane, *, view: View) -> None:
             else:
                 most = np.where(constant < 0, -np.inf, most)
     width = len(picture.right)
-    scale, shift = view.focal_px[0], view.centre_px[0] - 0.5
+    scale, shift = view.focal_px[0], (view.size_px[0] - 1) / 2
     first = np.ceil(np.clip(least * scale + shift, -1, width)).clip(0).astype(np.int32)
     last = np.floor(np.clip(most * scale + shift, -1, width)).clip(max=width - 1).astype(np.int32)
     rows = np.flatnonzero(first <= last)

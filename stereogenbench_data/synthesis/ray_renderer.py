@@ -4,10 +4,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from stereogenbench_data.synthesis.maps import ANIMATIONS, CHARACTERS, MAPS, RayWorld, open_map
-from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.render import SceneState, render_frame, static_light
-from stereogenbench_data.synthesis.renderer import RenderedView
+from stereogenbench_data.synthesis.renderer import RenderedView, ScenePlan
 from stereogenbench_data.synthesis.request import SENSOR_MM
 
 

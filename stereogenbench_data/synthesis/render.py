@@ -15,12 +15,13 @@ from torch.nn.functional import grid_sample
 from stereogenbench_data.synthesis.ray_casting import (
     GROUND,
     SKY,
-    View,
     face_id,
     first_hits,
     hits_of_list,
+    in_unit_solid,
     shape_of,
 )
+from stereogenbench_data.synthesis.renderer import View
 from stereogenbench_data.synthesis.scene import Material, SceneModel, Shape, entry_depth
 from stereogenbench_data.synthesis.textures import sample_atlas, sample_tile, texture_row
 
@@ -304,7 +305,7 @@ def _on_face(rays: _Rays, view: View, shape: Shape, face: int, sun: Array) -> _L
 
 def _on_ball(rays: _Rays, view: View, shape: Shape, face: int, sun: Array) -> _Lit:
     """Return places on an ellipsoid, textured like a box, along the axes across its normal."""
-    eye, ray = view.in_unit_solid(shape)
+    eye, ray = in_unit_solid(view, shape)
     directions = np.stack([rays.along(row) for row in ray])
     point = eye.astype(np.float32)[:, None] + rays.depth_m * directions
     half_m = shape.half_m.astype(np.float32)[:, None]

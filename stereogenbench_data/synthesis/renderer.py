@@ -1,19 +1,176 @@
-"""What a renderer gives to generation: maps to ask, and pictures of accepted plans."""
+"""What a renderer gives to generation: maps that filters ask, and pictures of accepted plans.
+
+Map axes are Unreal's (left-handed: x forward, y right, z up), in metres, with an origin that the
+map chooses. Angles are degrees; yaw turns from x towards y.
+"""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Final, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64, UInt8
 
 from stereogenbench_data.errors import SynthesisError
+from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.selection.options import nearest_first
-from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.proposal import Proposal
-from stereogenbench_data.synthesis.world import World
+from stereogenbench_data.synthesis.request import SynthRequest
 
 _NEAREST: Final = 3
+
+Array = Any
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bounds:
+    """A box along the axes of a map.
+
+    Attributes:
+        low_m: Its corner with the smallest coordinates.
+        high_m: Its corner with the largest coordinates.
+    """
+
+    low_m: Float64[np.ndarray, "3"]
+    high_m: Float64[np.ndarray, "3"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spawn:
+    """The place where the subject starts.
+
+    Attributes:
+        place_m: The point of the floor between its feet at frame 0.
+        yaw_deg: The direction that it faces; 0 is along x, 90 along y.
+    """
+
+    place_m: Float64[np.ndarray, "3"]
+    yaw_deg: float
+
+
+@runtime_checkable
+class World(Protocol):
+    """The map of one proposal. Its answers follow from the proposal alone."""
+
+    @property
+    def bounds_m(self) -> Bounds:
+        """The part of the map in which cameras may be."""
+
+    @property
+    def spawn_bounds_m(self) -> Bounds:
+        """The part in which subjects are spawned, on any floor; `bounds_m` if it is all of it."""
+
+    def cast(
+        self, origins_m: Float64[np.ndarray, "n 3"], directions: Float64[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, " n"]:
+        """Return how far each ray goes until it meets the map; the subject does not stop it.
+
+        Args:
+            origins_m: Where the rays start.
+            directions: Their directions, of length 1.
+
+        Returns:
+            Distances along the rays in metres: infinity where nothing is met, 0 where a ray starts
+            inside a solid, as far as the renderer can tell.
+        """
+
+    def subject_points_m(self, spawn: Spawn, *, frame: int) -> Float64[np.ndarray, "p 3"]:
+        """Return points spread over the subject's body at a frame, from the soles to the crown.
+
+        Args:
+            spawn: Where the subject starts.
+            frame: From 0 to the last frame, at 15 Hz.
+
+        Returns:
+            At least 8 points, as many and in the same order at every frame. Some of them are the
+            lowest points of the body.
+        """
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """The view of one pinhole camera, whose principal point is the middle of the picture.
+
+    Attributes:
+        eye: (3,) the camera's centre.
+        axes: (3, 3) whose columns are the camera's forward, right and up axes.
+        focal_px: Focal lengths along the picture's width and height.
+        size_px: Width and height of the picture.
+    """
+
+    eye: Float64[np.ndarray, "3"]
+    axes: Float64[np.ndarray, "3 3"]
+    focal_px: tuple[float, float]
+    size_px: tuple[int, int]
+
+    def right_of_axis(self, u_px: Array) -> Array:
+        """Return the distance of a column to the right of the optical axis, at depth 1."""
+        return (u_px - self.size_px[0] / 2) / self.focal_px[0]
+
+    def below_axis(self, v_px: Array) -> Array:
+        """Return the distance of a row below the optical axis, at depth 1."""
+        return (v_px - self.size_px[1] / 2) / self.focal_px[1]
+
+    @property
+    def ray(self) -> Float64[np.ndarray, "3 3"]:
+        """The coefficients of 1, r and b in the directions of rays, as columns.
+
+        r and b are a pixel's distances to the right of and below the optical axis, at depth 1.
+        """
+        return self.axes * (1.0, 1.0, -1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScenePlan:
+    """A proposal that passed the filters, with the path that was found for it.
+
+    Attributes:
+        proposal: What was drawn.
+        spawn: Where the subject starts.
+        centres_m: The middle of the rig at each frame, in map axes.
+        rotators_deg: Pitch, yaw in -180..180 and roll of all cameras at each frame.
+        subject_m: Depth of the subject's middle at each frame, from the middle of the rig.
+        splices: How often a part of the path was thrown away and connected anew.
+    """
+
+    proposal: Proposal
+    spawn: Spawn
+    centres_m: Float64[np.ndarray, "frames 3"]
+    rotators_deg: Float64[np.ndarray, "frames 3"]
+    subject_m: Float64[np.ndarray, " frames"]
+    splices: int
+
+    @property
+    def request(self) -> SynthRequest:
+        """The request that the scene belongs to."""
+        return self.proposal.request
+
+    @property
+    def key(self) -> str:
+        """The scene's whole path below the root."""
+        return self.proposal.key
+
+    def view(self, *, camera: int, frame: int) -> View:
+        """Return a camera's view, in map axes."""
+        axes = rotation_from_rotator_deg(self.rotators_deg[frame])
+        return View(
+            eye=self.centres_m[frame] + self.proposal.rig.lateral_m[camera] * axes[:, 1],
+            axes=axes,
+            focal_px=self.proposal.focal_px,
+            size_px=self.request.picture_px,
+        )
+
+    def world_locations_cm(self, frame: int) -> Float64[np.ndarray, "6 3"]:
+        """Return the six camera centres in the recorded world.
+
+        The world's offset is added last, so the error of distances between centres is at most the
+        rounding of a coordinate of that size (1.2e-10 cm at 1e6 cm).
+        """
+        right = rotation_from_rotator_deg(self.rotators_deg[frame])[:, 1]
+        places_cm = self.proposal.places_cm
+        near_cm = 100 * self.centres_m[frame] + (places_cm - places_cm[-1] / 2)[:, None] * right
+        centres_cm: Float64[np.ndarray, "6 3"] = near_cm + self.proposal.offset_cm
+        return centres_cm
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,9 +14,10 @@ from stereogenbench_data.schema.release import (
     Subset,
 )
 from stereogenbench_data.selection.options import did_you_mean
-from stereogenbench_data.synthesis.cameras import OFFSET_RANGE_CM
 
 RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
+Check = Literal["pictures", "audit"]
+"""What a rendered scene must pass."""
 
 SENSOR_MM: Final = (23.76, 23.76)
 """Width and height of the sensor, where a renderer has no others."""
@@ -75,8 +76,10 @@ class SynthRequest:
         map_name: The map of the scenes, which names their folder; or several, of which each
             proposal draws one.
         focal_mm: The focal length, 4 to 1,000; None for a random one in 18..85 mm per scene.
-        world_offset_cm: The largest distance of a scene from the world's origin, along each axis.
         contract: How the files are written.
+        check: What a rendered scene must pass: "pictures" looks for pixels without depth, dark and
+            flat pictures, and near things at the border; "audit" also lets the audit and the
+            doctor look at the scene.
 
     Raises:
         SynthesisError: If a value is unknown or out of range.
@@ -92,14 +95,15 @@ class SynthRequest:
     subset: Subset = "seen_map"
     map_name: str | tuple[str, ...] = "SynthStage"
     focal_mm: float | None = None
-    world_offset_cm: float = OFFSET_RANGE_CM
     contract: ExportContract = field(default_factory=ExportContract)
+    check: Check = "pictures"
 
     def __post_init__(self) -> None:
         """Refuse values that no scene can have."""
         _require_choice("family", self.family, choices=FAMILIES)
         _require_choice("split", self.split, choices=get_args(Split))
         _require_choice("subset", self.subset, choices=get_args(Subset))
+        _require_choice("check", self.check, choices=get_args(Check))
         _require_split(self)
         for name, value in (("scenes", self.scenes), ("frames", self.frames)):
             if value < 1:
@@ -120,10 +124,6 @@ class SynthRequest:
                 raise SynthesisError(
                     f"focal_mm must be in {shortest:g}..{longest:g}, got {self.focal_mm:g}."
                 )
-        if not 0 <= self.world_offset_cm <= OFFSET_RANGE_CM:
-            raise SynthesisError(
-                f"world_offset_cm must be in 0..{OFFSET_RANGE_CM:g}, got {self.world_offset_cm}."
-            )
 
     @property
     def picture_px(self) -> tuple[int, int]:

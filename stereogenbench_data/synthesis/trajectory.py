@@ -20,19 +20,17 @@ from jaxtyping import Float64
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import FRAME_RATE_HZ
 from stereogenbench_data.synthesis.filters import (
-    Limits,
-    ProposedRig,
+    LIMITS,
+    PoseChecks,
     Reason,
     Refusal,
     check_poses,
     check_spawn,
-    check_subject_motion,
     find_spawn,
     obstructed,
 )
-from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.proposal import Proposal
-from stereogenbench_data.synthesis.world import World
+from stereogenbench_data.synthesis.renderer import ScenePlan, World
 
 _CANDIDATES: Final = 96
 _STEEPEST: Final = 0.95
@@ -53,19 +51,17 @@ _TARGETS: Final = 4
 Array = Any
 
 
-def examine(proposal: Proposal, *, world: World, limits: Limits) -> ScenePlan | Refusal:
+def examine(proposal: Proposal, *, world: World) -> ScenePlan | Refusal:
     """Return the plan of a proposal that passes all filters, or why it is refused."""
-    spawn = find_spawn(proposal, world=world, limits=limits)
+    spawn = find_spawn(proposal, world=world)
     if isinstance(spawn, Refusal):
         return spawn
     frames = proposal.request.frames
     body_m = np.stack([world.subject_points_m(spawn, frame=frame) for frame in range(frames)])
-    refusal = check_spawn(body_m, world=world, limits=limits) or check_subject_motion(
-        body_m, limits=limits
-    )
+    refusal = check_spawn(body_m, world=world)
     if refusal is not None:
         return refusal
-    search = _Search(proposal, world=world, limits=limits, body_m=body_m)
+    search = _Search(proposal, world=world, body_m=body_m)
     path = search.path()
     if isinstance(path, Refusal):
         return path
@@ -92,9 +88,9 @@ class _Knot:
 class _Search:
     """The search for the path of one proposal."""
 
-    def __init__(self, proposal: Proposal, *, world: World, limits: Limits, body_m: Array) -> None:
-        self.proposal, self.world, self.limits, self.body_m = proposal, world, limits, body_m
-        self.rig = ProposedRig.of(proposal)
+    def __init__(self, proposal: Proposal, *, world: World, body_m: Array) -> None:
+        self.proposal, self.world, self.body_m = proposal, world, body_m
+        self.rig = proposal.rig
         self.rng = proposal.rng("path")
         self.frames = len(body_m)
         self.splices = 0
@@ -114,7 +110,7 @@ class _Search:
 
     def _nearest_m(self) -> float:
         """Return the distance at which the subject fits into the picture of every camera."""
-        width, height = self.proposal.picture_at_1m
+        width, height = self.rig.picture_at_1m
         across = (self.proposal.span_m + 0.35 * self.height_m) / width
         return float(max(1.15 * self.height_m / height, across, 0.5 * self.height_m))
 
@@ -142,7 +138,7 @@ class _Search:
         candidates = np.empty((_CANDIDATES, 3))
         candidates[:, 0] = rng.uniform(-180, 180, _CANDIDATES)
         candidates[:, 1] = np.degrees(np.arcsin(rng.uniform(0, _STEEPEST, _CANDIDATES)))
-        least = self.limits.least_height * self.proposal.picture_at_1m[1]
+        least = LIMITS.least_height * self.rig.picture_at_1m[1]
         farthest_m = max(min(0.9 * self.height_m / least, 2 * self.nearest_m), self.nearest_m)
         candidates[:, 2] = rng.uniform(self.nearest_m, farthest_m, _CANDIDATES)
         pool = np.round(candidates, _DIGITS)
@@ -150,19 +146,21 @@ class _Search:
         for frame in sorted({0, self.frames // 2, self.frames - 1}):
             at = np.full(len(pool), frame)
             centres_m, rotators_deg = self._poses_at(pool, at)
-            checks = check_poses(
-                centres_m, rotators_deg,
-                body_m=self.body_m[at], rig=self.rig, world=self.world, limits=self.limits,
-            )  # fmt: skip
+            checks = self._checks(centres_m, rotators_deg, frames=at)
             refused.update(checks.reasons[~checks.passed].tolist())
             pool = pool[checks.passed]
-            if len(pool) < self.limits.viewpoints:
+            if len(pool) < LIMITS.viewpoints:
                 ((reason, most),) = refused.most_common(1)
                 return Refusal(
-                    reason, len(pool), self.limits.viewpoints,
+                    reason, len(pool), LIMITS.viewpoints,
                     f"{len(pool)} of {_CANDIDATES} viewpoints hold, {most} fail {reason}",
                 )  # fmt: skip
         return pool
+
+    def _checks(self, centres_m: Array, rotators_deg: Array, *, frames: Any) -> PoseChecks:
+        """Ask all filters about poses at frames."""
+        body_m = self.body_m[frames]
+        return check_poses(centres_m, rotators_deg, body_m=body_m, rig=self.rig, world=self.world)
 
     # The path through them.
 
@@ -231,10 +229,7 @@ class _Search:
         """Return how many of the viewpoints after the first hold, with the ways between them."""
         frames = slice(first, first + len(viewpoints))
         centres_m, rotators_deg = self.poses(np.round(viewpoints, _DIGITS), first=first)
-        checks = check_poses(
-            centres_m, rotators_deg,
-            body_m=self.body_m[frames], rig=self.rig, world=self.world, limits=self.limits,
-        )  # fmt: skip
+        checks = self._checks(centres_m, rotators_deg, frames=frames)
         eyes = self.rig.eyes(centres_m, rotation_from_rotator_deg(rotators_deg))
         held = checks.passed[1:] & ~obstructed(eyes, world=self.world)
         return len(held) if held.all() else int(held.argmin())
@@ -243,14 +238,13 @@ class _Search:
 
     def check_motion(self, centres_m: Array, rotators_deg: Array) -> Refusal | None:
         """Refuse a path with a jump."""
-        limits = self.limits
         axes = rotation_from_rotator_deg(rotators_deg)
         eyes = self.rig.eyes(centres_m, axes)
         step_m, turn_deg = steps(eyes, axes)
         for name, values, limit in (
-            ("m a frame", step_m, limits.step_m),
-            ("degrees a frame", turn_deg, limits.turn_deg),
-            ("degrees a frame more or less", np.abs(np.diff(turn_deg)), limits.jerk_deg),
+            ("m a frame", step_m, LIMITS.step_m),
+            ("degrees a frame", turn_deg, LIMITS.turn_deg),
+            ("degrees a frame more or less", np.abs(np.diff(turn_deg)), LIMITS.jerk_deg),
         ):
             if values.max(initial=0) > limit:
                 return Refusal(
@@ -261,10 +255,7 @@ class _Search:
 
     def check_all(self, centres_m: Array, rotators_deg: Array) -> Refusal | None:
         """Ask all filters about the six cameras at every frame."""
-        checks = check_poses(
-            centres_m, rotators_deg,
-            body_m=self.body_m, rig=self.rig, world=self.world, limits=self.limits,
-        )  # fmt: skip
+        checks = self._checks(centres_m, rotators_deg, frames=slice(None))
         if checks.passed.all():
             return None
         frame = int(checks.passed.argmin())

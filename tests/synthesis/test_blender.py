@@ -24,12 +24,10 @@ from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.synthesis.blender.assets import read_assets
 from stereogenbench_data.synthesis.blender.process import blender
 from stereogenbench_data.synthesis.blender.renderer import BlenderAssetWarning, BlenderRenderer
-from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.proposal import Proposal
-from stereogenbench_data.synthesis.renderer import Renderer
+from stereogenbench_data.synthesis.renderer import Renderer, ScenePlan, Spawn, World
 from stereogenbench_data.synthesis.request import SENSOR_MM, SynthRequest
-from stereogenbench_data.synthesis.world import Spawn, World
 from tests.synthesis.conftest import Drawn
 from tests.synthesis.test_pictures import psnr_db
 

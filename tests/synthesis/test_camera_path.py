@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -5,12 +7,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
-from stereogenbench_data.synthesis.cameras import (
-    quaternion_from_rotator,
-    rig_locations_cm,
-)
 from stereogenbench_data.synthesis.planning import plan_scene, propose
+from stereogenbench_data.synthesis.renderer import ScenePlan, Spawn
 from stereogenbench_data.synthesis.request import SynthRequest
+from stereogenbench_data.synthesis.scene_files import recorded_rotation
 
 angles = st.floats(-180, 180)
 rotators = st.tuples(st.floats(-90, 90), angles, angles).map(np.array)
@@ -35,7 +35,7 @@ def test_the_quaternion_is_the_same_rotation_as_the_matrix(rotator_deg):
     composed = Rotation.from_euler("ZYX", [yaw, -pitch, -roll], degrees=True).as_matrix()
 
     matrix = rotation_from_rotator_deg(rotator_deg)
-    quaternion = quaternion_from_rotator(rotator_deg)
+    quaternion = recorded_rotation(rotator_deg, form="quaternion_xyzw")
 
     np.testing.assert_allclose(matrix, composed, atol=1e-12)
     np.testing.assert_allclose(Rotation.from_quat(quaternion).as_matrix(), composed, atol=1e-12)
@@ -45,13 +45,14 @@ def test_the_quaternion_is_the_same_rotation_as_the_matrix(rotator_deg):
 @settings(max_examples=50, deadline=None)
 def test_centres_keep_their_distances_at_any_offset(rotator_deg, offset_cm):
     places_cm = np.array([0.0, 1.0, 6.5, 60.0, 150.0, 749.0])
+    drawn = propose(SynthRequest(), index=0, number=0)
+    plan = ScenePlan(
+        replace(drawn, places_cm=places_cm, offset_cm=offset_cm), Spawn(np.zeros(3), 0.0),
+        centres_m=np.array([[-5.23, 0.77, 1.81]]), rotators_deg=rotator_deg[None],
+        subject_m=np.ones(1), splices=0,
+    )  # fmt: skip
 
-    centres_cm = rig_locations_cm(
-        centre_cm=np.array([-523.0, 77.0, 181.0]),
-        rotator_deg=rotator_deg,
-        places_cm=places_cm,
-        offset_cm=offset_cm,
-    )
+    centres_cm = plan.world_locations_cm(0)
 
     distances_cm = np.linalg.norm(centres_cm[1:] - centres_cm[:-1], axis=1)
     np.testing.assert_allclose(distances_cm, np.diff(places_cm), rtol=0, atol=1e-9)
@@ -60,7 +61,7 @@ def test_centres_keep_their_distances_at_any_offset(rotator_deg, offset_cm):
 @pytest.mark.parametrize("family", ["IPD_Gaussian", "Uniform", "Pairwise_Uniform"])
 @pytest.mark.parametrize("index", range(2))
 def test_a_path_moves_and_is_smooth(family, index):
-    plan = plan_scene(SynthRequest(family=family), index=index).plan
+    plan = plan_scene(SynthRequest(family=family), index=index)[0]
 
     turns = np.diff(np.unwrap(plan.rotators_deg, axis=0, period=360), axis=0)
     assert plan.centres_m.shape == plan.rotators_deg.shape == (81, 3)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.synthesis.filters import (
-    DEFAULT_LIMITS,
-    ProposedRig,
+    LIMITS,
     Refusal,
     check_poses,
     check_spawn,
@@ -15,9 +14,10 @@ from stereogenbench_data.synthesis.filters import (
     obstructed,
 )
 from stereogenbench_data.synthesis.planning import propose
+from stereogenbench_data.synthesis.proposal import Rig
+from stereogenbench_data.synthesis.renderer import Spawn
 from stereogenbench_data.synthesis.request import SynthRequest
 from stereogenbench_data.synthesis.trajectory import examine
-from stereogenbench_data.synthesis.world import Spawn
 from tests.synthesis.worlds import FLOOR, Blocks, yard
 
 HERE = Spawn(np.zeros(3), 0.0)
@@ -28,9 +28,9 @@ def proposal(**request):
                    index=0, number=0)  # fmt: skip
 
 
-def spawn_refusal(world, *, frames=5):
-    body_m = np.stack([world.subject_points_m(HERE, frame=20 * frame) for frame in range(frames)])
-    return check_spawn(body_m, world=world, limits=DEFAULT_LIMITS)
+def spawn_refusal(world):
+    body_m = np.stack([world.subject_points_m(HERE, frame=frame) for frame in range(81)])
+    return check_spawn(body_m, world=world)
 
 
 def looking(world, *, eye, rig=None, yaw=180.0, pitch=0.0):
@@ -39,9 +39,8 @@ def looking(world, *, eye, rig=None, yaw=180.0, pitch=0.0):
         np.array([eye], float),
         np.array([[pitch, yaw, 0.0]]),
         body_m=world.subject_points_m(HERE, frame=0)[None],
-        rig=rig or ProposedRig(np.linspace(-0.16, 0.16, 6), (0.99, 0.99)),
+        rig=rig or Rig(np.linspace(-0.16, 0.16, 6), (0.99, 0.99)),
         world=world,
-        limits=DEFAULT_LIMITS,
     )
 
 
@@ -61,7 +60,7 @@ def test_a_pit_refuses_the_subject_that_walks_over_it():
 
     assert refusal.reason == "spawn_support"
     assert refusal.value == pytest.approx(3.0)
-    assert refusal.limit == DEFAULT_LIMITS.support_gap_m
+    assert refusal.limit == LIMITS.support_gap_m
     assert "3.00 m" in refusal.text
 
 
@@ -83,7 +82,7 @@ def test_a_wall_in_the_way_refuses_the_subject_that_walks_into_it():
     assert spawn_refusal(yard(wall)) is None
     refusal = spawn_refusal(yard(wall, walk_m=1.8))
     assert refusal.reason == "spawn_space"
-    assert refusal.value < DEFAULT_LIMITS.body_space_m
+    assert refusal.value < LIMITS.body_space_m
 
 
 def test_a_beam_through_the_body_refuses_it():
@@ -96,7 +95,7 @@ def test_a_subject_is_put_on_a_floor_with_headroom():
     """Under a table there are 80 cm, on it there is room; the sky above is open."""
     world = yard(((-1, -1, 0.8), (1, 1, 0.9)))
 
-    spawn = find_spawn(proposal(), world=world, limits=DEFAULT_LIMITS)
+    spawn = find_spawn(proposal(), world=world)
 
     assert spawn.place_m[2] == pytest.approx(0.9)
 
@@ -104,7 +103,7 @@ def test_a_subject_is_put_on_a_floor_with_headroom():
 def test_a_low_ceiling_refuses_all_floors():
     world = yard(((-9, -9, 1.5), (9, 9, 11)))
 
-    refusal = find_spawn(proposal(), world=world, limits=DEFAULT_LIMITS)
+    refusal = find_spawn(proposal(), world=world)
 
     assert (refusal.reason, refusal.limit) == ("spawn_space", 2.0)
     assert refusal.value == pytest.approx(1.5)
@@ -113,7 +112,7 @@ def test_a_low_ceiling_refuses_all_floors():
 def test_a_hole_without_a_floor_refuses_the_place():
     world = Blocks([((5, 5, -1), (6, 6, 0))])
 
-    assert find_spawn(proposal(), world=world, limits=DEFAULT_LIMITS).reason == "spawn_support"
+    assert find_spawn(proposal(), world=world).reason == "spawn_support"
 
 
 # Poses.
@@ -131,7 +130,7 @@ def test_a_wall_before_the_subject_hides_it_whatever_the_camera_sees():
 
 def test_a_post_before_one_of_six_cameras_is_enough():
     """The rig is 2 m wide; the post is between camera 0 and the subject only."""
-    wide = ProposedRig(np.linspace(-1, 1, 6), (0.99, 0.99))
+    wide = Rig(np.linspace(-1, 1, 6), (0.99, 0.99))
     side = -1 / 2  # Looking along -x, the camera's right is at -y: camera 0 is at +y.
     post = ((1.9, -side - 0.25, 0), (2.1, -side + 0.25, 3))
 
@@ -145,7 +144,7 @@ def test_half_a_wall_hides_half_the_subject():
     assert looking(yard(low), eye=(4, 0, 1.0)).passed.all()
     checks = looking(yard(high), eye=(4, 0, 1.0))
     assert checks.reasons[0] == "visibility"
-    assert 0 < checks.values[0] < DEFAULT_LIMITS.visible_share
+    assert 0 < checks.values[0] < LIMITS.visible_share
 
 
 def test_a_camera_inside_a_block_collides():
@@ -177,7 +176,7 @@ def test_a_camera_keeps_its_distance_from_a_wall(gap_m, passes):
 
 
 def test_the_outermost_camera_alone_can_collide():
-    wide = ProposedRig(np.linspace(-1, 1, 6), (0.99, 0.99))
+    wide = Rig(np.linspace(-1, 1, 6), (0.99, 0.99))
     block = ((3.7, -1.2, 0.7), (4.3, -0.9, 1.3))
 
     assert looking(yard(block), eye=(4, 0, 1.0)).passed.all()
@@ -193,7 +192,7 @@ def test_a_camera_outside_the_map_collides_though_nothing_is_near_it():
 
 
 def test_a_camera_inside_the_subject_collides():
-    near = ProposedRig(np.linspace(-0.01, 0.01, 6), (8.0, 8.0))
+    near = Rig(np.linspace(-0.01, 0.01, 6), (8.0, 8.0))
 
     assert looking(yard(), eye=(0.45, 0, 0.9), rig=near).reasons[0] == "collision"
 
@@ -219,13 +218,13 @@ def test_a_picture_full_of_sky_has_too_little_depth():
     checks = looking(world, eye=(4, 0, 1.0), pitch=8.0)
 
     assert checks.reasons[0] == "valid_depth"
-    assert checks.values[0] < DEFAULT_LIMITS.valid_share
+    assert checks.values[0] < LIMITS.valid_share
 
 
 def test_a_near_block_over_a_side_of_the_picture_is_an_occluder():
     """A slab 40 cm before the cameras covers the right third, beside the subject."""
     slab = ((3.5, -2, 0), (3.6, -0.05, 3))
-    narrow = ProposedRig(np.linspace(-0.01, 0.01, 6), (1.2, 1.2))
+    narrow = Rig(np.linspace(-0.01, 0.01, 6), (1.2, 1.2))
 
     assert looking(yard(slab), eye=(4, 0.05, 1.0), rig=narrow).reasons[0] == "border_occluder"
 
@@ -247,27 +246,24 @@ def test_a_free_yard_accepts_and_every_frame_holds(frames):
     for number in range(3):
         drawn = replace(proposal(frames=frames), number=number)
 
-        plan = examine(drawn, world=yard(walk_m=1.0), limits=DEFAULT_LIMITS)
+        plan = examine(drawn, world=yard(walk_m=1.0))
 
         assert plan.centres_m.shape == plan.rotators_deg.shape == (frames, 3)
         assert plan.subject_m.min() > 0.5
 
 
 def test_a_subject_that_jumps_from_one_frame_to_the_next_is_refused():
-    refusal = examine(proposal(), world=yard(walk_m=1.0, jump_m=1.0), limits=DEFAULT_LIMITS)
+    refusal = examine(proposal(), world=yard(walk_m=1.0, jump_m=1.0))
 
-    assert (refusal.reason, refusal.limit) == ("subject_motion", DEFAULT_LIMITS.subject_step_m)
+    assert (refusal.reason, refusal.limit) == ("subject_motion", LIMITS.subject_step_m)
     assert refusal.value == pytest.approx(1.0 + 1 / 80)
     assert "1.01 m from frame 3 to the next" in refusal.text
 
 
-def test_a_subject_may_run_and_the_limit_may_be_wider():
-    wide = replace(DEFAULT_LIMITS, subject_step_m=1.1)
+def test_a_subject_may_run():
+    run = examine(proposal(), world=yard(walk_m=80 * 0.5))
 
-    run = examine(proposal(), world=yard(walk_m=80 * 0.5), limits=DEFAULT_LIMITS)
-    jump = examine(proposal(), world=yard(walk_m=1.0, jump_m=1.0), limits=wide)
-
-    assert "subject_motion" not in [getattr(each, "reason", "") for each in (run, jump)]
+    assert getattr(run, "reason", "") != "subject_motion"
 
 
 def test_a_subject_that_runs_through_a_fence_between_frames_0_and_8_is_refused():
@@ -276,7 +272,7 @@ def test_a_subject_that_runs_through_a_fence_between_frames_0_and_8_is_refused()
         ((-1.0, -1.1, 0), (1.0, -1.0, 1)), ((-1.0, 1.0, 0), (1.0, 1.1, 1)),
     ]  # fmt: skip
 
-    refusal = examine(proposal(), world=yard(*fence, walk_m=24.0), limits=DEFAULT_LIMITS)
+    refusal = examine(proposal(), world=yard(*fence, walk_m=24.0))
 
     assert refusal.reason == "spawn_space"
 
@@ -288,11 +284,11 @@ def test_a_cell_around_the_subject_refuses_all_viewpoints():
         ((-1.6, -1.6, 2.4), (1.6, 1.6, 2.5)),
     ]  # fmt: skip
 
-    refusal = examine(proposal(), world=yard(*cell), limits=DEFAULT_LIMITS)
+    refusal = examine(proposal(), world=yard(*cell))
 
     assert isinstance(refusal, Refusal)
     assert refusal.reason == "visibility"
-    assert refusal.limit == DEFAULT_LIMITS.viewpoints
+    assert refusal.limit == LIMITS.viewpoints
     assert "of 96 viewpoints hold" in refusal.text
 
 
@@ -308,14 +304,14 @@ def test_walls_that_cut_a_yard_make_the_path_go_another_way():
     splices = 0
     for number in range(4):
         drawn = propose(SynthRequest(size_px=64, frames=81, focal_mm=20.0), index=0, number=number)
-        plan = examine(drawn, world=world, limits=DEFAULT_LIMITS)
+        plan = examine(drawn, world=world)
         if isinstance(plan, Refusal):
             continue
         splices += plan.splices
-        rig = ProposedRig.of(drawn)
+        rig = drawn.rig
         body_m = np.stack([world.subject_points_m(plan.spawn, frame=t) for t in range(81)])
         assert check_poses(
             plan.centres_m, plan.rotators_deg,
-            body_m=body_m, rig=rig, world=world, limits=DEFAULT_LIMITS,
+            body_m=body_m, rig=rig, world=world
         ).passed.all()  # fmt: skip
     assert splices > 0

@@ -15,17 +15,21 @@ from stereogenbench_data.cli.synth import synth
 from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import FAMILIES
-from stereogenbench_data.synthesis.checks import check_files
-from stereogenbench_data.synthesis.decisions import FOLDER, all_decisions
-from stereogenbench_data.synthesis.filters import DEFAULT_LIMITS, ProposedRig, Refusal, check_poses
+from stereogenbench_data.synthesis.decisions import (
+    ALL_MAPS,
+    FOLDER,
+    all_decisions,
+    report_markdown,
+    report_of,
+)
+from stereogenbench_data.synthesis.filters import LIMITS, Refusal, check_poses
 from stereogenbench_data.synthesis.maps import MAPS, open_map
 from stereogenbench_data.synthesis.planning import plan_scene, propose
-from stereogenbench_data.synthesis.produce import hold_out, plan_scenes, synthesise
+from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
 from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING, RayCasting
 from stereogenbench_data.synthesis.renderer import RenderedView
-from stereogenbench_data.synthesis.report import ALL_MAPS, markdown_of, report_of, report_of_tree
 from stereogenbench_data.synthesis.request import SynthRequest
-from stereogenbench_data.synthesis.sheets import write_sheets
+from stereogenbench_data.synthesis.review import hold_out, write_sheets
 from stereogenbench_data.synthesis.trajectory import steps
 
 app = typer.Typer()
@@ -45,22 +49,19 @@ def contents(root):
 @pytest.mark.parametrize("map_name", MAPS)
 def test_every_accepted_frame_passes_all_filters_and_moves_little(map_name):
     for index in range(2):
-        plan = plan_scene(SynthRequest(map_name=map_name, size_px=64), index=index).plan
-        world, rig = open_map(plan.proposal), ProposedRig.of(plan.proposal)
+        plan = plan_scene(SynthRequest(map_name=map_name, size_px=64), index=index)[0]
+        world, rig = open_map(plan.proposal), plan.proposal.rig
         frames = range(plan.request.frames)
         body_m = np.stack([world.subject_points_m(plan.spawn, frame=frame) for frame in frames])
 
-        checks = check_poses(
-            plan.centres_m, plan.rotators_deg,
-            body_m=body_m, rig=rig, world=world, limits=DEFAULT_LIMITS,
-        )  # fmt: skip
+        checks = check_poses(plan.centres_m, plan.rotators_deg, body_m=body_m, rig=rig, world=world)
         axes = rotation_from_rotator_deg(plan.rotators_deg)
         step_m, turn_deg = steps(rig.eyes(plan.centres_m, axes), axes)
 
         assert checks.passed.all()
-        assert step_m.max() <= DEFAULT_LIMITS.step_m
-        assert turn_deg.max() <= DEFAULT_LIMITS.turn_deg
-        assert np.abs(np.diff(turn_deg)).max() <= DEFAULT_LIMITS.jerk_deg
+        assert step_m.max() <= LIMITS.step_m
+        assert turn_deg.max() <= LIMITS.turn_deg
+        assert np.abs(np.diff(turn_deg)).max() <= LIMITS.jerk_deg
 
 
 @given(
@@ -83,9 +84,7 @@ def test_a_proposal_follows_from_its_numbers_alone(family, seed, index, number):
 
 
 def test_realised_baselines_are_those_of_the_accepted_proposal():
-    plan = plan_scene(
-        SynthRequest(family="Uniform", map_name="SynthHall", size_px=64), index=0
-    ).plan
+    plan = plan_scene(SynthRequest(family="Uniform", map_name="SynthHall", size_px=64), index=0)[0]
 
     for frame in (0, 40, 80):
         gaps_cm = np.linalg.norm(np.diff(plan.world_locations_cm(frame), axis=0), axis=1)
@@ -93,7 +92,7 @@ def test_realised_baselines_are_those_of_the_accepted_proposal():
 
 
 def test_the_poses_are_rounded_so_that_processors_agree():
-    plan = plan_scene(SynthRequest(map_name="SynthYard", size_px=64, frames=9), index=0).plan
+    plan = plan_scene(SynthRequest(map_name="SynthYard", size_px=64, frames=9), index=0)[0]
 
     for values in (plan.centres_m, plan.rotators_deg, plan.spawn.place_m):
         np.testing.assert_array_equal(values, np.round(values, 6))
@@ -142,7 +141,7 @@ def test_decisions_that_were_cut_short_are_taken_again(tmp_path):
 
 @pytest.mark.parametrize("part", [(0, 2), (3, 2), (0, 0)])
 def test_a_part_that_is_none_is_refused(tmp_path, part):
-    with pytest.raises(SynthesisError, match=r"part ./. is none: .* from 1 to the second"):
+    with pytest.raises(SynthesisError, match=r"part ./.: .* from 1 to the second"):
         synthesise(tmp_path, SynthRequest(**SMALL), part=part)
 
 
@@ -199,21 +198,19 @@ def test_a_scene_that_fails_after_rendering_is_replaced_by_its_next_proposal(
     tmp_path, spoilt, reason
 ):
     request = SynthRequest(map_name="SynthYard", **SMALL)
-    first = plan_scene(request, index=0).plan.proposal.number
+    first = plan_scene(request, index=0)[0].proposal.number
 
     (key,) = synthesise(tmp_path, request, renderer=Spoilt(number=first, **spoilt))
 
     ((_, (decision,)),) = all_decisions(tmp_path)
     refused = decision.refused[first]
     assert (refused.number, refused.refusal.reason) == (first, reason)
-    assert decision.accepted.number > first
+    assert decision.is_accepted
     marker = json.loads((tmp_path / key / "_scene_complete.json").read_text())
-    assert marker["synthesis"]["proposal"] == decision.accepted.number
+    assert marker["synthesis"]["proposal"] == decision.proposals[-1].number
 
 
-def test_a_renderer_that_always_fails_its_checks_ends_with_the_reason_and_leaves_nothing(
-    tmp_path, monkeypatch
-):
+def test_a_renderer_that_always_fails_its_checks_ends_with_the_reason(tmp_path, monkeypatch):
     monkeypatch.setattr("stereogenbench_data.synthesis.produce._MOST_RENDERED", 2)
 
     with pytest.raises(SynthesisError, match=r"2 rendered proposals .* dark .* Check the renderer"):
@@ -222,46 +219,46 @@ def test_a_renderer_that_always_fails_its_checks_ends_with_the_reason_and_leaves
             SynthRequest(scenes=2, map_name="SynthYard", **SMALL),
             renderer=Spoilt(number=9999, picture=lambda picture: picture // 64),
         )
-    assert not list(tmp_path.iterdir())
+    assert [path.name for path in tmp_path.iterdir()] == [FOLDER]
+    assert not list(tmp_path.rglob("*.mp4"))
 
 
 # Another check, another request.
 
 
 @pytest.mark.parametrize(("first", "then"), [("audit", "pictures"), ("pictures", "audit")])
-def test_scenes_of_one_request_pass_one_check(tmp_path, monkeypatch, first, then):
-    monkeypatch.setattr("stereogenbench_data.synthesis.produce.check_scene", lambda root, **_: None)
-    request = SynthRequest(scenes=2, **SMALL)
-    plan_scenes(tmp_path, request)  # Planning settles no check.
-    (done,) = synthesise(tmp_path, request, check=first, part=(1, 2))
+def test_scenes_of_another_check_are_neither_kept_nor_replaced(tmp_path, monkeypatch, first, then):
+    monkeypatch.setattr("stereogenbench_data.synthesis.produce._audited", lambda root, plan: None)
+    (done,) = synthesise(tmp_path, SynthRequest(check=first, **SMALL))
     before = contents(tmp_path)
 
-    for part in ((1, 2), (2, 2)):
-        with pytest.raises(SynthesisError, match=rf"check '{first}'.*'{then}'.*Give .* output"):
-            synthesise(tmp_path, request, check=then, part=part)
+    with pytest.raises(SynthesisError, match="scene_000000: another request wrote this scene"):
+        synthesise(tmp_path, SynthRequest(check=then, **SMALL))
 
     assert contents(tmp_path) == before
-    assert done == synthesise(tmp_path, request, check=first)[0]
+    assert synthesise(tmp_path, SynthRequest(check=first, **SMALL)) == [done]
 
 
-def test_a_refusal_by_the_audit_is_not_taken_over_by_another_check(tmp_path, monkeypatch):
+def test_what_the_audit_refused_is_not_rendered_again_by_the_next_run(tmp_path, monkeypatch):
     seen = []
 
-    def refuse_first(root, **_):
-        seen.append(root)
+    def refuse_first(root, plan):
+        seen.append(plan.proposal.number)
         return Refusal("audit", 1, 0, "as the test wants") if len(seen) == 1 else None
 
     def stop(done, total):
         if seen:  # The next proposal is being drawn.
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("stereogenbench_data.synthesis.produce.check_scene", refuse_first)
-    request = SynthRequest(**SMALL)
+    monkeypatch.setattr("stereogenbench_data.synthesis.produce._audited", refuse_first)
+    request = SynthRequest(check="audit", **SMALL)
     with pytest.raises(KeyboardInterrupt):
-        synthesise(tmp_path, request, check="audit", progress=stop)
+        synthesise(tmp_path, request, progress=stop)
 
-    with pytest.raises(SynthesisError, match="check 'audit'"):
-        synthesise(tmp_path, request, check="pictures")
+    synthesise(tmp_path, request)
+
+    assert len(seen) == 2
+    assert seen[1] > seen[0]
 
 
 def test_a_request_that_does_not_fit_the_tree_decides_nothing(tmp_path):
@@ -275,24 +272,14 @@ def test_a_request_that_does_not_fit_the_tree_decides_nothing(tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_missing_frames_and_broken_videos_are_found(tmp_path):
-    (key,) = synthesise(tmp_path, SynthRequest(**SMALL))
-    scene = tmp_path / key
-
-    assert check_files(scene, frames=2) is None
-    refusal = check_files(scene, frames=3)
-    assert (refusal.reason, refusal.value, refusal.limit) == ("missing_frames", 2, 3)
-    (scene / "cam_04_depth.mkv").write_bytes(b"not a video")
-    assert "cam_04_depth.mkv: 0 of 2" in check_files(scene, frames=2).text
-
-
 def test_a_scene_can_be_made_to_pass_the_audit_and_the_doctor(tmp_path):
-    request = SynthRequest(map_name="SynthYard", size_px=128, frames=3, seed=2, focal_mm=25)
+    request = SynthRequest(
+        map_name="SynthYard", size_px=128, frames=3, seed=2, focal_mm=25, check="audit"
+    )
 
-    (key,) = synthesise(tmp_path, request, check="audit")
+    (key,) = synthesise(tmp_path, request)
 
-    assert (tmp_path / key / "_scene_complete.json").exists()
-    assert not (tmp_path / ".unfinished").exists()
+    assert json.loads((tmp_path / key / "_scene_complete.json").read_text())["synthesis"]["check"]
 
 
 # Reports, sheets and the holdout.
@@ -306,17 +293,17 @@ def test_the_report_counts_acceptance_by_map_and_reason_and_wide_rigs_are_refuse
 
     report = report_of([("Uniform", decisions)])
 
-    by_map = {each.map_name: each for each in report}
+    by_map = {each["map_name"]: each for each in report}
     assert list(by_map) == ["SynthHall", "SynthYard", ALL_MAPS]
     everything = by_map[ALL_MAPS]
-    assert everything.accepted == 24
-    assert everything.proposals == 24 + sum(len(each.refused) for each in decisions)
-    assert sum(everything.reasons.values()) == everything.proposals - 24
-    assert everything.proposed_cm.median == pytest.approx(75.5, abs=12)
-    assert everything.realised_cm.median < everything.proposed_cm.median - 5
-    assert everything.reasons["collision"] > 0
-    assert report_of_tree(tmp_path) == report
-    assert "| Uniform | SynthHall |" in markdown_of(report)
+    assert everything["accepted"] == 24
+    assert everything["proposals"] == 24 + sum(len(each.refused) for each in decisions)
+    assert sum(everything["reasons"].values()) == everything["proposals"] - 24
+    assert everything["proposed_cm"]["median"] == pytest.approx(75.5, abs=12)
+    assert everything["realised_cm"]["median"] < everything["proposed_cm"]["median"] - 5
+    assert everything["reasons"]["collision"] > 0
+    assert report_of(all_decisions(tmp_path)) == report
+    assert "| Uniform | SynthHall " in report_markdown(report)
 
 
 def test_contact_sheets_show_every_scene_once(tmp_path):
@@ -351,7 +338,7 @@ def test_held_out_scenes_leave_the_tree_and_do_not_come_back(tmp_path):
 def test_a_holdout_of_what_is_no_scene_moves_nothing(tmp_path, key):
     (there,) = synthesise(tmp_path, SynthRequest(**SMALL))
 
-    with pytest.raises(SynthesisError, match=r"(no scene|not the path of a scene)"):
+    with pytest.raises(SynthesisError, match=r"there is no scene .* to hold out"):
         hold_out(tmp_path, [there, key])
     assert (tmp_path / there).is_dir()
 

@@ -71,7 +71,7 @@ def test_depth_has_near_far_and_sky(draw):
 
 
 def test_every_limb_of_the_subject_moves():
-    plan = plan_scene(SynthRequest(frames=7), index=0).plan
+    plan = plan_scene(SynthRequest(frames=7), index=0)[0]
     world = open_map(plan.proposal)
     before, after = (world.limbs(plan.spawn, frame=frame) for frame in (0, 6))
 

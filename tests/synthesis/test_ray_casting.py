@@ -5,8 +5,15 @@ import pytest
 
 from stereogenbench_data.synthesis.maps import open_map
 from stereogenbench_data.synthesis.planning import plan_scene
-from stereogenbench_data.synthesis.ray_casting import GROUND, SKY, View, first_hits, shape_of
+from stereogenbench_data.synthesis.ray_casting import (
+    GROUND,
+    SKY,
+    first_hits,
+    hits_of_list,
+    shape_of,
+)
 from stereogenbench_data.synthesis.render import SceneState, render_frame, static_light
+from stereogenbench_data.synthesis.renderer import View
 from stereogenbench_data.synthesis.request import SynthRequest
 from stereogenbench_data.synthesis.scene import Material, Shape
 
@@ -16,12 +23,10 @@ STONE = Material("plaster", 1.0, (1.0, 1.0, 1.0))
 
 def view_from(eye, *, size_px=(5, 5), focal_px=5.0):
     """A camera that looks along the scene's x axis, its principal point in the middle."""
-    width, height = size_px
     return View(
         eye=np.array(eye),
         axes=np.eye(3),
         focal_px=(focal_px, focal_px),
-        centre_px=(width / 2, height / 2),
         size_px=size_px,
     )
 
@@ -88,7 +93,7 @@ def test_a_shape_behind_the_camera_is_not_seen():
 @pytest.mark.parametrize("index", range(3))
 def test_every_hit_lies_on_the_surface_of_its_solid(index):
     """Independent of how it was found: the point at that depth fulfils the solid's equation."""
-    plan = plan_scene(SynthRequest(family="Uniform", size_px=48), index=index).plan
+    plan = plan_scene(SynthRequest(family="Uniform", size_px=48), index=index)[0]
     state = state_of(plan, frame=40)
     view = plan.view(camera=2, frame=40)
     depth_m, faces = depth_of(state.shapes, view, slope=state.scene.slope)
@@ -117,7 +122,7 @@ def test_every_hit_lies_on_the_surface_of_its_solid(index):
 
 def test_strips_of_a_large_picture_join_without_a_seam():
     """A 1280 px picture is cast in strips; its rows are those of rays cast one row at a time."""
-    plan = plan_scene(SynthRequest(size_px=1280, height_px=112), index=0).plan
+    plan = plan_scene(SynthRequest(size_px=1280, height_px=112), index=0)[0]
     state = state_of(plan, frame=0)
     view = plan.view(camera=0, frame=0)
 
@@ -125,13 +130,15 @@ def test_strips_of_a_large_picture_join_without_a_seam():
 
     assert picture.shape == (112, 1280, 3)
     np.testing.assert_array_equal(depth_m, depth_of(state.shapes, view, slope=state.scene.slope)[0])
+    among = [(number, np.arange(1280)) for number in range(len(state.shapes))]
     for row in (0, 101, 102, 111):
-        alone = View(
-            eye=view.eye,
-            axes=view.axes,
-            focal_px=view.focal_px,
-            centre_px=(view.centre_px[0], view.centre_px[1] - row),
-            size_px=(1280, 1),
+        inverse, _ = hits_of_list(
+            view,
+            right=view.right_of_axis(np.arange(1280) + 0.5),
+            below=np.full(1280, view.below_axis(row + 0.5)),
+            shapes=state.shapes,
+            slope=state.scene.slope,
+            among=among,
         )
-        cast, _ = depth_of(state.shapes, alone, slope=state.scene.slope)
-        np.testing.assert_allclose(depth_m[row : row + 1], cast, rtol=1e-9)
+        with np.errstate(divide="ignore"):
+            np.testing.assert_allclose(depth_m[row], 1 / inverse, rtol=1e-9)

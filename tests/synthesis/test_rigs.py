@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from stereogenbench_data.errors import SynthesisError
-from stereogenbench_data.synthesis.cameras import (
+from stereogenbench_data.synthesis.proposal import (
     lateral_places_cm,
     pair_distances_cm,
     random_gaps_cm,
@@ -50,8 +49,3 @@ def test_pair_distances_of_a_rig_worked_by_hand():
         *(18.5, 51.5, 61.25, 122.5, 163.0, 33.0, 42.75, 104.0),
         *(144.5, 9.75, 71.0, 111.5, 61.25, 101.75, 40.5),
     ]
-
-
-def test_an_unknown_family_is_refused():
-    with pytest.raises(SynthesisError, match="family 'Wide' is unknown: choose IPD_Gaussian"):
-        random_gaps_cm("Wide", rng=np.random.default_rng(0))

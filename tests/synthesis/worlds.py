@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stereogenbench_data.synthesis.world import Bounds
+from stereogenbench_data.synthesis.renderer import Bounds
 
 
 @dataclass

@@ -19,11 +19,15 @@ from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.synthesis.blender.assets import Assets, read_assets
 from stereogenbench_data.synthesis.blender.process import blender
-from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.proposal import Proposal
-from stereogenbench_data.synthesis.renderer import RenderedView, unknown_map
+from stereogenbench_data.synthesis.renderer import (
+    Bounds,
+    RenderedView,
+    ScenePlan,
+    Spawn,
+    unknown_map,
+)
 from stereogenbench_data.synthesis.request import SENSOR_MM
-from stereogenbench_data.synthesis.world import Bounds, Spawn
 
 _VERSION: Final = 1
 """Goes up when the same assets give other scenes."""

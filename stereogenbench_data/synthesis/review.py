@@ -1,4 +1,4 @@
-"""Contact sheets of scenes, for a person who looks through them and refuses some."""
+"""A person's pass over scenes: contact sheets to look through, and a holdout of what is refused."""
 
 from contextlib import closing
 from pathlib import Path
@@ -9,13 +9,55 @@ import numpy as np
 from stereogenbench_data.audit.geometry.audit import open_for_audit
 from stereogenbench_data.audit.pictures.scene_pictures import scene_sheet
 from stereogenbench_data.audit.pictures.scene_reader import SceneReader
-from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
+from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import SynthesisError, explain_os_errors
+from stereogenbench_data.index.open import warn_if_stale
+from stereogenbench_data.jobs import do_items
 from stereogenbench_data.samples.picture import write_png
+from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import COMPLETE_JSON
 
+HOLDOUT: Final = ".holdout"
 _TILE_PX: Final = 224
+
+
+def hold_out(out: str | Path, keys: list[str]) -> list[str]:
+    """Move scenes that a person refused out of the tree, into its hidden folder ``.holdout``.
+
+    A later run of their request does not render them again.
+
+    Args:
+        out: Root of the tree.
+        keys: Whole paths of scenes below the root. All must be in the tree or in the holdout.
+
+    Returns:
+        The keys of the scenes that were moved now.
+
+    Raises:
+        SynthesisError: If a key is no scene of the tree, or a folder cannot be moved.
+    """
+    root = Path(out)
+    for key in keys:
+        try:
+            parse_scene_key(key)
+            is_there = (root / key).is_dir() or (root / HOLDOUT / key).is_dir()
+        except ValueError:
+            is_there = False
+        if not is_there:
+            raise SynthesisError(
+                f"{root}: there is no scene {key!r} to hold out. List whole paths, such as "
+                f"train/Uniform/SynthStage/scene_000000, one a line."
+            )
+    moved = [key for key in dict.fromkeys(keys) if (root / key).is_dir()]
+    for key in moved:
+        target = root / HOLDOUT / key
+        where = f"{root / key}: cannot be moved to {target}"
+        with explain_os_errors(where, "Check that both may be written to.", kind=SynthesisError):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            (root / key).rename(target)
+    warn_if_stale(root)
+    return moved
 
 
 def write_sheets(  # noqa: PLR0913 - each names one thing that a user chooses
@@ -53,24 +95,28 @@ def write_sheets(  # noqa: PLR0913 - each names one thing that a user chooses
         for key, path in zip(keys, paths, strict=True)
         if not _is_newer(path, than=Path(out) / key / COMPLETE_JSON)
     ]
-    advance = advance_of(progress, done=len(keys) - len(tasks), total=len(keys))
-    advance(0)
     where = f"{folder}: contact sheets cannot be written there"
     with explain_os_errors(where, "Choose a folder that you may write to.", kind=SynthesisError):
         Path(folder).mkdir(parents=True, exist_ok=True)
-    for _ in engine.map(_write, tasks, name=lambda task: task[1], workers=workers):
-        advance(1)
+        do_items(
+            _write_sheet,
+            tasks,
+            name=lambda task: task[1],
+            engine=engine,
+            workers=workers,
+            progress=progress,
+            done=len(keys) - len(tasks),
+            total=len(keys),
+        )
     return paths
 
 
 def _is_newer(path: Path, *, than: Path) -> bool:
-    try:
-        return path.stat().st_mtime_ns >= than.stat().st_mtime_ns
-    except OSError:
-        return False
+    return path.exists() and path.stat().st_mtime_ns >= than.stat().st_mtime_ns
 
 
-def _write(task: tuple[Path, str, Path, float], after_scene: Advance) -> None:
+def _write_sheet(task: tuple[Path, str, Path, float], after_scene: Advance) -> None:
+    """Draw the sheet of a scene; a worker process calls this."""
     out, key, path, unit_m = task
     index = open_for_audit(out, workers=1, scenes=(key,))
     frames = index.scene(0).frames
@@ -79,6 +125,5 @@ def _write(task: tuple[Path, str, Path, float], after_scene: Advance) -> None:
             scene_sheet(reader, 0, frame=frame, tile_px=_TILE_PX)
             for frame in sorted({0, frames // 2, frames - 1})
         ]
-    where = f"{path}: the contact sheet cannot be written"
-    with explain_os_errors(where, "Choose a folder that you may write to.", kind=SynthesisError):
-        write_png(path, np.concatenate(sheets))
+    write_png(path, np.concatenate(sheets))
+    after_scene(1)
