@@ -67,7 +67,7 @@ def test_the_imports_have_no_cycle():
         "stereogenbench_data",
         "stereogenbench_data.schema.parse",
         "stereogenbench_data.geometry.camera",
-        "stereogenbench_data.geometry.visibility",
+        "stereogenbench_data.geometry.projection",
         "stereogenbench_data.media.depth",
         "stereogenbench_data.index.table",
         "stereogenbench_data.selection.plan",

@@ -15,9 +15,8 @@ from PIL import Image
 from stereogenbench_data.bridges.adapted import AdaptedPairs, PairsOptions
 from stereogenbench_data.datasets.mapped import Data
 from stereogenbench_data.errors import FieldError, SelectionError
-from stereogenbench_data.geometry.projection import project_rectified
+from stereogenbench_data.geometry.projection import front_pixels, project_rectified
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
-from stereogenbench_data.geometry.warp import front_pixels
 from stereogenbench_data.samples.fields import Sample
 
 Layout = Literal["tchw", "cthw"]

@@ -19,8 +19,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from stereogenbench_data.bridges.posed_images import CENTRE_PX, PosedImage, origin_at
-from stereogenbench_data.geometry.projection import Projection
-from stereogenbench_data.geometry.visibility import visible_in_target
+from stereogenbench_data.geometry.projection import Projection, visible_in_target
 from stereogenbench_data.schema.records import DepthEncoding
 
 ABOUT_JSON: Final = "stereogenbench.json"

@@ -9,26 +9,15 @@ Maps are (b, p, t, h, w) inside: moments, pairs, frames, rows, columns.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Final, Literal, NamedTuple, Protocol, TypeVar, cast
+from typing import Any, Final, Literal, NamedTuple
 
 import torch
 
 from stereogenbench_data.errors import FieldError, SelectionError
 from stereogenbench_data.geometry.arrays import take_pixels
-from stereogenbench_data.geometry.disparity import (
-    disparity_from_shifts,
-    error_bound_px,
-    ray_per_planar,
-)
-from stereogenbench_data.geometry.projection import (
-    Projection,
-    landing_pixels,
-    project_by_homography,
-    project_rectified,
-)
-from stereogenbench_data.geometry.visibility import agrees_with_target, visible_from_source
-from stereogenbench_data.geometry.warp import front_pixels
+from stereogenbench_data.geometry.disparity import disparity_from_shifts, ray_per_planar
+from stereogenbench_data.geometry.projection import front_pixels
+from stereogenbench_data.samples.derive import Direction, once
 
 DERIVE_FIELDS: Final = (
     "image", "stored_depth", "depth_unit_m", "depth_offset_m", "no_depth", "depth_kind",
@@ -133,11 +122,10 @@ def _of_contracts(
     made: dict[str, torch.Tensor] = {}
     for contract, rows in contracts:
         if len(rows) == len(depth):
-            made = _derived(_Moments.of(moved, contract), names, places)
+            made = _derived(_Moments(moved, contract), names, places)
             break
         chosen = {name: torch.stack([v[row] for row in rows]) for name, v in moved.items()}
-        part = _derived(_Moments.of(chosen, contract), names, places)
-        for name, values in part.items():
+        for name, values in _derived(_Moments(chosen, contract), names, places).items():
             if name not in made:
                 made[name] = values.new_empty((len(depth), *values.shape[1:]))
             for place, row in enumerate(rows):
@@ -183,11 +171,11 @@ def _derived(
     made: dict[str, torch.Tensor] = {}
     for start in range(0, len(places), step):
         chunk = places[start : start + step]
-        ahead = _Direction(moments, chunk)
-        back = _Direction(moments, [(second, first) for first, second in chunk])
+        ahead = _Pairs(moments, chunk)
+        back = _Pairs(moments, [(second, first) for first, second in chunk])
         for name in names:
             if name == "intrinsics":
-                made[name] = moments.intrinsics
+                made[name] = moments.batch["intrinsics"]
                 continue
             values = _MAKERS[name](ahead, back)
             if len(chunk) == len(places):
@@ -246,110 +234,51 @@ def _require_pairs(pairs: PairPlaces, *, views: int) -> list[tuple[int, int]]:
     return places
 
 
-class _Memory(Protocol):
-    """What keeps the results of its `_once` properties."""
-
-    made: dict[str, Any]
-
-
-T = TypeVar("T")
-
-
-def _once(make: Callable[[Any], T]) -> T:
-    """Return a property that is made once. torch.compile cannot trace functools' one before 3.12.
-
-    It is typed as what it gives.
-    """
-    name = make.__name__
-
-    def get(holder: _Memory) -> T:
-        if name not in holder.made:
-            holder.made[name] = make(holder)
-        return cast("T", holder.made[name])
-
-    return cast("T", property(get, doc=make.__doc__))
-
-
-@dataclass(frozen=True)
 class _Moments:
     """A batch of views: maps (b, v, t, h, w), numbers of each view (b, v).
 
     Attributes:
+        batch: Its fields.
         contract: What decides which formulas hold for them.
-        image: (b, v, t, 3, h, w) uint8; None where no field shows pictures.
         units: Stored numbers, int32.
         measured: Where they mean a depth.
-        unit_m: Metres in a stored unit.
-        offset_m: Depth in metres of the stored number 0.
-        intrinsics: (b, 3, 3), of every view.
-        baselines_m: (b, v, v), from the first view's camera to the second's, signed.
-        cams_from_cam: (b, v, t, v, 4, 4), from the first view's camera's coordinates to those of
-            the second's.
-        camera: Numbers of the cameras.
-        made: What was made of them.
+        made: What was made of them once.
     """
 
-    contract: _Contract
-    image: Any
-    units: torch.Tensor
-    measured: torch.Tensor
-    unit_m: torch.Tensor
-    offset_m: torch.Tensor
-    intrinsics: torch.Tensor
-    baselines_m: torch.Tensor
-    cams_from_cam: torch.Tensor
-    camera: torch.Tensor
-    made: dict[str, Any] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, batch: Mapping[str, torch.Tensor], contract: _Contract) -> "_Moments":
-        """Return the views of a batch; stills become clips of one frame."""
-        depth, motions, image = batch["stored_depth"], batch["cams_from_cam"], batch.get("image")
-        if depth.ndim == 5:
-            depth, motions = depth.unsqueeze(2), motions.unsqueeze(2)
-            image = None if image is None else image.unsqueeze(2)
+    def __init__(self, batch: Mapping[str, torch.Tensor], contract: _Contract) -> None:
+        """Take the views of a batch; stills become clips of one frame."""
+        self.batch, self.contract = dict(batch), contract
+        self.made: dict[str, Any] = {}
+        if batch["stored_depth"].ndim == 5:
+            for name in {"stored_depth", "cams_from_cam", "image"} & batch.keys():
+                self.batch[name] = batch[name].unsqueeze(2)
         # torch has few operations for uint16: its bits are read as int16, and the sign is dropped.
-        units = (depth.squeeze(-3).view(torch.int16).to(torch.int32)) & 0xFFFF
-        return cls(
-            contract=contract,
-            image=image,
-            units=units,
-            measured=units != _per_map(batch["no_depth"]),
-            unit_m=batch["depth_unit_m"],
-            offset_m=batch["depth_offset_m"],
-            intrinsics=batch["intrinsics"],
-            baselines_m=batch["baselines_m"],
-            cams_from_cam=motions,
-            camera=batch["camera"],
-        )
+        stored = self.batch["stored_depth"].squeeze(-3).view(torch.int16)
+        self.units = stored.to(torch.int32) & 0xFFFF
+        self.measured = self.units != _per_map(batch["no_depth"])
 
-    @_once
+    @once
     def stored(self) -> torch.Tensor:
         """Stored numbers as `disparity_from_shifts` takes them."""
         stored = self.units.to(torch.float64)
         is_inverse = self.contract.form == "inverse"
         return stored if is_inverse else torch.where(stored == 0, torch.inf, stored)
 
-    @_once
-    def seen_m(self) -> torch.Tensor:
-        """Depth along the optical axis, -inf where it was not measured."""
-        return torch.where(self.measured, self.depth_m, -torch.inf)
-
-    @_once
+    @once
     def depth_m(self) -> torch.Tensor:
         """Depth along the optical axis, as `depth_m_from_units` gives it."""
-        units, unit_m = self.units.to(torch.float64), _per_map(self.unit_m)
+        units, unit_m = self.units.to(torch.float64), _per_map(self.batch["depth_unit_m"])
         if self.contract.form == "depth":
             depth_m = (units * unit_m).to(torch.float32) * self.measured
         elif self.contract.form == "ranged":
-            ranged_m = units * unit_m + _per_map(self.offset_m)
+            ranged_m = units * unit_m + _per_map(self.batch["depth_offset_m"])
             depth_m = ranged_m.to(torch.float32) * self.measured
         else:
             depth_m = torch.where(self.measured, (unit_m / units).to(torch.float32), 0.0)
         if self.contract.kind == "planar":
             return depth_m
         fx_px, fy_px, cx_px, cy_px = (
-            self.intrinsics[:, row, column, None, None, None, None]
+            self.batch["intrinsics"][:, row, column, None, None, None, None]
             for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))
         )
         lengths: torch.Tensor = ray_per_planar(
@@ -370,145 +299,90 @@ def _taken(values: torch.Tensor, places: Sequence[int]) -> torch.Tensor:
     return torch.stack([values[:, place] for place in places], dim=1)
 
 
-class _Direction:
-    """What follows from the depth of some source views for one target view each.
+class _Pairs(Direction):
+    """What follows from the depth of some source views for one target view each, (b, p, t, h, w).
 
     It does for tensors of many scenes what `PairGeometry` does for the arrays of one.
-
-    Attributes:
-        made: What was made of them.
     """
+
+    coarser = staticmethod(torch.maximum)
 
     def __init__(self, moments: _Moments, places: list[tuple[int, int]]) -> None:
         """Take all views, and the places of the sources and targets among them."""
-        self.made: dict[str, Any] = {}
-        self._moments = moments
-        self._contract = moments.contract
-        self._places = places
+        super().__init__()
+        self._moments, self._batch, self._places = moments, moments.batch, places
         self._sources = [source for source, _ in places]
-        self._targets = [target for _, target in places]
+        self.is_rectified = moments.contract.rig == "rectified"
+        self.is_inverse = moments.contract.form == "inverse"
 
-    @_once
+    def of_maps(self, numbers: torch.Tensor, *, like: torch.Tensor) -> torch.Tensor:
+        """Return numbers (b, p) as they are broadcast to maps like these, in their dtype."""
+        return _per_map(numbers).to(like.dtype)
+
+    @once
     def measured(self) -> torch.Tensor:
         """Where the source's depth was measured."""
         return _taken(self._moments.measured, self._sources)
 
-    @_once
+    @once
     def depth_m(self) -> torch.Tensor:
         """The source's depth along the optical axis."""
         return _taken(self._moments.depth_m, self._sources)
 
-    @_once
+    @once
     def baseline_m(self) -> torch.Tensor:
         """(b, p) signed baselines."""
-        baselines_m = self._moments.baselines_m
+        baselines_m = self._batch["baselines_m"]
         return torch.stack([baselines_m[:, source, target] for source, target in self._places], 1)
 
-    @property
+    @once
     def shift_px_m(self) -> torch.Tensor:
         """(b, p) focal lengths in pixels times baselines."""
-        return self._moments.intrinsics[:, 0, 0, None] * self.baseline_m
+        return self._batch["intrinsics"][:, 0, 0, None] * self.baseline_m
 
-    @property
+    @once
     def unit_m(self) -> torch.Tensor:
         """(b, p) metres in a stored unit of the source."""
-        return _taken(self._moments.unit_m, self._sources)
+        return _taken(self._batch["depth_unit_m"], self._sources)
 
-    @_once
-    def known(self) -> torch.Tensor:
-        """Where disparity is known: depth was measured, and the point is ahead of the target."""
-        if self._contract.rig == "rectified":
-            return self.measured
-        return self.measured & torch.isfinite(self.projection.u_px)
-
-    @_once
+    @once
     def disparity(self) -> torch.Tensor:
         """Disparity in pixels, 0 where it is not known."""
-        if self._contract.rig != "rectified":
-            width_px = self.measured.shape[-1]
-            u_px = torch.arange(width_px, dtype=torch.float64, device=self.measured.device) + 0.5
-            moved = torch.where(self.known, u_px - self.projection.u_px, 0.0)
-            return moved.to(torch.float32)
-        if self._contract.kind == "ray" or self._contract.form == "ranged":
+        contract = self._moments.contract
+        disparity: torch.Tensor
+        if not self.is_rectified:
+            disparity = self.moved_px.to(torch.float32)
+            return disparity
+        if contract.kind == "ray" or contract.form == "ranged":
             depth_m = torch.where(self.depth_m > 0, self.depth_m, torch.inf).to(torch.float64)
             return (_per_map(self.shift_px_m) / depth_m).to(torch.float32)
         disparity = disparity_from_shifts(
             _taken(self._moments.stored, self._sources),
             _per_map(self.shift_px_m / self.unit_m),
-            form="depth" if self._contract.form == "depth" else "inverse",
+            form="inverse" if self.is_inverse else "depth",
         )
         return torch.where(self.measured, disparity, 0.0)
 
-    @_once
-    def projection(self) -> Projection:
-        """Where each source pixel lands in the target."""
-        if self._contract.rig == "rectified":
-            return project_rectified(self.depth_m, self.disparity)
+    @once
+    def homography(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """(b, p, t, 3, 3) and (b, p, t, 3): what takes pixels and depth to the target."""
+        cams_from_cam = self._batch["cams_from_cam"]
         target_from_source = torch.stack(
-            [self._moments.cams_from_cam[:, source, :, target] for source, target in self._places],
-            dim=1,
+            [cams_from_cam[:, source, :, target] for source, target in self._places], dim=1
         )
-        camera_matrix = self._moments.intrinsics[:, None, None]
+        camera_matrix = self._batch["intrinsics"][:, None, None]
         homography = camera_matrix @ target_from_source[..., :3, :3] @ _inverse(camera_matrix)
-        step = (camera_matrix @ target_from_source[..., :3, 3:])[..., 0]
-        return project_by_homography(self.depth_m.to(torch.float64), homography, step)
+        return homography, (camera_matrix @ target_from_source[..., :3, 3:])[..., 0]
 
-    @_once
-    def landed(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Which measured source pixels land in the target, and on which of its pixels."""
-        height_px, width_px = self.measured.shape[-2:]
-        inside, pixel = landing_pixels(self.projection, height_px=height_px, width_px=width_px)
-        return inside & self.measured, pixel
-
-    def quantum_m(self, unit_m: torch.Tensor) -> torch.Tensor:
-        """Return the step between depths, of the coarser of the source's and given units."""
-        if self._contract.form == "inverse":
-            return self.depth_m**2 / _per_map(self.unit_m).to(torch.float32)
-        coarser_m = torch.maximum(self.unit_m, unit_m)
-        return _per_map(coarser_m).to(self.projection.depth_m.dtype)
-
-    @property
-    def disparity_error(self) -> torch.Tensor:
-        """How far quantised depth can put disparity off, in pixels."""
-        shift_px_m = _per_map(self.shift_px_m.abs())
-        if self._contract.form == "inverse":
-            half_step_px = shift_px_m / _per_map(self.unit_m) / 2
-            return self.known * half_step_px.to(torch.float32)
-        bound_px: torch.Tensor = error_bound_px(
-            self.depth_m,
-            shift_px_m=shift_px_m.to(torch.float32),
-            half_step_m=(_per_map(self.unit_m) / 2).to(torch.float32),
-        )
-        return bound_px if self._contract.rig == "rectified" else bound_px * self.known
-
-    @property
-    def visible_from_source(self) -> torch.Tensor:
-        """What is visible in the target, decided by the source's own depth alone."""
-        visible: torch.Tensor = visible_from_source(
-            self.projection, measured=self.measured, quantum_m=self.quantum_m(self.unit_m)
-        )
-        return visible
-
-    def visible(self, back: "_Direction") -> torch.Tensor:
-        """Return what is visible in the target, by the depth of the way back."""
-        visible: torch.Tensor = agrees_with_target(
-            self.projection,
-            landed=self.landed,
-            seen_m=_taken(self._moments.seen_m, self._targets),
-            quantum_m=self.quantum_m(back.unit_m),
-        )
-        return visible
-
-    @property
+    @once
     def picture(self) -> torch.Tensor:
         """The source's pictures (b, p, t, 3, h, w)."""
-        return _taken(self._moments.image, self._sources)
+        return _taken(self._batch["image"], self._sources)
 
-    @_once
+    @once
     def front(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Which source pixel is in front at each target pixel, and where none landed."""
-        index, hole = front_pixels(self.projection, measured=self.measured, landed=self.landed)
-        return index, hole
+        return front_pixels(self.projection, measured=self.measured)
 
     @property
     def warped(self) -> torch.Tensor:
@@ -520,8 +394,8 @@ class _Direction:
     @property
     def cameras(self) -> torch.Tensor:
         """(b, p, 2) numbers of the two cameras."""
-        camera = self._moments.camera
-        return torch.stack([_taken(camera, self._sources), _taken(camera, self._targets)], dim=-1)
+        camera, targets = self._batch["camera"], [target for _, target in self._places]
+        return torch.stack([_taken(camera, self._sources), _taken(camera, targets)], dim=-1)
 
 
 def _inverse(camera_matrix: torch.Tensor) -> torch.Tensor:
@@ -534,7 +408,7 @@ def _inverse(camera_matrix: torch.Tensor) -> torch.Tensor:
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
-_MAKERS: Final[dict[str, Callable[[_Direction, _Direction], torch.Tensor]]] = {
+_MAKERS: Final[dict[str, Callable[[_Pairs, _Pairs], torch.Tensor]]] = {
     "left": lambda ahead, back: ahead.picture,
     "right": lambda ahead, back: back.picture,
     "disparity": lambda ahead, back: ahead.disparity.unsqueeze(-3),

@@ -2,27 +2,15 @@
 
 All functions take and return arrays of either library. The rest of the layer is written once,
 against the array API standard. The arrays of one call must be of one library and on one device.
-
-Torch tensors are recognised by their type before array_api_compat is asked: torch.compile cannot
-trace its cached checks without warnings.
 """
 
 import math
-from typing import Any
+from typing import Any, Literal
 
-import array_api_compat
 import numpy as np
 
 Array = Any
 """A numpy array or a torch tensor; jaxtyping checks its shape and dtype under test."""
-
-
-def is_torch_array(values: Array) -> bool:
-    """Return whether an array is a torch tensor; torch is not imported."""
-    if isinstance(values, np.ndarray):
-        return False
-    is_torchs_own = type(values).__module__.startswith("torch")
-    return is_torchs_own or bool(array_api_compat.is_torch_array(values))
 
 
 def is_numpy_array(values: Array) -> bool:
@@ -30,29 +18,22 @@ def is_numpy_array(values: Array) -> bool:
     return isinstance(values, (np.ndarray, np.generic))
 
 
-def array_namespace(*arrays: Array) -> Any:
-    """Return the functions of the array API standard for the library of these arrays.
+def array_namespace(values: Array) -> Any:
+    """Return the functions of the array API standard for the library of an array."""
+    if is_numpy_array(values):
+        from array_api_compat import numpy
 
-    Raises:
-        TypeError: If they are of several libraries.
-    """
-    if all(map(is_torch_array, arrays)):
-        from array_api_compat import torch as functions
+        return numpy
+    from array_api_compat import torch
 
-        return functions
-    return array_api_compat.array_namespace(*arrays)
-
-
-def device(values: Array) -> Any:
-    """Return the device on which an array is."""
-    return values.device if is_torch_array(values) else array_api_compat.device(values)
+    return torch
 
 
 def pixel_centres(like: Array, *, dtype: Any) -> tuple[Array, Array]:
     """Return u (w,) and v (h, 1) of the pixel centres of maps shaped (..., h, w)."""
     xp = array_namespace(like)
     height, width = like.shape[-2:]
-    place = {"dtype": dtype, "device": device(like)}
+    place = {"dtype": dtype, "device": like.device}
     return xp.arange(width, **place) + 0.5, (xp.arange(height, **place) + 0.5)[:, None]
 
 
@@ -65,7 +46,7 @@ def as_float64(values: Array) -> Array:
 def quotient(number: float | Array, divisor: Array) -> Array:
     """Return number / divisor, rounded once; torch would multiply by the rounded reciprocal."""
     xp = array_namespace(divisor)
-    return xp.asarray(number, dtype=divisor.dtype, device=device(divisor)) / divisor
+    return xp.asarray(number, dtype=divisor.dtype, device=divisor.device) / divisor
 
 
 def whole_where(mask: Array, values: Array) -> Array:
@@ -104,14 +85,10 @@ def take_flat(values: Array, index: Array) -> Array:
 
     The index must be in range: the fastest mode of numpy does not check it.
     """
-    xp = array_namespace(values, index)
     if is_numpy_array(values):
         return np.take(values.reshape(-1), index, mode="wrap")
-    if is_torch_array(values):
-        # array_api_compat's take first looks for negative numbers, in three passes.
-        return values.reshape(-1).index_select(0, index.reshape(-1)).reshape(index.shape)
-    taken = xp.take(xp.reshape(values, (-1,)), xp.reshape(index, (-1,)), axis=0)
-    return xp.reshape(taken, index.shape)
+    # array_api_compat's take first looks for negative numbers, in three passes.
+    return values.reshape(-1).index_select(0, index.reshape(-1)).reshape(index.shape)
 
 
 def take_pixels(image: Array, index: Array) -> Array:
@@ -119,46 +96,37 @@ def take_pixels(image: Array, index: Array) -> Array:
 
     The index counts pixels of flattened maps (..., h, w), so it serves all channels.
     """
-    xp = array_namespace(image, index)
+    xp = array_namespace(image)
     channels = image.shape[-3]
     flat = xp.reshape(xp.moveaxis(image, -3, 0), (channels, -1))
     places = xp.reshape(index, (-1,))
-    if is_torch_array(image):
+    if is_numpy_array(image):
+        taken = xp.take(flat, places, axis=1)
+    else:
         # Seven times as fast as index_select along the second axis.
         taken = flat.gather(1, places.expand(channels, -1))
-    else:
-        taken = xp.take(flat, places, axis=1)
     return xp.moveaxis(xp.reshape(taken, (channels, *index.shape)), 0, -3)
 
 
-def scatter_max(values: Array, index: Array, *, size: int, empty: int) -> Array:
-    """Return ``size`` cells with the largest of the ``values`` that ``index`` sends to each.
+def scatter(
+    values: Array, index: Array, *, size: int, reduce: Literal["amax", "amin"], empty: float | int
+) -> Array:
+    """Return ``size`` cells with the largest or smallest of the values that ``index`` sends there.
 
-    Cells without a value are ``empty``. Both arrays are flat. The result does not depend on the
-    order in which cells are written.
+    Cells without a value are ``empty``, which must be beyond all values. The result does not depend
+    on the order in which cells are written.
     """
-    xp = array_namespace(values, index)
-    cells = xp.full((size,), empty, dtype=values.dtype, device=device(values))
-    if is_torch_array(values):
-        return cells.scatter_reduce(0, index, values, reduce="amax")
-    xp.maximum.at(cells, index, values)
-    return cells
-
-
-def scatter_min(values: Array, index: Array, *, shape: tuple[int, ...]) -> Array:
-    """Return cells with the smallest of the values that ``index`` sends to each, or inf."""
-    xp = array_namespace(values, index)
-    cells = xp.full((math.prod(shape),), math.inf, dtype=values.dtype, device=device(values))
+    xp = array_namespace(values)
+    cells = xp.full((size,), empty, dtype=values.dtype, device=values.device)
     values, index = xp.reshape(values, (-1,)), xp.reshape(index, (-1,))
-    if is_torch_array(values):
-        cells = cells.scatter_reduce(0, index, values, reduce="amin")
-    else:
-        xp.minimum.at(cells, index, values)
-    return xp.reshape(cells, shape)
+    if not is_numpy_array(values):
+        return cells.scatter_reduce(0, index, values, reduce=reduce)
+    (np.maximum if reduce == "amax" else np.minimum).at(cells, index, values)
+    return cells
 
 
 def leading_offsets(shape: tuple[int, ...], *, step: int, like: Array) -> Array:
     """Return 0, step, 2 step ... for each index of ``shape``, int64, on the device of ``like``."""
     xp = array_namespace(like)
-    offsets = xp.arange(math.prod(shape), dtype=xp.int64, device=device(like))
+    offsets = xp.arange(math.prod(shape), dtype=xp.int64, device=like.device)
     return xp.reshape(offsets * step, shape)

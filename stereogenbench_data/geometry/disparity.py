@@ -14,16 +14,14 @@ from typing import Any, Final, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Integer
 
-from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry.arrays import (
     array_namespace,
     as_float64,
-    device,
     is_numpy_array,
     pixel_centres,
     quotient,
 )
-from stereogenbench_data.geometry.camera import Intrinsics, require_picture_size, require_positive
+from stereogenbench_data.geometry.camera import Intrinsics, require_picture_size
 from stereogenbench_data.schema.records import DepthForm
 
 _EXACT_FACTORS: Final = (128.0, 256.0)
@@ -52,21 +50,12 @@ def disparity_from_depth(
         Disparity in pixels, in the depth's dtype, rounded once from the float64 result;
         0 for sky and where depth was not measured.
 
-    Raises:
-        GeometryError: If focal_px is not positive and finite, or baseline_m is 0 or not finite.
-
     Source: Szeliski, Computer Vision: Algorithms and Applications, 2nd ed., ch. 12.
 
     >>> disparity_from_depth(np.array([[2.0, np.inf, 0.0]]), focal_px=800.0, baseline_m=0.1)
     array([[40.,  0.,  0.]])
     """
-    _require_pair(focal_px, baseline_m)
     xp = array_namespace(depth_m)
-    if depth_m.dtype not in (xp.float32, xp.float64):
-        raise GeometryError(
-            f"depth in metres must be float32 or float64, got {depth_m.dtype}: convert it, or use "
-            "disparity_from_units for stored numbers."
-        )
     disparity_px = quotient(focal_px * baseline_m, as_float64(_inf_where_not_positive(depth_m)))
     return xp.astype(disparity_px, depth_m.dtype, copy=False)
 
@@ -79,13 +68,9 @@ def depth_from_disparity(
     Depth is 0 ("not measured") where disparity is 0, nan, or of the sign opposite to the
     baseline's. Disparity 0 does not distinguish sky from pixels that were not measured.
 
-    Raises:
-        GeometryError: If focal_px is not positive and finite, or baseline_m is 0 or not finite.
-
     >>> depth_from_disparity(np.array([[40.0, 0.0]]), focal_px=800.0, baseline_m=0.1)
     array([[2., 0.]])
     """
-    _require_pair(focal_px, baseline_m)
     xp = array_namespace(disparity_px)
     size_px = disparity_px if baseline_m > 0 else -disparity_px
     depth_m = quotient(focal_px * abs(baseline_m), as_float64(_inf_where_not_positive(size_px)))
@@ -116,26 +101,22 @@ def disparity_from_units(
     Returns:
         Disparity in pixels, 0 where the stored number is 0.
 
-    Raises:
-        GeometryError: If a length is not positive and finite, or the baseline is 0.
-
     >>> disparity_from_units(np.array([[20, 0]]), focal_px=800.0, baseline_m=0.1, unit_m=0.1)
     array([[40.,  0.]], dtype=float32)
     """
-    _require_pair(focal_px, baseline_m)
-    require_positive(unit_m, name="unit_m")
     xp = array_namespace(units)
     shift_units = focal_px * baseline_m / unit_m
-    if form == "inverse":
-        return xp.astype(xp.astype(units, xp.float64) * shift_units, xp.float32)
     if is_numpy_array(units):
         disparity_px = np.empty(units.shape, dtype=np.float32)
-        write_disparity(disparity_px, units, measured=units != 0, shift_units=shift_units)
+        write_disparity(
+            disparity_px, units, measured=units != 0, shift_units=shift_units, form=form
+        )
         return disparity_px
-    product, factor, dtype = _exact_quotient(shift_units)
-    divisor = xp.astype(units, getattr(xp, dtype)) * factor
-    divisor[divisor == 0] = math.inf
-    return xp.astype(quotient(product, divisor), xp.float32, copy=False)
+    stored = as_float64(units)
+    if form == "depth":
+        stored = _inf_where_not_positive(stored)
+    shifts = xp.asarray(shift_units, dtype=xp.float64, device=units.device)
+    return disparity_from_shifts(stored, shifts, form=form)
 
 
 def disparity_from_shifts(
@@ -223,7 +204,7 @@ def _exact_quotients(
     """Return the float32 product and the factor of `_exact_quotient`, and whether they will do."""
     xp = array_namespace(shift_units)
     # Made where they are used: a copy to a GPU would wait for all that is queued there.
-    factors = xp.arange(*_EXACT_FACTORS, dtype=xp.float64, device=device(shift_units))
+    factors = xp.arange(*_EXACT_FACTORS, dtype=xp.float64, device=shift_units.device)
     products = shift_units[..., None] * factors
     rounded = as_float64(xp.astype(products, xp.float32))
     misses = xp.abs(rounded / products - 1.0)
@@ -255,20 +236,11 @@ def disparity_error_px(
         step or less (the true depth may be arbitrarily small), 0 for sky and where depth was
         not measured.
 
-    Raises:
-        GeometryError: If a number is out of range.
-
     >>> depth_m = np.array([[10.0, np.inf, 0.0]])
     >>> error_px = disparity_error_px(depth_m, focal_px=800.0, baseline_m=0.1, quantum_m=0.1)
     >>> error_px.round(4)
     array([[0.0402, 0.    , 0.    ]])
     """
-    _require_pair(focal_px, baseline_m)
-    if not (math.isfinite(quantum_m) and quantum_m >= 0):
-        raise GeometryError(
-            f"quantum_m must be a finite number of metres, 0 or more, got {quantum_m!r}: "
-            "give the depth encoding's unit."
-        )
     return error_bound_px(depth_m, shift_px_m=focal_px * abs(baseline_m), half_step_m=quantum_m / 2)
 
 
@@ -278,7 +250,7 @@ def error_bound_px(
     shift_px_m: float | Float[Any, "*#batch h1 w1"],
     half_step_m: float | Float[Any, "*#batch h1 w1"],
 ) -> Float[Any, "*batch h w"]:
-    """Return the bound of `disparity_error_px`; its numbers are not checked.
+    """Return the bound of `disparity_error_px` for one rig or several.
 
     Args:
         depth_m: Stored depth along the optical axis, in metres.
@@ -335,12 +307,3 @@ def ray_per_planar(
 def _inf_where_not_positive(values: Float[Any, "*batch h w"]) -> Float[Any, "*batch h w"]:
     xp = array_namespace(values)
     return xp.where(values > 0, values, math.inf)
-
-
-def _require_pair(focal_px: float, baseline_m: float) -> None:
-    require_positive(focal_px, name="focal_px")
-    if not (math.isfinite(baseline_m) and baseline_m != 0):
-        raise GeometryError(
-            f"baseline_m must be finite and not 0, got {baseline_m!r}: "
-            "give the signed distance between two different cameras in metres."
-        )

@@ -3,28 +3,35 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, TypeVar, cast
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt16
 
 from stereogenbench_data.errors import FieldError, GeometryError
-from stereogenbench_data.geometry.arrays import take_flat
+from stereogenbench_data.geometry.arrays import (
+    array_namespace,
+    as_float64,
+    pixel_centres,
+    take_flat,
+)
 from stereogenbench_data.geometry.disparity import (
-    disparity_error_px,
     disparity_from_depth,
+    error_bound_px,
     write_disparity,
 )
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.projection import (
     Projection,
+    homography,
     landing_pixels,
+    project_by_homography,
     project_rectified,
-    project_through_poses,
+    splat,
+    visible_from_source,
+    visible_in_target,
 )
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
-from stereogenbench_data.geometry.visibility import visible_from_source, visible_in_target
-from stereogenbench_data.geometry.warp import splat
 from stereogenbench_data.media.depth import depth_m_from_units
 from stereogenbench_data.samples.views import StoredDepth, Views
 from stereogenbench_data.schema.records import DepthEncoding, Scene
@@ -66,10 +73,126 @@ class SceneFacts:
         return self.poses
 
 
-class PairGeometry:
-    """Geometry from a source camera's depth to a target camera.
+T = TypeVar("T")
 
-    Maps are (t, h, w). Disparity is u_source - u_target in pixels.
+
+def once(make: Callable[[Any], T]) -> T:
+    """Return a property whose value is kept in its holder's dictionary ``made``.
+
+    It is typed as what it gives. torch.compile cannot trace functools' one before 3.12.
+    """
+    name = make.__name__
+
+    def get(holder: Any) -> T:
+        if name not in holder.made:
+            holder.made[name] = make(holder)
+        return cast("T", holder.made[name])
+
+    return cast("T", property(get, doc=make.__doc__))
+
+
+class Direction:
+    """What follows from the depth of source views for one target view each.
+
+    Maps are (..., h, w): numpy arrays of one pair, or tensors of many. Disparity is
+    u_source - u_target in pixels.
+
+    Attributes:
+        is_rectified: Whether disparity is the closed form; else points go through the poses.
+        is_inverse: Whether a stored number is proportional to the inverse of depth.
+        measured: Where the source's depth was measured.
+        depth_m: The source's depth along the optical axis, 0 where it was not measured.
+        disparity: Disparity in pixels, 0 where it is not `known`.
+        unit_m: Metres in a stored unit of the source: of one pair or of each.
+        shift_px_m: Focal length in pixels times signed baseline, likewise.
+        homography: What `project_by_homography` takes, of a rig that is not rectified.
+        coarser: Returns the larger of two units, of one pair or of each.
+        made: What was made once.
+    """
+
+    is_rectified: bool
+    is_inverse: bool
+    measured: Any
+    depth_m: Any
+    disparity: Any
+    unit_m: Any
+    shift_px_m: Any
+    homography: tuple[Any, Any]
+    coarser: Callable[[Any, Any], Any] = staticmethod(max)
+
+    def __init__(self) -> None:
+        """Compute nothing yet."""
+        self.made: dict[str, Any] = {}
+
+    def of_maps(self, numbers: Any, *, like: Any) -> Any:
+        """Return numbers of one pair or of each as they are broadcast to maps like these."""
+        del like
+        return numbers
+
+    @once
+    def known(self) -> Any:
+        """Where disparity is known: depth was measured, and the target's plane is behind the point.
+
+        Only on a rig that is not rectified can a point lie on or behind that plane, or at infinity.
+        """
+        if self.is_rectified:
+            return self.measured
+        return array_namespace(self.measured).isfinite(self.projection.u_px) & self.measured
+
+    @once
+    def projection(self) -> Projection:
+        """Where each source pixel lands in the target."""
+        if self.is_rectified:
+            return project_rectified(self.depth_m, self.disparity)
+        return project_by_homography(as_float64(self.depth_m), *self.homography)
+
+    @property
+    def moved_px(self) -> Any:
+        """Disparity by the projection, in float64."""
+        xp = array_namespace(self.depth_m)
+        u_px, _ = pixel_centres(self.depth_m, dtype=xp.float64)
+        return xp.where(self.known, u_px - self.projection.u_px, 0.0)
+
+    def quantum_m(self, target: "Direction") -> Any:
+        """Return the coarser step between depths that the two cameras can store."""
+        if self.is_inverse:
+            return self.depth_m**2 / self.of_maps(self.unit_m, like=self.depth_m)
+        return self.of_maps(self.coarser(self.unit_m, target.unit_m), like=self.projection.depth_m)
+
+    @once
+    def disparity_error(self) -> Any:
+        """How far quantised depth can put disparity off, in pixels; 0 where it is not known."""
+        shift_px_m = abs(self.shift_px_m)
+        known = array_namespace(self.known).astype(self.known, self.depth_m.dtype)
+        if self.is_inverse:
+            return known * self.of_maps(shift_px_m / self.unit_m / 2, like=self.depth_m)
+        bound_px = error_bound_px(
+            self.depth_m,
+            shift_px_m=self.of_maps(shift_px_m, like=self.depth_m),
+            half_step_m=self.of_maps(self.unit_m / 2, like=self.depth_m),
+        )
+        return bound_px if self.is_rectified else bound_px * self.known
+
+    @once
+    def visible_from_source(self) -> Any:
+        """What is visible in the target, decided by the source's own depth alone."""
+        return visible_from_source(
+            self.projection, measured=self.measured, quantum_m=self.quantum_m(self)
+        )
+
+    def visible(self, target: "Direction") -> Any:
+        """Return what is visible in the target, by the depth of the way back."""
+        return visible_in_target(
+            self.projection,
+            measured=self.measured,
+            target_depth_m=target.depth_m,
+            target_measured=target.measured,
+            quantum_m=self.quantum_m(target),
+        )
+
+
+class PairGeometry(Direction):
+    """Geometry from a source camera's depth to a target camera. Maps are (t, h, w).
 
     Attributes:
         encoding: The depth contract of the source.
@@ -77,11 +200,14 @@ class PairGeometry:
 
     def __init__(self, views: Views, facts: SceneFacts, *, source: int, target: int) -> None:
         """Take the views of both cameras; nothing is computed yet."""
+        super().__init__()
         self._views = views
         self._facts = facts
         self._source = source
         self._target = target
         self.encoding = facts.encodings[source]
+        self.is_rectified = facts.is_rectified
+        self.is_inverse = self.encoding.form == "inverse"
 
     @property
     def stored(self) -> StoredDepth:
@@ -122,7 +248,7 @@ class PairGeometry:
             )
         return np.where(camera.measured, camera.units, np.uint16(self.no_depth))
 
-    @cached_property
+    @once
     def baseline_m(self) -> float:
         """The recorded baseline, negative where the target stands to the left; 0 for itself."""
         if self._target == self._source:
@@ -134,7 +260,22 @@ class PairGeometry:
         recorded_m = self._facts.scene.rig.baseline_cm(self._source, self._target) / 100
         return recorded_m if to_the_right else -recorded_m
 
-    @property
+    @once
+    def unit_m(self) -> float:
+        """Metres in a stored unit."""
+        return self.encoding.known_unit_m
+
+    @once
+    def shift_px_m(self) -> float:
+        """Focal length in pixels times signed baseline."""
+        return self._views.intrinsics.fx_px * self.baseline_m
+
+    @once
+    def measured(self) -> MapBool:
+        """Where depth was measured."""
+        return self.stored.measured
+
+    @once
     def depth_m(self) -> MapF32:
         """Depth along the optical axis, 0 where not measured; computed once for all pairs."""
         derived, key = self.stored.derived, ("depth_m", self._views.intrinsics)
@@ -148,18 +289,7 @@ class PairGeometry:
         depth_m: MapF32 = derived[key]
         return depth_m
 
-    @cached_property
-    def known(self) -> MapBool:
-        """Where disparity is known: depth was measured, and the target's plane is behind the point.
-
-        Only on a rig that is not rectified can a point lie on or behind that plane, or at infinity.
-        """
-        if self._facts.is_rectified:
-            return self.stored.measured
-        known: MapBool = np.isfinite(self.projection.u_px) & self.stored.measured
-        return known
-
-    @cached_property
+    @once
     def disparity(self) -> MapF32:
         """Disparity in pixels, 0 where it is not known."""
         disparity = np.empty(self.stored.units.shape, dtype=np.float32)
@@ -168,17 +298,14 @@ class PairGeometry:
 
     def write_disparity(self, out: MapF32, *, sign: Literal[1, -1] = 1) -> None:
         """Write disparity, times a sign, into an array."""
-        if "disparity" in self.__dict__:
+        if "disparity" in self.made:
             np.multiply(self.disparity, np.float32(sign), out=out)
-        elif not self._facts.is_rectified:
-            u_px = np.arange(self.depth_m.shape[-1]) + 0.5
-            moved = np.where(self.known, u_px - self.projection.u_px, 0)
-            np.multiply(moved, sign, out=out, casting="same_kind")
+        elif not self.is_rectified:
+            np.multiply(self.moved_px, sign, out=out, casting="same_kind")
         elif self.encoding.kind == "ray" or self.encoding.offset_m:
             rig = {"focal_px": self._views.intrinsics.fx_px, "baseline_m": self.baseline_m}
             np.multiply(disparity_from_depth(self.depth_m, **rig), np.float32(sign), out=out)
         else:
-            shift_m = self._views.intrinsics.fx_px * self.baseline_m
             measured = self.stored.measured
             if 0 not in self.encoding.no_depth and self.encoding.form == "depth":
                 # By this contract a stored 0 was measured; its disparity is 0.
@@ -187,31 +314,19 @@ class PairGeometry:
                 out,
                 self.stored.units,
                 measured=measured,
-                shift_units=sign * shift_m / self.encoding.known_unit_m,
+                shift_units=sign * self.shift_px_m / self.unit_m,
                 form=self.encoding.form,
             )
 
-    @cached_property
-    def projection(self) -> Projection:
-        """Where each source pixel lands in the target."""
-        if self._facts.is_rectified:
-            return project_rectified(self.depth_m, self.disparity)
-        parts = [
-            project_through_poses(
-                depth_m.astype(np.float64),
-                intrinsics=self._views.intrinsics,
-                target_intrinsics=self._views.intrinsics,
-                target_from_source=transform,
-            )
-            for depth_m, transform in zip(self.depth_m, self.target_from_source, strict=True)
-        ]
-        return Projection(
-            u_px=np.stack([part.u_px for part in parts]),
-            v_px=np.stack([np.asarray(part.v_px) for part in parts]),
-            depth_m=np.stack([part.depth_m for part in parts]),
-        )
+    @once
+    def homography(self) -> tuple[Any, Any]:
+        """(t, 3, 3) and (t, 3): what takes pixels and depth to the target, at each frame."""
+        camera = self._views.intrinsics
+        moved = [homography(camera, camera, each) for each in self.target_from_source]
+        homographies, steps = (np.stack(part) for part in zip(*moved, strict=True))
+        return homographies, steps
 
-    @cached_property
+    @once
     def target_from_source(self) -> Motions:
         """Source camera's coordinates to the target camera's, in metres."""
         poses = self._facts.camera_poses()
@@ -226,54 +341,20 @@ class PairGeometry:
     @property
     def assumed_motion(self) -> Motions:
         """`target_from_source`; of a rectified rig what its closed form assumes, without poses."""
-        if not self._facts.is_rectified:
+        if not self.is_rectified:
             return self.target_from_source
         motions: Motions = np.tile(np.eye(4), (len(self._views.frames), 1, 1))
         motions[:, 0, 3] = -self.baseline_m
         return motions
 
-    def quantum_m(self, target: DepthEncoding) -> float | MapF32:
-        """Return the coarser step between depths that the two cameras can store."""
-        if self.encoding.form == "depth":
-            return max(self.encoding.known_unit_m, target.known_unit_m)
-        return self.depth_m**2 / np.float32(self.encoding.known_unit_m)
-
-    @cached_property
-    def disparity_error(self) -> MapF32:
-        """How far quantised depth can put disparity off, in pixels; 0 where it is not known."""
-        focal_px = self._views.intrinsics.fx_px
-        if self.encoding.form == "inverse":
-            half_step_px = focal_px * abs(self.baseline_m) / self.encoding.known_unit_m / 2
-            flat: MapF32 = self.known * np.float32(half_step_px)
-            return flat
-        bound: MapF32 = disparity_error_px(
-            self.depth_m,
-            focal_px=focal_px,
-            baseline_m=self.baseline_m,
-            quantum_m=self.encoding.known_unit_m,
-        )
-        return bound if self._facts.is_rectified else bound * self.known
-
-    @cached_property
+    @once
     def visible_from_source(self) -> MapBool:
         """What is visible in the target, decided by the source's own depth alone."""
-        visible: MapBool = visible_from_source(
-            self.projection,
-            measured=self.stored.measured,
-            quantum_m=self.quantum_m(self.encoding),
-        )
-        return self._shown_in_both(visible)
+        return self._shown_in_both(super().visible_from_source)
 
-    def visible(self, target: "PairGeometry") -> MapBool:
+    def visible(self, target: Direction) -> MapBool:
         """Return what is visible in the target, by the depth of the target's own geometry."""
-        visible: MapBool = visible_in_target(
-            self.projection,
-            measured=self.stored.measured,
-            target_depth_m=target.depth_m,
-            target_measured=target.stored.measured,
-            quantum_m=self.quantum_m(self._facts.encodings[self._target]),
-        )
-        return self._shown_in_both(visible)
+        return self._shown_in_both(super().visible(target))
 
     def _shown_in_both(self, visible: MapBool) -> MapBool:
         """Return what is visible, where both pictures show what their cameras saw."""
@@ -284,7 +365,7 @@ class PairGeometry:
             visible = visible & ~take_flat(np.broadcast_to(there, visible.shape), pixel)
         return visible if here is None else visible & ~here
 
-    @cached_property
+    @once
     def splatted(self) -> tuple[Any, MapBool]:
         """The source picture in the target's view, and the holes in it."""
         return self._splat(self._views.pictures[self._source])
@@ -294,7 +375,7 @@ class PairGeometry:
         padded = self._views.padded
         return (warped, hole) if padded is None else (warped * ~padded, hole | padded)
 
-    @cached_property
+    @once
     def hole(self) -> MapBool:
         """Target pixels on which no source pixel lands."""
         if self._source in self._views.pictures:
@@ -332,15 +413,11 @@ class PairSample:
     @cached_property
     def valid(self) -> MapBool:
         """Where the source's disparity to each target of the sample is known."""
-        if self.facts.is_rectified:
-            return self.forward.known
-        ways = [
-            self.forward
-            if target == self.target
-            else PairGeometry(self.views, self.facts, source=self.views.source, target=target)
-            for target in self.views.targets
-        ]
-        known: MapBool = np.logical_and.reduce([way.known for way in ways])
+        known: MapBool = self.forward.known
+        others = [target for target in self.views.targets if target != self.target]
+        for target in [] if self.facts.is_rectified else others:
+            way = PairGeometry(self.views, self.facts, source=self.views.source, target=target)
+            known = known & way.known
         return known
 
     @property

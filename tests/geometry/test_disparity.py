@@ -222,31 +222,6 @@ def test_rays_of_an_image_of_another_size_are_refused():
         planar_from_ray(np.ones((2, 8)), Intrinsics(1.0, 1.0, 3.0, 1.0, 6, 2))
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"focal_px": 0.0}, r"focal_px must be a positive finite number, got 0\.0"),
-        ({"focal_px": float("nan")}, "focal_px must be a positive finite number, got nan"),
-        ({"baseline_m": 0.0}, r"baseline_m must be finite and not 0, got 0\.0"),
-        ({"baseline_m": float("nan")}, "baseline_m must be finite and not 0, got nan"),
-    ],
-)
-@pytest.mark.parametrize("formula", [disparity_from_depth, depth_from_disparity])
-def test_a_pair_without_a_focal_length_or_a_baseline_is_refused(formula, changes, message):
-    with pytest.raises(GeometryError, match=message):
-        formula(np.ones((1, 1)), **({"focal_px": 800.0, "baseline_m": 0.1} | changes))
-
-
-def test_a_unit_of_zero_length_is_refused():
-    with pytest.raises(GeometryError, match=r"unit_m must be a positive finite number, got 0\.0"):
-        disparity_from_units(np.ones((1, 1), int), focal_px=1.0, baseline_m=1.0, unit_m=0.0)
-
-
-def test_a_negative_quantum_is_refused():
-    with pytest.raises(GeometryError, match=r"quantum_m must be .* 0 or more, got -0\.1"):
-        disparity_error_px(np.ones((1, 1)), focal_px=1.0, baseline_m=1.0, quantum_m=-0.1)
-
-
 @given(
     stored=st.lists(st.integers(0, 65535), min_size=6, max_size=6),
     measured=st.lists(st.booleans(), min_size=6, max_size=6),

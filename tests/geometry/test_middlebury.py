@@ -15,12 +15,13 @@ from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import depth_from_disparity
 from stereogenbench_data.geometry.projection import (
     Projection,
+    backward_warp,
     lands_inside,
     project_rectified,
     project_through_poses,
+    visible_from_source,
+    visible_in_target,
 )
-from stereogenbench_data.geometry.visibility import visible_from_source, visible_in_target
-from stereogenbench_data.geometry.warp import backward_warp
 
 
 def read(path: Path) -> np.ndarray:

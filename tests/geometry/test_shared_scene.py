@@ -12,13 +12,14 @@ from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import disparity_from_depth, disparity_from_units
 from stereogenbench_data.geometry.pose import CameraPoses, invert_rigid
 from stereogenbench_data.geometry.projection import (
+    backward_warp,
     lands_inside,
     project_rectified,
     project_through_poses,
+    visible_from_source,
+    visible_in_target,
 )
 from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
-from stereogenbench_data.geometry.visibility import visible_from_source, visible_in_target
-from stereogenbench_data.geometry.warp import backward_warp
 from stereogenbench_data.schema.records import Trajectory
 
 SCENE = "train/Pairwise_Uniform/SeyeonjeongPavilion/scene_000003"

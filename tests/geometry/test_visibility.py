@@ -4,8 +4,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereogenbench_data.geometry.disparity import disparity_from_depth
-from stereogenbench_data.geometry.projection import Projection, project_rectified
-from stereogenbench_data.geometry.visibility import visible_from_source, visible_in_target
+from stereogenbench_data.geometry.projection import (
+    Projection,
+    project_rectified,
+    visible_from_source,
+    visible_in_target,
+)
 
 
 def row(library, *values, dtype=np.float32):

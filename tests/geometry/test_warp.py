@@ -6,9 +6,14 @@ from scipy.ndimage import map_coordinates
 
 from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry import projection as projection_module
-from stereogenbench_data.geometry.projection import Projection, project_rectified
-from stereogenbench_data.geometry.visibility import visible_from_source, visible_in_target
-from stereogenbench_data.geometry.warp import backward_warp, splat
+from stereogenbench_data.geometry.projection import (
+    Projection,
+    backward_warp,
+    project_rectified,
+    splat,
+    visible_from_source,
+    visible_in_target,
+)
 
 
 def splat_pixel_by_pixel(image, u_px, v_px, depth_m, measured):
@@ -180,7 +185,11 @@ def test_blocks_of_rows_give_the_result_of_one_block(monkeypatch, quantum):
 
     whole = all_of_it()
     monkeypatch.setattr(projection_module, "_BLOCK_PIXELS", 2 * 2 * 16)
-    assert len(projection_module.row_blocks(projection, height_px=9)) == 5
+    shapes = []
+    projection_module.by_rows(
+        lambda _, rows: shapes.append(rows.shape) or rows, projection, measured, height_px=9
+    )
+    assert shapes == [(2, 2, 16)] * 4 + [(2, 1, 16)]
 
     for one, other in zip(whole, all_of_it(), strict=True):
         assert one.dtype == other.dtype

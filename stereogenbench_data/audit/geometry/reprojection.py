@@ -24,8 +24,7 @@ from jaxtyping import Bool, Float64
 
 from stereogenbench_data.audit.geometry.records import QUANTILES, PairAudit, ToleranceAudit
 from stereogenbench_data.geometry.camera import Intrinsics
-from stereogenbench_data.geometry.projection import Projection
-from stereogenbench_data.geometry.visibility import visible_from_source
+from stereogenbench_data.geometry.projection import Projection, visible_from_source
 
 _SIGNIFICANT: Final = 7
 
