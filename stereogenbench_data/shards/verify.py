@@ -39,7 +39,6 @@ from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
     METADATA_FILES,
     PACKED_DEPTH_NAMES,
-    TRAINING_JSON,
     depth_name,
 )
 from stereogenbench_data.schema.text import counted
@@ -102,12 +101,20 @@ class _ExpectedShard:
 
 
 @dataclass(frozen=True, slots=True)
-class _DecodeTask:
-    """Videos of one scene to decode."""
+class _SceneTask:
+    """A scene whose videos are decoded, and compared with the source where there is one.
+
+    Attributes:
+        names: Its videos whose bytes are sound.
+        derivation: How training shards were derived; None compares nothing.
+        released: The same scene of the source; None if that has no such.
+    """
 
     root: str
     scene: Scene
     names: tuple[str, ...]
+    derivation: Derivation | None = None
+    released: Scene | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,14 +169,18 @@ def verify(  # noqa: PLR0913 - each is an option of the command
         warnings.simplefilter("ignore", StaleIndexWarning)
         index = open_shards(data, root)
     if source is not None:
-        _require_comparable(index, source)
+        if not index.is_derived:
+            raise ShardError(
+                f"{index.where}: holds released data, which have no source to compare with. Leave "
+                f"the source out."
+            )
+        source.require_released("A comparison")
     expected = _expected_of(index)
     problems = list(_folder_problems(index, expected))
     checks = [each for each in expected.values() if each.path.is_file()]
     scenes = [index.scene(row) for row in range(len(index))] if mode == "decode" else []
     video_bytes = sum(scene.members[name].size for scene in scenes for name in scene.held_videos)
-    compared = scenes if source is not None else []
-    total = sum(each.facts.size for each in checks) + video_bytes * (2 if compared else 1)
+    total = sum(each.facts.size for each in checks) + video_bytes * (1 if source is None else 2)
     advance = advance_of(progress, total=total)
     sound: set[str] = set()
     for wrong, right in engine.map(
@@ -177,23 +188,10 @@ def verify(  # noqa: PLR0913 - each is an option of the command
     ):
         problems += wrong
         sound |= right
-    tasks = []
-    for scene in scenes:
-        names = tuple(name for name in scene.held_videos if f"{scene.id.key}.{name}" in sound)
-        if names:
-            tasks.append(_DecodeTask(index.root, scene, names))
+    tasks = list(_scene_tasks(index, source, scenes, sound))
     for found in engine.map(
-        _decode_scene,
+        _check_scene,
         tasks,
-        name=lambda task: task.scene.id.key,
-        workers=workers,
-        advance=advance,
-    ):
-        problems += found
-    comparisons = _comparisons(index, source, compared, sound) if source is not None else []
-    for found in engine.map(
-        compare_scene,
-        comparisons,
         name=lambda task: task.scene.id.key,
         workers=workers,
         advance=advance,
@@ -208,7 +206,7 @@ def verify(  # noqa: PLR0913 - each is an option of the command
         videos_decoded=sum(len(task.names) for task in tasks),
         problems=tuple(sorted(problems)),
         derived=index.derivation if index.is_derived else "",
-        videos_compared=sum(len(task.names) for task in comparisons),
+        videos_compared=sum(len(task.names) for task in tasks if task.derivation is not None),
     )
 
 
@@ -251,57 +249,36 @@ def _folder_problems(index: SceneIndex, expected: dict[str, _ExpectedShard]) -> 
 
 def _check_shard(expected: _ExpectedShard, after_bytes: Advance) -> tuple[list[Problem], set[str]]:
     """Return what is wrong with a shard, and its sound members; a worker process calls this."""
+    facts = expected.facts
     try:
         with expected.path.open("rb", buffering=0) as file:
-            return _check_contents(expected, file, expected.path.stat().st_size, after_bytes)
+            size = expected.path.stat().st_size
+            problems, sound, sha256 = _check_contents(expected, file, size, after_bytes)
+            problems += _misindexed(expected, file, sound)
     except OSError as error:
         found = f"cannot be read ({error.strerror or error})"
         return [expected.problem("", found, cure_of(error, _FETCH_AGAIN))], set()
+    if size != facts.size:
+        what = "it is cut short" if size < facts.size else "something was added"
+        text = f"has {size} bytes, and the index says {facts.size}: {what}"
+        problems.append(expected.problem("", text))
+    elif not problems and sha256 != facts.sha256:
+        text = f"is sound, but has sha256 {sha256[:16]}..., and the index says"
+        problems.append(expected.problem("", f"{text} {facts.sha256[:16]}..."))
+    return problems, sound
 
 
 def _check_contents(
     expected: _ExpectedShard, file: io.FileIO, size: int, after_bytes: Advance
-) -> tuple[list[Problem], set[str]]:
-    members = _apart(expected.members, size)
-    found = _read_through(members, file, size, after_bytes)
-    sound = {name for name, member in members.items() if found.crc32s[name] == member.crc32}
-    if members and not sound and found.headless == members.keys():
-        text = "holds other files than the index says; shard and index are of different packs"
-        return [expected.problem("", text, _WRONG_INDEX)], set()
-    problems = [*_differing(expected, found, size), *_misindexed(expected, file, sound)]
-    facts = expected.facts
-    if not problems and (size, found.sha256) != (facts.size, facts.sha256):
-        text = (
-            f"all members are sound, but the file has {size} bytes with sha256 "
-            f"{found.sha256[:16]}..., and the index says {facts.size} with {facts.sha256[:16]}..."
-        )
-        problems.append(expected.problem("", text))
-    return problems, sound
+) -> tuple[list[Problem], set[str], str]:
+    """Read a shard once, from its start to its end.
 
-
-@dataclass(frozen=True, slots=True)
-class _Contents:
-    """What a shard holds at the places of the index.
-
-    Attributes:
-        crc32s: Of the bytes of each member.
-        headless: Members without their own header before them.
-        odd_bytes: How many bytes there are between and behind where zeros should be.
+    The index tells every byte of it: each member, the header before it, zeros up to whole blocks.
     """
-
-    sha256: str
-    crc32s: dict[str, int]
-    headless: set[str]
-    odd_bytes: int
-
-
-def _read_through(
-    members: dict[str, Member], file: io.FileIO, size: int, after_bytes: Advance
-) -> _Contents:
-    """Read a shard once, from its start to its end."""
-    sha256, at, odd_bytes = hashlib.sha256(), 0, 0
-    crc32s: dict[str, int] = {}
-    headless: set[str] = set()
+    sha256, at = hashlib.sha256(), 0
+    problems: list[Problem] = []
+    sound: set[str] = set()
+    lost = defaultdict(list)
 
     def crc32_up_to(end: int) -> int:
         nonlocal at
@@ -309,43 +286,34 @@ def _read_through(
         at = end
         return copy_with_crc32(chunks, sha256.update)
 
-    def count_odd_bytes(end: int, zeros: int) -> None:
-        nonlocal odd_bytes
-        between = end - at
-        if crc32_up_to(end) != zlib.crc32(bytes(zeros)) or between != zeros:
-            odd_bytes += between
+    def is_next(end: int, content: bytes) -> bool:
+        is_as_long = end - at == len(content)
+        return crc32_up_to(end) == zlib.crc32(content) and is_as_long
 
-    for name, member in members.items():
-        count_odd_bytes(member.offset - BLOCK_BYTES, -at % BLOCK_BYTES)
-        if crc32_up_to(member.offset) != zlib.crc32(member_header(name, member.size)):
-            headless.add(name)
-        crc32s[name] = crc32_up_to(member.offset + member.size)
-    count_odd_bytes(size, -at % BLOCK_BYTES + len(END_OF_ARCHIVE))
-    return _Contents(sha256.hexdigest(), crc32s, headless, odd_bytes)
-
-
-def _differing(expected: _ExpectedShard, found: _Contents, size: int) -> Iterator[Problem]:
-    """Yield what differs between a shard and what the index says of it."""
-    lost = defaultdict(list)
-    for name, member in sorted(expected.members.items()):
-        if name not in found.crc32s:
-            scene, _, file = name.partition(".")
-            lost[scene].append(file)
-        elif found.crc32s[name] != member.crc32:
+    for name, member in sorted(expected.members.items(), key=lambda item: item[1].offset):
+        if member.offset - BLOCK_BYTES < at or member.offset + member.size > size:
+            scene, _, file_name = name.partition(".")
+            lost[scene].append(file_name)
+            continue
+        header = bytes(-at % BLOCK_BYTES) + member_header(name, member.size)
+        has_header = is_next(member.offset, header)
+        crc32 = crc32_up_to(member.offset + member.size)
+        if crc32 != member.crc32:
             indexed = "has none" if member.crc32 is None else f"says {member.crc32:08x}"
-            text = f"its bytes have crc32 {found.crc32s[name]:08x}, and the index {indexed}"
-            yield expected.problem(name, text)
-        elif name in found.headless:
-            yield expected.problem(name, "its header in the tar is damaged or of another")
+            text = f"its bytes have crc32 {crc32:08x}, and the index {indexed}"
+            problems.append(expected.problem(name, text))
+            continue
+        sound.add(name)
+        if not has_header:
+            text = "its header in the tar, or what lies before that, is damaged or of another"
+            problems.append(expected.problem(name, text))
     for scene, names in lost.items():
-        yield expected.problem(scene, f"{len(names)} of its files are not whole ({_few(names)})")
-    if size != expected.facts.size:
-        what = "it is cut short" if size < expected.facts.size else "something was added"
-        text = f"has {size} bytes, and the index says {expected.facts.size}: {what}"
-        yield expected.problem("", text)
-    if found.odd_bytes and size >= expected.facts.size:
-        text = f"holds {found.odd_bytes} bytes between and behind its files that no shard has there"
-        yield expected.problem("", text)
+        text = f"{len(names)} of its files are not whole ({_few(sorted(names))})"
+        problems.append(expected.problem(scene, text))
+    is_ended = is_next(size, bytes(-at % BLOCK_BYTES) + END_OF_ARCHIVE)
+    if not is_ended and size >= expected.facts.size:
+        problems.append(expected.problem("", "holds more behind its last file than a shard has"))
+    return problems, sound, sha256.hexdigest()
 
 
 def _misindexed(expected: _ExpectedShard, file: io.FileIO, sound: set[str]) -> Iterator[Problem]:
@@ -365,25 +333,31 @@ def _few(names: list[str]) -> str:
     return ", ".join([*names[:_SHOWN], "..."] if len(names) > _SHOWN else names)
 
 
-def _apart(members: dict[str, Member], size: int) -> dict[str, Member]:
-    """Return members in the order of their bytes, as far as they lie in a shard of this size.
-
-    None begins inside another, which only an altered index says.
-    """
-    apart: dict[str, Member] = {}
-    end = 0
-    for name, member in sorted(members.items(), key=lambda item: item[1].offset):
-        if end <= member.offset - BLOCK_BYTES and member.offset + member.size <= size:
-            apart[name] = member
-            end = member.offset + member.size
-    return apart
+# One scene: every frame, and those of the source.
 
 
-def _decode_scene(task: _DecodeTask, after_bytes: Advance) -> list[Problem]:
-    """Decode all frames of a scene's videos; return what is wrong with any."""
-    problems = []
+def _scene_tasks(
+    index: SceneIndex, source: SceneIndex | None, scenes: Sequence[Scene], sound: Collection[str]
+) -> Iterator[_SceneTask]:
+    rows = {} if source is None else {str(key): row for row, key in enumerate(source.column("key"))}
+    for scene in scenes:
+        names = tuple(name for name in scene.held_videos if f"{scene.id.key}.{name}" in sound)
+        if source is None:
+            yield _SceneTask(index.root, scene, names)
+            continue
+        row = rows.get(scene.id.key)
+        released = None if row is None else source.scene(row)
+        size = (scene.rig.image_height_px, scene.rig.image_width_px)
+        settings = TrainingSettings(size, "high")  # nothing is encoded, and it stores any size
+        derivation = Derivation.of_index(source, settings, [] if released is None else [released])
+        yield _SceneTask(index.root, scene, names, derivation, released)
+
+
+def _check_scene(task: _SceneTask, after_bytes: Advance) -> list[Problem]:
+    """Return what is wrong with a scene's videos; a worker process calls this."""
+    scene, problems = task.scene, []
     for name in task.names:
-        member = task.scene.members[name]
+        member = scene.members[name]
         try:
             _decode(task, name)
         except (MediaError, OSError) as error:
@@ -391,12 +365,26 @@ def _decode_scene(task: _DecodeTask, after_bytes: Advance) -> list[Problem]:
             cure = "Pack the scene again from an undamaged video."
             if isinstance(error, OSError):
                 cure = cure_of(error, cure)
-            problems.append(Problem(member.path, task.scene.id.key, name, reason, cure))
+            problems.append(Problem(member.path, scene.id.key, name, reason, cure))
         after_bytes(member.size)
+    if task.derivation is None:
+        return problems
+    cure = "Derive the scene again, or pass the data that it was derived from."
+    if task.released is None:
+        place = next(iter(scene.members.values())).path
+        return [*problems, Problem(place, scene.id.key, "", "is not in the source", cure)]
+    for name, member in scene.members.items():
+        try:
+            found = _difference(task.derivation, task, task.released, name)
+        except (MediaError, OSError) as error:
+            found = f"cannot be compared: {str(error).rstrip('.')}"
+        if found:
+            problems.append(Problem(member.path, scene.id.key, name, found, cure))
+        after_bytes(member.size if name in task.names else 0)
     return problems
 
 
-def _decode(task: _DecodeTask, name: str) -> None:
+def _decode(task: _SceneTask, name: str) -> None:
     """Decode all frames of a video in a shard, and compare its header with the index."""
     scene, member = task.scene, task.scene.members[name]
     file = io.BytesIO(_content(task.root, member))
@@ -442,70 +430,9 @@ def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
     )
 
 
-# Training shards and what they were derived from: every frame is compared.
-
-
-@dataclass(frozen=True, slots=True)
-class ComparisonTask:
-    """A scene of training shards, and the same scene of the source; None if that has no such."""
-
-    root: str
-    scene: Scene
-    released: Scene | None
-    derivation: Derivation
-    names: tuple[str, ...]
-
-
-def _require_comparable(index: SceneIndex, source: SceneIndex) -> None:
-    if not index.is_derived:
-        raise ShardError(
-            f"{index.where}: holds released data, which have no source to compare with. Leave the "
-            f"source out."
-        )
-    source.require_released("A comparison")
-
-
-def _comparisons(
-    index: SceneIndex, source: SceneIndex, scenes: Sequence[Scene], sound: Collection[str]
-) -> list[ComparisonTask]:
-    rows = {str(key): row for row, key in enumerate(source.column("key"))}
-    tasks = []
-    for scene in scenes:
-        row = rows.get(scene.id.key)
-        released = None if row is None else source.scene(row)
-        size = (scene.rig.image_height_px, scene.rig.image_width_px)
-        settings = TrainingSettings(size, "high")  # nothing is encoded, and it stores any size
-        derivation = Derivation.of_index(source, settings, [] if released is None else [released])
-        names = tuple(name for name in scene.held_videos if f"{scene.id.key}.{name}" in sound)
-        tasks.append(ComparisonTask(index.root, scene, released, derivation, names))
-    return tasks
-
-
-def compare_scene(task: ComparisonTask, after_bytes: Advance) -> list[Problem]:
-    """Compare a scene of training shards with its source; a worker process calls this."""
-    scene, problems = task.scene, []
-    cure = "Derive the scene again, or pass the data that it was derived from."
-    released = task.released
-    for name, member in scene.members.items() if released is not None else ():
-        try:
-            found = ""
-            if name != TRAINING_JSON and released is not None:
-                found = _difference(task, released, name)
-        except (MediaError, OSError) as error:
-            found = f"cannot be compared: {str(error).rstrip('.')}"
-        if found:
-            problems.append(Problem(member.path, scene.id.key, name, found, cure))
-        after_bytes(member.size if name in task.names else 0)
-    if released is None:
-        path = next(iter(scene.members.values())).path
-        problems.append(Problem(path, scene.id.key, "", "is not in the source", cure))
-        after_bytes(sum(scene.members[name].size for name in task.names))
-    return problems
-
-
-def _difference(task: ComparisonTask, released: Scene, name: str) -> str:
+def _difference(derivation: Derivation, task: _SceneTask, released: Scene, name: str) -> str:
     """Return how a file differs from what deriving it gives, "" if it does not."""
-    scene, source = task.scene, task.derivation.source()
+    scene, source = task.scene, derivation.source()
     content = _content(task.root, scene.members[name])
     if name in METADATA_FILES:
         is_same = name in released.members and source.read(released, name) == content
@@ -518,7 +445,7 @@ def _difference(task: ComparisonTask, released: Scene, name: str) -> str:
     label = source.label(released, original)
     video = open_source(source, released, original)
     if name.endswith("_rgb.mp4"):
-        pictures = source_pictures(video, released, task.derivation.settings, name=label)
+        pictures = source_pictures(video, released, derivation.settings, name=label)
         error = measured_error(pictures, io.BytesIO(content), name=name)
         camera = int(name[4:6])
         facts = scene.training
@@ -530,7 +457,7 @@ def _difference(task: ComparisonTask, released: Scene, name: str) -> str:
             f"has a PSNR of {measured[0]:.3f} dB (worst frame {measured[1]:.3f}) against the "
             f"source, and the index says {said[0]:.3f} ({said[1]:.3f})"
         )
-    size = task.derivation.settings.size
+    size = derivation.settings.size
     with (
         open_depth(video, name=label, frames=scene.frames) as reader,
         DepthFrames(io.BytesIO(content), name=name, frames=scene.frames) as derived,
