@@ -12,8 +12,9 @@ import os
 import platform
 import signal
 import threading
+from abc import abstractmethod
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from multiprocessing.process import BaseProcess
 from multiprocessing.sharedctypes import Synchronized
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from typing import Any, Final, NoReturn, Protocol, TypeVar, runtime_checkable
+from typing import Any, Final, TypeVar
 
 from stereogenbench_data.errors import StorageError, explain_os_errors, missing_extra
 
@@ -53,9 +54,8 @@ def advance_of(progress: Progress | None, *, done: int = 0, total: int) -> Advan
     return advance
 
 
-@runtime_checkable
-class Engine(Protocol):
-    """Where the items of a batch are worked on."""
+class Engine:
+    """Where the items of a batch are worked on: a `ProcessPool` or a `RayCluster`."""
 
     def map(
         self,
@@ -80,7 +80,37 @@ class Engine(Protocol):
 
         Raises:
             StorageError: If ``workers`` is below 1, or a worker died; the message names its item.
+                Of Ray, also if no cluster is there or it has too few GPUs.
+            ExtraError: If Ray is to be used and not installed.
         """
+        require_workers(workers)
+        with closing(self._results(_Work(task, items, name, advance), workers)) as results:
+            yield from results
+
+    @abstractmethod
+    def _results(self, work: "_Work", workers: int | None) -> Generator[Any, None, None]:
+        """Yield the result of each item as it comes."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Work:
+    """What `Engine.map` was given."""
+
+    task: Callable[[Any, Advance], Any]
+    items: Sequence[Any]
+    name: Callable[[Any], str]
+    advance: Advance
+
+    @contextmanager
+    def noting(self, item: Any) -> Iterator[None]:
+        """Add the name of an item to whatever error its task raises."""
+        try:
+            yield
+        except BrokenProcessPool:
+            raise
+        except BaseException as error:
+            error.add_note(f"This happened while {self.name(item)} was worked on.")
+            raise
 
 
 def engine_of(text: str, *, device: str = "cpu") -> Engine:
@@ -116,18 +146,6 @@ def require_workers(workers: int | None) -> None:
         raise StorageError(f"workers must be at least 1, got {workers}.")
 
 
-@contextmanager
-def _noting(name: Callable[[Item], str], item: Item) -> Iterator[None]:
-    """Add the name of an item to whatever error its task raises."""
-    try:
-        yield
-    except BrokenProcessPool:
-        raise
-    except BaseException as error:
-        error.add_note(f"This happened while {name(item)} was worked on.")
-        raise
-
-
 # Processes of this machine.
 
 
@@ -150,25 +168,19 @@ _shared: list[_Shared] = []
 
 
 @dataclass(frozen=True, slots=True)
-class ProcessPool:
-    """Processes of this machine; for one worker or one item, this process alone."""
+class ProcessPool(Engine):
+    """Processes of this machine; for one worker or one item, this process alone.
 
-    def map(
-        self,
-        task: Callable[[Item, Advance], Result],
-        items: Sequence[Item],
-        *,
-        name: Callable[[Item], str],
-        workers: int | None = None,
-        advance: Advance = no_advance,
-    ) -> Generator[Result, None, None]:
-        """See `Engine.map`; the items of a dead worker are not tried again."""
-        require_workers(workers)
+    The items of a dead worker are not tried again.
+    """
+
+    def _results(self, work: _Work, workers: int | None) -> Generator[Any, None, None]:
+        items = work.items
         needed = min(workers or os.cpu_count() or 1, len(items))
         if needed <= 1:
             for item in items:
-                with _noting(name, item):
-                    result = task(item, advance)
+                with work.noting(item):
+                    result = work.task(item, work.advance)
                 yield result
             return
         context = multiprocessing.get_context("spawn")
@@ -181,14 +193,23 @@ class ProcessPool:
         try:
             with _interrupts_held():
                 futures = {
-                    pool.submit(_run_in_process, task, item, number): item
+                    pool.submit(_run_in_process, work.task, item, number): item
                     for number, item in enumerate(items)
                 }
             workers_here = set(multiprocessing.active_children()) - others
-            yield from _results(futures, name=name, shared=shared, advance=advance)
+            reported, waiting = 0, set(futures)
+            while waiting:
+                finished, waiting = wait(waiting, timeout=_POLL_S, return_when=FIRST_COMPLETED)
+                done = shared.done.value
+                work.advance(done - reported)
+                reported = done
+                for future in finished:
+                    with work.noting(futures[future]):
+                        result = future.result()
+                    yield result
         except BrokenProcessPool as error:
             pool.shutdown()
-            named = [name(items[number]) for number in _items_of_dead(workers_here, shared)]
+            named = [work.name(items[number]) for number in _items_of_dead(workers_here, shared)]
             where = f"{', '.join(named[:_SHOWN])}: " if named else ""
             raise StorageError(
                 f"{where}a worker process died: it was killed (is memory short?), or the calling "
@@ -201,26 +222,6 @@ class ProcessPool:
 
 
 LOCAL: Final = ProcessPool()
-
-
-def _results(
-    futures: dict[Future[Result], Item],
-    *,
-    name: Callable[[Item], str],
-    shared: _Shared,
-    advance: Advance,
-) -> Iterator[Result]:
-    reported = 0
-    waiting = set(futures)
-    while waiting:
-        finished, waiting = wait(waiting, timeout=_POLL_S, return_when=FIRST_COMPLETED)
-        done = shared.done.value
-        advance(done - reported)
-        reported = done
-        for future in finished:
-            with _noting(name, futures[future]):
-                result = future.result()
-            yield result
 
 
 def _items_of_dead(workers: set[BaseProcess], shared: _Shared) -> list[int]:
@@ -287,7 +288,7 @@ _PER_CORE: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
-class RayCluster:
+class RayCluster(Engine):
     """A running Ray cluster, with one task per item; none is started. Needs the extra ``ray``.
 
     All nodes need this package, the same files at the same paths, and the working folder that
@@ -304,24 +305,8 @@ class RayCluster:
     address: str = "auto"
     gpus: int = 0
 
-    def map(
-        self,
-        task: Callable[[Item, Advance], Result],
-        items: Sequence[Item],
-        *,
-        name: Callable[[Item], str],
-        workers: int | None = None,
-        advance: Advance = no_advance,
-    ) -> Generator[Result, None, None]:
-        """See `Engine.map`.
-
-        Raises:
-            ExtraError: If Ray is not installed.
-            StorageError: If no cluster is there, it has too few GPUs, or workers died of one item
-                again and again.
-        """
-        require_workers(workers)
-        if not items:
+    def _results(self, work: _Work, workers: int | None) -> Generator[Any, None, None]:
+        if not work.items:
             return
         try:
             ray = importlib.import_module("ray")
@@ -337,72 +322,56 @@ class RayCluster:
                 )
             limit = workers or _PER_CORE * max(1, int(there.get("CPU", 1)))
             folder = str(Path.cwd())
-            results = _ray_results(
-                ray,
-                lambda item: remote.remote(task, item, folder),
-                items,
-                name=name,
-                limit=limit,
-                advance=advance,
-            )
-            with closing(results):
-                yield from results
+            waiting = [(item, 1) for item in reversed(work.items)]
+            running: dict[Any, tuple[Any, int]] = {}
+            try:
+                while waiting or running:
+                    while waiting and len(running) < limit:
+                        item, attempt = waiting.pop()
+                        running[remote.remote(work.task, item, folder)] = (item, attempt)
+                    finished, _ = ray.wait(list(running), num_returns=1, timeout=_RAY_POLL_S)
+                    work.advance(0)
+                    for reference in finished:
+                        item, attempt = running.pop(reference)
+                        found = _ray_result(ray, reference, work, item, attempt=attempt)
+                        if found is None:
+                            waiting.append((item, attempt + 1))
+                            continue
+                        work.advance(found[1])
+                        yield found[0]
+            finally:
+                for reference in running:
+                    ray.cancel(reference)
+                if running:
+                    ray.wait(list(running), num_returns=len(running), timeout=_CANCEL_S)
 
 
-def _ray_results(
-    ray: Any,
-    submit: Callable[[Any], Any],
-    items: Sequence[Any],
-    *,
-    name: Callable[[Any], str],
-    limit: int,
-    advance: Advance,
-) -> Generator[Any, None, None]:
-    """Yield the result of each item, with at most ``limit`` items submitted at a time."""
-    waiting = [(item, 1) for item in reversed(items)]
-    running: dict[Any, tuple[Any, int]] = {}
+def _ray_result(
+    ray: Any, reference: Any, work: _Work, item: Any, *, attempt: int
+) -> tuple[Any, int] | None:
+    """Return a task's result and how much it did; None if its worker died and it is tried again."""
     try:
-        while waiting or running:
-            while waiting and len(running) < limit:
-                item, attempt = waiting.pop()
-                running[submit(item)] = (item, attempt)
-            finished, _ = ray.wait(list(running), num_returns=1, timeout=_RAY_POLL_S)
-            advance(0)
-            for reference in finished:
-                item, attempt = running.pop(reference)
-                try:
-                    result, done = ray.get(reference)
-                except ray.exceptions.RayTaskError as error:
-                    _raise_cause(error, name, item)
-                except ray.exceptions.RayError as error:
-                    if attempt == _TRIES:
-                        raise StorageError(
-                            f"{name(item)}: Ray did not finish it in {_TRIES} tries "
-                            f"({_first_line(error)}). Check whether its worker was killed for lack "
-                            f"of memory, and run it again with fewer workers; what is finished is "
-                            f"kept."
-                        ) from error
-                    waiting.append((item, attempt + 1))
-                    continue
-                advance(done)
-                yield result
-    finally:
-        for reference in running:
-            ray.cancel(reference)
-        if running:
-            ray.wait(list(running), num_returns=len(running), timeout=_CANCEL_S)
-
-
-def _raise_cause(error: Any, name: Callable[[Any], str], item: Any) -> NoReturn:
-    """Raise what a task raised, without Ray's wrapper."""
-    cause = error.cause
-    if isinstance(cause, RuntimeError) and "failed to import" in _first_line(cause):
+        found: tuple[Any, int] = ray.get(reference)
+    except ray.exceptions.RayTaskError as error:
+        cause = error.cause
+        if isinstance(cause, RuntimeError) and "failed to import" in _first_line(cause):
+            raise StorageError(
+                f"{work.name(item)}: a node of the Ray cluster cannot import this package, or has "
+                f"another version of it. Install the same stereogenbench-data on all nodes."
+            ) from error
+        failure = cause if isinstance(cause, Exception) else error
+    except ray.exceptions.RayError as error:
+        if attempt < _TRIES:
+            return None
         raise StorageError(
-            f"{name(item)}: a node of the Ray cluster cannot import this package, or has another "
-            f"version of it. Install the same stereogenbench-data on all nodes."
+            f"{work.name(item)}: Ray did not finish it in {_TRIES} tries ({_first_line(error)}). "
+            f"Check whether its worker was killed for lack of memory, and run it again with fewer "
+            f"workers; what is finished is kept."
         ) from error
-    with _noting(name, item):
-        raise cause if isinstance(cause, Exception) else error
+    else:
+        return found
+    with work.noting(item):
+        raise failure
 
 
 def _run_on_ray(

@@ -18,7 +18,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from threading import Event
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -443,7 +442,7 @@ class Presumption:
         if not self.is_remote or key in self._planned or self._known(key, videos) is not None:
             return
 
-        def fill(start: int, stop: int, cancellation: Event) -> bytes:
+        def fill(start: int, stop: int) -> bytes:
             self._describe(presumed, videos)
             return b""
 

@@ -34,8 +34,6 @@ LARGEST_GAP: Final = 2048
 """Bytes that nobody needs between two ranges that are merged: the headers of a tar."""
 
 _START: Final = attrgetter("start")
-_END_S: Final = 2.0
-"""Seconds that closing waits for requests under way."""
 
 
 class Wanted(NamedTuple):
@@ -45,14 +43,14 @@ class Wanted(NamedTuple):
         place: What tells objects apart: ranges of one place are merged.
         start: The first byte.
         stop: The byte behind the last one.
-        fetch: Returns the bytes from a start to a stop; another thread may cancel that.
+        fetch: Returns the bytes from a start to a stop.
         held_bytes: How many bytes it counts for, where these are not those of the range.
     """
 
     place: Hashable
     start: int
     stop: int
-    fetch: Callable[[int, int, threading.Event], bytes]
+    fetch: Callable[[int, int], bytes]
     held_bytes: int | None = None
 
 
@@ -68,7 +66,7 @@ class _Part:
     place: Hashable
     start: int
     stop: int
-    fetch: Callable[[int, int, threading.Event], bytes]
+    fetch: Callable[[int, int], bytes]
     first: int
     last: int
     held_bytes: int
@@ -82,7 +80,6 @@ class _State:
     """What the threads of a process share."""
 
     pid: int = field(default_factory=os.getpid)
-    cancellation: threading.Event = field(default_factory=threading.Event)
     changed: threading.Condition = field(default_factory=threading.Condition)
     queue: list[tuple[int, int, _Part]] = field(default_factory=list)
     threads: set[threading.Thread] = field(default_factory=set)
@@ -186,7 +183,7 @@ class FetchAhead:
                 _drop(state, part)
 
     def close(self) -> None:
-        """Forget everything, and end all threads; it can be used again."""
+        """Forget everything; threads end with their requests. It can be used again."""
         self._own = None
         if self._finalizer is not None:
             self._finalizer()
@@ -288,7 +285,7 @@ def _work(state: _State) -> None:
             part.state = "under way"
         data, error = b"", None
         try:
-            data = part.fetch(part.start, part.stop, state.cancellation)
+            data = part.fetch(part.start, part.stop)
         except BaseException as found:  # noqa: BLE001 - raised again in the thread that reads
             error = found
         with state.changed:
@@ -299,16 +296,10 @@ def _work(state: _State) -> None:
 
 
 def _end(state: _State) -> None:
-    """End the threads of this process."""
-    if state.pid != os.getpid():
-        return
-    with state.changed:
-        for part in [part for parts in state.parts.values() for part in parts]:
-            _drop(state, part)
-        state.queue.clear()
-        state.due.clear()
-        threads = list(state.threads)
-    state.cancellation.set()
-    for thread in threads:
-        if thread is not threading.current_thread():
-            thread.join(_END_S / len(threads))
+    """Let the threads of this process find nothing more to fetch."""
+    if state.pid == os.getpid():
+        with state.changed:
+            for part in [part for parts in state.parts.values() for part in parts]:
+                _drop(state, part)
+            state.queue.clear()
+            state.due.clear()

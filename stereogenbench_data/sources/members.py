@@ -4,7 +4,6 @@ import copy
 import os
 import re
 import stat
-import threading
 import zlib
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
@@ -165,7 +164,7 @@ class MemberSource:
         cache = self._cache
         if cache is not None:
 
-            def fill(start: int, stop: int, cancellation: threading.Event) -> bytes:
+            def fill(start: int, stop: int) -> bytes:
                 cache.open(member, remote=remote, revision=self._revision).close()
                 return b""
 
@@ -173,11 +172,8 @@ class MemberSource:
                 return []
             return [Wanted(_cached(member), 0, 1, fill, member.size)]
 
-        def fetch(start: int, stop: int, cancellation: threading.Event) -> bytes:
-            return remote.read(start, stop, cancellation=cancellation)
-
         parts = [(0, member.size)] if ranges is None else ranges
-        return [Wanted(member.path, offset + a, offset + b, fetch) for a, b in parts]
+        return [Wanted(member.path, offset + a, offset + b, remote.read) for a, b in parts]
 
     def _table(self, scene: Scene, name: str) -> SeekTable | None:
         """Return the seek table of one of a scene's videos, if there is one that fits it."""

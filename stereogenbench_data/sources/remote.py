@@ -4,7 +4,6 @@ A `Transport` makes the requests: that of `web` for http and https, that of `hub
 of the Hub, that of `filesystems` for everything else.
 """
 
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from typing import TypeVar
@@ -99,27 +98,18 @@ class RemoteObject:
             return ""
         return self._retried(self._transport.pinned, doing="requesting its commit")
 
-    def read(self, start: int, stop: int, *, cancellation: threading.Event | None = None) -> bytes:
-        """Return the bytes from start to stop; `chunks` describes arguments and errors."""
-        return b"".join(self.chunks(start, stop, cancellation=cancellation))
+    def read(self, start: int, stop: int) -> bytes:
+        """Return the bytes from start to stop; `chunks` describes errors."""
+        return b"".join(self.chunks(start, stop))
 
-    def chunks(
-        self, start: int, stop: int, *, cancellation: threading.Event | None = None
-    ) -> Iterator[bytes]:
+    def chunks(self, start: int, stop: int) -> Iterator[bytes]:
         """Yield the bytes from start to stop in pieces; each byte comes once.
-
-        Args:
-            start: The first byte.
-            stop: The byte behind the last one.
-            cancellation: Ends the read once another thread sets it: at once where it waits to try
-                again, else when the server has sent something, or nothing for too long.
 
         Raises:
             ShardError: If the file does not have the expected size, or was replaced meanwhile.
-            ReadCancelled: If it was cancelled.
             StorageError: If they cannot be fetched.
         """
-        attempts = self._attempts(cancellation)
+        attempts = self._attempts()
         while start < stop:
             timeout_s = attempts.begin(f"at byte {start} of {stop}")
             error = TransientError("the answer ended early")
@@ -141,11 +131,8 @@ class RemoteObject:
             if start < stop:
                 attempts.failed(error)
 
-    def _attempts(self, cancellation: threading.Event | None = None) -> Attempts:
-        return Attempts(
-            self.where, server=self._transport.server, policy=self._policy,
-            cancellation=cancellation,
-        )  # fmt: skip
+    def _attempts(self) -> Attempts:
+        return Attempts(self.where, server=self._transport.server, policy=self._policy)
 
     def _retried(self, request: Callable[[float], _T], *, doing: str) -> _T:
         attempts = self._attempts()

@@ -3,10 +3,10 @@
 import os
 import random
 import threading
-import time
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from time import monotonic, sleep
 from typing import ClassVar, Final, Protocol
 
 from stereogenbench_data.errors import ShardError, StorageError
@@ -22,10 +22,6 @@ PASSING: Final = (408, 425, 429, 500, 502, 503, 504)
 
 _pauses: Final[dict[str, float]] = {}
 """Until when, on the monotonic clock, servers asked this process to wait."""
-
-
-class ReadCancelled(StorageError):
-    """A read was ended by another thread."""
 
 
 class MissingObject(StorageError):
@@ -112,14 +108,11 @@ class RetryPolicy:
 class Attempts:
     """The attempts of one read: how long each may wait, and whether there is another one."""
 
-    def __init__(
-        self, where: str, *, server: str, policy: RetryPolicy, cancellation: threading.Event | None
-    ) -> None:
-        """Begin a read of an object, which another thread may cancel."""
+    def __init__(self, where: str, *, server: str, policy: RetryPolicy) -> None:
+        """Begin a read of an object."""
         self._where = where
         self._server = server
         self._policy = policy
-        self._cancellation = cancellation or threading.Event()
         self._doing = ""
         self._received = 0
         self._renew()
@@ -127,61 +120,52 @@ class Attempts:
     def _renew(self) -> None:
         self._tries = 0
         self._asked_s = 0.0
-        self._until_s = time.monotonic() + self._policy.longest_outage_s
+        self._until_s = monotonic() + self._policy.longest_outage_s
 
     def begin(self, doing: str) -> float:
-        """Wait while the server asked for that; return the seconds that it may take to answer.
-
-        Raises:
-            ReadCancelled: If the read was cancelled.
-        """
+        """Wait while the server asked for that; return the seconds that it may take to answer."""
         self._doing = doing
-        pause_s = _pauses.get(self._server, 0.0) - time.monotonic()
+        pause_s = _pauses.get(self._server, 0.0) - monotonic()
         if pause_s > 0:
             with self.waiting():
-                self._cancellation.wait(pause_s)
-        self._require_not_cancelled()
-        return max(0.001, min(self._policy.timeout_s, self._until_s - time.monotonic()))
+                sleep(pause_s)
+        return max(0.001, min(self._policy.timeout_s, self._until_s - monotonic()))
 
     def add(self, received: int) -> None:
         """Count received bytes.
 
         Raises:
             TransientError: If too few came for too long.
-            ReadCancelled: If the read was cancelled.
         """
-        self._require_not_cancelled()
         self._received += received
         if self._received >= CHUNK_BYTES:
             self._received = 0
             self._renew()
-        elif time.monotonic() > self._until_s:
+        elif monotonic() > self._until_s:
             raise TransientError(f"too little came for {self._policy.longest_outage_s:g} s")
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
         """Leave the time that the block takes out of account."""
-        began_s = time.monotonic()
+        began_s = monotonic()
         try:
             yield
         finally:
-            self._until_s += time.monotonic() - began_s
+            self._until_s += monotonic() - began_s
 
     def failed(self, error: TransientError) -> None:
         """Wait before the next attempt.
 
         Raises:
             StorageError: If there is none.
-            ReadCancelled: If the read was cancelled.
         """
-        self._require_not_cancelled()
         policy = self._policy
         self._tries += 1
         self._asked_s += error.wait_s
         # Drawn without changing the program's own random numbers.
         wait_s = min(policy.longest_wait_s, policy.first_wait_s * 2.0 ** (self._tries - 1))
         wait_s *= 1 - random.SystemRandom().random() / 2
-        is_in_time = error.wait_s > 0 or time.monotonic() + wait_s < self._until_s
+        is_in_time = error.wait_s > 0 or monotonic() + wait_s < self._until_s
         if (
             self._tries >= policy.attempts
             or self._asked_s > policy.longest_pause_s
@@ -196,14 +180,10 @@ class Attempts:
                 f"SceneIndex.open(..., retry=RetryPolicy(timeout_s={2 * policy.timeout_s:g}))."
             ) from error
         if error.wait_s > 0:  # all reads of this process wait, in `begin`
-            until_s = time.monotonic() + error.wait_s
+            until_s = monotonic() + error.wait_s
             _pauses[self._server] = max(until_s, _pauses.get(self._server, 0.0))
         else:
-            self._cancellation.wait(wait_s)
-
-    def _require_not_cancelled(self) -> None:
-        if self._cancellation.is_set():
-            raise ReadCancelled(f"{self._where}: reading was cancelled, {self._doing}.")
+            sleep(wait_s)
 
 
 class ProcessLock:

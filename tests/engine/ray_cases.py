@@ -13,22 +13,13 @@ from typing import Any
 
 import pytest
 
-from stereogenbench_data.audit.contract.doctor import diagnose
-from stereogenbench_data.audit.geometry.audit import AuditRequest, audit
-from stereogenbench_data.bridges.clips import ClipForm, ExportRun, export_clips
-from stereogenbench_data.bridges.export_views import export_views
 from stereogenbench_data.engine import Engine, RayCluster
 from stereogenbench_data.errors import ExtraError, ShardError, StorageError
 from stereogenbench_data.evaluation.evaluate import evaluate
-from stereogenbench_data.evaluation.inputs import export_inputs
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
-from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.media.encoder import Encoding
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.training import TrainingSettings
-from stereogenbench_data.shards.unpack import unpack
-from stereogenbench_data.shards.verify import verify
 from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.evaluation.conftest import write_pngs
@@ -123,26 +114,9 @@ class Data:
     out: Path
 
 
-def index_(data, **how):
-    return walk(data.release, **how)
-
-
-def pack_(data, **how):
-    pack(data.release, data.out, target_bytes=ONE_EACH, **how)
-    return bytes_of(data.out)
-
-
 def pack_training_(data, **how):
     pack(data.release, data.out, training=TrainingSettings((32, 32)), **how)
     return bytes_of(data.out)
-
-
-def verify_(data, **how):
-    return verify(data.shards, mode="decode", **how)
-
-
-def audit_(data, **how):
-    return repr(audit(data.release, AuditRequest(frames=2), **how))
 
 
 def evaluate_(data, **how):
@@ -159,34 +133,6 @@ def synth_(data, **how):
     return bytes_of(data.out)
 
 
-def unpack_(data, **how):
-    unpack(data.shards, data.out, **how)
-    return bytes_of(data.out)
-
-
-def doctor_(data, **how):
-    return repr(diagnose(data.release, scenes=2, frames=2, **how))
-
-
-def export_inputs_(data, **how):
-    export_inputs(
-        data.release, data.out, tier="G0", size=(48, 64), pairs=[(0, 1)], frames=[0], **how
-    )
-    return bytes_of(data.out)
-
-
-def export_clips_(data, **how):
-    form = ClipForm(length=1, size=(48, 64), encoding=Encoding(preset="ultrafast"))
-    run = ExportRun(**how)
-    export_clips(data.release, data.out, layout="diffsynth", form=form, run=run)
-    return bytes_of(data.out)
-
-
-def export_views_(data, **how):
-    export_views(data.release, data.out, layout="ply", size=(48, 64), **how)
-    return bytes_of(data.out)
-
-
 @pytest.fixture(scope="module")
 def material(small_release, tmp_path_factory):
     place = tmp_path_factory.mktemp("material")
@@ -197,14 +143,7 @@ def material(small_release, tmp_path_factory):
 
 
 @pytest.mark.usefixtures("ray")
-@pytest.mark.parametrize(
-    "command",
-    [
-        index_, pack_, pack_training_, verify_, audit_, evaluate_, synth_, unpack_, doctor_,
-        export_inputs_, export_clips_, export_views_,
-    ],
-    ids=lambda command: command.__name__.rstrip("_"),
-)  # fmt: skip
+@pytest.mark.parametrize("command", [pack_training_, evaluate_, synth_])
 def test_a_cluster_that_loses_a_worker_gives_what_this_process_gives(command, material, tmp_path):
     mark = tmp_path / "died"
 

@@ -8,16 +8,11 @@ LONGEST_S = 50.0
 """What hangs in these tests hangs for longer, so that what waits for it fails."""
 
 
-class Waits(threading.Event):
-    """The cancellation of a read, for which waits take no time and are noted."""
-
-    def __init__(self):
-        super().__init__()
-        self.seconds = []
-
-    def wait(self, timeout=None):
-        self.seconds.append(timeout)
-        return self.is_set()
+def waits_noted(monkeypatch):
+    """Return the list of the waits between tries, in seconds, which take no time from now on."""
+    seconds = []
+    monkeypatch.setattr("stereogenbench_data.sources.retry.sleep", seconds.append)
+    return seconds
 
 
 def ended(call):

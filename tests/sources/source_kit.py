@@ -20,7 +20,6 @@ from stereogenbench_data.sources.location import is_remote, joined, local_path, 
 from stereogenbench_data.sources.members import MemberSource
 from stereogenbench_data.sources.ranged_file import FileSlice
 from stereogenbench_data.sources.remote import RemoteObject
-from tests.sources.policies import Waits
 
 VIDEO = "cam_00_rgb.mp4"
 
@@ -28,7 +27,7 @@ VIDEO = "cam_00_rgb.mp4"
 def read_range(place, start, stop):
     """Return the bytes from start to stop of a file, local or by URL; retries do not wait."""
     if is_remote(place):
-        return RemoteObject(str(place)).read(start, stop, cancellation=Waits())
+        return RemoteObject(str(place)).read(start, stop)
     with FileSlice(local_path(place), Member("", start, stop - start)) as file:
         return file.read()
 

@@ -10,7 +10,6 @@ from benchmarks.server import serving as delayed_serving
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import ReadCancelled
 from tests.servers.gate import Gate
 from tests.servers.hub import COMMIT, REPOSITORY
 from tests.servers.raw import raw_serving
@@ -119,21 +118,6 @@ def test_a_dead_store_is_a_named_error_within_the_longest_outage(store, how):
 
         with pytest.raises(StorageError, match=rf"{root}/x.tar : cannot be read, at byte 0 of 9 "):
             ended(lambda: remote.read(0, 9))
-
-
-def test_a_read_of_a_store_ends_when_it_is_cancelled(store):
-    def never(start, stop):
-        yield 60.0
-
-    _, point = store
-    cancellation = threading.Event()
-    with raw_serving(never) as silent:
-        root = point(silent)
-        threading.Timer(0.1, cancellation.set).start()
-        remote = RemoteObject(f"{root}/x.tar", retry=retry_policy(timeout_s=0.4))
-
-        with pytest.raises(ReadCancelled, match=rf"{root}/x.tar : reading was cancelled"):
-            ended(lambda: remote.read(0, 9, cancellation=cancellation))
 
 
 def test_the_size_that_the_index_records_is_compared_with_the_first_bytes(store, shard):

@@ -11,10 +11,10 @@ import pytest
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import ReadCancelled, RetryPolicy
+from stereogenbench_data.sources.retry import RetryPolicy
 from tests.servers.failing_server import Answer, serving
 from tests.servers.raw import raw_serving
-from tests.sources.policies import LONGEST_S, Waits, ended, retry_policy
+from tests.sources.policies import LONGEST_S, ended, retry_policy, waits_noted
 
 DATA = bytes(range(256)) * 1000
 FORK = multiprocessing.get_context("fork")
@@ -129,69 +129,15 @@ def test_by_default_a_dead_server_is_an_error_within_a_minute():
     assert RetryPolicy().longest_outage_s + RetryPolicy().first_wait_s < 60
 
 
-def test_a_cancelled_read_ends_and_is_not_tried_again(dead):
-    cancellation = threading.Event()
-    policy = retry_policy(attempts=999, timeout_s=0.4, first_wait_s=999.0, longest_wait_s=999.0)
-    policy = type("Patient", (type(policy),), {"longest_outage_s": 9999.0})(0.4)
-    threading.Timer(0.1, cancellation.set).start()
-
-    with pytest.raises(ReadCancelled, match=r"x.tar : reading was cancelled, at byte"):
-        ended(
-            lambda: RemoteObject(f"{dead}/x.tar", retry=policy).read(
-                0, 65536, cancellation=cancellation
-            )
-        )
-
-
-def test_what_is_read_after_cancelling_is_not_requested(served):
-    cancellation = threading.Event()
-    remote = RemoteObject(f"{served.url}/x.tar")
-    assert remote.read(0, 9, cancellation=cancellation) == DATA[:9]
-    cancellation.set()
-
-    with pytest.raises(ReadCancelled, match=r"x.tar : reading was cancelled, at byte 9 of 18"):
-        remote.read(9, 18, cancellation=cancellation)
-    assert len(served.asked) == 1
-    assert remote.read(9, 18) == DATA[9:18]
-
-
-def test_a_wait_that_a_server_asks_for_is_cancelled(served):
-    served.always["x.tar"] = Answer(status=429, headers={"Retry-After": "100"})
-    cancellation = threading.Event()
-    threading.Timer(0.1, cancellation.set).start()
-
-    with pytest.raises(ReadCancelled, match="reading was cancelled"):
-        ended(lambda: RemoteObject(f"{served.url}/x.tar").read(0, 9, cancellation=cancellation))
-
-
-def test_a_busy_server_is_left_alone_by_all_reads_of_a_process_until_it_said(served):
+def test_a_busy_server_is_left_alone_by_all_reads_of_a_process_until_it_said(served, monkeypatch):
     served.answers = [Answer(status=429, headers={"Retry-After": "30"})]
-    cancellation = threading.Event()
-    first = threading.Thread(
-        target=lambda: cancelled.append(
-            reads_cancelled(lambda: RemoteObject(url).read(0, 9, cancellation=cancellation))
-        )
-    )
-    url, cancelled, waits = f"{served.url}/x.tar", [], Waits()
+    waits = waits_noted(monkeypatch)
+    url = f"{served.url}/x.tar"
 
-    def reads_cancelled(read):
-        try:
-            read()
-        except ReadCancelled:
-            return True
-        return False
+    assert RemoteObject(url).read(0, 9) == DATA[:9]
+    assert RemoteObject(url).read(9, 18) == DATA[9:18]
 
-    first.start()
-    while not served.asked:
-        time.sleep(0.01)
-    time.sleep(0.05)
-    assert RemoteObject(url).read(9, 18, cancellation=waits) == DATA[9:18]
-    cancellation.set()
-    first.join()
-
-    assert waits.seconds == [pytest.approx(30, abs=2)]
-    assert cancelled == [True]
-    assert len(served.asked) == 2
+    assert waits == [pytest.approx(30, abs=2)] * 2
 
 
 def test_a_wait_longer_than_the_policy_allows_is_an_error_and_not_kept(served):

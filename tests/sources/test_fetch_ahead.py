@@ -19,7 +19,7 @@ class Log:
     def __init__(self):
         self.asked = []
 
-    def fetch(self, start, stop, cancellation):
+    def fetch(self, start, stop):
         self.asked.append((start, stop))
         return CONTENT[start:stop]
 
@@ -93,7 +93,7 @@ def test_ranges_of_later_samples_wait_and_grow():
 def test_eight_requests_are_made_at_a_time():
     running, most, lock, eight = [0], [0], threading.Lock(), threading.Barrier(8, timeout=60)
 
-    def fetch(start, stop, cancellation):
+    def fetch(start, stop):
         with lock:
             running[0] += 1
             most[0] = max(most[0], running[0])
@@ -114,7 +114,7 @@ def test_eight_requests_are_made_at_a_time():
 
 
 def test_an_error_is_raised_where_the_bytes_are_read_and_not_before():
-    def fetch(start, stop, cancellation):
+    def fetch(start, stop):
         raise StorageError("place: gone.")
 
     ahead = FetchAhead()

@@ -14,7 +14,7 @@ from stereogenbench_data.sources.retry import RetryPolicy
 from tests.servers.failing_server import Answer
 from tests.servers.hub import COMMIT, REPOSITORY, hub_serving
 from tests.servers.tools import require_module
-from tests.sources.policies import Waits, retry_policy
+from tests.sources.policies import retry_policy, waits_noted
 
 DATA = bytes(range(256)) * 100
 BRANCH = f"hf://datasets/{REPOSITORY}/x.tar"
@@ -179,12 +179,12 @@ def test_a_repository_that_asks_for_consent_says_so(hub):
     ("headers", "wait_s"),
     [({"Retry-After": "3"}, 3.0), ({"RateLimit": '"resolvers";r=0;t=2', "Retry-After": "9"}, 3.0)],
 )
-def test_a_limit_of_the_hub_is_waited_for(hub, headers, wait_s):
-    waits = Waits()
+def test_a_limit_of_the_hub_is_waited_for(hub, headers, wait_s, monkeypatch):
+    waits = waits_noted(monkeypatch)
     hub.facts["refusals"] = [(429, headers)]
 
-    assert RemoteObject(PINNED).read(0, 9, cancellation=waits) == DATA[:9]
-    assert waits.seconds[-1] == pytest.approx(wait_s, abs=0.5)
+    assert RemoteObject(PINNED).read(0, 9) == DATA[:9]
+    assert waits[-1] == pytest.approx(wait_s, abs=0.5)
 
 
 def test_a_file_in_the_hubs_own_cache_is_read_from_there(hub, own_cache):

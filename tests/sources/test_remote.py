@@ -12,15 +12,15 @@ from stereogenbench_data.sources.retry import RetryPolicy
 from stereogenbench_data.sources.web import close_connections
 from tests.servers.failing_server import Answer, serving
 from tests.servers.raw import raw_serving
-from tests.sources.policies import Waits, retry_policy
+from tests.sources.policies import retry_policy, waits_noted
 from tests.sources.source_kit import read_range, size_of
 
 DATA = bytes(range(256)) * 1000
 
 
 @pytest.fixture
-def waits():
-    return Waits()
+def waits(monkeypatch):
+    return waits_noted(monkeypatch)
 
 
 @pytest.fixture
@@ -48,11 +48,11 @@ def test_an_answer_cut_short_is_gone_on_with_where_it_ended(served, waits):
     served.answers = [Answer(stop_after=30_000), Answer(stop_after=100_000)]
     remote = RemoteObject(f"{served.url}/x.tar")
 
-    assert remote.read(500, 200_500, cancellation=waits) == DATA[500:200_500]
+    assert remote.read(500, 200_500) == DATA[500:200_500]
     assert ranges(served) == [(500, 200_500), (30_500, 200_500), (130_500, 200_500)]
     assert served.sent == 200_000
-    assert len(waits.seconds) == 2
-    assert all(0.01 <= wait_s <= 0.02 for wait_s in waits.seconds)
+    assert len(waits) == 2
+    assert all(0.01 <= wait_s <= 0.02 for wait_s in waits)
 
 
 def test_waits_double_up_to_a_limit_while_nothing_is_gained(served, waits):
@@ -63,11 +63,10 @@ def test_waits_double_up_to_a_limit_while_nothing_is_gained(served, waits):
         StorageError,
         match=r"x.tar : .* byte 0 of 9 \(the server answers 503 .*; 10 tries\). Check the network",
     ):
-        remote.read(0, 9, cancellation=waits)
+        remote.read(0, 9)
     longest_s = [0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28, 2.56, 3.0]
     assert all(
-        most_s / 2 <= wait_s <= most_s
-        for wait_s, most_s in zip(waits.seconds, longest_s, strict=True)
+        most_s / 2 <= wait_s <= most_s for wait_s, most_s in zip(waits, longest_s, strict=True)
     )
 
 
@@ -76,8 +75,8 @@ def test_the_server_says_how_long_to_wait(served, waits, status):
     served.answers = [Answer(status=status, headers={"Retry-After": "7"})]
     remote = RemoteObject(f"{served.url}/x.tar")
 
-    assert remote.read(0, 9, cancellation=waits) == DATA[:9]
-    assert waits.seconds == [pytest.approx(7.0, abs=0.5)]
+    assert remote.read(0, 9) == DATA[:9]
+    assert waits == [pytest.approx(7.0, abs=0.5)]
 
 
 def test_the_server_may_say_until_when_to_wait(served, waits):
@@ -88,25 +87,25 @@ def test_the_server_may_say_until_when_to_wait(served, waits):
     remote = RemoteObject(f"{served.url}/x.tar")
 
     with pytest.raises(StorageError, match=r"503 Service Unavailable, which asks to wait \d{4,} s"):
-        remote.read(0, 9, cancellation=waits)
-    assert len(waits.seconds) == 2
-    assert max(waits.seconds) <= 0.04
+        remote.read(0, 9)
+    assert len(waits) == 2
+    assert max(waits) <= 0.04
 
 
 def test_silence_is_retried(served, waits):
     served.answers = [Answer(delay_s=1.0)]
     remote = RemoteObject(f"{served.url}/x.tar", retry=retry_policy(timeout_s=0.2))
 
-    assert remote.read(0, 9, cancellation=waits) == DATA[:9]
-    assert len(waits.seconds) == 1
+    assert remote.read(0, 9) == DATA[:9]
+    assert len(waits) == 1
 
 
 def test_a_server_that_is_not_there_is_reported_after_some_tries(served, waits):
     remote = RemoteObject("http://127.0.0.1:1/x.tar", retry=retry_policy(attempts=3))
 
     with pytest.raises(StorageError, match=r"Connection refused.*; 3 tries\)"):
-        remote.read(0, 9, cancellation=waits)
-    assert len(waits.seconds) == 2
+        remote.read(0, 9)
+    assert len(waits) == 2
 
 
 @pytest.mark.parametrize(
@@ -123,9 +122,9 @@ def test_what_will_not_pass_is_reported_at_once(served, waits, status, cure):
     remote = RemoteObject(f"{served.url}/x.tar")
 
     with pytest.raises(StorageError, match=rf"x.tar : the server answers {status} .*\. {cure}"):
-        remote.read(0, 9, cancellation=waits)
+        remote.read(0, 9)
     assert len(served.asked) == 1
-    assert waits.seconds == []
+    assert waits == []
 
 
 def test_a_server_that_ignores_ranges_is_refused_before_it_has_sent_all(served):
@@ -219,7 +218,7 @@ def test_a_login_in_the_url_is_sent_and_never_shown(served):
 def test_a_query_is_neither_shown_nor_chained(waits):
     remote = RemoteObject("http://127.0.0.1:1/x.tar?key=secret", retry=retry_policy(attempts=1))
     with pytest.raises(StorageError, match=r"http://127\.0\.0\.1:1/x\.tar : .*try again") as caught:
-        remote.read(0, 9, cancellation=waits)
+        remote.read(0, 9)
 
     error: BaseException | None = caught.value
     while error is not None:
@@ -229,7 +228,7 @@ def test_a_query_is_neither_shown_nor_chained(waits):
 
 def test_a_url_that_is_none_is_reported(waits):
     with pytest.raises(StorageError, match="not a valid URL: correct it"):
-        RemoteObject("http://a:b:c/x").read(0, 9, cancellation=waits)
+        RemoteObject("http://a:b:c/x").read(0, 9)
 
 
 def test_threads_read_at_the_same_time_over_connections_that_are_used_again(served):
@@ -299,7 +298,7 @@ def test_a_file_that_is_replaced_within_one_read_is_reported(served, waits):
     served.validators = {"ETag": '"a"'}
     served.answers = [Answer(stop_after=30_000)]
     remote = RemoteObject(f"{served.url}/x.tar")
-    chunks = remote.chunks(0, 200_000, cancellation=waits)
+    chunks = remote.chunks(0, 200_000)
     next(chunks)
     served.validators = {"ETag": '"b"'}
 
@@ -417,10 +416,8 @@ def test_the_waits_that_a_server_asks_for_have_a_bound_in_all(served, waits):
     served.always["x.tar"] = Answer(status=503, headers={"Retry-After": "40"})
 
     with pytest.raises(StorageError, match=r"which asks to wait 40 s; 3 tries\)"):
-        RemoteObject(f"{served.url}/x.tar", retry=retry_policy(longest_pause_s=100.0)).read(
-            0, 9, cancellation=waits
-        )
-    assert waits.seconds == [pytest.approx(40.0, abs=1.0)] * 2
+        RemoteObject(f"{served.url}/x.tar", retry=retry_policy(longest_pause_s=100.0)).read(0, 9)
+    assert waits == [pytest.approx(40.0, abs=1.0)] * 2
 
 
 def test_a_slow_server_is_read_to_the_end_while_it_goes_on(waits):
@@ -466,7 +463,7 @@ def test_a_retry_after_that_is_none_is_no_error_of_its_own(waits, told):
         yield "\r\n".join([*lines, "", ""]).encode("latin-1")
 
     with raw_serving(busy) as url, pytest.raises(StorageError, match=r"the server answers 503 x"):
-        RemoteObject(f"{url}/x.tar", retry=retry_policy(attempts=2)).read(0, 9, cancellation=waits)
+        RemoteObject(f"{url}/x.tar", retry=retry_policy(attempts=2)).read(0, 9)
 
 
 @pytest.mark.parametrize("told", ["\u00b2\u00b2", "9" * 5000, "-5", "0x10", ""])

@@ -14,7 +14,7 @@ from stereogenbench_data.sources.remote import RemoteObject
 from tests.servers.fixtures import BUCKET
 from tests.servers.hub import COMMIT, REPOSITORY
 from tests.servers.tools import require_module
-from tests.sources.policies import Waits, retry_policy
+from tests.sources.policies import retry_policy, waits_noted
 from tests.sources.source_kit import read_range, size_of
 
 
@@ -135,7 +135,7 @@ def test_an_object_of_a_store_that_is_replaced_between_two_ranges_is_reported(s3
 
 
 def test_a_file_system_that_fails_is_requested_again(monkeypatch):
-    waits = Waits()
+    waits = waits_noted(monkeypatch)
     files = fsspec.filesystem("memory")
     files.pipe_file("/shard.tar", b"0123456789")
     failures = [OSError("connection reset"), TimeoutError()]
@@ -147,8 +147,8 @@ def test_a_file_system_that_fails_is_requested_again(monkeypatch):
 
     monkeypatch.setattr(files, "cat_file", fetched)
 
-    assert RemoteObject("memory://shard.tar").read(2, 6, cancellation=waits) == b"2345"
-    assert len(waits.seconds) == 2
+    assert RemoteObject("memory://shard.tar").read(2, 6) == b"2345"
+    assert len(waits) == 2
     files.rm("/shard.tar")
 
 
@@ -168,10 +168,10 @@ def test_a_wait_that_a_store_asks_for_holds_for_all_its_objects(monkeypatch):
 
     monkeypatch.setattr(files, "cat_file", fetched)
     for _ in range(2):
-        waits = Waits()
+        waits = waits_noted(monkeypatch)
         remote = RemoteObject("memory://busy/shard.tar")
-        assert remote.read(2, 6, cancellation=waits) == b"2345"
-        assert waits.seconds == [pytest.approx(2.0, abs=1.1)]
+        assert remote.read(2, 6) == b"2345"
+        assert waits == [pytest.approx(2.0, abs=1.1)]
     files.rm("/busy", recursive=True)
 
 
