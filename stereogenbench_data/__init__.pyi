@@ -64,7 +64,6 @@ from stereogenbench_data.samples.transforms import Resize as Resize
 from stereogenbench_data.schema.conventions import Conventions as Conventions
 from stereogenbench_data.schema.records import DepthEncoding as DepthEncoding
 from stereogenbench_data.selection.pairs import FewerPairsWarning as FewerPairsWarning
-from stereogenbench_data.shards.pack import OversizedSceneWarning as OversizedSceneWarning
 from stereogenbench_data.sources.cache import ShardCache as ShardCache
 from stereogenbench_data.sources.retry import RetryPolicy as RetryPolicy
 

@@ -24,7 +24,6 @@ IncompleteSceneWarning   index.open           some scenes of the data cannot be 
 AssumptionWarning        index.assumptions    files are not as the paper prints them
 OddSceneWarning          samples.checks       selected scenes differ from what the release promises
 SwappedSizeWarning       samples.size         a size looks like (width, height)
-OversizedSceneWarning    shards.pack          some scenes alone exceed the size of a shard
 OpenVideosWarning        datasets.open_videos more videos are needed than may be open
 RepeatedDecodingWarning  datasets.open_videos several processes decode the same videos
 FewerPairsWarning        selection.pairs      the data hold some cameras alone

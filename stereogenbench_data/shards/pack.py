@@ -8,14 +8,13 @@ import base64
 import json
 import os
 import shutil
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
-from stereogenbench_data.errors import ShardError, describe_os_error
+from stereogenbench_data.errors import ShardError, explain_os_errors
 from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.scene_folder import derived_scene
@@ -47,10 +46,6 @@ from stereogenbench_data.sources.members import require_own_files
 _PLAN_FILE: Final = "plan.json"
 
 
-class OversizedSceneWarning(UserWarning):
-    """Some scenes alone exceed the size of a shard; the message names the largest."""
-
-
 @dataclass(frozen=True, slots=True)
 class PackReport:
     """What a run of packing did.
@@ -68,25 +63,6 @@ class PackReport:
     missing: tuple[str, ...]
     index: Path | None
     scenes: int
-
-
-@dataclass(frozen=True, slots=True)
-class PackJob:
-    """One part of a plan, in the folder that it is packed into; `prepare` makes it.
-
-    Attributes:
-        tasks: All shards of the plan.
-        part: The shards of this part.
-    """
-
-    index: SceneIndex
-    out: Path
-    tasks: tuple[ShardTask, ...]
-    part: tuple[ShardTask, ...]
-
-    def remaining(self) -> list[ShardTask]:
-        """Return the shards of this part that are not finished."""
-        return [task for task in self.part if find_packed(task) is None]
 
 
 def pack(  # noqa: PLR0913 - each is an option of the command
@@ -132,17 +108,34 @@ def pack(  # noqa: PLR0913 - each is an option of the command
         ShardError: If a shard cannot be packed; or the folder is in the release, or holds another
             plan, other shards, or shards that were packed from other files.
     """
-    job = prepare(
-        data,
-        out,
-        target_bytes=target_bytes,
-        depth_codec=depth_codec,
-        training=training,
-        rows=rows,
-        part=part,
-    )
-    tasks = job.remaining()
-    total = sum(task.shard.source_bytes for task in job.part)
+    number, count = part
+    if not 1 <= number <= count:
+        raise ShardError(f"part {number}/{count}: a part is I/N with I from 1 to N, such as 1/4.")
+    index = data if isinstance(data, SceneIndex) else SceneIndex.open(data, rows="read")
+    if depth_codec == "blosc2" or training is not None:
+        blosc2_module()
+    plan = plan_shards(index, target_bytes, depth_codec=depth_codec, training=training, rows=rows)
+    if not is_remote(plan.root):
+        sources = {member.source for shard in plan.shards for member in shard.members} - {""}
+        require_own_files(plan.root, sorted(sources))
+    out = Path(out)
+    with explain_os_errors(
+        f"{out}: cannot be written to", "Pack into another folder.", kind=ShardError
+    ):
+        _claim_folder(plan, out)
+    plan_tasks = [
+        ShardTask(
+            shard,
+            plan.root,
+            str(out),
+            plan.digest,
+            None if training is None else Derivation.of_index(index, training, shard.scenes),
+        )
+        for shard in plan.shards
+    ]
+    part_tasks = plan_tasks[number - 1 :: count]
+    tasks = [task for task in part_tasks if find_packed(task) is None]
+    total = sum(task.shard.source_bytes for task in part_tasks)
     left = sum(task.shard.source_bytes for task in tasks)
     advance = advance_of(progress, done=total - left, total=total)
     advance(0)
@@ -165,116 +158,44 @@ def pack(  # noqa: PLR0913 - each is an option of the command
         workers=workers,
         advance=(lambda count: advance(0)) if is_counted else advance,
     )
-    return _finish(job, packed={shard.name for shard, work in outcomes if work == "packed"})
-
-
-def prepare(  # noqa: PLR0913 - what `pack` takes
-    data: SceneIndex | str | Path,
-    out: str | Path,
-    *,
-    target_bytes: int,
-    part: tuple[int, int],
-    depth_codec: DepthCodec = "released",
-    training: TrainingSettings | None = None,
-    rows: Sequence[int] | None = None,
-) -> PackJob:
-    """Make the plan and claim the folder for it.
-
-    Raises:
-        StorageError: If the release cannot be read or many scenes of it are broken.
-        ShardError: As `pack` says of the folder; if no scene fits into a shard; or if the part is
-            not one of 1 to N.
-        ExtraError: If the codec needs a package that is not installed.
-    """
-    number, count = part
-    if not 1 <= number <= count:
-        raise ShardError(f"part {number}/{count}: a part is I/N with I from 1 to N, such as 1/4.")
-    index = data if isinstance(data, SceneIndex) else SceneIndex.open(data, rows="read")
-    if depth_codec == "blosc2" or training is not None:
-        blosc2_module()
-    plan = plan_shards(index, target_bytes, depth_codec=depth_codec, training=training, rows=rows)
-    if not is_remote(plan.root):
-        sources = {member.source for shard in plan.shards for member in shard.members} - {""}
-        require_own_files(plan.root, sorted(sources))
-    _require_fitting(plan)
-    out = Path(out)
-    tasks = tuple(
-        ShardTask(
-            shard,
-            plan.root,
-            str(out),
-            plan.digest,
-            None if training is None else Derivation.of_index(index, training, shard.scenes),
-        )
-        for shard in plan.shards
+    packed = {shard.name for shard, work in outcomes if work == "packed"}
+    names = tuple(task.shard.name for task in part_tasks)
+    return replace(
+        _finish(plan_tasks, out), part=names, packed=tuple(name for name in names if name in packed)
     )
-    try:
-        _claim_folder(plan, out)
-    except OSError as error:
-        if isinstance(error, ShardError):
-            raise
-        what = f"{out}: cannot be written to"
-        raise ShardError(describe_os_error(what, error, "Pack into another folder.")) from error
-    return PackJob(index, out, tasks, tasks[number - 1 :: count])
 
 
-def _require_fitting(plan: ShardPlan) -> None:
-    """Warn of scenes that exceed the size of a shard; refuse a size that no scene fits into."""
-    above = sorted(
-        (shard.size, shard.keys[0]) for shard in plan.shards if shard.size > plan.target_bytes
-    )
-    if above and len(above) == len(plan.shards):
-        raise ShardError(
-            f"no scene fits into a shard of {plan.target_bytes} bytes: the smallest, "
-            f"{above[0][1]}, needs {above[0][0]}. Choose a larger size."
-        )
-    if above:
-        warnings.warn(
-            f"{len(above)} of {len(plan.shards)} shards exceed {plan.target_bytes} bytes, because "
-            f"each holds one scene that does: the largest, {above[-1][1]}, needs {above[-1][0]}",
-            OversizedSceneWarning,
-            stacklevel=3,
-        )
-
-
-def _finish(job: PackJob, *, packed: set[str]) -> PackReport:
+def _finish(tasks: Sequence[ShardTask], out: Path) -> PackReport:
     """Write the index, if all shards of the plan are finished by now.
 
     Raises:
         StorageError: If the index cannot be written.
         ShardError: If a shard was changed after it was packed.
     """
-    found = [find_packed(task) for task in job.tasks]
-    shards = [manifest for manifest in found if manifest is not None]
-    part = tuple(task.shard.name for task in job.part)
-    here = {manifest.name for manifest in shards}
-    report = PackReport(
-        part=part,
-        packed=tuple(name for name in part if name in packed),
-        missing=tuple(task.shard.name for task in job.tasks if task.shard.name not in here),
-        index=None,
-        scenes=sum(len(task.shard.scenes) for task in job.tasks),
-    )
-    if report.missing:
+    found = {task.shard.name: find_packed(task) for task in tasks}
+    shards = [manifest for manifest in found.values() if manifest is not None]
+    missing = tuple(name for name, manifest in found.items() if manifest is None)
+    report = PackReport((), (), missing, None, sum(len(task.shard.scenes) for task in tasks))
+    if missing:
         return report
-    for task in job.tasks:
+    for task in tasks:
         shutil.rmtree(task.derived, ignore_errors=True)  # of a run killed after its last shard
     index = SceneIndex.from_scenes(
         [
             scene
-            for task, manifest in zip(job.tasks, shards, strict=True)
+            for task, manifest in zip(tasks, shards, strict=True)
             for scene in _scenes_in(task, manifest)
         ],
-        job.out,
+        out,
         shards={
             manifest.name: ShardFacts(manifest.size, manifest.sha256, len(manifest.members))
             for manifest in shards
         },
     )
     # The index is written last: where it exists, every shard does, too.
-    index.write(job.out / INDEX_NAME)
-    warn_if_stale(job.out)
-    return replace(report, index=job.out / INDEX_NAME)
+    index.write(out / INDEX_NAME)
+    warn_if_stale(out)
+    return replace(report, index=out / INDEX_NAME)
 
 
 def _scenes_in(task: ShardTask, shard: ShardManifest) -> Iterator[Scene]:
@@ -319,35 +240,28 @@ def _claim_folder(plan: ShardPlan, out: Path) -> None:
     if plan.training is not None:
         expected["training"] = plan.training.describe()
     _require_outside_release(plan, out)
-    if not place.exists():
-        for path in sorted(out.iterdir()) if out.exists() else []:
-            if path.name == INDEX_NAME or path.name.removesuffix(TEMPORARY_SUFFIX).endswith(".tar"):
-                raise not_of_plan(path)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(place, json.dumps(expected).encode())
+    is_claimed = place.exists()
     try:
-        found = json.loads(place.read_bytes())
+        found = json.loads(place.read_bytes()) if is_claimed else expected
     except ValueError:
         found = None
     if found != expected:
+        there = found if isinstance(found, dict) else {}
+        differing = [key for key in {**expected, **there} if there.get(key) != expected.get(key)]
         raise ShardError(
-            f"{place}: this folder is for another plan ({_brief(found)}, and this one is "
-            f"{_brief(expected)}): the release, the size of the shards, the depth codec or the "
-            f"training settings differ. "
-            f"Pack into an empty folder, or remove what is in {out}."
+            f"{place}: this folder is for another plan ({', '.join(differing)} differ): of another "
+            f"release, size of the shards, depth codec or training settings. Pack into an empty "
+            f"folder, or remove what is in {out}."
         )
-    _require_no_others(plan, out)
-
-
-def _brief(content: object) -> str:
-    if not isinstance(content, dict):
-        return "unreadable"
-    digest, size = str(content.get("plan"))[:12], content.get("target_bytes")
-    depth = content.get("depth", "released")
-    training = content.get("training")
-    if isinstance(training, dict):
-        depth = f"{depth}, for training at {training.get('size')}, {training.get('quality')}"
-    return f"{content.get('shards')} shards of {size} bytes, depth {depth}, {digest}"
+    known = {shard.name for shard in plan.shards} if is_claimed else set()
+    for path in sorted(out.iterdir()) if out.exists() else []:
+        name = path.name.removesuffix(TEMPORARY_SUFFIX)
+        is_index = name == INDEX_NAME and not is_claimed
+        if is_index or (name.endswith(".tar") and name not in known):
+            raise not_of_plan(path)
+    if not is_claimed:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(place, json.dumps(expected).encode())
 
 
 def _require_outside_release(plan: ShardPlan, out: Path) -> None:
@@ -362,12 +276,3 @@ def _require_outside_release(plan: ShardPlan, out: Path) -> None:
                 f"{out}: is in {plan.root}/{split}, among the scenes of the release. "
                 f"Pack into a folder outside it."
             )
-
-
-def _require_no_others(plan: ShardPlan, out: Path) -> None:
-    """Refuse a folder that holds a shard of another plan."""
-    known = {shard.name for shard in plan.shards}
-    for path in sorted(out.iterdir()) if out.exists() else []:
-        name = path.name.removesuffix(TEMPORARY_SUFFIX)
-        if name.endswith(".tar") and name not in known:
-            raise not_of_plan(path)

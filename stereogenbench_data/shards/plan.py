@@ -137,8 +137,7 @@ def plan_shards(
 
     Raises:
         ShardError: If the data are packed already or remote (training shards may be made of such),
-            or derived already; no scene is selected, or many lack a file; the target is below 1; or
-            two shards would have the same name.
+            or derived already; no scene is selected, or many lack a file; or the target is below 1.
     """
     _require_released(index, training=training)
     if rows is not None and not len(rows):
@@ -160,14 +159,6 @@ def plan_shards(
             group, members, target_bytes=target_bytes, planned=planned, training=training
         )
     )
-    names: dict[str, str] = {}
-    for shard in shards:
-        other = names.setdefault(shard.name.casefold(), shard.name)
-        if other != shard.name:
-            raise ShardError(
-                f"{shard.name} and {other} would be the same file on a disk that ignores case. "
-                f"Rename one of the two families' folders."
-            )
     content = [
         [
             shard.name,

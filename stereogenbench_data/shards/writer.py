@@ -13,8 +13,8 @@ import os
 import shutil
 import stat
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from io import FileIO
 from itertools import groupby
@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from stereogenbench_data.engine import Advance
-from stereogenbench_data.errors import DISK_FULL, MediaError, ShardError, describe_os_error
+from stereogenbench_data.errors import MediaError, ShardError, explain_os_errors
 from stereogenbench_data.index.scene_folder import derived_scene, metadata_differences
 from stereogenbench_data.media.depth_packing import packed_depth
 from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
@@ -34,7 +34,6 @@ from stereogenbench_data.shards.tar import (
     BLOCK_BYTES,
     END_OF_ARCHIVE,
     member_header,
-    padded,
     read_chunks,
 )
 from stereogenbench_data.shards.training import Derivation, derive_scene, derived_names
@@ -170,22 +169,10 @@ def derive_task(work: tuple[ShardTask, Scene], after_bytes: Advance) -> None:
         _derive(task, scene, after_bytes)
 
 
-@contextmanager
-def _named_errors(task: ShardTask) -> Iterator[None]:
+def _named_errors(task: ShardTask) -> AbstractContextManager[None]:
     """Turn errors of the system about a shard into a ShardError that names it."""
-    try:
-        yield
-    except OSError as error:
-        if isinstance(error, ShardError):
-            raise
-        if error.errno in DISK_FULL:
-            raise ShardError(
-                f"{task.target}: the disk is full; the shard needs {task.shard.size} bytes. The "
-                f"unfinished shard is removed: make room, then run the same command again to "
-                f"continue."
-            ) from error
-        what = f"{task.target}: cannot be written"
-        raise ShardError(describe_os_error(what, error, "Pack into another folder.")) from error
+    what = f"{task.target}: cannot be written"
+    return explain_os_errors(what, "Pack into another folder.", kind=ShardError)
 
 
 @contextmanager
@@ -240,8 +227,7 @@ def _with_derived_files(task: ShardTask, derivation: Derivation, after_bytes: Ad
             )
             for name in derived_names(scene, derivation.settings)
         ]
-    size = len(END_OF_ARCHIVE) + sum(BLOCK_BYTES + padded(member.size) for member in members)
-    shard = replace(task.shard, size=size, members=tuple(members))
+    shard = replace(task.shard, members=tuple(members))
     return replace(task, shard=shard, root=str(task.derived))
 
 
@@ -252,13 +238,6 @@ def _pack(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardManifest:
     manifest = replace(manifest, seek_tables=encoded)
     write_atomic(task.manifest, json.dumps(asdict(manifest)).encode())
     task.temporary.replace(task.target)
-    # The rename outlives a power cut where folders can be synchronised.
-    folder = os.open(task.target.parent, os.O_RDONLY)
-    try:
-        with suppress(OSError):
-            os.fsync(folder)
-    finally:
-        os.close(folder)
     return manifest
 
 
@@ -301,7 +280,7 @@ def _write_shard(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardMa
     output = _Output(file)
     scenes = {scene.id.key: scene for scene in task.shard.scenes}
     for key, members in groupby(task.shard.members, key=lambda each: each.name.partition(".")[0]):
-        _write_scene(task, list(members), output, scene=scenes.get(key), after_bytes=after_bytes)
+        _write_scene(task, members, output, scene=scenes.get(key), after_bytes=after_bytes)
     output.write(END_OF_ARCHIVE)
     os.fsync(file.fileno())
     offsets, sizes, crc32s = zip(*output.members, strict=True)
@@ -319,39 +298,37 @@ def _write_shard(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardMa
 
 def _write_scene(
     task: ShardTask,
-    members: Sequence[PlannedMember],
+    members: Iterable[PlannedMember],
     output: _Output,
     *,
     scene: Scene | None,
     after_bytes: Advance,
 ) -> None:
-    """Write a scene's files: its metadata first, which must be what the index was made from."""
+    """Write a scene's files, whose metadata must be what the index was made from."""
     texts: dict[str, bytes] = {}
-    videos = []
     for member in members:
         name = member.name.partition(".")[2]
-        if name not in SCENE_TEXTS:
-            videos.append(member)
-            continue
-        texts[name] = _read_whole(Path(task.root, member.source), member.size, after_bytes)
-        output.write_member(member.name, texts[name])
-    if scene is not None and texts:
-        if task.derivation is not None:
-            where = f"{scene.id.key}/{TRAINING_JSON}"
-            document = parse_training(texts[TRAINING_JSON], where=where)
-            scene = replace(derived_scene(scene, document), members={})
-        _require_indexed_metadata(scene, texts, root=task.root)
-    for member in videos:
-        source = Path(task.root, member.source)
-        if member.form == "released" or scene is None:
+        chunks = _source_chunks(Path(task.root, member.source), member.size, after_bytes)
+        if name in SCENE_TEXTS:
+            texts[name] = b"".join(chunks)
+            output.write_member(member.name, texts[name])
+        elif member.form == "released" or scene is None:
             output.write(member_header(member.name, member.size))
-            crc32 = _copy_source(source, member.size, output.write, after_bytes)
-            output.end_member(member.size, crc32)
+            output.end_member(member.size, copy_with_crc32(chunks, output.write))
         else:
-            content = _packed_depth(
-                source, member.size, frames=scene.frames, after_bytes=after_bytes
-            )
+            content = _packed_depth(task, member, frames=scene.frames, after_bytes=after_bytes)
             output.write_member(member.name, content)
+    if scene is None or not texts:
+        return
+    if task.derivation is not None:
+        where = f"{scene.id.key}/{TRAINING_JSON}"
+        document = parse_training(texts[TRAINING_JSON], where=where)
+        scene = replace(derived_scene(scene, document), members={})
+    for name, difference in metadata_differences(scene, texts)[:1]:
+        raise ShardError(
+            f"{Path(task.root, scene.id.key, name)}: {difference}. The index is older than the "
+            f"file: run `stereogenbench index` on the release again, then the same command."
+        )
 
 
 def _seek_tables(task: ShardTask, manifest: ShardManifest) -> dict[str, bytes]:
@@ -371,75 +348,44 @@ def _seek_tables(task: ShardTask, manifest: ShardManifest) -> dict[str, bytes]:
     return {key: packed_tables(found) for key, found in tables.items()}
 
 
-def _require_indexed_metadata(scene: Scene, texts: Mapping[str, bytes], *, root: str) -> None:
-    """Refuse to pack metadata files that contradict the index of their release.
-
-    Raises:
-        ShardError: Naming the first such file, what it says and what to do.
-    """
-    for name, difference in metadata_differences(scene, texts)[:1]:
-        where = Path(root, scene.id.key, name)
-        raise ShardError(
-            f"{where}: {difference}. The index is older than the file: run `stereogenbench index` "
-            f"on the release again, then the same command."
-        )
-
-
-def _copy_source(
-    source: Path, size: int, write: Callable[[bytes], object], after_bytes: Advance
-) -> int:
-    """Pass on all bytes of a released file of the planned size, and return zlib's crc32 of them.
+def _source_chunks(source: Path, size: int, after_bytes: Advance) -> Iterator[bytes]:
+    """Yield all bytes of a released file of the planned size.
 
     Raises:
         ShardError: If it is missing, unreadable, has another size or changes meanwhile.
     """
-
-    def take(chunk: bytes) -> None:
-        write(chunk)
-        after_bytes(len(chunk))
-
-    with _readable(source):
+    cure = "Fetch it again, then run the same command again."
+    with explain_os_errors(f"{source}: cannot be read", cure, kind=ShardError):
         if not stat.S_ISREG(source.stat().st_mode):
             raise ShardError(f"{source}: is not a file. Put the release's own file in its place.")
-        file = FileIO(source)
-    with file:
-        before = os.fstat(file.fileno())
-        if before.st_size != size:
-            raise ShardError(
-                f"{source}: has {before.st_size} bytes, and had {size} when the plan was made. Let "
-                f"nothing write to the release; run `stereogenbench index` again if it has an "
-                f"index."
-            )
-        crc32 = copy_with_crc32(_source_chunks(source, file, size), take)
-        with _readable(source):
+        with FileIO(source) as file:
+            before = os.fstat(file.fileno())
+            if before.st_size != size:
+                raise ShardError(
+                    f"{source}: has {before.st_size} bytes, and had {size} when the plan was made. "
+                    f"Let nothing write to the release; run `stereogenbench index` again if it has "
+                    f"an index."
+                )
+            yield from read_chunks(file, size, after_bytes=after_bytes)
             after = source.stat()
-        found = (after.st_size, after.st_mtime_ns)
-        if found != (size, before.st_mtime_ns) or not os.path.samestat(after, before):
-            raise ShardError(
-                f"{source}: was changed while it was packed. Let nothing write to the release, "
-                f"then run the same command again."
-            )
-    return crc32
+            found = (after.st_size, after.st_mtime_ns)
+            if found != (size, before.st_mtime_ns) or not os.path.samestat(after, before):
+                raise ShardError(
+                    f"{source}: was changed while it was packed. Let nothing write to the release, "
+                    f"then run the same command again."
+                )
 
 
-def _source_chunks(source: Path, file: FileIO, size: int) -> Iterator[bytes]:
-    with _readable(source):
-        yield from read_chunks(file, size)
-
-
-def _read_whole(source: Path, size: int, after_bytes: Advance) -> bytes:
-    parts: list[bytes] = []
-    _copy_source(source, size, parts.append, after_bytes)
-    return b"".join(parts)
-
-
-def _packed_depth(source: Path, size: int, *, frames: int, after_bytes: Advance) -> bytes:
+def _packed_depth(
+    task: ShardTask, member: PlannedMember, *, frames: int, after_bytes: Advance
+) -> bytes:
     """Return a released depth video as blosc2's frames.
 
     Raises:
         ShardError: If it cannot be read, or not be packed bit for bit.
     """
-    video = _read_whole(source, size, lambda count: after_bytes(0))
+    source, size = Path(task.root, member.source), member.size
+    video = b"".join(_source_chunks(source, size, lambda count: after_bytes(0)))
     share = size // frames
     try:
         content = packed_depth(
@@ -452,15 +398,3 @@ def _packed_depth(source: Path, size: int, *, frames: int, after_bytes: Advance)
         raise ShardError(str(error)) from error
     after_bytes(size - share * frames)
     return content
-
-
-@contextmanager
-def _readable(source: Path) -> Iterator[None]:
-    """Turn errors of the system about a source file into a ShardError that names it."""
-    try:
-        yield
-    except OSError as error:
-        if isinstance(error, ShardError):
-            raise
-        cure = "Fetch it again, then run the same command again."
-        raise ShardError(describe_os_error(f"{source}: cannot be read", error, cure)) from error

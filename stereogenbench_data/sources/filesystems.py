@@ -68,8 +68,7 @@ class FilesystemTransport:
             )
         self.server = "/".join(self._where.split("/")[:3])
         self._expected_size = expected_size
-        self._has_expected_size = expected_size is None
-        self._etags: dict[str, str] = {}
+        self._seen: dict[str, str] = {}  # the ETag and the size of the first read
         self._opened: tuple[int, Any, str] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -80,11 +79,8 @@ class FilesystemTransport:
         """Return the size of the object in bytes."""
         with self.named_errors():
             files, path = self._open()
-            if _is_s3(files):
-                size = self._s3_call("head_object", files, path, timeout_s)["ContentLength"]
-            else:
-                limit = {"timeout": timeout_s} if files.async_impl else {}
-                size = files.size(path, **limit)
+            limit = {"timeout": timeout_s} if files.async_impl else {}
+            size = files.size(path, **limit)
         if not isinstance(size, int):
             raise StorageError(f"{self._where}: has no size ({size!r}): is it a folder?")
         return size
@@ -120,7 +116,8 @@ class FilesystemTransport:
         """Yield the bytes from start to stop, or the first of them."""
         with self.named_errors():
             files, path = self._open()
-            if _is_s3(files):
+            # s3fs itself, whose objects are read by their ETag.
+            if type(files).__module__.partition(".")[0] == "s3fs":
                 yield from self._s3_part(start, stop, timeout_s, files, path)
                 return
             self._require_size(timeout_s)
@@ -139,9 +136,14 @@ class FilesystemTransport:
         """Yield a part of an object of S3, which is read only while its ETag stays the same."""
         from fsspec.asyn import sync
 
-        part = {"Range": f"bytes={start}-{stop - 1}"}
+        bucket, key, version = files.split_path(path)
+        options = {"Bucket": bucket, "Key": key, "Range": f"bytes={start}-{stop - 1}"}
+        if version is not None:
+            options["VersionId"] = version
+        if "etag" in self._seen:
+            options["IfMatch"] = self._seen["etag"]
         try:
-            stated = self._s3_call("get_object", files, path, timeout_s, **part)
+            stated = files.call_s3("get_object", timeout=timeout_s, **options)
         except OSError as error:
             if _answer(error)[0] == 416:
                 self._require_size(timeout_s)  # it may end before the part
@@ -149,7 +151,7 @@ class FilesystemTransport:
         body = stated["Body"]
         try:
             etag = str(stated.get("ETag", ""))
-            first = self._etags.setdefault("first", etag)
+            first = self._seen.setdefault("etag", etag)
             if etag != first:
                 raise replaced(self._where, "in its store", f"its ETag was {first} and is {etag}")
             whole = str(stated.get("ContentRange", "")).rpartition("/")[2]
@@ -160,21 +162,11 @@ class FilesystemTransport:
         finally:
             files.loop.call_soon_threadsafe(body.close)
 
-    def _s3_call(self, method: str, files: Any, path: str, timeout_s: float, **how: Any) -> Any:
-        """Return what S3 answers of the object, if it is the one that was read before."""
-        bucket, key, version = files.split_path(path)
-        options = {"Bucket": bucket, "Key": key, **how}
-        if version is not None:
-            options["VersionId"] = version
-        if self._etags.get("first"):
-            options["IfMatch"] = self._etags["first"]
-        return files.call_s3(method, timeout=timeout_s, **options)
-
     def _require_size(self, timeout_s: float) -> None:
-        if not self._has_expected_size:
+        if self._expected_size is not None and "size" not in self._seen:
             found = self.size(timeout_s)
             require_expected_size(found, expected=self._expected_size, where=self._where)
-            self._has_expected_size = True
+            self._seen["size"] = str(found)
 
     def _open(self) -> tuple[Any, str]:
         """Return this process's file system, and the object's path in it."""
@@ -243,11 +235,6 @@ def _not_installed(where: str, error: ImportError, *, extra: str | None) -> Extr
     if extra:
         return missing_extra(where, extra, error)
     return ExtraError(f"{where}: needs a package that is not installed ({error}). Install it.")
-
-
-def _is_s3(files: Any) -> bool:
-    """Return whether a file system is s3fs itself, whose objects are read by their ETag."""
-    return type(files).__module__.partition(".")[0] == "s3fs"
 
 
 def _answer(error: BaseException) -> tuple[int, float]:

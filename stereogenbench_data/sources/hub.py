@@ -73,6 +73,11 @@ class HubFile:
         kind, repository, revision, path = found.groups(default="")
         return cls(kind[:-1] or "models", repository, unquote(revision) or "main", path)
 
+    @property
+    def place(self) -> str:
+        """The repository's path on the Hub, and in URLs behind ``hf://``."""
+        return self.repository if self.kind == "models" else f"{self.kind}/{self.repository}"
+
 
 class HubTransport:
     """One file of a repository of the Hub."""
@@ -81,7 +86,7 @@ class HubTransport:
         """Name a file; nothing is requested yet.
 
         Args:
-            url: ``hf://datasets/ORG/NAME@REVISION/PATH``; see `is_hub_file`.
+            url: ``hf://datasets/ORG/NAME@REVISION/PATH``.
             expected_size: The size in bytes that the index records; None if it is not known.
 
         Raises:
@@ -144,8 +149,7 @@ class HubTransport:
     def pinned(self, timeout_s: float) -> str:
         """Return the URL of a folder as of the commit that its branch is at now."""
         file, commit = self._file, self._commit(timeout_s, of="folder")
-        kind = "" if file.kind == "models" else f"{file.kind}/"
-        return f"hf://{kind}{file.repository}@{quote(commit, safe='')}/{file.path}".rstrip("/")
+        return f"hf://{file.place}@{quote(commit, safe='')}/{file.path}".rstrip("/")
 
     def _tree(self, timeout_s: float, *, depth: Literal["one level", "all levels"]) -> list[Any]:
         """Return the entries of a folder, of which the Hub lists a thousand a request."""
@@ -198,7 +202,7 @@ class HubTransport:
         """Return the commit of the revision, the same for all that this process reads."""
         if _COMMIT.fullmatch(self._file.revision):
             return self._file.revision
-        key = (_settings()[0], f"{self._file.kind}/{self._file.repository}@{self._file.revision}")
+        key = (_settings()[0], f"{self._file.place}@{self._file.revision}")
         if key not in _commits:
             # Of a folder, which has no such URL, a file is asked for that every repository has.
             asked = replace(self._file, path=self._file.path if of == "file" else ".gitattributes")
@@ -219,8 +223,7 @@ class _HubWeb(WebTransport):
             from huggingface_hub.utils import build_hf_headers
         endpoint, token = _settings()
         headers = build_hf_headers(token=token, library_name=_LIBRARY)
-        place = file.repository if file.kind == "models" else f"{file.kind}/{file.repository}"
-        url = f"{endpoint}/{place}/resolve/{quote(revision, safe='')}/{quote(file.path)}"
+        url = f"{endpoint}/{file.place}/resolve/{quote(revision, safe='')}/{quote(file.path)}"
         super().__init__(url, expected_size=expected_size, headers=headers)
         self._where = where
         self._revision = revision
@@ -251,11 +254,6 @@ class _HubWeb(WebTransport):
         if response.status in (401, 404, 410) or code in ("RepoNotFound", "EntryNotFound"):
             return MissingObject(f"{self._where}: does not exist, or is private. {MISSING}")
         return super().refusal(response)
-
-
-def is_hub_file(url: str) -> bool:
-    """Return whether a URL names a file or folder of a repository of the Hub."""
-    return HubFile.of_url(url) is not None
 
 
 def _settings() -> tuple[str, str | bool | None]:

@@ -21,9 +21,9 @@ def _transport(url: str, *, expected_size: int | None) -> Transport:
         from stereogenbench_data.sources.web import WebTransport
 
         return WebTransport(url, expected_size=expected_size)
-    from stereogenbench_data.sources.hub import HubTransport, is_hub_file
+    from stereogenbench_data.sources.hub import HubFile, HubTransport
 
-    if is_hub_file(url):
+    if HubFile.of_url(url) is not None:
         return HubTransport(url, expected_size=expected_size)
     from stereogenbench_data.sources.filesystems import FilesystemTransport
 

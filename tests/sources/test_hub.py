@@ -253,4 +253,4 @@ def test_a_url_of_the_hub_names_repository_revision_and_path(url, found):
 
 @pytest.mark.parametrize("url", ["hf://buckets/a/b/c", "hf://datasets/a", "s3://a/b/c"])
 def test_what_is_no_repository_is_left_to_its_file_system(url):
-    assert not hub_transport.is_hub_file(url)
+    assert hub_transport.HubFile.of_url(url) is None
