@@ -101,7 +101,7 @@ def test_an_unknown_engine_is_refused_with_those_there_are():
 @pytest.mark.parametrize(
     "command",
     ["index {release} -o {out}/index.parquet", "pack {release} {out}/shards",
-     "audit {release} -o {out}/audit.md", "evaluate {release} {out} --tier G1",
+     "audit {release} -o {out}/audit.md", "eval score {release} {out} --tier G1",
      "synth {out}/scenes", "verify {shards}", "unpack {shards} {out}/scenes",
      "doctor {shards}", "eval inputs {shards} {out}/inputs --tier G1"],
     ids=lambda command: command.partition(" ")[0],
