@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Final, NamedTuple
 
 from stereogenbench_data.media.seek_table import Position
+from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.selection.plan import Address
 from stereogenbench_data.sources.fetch_ahead import FetchAhead, Wanted
@@ -65,17 +66,17 @@ FilesOf = Callable[[Address], NeededFiles]
 class ComingSamples:
     """Plans the bytes of coming samples, and of the one that is read now."""
 
-    def __init__(self, source: MemberSource, ahead: FetchAhead) -> None:
+    def __init__(self, source: MemberSource, ahead: FetchAhead, streams: Streams) -> None:
         """Plan nothing yet.
 
         Args:
             source: Where the files are.
             ahead: What fetches them.
+            streams: Says how many videos stay open, and how many frames of each are kept.
         """
         self._source = source
         self._ahead = ahead
-        self._open_videos = 0
-        self._kept_frames = 1
+        self._streams = streams
         self._steps: Iterator[Step] = iter(())
         self._due: deque[_Planned] = deque()
         self._waiting: deque[_Planned] = deque()  # for their requests
@@ -86,10 +87,6 @@ class ComingSamples:
         self._is_filling = True
         self._has_order = False
         self._pid, self._lock = os.getpid(), threading.RLock()
-
-    def keep(self, videos: int, *, frames: int) -> None:
-        """Expect so many videos to stay open, and so many frames of each to be kept."""
-        self._open_videos, self._kept_frames = videos, frames
 
     @property
     def has_order(self) -> bool:
@@ -203,13 +200,13 @@ class ComingSamples:
         member = scene.member(name)
         place = (member.path, member.offset, run)
         if place not in self._positions:
-            while len(self._positions) >= self._open_videos > 0:
+            while len(self._positions) >= self._streams.limit > 0:
                 self._positions.popitem(last=False)
             self._positions[place] = _Video(self._source.position(scene, name))
             if self._source.is_cached:
                 return self._source.wanted(scene, name)
         self._positions.move_to_end(place)
-        ranges = self._positions[place].needed(frames, kept=self._kept_frames)
+        ranges = self._positions[place].needed(frames, kept=self._streams.kept_frames)
         return self._source.wanted(scene, name, ranges) if ranges else []
 
 

@@ -1,17 +1,306 @@
 """One sample: decoded, transformed, written; read and decoded only as far as the fields need."""
 
+import copy
+import warnings
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Final, Literal, Self
+
 import numpy as np
 
-from stereogenbench_data.errors import MediaError, SchemaError, StorageError
-from stereogenbench_data.samples.decoder import SampleDecoder
+from stereogenbench_data.errors import (
+    MediaError,
+    SchemaError,
+    ShardError,
+    StorageError,
+    text_without_secrets,
+)
+from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
+from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.geometry.rig import RECTIFIED_PX
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.media.depth import depth_frame_index
+from stereogenbench_data.samples.checks import OddSceneWarning
+from stereogenbench_data.samples.coming import ComingSamples, NeededFiles, Step
+from stereogenbench_data.samples.derive import SceneFacts
 from stereogenbench_data.samples.fields import Sample
-from stereogenbench_data.samples.request import Clip
+from stereogenbench_data.samples.request import Clip, Request
+from stereogenbench_data.samples.streams import Streams, StreamStats
+from stereogenbench_data.samples.views import StoredDepth, Views
 from stereogenbench_data.samples.writer import Allocate, SampleWriter, new_array
+from stereogenbench_data.schema.conventions import depth_of
+from stereogenbench_data.schema.records import DepthEncoding, Scene
+from stereogenbench_data.schema.release import (
+    TRAJECTORY_JSON,
+    VIDEO_FILES,
+    depth_name,
+    rgb_name,
+)
 from stereogenbench_data.selection.plan import Address
+from stereogenbench_data.sources.cache import ShardCache
+from stereogenbench_data.sources.fetch_ahead import FetchAhead
+from stereogenbench_data.sources.members import MemberSource
+
+KEPT_POSES: Final = 32
+"""Of how many scenes the poses are kept (46 kB a scene of 81 frames)."""
+
+KEPT_SCENES: Final = 256
+"""Of how many scenes what the index says is kept."""
+
+SCENES_AHEAD: Final = 8
+"""How many presumed scenes behind a URL are planned ahead of the one that is read, and how many are
+described ahead of these."""
+
+STEPS_AHEAD: Final = 2048
+"""How many steps are looked ahead for such scenes."""
 
 
-class SampleLoader(SampleDecoder):
-    """A decoder whose views become samples: flat dicts of numpy arrays and texts."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _KnownScene:
+    """What is known of a scene from its row of the index.
+
+    Attributes:
+        scene: The row.
+        intrinsics: Of its pictures, as large as they are wanted.
+        encodings: The depth contract of each camera.
+        videos: The videos that were opened for it, where its row is presumed and behind a URL.
+    """
+
+    scene: Scene
+    intrinsics: Intrinsics
+    encodings: dict[int, DepthEncoding]
+    videos: frozenset[str]
+
+
+class _DescribedAhead:
+    """The steps of an order over presumed scenes behind a URL, which are described ahead of them.
+
+    It ends for now where too many scenes are given that were not begun: describing costs requests.
+    """
+
+    def __init__(self, steps: Iterable[Step], describe: Callable[[Address], None]) -> None:
+        self._steps, self._describe = iter(steps), describe
+        self._waiting: deque[Step] = deque()
+        self._soon: set[int] = set()
+        self._given: set[int] = set()
+        self._ahead: set[int] = set()
+
+    def begin(self, row: int) -> None:
+        """Take a scene as begun."""
+        self._given.add(row)
+        self._ahead.discard(row)
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Step:
+        while len(self._soon) < SCENES_AHEAD and len(self._waiting) < STEPS_AHEAD:
+            step = next(self._steps, None)
+            if step is None:
+                break
+            self._waiting.append(step)
+            row = step.address.row
+            if row not in self._given and row not in self._soon:
+                self._soon.add(row)
+                self._describe(step.address)
+        row = self._waiting[0].address.row if self._waiting else -1
+        if row < 0 or (row not in self._given and len(self._ahead) >= SCENES_AHEAD):
+            raise StopIteration
+        if row not in self._given:
+            self._given.add(row)
+            self._ahead.add(row)
+        self._soon.discard(row)
+        return self._waiting.popleft()
+
+
+class SampleLoader:
+    """Loads samples: flat dicts of numpy arrays and texts.
+
+    Rows of the index, poses, open videos and their current frames are kept for later samples.
+    Threads may share a loader. Files that it opens stay in this process.
+    """
+
+    def __init__(
+        self,
+        index: SceneIndex,
+        request: Request,
+        *,
+        cache: ShardCache | None = None,
+        check: Literal["opened", "metadata"] = "metadata",
+        frames: Literal["shared", "used once"] = "shared",
+        ahead: FetchAhead | None = None,
+    ) -> None:
+        """Prepare to decode; nothing is opened yet.
+
+        Args:
+            index: The scenes.
+            request: What is needed of them.
+            cache: Where to keep what comes from a URL, or None.
+            check: What is compared with its checksum, as `MemberSource` says.
+            frames: Whether several samples may show a frame of a camera, which is kept for them.
+            ahead: What fetches the bytes of samples from a URL; None fetches each as it is read.
+        """
+        self._index = index
+        self._request = request
+        self._source = MemberSource(
+            index.root,
+            shards=index.shards,
+            revision=index.digest,
+            cache=cache,
+            check=check,
+            retry=index.retry,
+            ahead=ahead,
+        )
+        self._ahead = ahead
+        self._frames = frames
+        self._needs = request.streams
+        poses = {request.known[name].needs_poses for name in request.fields}
+        self._poses_needed: Literal["always", "unless rectified", "never"] = "never"
+        if poses - {"never"}:
+            self._poses_needed = "always" if "always" in poses else "unless rectified"
+        # A transform may write into what it is given.
+        self._is_changed = request.transform is not None
+        self._begin_anew(Streams(self._source))
+
+    def _begin_anew(self, streams: Streams) -> None:
+        """Begin with nothing read, and with these videos."""
+        self._streams = streams
+        self._coming = None
+        if self._ahead is not None:
+            self._coming = ComingSamples(self._source, self._ahead, streams)
+        self._described: _DescribedAhead | None = None
+        self._scenes: OrderedDict[int, _KnownScene] = OrderedDict()
+        self._poses: OrderedDict[str, CameraPoses] = OrderedDict()
+
+    @property
+    def stats(self) -> StreamStats:
+        """What this process has open."""
+        return self._streams.stats
+
+    def copy(self) -> Self:
+        """Return a loader of the same samples with open videos of its own."""
+        twin = copy.copy(self)
+        if self._ahead is not None:
+            twin._ahead = FetchAhead(limit_bytes=self._ahead.limit_bytes)
+            twin._source = self._source.fetching_by(twin._ahead)
+        twin._begin_anew(Streams(twin._source))
+        return twin
+
+    def keep_open(self, videos: int, *, frames: int = 1) -> None:
+        """Keep up to so many videos open, and so many frames of each, in each process."""
+        self._streams.limit, self._streams.kept_frames = videos, frames
+
+    @property
+    def fetched(self) -> tuple[int, int]:
+        """How many ranges this process has fetched, and how many bytes."""
+        return self._source.fetched
+
+    @property
+    def has_order(self) -> bool:
+        """Whether samples were decoded as they were expected; True where none is fetched."""
+        return self._coming is None or self._coming.has_order
+
+    def expect(self, steps: Iterable[Step]) -> None:
+        """Take the samples that will be decoded next, so that their bytes are fetched ahead."""
+        if self._coming is not None:
+            if self._index.presumption is not None:
+                self._described = steps = _DescribedAhead(steps, self._describe_soon)
+            self._coming.expect(steps)
+
+    def begin(self, address: Address) -> None:
+        """Fetch what a sample needs, which is decoded next, and what those after it need."""
+        if self._coming is not None:
+            if self._described is not None:
+                self._described.begin(address.row)
+            self._coming.begin(address, self._needed_files)
+
+    def end(self, address: Address) -> None:
+        """Forget the bytes that a sample needed, which was decoded."""
+        if self._coming is not None:
+            self._coming.end(address)
+
+    def release(self, address: Address) -> None:
+        """Close the videos of a run that has been read to its end."""
+        self._streams.release(self._known_scene(address).scene, run=address.run)
+
+    def stop_fetching(self) -> None:
+        """End requests, and expect no sample."""
+        if self._coming is not None:
+            self._coming.close()
+
+    def close(self) -> None:
+        """Close the videos that are open in this process, and end its requests."""
+        self.stop_fetching()
+        self._streams.close()
+        self._scenes.clear()
+
+    def _describe_soon(self, address: Address) -> None:
+        """Describe a sample's presumed scene in the background."""
+        if self._index.presumption is not None:
+            presumed = self._index.indexed_scene(address.row)
+            self._index.presumption.expect(presumed, self._videos(address))
+
+    def _videos(self, address: Address) -> tuple[str, ...]:
+        """Return the names of the videos that a sample needs."""
+        return (
+            *(rgb_name(camera) for camera in self._cameras(address, "rgb")),
+            *(depth_name(camera) for camera in self._cameras(address, "depth")),
+        )
+
+    def _known_scene(self, address: Address) -> _KnownScene:
+        """Return what is known of a sample's scene; that of the last rows asked for is kept."""
+        row, presumption = address.row, self._index.presumption
+        known = self._scenes.get(row)
+        is_far = presumption is not None and presumption.is_remote
+        videos = self._videos(address) if is_far else ()
+        if known is None or not known.videos.issuperset(videos):
+            scene = self._index.scene(row, videos=videos or VIDEO_FILES)
+            self._require_as_presumed(row, scene)
+            if self._coming is not None and not is_far:
+                scene = replace(scene, seek_tables=self._index.seek_tables(row))
+            intrinsics = rig_intrinsics(scene.rig)
+            if self._request.size is not None:
+                height, width = self._request.size
+                intrinsics = intrinsics.resized(width_px=width, height_px=height)
+            encodings = {
+                camera: scene.depth_encoding(camera, self._request.depth or depth_of(scene))
+                for camera in range(len(scene.depth_unit_m))
+            }
+            opened = frozenset(videos) | (known.videos if known is not None else frozenset())
+            known = self._scenes[row] = _KnownScene(scene, intrinsics, encodings, opened)
+            if len(self._scenes) > KEPT_SCENES:
+                self._scenes.popitem(last=False)
+        return known
+
+    def _require_as_presumed(self, row: int, scene: Scene) -> None:
+        """Refuse a scene that was presumed to give what is requested, and does not.
+
+        Where all rows were read, such scenes are no part of the plan. The first of those whose
+        poses are not understood, and not needed either, is told.
+        """
+        presumption, request = self._index.presumption, self._request
+        if presumption is None:
+            return
+        for name in request.fields:
+            for about in request.known[name].stopped_by:
+                if reason := scene.remark(about):
+                    raise StorageError(
+                        f"{self._index.where}: {scene.id.key} cannot give {name!r}: {reason}. "
+                        f"{presumption.cures()}"
+                    )
+        reason = scene.remark("poses")
+        if self._poses_needed == "never" or not reason or presumption.was_told:
+            return
+        if not self._index.indexed_scene(row).remark("poses"):
+            presumption.was_told = True
+            message = (
+                f"{self._index.where}: {scene.id.key} has poses that are not understood, so its "
+                f"rig is assumed rectified ({reason}). There may be more such scenes: "
+                f"`stereogenbench index {self._index.where}` tells all of them."
+            )
+            warnings.warn(text_without_secrets(message), OddSceneWarning, stacklevel=2)
 
     def load(
         self,
@@ -34,17 +323,18 @@ class SampleLoader(SampleDecoder):
             MediaError: If a video does not decode to what the index says.
             SchemaError: If the trajectory does not follow the format.
         """
-        request, scene = self._request, self.scene(address)
+        request, scene = self._request, self._known_scene(address).scene
         size = request.size or (scene.rig.image_height_px, scene.rig.image_width_px)
         writer = SampleWriter(request, address, clip=clip, allocate=allocate)
+        decodes_in_place = self._frames == "used once" and not self._is_changed
         # One frame at a time, or all that a transform treats alike.
         step = 1 if request.transform is None else len(address.frames)
         self.begin(address)
         try:
             for start in range(0, len(address.frames), step):
                 frames = slice(start, start + step)
-                out = writer.pictures(frames, size=size) if self.decodes_in_place else {}
-                views, facts = self.decode(address, frames=frames, out=out)
+                out = writer.pictures(frames, size=size) if decodes_in_place else {}
+                views, facts = self._decoded(address, frames=frames, out=out)
                 if request.transform is not None:
                     views = request.transform(views, np.random.default_rng(seeds))
                 writer.write(views, facts, frames)
@@ -53,3 +343,177 @@ class SampleLoader(SampleDecoder):
         finally:
             self.end(address)
         return {name: writer.sample[name] for name in request.fields}
+
+    def _decoded(
+        self, address: Address, *, frames: slice, out: Mapping[int, Any]
+    ) -> tuple[Views, SceneFacts]:
+        """Return the views of a sample, of some of its frames, and what is known of its scene.
+
+        What was decoded from a cache that was damaged since is decoded again.
+
+        Args:
+            address: The sample.
+            frames: Which of its frames: one, or with a transform any number.
+            out: By camera, the (t, 3, h, w) uint8 arrays to decode into, where each picture is used
+                once and nothing changes it.
+        """
+        known = self._known_scene(address)
+        try:
+            return self._decode(known, address, frames=frames, out=out)
+        except (MediaError, SchemaError, ShardError):
+            names = (*self._videos(address), TRAJECTORY_JSON)
+            if not self._source.drop_damaged(known.scene, map(known.scene.held_name, names)):
+                raise
+            self.close()
+            return self._decode(known, address, frames=frames, out=out)
+
+    def _decode(
+        self, known: _KnownScene, address: Address, *, frames: slice, out: Mapping[int, Any]
+    ) -> tuple[Views, SceneFacts]:
+        scene, intrinsics, encodings = known.scene, known.intrinsics, known.encodings
+        numbers = address.frames[frames]
+        views = Views(
+            source=address.source,
+            targets=address.targets,
+            frames=numbers,
+            pictures=self._pictures(
+                scene,
+                address.run,
+                self._cameras(address, "rgb"),
+                numbers,
+                shape=(len(numbers), 3, intrinsics.height_px, intrinsics.width_px),
+                out=out,
+            ),
+            depths={
+                camera: self._depth(scene, address, camera, numbers, encodings[camera])
+                for camera in self._cameras(address, "depth")
+            },
+            intrinsics=intrinsics,
+        )
+        return views, SceneFacts(
+            scene,
+            encodings,
+            self._camera_poses(scene),
+            url=partial(self._source.url, scene, rgb_name(address.source)),
+            frames=address.frames,
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy in another process needs."""
+        return self.__dict__ | dict.fromkeys(("_coming", "_described", "_scenes", "_poses"))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Become a copy, with nothing read."""
+        self.__dict__.update(state)
+        self._begin_anew(self._streams)
+
+    def _needed_files(self, address: Address) -> NeededFiles:
+        """Return what a sample is read from."""
+        known = self._known_scene(address)
+        scene = known.scene
+        frames = {rgb_name(camera): [*address.frames] for camera in self._cameras(address, "rgb")}
+        for camera in self._cameras(address, "depth"):
+            encoding = known.encodings[camera]
+            lagged = [
+                depth_frame_index(frame, encoding=encoding, frames=scene.frames)
+                for frame in address.frames
+            ]
+            frames[depth_name(camera)] = [frame for frame in lagged if frame is not None]
+        texts = (TRAJECTORY_JSON,) if self._needs_poses(scene) else ()
+        return NeededFiles(scene, frames, texts)
+
+    def _needs_poses(self, scene: Scene) -> bool:
+        rectified = scene.rig_residual_px <= RECTIFIED_PX
+        return self._poses_needed == "always" or (
+            self._poses_needed == "unless rectified" and not rectified
+        )
+
+    def _cameras(self, address: Address, suffix: Literal["rgb", "depth"]) -> list[int]:
+        """Return the cameras whose colour or depth is needed."""
+        cameras = [address.source] if f"source_{suffix}" in self._needs else []
+        if f"target_{suffix}" in self._needs:
+            cameras.extend(address.targets)
+        return list(dict.fromkeys(cameras))
+
+    def _pictures(
+        self,
+        scene: Scene,
+        run: int,
+        cameras: list[int],
+        frames: tuple[int, ...],
+        *,
+        shape: tuple[int, ...],
+        out: Mapping[int, Any],
+    ) -> dict[int, Any]:
+        pictures = {camera: out[camera] for camera in cameras if camera in out}
+        if self._is_changed:
+            pictures = {camera: np.empty(shape, dtype=np.uint8) for camera in cameras}
+        for number, frame in enumerate(frames):
+            for camera in cameras:
+                name = rgb_name(camera)
+                if self._frames == "used once" and camera in pictures:
+                    place = pictures[camera][number]
+                    self._streams.write_rgb(scene, name, frame, out=place, run=run)
+                    continue
+                kept = self._streams.rgb(scene, name, frame, size=self._request.size, run=run)
+                if camera in pictures:
+                    pictures[camera][number] = kept
+                else:
+                    # Without a transform frames come one by one: the kept picture is all of it.
+                    pictures[camera] = kept[None]
+        return pictures
+
+    def _depth(
+        self,
+        scene: Scene,
+        address: Address,
+        camera: int,
+        frames: tuple[int, ...],
+        encoding: DepthEncoding,
+    ) -> StoredDepth:
+        """Return a camera's stored depth over frames; that of single frames is kept."""
+        stored_at = partial(self._stored, scene, camera, run=address.run, encoding=encoding)
+        if len(frames) > 1:
+            parts = [stored_at(frame=frame) for frame in frames]
+            return StoredDepth(
+                units=np.concatenate([part.units for part in parts]),
+                measured=np.concatenate([part.measured for part in parts]),
+            )
+        stored = stored_at(frame=frames[0])
+        if self._is_changed:
+            return StoredDepth(stored.units.copy(), stored.measured.copy())
+        return stored
+
+    def _stored(
+        self, scene: Scene, camera: int, *, frame: int, run: int, encoding: DepthEncoding
+    ) -> StoredDepth:
+        """Return a camera's stored depth at a frame of its pictures, (1, h, w)."""
+        size = self._request.size
+        index = depth_frame_index(frame, encoding=encoding, frames=scene.frames)
+        if index is None:
+            height, width = size or (scene.rig.image_height_px, scene.rig.image_width_px)
+            return StoredDepth(
+                np.zeros((1, height, width), dtype=np.uint16),
+                np.zeros((1, height, width), dtype=bool),
+            )
+        kept = self._streams.read_stored_depth(
+            scene, depth_name(camera), index, encoding=encoding, size=size, run=run
+        )
+        stored = StoredDepth(kept.units[None], kept.measured[None])
+        # Where depth of several frames is kept, what is computed from it would be too much.
+        return stored if self._streams.kept_frames > 1 else replace(stored, derived=kept.derived)
+
+    def _camera_poses(self, scene: Scene) -> CameraPoses | None:
+        if not self._needs_poses(scene):
+            return None
+        poses = self._poses.get(scene.id.key)
+        if poses is None:
+            from stereogenbench_data.index.evidence import poses_as  # slow to import
+
+            text = self._source.read(scene, TRAJECTORY_JSON)
+            where = self._source.label(scene, TRAJECTORY_JSON)
+            poses = poses_as(text, scene.pose_form, where=where)
+            self._poses[scene.id.key] = poses
+            if len(self._poses) > KEPT_POSES:
+                self._poses.popitem(last=False)
+        return poses

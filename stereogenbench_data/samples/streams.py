@@ -50,50 +50,49 @@ class StreamStats(NamedTuple):
     videos_limit: int
 
 
-class _PictureMemory:
-    """Memory for one picture at a time, reused once nobody holds the previous picture.
-
-    New memory costs more than what is written into it: the system clears it first. A weak reference
-    shows whether anybody holds a picture, or a view or tensor of it. Where an interpreter frees
-    objects late, the next picture gets memory of its own.
-    """
-
-    def __init__(self) -> None:
-        self._memory = memoryview(b"")
-        self._last: Callable[[], object] = lambda: None
-
-    def picture(self, *, height: int, width: int) -> UInt8[np.ndarray, "3 h w"]:
-        """Return an array to write a picture into, of any content."""
-        if self._last() is not None or self._memory.nbytes != 3 * height * width:
-            self._memory = np.empty(3 * height * width, dtype=np.uint8).data
-        # All views of the picture are based on this array, and none on what is below it.
-        base = np.frombuffer(self._memory, dtype=np.uint8)
-        self._last = weakref.ref(base)
-        return base.reshape(3, height, width)
-
-
 @dataclass(slots=True)
 class _Stream:
-    reader: Any  # a VideoReader or, of depth that blosc2 packed, DepthFrames
+    """An open video, and what was read of it last.
+
+    Attributes:
+        reader: A `VideoReader` or, of depth that blosc2 packed, `DepthFrames`.
+        file: What it reads.
+        kept: Pictures and stored depth, by their frames.
+        memories: The memory of its last pictures, and weak references to them, the oldest first.
+    """
+
+    reader: Any
     file: Path | MemberFile
     kept: OrderedDict[Any, Any] = field(default_factory=OrderedDict)
-    memories: list[_PictureMemory] = field(default_factory=list)
+    memories: list[tuple[memoryview, Callable[[], object]]] = field(default_factory=list)
 
     def keep(self, key: Any, make: Callable[[], Any], *, most: int) -> Any:
         """Return what is kept under a key, made now unless it is there; the oldest makes room."""
         if key not in self.kept:
             while len(self.kept) >= most:
                 self.kept.popitem(last=False)
-            self.kept[key] = _read_only(make())
+            self.kept[key] = make()
         return self.kept[key]
 
     def picture(self, *, height: int, width: int, most: int) -> UInt8[np.ndarray, "3 h w"]:
-        """Return an array to write a picture into, in the memory of one that nobody has."""
-        while len(self.memories) < most:
-            self.memories.append(_PictureMemory())
-        # The memory that was written longest ago comes first.
-        self.memories.append(self.memories.pop(0))
-        return self.memories[-1].picture(height=height, width=width)
+        """Return an array to write a picture into, of any content.
+
+        It lies in the memory of an earlier picture that nobody holds. New memory costs more than
+        what is written into it: the system clears it first. A weak reference shows whether anybody
+        holds a picture, or a view or tensor of it. Where an interpreter frees objects late, the
+        next picture gets memory of its own.
+        """
+        size = 3 * height * width
+        memory = np.empty(0, dtype=np.uint8).data
+        if len(self.memories) >= most:
+            memory, held = self.memories.pop(0)
+            memory = memory if held() is None else memory[:0]
+        if memory.nbytes != size:
+            memory = np.empty(size, dtype=np.uint8).data
+        # All views of the picture are based on this array, and none on what is below it.
+        base = np.frombuffer(memory, dtype=np.uint8)
+        self.memories.append((memory, weakref.ref(base)))
+        return base.reshape(3, height, width)
 
     def close(self) -> None:
         self.reader.close()
@@ -104,15 +103,21 @@ class _Stream:
 class Streams:
     """A pool of open videos that survives fork and spawn: each process opens its own.
 
-    Threads of one process take turns. Pictures come back read-only, because the pool may hand out
-    the same one again.
+    Threads of one process take turns. Pictures and depth come back read-only, because the pool may
+    hand out the same ones again.
+
+    Attributes:
+        limit: How many videos it keeps open.
+        kept_frames: How many frames of each it keeps.
     """
 
-    def __init__(self, source: MemberSource, *, limit: int = OPEN_STREAMS) -> None:
-        """Open videos from a source, and keep at most ``limit`` of them open."""
+    def __init__(
+        self, source: MemberSource, *, limit: int = OPEN_STREAMS, kept_frames: int = 1
+    ) -> None:
+        """Open videos from a source; none is opened yet."""
         self._source = source
-        self._limit = limit
-        self._kept_frames = 1
+        self.limit = limit
+        self.kept_frames = kept_frames
         self._open: OrderedDict[_Place, _Stream] = OrderedDict()
         self._lock = threading.RLock()
         self._process = os.getpid()
@@ -128,17 +133,19 @@ class Streams:
             StorageError: If the video cannot be read.
             MediaError: If it does not decode to the scene's number of colour pictures.
         """
-        most = self._kept_frames
+        most = self.kept_frames
         height, width = size or (scene.rig.image_height_px, scene.rig.image_width_px)
         with self._stream(scene, name, run) as stream:
             kept: UInt8[np.ndarray, "3 h w"] = stream.keep(
                 (index, size),
-                lambda: read_rgb(
-                    stream.reader,
-                    index,
-                    size=size,
-                    out=stream.picture(height=height, width=width, most=most),
-                    content="colour",
+                lambda: _read_only(
+                    read_rgb(
+                        stream.reader,
+                        index,
+                        size=size,
+                        out=stream.picture(height=height, width=width, most=most),
+                        content="colour",
+                    )
                 ),
                 most=most,
             )
@@ -190,23 +197,23 @@ class Streams:
             MediaError: If it is not one that the encoding describes or does not decode.
         """
         with self._stream(scene, name, run) as stream:
-            units = stream.keep(
-                index, partial(read_depth_units, stream.reader, index, encoding=encoding), most=1
-            )
-            pixel_format = stream.reader.facts.pixel_format
-        if size is not None:
-            units = resized_nearest(units, size=size)
-        return StoredDepth(units, measured(units, encoding=encoding, pixel_format=pixel_format))
+
+            def read() -> StoredDepth:
+                units = read_depth_units(stream.reader, index, encoding=encoding)
+                if size is not None:
+                    units = resized_nearest(units, size=size)
+                pixel_format = stream.reader.facts.pixel_format
+                known = measured(units, encoding=encoding, pixel_format=pixel_format)
+                return StoredDepth(_read_only(units), known)
+
+            kept: StoredDepth = stream.keep((index, size, encoding), read, most=self.kept_frames)
+            return kept
 
     @property
     def stats(self) -> "StreamStats":
         """What this process has open."""
         is_own = os.getpid() == self._process
-        return StreamStats(len(self._open) if is_own else 0, self._limit)
-
-    def keep(self, limit: int, *, frames: int = 1) -> None:
-        """Keep at most so many videos open from now on, and so many pictures of each."""
-        self._limit, self._kept_frames = limit, frames
+        return StreamStats(len(self._open) if is_own else 0, self.limit)
 
     def release(self, scene: Scene, *, run: int = 0) -> None:
         """Close the videos of a scene's run, of which no more is wanted for now."""
@@ -232,7 +239,7 @@ class Streams:
             member, name = scene.member(name), scene.held_name(name)
             place = (member.path, member.offset, run)
             if place not in self._open:
-                while len(self._open) >= self._limit:
+                while len(self._open) >= self.limit:
                     self._open.popitem(last=False)[1].close()
                 file = self._source.open(scene, name)
                 with _cause_raised(file):
@@ -263,7 +270,8 @@ class Streams:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what another process makes a pool of its own from."""
-        return partial(Streams, limit=self._limit), (self._source,)
+        again = partial(Streams, limit=self.limit, kept_frames=self.kept_frames)
+        return again, (self._source,)
 
 
 def _require_size(reader: Any, scene: Scene, *, name: str) -> None:
