@@ -201,8 +201,7 @@ def test_only_what_hangs_on_the_armature_is_the_subject(assets):
     alone = BlenderRenderer(_changed(assets, file, file)).world(proposal())
     changed = _changed(assets, file, file.replace("figure.glb", "figure_extra.blend"))
 
-    with pytest.warns(BlenderAssetWarning, match=r"object 'plinth', hidden: bound to no armature"):
-        world = BlenderRenderer(changed).world(proposal())
+    world = BlenderRenderer(changed).world(proposal())
 
     for points in (each.subject_points_m(spawn, frame=0) for each in (alone, world)):
         np.testing.assert_allclose(points[:, 2].min(), 0, atol=0.02)
@@ -357,10 +356,10 @@ def test_two_parts_write_the_files_of_one_run(renderer, tmp_path):
 FAULTS = {
     "empty.blend": r"empty\.blend: the map is empty.*Show its",
     "dark.blend": r"dark\.blend: it has no light.*set light = \"sky\"",
-    "huge.blend": r"huge\.blend: the map is 8e\+04 m wide.*Set scale = 0\.001",
-    "vast.blend": r"vast\.blend: its ceiling is 280 m high.*Set scale = 0\.01",
-    "tiny.blend": r"tiny\.blend: the map is 0\.08 m wide.*Set scale = 100",
-    "textureless.blend": r"1 textures are missing: //far\.png.*Copy",
+    "huge.blend": r"huge\.blend: its width is 8e\+04 m.*Set scale = 0\.001",
+    "vast.blend": r"vast\.blend: its height inside is 280 m.*Set scale = 0\.01",
+    "tiny.blend": r"tiny\.blend: its width is 0\.08 m.*Set scale = 100",
+    "textureless.blend": r"1 of its files are missing: .*//far\.png.*Copy",
     "far_texture.blend": r"refers to .*outside.far\.png, which is outside the asset folder.*Copy",
     "linked.blend": r"library\.blend.* outside the asset folder",
     "cut.blend": r"cut\.blend: Blender cannot open it",
@@ -380,18 +379,18 @@ def test_a_faulty_map_is_refused_with_the_cure(assets, name):
     ("before", "after", "says"),
     [
         ('[characters.Figure]\nfile = "figure.glb"', '[characters.Figure]\nfile = "boneless.blend"',
-         r"characters\.Figure: .*has no armature.*it has mesh"),
+         r"characters\.Figure: .*has no armature.*it has 'mesh'"),
         ('[characters.Figure]', '[characters.Figure]\nscale = 100',
-         r"characters\.Figure: .*is 170 m tall.*Set scale = 1 "),
+         r"characters\.Figure: .*height is 170 m.*Set scale = 1 "),
         ('[characters.Figure]', '[characters.Figure]\nscale = 0.01',
-         r"is 0\.017 m tall.*Set scale = 1 "),
+         r"height is 0\.017 m.*Set scale = 1 "),
         ('file = "figure.glb"\ntake = "Walk"', 'file = "figure.glb"',
          r"animations\.Walk: .*has 3 takes.*'Lean', 'Turn', 'Walk'"),
-        ('take = "Walk"', 'take = "Run"', r"take = 'Run' names 0 takes.*'Walk'"),
+        ('take = "Walk"', 'take = "Run"', r"'Walk'.*take = 'Run' names 0 of them"),
         ('file = "figure.glb"\ntake = "Walk"', 'file = "other_bones.blend"',
          r"moves no bone of the armature.*'Bip01'.*'arm\.L'"),
         ('file = "figure.glb"\ntake = "Walk"', 'file = "boneless.blend"',
-         r"no take that moves bones"),
+         r"has 0 takes that move bones"),
     ],
 )  # fmt: skip
 def test_a_faulty_subject_is_refused_with_the_cure(assets, before, after, says):
@@ -419,7 +418,7 @@ def test_a_map_of_another_name_is_refused(renderer):
 def test_scripts_in_files_do_not_run_and_are_told(assets):
     changed = _changed(assets, "yard.blend", "scripted.blend")
 
-    with pytest.warns(BlenderAssetWarning, match=r"harm\.py.*driver of 'floor', location"):
+    with pytest.warns(BlenderAssetWarning, match=r"left out or not run: .*was_driven"):
         world = BlenderRenderer(changed).world(proposal())
 
     assert not list((assets.parent / "outside").glob("was_*"))

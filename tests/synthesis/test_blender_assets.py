@@ -1,13 +1,11 @@
 """``assets.toml``, without Blender: what is read, and what is refused in which words."""
 
 import importlib.util
-import json
-import struct
 
 import pytest
 
 from stereogenbench_data.errors import ExtraError, SynthesisError
-from stereogenbench_data.synthesis.blender.assets import gltf_uris, read_assets
+from stereogenbench_data.synthesis.blender.assets import read_assets
 from stereogenbench_data.synthesis.blender.renderer import BlenderRenderer
 
 COMPLETE = """\
@@ -60,15 +58,8 @@ def folder(tmp_path):
     (folder / "maps").mkdir(parents=True)
     (folder / "maps" / "yard.blend").write_bytes(b"BLENDER")
     (folder / "figure.fbx").write_bytes(b"Kaydara")
-    (folder / "room.bin").write_bytes(b"1234")
-    write_gltf(folder / "room.gltf", "room.bin")
+    (folder / "room.gltf").write_text("{}")
     return folder
-
-
-def write_gltf(path, *uris):
-    path.write_text(
-        json.dumps({"asset": {"version": "2.0"}, "buffers": [{"uri": u} for u in uris]})
-    )
 
 
 def read(folder, text):
@@ -111,7 +102,7 @@ def test_what_is_not_said_has_a_default(folder):
         ('file = "room.gltf"', 'fiel = "room.gltf"', r"maps\.Room\.fiel.*unknown.*Choose.*file"),
         ('file = "room.gltf"', "", r"maps\.Room\.file: found None.*must name a file"),
         ('file = "room.gltf"', "file = 3", r"maps\.Room\.file: found 3"),
-        ('"room.gltf"', '"room.obj"', r"found 'room.obj'.*must end in \.blend"),
+        ('"room.gltf"', '"room.obj"', r"found 'room.obj'.*must name a file \(\.blend"),
         ('"room.gltf"', '"hall.gltf"', r"found 'hall.gltf'.*must exist"),
         ('"room.gltf"', '"../room.gltf"', r"found '../room.gltf'.*outside the folder.*Copy"),
         ('"room.gltf"', '"/etc/room.gltf"', r"found '/etc/room.gltf'.*outside the folder"),
@@ -133,7 +124,7 @@ def test_what_is_not_said_has_a_default(folder):
         ("[characters.Figure]", "bounds_m = [0, 1]\n[characters.Figure]", r"bounds_m: found \[0"),
         ("[characters.Figure]", "[sensors]\nsmall = [0, 4]\n[characters.Figure]",
          r"sensors\.small: found \[0, 4\].*positive"),
-        ("[animations.Walk]\nfile = \"figure.fbx\"", "", r"animations: found \{\}.*at least"),
+        ("[animations.Walk]\nfile = \"figure.fbx\"", "", r"animations: found None.*one table"),
         ("[animations.Walk]", "[animations.Walk]\ntake = 3", r"Walk\.take: found 3"),
         ("[animations.Walk]", "[animations.Walk]\nforward = '-y'", r"Walk\.forward.*unknown"),
         ("[animations.Walk]", "[animations.Walk", r"is not TOML.*line 5"),
@@ -157,44 +148,6 @@ def test_a_link_out_of_the_folder_is_refused(folder, tmp_path):
 
     with pytest.raises(SynthesisError, match=r"maps\.Room\.file: found 'room.blend'.*outside"):
         read(folder, LEAST.replace("room.gltf", "room.blend"))
-
-
-@pytest.mark.parametrize(
-    ("uri", "says"),
-    [
-        ("../secret.bin", r"room\.gltf.*found .*outside the folder"),
-        ("%2e%2e/secret.bin", r"room\.gltf.*outside the folder"),
-        ("/etc/passwd", r"room\.gltf.*outside the folder"),
-        ("file:///etc/passwd", r"refers to 'file:///etc/passwd', which is missing"),
-        ("gone.bin", r"refers to 'gone.bin', which is missing"),
-    ],
-)
-def test_gltf_refers_only_to_files_of_the_folder(folder, tmp_path, uri, says):
-    (tmp_path / "secret.bin").write_bytes(b"1234")
-    write_gltf(folder / "room.gltf", uri)
-
-    with pytest.raises(SynthesisError, match=says):
-        read(folder, LEAST)
-
-
-def test_references_of_a_glb_are_read_too(tmp_path):
-    document = json.dumps(
-        {"buffers": [{"byteLength": 4}], "images": [{"uri": "a.png"}, {"uri": "data:,x"}]}
-    ).encode()
-    header = struct.pack("<4sII", b"glTF", 2, 20 + len(document))
-    path = tmp_path / "room.glb"
-    path.write_bytes(header + struct.pack("<II", len(document), 0x4E4F534A) + document)
-
-    assert gltf_uris(path) == ["a.png"]
-
-
-@pytest.mark.parametrize("content", [b"", b"glTF", b"[1, 2]", b"\xff\xfe", b'{"buffers": 3}'])
-def test_what_is_not_gltf_is_refused(tmp_path, content):
-    path = tmp_path / "room.gltf"
-    path.write_bytes(content)
-
-    with pytest.raises(SynthesisError, match=r"room\.gltf: is not glTF.*Export it again"):
-        gltf_uris(path)
 
 
 def test_the_digest_follows_every_file(folder):

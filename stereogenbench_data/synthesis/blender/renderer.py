@@ -1,14 +1,13 @@
 """The renderer ``blender``: users' own assets, by the interface of all renderers."""
 
-import json
 import warnings
 import zlib
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float64
@@ -17,7 +16,14 @@ from PIL import Image
 from stereogenbench_data.errors import SynthesisError, missing_extra
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import CAMERA_COUNT
-from stereogenbench_data.synthesis.blender.assets import Assets, read_assets
+from stereogenbench_data.synthesis.blender.assets import (
+    AnimationAsset,
+    Assets,
+    CharacterAsset,
+    MapAsset,
+    Shot,
+    read_assets,
+)
 from stereogenbench_data.synthesis.blender.process import blender
 from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.renderer import (
@@ -31,17 +37,10 @@ from stereogenbench_data.synthesis.request import SENSOR_MM
 
 _VERSION: Final = 1
 """Goes up when the same assets give other scenes."""
-_LEAST_BLENDER: Final = (5, 2)
 
 
-def _require_blender() -> None:
-    try:
-        found = version("bpy")
-    except PackageNotFoundError:
-        found = "none"
-    if found == "none" or tuple(map(int, found.split(".")[:2])) < _LEAST_BLENDER:
-        why = f"bpy is {found}; at least 5.2 is needed, which needs Python 3.13"
-        raise missing_extra("the renderer blender", "blender", why)
+Asked = tuple[str, MapAsset, CharacterAsset, AnimationAsset]
+"""The folder of the assets, and those of one proposal."""
 
 
 class BlenderAssetWarning(UserWarning):
@@ -64,10 +63,11 @@ class BlenderRenderer:
 
         Raises:
             SynthesisError: If the file does not follow the format.
-            ExtraError: If Blender is not installed, or too old.
+            ExtraError: If Blender is not installed.
         """
         renderer = cls(read_assets(path))
-        _require_blender()
+        if find_spec("bpy") is None:
+            raise missing_extra("Blender", "blender", "bpy is not installed; it needs Python 3.13")
         return renderer
 
     @property
@@ -111,32 +111,14 @@ class BlenderRenderer:
 
     def views(self, plan: ScenePlan, *, cameras: tuple[int, ...]) -> Iterator[RenderedView]:
         """Yield the views of cameras; see `Renderer.views`."""
-        settings = self.assets.settings
+        proposal, settings = plan.proposal, self.assets.settings
+        seed = zlib.crc32(f"{plan.request.seed}/{plan.key}".encode()) >> 1
         for frame in range(len(plan.centres_m)):
-            views = [plan.view(camera=camera, frame=frame) for camera in cameras]
-            process = blender(self.assets.maps[plan.proposal.map_name].file)
+            seen = [plan.view(camera=camera, frame=frame) for camera in cameras]
+            process = blender(self.map_of(proposal).file)
             what = f"{plan.key}, frame {frame}"
-            request = self.request(plan.proposal) | {
-                "call": "render",
-                "view": {
-                    "frame": frame,
-                    "place_m": plan.spawn.place_m.tolist(),
-                    "yaw_deg": plan.spawn.yaw_deg,
-                    "size_px": views[0].size_px,
-                    "focal_px": views[0].focal_px,
-                    "folder": str(process.folder),
-                    "seed": zlib.crc32(f"{plan.request.seed}/{plan.key}".encode()) >> 1,
-                    "samples_per_pixel": settings.samples_per_pixel,
-                    "device": settings.device,
-                    "denoise": settings.denoise,
-                    "threads": settings.threads,
-                },
-            }
-            eyes_m, axes = (
-                np.stack([np.asarray(getattr(view, name), np.float64) for view in views])
-                for name in ("eye", "axes")
-            )
-            _, (depths_m,) = process.call(request, [eyes_m, axes], what=what)
+            shot = Shot(frame, plan.spawn, seen, seed, settings, process.folder)
+            depths_m = process.call("render", *self.asked(proposal), shot, what=what)
             for number, depth_m in enumerate(depths_m):
                 path = process.folder / f"view_{number}.png"
                 try:
@@ -150,39 +132,27 @@ class BlenderRenderer:
                     ) from error
                 yield RenderedView(picture=shown, depth_m=depth_m)
 
-    def request(self, proposal: Proposal) -> dict[str, Any]:
-        """Return the map and the subject of a proposal, as the worker wants them.
+    def map_of(self, proposal: Proposal) -> MapAsset:
+        """Return the map of a proposal.
 
         Raises:
             SynthesisError: If there is no such map.
         """
-        assets = self.assets
-        if proposal.map_name not in assets.maps:
+        if proposal.map_name not in self.assets.maps:
             raise unknown_map(
-                f"{assets.path}: maps", proposal.map_name, self.maps,
+                f"{self.assets.path}: maps", proposal.map_name, self.maps,
                 choose=f"one of {', '.join(self.maps)}, or all",
             )  # fmt: skip
-        the_map = assets.maps[proposal.map_name]
-        character = assets.characters[proposal.character]
-        animation = assets.animations[proposal.animation]
-        return {
-            "map": {
-                "root": str(assets.root),
-                "where": f"{assets.path}: maps.{proposal.map_name}: {the_map.file}",
-                "path": the_map.file,
-                "scale": the_map.scale,
-                "light": the_map.light,
-                "is_bounded": the_map.bounds_m is not None,
-            },
-            "subject": {
-                "character": asdict(character),
-                "character_where": f"{assets.path}: characters.{proposal.character}: "
-                f"{character.file}",
-                "animation": asdict(animation),
-                "animation_where": f"{assets.path}: animations.{proposal.animation}: "
-                f"{animation.file}",
-            },
-        }
+        return self.assets.maps[proposal.map_name]
+
+    def asked(self, proposal: Proposal) -> Asked:
+        """Return the assets of a proposal, as the process of Blender wants them."""
+        return (
+            str(self.assets.root),
+            self.map_of(proposal),
+            self.assets.characters[proposal.character],
+            self.assets.animations[proposal.animation],
+        )
 
     def description(self, plan: ScenePlan) -> dict[str, object]:
         """Return the document of ``scene_description_qwen_dataset_level.json``."""
@@ -209,27 +179,14 @@ class BlenderWorld:
         Raises:
             SynthesisError: If one of them cannot be opened or used.
         """
-        self._request = renderer.request(proposal)
-        self._what = f"{proposal.map_name}, {proposal.character}, {proposal.animation}"
-        asset = renderer.assets.maps[proposal.map_name]
-        bounds_m, spawn_bounds_m, self._points_m = _facts(
-            json.dumps(self._request), proposal.request.frames
-        )
+        self._asked = renderer.asked(proposal)
+        asset = renderer.map_of(proposal)
+        bounds_m, spawn_bounds_m, self._points_m = _facts(self._asked, proposal.request.frames)
         if asset.bounds_m is not None:
-            bounds_m = spawn_bounds_m = np.array(asset.bounds_m)
+            bounds_m = spawn_bounds_m = np.array(asset.bounds_m, np.float64)
         if asset.spawn_bounds_m is not None:
-            spawn_bounds_m = np.array(asset.spawn_bounds_m)
-        self._bounds_m, self._spawn_bounds_m = bounds_m, spawn_bounds_m
-
-    @property
-    def bounds_m(self) -> Bounds:
-        """The part of the map in which cameras may be."""
-        return Bounds(*self._bounds_m)
-
-    @property
-    def spawn_bounds_m(self) -> Bounds:
-        """The part in which subjects are spawned."""
-        return Bounds(*self._spawn_bounds_m)
+            spawn_bounds_m = np.array(asset.spawn_bounds_m, np.float64)
+        self.bounds_m, self.spawn_bounds_m = Bounds(*bounds_m), Bounds(*spawn_bounds_m)
 
     def cast(
         self, origins_m: Float64[np.ndarray, "n 3"], directions: Float64[np.ndarray, "n 3"]
@@ -239,10 +196,9 @@ class BlenderWorld:
         A ray starts inside a solid if backs of faces are around it, along one axis less than 2 m
         apart; so a room whose faces look outwards is not taken for a solid.
         """
-        arrays = [np.asarray(each, np.float64) for each in (origins_m, directions)]
-        process = blender(self._request["map"]["path"])
-        _, (found_m,) = process.call(
-            self._request | {"call": "cast"}, arrays, what=f"{self._what}: rays"
+        root, asset, *_ = self._asked
+        found_m: Float64[np.ndarray, " n"] = blender(asset.file).call(
+            "cast", root, asset, origins_m, directions, what=f"{asset.where}: rays"
         )
         return found_m
 
@@ -254,20 +210,18 @@ class BlenderWorld:
 
 
 @lru_cache(maxsize=64)
-def _facts(request_json: str, frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _facts(asked: Asked, frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the bounds of a map, those of spawns, and a subject's points for a spawn at 0.
 
     Bounds are two corners, and points are (frames, p, 3).
     """
-    request = json.loads(request_json)
-    process = blender(request["map"]["path"])
-    answer, (bounds_m, spawn_bounds_m, points_m) = process.call(
-        request | {"call": "facts", "frames": frames}, what=request["map"]["where"]
-    )
-    if answer["notes"]:
+    _, asset, *_ = asked
+    *found, notes = blender(asset.file).call("facts", *asked, frames, what=asset.where)
+    if notes:
         warnings.warn(
-            f"{request['map']['where']}: left out or not run: {'; '.join(answer['notes'])}.",
+            f"{asset.where}: left out or not run: {'; '.join(notes)}.",
             BlenderAssetWarning,
             stacklevel=2,
         )
+    bounds_m, spawn_bounds_m, points_m = found
     return bounds_m, spawn_bounds_m, points_m

@@ -1,7 +1,6 @@
 """One scene inside Blender: it opens assets, answers rays, and renders frames with their depth.
 
-`worker.py` loads it by its path, so it imports only the standard library, NumPy and Blender's
-modules.
+A process of its own imports it (`process.py`), because Blender is a global of its process.
 
 Axes here are Blender's: right-handed, x and y level, z up, in units of the map's file; `Mirror`
 turns map axes into them. Blender evaluates a scene anew for each render, and otherwise than for its
@@ -23,9 +22,17 @@ import numpy as np
 from mathutils import Matrix
 from mathutils.bvhtree import BVHTree
 
+from stereogenbench_data.synthesis.blender.assets import (
+    AnimationAsset,
+    CharacterAsset,
+    MapAsset,
+    RenderSettings,
+    Shot,
+)
+from stereogenbench_data.synthesis.renderer import View
+
 Array = Any
 
-_GATHER: Final = "STEREOGENBENCH_GATHER"
 _RATE_HZ: Final = 15.0
 _MESHES: Final = frozenset({"MESH", "CURVE", "SURFACE", "FONT", "META"})
 _WITHOUT_MESH: Final = frozenset({"CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL"})
@@ -269,64 +276,19 @@ def first_hits(searched: list[Triangles], origins: Array, directions: Array) -> 
     return best
 
 
-def pass_through(
-    searched: list[Triangles], hits: Hits, *, eye: Array, ways: Array, seen: Array
-) -> Array:
-    """Return the depth of rays that meet a material with holes first.
-
-    Cycles tells, to the precision of its pass of depth, which of the surfaces along a ray is seen;
-    how far that is comes from its triangle.
-
-    Args:
-        searched: The triangles.
-        hits: What the rays meet first.
-        eye: Where they start.
-        ways: (n, 3) their directions, whose part along the optical axis is 1.
-        seen: (n,) the pass, whose largest numbers mean that nothing is seen.
-    """
-    depth = hits.distance.copy()
-    rays = np.flatnonzero(hits.is_cut)
-    depth[rays] = np.where(seen[rays] < _NOTHING, depth[rays], np.inf)
-    at = hits.distance[rays]
-    first = at.copy()
-    for _ in range(_MOST_LAYERS):
-        if not rays.size:
-            break
-        onward = at * (1 + 1e-6) + 1e-6
-        behind = first_hits(searched, eye + onward[:, None] * ways[rays], ways[rays])
-        at = onward + behind.distance
-        nearer = np.abs(at - seen[rays]) < np.abs(depth[rays] - seen[rays])
-        nearer &= seen[rays] < _NOTHING
-        depth[rays[nearer]] = at[nearer]
-        # Something solid is behind, yet Cycles saw nothing: its ray ended at a half-open surface.
-        lost = (seen[rays] >= _NOTHING) & np.isfinite(at) & ~behind.is_cut
-        depth[rays[lost]] = first[lost]
-        more = np.isfinite(at) & behind.is_cut
-        rays, at, first = rays[more], at[more], first[more]
-    return depth
-
-
-class _GatherEngine(bpy.types.RenderEngine):
-    """A render engine that draws nothing: Blender hands it the scene as evaluated for rendering."""
-
-    bl_idname = _GATHER
-    bl_label = "Gather triangles"
-    seen: Callable[[Any], None]
-
-    def render(self, depsgraph: Any) -> None:
-        """Hand the evaluated scene on."""
-        type(self).seen(depsgraph)
-
-
 @contextlib.contextmanager
-def _around_cycles(before: Callable[[Any], None], after: Callable[[Any], None]) -> Iterator[None]:
-    """Hand over the evaluated scene before Cycles renders it, and the engine with its result."""
+def _around_cycles(
+    before: Callable[[Any], None] | None = None, after: Callable[[Any], None] | None = None
+) -> Iterator[None]:
+    """Hand over the scene as evaluated for Cycles before it renders, and its engine afterwards."""
     from cycles import CyclesRender, engine
 
     def render(self: Any, depsgraph: Any) -> None:
-        before(depsgraph)
+        if before is not None:
+            before(depsgraph)
         engine.render(self, depsgraph)
-        after(self)
+        if after is not None:
+            after(self)
 
     own = CyclesRender.render
     CyclesRender.render = render
@@ -353,56 +315,20 @@ def check_files(where: str, *, root: str) -> None:
                 f"{where}: it refers to {path}, which is outside the asset folder {root}. Copy "
                 f"that file into the folder and point to it there, or pack it into the .blend file."
             )
-    for library in bpy.data.libraries:
-        path = bpy.path.abspath(library.filepath)
-        if library.is_missing or not (_inside(path, root) or _inside(path, own)):
-            raise AssetError(
-                f"{where}: the library {path} is missing or outside the asset folder {root}. Copy "
-                f"it into the folder and relocate it in Blender."
-            )
-    missing = sorted(
-        {
-            image.filepath or image.name
-            for image in bpy.data.images
-            if image.source in ("FILE", "SEQUENCE", "MOVIE")
-            and image.users > image.use_fake_user
-            and image.packed_file is None
-            and not image.packed_files
-            and not Path(bpy.path.abspath(image.filepath, library=image.library)).exists()
-        }
-    )
+    missing = {library.filepath for library in bpy.data.libraries if library.is_missing}
+    for image in bpy.data.images:
+        is_needed = image.source in ("FILE", "SEQUENCE", "MOVIE") and (
+            image.users > image.use_fake_user and not image.packed_files
+        )
+        path = bpy.path.abspath(image.filepath, library=image.library)
+        if is_needed and not Path(path).exists():
+            missing.add(image.filepath or image.name)
     if missing:
-        shown = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
         raise AssetError(
-            f"{where}: {len(missing)} textures are missing: {shown}. Copy them beside the file and "
-            f"repair the paths (Blender: File, External Data, Find Missing Files), or pack them."
+            f"{where}: {len(missing)} of its files are missing: {_few(missing)}. Copy them beside "
+            f"it and repair the paths (Blender: File, External Data, Find Missing Files), or pack "
+            f"them."
         )
-    readers = sorted(
-        {
-            tree.name
-            for tree in bpy.data.node_groups
-            for node in tree.nodes
-            if node.bl_idname.startswith("GeometryNodeImport")
-        }
-    )
-    if readers:
-        raise AssetError(
-            f"{where}: the node group {readers[0]!r} imports files while the scene is evaluated. "
-            f"Apply its modifier in Blender and save the file again."
-        )
-
-
-def unrun_scripts() -> list[str]:
-    """Return what would have run Python if automatic execution were on."""
-    notes = [f"text {text.name!r}" for text in bpy.data.texts if text.use_module]
-    kinds = ("objects", "armatures", "meshes", "shape_keys", "materials", "node_groups", "lights")
-    for kind in (*kinds, "cameras", "curves", "scenes", "worlds"):
-        for owner in getattr(bpy.data, kind):
-            data = owner.animation_data
-            for curve in data.drivers if data else ():
-                if curve.driver.type == "SCRIPTED" and not curve.driver.is_simple_expression:
-                    notes.append(f"driver of {owner.name!r}, {curve.data_path}")
-    return notes
 
 
 def _rate_hz(scene: Any) -> float:
@@ -472,33 +398,30 @@ def _rendered(layer: Any) -> Iterator[Any]:
 # Light.
 
 
+_GLOWING: Final = {
+    "ShaderNodeBackground": ("Color", "Strength"),
+    "ShaderNodeEmission": ("Color", "Strength"),
+    "ShaderNodeBsdfPrincipled": ("Emission Color", "Emission Strength"),
+}
+
+
 def _is_lit(scene: Any) -> bool:
-    if any(
-        item.type == "LIGHT" and not item.hide_render and item.data.energy > 0
-        for item in scene.objects
-    ):
+    """Return whether there is a lamp, a background or a glowing material."""
+    shown = [item for item in scene.objects if not item.hide_render]
+    if any(item.type == "LIGHT" and item.data.energy > 0 for item in shown):
         return True
-    for tree in (scene.world.node_tree if scene.world else None, *_material_trees(scene)):
-        for node in tree.nodes if tree else ():
-            if node.mute:
-                continue
-            if node.bl_idname in ("ShaderNodeBackground", "ShaderNodeEmission"):
-                colour, strength = node.inputs["Color"], node.inputs["Strength"]
-            elif node.bl_idname == "ShaderNodeBsdfPrincipled":
-                colour, strength = node.inputs["Emission Color"], node.inputs["Emission Strength"]
-            else:
-                continue
-            is_coloured = colour.is_linked or max(colour.default_value[:3]) > 0
-            if is_coloured and (strength.is_linked or strength.default_value > 0):
-                return True
+    materials = [slot.material for item in shown for slot in item.material_slots]
+    trees = [owner.node_tree for owner in (scene.world, *materials) if owner is not None]
+    for node in (node for tree in trees if tree is not None for node in tree.nodes):
+        sockets = [node.inputs[name] for name in _GLOWING.get(node.bl_idname, ())]
+        if sockets and not node.mute and all(map(_is_set, sockets)):
+            return True
     return False
 
 
-def _material_trees(scene: Any) -> Iterator[Any]:
-    for item in scene.objects:
-        for slot in item.material_slots:
-            if slot.material is not None and not item.hide_render:
-                yield slot.material.node_tree
+def _is_set(socket: Any) -> bool:
+    """Return whether a colour (whose alpha does not count) or a number may be above 0."""
+    return socket.is_linked or bool(np.max(np.atleast_1d(socket.default_value)[:3]) > 0)
 
 
 def _add_sky(scene: Any) -> None:
@@ -524,28 +447,26 @@ def _add_sky(scene: Any) -> None:
 class Subject:
     """A character with one take of an animation, below an empty object that places it."""
 
-    def __init__(self, spec: dict[str, Any], *, root: str, unit_m: float) -> None:
-        character, animation = spec["character"], spec["animation"]
-        where = spec["character_where"]
-        scripts = set(unrun_scripts())
-        objects, actions, rate_hz = _add(character["file"], where)
-        check_files(where, root=root)
+    def __init__(
+        self, character: CharacterAsset, animation: AnimationAsset, *, root: str, unit_m: float
+    ) -> None:
+        objects, actions, rate_hz = _add(character.file, character.where)
+        check_files(character.where, root=root)
         self.objects = [item for item in objects if item.type not in ("LIGHT", "CAMERA", "SPEAKER")]
         for item in objects:
             if item not in self.objects:
                 bpy.data.objects.remove(item)
-        self.armature, unbound = _armature_of(self.objects, where=where)
-        if animation["file"] != character["file"]:
-            others, actions, rate_hz = _add(animation["file"], spec["animation_where"])
-            check_files(spec["animation_where"], root=root)
+        self.armature = _armature_of(self.objects, where=character.where)
+        if animation.file != character.file:
+            others, actions, rate_hz = _add(animation.file, animation.where)
+            check_files(animation.where, root=root)
             for item in others:
                 bpy.data.objects.remove(item)
-        self.notes = [*sorted(set(unrun_scripts()) - scripts), *unbound]
-        action = _take(actions, name=animation["take"], where=spec["animation_where"])
-        self.rate_hz = animation["rate_hz"] or rate_hz
+        action = _take(actions, name=animation.take, where=animation.where)
+        self.rate_hz = animation.rate_hz or rate_hz
         self.start, end = map(float, action.frame_range)
         self.frames = max(end - self.start, 1e-6)
-        self.strips = self._animate(action, where=spec["animation_where"])
+        self.strip = self._animate(action, where=animation.where)
         self.names = frozenset(item.name for item in self.objects)
         self.unit_m = unit_m
         self.empty = bpy.data.objects.new("StereoGenBench subject", None)
@@ -553,12 +474,15 @@ class Subject:
         for item in self.objects:
             if item.parent is None:
                 item.parent = self.empty
-        self.scale = character["scale"] / unit_m
-        self.facing = {"-y": 0.0, "+x": -90.0, "+y": 180.0, "-x": 90.0}[character["forward"]]
-        self._measure(character["scale"], repeat=animation["repeat"], where=where)
+        self.scale = character.scale / unit_m
+        self.facing = {"-y": 0.0, "+x": -90.0, "+y": 180.0, "-x": 90.0}[character.forward]
+        self._measure(character, repeat=animation.repeat)
 
-    def _animate(self, action: Any, *, where: str) -> list[Any]:
-        """Bind the take to the armature and, where they have a slot of their own, to the rest."""
+    def _animate(self, action: Any, *, where: str) -> Any:
+        """Bind the take to the armature, in place of all that moved its objects.
+
+        Its time is then that of the strip, which is set by hand.
+        """
         bones = self.armature.data.bones
         own_slot = max(
             action.slots, key=lambda slot: len(_bones_of(action, slot).keys() & bones.keys())
@@ -576,15 +500,23 @@ class Subject:
                 pose.rotation_mode = "QUATERNION"
             elif "rotation_euler" in names and pose.rotation_mode in ("QUATERNION", "AXIS_ANGLE"):
                 pose.rotation_mode = "XYZ"
-        strips = []
         for item in self.objects:
-            for owner in filter(None, (item, getattr(item.data, "shape_keys", None))):
-                slot = own_slot if owner == self.armature else _slot_of(action, owner)
-                strips += _bind(owner, action=action, slot=slot)
-        return strips
+            for owner in (item, getattr(item.data, "shape_keys", None)):
+                if owner is not None and owner.animation_data is not None:
+                    owner.animation_data.action = None
+                    for track in list(owner.animation_data.nla_tracks):
+                        owner.animation_data.nla_tracks.remove(track)
+        tracks = self.armature.animation_data_create().nla_tracks
+        strip = tracks.new().strips.new("take", 1, action)
+        strip.action_slot = own_slot
+        strip.frame_end = strip.frame_start + _STRIP_FRAMES
+        strip.frame_start = -_STRIP_FRAMES
+        strip.use_animated_time = True
+        return strip
 
-    def _measure(self, scale: float, *, repeat: str, where: str) -> None:
+    def _measure(self, character: CharacterAsset, *, repeat: str) -> None:
         """Find the soles, the height, and how the take repeats."""
+        where, scale = character.where, character.scale
         self.place(None, time_frames=self.start)
         points = self._vertices()
         if not len(points):
@@ -594,12 +526,7 @@ class Subject:
             )
         low, high = points.min(axis=0), points.max(axis=0)
         height_m = float(high[2] - low[2]) * scale
-        if not _HEIGHT_M[0] <= height_m <= _HEIGHT_M[1]:
-            raise AssetError(
-                f"{where}: it is {height_m:.3g} m tall, and subjects are "
-                f"{_HEIGHT_M[0]:g} to {_HEIGHT_M[1]:g} m. "
-                + _scale_cure(height_m, scale, within=_HEIGHT_M)
-            )
+        _require_size("height", height_m, scale, where=where, within=_HEIGHT_M, usual=_HEIGHT_M)
         self.chosen = _spread(points)
         first = self._bones()
         # No frame puts a sole below the floor on which the subject stands.
@@ -635,8 +562,7 @@ class Subject:
         self, spawn: tuple[Array, float] | None, *, time_frames: float, times: int = 0
     ) -> None:
         """Put the subject at a place and a heading, in its file's own axes for None."""
-        for strip in self.strips:
-            strip.strip_time = time_frames
+        self.strip.strip_time = time_frames
         if spawn is None:
             self.empty.matrix_world = Matrix.Identity(4)
         else:
@@ -681,26 +607,22 @@ class Subject:
         return placed
 
 
-def _armature_of(objects: list[Any], *, where: str) -> tuple[Any, list[str]]:
-    """Return the armature with the most bones, and notes on meshes that are hidden.
+def _armature_of(objects: list[Any], *, where: str) -> Any:
+    """Return the armature with the most bones.
 
-    Meshes that hang on no armature are no part of the subject, such as a floor that it stands on.
+    Meshes that hang on no armature are hidden: they are no part of the subject, such as a floor
+    that it stands on.
     """
     armatures = [item for item in objects if item.type == "ARMATURE"]
     if not armatures:
-        found = ", ".join(sorted({item.type.lower() for item in objects})) or "nothing"
         raise AssetError(
-            f"{where}: it has no armature, so it cannot be animated; it has {found}. Export the "
-            f"skeleton with the mesh, or name another file."
+            f"{where}: it has no armature, so it cannot be animated; it has "
+            f"{_few({item.type.lower() for item in objects})}. Export the skeleton with the mesh, "
+            f"or name another file."
         )
-    markers = {bone.custom_shape for each in armatures for bone in each.pose.bones}
-    notes = []
     for item in objects:
-        if item.type in _MESHES and not item.hide_render and not _is_bound(item):
-            item.hide_render = True
-            if item not in markers:
-                notes.append(f"object {item.name!r}, hidden: bound to no armature")
-    return max(armatures, key=lambda item: len(item.data.bones)), notes
+        item.hide_render |= item.type in _MESHES and not _is_bound(item)
+    return max(armatures, key=lambda item: len(item.data.bones))
 
 
 def _is_bound(item: Any) -> bool:
@@ -725,40 +647,6 @@ def _bones_of(action: Any, slot: Any) -> dict[str, set[str]]:
     return moved
 
 
-def _slot_of(action: Any, owner: Any) -> Any:
-    """Return the slot of an action that is named after an object or its shape keys, else None."""
-    return next(
-        (
-            slot
-            for slot in action.slots
-            if slot.target_id_type == owner.id_type
-            and _stem(slot.name_display) == _stem(owner.name)
-        ),
-        None,
-    )
-
-
-def _bind(owner: Any, *, action: Any, slot: Any) -> list[Any]:
-    """Replace what moves an object by a strip of an action, whose time is then set by hand."""
-    data = owner.animation_data_create()
-    data.action = None
-    for track in list(data.nla_tracks):
-        data.nla_tracks.remove(track)
-    if slot is None:
-        return []
-    strip = data.nla_tracks.new().strips.new("take", 1, action)
-    strip.action_slot = slot
-    strip.frame_end = strip.frame_start + _STRIP_FRAMES
-    strip.frame_start = -_STRIP_FRAMES
-    strip.use_animated_time = True
-    return [strip]
-
-
-def _stem(name: str) -> str:
-    """Return a name without the number that Blender adds where it is taken."""
-    return re.sub(r"\.\d{3,}$", "", name)
-
-
 def _take(actions: list[Any], *, name: str | None, where: str) -> Any:
     takes = {
         action.name: action
@@ -767,25 +655,14 @@ def _take(actions: list[Any], *, name: str | None, where: str) -> Any:
     }
     if name is None and len(takes) == 1:
         return next(iter(takes.values()))
-    matching = [
-        action
-        for full, action in sorted(takes.items())
-        if name is not None and (full == name or name in full.split("|"))
-    ]
-    if len(matching) == 1:
-        return matching[0]
-    if not takes:
+    matching = [action for full, action in takes.items() if name in (full, *full.split("|"))]
+    if len(matching) != 1:
+        asked = "" if name is None else f"; take = {name!r} names {len(matching)} of them"
         raise AssetError(
-            f"{where}: it has no take that moves bones. Export the animation with the armature, or "
-            f"name another file."
+            f"{where}: it has {len(takes)} takes that move bones ({_few(takes, 12)}){asked}. Name "
+            f"one of them by `take`, or export the animation with the armature."
         )
-    if name is None:
-        raise AssetError(
-            f"{where}: it has {len(takes)} takes. Say which by `take`: {_few(takes, 12)}."
-        )
-    raise AssetError(
-        f"{where}: take = {name!r} names {len(matching)} takes. The file has {_few(takes, 12)}."
-    )
+    return matching[0]
 
 
 def _few(names: Any, most: int = 4) -> str:
@@ -795,11 +672,24 @@ def _few(names: Any, most: int = 4) -> str:
     )
 
 
-def _scale_cure(size_m: float, scale: float, *, within: tuple[float, float]) -> str:
-    for factor in _UNITS_M:
-        if within[0] <= size_m * factor <= within[1]:
-            return f"Set scale = {scale * factor:g} there, which makes it {size_m * factor:.3g} m."
-    return "Set scale there to the metres in one unit of the file."
+def _require_size(
+    what: str,
+    size_m: float,
+    scale: float,
+    *,
+    where: str,
+    within: tuple[float, float],
+    usual: tuple[float, float],
+) -> None:
+    """Refuse a size that tells of a wrong scale, and name the scale that makes it a usual one."""
+    if within[0] <= size_m <= within[1]:
+        return
+    likely = [factor for factor in _UNITS_M if usual[0] <= size_m * factor <= usual[1]]
+    cure = f"Set scale = {scale * likely[0]:g}" if likely else "Set scale to metres in a unit"
+    raise AssetError(
+        f"{where}: its {what} is {size_m:.3g} m, and should be {within[0]:g} to {within[1]:g} m. "
+        f"{cure} there. If a map is right, set bounds_m to the part where cameras may be."
+    )
 
 
 def _spread(points: Array) -> Array:
@@ -818,40 +708,39 @@ def _spread(points: Array) -> Array:
 class Stage:
     """The one scene of this process: a map, and a subject in it."""
 
-    def __init__(self, spec: dict[str, Any]) -> None:
-        self.root: str = spec["root"]
-        where = self.where = spec["where"]
+    def __init__(self, root: str, asset: MapAsset) -> None:
+        self.root, self.asset = root, asset
+        where = asset.where
         bpy.ops.wm.read_factory_settings(use_empty=True)
         bpy.context.preferences.filepaths.use_scripts_auto_execute = False
-        path = spec["path"]
-        if Path(path).suffix.lower() == ".blend":
+        if Path(asset.file).suffix.lower() == ".blend":
             try:
-                bpy.ops.wm.open_mainfile(filepath=path, load_ui=False, use_scripts=False)
+                bpy.ops.wm.open_mainfile(filepath=asset.file, load_ui=False, use_scripts=False)
             except RuntimeError as error:
                 raise AssetError(
                     f"{where}: Blender cannot open it ({str(error).strip()}). Save it again with "
                     f"Blender 5.2."
                 ) from error
         else:
-            _import(path, where)
+            _import(asset.file, where)
         check_files(where, root=self.root)
         self.scene = bpy.context.scene
         units = self.scene.unit_settings
         self.mirror = Mirror(
-            spec["scale"] * (1.0 if units.system == "NONE" else float(units.scale_length))
+            asset.scale * (1.0 if units.system == "NONE" else float(units.scale_length))
         )
         self.start = self.scene.frame_start
         self.rate_hz = _rate_hz(self.scene)
-        self.notes = unrun_scripts()
+        self.notes: list[str] = []
         self._prepare()
-        if spec["light"] == "sky":
+        if asset.light == "sky":
             _add_sky(self.scene)
         self.subject: Subject | None = None
         self._own: set[Any] = set()
-        self._subject_spec: dict[str, Any] = {}
+        self._subject_assets: tuple[CharacterAsset, AnimationAsset] | None = None
         self.surfaces = Surfaces()
         self.still = self._gather()
-        self.bounds_m, self.spawn_bounds_m = self._bounds(spec)
+        self.bounds_m, self.spawn_bounds_m = self._bounds()
         self._own = {*bpy.data.objects, *bpy.data.actions}
         if not _is_lit(self.scene):
             raise AssetError(
@@ -878,7 +767,7 @@ class Stage:
                     if settings.render_type in ("PATH", "HALO", "LINE"):
                         modifier.show_render = False
                         self.notes.append(f"hair of {item.name!r}, hidden: no depth")
-                if modifier.type == "SUBSURF" and hasattr(modifier, "use_adaptive_subdivision"):
+                if modifier.type == "SUBSURF":
                     modifier.use_adaptive_subdivision = False
         for material in bpy.data.materials:
             # Displacement that only Cycles sees would not be in the depth.
@@ -886,51 +775,51 @@ class Stage:
         for layer in scene.view_layers:
             layer.use = layer == bpy.context.view_layer
         scene.frame_set(self.start)
+        if bpy.app.autoexec_fail:
+            self.notes.append(bpy.app.autoexec_fail_message)
 
     def _gather(self) -> list[Triangles]:
         """Return the map's triangles at its first frame, without the subject."""
         found: list[Mesh] = []
-        _GatherEngine.seen = lambda depsgraph: found.extend(
-            triangles_of(depsgraph, subject=frozenset())
-        )
-        self.scene.render.engine = _GATHER
+        self.scene.render.engine = "CYCLES"
         self.scene.render.use_multiview = False
-        self.scene.render.resolution_x = self.scene.render.resolution_y = 16
+        self.scene.render.resolution_x = self.scene.render.resolution_y = 1
+        self.scene.cycles.samples = 1
         if self.scene.camera is None:
             camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
             self.scene.collection.objects.link(camera)
             self.scene.camera = camera
-        bpy.ops.render.render()
+        with _around_cycles(
+            lambda depsgraph: found.extend(triangles_of(depsgraph, subject=frozenset()))
+        ):
+            bpy.ops.render.render()
         return self.surfaces.at_frame(found)
 
-    def _bounds(self, spec: dict[str, Any]) -> tuple[Array, Array]:
+    def _bounds(self) -> tuple[Array, Array]:
         """Return two corners of where cameras may be, and of where subjects are spawned."""
+        asset = self.asset
         points = np.concatenate([each.vertices for each in self.still])
         if not len(points):
             raise AssetError(
-                f"{self.where}: the map is empty: no mesh of its scene is rendered. Show its "
+                f"{asset.where}: the map is empty: no mesh of its scene is rendered. Show its "
                 f"collections in renders, or name another file."
             )
         corners = self.mirror.to_map(np.stack([points.min(axis=0), points.max(axis=0)]))
         bounds_m: Array = np.sort(corners, axis=0)
         low, high = bounds_m
-        size_m = float((high - low).max())
-        if not (spec["is_bounded"] or _MAP_SIZE_M[0] <= size_m <= _MAP_SIZE_M[1]):
-            raise AssetError(
-                f"{self.where}: the map is {size_m:.4g} m wide, and maps are {_MAP_SIZE_M[0]:g} to "
-                f"{_MAP_SIZE_M[1]:g} m. {_scale_cure(size_m, spec['scale'], within=(4.0, 200.0))} "
-                f"If it is right, set bounds_m to the part where cameras may be."
-            )
         floor_m, ceiling_m = self._floor_and_ceiling_m(low, high)
+        if asset.bounds_m is None:
+            width_m = float((high - low).max())
+            _require_size(
+                "width", width_m, asset.scale,
+                where=asset.where, within=_MAP_SIZE_M, usual=(4.0, 200.0),
+            )  # fmt: skip
+            if np.isfinite(ceiling_m):
+                _require_size(
+                    "height inside", ceiling_m - floor_m, asset.scale,
+                    where=asset.where, within=_ROOM_HEIGHT_M, usual=(2.0, 12.0),
+                )  # fmt: skip
         if np.isfinite(ceiling_m):
-            height_m = ceiling_m - floor_m
-            if not (spec["is_bounded"] or _ROOM_HEIGHT_M[0] <= height_m <= _ROOM_HEIGHT_M[1]):
-                raise AssetError(
-                    f"{self.where}: its ceiling is {height_m:.4g} m high, and rooms are "
-                    f"{_ROOM_HEIGHT_M[0]:g} to {_ROOM_HEIGHT_M[1]:g} m. "
-                    f"{_scale_cure(height_m, spec['scale'], within=(2.0, 12.0))} "
-                    f"If it is right, set bounds_m to the part where cameras may be."
-                )
             return bounds_m, np.stack([low, [*high[:2], ceiling_m - 0.01]])
         bounds_m[1, 2] += _OPEN_SKY_M
         return bounds_m, np.stack([low, high + np.array([0.0, 0.0, 0.01])])
@@ -997,60 +886,56 @@ class Stage:
         solid: Array = (is_back.sum(axis=0) >= _BACKS) & (thickness_m < _SOLID_M)
         return solid
 
-    def set_subject(self, spec: dict[str, Any]) -> Subject:
+    def set_subject(self, character: CharacterAsset, animation: AnimationAsset) -> Subject:
         """Put a character with an animation into the scene, in place of the one before."""
-        if self.subject is not None and spec == self._subject_spec:
-            return self.subject
-        self.subject = None
-        for kind in (bpy.data.objects, bpy.data.actions):
-            for added in set(kind) - self._own:
-                kind.remove(added)
-        bpy.data.orphans_purge(do_recursive=True)
-        self.subject = Subject(spec, root=self.root, unit_m=self.mirror.unit_m)
-        self._subject_spec = spec
+        if self.subject is None or self._subject_assets != (character, animation):
+            self.subject = None
+            for kind in (bpy.data.objects, bpy.data.actions):
+                for added in set(kind) - self._own:
+                    kind.remove(added)
+            bpy.data.orphans_purge(do_recursive=True)
+            self.subject = Subject(character, animation, root=self.root, unit_m=self.mirror.unit_m)
+            self._subject_assets = character, animation
         return self.subject
 
-    def render(self, spec: dict[str, Any], eyes_m: Array, axes: Array) -> Array:
+    def render(self, subject: Subject, shot: Shot) -> Array:
         """Write the pictures of several cameras at a frame; return their depths in metres.
 
         Pictures and depths come from one evaluation of the scene.
         """
-        subject = self.subject
-        assert subject is not None
-        frame = spec["frame"]
-        time_frames, times = subject.time_of(frame)
-        exact = self.start + max(0, frame) / _RATE_HZ * self.rate_hz
+        time_frames, times = subject.time_of(shot.frame)
+        exact = self.start + shot.frame / _RATE_HZ * self.rate_hz
         self.scene.frame_set(int(exact), subframe=exact - int(exact))
-        place = self.mirror.to_blender(np.array(spec["place_m"]))
-        subject.place((place, 90.0 - spec["yaw_deg"]), time_frames=time_frames, times=times)
+        place = self.mirror.to_blender(shot.spawn.place_m)
+        subject.place((place, 90.0 - shot.spawn.yaw_deg), time_frames=time_frames, times=times)
         self.scene.frame_set(int(exact), subframe=exact - int(exact))
-        eyes, turned = self.mirror.to_blender(eyes_m), axes * self.mirror.flip[:, None]
-        self._set_render(spec)
-        self._set_cameras(spec, eyes=eyes, axes=turned)
+        eyes = [self.mirror.to_blender(view.eye) for view in shot.views]
+        turned = [view.axes * self.mirror.flip[:, None] for view in shot.views]
+        width_px, height_px = shot.views[0].size_px
+        self._set_render(shot)
+        self._set_cameras(shot, eyes=eyes, axes=turned)
         searched: list[Triangles] = []
 
         def gather(depsgraph: Any) -> None:
             searched.extend(self.surfaces.at_frame(triangles_of(depsgraph, subject=subject.names)))
 
-        with _around_cycles(gather, lambda engine: None):
+        with _around_cycles(gather):
             bpy.ops.render.render(write_still=True)
         if not searched:
             raise RuntimeError("Cycles ended before it rendered")
-        ways = [_pixel_ways(spec, axes=axes) for axes in turned]
+        ways = [_pixel_ways(view, axes=axes) for view, axes in zip(shot.views, turned, strict=True)]
         hits = [first_hits(searched, eye, way) for eye, way in zip(eyes, ways, strict=True)]
-        depths = [each.distance for each in hits]
-        if any(each.is_cut.any() for each in hits):
-            depths = [
-                pass_through(searched, hit, eye=eye, ways=way, seen=seen)
-                for hit, eye, way, seen in zip(
-                    hits, eyes, ways, self._depth_passes(spec), strict=True
-                )
-            ]
-        width_px, height_px = spec["size_px"]
-        return np.stack(depths).reshape(-1, height_px, width_px) * self.mirror.unit_m
+        depths = np.stack([each.distance for each in hits])
+        is_cut = np.stack([each.is_cut for each in hits])
+        if is_cut.any():
+            # Where a material has holes, Cycles tells how far the surface is that is seen.
+            seen = self._depth_passes(width_px, height_px)
+            depths = np.where(is_cut, np.where(seen < _NOTHING, seen, np.inf), depths)
+        depths_m: Array = depths.reshape(-1, height_px, width_px) * self.mirror.unit_m
+        return depths_m
 
-    def _depth_passes(self, spec: dict[str, Any]) -> list[Array]:
-        """Return Cycles' own depth of every camera through (nearly) the centres of pixels."""
+    def _depth_passes(self, width_px: int, height_px: int) -> Array:
+        """Return Cycles' own depth (cameras, pixels) through (nearly) the centres of pixels."""
         cycles, layer = self.scene.cycles, bpy.context.view_layer
         cycles.samples, cycles.use_denoising, cycles.filter_width = 1, False, 0.01
         layer.use_pass_z, layer.pass_alpha_threshold = True, 0.5
@@ -1059,49 +944,47 @@ class Stage:
         def read(engine: Any) -> None:
             for each in engine.get_result().layers[layer.name].passes:
                 if each.name == "Depth":
-                    found[each.view_id] = np.empty(math.prod(spec["size_px"]), np.float32)
+                    found[each.view_id] = np.empty(width_px * height_px, np.float32)
                     each.rect.foreach_get(found[each.view_id])
 
-        with _around_cycles(lambda depsgraph: None, read):
+        with _around_cycles(after=read):
             bpy.ops.render.render()
         layer.use_pass_z = False
-        width_px, height_px = spec["size_px"]
+        passes = np.stack([found[view] for view in sorted(found)]).astype(np.float64)
         # Blender's first row is the lowest.
-        return [
-            found[view].reshape(height_px, width_px)[::-1].ravel().astype(np.float64)
-            for view in sorted(found)
-        ]
+        return passes.reshape(-1, height_px, width_px)[:, ::-1].reshape(len(passes), -1)
 
-    def _set_render(self, spec: dict[str, Any]) -> None:
+    def _set_render(self, shot: Shot) -> None:
+        settings = shot.settings
         scene, cycles = self.scene, self.scene.cycles
         render = scene.render
         render.engine = "CYCLES"
-        render.resolution_x, render.resolution_y = spec["size_px"]
-        render.filepath = str(Path(spec["folder"]) / "view")
+        render.resolution_x, render.resolution_y = shot.views[0].size_px
+        render.filepath = str(shot.folder / "view")
         render.use_file_extension = render.use_overwrite = True
         image = render.image_settings
         image.media_type = "IMAGE"
         image.file_format, image.color_mode, image.color_depth = "PNG", "RGB", "8"
         image.compression = 0
         image.views_format = "INDIVIDUAL"
-        cycles.samples = spec["samples_per_pixel"]
-        cycles.seed, cycles.use_animated_seed = spec["seed"], False
+        cycles.samples = settings.samples_per_pixel
+        cycles.seed, cycles.use_animated_seed = shot.seed, False
         cycles.use_adaptive_sampling = False
         cycles.time_limit = 0.0
-        cycles.use_denoising = spec["denoise"]
+        cycles.use_denoising = settings.denoise
         cycles.denoiser = "OPENIMAGEDENOISE"
         cycles.shading_system = False
         cycles.use_auto_tile = False
         cycles.pixel_filter_type, cycles.filter_width = "BLACKMAN_HARRIS", 1.5
-        cycles.device = _device(spec["device"])
-        render.threads_mode = "FIXED" if spec["threads"] else "AUTO"
-        if spec["threads"]:
-            render.threads = spec["threads"]
+        cycles.device = _device(settings)
+        render.threads_mode = "FIXED" if settings.threads else "AUTO"
+        if settings.threads:
+            render.threads = settings.threads
 
-    def _set_cameras(self, spec: dict[str, Any], *, eyes: Array, axes: Array) -> None:
+    def _set_cameras(self, shot: Shot, *, eyes: list[Array], axes: list[Array]) -> None:
         """Make one camera a view, whose pictures Cycles writes in one render."""
         scene, render = self.scene, self.scene.render
-        width_px, (fx, fy) = spec["size_px"][0], spec["focal_px"]
+        (width_px, _), (fx, fy) = shot.views[0].size_px, shot.views[0].focal_px
         render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, fy / fx), max(1.0, fx / fy)
         render.use_multiview = True
         render.views_format = "MULTIVIEW"
@@ -1130,29 +1013,26 @@ class Stage:
                 scene.camera = item
 
 
-def _pixel_ways(spec: dict[str, Any], *, axes: Array) -> Array:
+def _pixel_ways(view: View, *, axes: Array) -> Array:
     """Return the directions (n, 3) through pixel centres; their part along the axis is 1."""
-    (width_px, height_px), (fx, fy) = spec["size_px"], spec["focal_px"]
-    across = (np.arange(width_px) + 0.5 - width_px / 2) / fx
-    down = (np.arange(height_px) + 0.5 - height_px / 2) / fy
+    width_px, height_px = view.size_px
+    across = view.right_of_axis(np.arange(width_px) + 0.5)
+    down = view.below_axis(np.arange(height_px) + 0.5)
     forward, right, up = axes.T
     ways: Array = forward + across[None, :, None] * right - down[:, None, None] * up
     return ways.reshape(-1, 3)
 
 
-def _device(asked: str) -> str:
+def _device(settings: RenderSettings) -> str:
     """Return Cycles' name of a device, and switch it on."""
-    if asked == "CPU":
+    if settings.device == "CPU":
         return "CPU"
     preferences = bpy.context.preferences.addons["cycles"].preferences
-    kinds = {kind[0] for kind in preferences.get_device_types(bpy.context)}
-    for kind in _GPU_KINDS:
-        if kind not in kinds:
-            continue
+    kinds = {each[0] for each in preferences.get_device_types(bpy.context)}
+    for kind in filter(kinds.__contains__, _GPU_KINDS):
         preferences.compute_device_type = kind
         preferences.refresh_devices()
-        devices = [device for device in preferences.devices if device.type == kind]
-        if devices:
+        if any(device.type == kind for device in preferences.devices):
             for device in preferences.devices:
                 device.use = device.type == kind
             return "GPU"
@@ -1163,35 +1043,46 @@ def _device(asked: str) -> str:
 
 
 class Server:
-    """Answers requests about the one scene."""
+    """Answers requests about the one scene. Each names its map, which is opened if it is another.
+
+    Every method raises `AssetError` if an asset cannot be used.
+    """
 
     def __init__(self) -> None:
-        bpy.utils.register_class(_GatherEngine)
         self._stage: Stage | None = None
-        self._spec: dict[str, Any] = {}
 
-    def answer(
-        self, call: dict[str, Any], arrays: list[Array]
-    ) -> tuple[dict[str, Any], list[Array]]:
-        """Return the answer to one request.
-
-        Raises:
-            AssetError: If an asset cannot be used.
-        """
-        name = call["call"]
-        stage = self._stage
-        if stage is None or call["map"] != self._spec:
+    def _open(self, root: str, asset: MapAsset) -> Stage:
+        if self._stage is None or (self._stage.root, self._stage.asset) != (root, asset):
             self._stage = None
-            stage = self._stage = Stage(call["map"])
-            self._spec = call["map"]
-        if name == "cast":
-            return {}, [stage.cast(*arrays)]
-        subject = stage.set_subject(call["subject"])
-        if name == "facts":
-            points_m = [subject.points_m(frame) for frame in range(call["frames"])]
-            return {"notes": [*stage.notes, *subject.notes]}, [
-                stage.bounds_m,
-                stage.spawn_bounds_m,
-                np.stack(points_m),
-            ]
-        return {}, [stage.render(call["view"], *arrays)]
+            self._stage = Stage(root, asset)
+        return self._stage
+
+    def cast(self, root: str, asset: MapAsset, origins_m: Array, directions: Array) -> Array:
+        """See `Stage.cast`."""
+        return self._open(root, asset).cast(origins_m, directions)
+
+    def facts(
+        self,
+        root: str,
+        asset: MapAsset,
+        character: CharacterAsset,
+        animation: AnimationAsset,
+        frames: int,
+    ) -> tuple[Array, Array, Array, list[str]]:
+        """Return bounds, those of spawns, the subject's points (frames, p, 3), and notes."""
+        stage = self._open(root, asset)
+        subject = stage.set_subject(character, animation)
+        points_m = np.stack([subject.points_m(frame) for frame in range(frames)])
+        return stage.bounds_m, stage.spawn_bounds_m, points_m, stage.notes
+
+    def render(
+        self,
+        root: str,
+        asset: MapAsset,
+        character: CharacterAsset,
+        animation: AnimationAsset,
+        shot: Shot,
+    ) -> Array:
+        """See `Stage.render`."""
+        stage = self._open(root, asset)
+        return stage.render(stage.set_subject(character, animation), shot)
