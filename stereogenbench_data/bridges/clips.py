@@ -292,7 +292,7 @@ def _windows(
         below = max(0, length - 1) // unit * unit + 1
         raise SelectionError(
             f"length={length}: {layout} takes clips of {unit}N+1 frames and cuts others: give "
-            f"{below} or {below + unit}, or length_rule='any' (--any-length)."
+            f"{below} or {below + unit}, or length_rule='any'."
         )
     step = () if form.step is None else (form.step,)
     spec = cast("FramesSpec", ("clips", length, form.stride, *step))
@@ -424,7 +424,7 @@ def _facts(sample: Sample, *, frames: tuple[int, ...], form: ClipForm) -> dict[s
     if not 0 < rate_hz < math.inf:
         raise MediaError(
             f"{sample['scene']}: the clip's rate is {rate_hz:g} frames a second: give rate_hz "
-            "(--rate-hz) above 0."
+            "above 0."
         )
     return {
         "scene": sample["scene"],

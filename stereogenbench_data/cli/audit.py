@@ -2,24 +2,21 @@
 
 import hashlib
 import json
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from stereogenbench_data.cli.data import full_place
-from stereogenbench_data.cli.errors import FINDINGS, resumable
-from stereogenbench_data.cli.help import RARE
+from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import (
-    AcceptOption,
     DataOptions,
     JsonOption,
     OutOption,
     SceneOptions,
     WorkOptions,
     complete_from,
-    depth_of,
     grouped,
 )
 from stereogenbench_data.cli.progress import progress_bar
@@ -38,53 +35,25 @@ def _complete_limit(incomplete: str) -> list[str]:
 
 
 @grouped
-@resumable()
 def audit(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
     *,
     scenes: Annotated[
         int | None, typer.Option(min=1, help="Scenes to draw at random [all].")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the draw.")] = 0,
-    frames: Annotated[
-        str, typer.Option(help="Frames of each scene, or all, as in the paper.")
+    per_scene: Annotated[
+        str, typer.Option(metavar="N|all", help="Frames of each scene; all, as in the paper.")
     ] = "5",
     chosen: SceneOptions,
-    depth_unit_m: Annotated[
-        float | None,
-        typer.Option(
-            help="Metres in a stored unit of depth [as files state].", rich_help_panel=RARE
-        ),
-    ] = None,
-    depth_kind: Annotated[
-        Literal["planar", "ray"] | None,
-        typer.Option(help="Depth along the axis or the ray [planar].", rich_help_panel=RARE),
-    ] = None,
-    accept: AcceptOption = None,
     limit: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=NUMBER",
             help="Such as baseline_cm=0.01. May be repeated.",
-            rich_help_panel=RARE,
             autocompletion=_complete_limit,
         ),
     ] = None,
-    derived: Annotated[
-        Literal["refuse", "ok"],
-        typer.Option(
-            help="Whether to audit training shards, which differ from the release.",
-            rich_help_panel=RARE,
-        ),
-    ] = "refuse",
     out: OutOption = None,
-    journal: Annotated[
-        Path | None,
-        typer.Option(
-            help="File of a stopped audit [beside --out, else in ~/.cache].",
-            rich_help_panel=RARE,
-        ),
-    ] = None,
     as_json: JsonOption = False,
     work: WorkOptions,
 ) -> None:
@@ -95,6 +64,8 @@ def audit(  # noqa: PLR0913 - one parameter an option
     frozen pictures, invalid depth and occluders at the border. It prints Markdown; --out also
     writes it to a file (as JSON if the name ends with .json). To continue a stopped audit, run it
     again. The exit status is 1 if anything exceeds its limit.
+
+    Example: `stereogenbench audit shards/ --scenes 20 -o audit.md`
     """
     from stereogenbench_data.audit.geometry import audit as geometry_audit
     from stereogenbench_data.audit.geometry.records import AuditLimits
@@ -104,17 +75,15 @@ def audit(  # noqa: PLR0913 - one parameter an option
         raise typer.BadParameter(
             f"{out} is a folder: name a file, such as {out / 'audit.md'}.", param_hint="--out"
         )
-    if frames != _ALL and not (frames.isdecimal() and int(frames) > 0):
+    if per_scene != _ALL and not (per_scene.isdecimal() and int(per_scene) > 0):
         raise typer.BadParameter(
-            f"{frames!r} is neither a number of frames, such as 5, nor 'all'.",
-            param_hint="--frames",
+            f"{per_scene!r} is neither a number of frames, such as 5, nor 'all'.",
+            param_hint="--per-scene",
         )
     request = geometry_audit.AuditRequest(
         sample=scenes,
-        frames=0 if frames == _ALL else int(frames),
-        seed=seed,
+        frames=0 if per_scene == _ALL else int(per_scene),
         limits=AuditLimits.parse(limit or []),
-        derived=derived,
     )
     options: Any = chosen.filters() | work.options()
     with progress_bar("reading the index", unit="scenes") as progress:
@@ -125,9 +94,7 @@ def audit(  # noqa: PLR0913 - one parameter an option
             conventions=source.conventions,
             **options,
         )
-    contract = depth_of(index, unit_m=depth_unit_m, kind=depth_kind, accept=accept)
-    request = replace(request, depth=contract)
-    notes = journal or _journal(out, source.data, request)
+    notes = _journal(out, source.data, request)
     kept = geometry_audit.audit_journal(notes, index, request)
     with writing(notes), kept, progress_bar("auditing", unit="frames") as progress:
         report = geometry_audit.audit(index, request, progress=progress, journal=kept, **options)

@@ -6,13 +6,7 @@ from typing import Annotated
 import typer
 
 from stereogenbench_data.cli.data import full_place
-from stereogenbench_data.cli.options import (
-    AcceptOption,
-    DataOptions,
-    DepthUnitOption,
-    depth_of,
-    grouped,
-)
+from stereogenbench_data.cli.options import DataOptions, grouped
 from stereogenbench_data.schema.text import counted
 
 
@@ -22,16 +16,16 @@ def browse(
     *,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 is any free one.")] = 0,
     open_page: Annotated[
-        bool, typer.Option("--open/--no-open", help="Open the web browser.")
+        bool, typer.Option("--open/--no-open", metavar="", help="Open the web browser.")
     ] = True,
-    depth_unit_m: DepthUnitOption = None,
-    accept: AcceptOption = None,
 ) -> None:
     """Look through scenes in a local web page.
 
     The page filters scenes, flips through pairs and frames, shows disparity in pixels and depth in
     metres under the cursor, and gives the Python line for what is shown. Only this machine can
     reach it. Nothing is written. Ctrl-C ends it.
+
+    Example: `stereogenbench browse shards/`
     """
     from stereogenbench_data.audit.browser.catalogue import Catalogue
     from stereogenbench_data.audit.browser.server import PageServer
@@ -39,9 +33,8 @@ def browse(
     from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 
     index, shown_data = source.open(), full_place(source.data)
-    depth = depth_of(index, unit_m=depth_unit_m, accept=accept)
-    reader = SceneReader(index, depth=depth)
-    service = Service(Catalogue(index, shown_data=shown_data, depth=depth), reader)
+    reader = SceneReader(index)
+    service = Service(Catalogue(index, shown_data=shown_data, depth=None), reader)
     with PageServer(service, port=port) as server:
         typer.echo(f"{server.url}: {counted(len(index), 'scene')} of {shown_data}; Ctrl-C ends it")
         if index.is_derived:

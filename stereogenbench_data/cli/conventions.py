@@ -7,13 +7,12 @@ import typer
 
 from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import (
-    FamilyOption,
-    MapOption,
     OutOption,
-    SplitOption,
+    RootArgument,
+    SceneOptions,
     WorkOptions,
+    flag,
     grouped,
-    wanted_scenes,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
@@ -22,7 +21,7 @@ from stereogenbench_data.schema.text import counted, plain_line
 
 @grouped
 def conventions(  # noqa: PLR0913 - one parameter an option
-    root: Annotated[str, typer.Argument(help="Folder that holds train/ or eval/, or its URL.")],
+    root: RootArgument,
     *,
     out: OutOption = None,
     check: Annotated[
@@ -30,16 +29,13 @@ def conventions(  # noqa: PLR0913 - one parameter an option
         typer.Option("--check", metavar="FILE", help="Test these conventions; learn none."),
     ] = None,
     report: Annotated[
-        bool,
-        typer.Option("--report", help="Print the format without content, for a public issue."),
+        bool, flag("--report", "Print the format without content, for a public issue.")
     ] = False,
     scenes: Annotated[int, typer.Option(min=1, help="Scenes to read.")] = 20,
     pictures: Annotated[
         int, typer.Option(min=0, help="Scenes of a shape to measure by pictures, and to verify.")
     ] = 3,
-    split: SplitOption = None,
-    family: FamilyOption = None,
-    map_name: MapOption = None,
+    chosen: SceneOptions,
     work: WorkOptions,
 ) -> None:
     """Learn how a dataset's files are read, and write it down.
@@ -48,6 +44,8 @@ def conventions(  # noqa: PLR0913 - one parameter an option
     stands, how it is read and how that is known; the doctor measures the depth of some by their
     pictures. Other scenes verify it. Without -o the file is printed. Give it to any command with
     --conventions. The exit status is 1 if something is not understood or contradicted.
+
+    Example: `stereogenbench conventions scenes/ -o conventions.toml`
     """
     from stereogenbench_data.audit.conventions import survey
     from stereogenbench_data.audit.format_report import format_report
@@ -62,7 +60,7 @@ def conventions(  # noqa: PLR0913 - one parameter an option
             scenes=scenes,
             pictured=pictures,
             conventions=stated,
-            wanted=wanted_scenes(split, family or [], map_name or []),
+            wanted=chosen.by_path(),
             **work.options(),
             progress=progress,
         )

@@ -4,19 +4,17 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import (
-    AcceptOption,
     DataOptions,
     JsonOption,
     OutOption,
     SceneOptions,
     WorkOptions,
-    depth_of,
     grouped,
 )
 from stereogenbench_data.cli.progress import progress_bar
@@ -29,8 +27,6 @@ if TYPE_CHECKING:
     from stereogenbench_data.audit.contract.verdict import Answer, Verdict
 
 
-_DECLARED = "The contract that is tested"
-"""Panel of the help for the options that declare a depth contract."""
 QUOTIENT_MEANS = (
     "Disparity shows only the quotient unit / (focal length x baseline). No picture tells which of "
     "the three is wrong, or whether two of them cancel out."
@@ -51,25 +47,8 @@ def doctor(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
     *,
     scenes: Annotated[int, typer.Option(min=1, help="Scenes to look at.")] = 6,
-    frames: Annotated[int, typer.Option(min=1, help="Frames of each scene.")] = 4,
+    per_scene: Annotated[int, typer.Option(min=1, help="Frames of each scene.")] = 4,
     chosen: SceneOptions,
-    unit_m: Annotated[
-        float | None,
-        typer.Option(help="Metres in a stored unit [as tagged].", rich_help_panel=_DECLARED),
-    ] = None,
-    kind: Annotated[
-        Literal["planar", "ray"] | None,
-        typer.Option(help="Depth along the axis or the ray [planar].", rich_help_panel=_DECLARED),
-    ] = None,
-    form: Annotated[
-        Literal["depth", "inverse"] | None,
-        typer.Option(help="Depth is stored, or its inverse [depth].", rich_help_panel=_DECLARED),
-    ] = None,
-    frame_lag: Annotated[
-        int | None,
-        typer.Option(help="Picture t belongs to depth frame t + N [0].", rich_help_panel=_DECLARED),
-    ] = None,
-    accept: AcceptOption = None,
     out: OutOption = None,
     as_json: JsonOption = False,
     work: WorkOptions,
@@ -78,9 +57,12 @@ def doctor(  # noqa: PLR0913 - one parameter an option
 
     The doctor compares what the cameras of a scene see with what depth predicts: planar or ray,
     inverse, frame lag, camera order, flips, offset, unit / (focal length x baseline), and each
-    camera beside the others. -o writes a picture. The exit status is 0 if the declared contract
+    camera beside the others. The declared contract is that of the files and of --conventions
+    FILE. -o writes a picture. The exit status is 0 if the declared contract
     fits or the pictures cannot tell, 1 if another one is clearly better or a camera does not fit,
     2 if the command failed.
+
+    Example: `stereogenbench doctor scenes/ -o doctor.png`
     """
     from stereogenbench_data.audit.contract.doctor import diagnose
     from stereogenbench_data.audit.contract.picture import draw_report, require_picture_file
@@ -89,13 +71,11 @@ def doctor(  # noqa: PLR0913 - one parameter an option
         require_picture_file(out)
     filters: Any = chosen.filters()
     index = source.open()
-    depth = depth_of(index, unit_m=unit_m, kind=kind, form=form, frame_lag=frame_lag, accept=accept)
     with progress_bar("examining", unit="scenes") as progress:
         report = diagnose(
             index,
             scenes=scenes,
-            frames=frames,
-            depth=depth,
+            frames=per_scene,
             **work.options(),
             progress=progress,
             filters=filters,

@@ -1,17 +1,16 @@
-"""How a command ends: with an exit status, and one or two lines about an error."""
+"""How a command ends: with an exit status, and one line about an error that was expected."""
 
 import errno
 import os
 import sys
+import traceback
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from types import TracebackType
 from typing import Final, TextIO
 
 import typer
 
-from stereogenbench_data.cli.signals import STOPPED
 from stereogenbench_data.errors import DISK_FULL, StereoGenBenchError, describe_os_error
 from stereogenbench_data.schema.text import plain_line
 
@@ -19,6 +18,8 @@ FINDINGS: Final = 1
 """Exit status if something is wrong with the data."""
 NOT_DONE: Final = 2
 """Exit status if the command failed."""
+STOPPED: Final = 130
+"""Exit status after Ctrl-C: 128 plus the number of the signal."""
 PIPE_CLOSED: Final = 141
 """Exit status if the reader closed the output, as ``head`` does."""
 
@@ -31,18 +32,8 @@ _CURES: Final = {
 """Cures of errors that are not in the table of `errors`, for a path or a port that was named."""
 
 
-@contextmanager
-def resumable() -> Iterator[None]:
-    """Say on Ctrl-C that the same command resumes the work. Decorates a command."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        typer.echo("stopped; run the same command again to go on from here", err=True)
-        raise typer.Exit(STOPPED) from None
-
-
 class ErrorsReported:
-    """A context in which every error ends the command with a message instead of a traceback.
+    """A context in which every error ends the command with a message and an exit status.
 
     Exits and usage errors pass: typer reports them. The context flushes stdout before it ends, so
     that it notices a closed pipe.
@@ -65,16 +56,38 @@ class ErrorsReported:
         """Turn an exception into a message and an exit status."""
         warnings.formatwarning = self._formatwarning
         error = _flush_error() or error
+        if error is None or _is_typers(error):
+            return
         if isinstance(error, BrokenPipeError):
             _discard(sys.stdout)
             raise SystemExit(PIPE_CLOSED) from None
-        if isinstance(error, KeyboardInterrupt):
-            _print_error("stopped")
-            raise SystemExit(STOPPED) from None
-        message = "" if error is None else _message(error)
-        if message:
-            _print_error(message)
-            raise SystemExit(NOT_DONE) from None
+        try:
+            typer.echo(_message(error), err=True)
+        except OSError:  # Only the exit status is left.
+            _discard(sys.stderr)
+        raise SystemExit(STOPPED if isinstance(error, KeyboardInterrupt) else NOT_DONE) from None
+
+
+def _is_typers(error: BaseException) -> bool:
+    by_typer = isinstance(error, typer.Exit | typer.Abort | SystemExit | EOFError)
+    return by_typer or type(error).__module__.startswith(("typer.", "click."))
+
+
+def _message(error: BaseException) -> str:
+    """Return the lines about an error; of one that nobody expected, its traceback."""
+    if isinstance(error, KeyboardInterrupt):
+        return "stopped; run the same command again to go on"
+    if isinstance(error, StereoGenBenchError):
+        return _plain_lines(f"{type(error).__name__}: {error}")
+    if isinstance(error, OSError) and error.errno is not None:
+        kind = "StorageError" if type(error) is OSError else type(error).__name__
+        is_output = not error.filename and error.errno in DISK_FULL
+        where = error.filename or ("the output cannot be written" if is_output else "")
+        what = f"{kind}: {where}" if where else kind
+        return _plain_lines(describe_os_error(what, error, _CURES.get(error.errno, "")))
+    if isinstance(error, MemoryError):
+        return "MemoryError: memory is short. Use fewer workers or smaller pictures."
+    return "".join(traceback.format_exception(error)).rstrip()
 
 
 def _flush_error() -> OSError | None:
@@ -88,39 +101,8 @@ def _flush_error() -> OSError | None:
     return None
 
 
-def _print_error(message: str) -> None:
-    """Print a message on stderr; if that fails, only the exit status is left."""
-    try:
-        typer.echo(_plain_lines(message), err=True)
-    except OSError:
-        _discard(sys.stderr)
-
-
 def _plain_lines(text: str) -> str:
     return "\n".join(map(plain_line, text.split("\n")))
-
-
-def _message(error: BaseException) -> str:
-    """Return the message for an error; empty if typer reports it."""
-    if isinstance(error, StereoGenBenchError):
-        return f"{type(error).__name__}: {error}"
-    if isinstance(error, OSError) and error.errno is not None:
-        kind = "StorageError" if type(error) is OSError else type(error).__name__
-        is_output = not error.filename and error.errno in DISK_FULL
-        where = error.filename or ("the output cannot be written" if is_output else "")
-        what = f"{kind}: {where}" if where else kind
-        return describe_os_error(what, error, _CURES.get(error.errno, ""))
-    if isinstance(error, MemoryError):
-        return "MemoryError: memory is short. Use fewer workers or smaller pictures."
-    by_typer = isinstance(error, typer.Exit | typer.Abort | EOFError)
-    by_typer |= type(error).__module__.startswith(("typer.", "click."))
-    if by_typer or not isinstance(error, Exception):
-        return ""
-    first_line = str(error).strip().partition("\n")[0]
-    return (
-        f"{type(error).__name__}: {first_line}\n"
-        "This error was not expected: run `stereogenbench --debug ...` to see where it arose."
-    )
 
 
 def _discard(stream: TextIO) -> None:

@@ -5,26 +5,25 @@ They share their options: scenes, pairs and frames, metrics and models, the repo
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stereogenbench_data.cli.errors import FINDINGS, resumable
+from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import (
-    AcceptOption,
+    SCENES,
     DataOptions,
-    DepthUnitOption,
     JsonOption,
-    SplitOption,
+    OutArgument,
+    SampleOptions,
     WorkOptions,
-    depth_of,
+    complete_from,
     grouped,
-    out_folder,
+    size_of,
 )
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.samples import SampleSelectionOptions, parse_picture_size
 from stereogenbench_data.evaluation.columns import METRICS, OFFLINE_METRICS, require_metrics
 from stereogenbench_data.schema.text import counted
 
@@ -61,22 +60,33 @@ TierOption = Annotated[
         "G2 nothing.",
     ),
 ]
-SizeOption = Annotated[str, typer.Option(metavar="WxH", help="Width x height of what is scored.")]
+ScoredSizeOption = Annotated[
+    Any,
+    typer.Option("--size", parser=size_of, metavar="WxH", help="Width x height of what is scored."),
+]
 PAPER_SIZE = "832x480"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScoredOptions(SampleSelectionOptions):
+class ScoredOptions(SampleOptions):
     """Which samples are scored: those of the eval split by default."""
 
-    split: SplitOption = "eval"
+    split: Annotated[
+        str,
+        typer.Option(
+            metavar="train|eval|all",
+            help="The split.",
+            autocompletion=complete_from(("train", "eval", "all")),
+            rich_help_panel=SCENES,
+        ),
+    ] = "eval"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProtocolOptions:
     """The metrics and the models that compute them."""
 
-    size: SizeOption = PAPER_SIZE
+    size: ScoredSizeOption = PAPER_SIZE
     metrics: Annotated[
         str,
         typer.Option(
@@ -100,13 +110,9 @@ class ProtocolOptions:
             rich_help_panel=_METRICS,
         ),
     ] = "sgbm"
-    depth_unit_m: DepthUnitOption = None
-    accept: AcceptOption = None
     weights: Annotated[
         Path | None,
         typer.Option(
-            "--weights",
-            "--checkpoint",
             metavar="DIR",
             help="Folder of weights [torch.hub's checkpoints].",
             rich_help_panel=_METRICS,
@@ -120,7 +126,6 @@ class ProtocolOptions:
         """Return the protocol of the options.
 
         Raises:
-            typer.BadParameter: If the size is not WIDTHxHEIGHT.
             EvaluationError: If a metric is unknown.
         """
         from stereogenbench_data.evaluation.models.registry import ModelOptions
@@ -128,7 +133,7 @@ class ProtocolOptions:
 
         return EvaluationProtocol(
             metrics=require_metrics(self.metrics),
-            size=parse_picture_size(self.size),
+            size=self.size,
             keypoint_matcher=self.keypoint_matcher,
             stereo_matcher=self.stereo_matcher,
             models=ModelOptions(device=self.device, weights=self.weights),
@@ -145,9 +150,6 @@ class ReportOptions:
             "--out", "-o", metavar="DIR", help="Folder of the report and of partial results."
         ),
     ] = None
-    plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Draw metric by baseline.")] = (
-        True
-    )
     compare: Annotated[
         Path | None,
         typer.Option(
@@ -185,7 +187,7 @@ class ReportOptions:
         else:
             typer.echo(page(results, tables, found=found).rstrip())
         files = write_report(
-            folder, results, tables, found=found, plots="write" if self.plots else "skip"
+            folder, results, tables, found=found, plots="skip" if found else "write"
         )
         names = ", ".join(str(path.relative_to(folder)) for path in files)
         typer.echo(f"{folder}: {names}", err=True)
@@ -200,26 +202,14 @@ class ReportOptions:
         typer.echo(f"{self.compare}: reproduced, {_WHAT_IS_SAME}", err=True)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ControlsReportOptions(ReportOptions):
-    """The same, without plots by default."""
-
-    plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Draw metric by baseline.")] = (
-        False
-    )
-
-
 @grouped
-@resumable()
-def inputs(  # noqa: PLR0913 - one parameter an option
+def inputs(
     source: DataOptions,
-    out: Annotated[Path, typer.Argument(parser=out_folder, help="Folder to write into.")],
+    out: OutArgument,
     *,
     tier: TierOption,
-    chosen: SampleSelectionOptions,
-    size: SizeOption = PAPER_SIZE,
-    depth_unit_m: DepthUnitOption = None,
-    accept: AcceptOption = None,
+    chosen: ScoredOptions,
+    size: ScoredSizeOption = PAPER_SIZE,
     work: WorkOptions,
 ) -> None:
     """Write what a method is given: left views, geometry, camera.
@@ -228,18 +218,18 @@ def inputs(  # noqa: PLR0913 - one parameter an option
     one pair of one scene; its folder's name reveals neither. Write the output of the method as
     PREDICTIONS/ITEM/000.png ... or PREDICTIONS/ITEM.mp4, then run `stereogenbench eval score` with
     the same selection. To continue a stopped run, run it again.
+
+    Example: `stereogenbench eval inputs shards/ inputs/ --tier G1`
     """
     from stereogenbench_data.evaluation.inputs import export_inputs
 
-    size_px, selection = parse_picture_size(size), chosen.selection()
-    index = source.open()
+    selection, index = chosen.selection(), source.open()
     with progress_bar("writing", unit="frames") as progress:
         items = export_inputs(
             index,
             out,
             tier=tier,
-            size=size_px,
-            depth=depth_of(index, unit_m=depth_unit_m, accept=accept),
+            size=size,
             **work.options(),
             progress=progress,
             **selection,
@@ -248,7 +238,6 @@ def inputs(  # noqa: PLR0913 - one parameter an option
 
 
 @grouped
-@resumable()
 def score(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
     predictions: Annotated[
@@ -259,7 +248,7 @@ def score(  # noqa: PLR0913 - one parameter an option
     name: Annotated[
         str | None, typer.Option(help="Name of the method [the folder's name].")
     ] = None,
-    chosen: SampleSelectionOptions,
+    chosen: ScoredOptions,
     scoring: ProtocolOptions,
     by: Annotated[
         list[str] | None,
@@ -281,6 +270,8 @@ def score(  # noqa: PLR0913 - one parameter an option
     item, a folder of PNGs or a video of the same name. The report (Markdown, LaTeX, CSV, JSON,
     plots) and partial results go to --out [evaluation/NAME-TIER]. To continue a stopped run, run it
     again.
+
+    Example: `stereogenbench eval score shards/ predictions/ --tier G1`
     """
     from stereogenbench_data.evaluation.evaluate import evaluate
     from stereogenbench_data.evaluation.tables import tables_of
@@ -290,8 +281,6 @@ def score(  # noqa: PLR0913 - one parameter an option
     called = name or predictions.resolve().name
     folder = report.out or Path("evaluation") / f"{called}-{tier}"
     index = source.open()
-    contract = depth_of(index, unit_m=scoring.depth_unit_m, accept=scoring.accept)
-    protocol = replace(protocol, depth=contract)
     for column in strata:
         index.column(column)  # refuses an unknown one before the work
     with progress_bar("scoring", unit="frames") as progress:
@@ -311,14 +300,12 @@ def score(  # noqa: PLR0913 - one parameter an option
 
 
 @grouped
-@resumable()
 def controls(
     source: DataOptions,
     *,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the random right views.")] = 0,
     chosen: ScoredOptions,
     scoring: ProtocolOptions,
-    report: ControlsReportOptions,
+    report: ReportOptions,
     work: WorkOptions,
 ) -> None:
     """Score a perfect, a copied, a wrong and a random right view.
@@ -327,6 +314,8 @@ def controls(
     and the right view of another scene. The report shows the paper's own controls beside them, and
     whether the relations between them hold; the exit status is 1 if one does not. It goes to --out
     [evaluation/controls]. To continue a stopped run, run it again.
+
+    Example: `stereogenbench eval controls shards/ --frames every:20`
     """
     from stereogenbench_data.evaluation.controls import relations, score_controls
     from stereogenbench_data.evaluation.tables import table_of
@@ -334,13 +323,10 @@ def controls(
     protocol, selection = scoring.protocol(), chosen.selection()
     folder = report.out or Path("evaluation") / "controls"
     index = source.open()
-    contract = depth_of(index, unit_m=scoring.depth_unit_m, accept=scoring.accept)
-    protocol = replace(protocol, depth=contract)
     with progress_bar("scoring", unit="frames") as progress:
         results = score_controls(
             index,
             protocol=protocol,
-            seed=seed,
             out=folder / "partial",
             **work.options(device=scoring.device),
             progress=progress,

@@ -7,19 +7,14 @@ from typing import Annotated, Any
 
 import typer
 
-from stereogenbench_data.cli.help import RARE, SCENES
 from stereogenbench_data.cli.options import (
-    AcceptOption,
+    SCENES,
     DataOptions,
-    DepthUnitOption,
     JsonOption,
-    depth_of,
+    SampleOptions,
+    SizeOption,
+    frames_of,
     grouped,
-)
-from stereogenbench_data.cli.samples import (
-    SampleSelectionOptions,
-    frames_option,
-    parse_picture_size,
 )
 
 
@@ -27,20 +22,26 @@ def _of(text: str, *, panel: str = "What trains, and on which network", **more: 
     return typer.Option(help=text, rich_help_panel=panel, **more)
 
 
+def _trained_frames(text: str) -> Any:
+    """Return frames as `StereoPairs` takes them: drawn at random and clips, too."""
+    kind, _, number = text.partition(":")
+    is_drawn = kind in ("random", "clips") and number.isdecimal()
+    return (kind, int(number)) if is_drawn else frames_of(text)
+
+
 @dataclass(frozen=True, kw_only=True)
-class TrainedOptions(SampleSelectionOptions):
-    """Which samples of which scenes are trained on: frames drawn at random and clips, too."""
+class TrainedOptions(SampleOptions):
+    """Which samples of which scenes are trained on."""
 
     frames: Annotated[
-        str, _of("all, first, every:K, random:N, clips:LENGTH, or such as 0,40,80.", panel=SCENES)
+        Any,
+        _of(
+            "all, first, every:K, random:N, clips:LENGTH, or such as 0,40,80.",
+            panel=SCENES,
+            parser=_trained_frames,
+            metavar="FRAMES",
+        ),
     ] = "all"
-
-    def windows(self) -> dict[str, Any]:
-        """Return the option of `StereoPairs` that selects frames."""
-        kind, _, number = self.frames.partition(":")
-        if kind in ("random", "clips") and number.isdecimal():
-            return {"frames": (kind, int(number))}
-        return {"frames": frames_option(self.frames)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,20 +52,17 @@ class MachineOptions:
     accelerators: Annotated[str, _of("How many, in all.", metavar="N,N")] = "1,8,64,512,1000,10000"
     per_machine: Annotated[int, _of("Accelerators of a machine.", min=1)] = 8
     cores: Annotated[int | None, _of("Cores of a machine [as here].", min=1)] = None
-    workers: Annotated[int | None, _of("Workers of a machine, at most [one a core].", min=1)] = None
     delay_ms: Annotated[float | None, _of("Until the first byte [of a URL: measured].", min=0)] = (
         None
     )
-    connection_mb_s: Annotated[float, _of("Of a connection.", min=0.001)] = math.inf
     machine_mb_s: Annotated[float, _of("Of a machine.", min=0.001)] = math.inf
     total_mb_s: Annotated[float, _of("Of the server, for all.", min=0.001)] = math.inf
-    requests_s: Annotated[float, _of("That the server allows.", min=0.001)] = math.inf
 
     def options(self) -> dict[str, Any]:
         """Return the options of `forecast`.
 
         Raises:
-            typer.BadParameter: If the numbers of accelerators are no numbers from 1.
+            typer.BadParameter: If the numbers of accelerators are not numbers from 1.
         """
         parts = [part.strip() for part in self.accelerators.split(",")]
         if not all(part.isdecimal() and int(part) > 0 for part in parts):
@@ -80,23 +78,20 @@ def forecast(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
     *,
     trains: MachineOptions,
-    size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Of a sample's pictures [as stored].")
-    ] = None,
+    size: SizeOption = None,
     fields: Annotated[
         str | None, typer.Option(metavar="NAMES", help="Such as left,right [the defaults].")
     ] = None,
     batch_size: Annotated[int, typer.Option(min=1, help="Samples of a batch.")] = 8,
-    measure_s: Annotated[float, _of("How long to decode.", min=0.1, panel=RARE)] = 6.0,
     chosen: TrainedOptions,
-    depth_unit_m: DepthUnitOption = None,
-    accept: AcceptOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Forecast what will limit a training: processors, network, requests.
 
     Bytes and requests of a sample follow from the index. Decoding is measured on this machine, for
     seconds. The documentation has the formula.
+
+    Example: `stereogenbench forecast shards/ --samples-s 100 --delay-ms 60`
     """
     from stereogenbench_data.datasets.forecast import forecast as forecast_by
 
@@ -104,10 +99,8 @@ def forecast(  # noqa: PLR0913 - one parameter an option
     if fields is not None:
         options["fields"] = [each.strip() for each in fields.split(",")]
     if size is not None:
-        options["size"] = parse_picture_size(size)
-    index = source.open()
-    options["depth"] = depth_of(index, unit_m=depth_unit_m, accept=accept)
-    found = forecast_by(index, batch_size=batch_size, measure_s=measure_s, **options)
+        options["size"] = size
+    found = forecast_by(source.open(), batch_size=batch_size, **options)
     typer.echo(json.dumps(asdict(found), indent=1) if as_json else _table(found))
 
 

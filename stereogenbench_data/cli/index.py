@@ -9,17 +9,15 @@ import typer
 from rich.console import Console
 
 from stereogenbench_data.cli.data import full_place
-from stereogenbench_data.cli.errors import FINDINGS, resumable
-from stereogenbench_data.cli.help import RARE
+from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import (
     ConventionsOption,
-    FamilyOption,
     JsonOption,
-    MapOption,
-    SplitOption,
+    RootArgument,
+    SceneOptions,
     WorkOptions,
+    flag,
     grouped,
-    wanted_scenes,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import require_writable, writing
@@ -29,9 +27,8 @@ _INDEX_NAME = "index.parquet"
 
 
 @grouped
-@resumable()
 def index(  # noqa: PLR0913 - one parameter an option
-    root: Annotated[str, typer.Argument(help="Folder that holds train/ or eval/, or its URL.")],
+    root: RootArgument,
     *,
     out: Annotated[
         Path | None,
@@ -41,24 +38,19 @@ def index(  # noqa: PLR0913 - one parameter an option
     ] = None,
     work: WorkOptions,
     valid_depth: Annotated[
-        bool,
-        typer.Option(
-            "--valid-depth",
-            help="Measure the share of valid depth, to select by it.",
-            rich_help_panel=RARE,
-        ),
+        bool, flag("--valid-depth", "Measure the share of valid depth, to select by it.")
     ] = False,
-    split: SplitOption = None,
-    family: FamilyOption = None,
-    map_name: MapOption = None,
+    chosen: SceneOptions,
     conventions: ConventionsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Index a released tree, so that it opens at once.
 
     After an interruption, run the same command again to continue. Incomplete and broken scenes are
-    listed and left out; the exit status is 1 if a scene is broken. --split, --family and --map
-    restrict which scenes are read.
+    listed and left out; the exit status is 1 if a scene is broken. --split and --where family=NAME
+    or map=NAME restrict which scenes are read.
+
+    Example: `stereogenbench index scenes/`
     """
     from stereogenbench_data.index.build import scene_journal, walk
     from stereogenbench_data.index.parquet import recorded_root
@@ -69,7 +61,7 @@ def index(  # noqa: PLR0913 - one parameter an option
     console = Console(stderr=True)
     target = out or Path("." if is_remote(root) else root, _INDEX_NAME)
     mode: Literal["skip", "sample"] = "sample" if valid_depth else "skip"
-    wanted = wanted_scenes(split, family or [], map_name or [])
+    wanted = chosen.by_path()
     if wanted is not None and out is None:
         raise typer.BadParameter(
             "the index of a part needs its own file: name it with --out FILE.",

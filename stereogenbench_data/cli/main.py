@@ -1,14 +1,20 @@
-"""Entry point of the command ``stereogenbench``: sets up Ctrl-C before the long imports."""
+"""Entry point of ``stereogenbench``: signals stop it without a traceback, also while it imports."""
 
-from stereogenbench_data.cli.signals import stop_at_once
+import signal
+import sys
 
 
 def main() -> None:
-    """Run the command line."""
-    stop_at_once()
-    from stereogenbench_data.cli.commands import run
+    """Run the command line; SIGTERM stops it as Ctrl-C does."""
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        from stereogenbench_data.cli.commands import run
 
-    run()
+        run()
+    except KeyboardInterrupt:
+        sys.stderr.write("stopped\n")
+        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Options that several commands share, single and in groups, each declared once.
+"""Options that several commands share, in groups, each declared once, and how their texts are read.
 
 A group is a dataclass whose fields are options. A command takes it as one parameter; `grouped`
 shows typer the fields in its place.
@@ -6,27 +6,37 @@ shows typer the fields in its place.
 
 import inspect
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from stereogenbench_data.cli.data import open_data
-from stereogenbench_data.cli.help import RARE, SCENES
-from stereogenbench_data.schema.release import (
-    CAMERA_PAIRS,
-    FAMILIES,
-    TRAIN_MAPS,
-    UNSEEN_MAPS,
-    Split,
-    Subset,
-)
+from stereogenbench_data.schema.release import CAMERA_COUNT, CAMERA_PAIRS
 
 if TYPE_CHECKING:
     from stereogenbench_data.index.table import SceneIndex
-    from stereogenbench_data.schema.records import DepthEncoding, SceneId
+    from stereogenbench_data.schema.records import SceneId
+
+SCENES: Final = "Which scenes"
+"""Panel of the help for the options that select scenes, pairs and frames."""
+
+_RANGES: Final = ("focal_mm", "valid_depth_ratio", "baseline_cm")
+"""Filters of ``--where`` that take two numbers."""
+_OF_PATH: Final = ("split", "family", "map", "scenes")
+"""Filters that the path of a scene answers."""
+_FILTERS: Final = (
+    "scene",
+    "family",
+    "map",
+    "subset",
+    "caption",
+    "min_frames",
+    "character",
+    "animation",
+)
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
@@ -63,6 +73,11 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
     return called
 
 
+def flag(name: str, text: str) -> Any:
+    """Return an option that takes no value; newer typer shows the type ``<bool>`` for such."""
+    return typer.Option(name, help=text, metavar="")
+
+
 def complete_from(values: Iterable[str]) -> Callable[[str], list[str]]:
     """Return a function for shell completion that lists the values with the typed beginning."""
     known = sorted(values)
@@ -88,128 +103,11 @@ def complete_scene(context: typer.Context, incomplete: str) -> list[str]:
     return complete_from(map(str, keys))(incomplete)
 
 
-def pair_of(text: str, *, option: str) -> tuple[int, int]:
-    """Return the two cameras of a pair such as 0-5.
-
-    Raises:
-        typer.BadParameter: If they are not two cameras, the left one first.
-    """
-    left, _, right = text.replace(",", "-").partition("-")
-    if not (left.strip().isdecimal() and right.strip().isdecimal()):
-        raise typer.BadParameter(
-            f"{text!r} is not a pair: write two cameras, such as 0-5.", param_hint=option
-        )
-    pair = int(left), int(right)
-    if pair not in CAMERA_PAIRS:
-        swapped = pair[1], pair[0]
-        cure = f"write it as {right}-{left}" if swapped in CAMERA_PAIRS else "such as 0-5"
-        raise typer.BadParameter(
-            f"{text!r} is not a pair: two different cameras from 0 to 5, the left one first; "
-            f"{cure}.",
-            param_hint=option,
-        )
-    return pair
-
-
-def depth_of(
-    index: "SceneIndex", *, accept: list[str] | None = None, **options: Any
-) -> "DepthEncoding | None":
-    """Return the depth contract of a command's options; None without any: data state their own.
-
-    What no option says is as the conventions of the data state it.
-
-    Raises:
-        typer.BadParameter: If these state several contracts.
-    """
-    from stereogenbench_data.schema.records import DepthEncoding
-
-    given = {name: value for name, value in options.items() if value is not None}
-    if accept:
-        given["accept"] = frozenset(accept)
-    if not given:
-        return None
-    stated = {shape.depth.encoding for shape in index.shapes if shape.depth is not None}
-    if len(stated) > 1:
-        raise typer.BadParameter(
-            f"the conventions of {index.where} state {len(stated)} depth contracts, and options "
-            f"would replace all: choose scenes of one, or edit the conventions."
-        )
-    return replace(stated.pop() if stated else DepthEncoding(), **given, source="user")
-
-
-RootOption = Annotated[
-    str | None,
-    typer.Option(
-        "--root",
-        help="Where the data of an index file are, if not beside.",
-        rich_help_panel=RARE,
-    ),
-]
-ConventionsOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--conventions",
-        metavar="FILE",
-        help="How the files are read, as `conventions` writes it.",
-        rich_help_panel=RARE,
-    ),
-]
-SplitOption = Annotated[
-    str | None,
-    typer.Option(
-        help="train or eval.",
-        autocompletion=complete_from(get_args(Split)),
-        rich_help_panel=SCENES,
-    ),
-]
-FamilyOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Family of baselines. May be repeated.",
-        autocompletion=complete_from(FAMILIES),
-        rich_help_panel=SCENES,
-    ),
-]
-MapOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--map",
-        metavar="MAP",
-        help="Map, such as Stylized_Egypt. May be repeated.",
-        autocompletion=complete_from(TRAIN_MAPS | UNSEEN_MAPS),
-        rich_help_panel=SCENES,
-    ),
-]
-DepthUnitOption = Annotated[
-    float | None,
-    typer.Option(
-        help="Metres in a stored unit of depth [as files state].",
-        rich_help_panel=RARE,
-    ),
-]
-AcceptOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--accept",
-        metavar="LOSS",
-        help="Accept depth that is 8-bit ... 14-bit, lossy, chroma.",
-        rich_help_panel=RARE,
-        autocompletion=complete_from(
-            ("8-bit", "9-bit", "10-bit", "12-bit", "14-bit", "lossy", "chroma")
-        ),
-    ),
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Report as JSON on stdout.")]
-WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes [one a core].")]
-EngineOption = Annotated[
-    str,
-    typer.Option(
-        help="local, ray, or ray://HOST:PORT.",
-        autocompletion=complete_from(("local", "ray")),
-        rich_help_panel=RARE,
-    ),
-]
-OutOption = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")]
+def _complete_where(context: typer.Context, incomplete: str) -> list[str]:
+    name, equals, value = incomplete.partition("=")
+    if name == "scene" and equals:
+        return [f"scene={key}" for key in complete_scene(context, value)]
+    return complete_from(f"{name}=" for name in (*_FILTERS, *_RANGES))(incomplete)
 
 
 def out_folder(text: str) -> Path:
@@ -219,28 +117,134 @@ def out_folder(text: str) -> Path:
     return Path(text)
 
 
-def wanted_scenes(
-    split: str | None, families: list[str], maps: list[str]
-) -> "Callable[[SceneId], bool] | None":
-    """Return a function that says whether the options select a scene; None if they select all."""
-    if not (split or families or maps):
-        return None
-    return lambda scene: (
-        split in (None, "", scene.split)
-        and (not families or scene.family in families)
-        and (not maps or scene.map_name in maps)
-    )
+def size_of(text: str) -> tuple[int, int]:
+    """Return (height, width) of a size, which is WIDTHxHEIGHT."""
+    from stereogenbench_data.errors import FieldError
+    from stereogenbench_data.samples.size import parse_size
+
+    try:
+        return parse_size(text)
+    except FieldError as error:
+        raise typer.BadParameter(str(error)) from None
+
+
+def cameras_of(text: str) -> tuple[int, ...]:
+    """Return the numbers of cameras such as 0,2,5, ascending."""
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdecimal() and int(part) < CAMERA_COUNT for part in parts):
+        raise typer.BadParameter(f"{text!r}: write numbers from 0 to 5, such as 0,1.")
+    return tuple(sorted({int(part) for part in parts}))
+
+
+def pair_of(text: str) -> tuple[int, int]:
+    """Return the two cameras of a pair such as 0-5, the left one first."""
+    left, _, right = text.partition("-")
+    if not (left.strip().isdecimal() and right.strip().isdecimal()):
+        raise typer.BadParameter(f"{text!r} is not a pair: write two cameras, such as 0-5.")
+    pair = int(left), int(right)
+    if pair not in CAMERA_PAIRS:
+        cure = f"write it as {right}-{left}" if pair[::-1] in CAMERA_PAIRS else "such as 0-5"
+        raise typer.BadParameter(
+            f"{text!r} is not a pair: two different cameras from 0 to 5, the left one first; "
+            f"{cure}."
+        )
+    return pair
+
+
+def pairs_of(text: str) -> Any:
+    """Return pairs as `StereoPairs` takes them."""
+    if text in ("primary", "adjacent", "all"):
+        return text
+    if "-" not in text:
+        raise typer.BadParameter(
+            f"{text!r} is not primary, adjacent, all or pairs such as 0-1,0-5."
+        )
+    return [pair_of(each) for each in text.split(",")]
+
+
+def frames_of(text: str) -> Any:
+    """Return frames as `StereoPairs` takes them."""
+    if text in ("all", "first"):
+        return text
+    every, _, step = text.partition(":")
+    if every == "every" and step.isdecimal():
+        return ("every", int(step))
+    if all(map(str.isdecimal, text.split(","))):
+        return [int(number) for number in text.split(",")]
+    raise typer.BadParameter(f"{text!r} is not all, first, every:K or numbers such as 0,40,80.")
+
+
+def filter_of(text: str) -> tuple[str, Any]:
+    """Return the name and the value of a filter such as family=Uniform; texts in a list."""
+    name, _, value = text.partition("=")
+    low, _, high = value.partition(":")
+    if not value:
+        raise typer.BadParameter(f"{text!r}: write NAME=VALUE, such as family=Uniform.")
+    try:
+        if name in _RANGES:
+            return name, (float(low), float(high or low))
+        if name == "min_frames":
+            return name, int(value)
+    except ValueError:
+        cure = "LOW:HIGH, such as focal_mm=18:35" if name in _RANGES else "a whole number"
+        raise typer.BadParameter(f"{text!r}: write {cure}.") from None
+    return ("scenes" if name == "scene" else name), value if name == "caption" else [value]
+
+
+def part_of(text: str) -> tuple[int, int]:
+    """Return (number, count) of a part such as 1/4."""
+    number, _, count = text.partition("/")
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise typer.BadParameter(
+            f"{text!r} is not a part: write I/N with I from 1 to N, such as 1/4 to 4/4."
+        )
+    return int(number), int(count)
+
+
+SizeOption = Annotated[
+    Any,
+    typer.Option(
+        "--size", parser=size_of, metavar="WxH", help="Width x height, such as 832x480 [as stored]."
+    ),
+]
+CamerasOption = Annotated[
+    Any,
+    typer.Option(
+        "--cameras", parser=cameras_of, metavar="N,N", help="Such as 0,1 [all that a scene has]."
+    ),
+]
+PartOption = Annotated[
+    Any,
+    typer.Option(
+        "--part", parser=part_of, metavar="I/N", help="The I-th of N parts, one for each machine."
+    ),
+]
+ShardsArgument = Annotated[str, typer.Argument(help="Folder of shards, or its index file.")]
+JsonOption = Annotated[bool, flag("--json", "Report as JSON on stdout.")]
+OutOption = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")]
+OutArgument = Annotated[Path, typer.Argument(parser=out_folder, help="Folder to write into.")]
+RootArgument = Annotated[
+    str, typer.Argument(help="Folder that holds train/ or eval/, or its URL.", show_default=False)
+]
+ConventionsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--conventions",
+        metavar="FILE",
+        help="How files are read and what depth means, as `conventions` writes it.",
+    ),
+]
 
 
 @dataclass(frozen=True, kw_only=True)
 class DataOptions:
     """The data that a command reads."""
 
-    data: Annotated[
-        str,
-        typer.Argument(help="Folder of scenes or shards, an index file, or a URL."),
-    ]
-    data_root: RootOption = None
+    data: Annotated[str, typer.Argument(help="Folder of scenes or shards, an index file, or URL.")]
+    data_root: Annotated[
+        str | None,
+        typer.Option("--root", help="Where the data of an index file are, if not beside."),
+    ] = None
     conventions: ConventionsOption = None
 
     def open(self) -> "SceneIndex":
@@ -249,67 +253,84 @@ class DataOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShardsOptions:
-    """The shards that a command reads."""
-
-    shards: Annotated[str, typer.Argument(help="Folder of shards, or its index file.")]
-    data_root: RootOption = None
-
-
-@dataclass(frozen=True, kw_only=True)
 class SceneOptions:
     """Which scenes of the data a command takes."""
 
-    split: SplitOption = None
-    subset: Annotated[
+    split: Annotated[
         str | None,
         typer.Option(
-            help="Of eval scenes: seen_map or unseen_map.",
-            autocompletion=complete_from(get_args(Subset)),
+            metavar="train|eval",
+            help="The split [both].",
+            autocompletion=complete_from(("train", "eval")),
             rich_help_panel=SCENES,
         ),
     ] = None
-    family: FamilyOption = None
-    map_name: MapOption = None
-    scene: Annotated[
-        list[str] | None,
+    where: Annotated[
+        list[Any] | None,
         typer.Option(
-            metavar="KEY",
-            help="Key of a scene. May be repeated.",
-            autocompletion=complete_scene,
-            rich_help_panel=SCENES,
-        ),
-    ] = None
-    focal_mm: Annotated[
-        tuple[float, float] | None,
-        typer.Option(help="Focal lengths, such as 18 35.", rich_help_panel=SCENES),
-    ] = None
-    min_frames: Annotated[
-        int | None,
-        typer.Option(min=1, help="Fewest frames of a scene.", rich_help_panel=SCENES),
-    ] = None
-    caption: Annotated[
-        str | None,
-        typer.Option(
-            metavar="WORDS",
-            help="Words that must all be in the caption.",
+            parser=filter_of,
+            metavar="NAME=VALUE",
+            help="Such as scene=KEY (or a part of it), family=Uniform, map=Stylized_Egypt, "
+            "subset=unseen_map, focal_mm=18:35, min_frames=60, caption=WORDS. May be repeated.",
+            autocompletion=_complete_where,
             rich_help_panel=SCENES,
         ),
     ] = None
 
     def filters(self) -> dict[str, Any]:
         """Return the filters that were given, by their names in `SceneFilters`."""
-        options = {
-            "split": self.split,
-            "subset": self.subset,
-            "family": self.family,
-            "map": self.map_name,
-            "scenes": self.scene,
-            "focal_mm": self.focal_mm,
-            "min_frames": self.min_frames,
-            "caption": self.caption,
-        }
-        return {name: value for name, value in options.items() if value not in (None, [], ())}
+        filters: dict[str, Any] = {}
+        for name, value in self.where or []:
+            is_listed = isinstance(value, list)
+            filters[name] = [*filters.get(name, ()), *value] if is_listed else value
+        return filters if self.split in (None, "all") else {"split": self.split} | filters
+
+    def by_path(self) -> "Callable[[SceneId], bool] | None":
+        """Return whether a scene's path passes the filters; None if all pass.
+
+        Raises:
+            typer.BadParameter: If the path does not answer one of the filters.
+        """
+        from stereogenbench_data.selection.filters import may_pass
+
+        filters = self.filters()
+        for name in filters.keys() - {*_OF_PATH}:
+            raise typer.BadParameter(
+                f"{name}: the path of a scene does not tell it; filter by family or map.",
+                param_hint="--where",
+            )
+        return may_pass(filters)
+
+
+PairsOption = Annotated[
+    Any,
+    typer.Option(
+        parser=pairs_of,
+        metavar="PAIRS",
+        help="primary, adjacent, all, or such as 0-1,0-5; by length --where baseline_cm=10:60.",
+        rich_help_panel=SCENES,
+    ),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampleOptions(SceneOptions):
+    """Which pairs and frames of which scenes a command takes."""
+
+    pairs: PairsOption = "primary"
+    frames: Annotated[
+        Any,
+        typer.Option(
+            parser=frames_of,
+            metavar="FRAMES",
+            help="all, first, every:K, or such as 0,40,80.",
+            rich_help_panel=SCENES,
+        ),
+    ] = "all"
+
+    def selection(self) -> dict[str, Any]:
+        """Return the options of `StereoPairs` that select samples."""
+        return self.filters() | {"pairs": self.pairs, "frames": self.frames}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -342,7 +363,7 @@ class ShareOptions:
         """Return the rows to take of some scenes, given how many bytes each takes.
 
         Raises:
-            ShardError: If the size is none.
+            ShardError: If the size cannot be parsed.
             SelectionError: If there are fewer scenes, or none fits.
         """
         from stereogenbench_data.selection.share import balanced_share
@@ -357,8 +378,12 @@ class ShareOptions:
 class WorkOptions:
     """How many processes do the work of a command, and where."""
 
-    workers: WorkersOption = None
-    engine: EngineOption = "local"
+    workers: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N|ray|ray://HOST:PORT", help="Processes, or a Ray cluster [one a core]."
+        ),
+    ] = None
 
     def options(self, *, device: str = "cpu") -> dict[str, Any]:
         """Return ``workers`` and ``engine`` as the functions that do batch work take them.
@@ -369,6 +394,8 @@ class WorkOptions:
         Raises:
             StorageError: If there is no engine of that name.
         """
-        from stereogenbench_data.engine import engine_of
+        from stereogenbench_data.engine import LOCAL, engine_of
 
-        return {"workers": self.workers, "engine": engine_of(self.engine, device=device)}
+        if self.workers is None or self.workers.isdecimal():
+            return {"workers": int(self.workers) if self.workers else None, "engine": LOCAL}
+        return {"workers": None, "engine": engine_of(self.workers, device=device)}

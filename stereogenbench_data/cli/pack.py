@@ -8,20 +8,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from stereogenbench_data.cli.data import open_index
-from stereogenbench_data.cli.errors import FINDINGS, resumable
-from stereogenbench_data.cli.help import RARE
+from stereogenbench_data.cli.data import open_data
+from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import (
-    AcceptOption,
-    ConventionsOption,
+    CamerasOption,
+    DataOptions,
     JsonOption,
-    RootOption,
+    OutArgument,
+    PartOption,
     SceneOptions,
-    ShardsOptions,
+    ShardsArgument,
     ShareOptions,
+    SizeOption,
     WorkOptions,
+    flag,
     grouped,
-    out_folder,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted, plain_line
@@ -30,71 +31,32 @@ if TYPE_CHECKING:
     from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.shards.training import TrainingSettings
 
-_TRAINING = "Training shards"
-"""Panel of the help for the options that training shards have."""
-
 
 @grouped
-@resumable()
 def pack(  # noqa: PLR0913 - one parameter an option
-    root: Annotated[
-        str,
-        typer.Argument(
-            help="Folder of scenes or its index file; with --size also shards or a URL."
-        ),
-    ],
-    out: Annotated[
-        Path, typer.Argument(parser=out_folder, help="Folder for the shards and their index.")
-    ],
+    source: DataOptions,
+    out: OutArgument,
     *,
-    data_root: RootOption = None,
-    conventions: ConventionsOption = None,
     shard_size: Annotated[
         str,
         typer.Option(help="Largest shard, such as 500MB or 2GiB; a scene is never divided."),
     ] = "2GB",
-    part: Annotated[
-        str,
-        typer.Option(
-            metavar="I/N",
-            help="Every N-th shard from the I-th on: a part for each machine.",
-            rich_help_panel=RARE,
-        ),
-    ] = "1/1",
-    size: Annotated[
-        str | None,
-        typer.Option(
-            metavar="WxH",
-            help="Width x height, such as 832x480; makes training shards.",
-            rich_help_panel=_TRAINING,
-        ),
-    ] = None,
+    part: PartOption = "1/1",
+    size: SizeOption = None,
     quality: Annotated[
         Literal["small", "balanced", "high"] | None,
-        typer.Option(help="Fewest bytes, or least error [balanced].", rich_help_panel=_TRAINING),
+        typer.Option(help="With --size: fewest bytes, or least error [balanced]."),
     ] = None,
-    cameras: Annotated[
-        str | None,
-        typer.Option(help="Such as 0,1 [all that a scene has].", rich_help_panel=_TRAINING),
-    ] = None,
-    accept: AcceptOption = None,
+    cameras: CamerasOption = None,
     dry_run: Annotated[
-        bool,
-        typer.Option(
-            "--dry-run",
-            help="Estimate bytes and core-hours; write nothing.",
-            rich_help_panel=_TRAINING,
-        ),
+        bool, flag("--dry-run", "With --size: estimate bytes and core-hours; write nothing.")
     ] = False,
     chosen: SceneOptions,
     share: ShareOptions,
     work: WorkOptions,
     depth_codec: Annotated[
         Literal["released", "blosc2"],
-        typer.Option(
-            help="As released, or lossless and ten times as fast to decode.",
-            rich_help_panel=RARE,
-        ),
+        typer.Option(help="As released, or lossless and ten times as fast to decode."),
     ] = "released",
     as_json: JsonOption = False,
 ) -> None:
@@ -109,23 +71,23 @@ def pack(  # noqa: PLR0913 - one parameter an option
     With --size the shards are derived for training: smaller pictures, a key frame every few frames,
     depth bit for bit as `size=` gives it. --quality small and balanced encode H.264, high encodes
     JPEG. The error of each video is in the index. Evaluation and audit refuse such data.
+
+    Example: `stereogenbench pack scenes/ packed/ --shard-size 2GB`
     """
     from stereogenbench_data.selection.filters import filter_scenes
     from stereogenbench_data.shards.pack import pack as packed_by
     from stereogenbench_data.shards.plan import packed_bytes, parse_bytes
 
-    number, _, count = part.partition("/")
-    if not (number.isdecimal() and count.isdecimal()):
+    for option, value in (("--quality", quality), ("--cameras", cameras), ("--dry-run", dry_run)):
+        if value and size is None:
+            raise typer.BadParameter("is of training shards: give --size.", param_hint=option)
+    if size is not None and depth_codec != "released":
         raise typer.BadParameter(
-            f"{part!r} is not a part: write I/N, such as 1/4.", param_hint="--part"
+            "training shards have depth of their own: leave it out.", param_hint="--depth-codec"
         )
     target_bytes = parse_bytes(shard_size)
-    training = _training(
-        size, quality=quality, cameras=cameras, depth_codec=depth_codec, accept=accept
-    )
-    if dry_run and training is None:
-        raise typer.BadParameter("estimates training shards: give --size.", param_hint="--dry-run")
-    index = open_index(root, root=data_root, conventions=conventions)
+    index = source.open()
+    training = None if size is None else _training(index, size, quality, cameras)
     filters: Any = chosen.filters()
     rows = filter_scenes(index, filters).tolist() if filters or share.is_given else None
     if rows is not None and share.is_given:
@@ -145,7 +107,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
             depth_codec=depth_codec,
             training=training,
             rows=rows,
-            part=(int(number), int(count)),
+            part=part,
             **work.options(),
             progress=progress,
         )
@@ -174,41 +136,14 @@ def pack(  # noqa: PLR0913 - one parameter an option
 
 
 def _training(
-    size: str | None,
-    *,
-    quality: Any,
-    cameras: str | None,
-    depth_codec: str,
-    accept: list[str] | None,
-) -> "TrainingSettings | None":
-    """Return the settings of training shards; None without a size."""
-    if size is None:
-        for option, value in (
-            ("--quality", quality), ("--cameras", cameras), ("--accept", accept),
-        ):  # fmt: skip
-            if value:
-                raise typer.BadParameter("is of training shards: give --size.", param_hint=option)
-        return None
-    from stereogenbench_data.cli.samples import parse_picture_size
+    index: "SceneIndex", size: tuple[int, int], quality: Any, cameras: tuple[int, ...] | None
+) -> "TrainingSettings":
     from stereogenbench_data.schema.records import DepthEncoding
     from stereogenbench_data.shards.training import TrainingSettings
 
-    if depth_codec != "released":
-        raise typer.BadParameter(
-            "training shards have depth of their own: leave it out.", param_hint="--depth-codec"
-        )
-    numbers = None
-    if cameras is not None:
-        parts = [part.strip() for part in cameras.split(",")]
-        if not all(part in set("012345") for part in parts):
-            raise typer.BadParameter(
-                f"{cameras!r}: write numbers from 0 to 5, such as 0,1", param_hint="--cameras"
-            )
-        numbers = tuple(sorted({int(part) for part in parts}))
-    losses: Any = frozenset(accept or ())
-    return TrainingSettings(
-        parse_picture_size(size), quality or "balanced", numbers, DepthEncoding(accept=losses)
-    )
+    stated = [shape.depth.encoding.accept for shape in index.shapes if shape.depth is not None]
+    depth = DepthEncoding(accept=frozenset().union(*stated))
+    return TrainingSettings(size, quality or "balanced", cameras, depth)
 
 
 def _print_estimate(
@@ -232,18 +167,15 @@ def _print_estimate(
 
 @grouped
 def verify(
-    source: ShardsOptions,
+    shards: ShardsArgument,
     *,
-    deep: Annotated[
-        bool, typer.Option("--deep", help="Decode every video, and count its frames.")
-    ] = False,
+    deep: Annotated[bool, flag("--deep", "Decode every video, and count its frames.")] = False,
     comparison: Annotated[
         str | None,
         typer.Option(
             "--source",
             metavar="DATA",
             help="With --deep: released data to compare training shards with.",
-            rich_help_panel=RARE,
         ),
     ] = None,
     as_json: JsonOption = False,
@@ -252,6 +184,8 @@ def verify(
     """Read every byte of shards, and list what is wrong.
 
     The exit status is 0 if nothing is wrong, 1 if something is, 2 if they cannot be verified.
+
+    Example: `stereogenbench verify shards/ --deep`
     """
     from stereogenbench_data.shards.verify import verify as verified
 
@@ -259,10 +193,9 @@ def verify(
         raise typer.BadParameter("compares frames: add --deep.", param_hint="--source")
     with progress_bar("verifying", unit="MB") as progress:
         report = verified(
-            source.shards,
-            root=source.data_root,
+            shards,
             mode="decode" if deep else "bytes",
-            source=None if comparison is None else open_index(comparison),
+            source=None if comparison is None else open_data(comparison),
             **work.options(),
             progress=progress,
         )
@@ -286,10 +219,9 @@ def verify(
 
 
 @grouped
-@resumable()
 def unpack(
-    source: ShardsOptions,
-    out: Annotated[Path, typer.Argument(parser=out_folder, help="Folder for the scenes.")],
+    shards: ShardsArgument,
+    out: OutArgument,
     *,
     work: WorkOptions,
     as_json: JsonOption = False,
@@ -299,14 +231,15 @@ def unpack(
     Each file is checked against the index. Files that were packed unchanged come out byte for byte.
     Depth that blosc2 packed becomes FFV1 video again, with the same numbers, times and tags.
     Nothing is overwritten. To continue a stopped run, run it again: it keeps the scenes that exist.
+
+    Example: `stereogenbench unpack shards/ scenes/`
     """
     from stereogenbench_data.shards.unpack import unpack as unpacked
 
     with progress_bar("unpacking", unit="MB") as progress:
         report = unpacked(
-            source.shards,
+            shards,
             out,
-            root=source.data_root,
             **work.options(),
             progress=progress,
         )

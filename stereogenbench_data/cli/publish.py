@@ -10,8 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from stereogenbench_data.cli.errors import FINDINGS
-from stereogenbench_data.cli.help import RARE
-from stereogenbench_data.cli.options import JsonOption, RootOption, ShardsOptions, grouped
+from stereogenbench_data.cli.options import (
+    JsonOption,
+    ShardsArgument,
+    flag,
+    grouped,
+)
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted
 
@@ -61,21 +65,13 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         ),
     ] = None,
     *,
-    data_root: RootOption = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Descriptor to write, with tables beside.")
     ] = None,
-    check: Annotated[
-        bool,
-        typer.Option("--check", help="Check a descriptor and its files."),
-    ] = False,
+    check: Annotated[bool, flag("--check", "Check a descriptor and its files.")] = False,
     base_url: Annotated[
         str | None,
         typer.Option(help="URL of the data, pinned to a revision [paths from the descriptor]."),
-    ] = None,
-    tables_url: Annotated[
-        str | None,
-        typer.Option(help="URL of the tables' folder [beside the data].", rich_help_panel=RARE),
     ] = None,
     name: Annotated[
         str | None, typer.Option(help="The dataset's name [as its maker states].")
@@ -91,14 +87,16 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     ] = None,
     about: AboutOption = None,
     template: Annotated[
-        bool, typer.Option("--template", help="Write the questions that --about answers.")
+        bool, flag("--template", "Write the questions that --about answers.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Report as JSON on stdout.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Write a Croissant 1.1 descriptor, or check one.
 
     The check is mlcroissant's own (extra 'croissant'), and of the properties on responsible use
     and the files that are beside the descriptor: size and checksum.
+
+    Example: `stereogenbench publish croissant shards/ -o croissant/sample.json`
     """
     if check:
         _check(data, as_json=as_json)
@@ -119,13 +117,12 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         write_node(dataset_facts.template(), out)
         typer.echo(f"{out}: answer the questions, then add --about {out}")
         return
-    index = None if data is None else SceneIndex.open(data, root=data_root, rows="read")
+    index = None if data is None else SceneIndex.open(data, rows="read")
     publication = Publication(
         name=name,
         version=release,
         published=None if published is None else published.date(),
         data_url=None if base_url is None else base_url.rstrip("/"),
-        tables_url=None if tables_url is None else tables_url.rstrip("/"),
         about=_stated(about),
     )
     descriptor = write_descriptor(index, out, publication=publication)
@@ -155,7 +152,7 @@ def _check(data: str | None, *, as_json: bool) -> None:
 
 @grouped
 def card(
-    source: ShardsOptions,
+    shards: ShardsArgument,
     repository: RepositoryArgument,
     *,
     out: Annotated[
@@ -168,12 +165,14 @@ def card(
 
     The Hub shows it, and `datasets` reads its configurations. With --out, the rows that the Hub's
     viewer shows are written beside it, in `viewer/`.
+
+    Example: `stereogenbench publish card packed/ ORG/NAME -o packed/`
     """
     from stereogenbench_data.bridges.card import card as card_text
     from stereogenbench_data.bridges.card import write_card
     from stereogenbench_data.index.table import SceneIndex
 
-    index = SceneIndex.open(source.shards, root=source.data_root)
+    index = SceneIndex.open(shards)
     if out is None:
         typer.echo(card_text(index, repository=repository, about=_stated(about)), nl=False)
         return
@@ -185,7 +184,7 @@ def card(
 
 
 def upload(
-    shards: Annotated[Path, typer.Argument(help="Folder of shards, as `pack` wrote it.")],
+    shards: ShardsArgument,
     repository: RepositoryArgument,
     *,
     branch: Annotated[str, typer.Option(help="Branch to commit to.")] = "main",
@@ -196,14 +195,16 @@ def upload(
 
     It needs the extra 'hub'. The card and the descriptor are written into the folder first. Log in
     with `hf auth login`. To continue a stopped run, run it again.
+
+    Example: `stereogenbench publish upload packed/ ORG/NAME`
     """
     from stereogenbench_data.bridges.upload import prepare_upload
     from stereogenbench_data.bridges.upload import upload as uploaded
 
     # The Hub's client has progress bars of its own.
     with progress_bar("picturing", unit="scenes") as progress:
-        prepare_upload(shards, repository, about=_stated(about), progress=progress)
-    report = uploaded(shards, repository, branch=branch, about=_stated(about))
+        prepare_upload(Path(shards), repository, about=_stated(about), progress=progress)
+    report = uploaded(Path(shards), repository, branch=branch, about=_stated(about))
     if as_json:
         typer.echo(json.dumps(asdict(report), indent=2))
         return

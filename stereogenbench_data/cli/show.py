@@ -5,23 +5,15 @@ from typing import Annotated, Any
 
 import typer
 
-from stereogenbench_data.cli.options import (
-    AcceptOption,
-    DataOptions,
-    DepthUnitOption,
-    complete_scene,
-    depth_of,
-    grouped,
-    pair_of,
-)
+from stereogenbench_data.cli.options import DataOptions, complete_scene, grouped, pair_of
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
 
-_CLIPS = (".mp4", ".gif")
+_ENDINGS = (".png", ".mp4", ".gif", ".rrd")
 
 
 @grouped
-def show(  # noqa: PLR0913 - one parameter an option
+def show(
     source: DataOptions,
     scene: Annotated[
         str | None,
@@ -40,93 +32,60 @@ def show(  # noqa: PLR0913 - one parameter an option
         ),
     ] = None,
     pair: Annotated[
-        str | None, typer.Option(help="Two cameras, such as 0-5 [as recorded].")
+        Any,
+        typer.Option(
+            parser=pair_of, metavar="LEFT-RIGHT", help="Two cameras, such as 0-5 [as recorded]."
+        ),
     ] = None,
     frame: Annotated[int, typer.Option(min=0, help="Number of the frame.")] = 0,
-    size: Annotated[
+    width: Annotated[
         int | None,
         typer.Option(min=1, max=2048, help="Width of each drawn picture, px [320]."),
     ] = None,
-    live: Annotated[
-        bool, typer.Option("--live", help="Open Rerun's viewer; write no file.")
-    ] = False,
-    depth_unit_m: DepthUnitOption = None,
-    accept: AcceptOption = None,
 ) -> None:
     """Draw one scene with the disparity of a pair.
 
     A sheet shows the six views, and a pair's disparity, depth, visibility and warp. The bar of
     disparity shows pixels and metres, of the stored pictures. A clip shows left, right, disparity
     and anaglyph over time. A recording for Rerun's viewer has all six cameras over time.
+
+    Example: `stereogenbench show shards/ scene_000001 --pair 0-5 -o sheet.png`
     """
     from stereogenbench_data.audit.pictures import scene_pictures
     from stereogenbench_data.audit.pictures.scene_reader import SceneReader
     from stereogenbench_data.samples.picture import write_png
     from stereogenbench_data.selection.filters import find_scene
 
-    cameras = None if pair is None else pair_of(pair, option="--pair")
     ending = ".png" if out is None else out.suffix.lower()
-    if live or ending == ".rrd":
-        shown: dict[str, Any] = {
-            "pair": cameras,
-            "depth": {"unit_m": depth_unit_m, "accept": accept},
-        }
-        _show_in_rerun(source, scene, out, width_px=size, is_live=live, **shown)
-        return
-    if ending not in (".png", *_CLIPS):
+    if ending not in _ENDINGS:
         raise typer.BadParameter(
             f"{out}: a sheet is .png, a clip .mp4 or .gif, a recording .rrd.", param_hint="--out"
         )
     index = source.open()
     row = 0 if scene is None else find_scene(index, scene)
     recorded = index.scene(row)
-    key = recorded.id.key
+    key, rig = recorded.id.key, recorded.rig
     target = out or Path(key.replace("/", "_") + ".png")
-    reader = SceneReader(index, depth=depth_of(index, unit_m=depth_unit_m, accept=accept))
     with writing(target):
-        if ending in _CLIPS:
+        if ending == ".png":
+            sheet = scene_pictures.scene_sheet(
+                SceneReader(index), row, pair=pair, frame=frame, tile_px=width
+            )
+            write_png(target, sheet)
+        elif ending == ".rrd":
+            from stereogenbench_data.bridges.rerun import write_recording
+
+            height = rig.image_height_px * (width or 0) / rig.image_width_px
+            size = None if width is None else (max(1, round(height)), width)
+            with progress_bar("logging", unit="frames") as progress:
+                write_recording(target, index, key, pair=pair, size=size, progress=progress)
+        else:
             with progress_bar("drawing", unit="frames") as progress:
                 scene_pictures.write_clip(
                     target,
-                    scene_pictures.clip_pages(reader, row, pair=cameras, tile_px=size),
+                    scene_pictures.clip_pages(SceneReader(index), row, pair=pair, tile_px=width),
                     frames=recorded.frames,
                     rate_hz=recorded.frame_rate_hz,
                     progress=progress,
                 )
-        else:
-            sheet = scene_pictures.scene_sheet(reader, row, pair=cameras, frame=frame, tile_px=size)
-            write_png(target, sheet)
     typer.echo(f"{target}: {key}")
-
-
-def _show_in_rerun(
-    source: DataOptions,
-    scene: str | None,
-    out: Path | None,
-    *,
-    width_px: int | None,
-    is_live: bool,
-    depth: dict[str, Any],
-    **shown: Any,
-) -> None:
-    from stereogenbench_data.bridges.rerun import view_live, write_recording
-    from stereogenbench_data.selection.filters import find_scene
-
-    if is_live and out is not None:
-        raise typer.BadParameter(f"{out}: --live writes no file.", param_hint="--out")
-    index = source.open()
-    found = index.scene(0 if scene is None else find_scene(index, scene))
-    key, rig = found.id.key, found.rig
-    shown["depth"] = depth_of(index, **depth)
-    if width_px is not None:
-        shown["size"] = (
-            max(1, round(rig.image_height_px * width_px / rig.image_width_px)),
-            width_px,
-        )
-    target = out or Path(key.replace("/", "_") + ".rrd")
-    with progress_bar("logging", unit="frames") as progress, writing(target):
-        if is_live:
-            view_live(index, key, progress=progress, **shown)
-        else:
-            write_recording(target, index, key, progress=progress, **shown)
-    typer.echo(f"{'live' if is_live else target}: {key}")

@@ -7,13 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stereogenbench_data.cli.options import (
-    DataOptions,
-    JsonOption,
-    OutOption,
-    SceneOptions,
-    grouped,
-)
+from stereogenbench_data.cli.options import DataOptions, JsonOption, SceneOptions, grouped
 from stereogenbench_data.cli.writing import write_report, writing
 
 
@@ -22,16 +16,22 @@ def stats(
     source: DataOptions,
     *,
     chosen: SceneOptions,
-    plots: Annotated[
+    out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Folder for histograms (extra 'plots')."),
+        typer.Option(
+            "--out",
+            "-o",
+            help="File to write, .md or .json; or a folder for the page and histograms (extra "
+            "'plots').",
+        ),
     ] = None,
-    out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Count scenes, maps, baselines and focal lengths.
 
     The tables are the paper's; its figures stand beside whole splits. It reads only the index.
+
+    Example: `stereogenbench stats shards/ -o stats/`
     """
     from stereogenbench_data.audit.statistics import statistics
     from stereogenbench_data.audit.statistics_report import (
@@ -48,11 +48,11 @@ def stats(
     }
     text = json.dumps(document, indent=1)
     markdown = statistics_markdown(found, lines)
+    if out is not None and not out.suffix:
+        with writing(out):
+            for path in write_plots(index, out, **filters):
+                typer.echo(str(path), err=True)
+        out = out / "stats.md"
     if out is not None:
         write_report(out, text if out.suffix == ".json" else markdown)
     typer.echo(text if as_json else markdown.rstrip())
-    if plots is not None:
-        with writing(plots):
-            written = write_plots(index, plots, **filters)
-        for path in written:
-            typer.echo(str(path), err=True)

@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from stereogenbench_data.cli.errors import resumable
 from stereogenbench_data.cli.options import (
     JsonOption,
+    OutArgument,
+    PartOption,
     WorkOptions,
     complete_from,
+    flag,
     grouped,
-    out_folder,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import require_writable, write_report
@@ -34,11 +35,8 @@ _ALL: str = "all"
 
 
 @grouped
-@resumable()
 def synth(  # noqa: PLR0913 - one parameter an option
-    out: Annotated[
-        Path, typer.Argument(parser=out_folder, help="Folder to write train/ or eval/ into.")
-    ],
+    out: OutArgument,
     *,
     family: Annotated[
         str,
@@ -77,16 +75,12 @@ def synth(  # noqa: PLR0913 - one parameter an option
             help="assets.toml of your own maps and characters, for Blender [the built-in maps]."
         ),
     ] = None,
-    part: Annotated[
-        str, typer.Option(help="I/N: the I-th of N parts, for N machines.", metavar="I/N")
-    ] = "1/1",
+    part: PartOption = "1/1",
     check: Annotated[
         Literal["pictures", "audit"],
         typer.Option(help="What rendered scenes must pass; audit: also the audit and the doctor."),
     ] = "pictures",
-    plan_only: Annotated[
-        bool, typer.Option("--plan-only", help="Propose and filter, render nothing.")
-    ] = False,
+    plan_only: Annotated[bool, flag("--plan-only", "Propose and filter, render nothing.")] = False,
     report: Annotated[
         Path | None,
         typer.Option(help="File for a report on all proposals of OUT so far: .md or .json."),
@@ -107,6 +101,8 @@ def synth(  # noqa: PLR0913 - one parameter an option
     Proposals of subject, lens, rig and path are examined until one passes the filters; that one is
     rendered and checked. To continue a stopped run, run it again: it keeps the scenes and decisions
     of the same request. Scene i is the same for any number of scenes, workers and parts.
+
+    Example: `stereogenbench synth scenes/ --family Uniform --scenes 4 --size 256`
     """
     from stereogenbench_data.synthesis.decisions import (
         all_decisions,
@@ -154,7 +150,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
         ),
         check=check,
     )
-    how: Any = {"renderer": chosen, "part": _part_of(part), **work.options()}
+    how: Any = {"renderer": chosen, "part": part, **work.options()}
     with progress_bar("proposing", unit="scenes") as progress:
         decisions = plan_scenes(out, request, progress=progress, **how)
     keys: list[str] = []
@@ -183,7 +179,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
     where = (
         f" in {', '.join(folders)}"
         if folders
-        else f" (part {part} of {scenes} has none, or all are held out)"
+        else f" (part {part[0]}/{part[1]} of {scenes} has none, or all are held out)"
     )
     _print(
         {"root": str(out), "scenes": keys},
@@ -221,16 +217,6 @@ def _listed(path: Path) -> list[str]:
         raise typer.BadParameter(
             f"{path} is not text. List paths of scenes, one a line.", param_hint="--holdout"
         ) from error
-
-
-def _part_of(text: str) -> tuple[int, int]:
-    number, _, count = text.partition("/")
-    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
-        raise typer.BadParameter(
-            f"{text!r} is not a part: write I/N with I from 1 to N, such as 1/4 to 4/4.",
-            param_hint="--part",
-        )
-    return int(number), int(count)
 
 
 def _print(document: Any, text: str, *, as_json: bool) -> None:

@@ -34,8 +34,8 @@ ANY_DEPTH: Final = DepthEncoding(accept=frozenset(get_args(DepthRisk)))
 
 NO_DEPTH_UNIT: Final = "its files do not tell how many metres a stored unit of depth has"
 DEPTH_CURES: Final = (
-    "Pass DepthEncoding(unit_m=...), by command --depth-unit-m, with what `stereogenbench doctor "
-    "ROOT` measures; or correct the files and index them again."
+    "State what `stereogenbench doctor ROOT` measures: pass DepthEncoding(unit_m=...), or write "
+    "unit_m below [depth] in a file for --conventions. Or correct the files and index them again."
 )
 """What to do where no unit is known."""
 
@@ -165,8 +165,8 @@ def require_depth_stream(
         raise MediaError(
             f"{stored} ({', '.join(refused)}), which does not keep depth whole. Store it as "
             f"gray16le with FFV1; if this is intended, pass "
-            f"DepthEncoding(accept=frozenset({{{accept}}})), by command --accept, with unit_m=... "
-            f"if the file does not tell its unit.{rescaled}"
+            f"DepthEncoding(accept=frozenset({{{accept}}})), with unit_m=... if the file does not "
+            f"tell its unit; or write both below [depth] in a file for --conventions.{rescaled}"
         )
     return layout
 

@@ -3,30 +3,20 @@
 import json
 
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from stereogenbench_data.audit.geometry import audit as geometry_audit
-from stereogenbench_data.cli.audit import audit
-from stereogenbench_data.errors import StorageError
 from tests.audit.corruption import copied, rewrite_rgb
+from tests.cli.command import invoke
 
 SCENE = "train/Uniform/SynthStage/scene_000000"
-FEW = ("--workers", "1", "--frames", "1", "--scene", SCENE)
+FEW = ("--workers", "1", "--per-scene", "1", "--where", f"scene={SCENE}")
 
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    """Run the command with a home of its own; several commands in one app, as the real one has."""
+    """Run the command with a home of its own."""
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    app = typer.Typer()
-    app.command()(audit)
-    app.command("other")(lambda: None)
-
-    def invoke(*words):
-        return CliRunner().invoke(app, ["audit", *map(str, words)], catch_exceptions=False)
-
-    return invoke
+    return lambda *words: invoke("audit", *words)
 
 
 def test_data_that_are_right_are_reported_as_a_table_with_exit_code_0(small_shards, run):
@@ -67,19 +57,18 @@ def test_the_report_can_be_written_as_markdown_or_json(small_shards, run, tmp_pa
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["audit.json", "audit.md"]
 
 
-def test_the_depth_contract_can_be_overridden(small_shards, run):
-    options = ("--depth-unit-m", "0.002", "--depth-kind", "ray", "--accept", "8-bit", "--json")
+def test_conventions_replace_the_depth_contract(small_shards, run, tmp_path):
+    stated = tmp_path / "stated.toml"
+    stated.write_text("[depth]\nunit_m = 0.002\ninstead_of_tag_m = 0.001\nkind = 'ray'\n")
 
-    document = json.loads(run(small_shards, *FEW, *options).stdout)
+    shown = run(small_shards, *FEW, "--conventions", stated, "--json")
 
-    assert document["scenes"][0]["cameras"][0]["depth_unit_m"] == 0.002
+    assert json.loads(shown.stdout)["scenes"][0]["cameras"][0]["depth_unit_m"] == 0.002
 
 
-@pytest.mark.parametrize("journal", ["given", "default"])
 def test_a_stopped_audit_keeps_its_journal_and_the_next_run_uses_it(
-    small_shards, run, monkeypatch, tmp_path, journal
+    small_shards, run, monkeypatch, tmp_path
 ):
-    place = ("--journal", tmp_path / "kept") if journal == "given" else ()
     plain = geometry_audit.audit_scene
     audited = []
 
@@ -90,18 +79,17 @@ def test_a_stopped_audit_keeps_its_journal_and_the_next_run_uses_it(
         return plain(task, after_bytes)
 
     monkeypatch.setattr(geometry_audit, "audit_scene", stop_at_the_second)
-    stopped = run(small_shards, "--workers", "1", "--frames", "1", *place)
-    written = (tmp_path / "kept", *(tmp_path / "home").rglob("audit-*.journal"))
-    kept = [path for path in written if path.is_file()]
+    stopped = run(small_shards, "--workers", "1", "--per-scene", "1")
+    kept = [*(tmp_path / "home").rglob("audit-*.journal")]
     monkeypatch.setattr(
         geometry_audit,
         "audit_scene",
         lambda task, told: audited.append(task.access.key) or plain(task, told),
     )
-    again = run(small_shards, "--workers", "1", "--frames", "1", *place)
+    again = run(small_shards, "--workers", "1", "--per-scene", "1")
 
     assert stopped.exit_code == 130
-    assert "stopped; run the same command again to go on from here" in stopped.stderr
+    assert "stopped; run the same command again to go on" in stopped.stderr
     assert len(kept) == 1
     assert again.exit_code == 0
     assert len(audited) == len(set(audited)) == 4
@@ -111,8 +99,8 @@ def test_a_stopped_audit_keeps_its_journal_and_the_next_run_uses_it(
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--frames", "some"), "--frames: 'some' is"),
-        (("--frames", "0"), "--frames: '0' is"),
+        (("--per-scene", "some"), "--per-scene: 'some' is"),
+        (("--per-scene", "0"), "--per-scene: '0' is"),
         (("-o", "."), "is a folder: name a file"),
     ],
 )
@@ -128,12 +116,14 @@ def test_a_filter_that_no_folder_matches_says_what_folders_there_are(small_relea
         "none of its 4 scenes is asked for; there are scenes in eval/MapSeenInTrain/Uniform/"
         "SynthStage, train/IPD_Gaussian/SynthStage, train/Uniform/SynthStage. Check the filters"
     )
-    with pytest.raises(StorageError, match=there):
-        run(small_release, "--workers", "1", "--family", "uniform")
+    refused = run(small_release, "--workers", "1", "--where", "family=uniform")
+
+    assert refused.exit_code == 2
+    assert there in refused.stderr
 
 
 def test_all_frames_can_be_audited(small_shards, run):
-    result = run(small_shards, "--workers", "1", "--scene", SCENE, "--frames", "all")
+    result = run(small_shards, "--workers", "1", "--where", f"scene={SCENE}", "--per-scene", "all")
 
     assert "1 of 4 scenes, all frames of each." in result.stdout
     assert "7/7 frames" in result.stderr

@@ -159,7 +159,7 @@ def test_a_report_has_structure_and_no_content(shared_scenes, tmp_path):
 
 
 def test_no_scene_of_a_filter_ends_with_2(small_release):
-    result = invoke("conventions", small_release, "--family", "Pairwise_Uniform")
+    result = invoke("conventions", small_release, "--where", "family=Pairwise_Uniform")
 
     assert result.exit_code == 2
     assert "filter" in result.stderr

@@ -13,7 +13,7 @@ from tests.audit.corruption import copied, rewrite_one_depth, scaled
 
 
 def run(*arguments):
-    few = ("--frames", "1", "--scenes", "1")
+    few = ("--per-scene", "1", "--scenes", "1")
     return CliRunner().invoke(app, ["doctor", *map(str, arguments), *few])
 
 
@@ -33,9 +33,11 @@ def test_a_right_tree_ends_with_0_and_says_what_was_tested(detailed_release, tmp
         assert min(image.size) > 800
 
 
-def test_a_wrong_quotient_ends_with_1_and_no_unit_to_paste(detailed_release):
-    text = run(detailed_release, "--unit-m", "0.1")
-    result = run(detailed_release, "--json", "--unit-m", "0.1")
+def test_a_wrong_quotient_ends_with_1_and_no_unit_to_paste(detailed_release, tmp_path):
+    stated = tmp_path / "stated.toml"
+    stated.write_text("[depth]\nunit_m = 0.1\ninstead_of_tag_m = 0.001\n")
+    text = run(detailed_release, "--conventions", stated)
+    result = run(detailed_release, "--json", "--conventions", stated)
 
     assert text.exit_code == result.exit_code == 1
     assert "Paste" not in text.stdout
@@ -74,7 +76,7 @@ def test_a_picture_of_no_known_kind_is_refused_before_anything_is_read(tmp_path)
 
 
 def test_a_filter_that_leaves_nothing_ends_with_2(detailed_release):
-    result = run(detailed_release, "--family", "Uniform")
+    result = run(detailed_release, "--where", "family=Uniform")
 
     assert result.exit_code == 2
     assert "family" in result.stderr

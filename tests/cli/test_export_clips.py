@@ -20,7 +20,7 @@ def records(out):
 
 def test_it_says_what_was_written_and_what_was_there(indexed_release, tmp_path):
     words = [indexed_release, tmp_path / "out", "--layout", "musubi", "--split", "train"]
-    words += ["--workers", "1", "--preset", "ultrafast"]
+    words += ["--workers", "1"]
 
     first, again = run(*words), run(*words, "--json")
 
@@ -33,38 +33,32 @@ def test_it_says_what_was_written_and_what_was_there(indexed_release, tmp_path):
 
 def test_every_option_reaches_the_export(indexed_release, tmp_path):
     shown = run(
-        indexed_release, tmp_path / "out", "--layout", "diffsynth", "--family", "Uniform",
-        "--split", "train", "--pairs", "0-1,1-2", "--baseline-cm", "0", "500", "--length", "3",
-        "--stride", "2", "--step", "1", "--any-length", "--size", "48x32", "--fit", "crop",
-        "--rate-hz", "16",
+        indexed_release, tmp_path / "out", "--layout", "diffsynth", "--where", "family=Uniform",
+        "--where", "baseline_cm=0:500", "--split", "train", "--pairs", "0-1,1-2", "--length", "5",
+        "--stride", "1", "--step", "1", "--size", "48x32", "--fit", "crop", "--rate-hz", "16",
         "--also", "depth", "--also", "disparity", "--control", "left", "--baseline-in-caption",
-        "--crf", "20", "--preset", "ultrafast", "--pixel-format", "yuv444p",
-        "--key-frame-every", "2", "--depth-unit-m", "0.2", "--workers", "1",
+        "--crf", "20", "--workers", "1",
     )  # fmt: skip
 
     assert shown.exit_code == 0, shown.output
     found = records(tmp_path / "out")
     assert len(found) == 2 * 2 * 3
     assert (found[0]["width"], found[0]["height"], found[0]["frame_rate_hz"]) == (48, 32, 16)
-    assert found[0]["frames"] == [0, 2, 4]
+    assert found[0]["frames"] == [0, 1, 2, 3, 4]
     assert found[0]["caption"].endswith(" cm.")
     assert {"depth", "disparity"} < found[0]["videos"].keys()
     settings = json.loads((tmp_path / "out" / "export.json").read_text())
     assert (settings["control"], settings["form"]["fit"]) == ("left", "crop")
-    assert settings["form"]["encoding"] == {
-        "crf": 20, "preset": "ultrafast", "pixel_format": "yuv444p", "key_frame_every": 2,
-    }  # fmt: skip
-    assert "unit_m=0.2" in settings["depth"]
+    assert settings["form"]["encoding"]["crf"] == 20
 
 
 def test_evaluation_scenes_are_left_out_unless_their_split_is_named(indexed_release, tmp_path):
     words = [indexed_release, tmp_path / "out", "--layout", "stereocrafter", "--workers", "1"]
-    words += ["--preset", "ultrafast"]
 
     plain = run(*words)
-    refused = run(*words, "--subset", "seen_map")
+    refused = run(*words, "--where", "subset=seen_map")
     words[1] = tmp_path / "eval"
-    named = run(*words, "--subset", "seen_map", "--split", "eval")
+    named = run(*words, "--where", "subset=seen_map", "--split", "eval")
 
     assert "1 evaluation scene left out: --split eval exports them" in plain.stderr
     assert {record["split"] for record in records(tmp_path / "out")} == {"train"}
@@ -83,9 +77,8 @@ def test_evaluation_scenes_are_left_out_unless_their_split_is_named(indexed_rele
         (["--length", "7"], ["length=7", "4N+1", "5 or 9"]),
         (["--crf", "52"], ["crf", "0 to 51", "52"]),
         (["--stride", "0"], ["at least 1", "got 0"]),
-        (["--preset", "quick"], ["preset", "'quick'", "ultrafast"]),
         (["--also", "sound"], ["also", "'sound'", "disparity"]),
-        (["--family", "Narrow"], ["family", "Narrow", "Uniform"]),
+        (["--where", "family=Narrow"], ["family", "Narrow", "Uniform"]),
     ],
 )
 def test_what_cannot_be_is_refused_with_its_cure(indexed_release, tmp_path, words, said):
@@ -95,10 +88,3 @@ def test_what_cannot_be_is_refused_with_its_cure(indexed_release, tmp_path, word
     text = " ".join(shown.stderr.replace("│", " ").split())
     assert all(word in text for word in said), text
     assert not (tmp_path / "out").exists()
-
-
-def test_help_of_the_group_lists_what_can_be_exported():
-    shown = CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "200"})
-
-    assert "clips" in shown.stdout
-    assert "export clips" in shown.stdout

@@ -36,14 +36,6 @@ def test_an_error_is_reported_without_a_traceback_and_ends_with_exit_status_2(tm
     assert len(shown.stderr.strip().splitlines()) <= 2
 
 
-@pytest.mark.parametrize("words", ["--debug index nowhere", "index nowhere --debug"])
-def test_debug_shows_the_traceback_wherever_it_stands(tmp_path, words):
-    shown = run(*words.split(), cwd=tmp_path)
-
-    assert shown.returncode != 0
-    assert "Traceback" in shown.stderr
-
-
 @pytest.mark.parametrize("arguments", [["idnex"], ["index"], ["synth", "out", "--scenes", "some"]])
 def test_a_wrong_call_is_a_usage_error(arguments, tmp_path):
     shown = run(*arguments, cwd=tmp_path)

@@ -26,9 +26,7 @@ def test_the_first_scene_is_drawn_under_its_key(small_shards, tmp_path, monkeypa
 
 def test_a_part_of_a_key_a_pair_a_frame_and_a_size_are_taken(indexed_release, tmp_path):
     sheets = []
-    for number, options in enumerate(
-        ([], ["--pair", "0-5"], ["--frame", 6], ["--size", 256], ["--depth-unit-m", 0.01])
-    ):
+    for number, options in enumerate(([], ["--pair", "0-5"], ["--frame", 6], ["--width", 256])):
         out = tmp_path / f"{number}.png"
         shown = invoke("show", indexed_release, "scene_000001", "-o", out, *options)
         assert (shown.exit_code, shown.stdout) == (0, f"{out}: {SCENE}\n")
@@ -58,7 +56,6 @@ def test_a_clip_is_written_by_the_ending_of_its_name(small_shards, tmp_path, nam
         ([SCENE, "--frame", "7"], "has no frame 7: its 7 are 0 to 6"),
         ([SCENE, "-o", "sheet.jpg"], "a sheet is .png"),
         ([SCENE, "-o", "clip.avi"], "a clip .mp4 or .gif"),
-        ([SCENE, "--depth-unit-m", "-1"], "unit_m must be a positive number"),
     ],
 )
 def test_what_cannot_be_shown_is_refused(small_shards, tmp_path, monkeypatch, options, reason):
@@ -79,11 +76,13 @@ def test_depth_of_an_unknown_unit_is_refused_as_at_opening_and_an_option_cures_i
     place.write_text(json.dumps(recorded))
 
     refused = invoke("show", tree, SCENE, "-o", tmp_path / "sheet.png")
-    cured = invoke("show", tree, SCENE, "-o", tmp_path / "sheet.png", "--depth-unit-m", "0.001")
+    stated = tmp_path / "stated.toml"
+    stated.write_text("[depth]\nunit_m = 0.001\n")
+    cured = invoke("show", tree, SCENE, "-o", tmp_path / "sheet.png", "--conventions", stated)
 
     assert refused.exit_code == 2
     assert "$.depth_scale is '0.5'" in one_line(refused.stderr)
-    assert "--depth-unit-m" in one_line(refused.stderr)
+    assert "--conventions" in one_line(refused.stderr)
     assert (cured.exit_code, (tmp_path / "sheet.png").exists()) == (0, True)
 
 
@@ -95,8 +94,7 @@ def test_a_tree_with_a_broken_scene_shows_the_others(small_release, tmp_path):
     bad = invoke("show", tmp_path / "data", SCENE, "-o", tmp_path / "sheet.png")
     assert (good.exit_code, bad.exit_code) == (0, 2)
     assert f"'{SCENE}' is not a key of 3 scenes" in bad.stderr
-    assert f"1 broken of 4 scenes left out: {SCENE}/baseline.json: " in good.stderr
-    assert f"`stereogenbench index {tmp_path / 'data'}`" in good.stderr
+    assert f"{SCENE}/baseline.json: " in good.stderr
 
 
 def test_statistics_count_the_whole_scenes_of_a_tree_and_say_which_they_leave_out(
@@ -110,8 +108,8 @@ def test_statistics_count_the_whole_scenes_of_a_tree_and_say_which_they_leave_ou
 
     assert counted.exit_code == 0
     assert json.loads(counted.stdout)["scenes"] == 2
-    assert "1 broken and 1 incomplete of 4 scenes left out: " in counted.stderr
-    assert "(and 1 more)" in counted.stderr
+    assert "baseline.json" in counted.stderr
+    assert "_scene_complete.json" in counted.stderr
 
 
 def test_a_part_that_is_whole_folders_of_one_key_is_that_scene(small_release, tmp_path):

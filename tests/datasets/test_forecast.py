@@ -157,8 +157,8 @@ def test_a_forecast_of_small_scenes_measures_and_adds_up(small_shards):
 
 def test_the_command_prints_a_table_or_json(small_shards):
     words = (
-        "forecast", small_shards, "--samples-s", "20", "--delay-ms", "60", "--requests-s", "10",
-        "--batch-size", "2", "--measure-s", "0.5", "--accelerators", "1,100",
+        "forecast", small_shards, "--samples-s", "20", "--delay-ms", "60", "--total-mb-s", "0.001",
+        "--batch-size", "2", "--accelerators", "1,100",
         "--frames", "random:2",
     )  # fmt: skip
     text, document = invoke(*words), invoke(*words, "--json")
@@ -167,9 +167,9 @@ def test_the_command_prints_a_table_or_json(small_shards):
     assert "each 60 ms until its first byte" in text.stdout
     lines = text.stdout.splitlines()
     assert lines[-1].split()[:2] == ["100", "13"]
-    assert lines[-1].endswith("requests")
+    assert lines[-1].endswith("total bandwidth")
     found = json.loads(document.stdout)
-    assert found["scales"][1]["limit"] == "requests"
+    assert found["scales"][1]["limit"] == "total bandwidth"
     assert found["delay_ms"] == 60
 
 

@@ -295,7 +295,7 @@ def test_the_command_works_on_a_cluster_by_its_address_with_relative_paths(
 
     ended = subprocess.run(
         [sys.executable, "-m", "stereogenbench_data.cli.main", "pack", "scenes", "out",
-         "--shard-size", "250kB", "--engine", cluster],
+         "--shard-size", "250kB", "--workers", cluster],
         cwd=tmp_path, capture_output=True, text=True, check=False,
     )  # fmt: skip
 

@@ -109,7 +109,7 @@ def test_an_unknown_engine_is_refused_with_those_there_are():
 def test_each_batch_command_takes_an_engine(command, small_release, small_shards, tmp_path):
     arguments = command.format(release=small_release, shards=small_shards, out=tmp_path)
 
-    ended = CliRunner().invoke(app, [*arguments.split(), "--engine", "dask"])
+    ended = CliRunner().invoke(app, [*arguments.split(), "--workers", "dask"])
 
     assert ended.exit_code == 2
     assert "engine 'dask'" in ended.output

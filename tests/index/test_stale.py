@@ -65,7 +65,7 @@ def test_an_added_scene_is_named_wherever_data_are_opened(tree, key):
 
 
 @pytest.mark.parametrize(
-    "words", [("stats",), ("show",), ("download", "--dry-run", "--dest", "to")], ids=lambda w: w[0]
+    "words", [("stats",), ("show",), ("download", "--dry-run", "-o", "to")], ids=lambda w: w[0]
 )
 def test_commands_say_so_on_stderr(tree, tmp_path, words):
     add_scene(tree)
@@ -168,7 +168,7 @@ def test_an_index_alone_and_one_of_a_part_are_not_old(tree, tmp_path):
     (tmp_path / "alone").mkdir()
     shutil.copy(tree / INDEX_NAME, tmp_path / "alone")
     part = tmp_path / "part.parquet"
-    assert invoke("index", tree, "-o", part, "--family", "Uniform").exit_code == 0
+    assert invoke("index", tree, "-o", part, "--where", "family=Uniform").exit_code == 0
 
     assert SceneIndex.open(tmp_path / "alone").stale == ""
     assert SceneIndex.open(part).stale == ""
@@ -189,7 +189,9 @@ def test_an_index_that_lies_elsewhere_names_itself_in_the_cure(tree, tmp_path):
 def test_scenes_of_an_earlier_download_are_known_and_later_ones_are_not(tree, tmp_path):
     there = tmp_path / "there"
     for family in ("Uniform", "IPD_Gaussian"):
-        done = invoke("download", tree, "--dest", there, "--split", "train", "--family", family)
+        done = invoke(
+            "download", tree, "-o", there, "--split", "train", "--where", f"family={family}"
+        )
         assert done.exit_code == 0
 
     assert len(SceneIndex.open(there)) == 1

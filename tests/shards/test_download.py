@@ -139,7 +139,7 @@ def test_a_part_cannot_give_what_it_lacks(shards_on_the_web, tmp_path):
 
 def test_the_command_says_the_size_first_and_reports(small_release, tmp_path):
     dest = tmp_path / "part"
-    arguments = ["download", str(small_release), "--dest", str(dest), "--split", "eval"]
+    arguments = ["download", str(small_release), "-o", str(dest), "--split", "eval"]
     arguments += ["--cameras", "0,5", "--json"]
 
     said = CliRunner().invoke(app, [*arguments, "--dry-run"])
@@ -147,14 +147,14 @@ def test_the_command_says_the_size_first_and_reports(small_release, tmp_path):
 
     assert said.exit_code == done.exit_code == 0, done.output
     assert "1 scene, 9 files" in said.stderr
-    assert json.loads(said.stdout)["dest"] is None
+    assert json.loads(said.stdout)["out"] is None
     assert json.loads(done.stdout)["bytes"] == json.loads(said.stdout)["bytes"]
     assert len(StereoPairs(dest, pairs=[(0, 5)])) == 1
 
 
 def test_the_command_takes_a_share_that_fits(small_release, tmp_path):
     def taken(*words):
-        command = ["download", str(small_release), "--dest", str(tmp_path), "--dry-run", "--json"]
+        command = ["download", str(small_release), "-o", str(tmp_path), "--dry-run", "--json"]
         done = CliRunner().invoke(app, [*command, *words])
         return json.loads(done.stdout) if done.exit_code == 0 else done.output
 
@@ -181,7 +181,7 @@ def test_a_share_passes_over_scenes_without_the_wanted_videos(small_release, tmp
 
 def test_a_camera_that_does_not_exist_is_refused(small_release, tmp_path):
     done = CliRunner().invoke(
-        app, ["download", str(small_release), "--dest", str(tmp_path / "x"), "--cameras", "0,6"]
+        app, ["download", str(small_release), "-o", str(tmp_path / "x"), "--cameras", "0,6"]
     )
 
     assert done.exit_code == 2
@@ -215,7 +215,7 @@ def test_a_killed_download_goes_on_and_leaves_no_file_that_is_not_whole(
 ):
     """The process is killed while a server that answers slowly has sent some files."""
     dest = tmp_path / "part"
-    command = ["download", shards_on_the_web, "--dest", str(dest), "--workers", "1"]
+    command = ["download", shards_on_the_web, "-o", str(dest), "--workers", "1"]
     for name in sorted(path.relative_to(web.folder) for path in web.folder.rglob("*.tar")):
         web.always[str(name)] = Answer(delay_s=0.1)
     killed = subprocess.Popen(

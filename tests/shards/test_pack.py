@@ -346,7 +346,7 @@ def test_ctrl_c_ends_with_exit_code_130_and_leaves_no_half_shard(small_release, 
             process.kill()
 
     assert process.returncode == 130
-    assert message == "stopped; run the same command again to go on from here\n"
+    assert message == "stopped; run the same command again to go on\n"
     assert tars(tmp_path) == []
 
 

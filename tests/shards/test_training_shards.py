@@ -699,7 +699,7 @@ def test_the_command_derives_and_verifies(release, tmp_path):
     out = tmp_path / "train"
     packed = command(
         "pack", release, out, "--size", "32x24", "--quality", "small", "--cameras", "0,1",
-        "--family", "Uniform", "--workers", 1,
+        "--where", "family=Uniform", "--workers", 1,
     )  # fmt: skip
     verified = command("verify", out, "--deep", "--source", release, "--workers", 1)
 

@@ -172,7 +172,7 @@ def audit(
     else:
         index = open_for_audit(data, workers=workers, engine=engine, **filters)
     if request.derived == "refuse":
-        index.require_released("The audit", cure=", or accept derived data (--derived ok)")
+        index.require_released("The audit", cure="")
     is_wanted = _KeyFilter(filters)
     broken = {key: text for key, text in index.broken.items() if is_wanted(key)}
     incomplete = {key: text for key, text in index.incomplete.items() if is_wanted(key)}
