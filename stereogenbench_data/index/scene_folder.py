@@ -44,9 +44,9 @@ from stereogenbench_data.media.depth import (
     open_depth,
     read_depth_units,
     require_depth_stream,
+    resolve_encoding,
 )
 from stereogenbench_data.media.depth_frames import CODEC_NAME
-from stereogenbench_data.media.depth_meaning import resolve_encoding
 from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
 from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
 from stereogenbench_data.schema.conventions import (

@@ -15,7 +15,7 @@ import av
 from av.container import InputContainer
 
 from stereogenbench_data.errors import MediaError
-from stereogenbench_data.media.container import exact, frames_by_duration
+from stereogenbench_data.media.container import exact, frames_by_duration, stream_codec
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,12 +89,6 @@ def steady_clock(container: InputContainer, *, frames: int) -> SteadyClock | Non
     return SteadyClock(stream.start_time, step) if agrees else None
 
 
-INTRA_ONLY: Final = frozenset(
-    {"ffv1", "ffvhuff", "huffyuv", "mjpeg", "png", "prores", "rawvideo", "utvideo"}
-)
-"""Codecs that store each picture by itself, so that pictures are shown in the order of the file."""
-
-
 def table_clock(
     container: InputContainer, *, name: str, steady: SteadyClock | None = None
 ) -> TableClock:
@@ -133,7 +127,7 @@ def table_clock(
             f"{name}: cannot be read past its frame number {len(times)} as stored "
             f"({error.strerror}): fetch it again."
         ) from error
-    if container.streams.video[0].codec_context.codec.canonical_name in INTRA_ONLY:
+    if stream_codec(container).is_intra_only:
         require_file_order(times, steady, name=name)
     times.sort()
     twice = next((a for a, b in pairwise(times) if a == b), None)

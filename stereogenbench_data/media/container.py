@@ -5,6 +5,7 @@ containers of the release are allowed, and a path is never read as an address.
 """
 
 import errno
+import io
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -32,6 +33,36 @@ class BinaryFile(Protocol):
 
     def tell(self) -> int:
         """Return the current offset."""
+
+
+class SeekableFile(io.RawIOBase):
+    """A read-only file of so many bytes, whose subclasses read them."""
+
+    def __init__(self, size: int) -> None:
+        """Begin at the start."""
+        super().__init__()
+        self.size = size
+        self._position = 0
+
+    def readable(self) -> bool:
+        """Return that it can be read."""
+        return True
+
+    def seekable(self) -> bool:
+        """Return that positions can be set."""
+        return True
+
+    def tell(self) -> int:
+        """Return the position of the next byte."""
+        return self._position
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        """Set the position, relative to the start, to itself or to the end; return it."""
+        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self.size}[whence]
+        if start + offset < 0:
+            raise ValueError(f"a file has no position {start + offset}: seek to 0 or later.")
+        self._position = start + offset
+        return self._position
 
 
 @runtime_checkable
@@ -156,7 +187,49 @@ class StreamFacts:
     is_lossless: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class Codec:
+    """What reading has to know of a codec.
+
+    Attributes:
+        is_lossless: Whether it returns what it was given, whatever its settings.
+        is_intra_only: Whether it stores each picture by itself, so that pictures are shown in the
+            order of the file.
+        skips_exactly: Whether its decoder drops, on NONREF, only pictures that no other is
+            predicted from.
+        has_slice_checksums: Whether its packets may hold checksums of their own.
+    """
+
+    is_lossless: bool = False
+    is_intra_only: bool = False
+    skips_exactly: bool = False
+    has_slice_checksums: bool = False
+
+
+_CODECS: Final = (
+    dict.fromkeys(("h264", "hevc", "mpeg4"), Codec(skips_exactly=True))
+    | dict.fromkeys(("mjpeg", "prores"), Codec(is_intra_only=True))
+    | dict.fromkeys(
+        ("ffvhuff", "huffyuv", "png", "rawvideo", "utvideo"),
+        Codec(is_lossless=True, is_intra_only=True),
+    )
+    | {
+        "ffv1": Codec(is_lossless=True, is_intra_only=True, has_slice_checksums=True),
+        "blosc2": Codec(is_lossless=True),
+    }
+)
+
 LOSSLESS_SUFFIX: Final = " lossless"
+
+
+def codec_of(name: str) -> Codec:
+    """Return a codec by FFmpeg's name."""
+    return _CODECS.get(name, Codec())
+
+
+def stream_codec(container: InputContainer) -> Codec:
+    """Return the codec of the first video of an open container."""
+    return codec_of(container.streams.video[0].codec_context.codec.canonical_name)
 
 
 def depth_coding(facts: StreamFacts) -> str:

@@ -20,16 +20,13 @@ from av.packet import Packet
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
-from stereogenbench_data.media.clock import INTRA_ONLY, Clock
-from stereogenbench_data.media.container import Placed
+from stereogenbench_data.media.clock import Clock
+from stereogenbench_data.media.container import Placed, stream_codec
 
 if TYPE_CHECKING:
     VideoPacket = Packet[VideoStream]
 else:
     VideoPacket = Packet  # generic only in PyAV's stubs
-
-_SKIPS_EXACTLY: Final = frozenset({"h264", "hevc", "mpeg4"})
-"""Codecs whose decoders drop, on NONREF, only pictures that no other is predicted from."""
 
 BLIND_JUMP: Final = 8
 """Frames to decode through rather than to seek, while a file's key frames are not known."""
@@ -55,9 +52,6 @@ class Decoder:
 
     Damage is an error (``err_detect=explode``), never concealed. There is one thread: frame threads
     would run ahead of the frame asked for, and blur which one failed.
-
-    Attributes:
-        codec: FFmpeg's name of the codec.
     """
 
     def __init__(
@@ -84,12 +78,12 @@ class Decoder:
         self._context = self._stream.codec_context
         self._context.options = {"err_detect": "explode"}
         self._context.thread_count = 1
-        self.codec: str = self._context.codec.canonical_name
-        self._can_skip = self.codec in _SKIPS_EXACTLY
+        codec = stream_codec(container)
+        self._can_skip = codec.skips_exactly
+        self._is_intra_only = codec.is_intra_only
         # FFV1 before version 3 keeps no record beside its packets, and no checksums in them.
-        self._has_checksums = self.codec == "ffv1" and bool(self._context.extradata)
+        self._has_checksums = codec.has_slice_checksums and bool(self._context.extradata)
         self._crc32s = crc32s
-        self._is_intra_only = self.codec in INTRA_ONLY
         self._knows_key_frames = self._stream.frames > 0
         self._packets: Iterator[VideoPacket] = container.demux(self._stream)
         self._pending: deque[tuple[int, VideoFrame]] = deque()

@@ -5,29 +5,29 @@ FFmpeg: its conversion to 8 bits drops the low byte, and one between 10, 12 and 
 """
 
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Final, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float32, Shaped, UInt16
 
-from stereogenbench_data.errors import MediaError
+from stereogenbench_data.errors import MediaError, SchemaError
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import planar_from_ray
 from stereogenbench_data.media.container import (
     LOSSLESS_SUFFIX,
+    StreamFacts,
     VideoFile,
+    codec_of,
     depth_coding,
 )
-from stereogenbench_data.media.depth_frames import CODEC_NAME, PACKED_SUFFIX, DepthFrames
+from stereogenbench_data.media.depth_frames import PACKED_SUFFIX, DepthFrames
 from stereogenbench_data.media.video import VideoReader, plane_numbers
+from stereogenbench_data.schema.depth_contract import Statement, agreed, stated_in_tags
 from stereogenbench_data.schema.records import DepthEncoding, DepthRisk
-
-_LOSSLESS_CODECS: Final = frozenset(
-    {CODEC_NAME, "ffv1", "ffvhuff", "huffyuv", "png", "rawvideo", "utvideo"}
-)
-"""Codecs that return what they were given, whatever their settings."""
+from stereogenbench_data.schema.release import DEFAULT_DEPTH_UNIT_M
 
 ANY_DEPTH: Final = DepthEncoding(accept=frozenset(get_args(DepthRisk)))
 """A contract that takes whatever holds one number a pixel."""
@@ -142,7 +142,7 @@ def require_depth_stream(
             f"{stored}, which is not one number of 8 to 16 bits a pixel: no DepthEncoding accepts "
             f"it. Store depth as gray16le with FFV1."
         )
-    is_lossy = codec not in _LOSSLESS_CODECS and not codec.endswith(LOSSLESS_SUFFIX)
+    is_lossy = not codec_of(codec).is_lossless and not codec.endswith(LOSSLESS_SUFFIX)
     if layout.channels and is_lossy:
         raise MediaError(
             f"{stored} (lossy), and depth in channels of colours survives only without loss: no "
@@ -284,6 +284,42 @@ def _not_numbers(name: str, why: str) -> MediaError:
         f"{name}: depth is stored in channels of colours, and {why}: they are neither three equal "
         f"channels nor the high and the low byte of a number. Store depth as gray16le with FFV1."
     )
+
+
+def resolve_encoding(
+    facts: StreamFacts,
+    *,
+    name: str,
+    override: DepthEncoding | None = None,
+    stated: Sequence[Statement] = (),
+) -> DepthEncoding:
+    """Return how a depth stream's numbers become metres: as the user says, else as files state.
+
+    Tags of the container and the stream and the scene's JSON are read as `depth_contract` reads
+    them; all must agree. Where nothing is stated the release's default holds, 0.1 m.
+
+    Args:
+        facts: What `probe` found.
+        name: What messages call the file.
+        override: The user's contract, which holds whatever files say if it has a unit.
+        stated: What the scene's JSON says.
+
+    Raises:
+        MediaError: If what is stated is not understood, or contradicts itself.
+
+    Source: the paper's appendix on the file schema.
+    """
+    if override is not None and override.unit_m is not None:
+        return replace(override, source="user")
+    contract = override or DepthEncoding()
+    largest = largest_number(facts.pixel_format) or 2**16 - 1
+    try:
+        found = agreed([*stated_in_tags(facts.tags, name=name), *stated], largest=largest)
+    except SchemaError as error:
+        raise MediaError(f"{error}. {DEPTH_CURES}") from error
+    if found.unit_m is None:
+        return contract.with_file_unit(DEFAULT_DEPTH_UNIT_M, source="default")
+    return contract.with_file_unit(found.unit_m, source=found.origin, offset_m=found.offset_m)
 
 
 def measured(

@@ -100,23 +100,6 @@ class StoredClip:
         return self.width_px * self.height_px * UNIT_BYTES
 
 
-@dataclass(frozen=True, slots=True)
-class FrameHeader:
-    """What a file's header says: the clip, and where each chunk lies.
-
-    Attributes:
-        clip: Facts of the depth video that was packed.
-        offsets: The first byte of each chunk.
-        sizes: How many bytes each has; 0 for a frame of zeros, which has none.
-        crc32s: zlib's checksum of each.
-    """
-
-    clip: StoredClip
-    offsets: tuple[int, ...]
-    sizes: tuple[int, ...]
-    crc32s: tuple[int, ...]
-
-
 def blosc2_module() -> Any:
     """Return blosc2.
 
@@ -178,57 +161,6 @@ def frame_file(clip: StoredClip, chunks: Sequence[bytes]) -> bytes:
     return content
 
 
-def header_bytes(start: bytes, *, frames: int, name: str) -> int:
-    """Return how many bytes a file's header has, from its first ones.
-
-    Raises:
-        MediaError: If it is not such a file, or its header is larger than so many frames need.
-    """
-    if len(start) < _NAME_AT or start[2 : 2 + len(_MAGIC)] != _MAGIC:
-        raise _unfit(name, f"its first bytes are {start[:10]!r}, not those of a blosc2 frame")
-    size = int(_FIXED.unpack_from(start)[1])
-    if not _NAME_AT < size <= FIXED_BYTES + frames * _BYTES_A_FRAME:
-        raise _unfit(name, f"its header claims {size} bytes")
-    return size
-
-
-def parse_header(header: bytes, *, file_bytes: int, name: str) -> FrameHeader:
-    """Return what a whole header says, after checking that this module wrote it.
-
-    Args:
-        header: All bytes of the header.
-        file_bytes: How many bytes the file has.
-        name: What messages call the file.
-
-    Raises:
-        MediaError: If it is damaged, or was not written by this module.
-    """
-    _, size, frame_bytes, units, chunks, typesize, _, chunk_bytes, *_ = _FIXED.unpack_from(header)
-    if frame_bytes != file_bytes:
-        raise _unfit(name, f"its header claims {frame_bytes} bytes, and it has {file_bytes}")
-    description = _description(header, name=name)
-    try:
-        clip = _clip(description["clip"])
-        sizes, crc32s = (tuple(map(int, description[key])) for key in ("sizes", "crc32s"))
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise _unfit(
-            name, f"its description of itself is malformed or incomplete ({shortened(repr(error))})"
-        ) from error
-    offsets = tuple(accumulate(sizes, initial=size))[:-1]
-    expected = (len(sizes) * clip.frame_bytes, sum(sizes), UNIT_BYTES, clip.frame_bytes)
-    found = (units, chunks, typesize, chunk_bytes)
-    counts = {len(sizes), len(crc32s), len(clip.pts)}
-    largest = clip.frame_bytes + _CHUNK.size
-    if found != expected or len(counts) != 1 or not all(0 <= each <= largest for each in sizes):
-        raise _unfit(
-            name,
-            f"its header claims {found} bytes of units, chunks, unit, frame, not {expected}",
-        )
-    if size + chunks > file_bytes:
-        raise _unfit(name, f"its chunks would end at byte {size + chunks} of {file_bytes}")
-    return FrameHeader(clip, offsets, sizes, crc32s)
-
-
 def _description(header: bytes, *, name: str) -> dict[str, Any]:
     """Return the metalayer's content."""
     content_at = _NAME_AT + len(_NAME)
@@ -251,28 +183,26 @@ def _description(header: bytes, *, name: str) -> dict[str, Any]:
     return description
 
 
-def _clip(description: Mapping[str, Any]) -> StoredClip:
+def _clip(told: Mapping[str, Any]) -> StoredClip:
+    (up, down), (time_up, time_down) = told["rate"], told["time_base"]
     tags, stream_tags = (
-        {str(key): str(value) for key, value in description[which].items()}
+        {str(key): str(value) for key, value in told[which].items()}
         for which in ("tags", "stream_tags")
     )
-    rate, time_base = (
-        (int(description[w][0]), int(description[w][1])) for w in ("rate", "time_base")
-    )
     clip = StoredClip(
-        width_px=int(description["width_px"]),
-        height_px=int(description["height_px"]),
-        codec=str(description["codec"]),
-        pixel_format=str(description["pixel_format"]),
-        rate=rate,
-        time_base=time_base,
-        pts=tuple(map(int, description["pts"])),
+        width_px=int(told["width_px"]),
+        height_px=int(told["height_px"]),
+        codec=str(told["codec"]),
+        pixel_format=str(told["pixel_format"]),
+        rate=(int(up), int(down)),
+        time_base=(int(time_up), int(time_down)),
+        pts=tuple(map(int, told["pts"])),
         tags=tags,
         stream_tags=stream_tags,
     )
-    numbers = (clip.width_px, clip.height_px, *rate, *time_base)
+    numbers = (clip.width_px, clip.height_px, *clip.rate, *clip.time_base)
     if not 1 <= min(numbers) <= max(numbers) < _TOO_LARGE:
-        raise ValueError(f"{clip.width_px}x{clip.height_px}, {rate}, {time_base}")
+        raise ValueError(f"{clip.width_px}x{clip.height_px}, {clip.rate}, {clip.time_base}")
     if clip.codec != "ffv1" or not clip.pixel_format.startswith("gray"):
         raise ValueError(f"{clip.codec}, {clip.pixel_format}")
     if any(not -_TOO_LATE < here < there < _TOO_LATE for here, there in pairwise(clip.pts)):
@@ -321,6 +251,7 @@ class DepthFrames(FrameReader):
 
     Attributes:
         facts: What the header says, as of a video; the codec is "blosc2".
+        clip: Facts of the depth video that was packed.
     """
 
     def __init__(self, file: VideoFile, *, name: str, frames: int | Literal["any"]) -> None:
@@ -345,11 +276,11 @@ class DepthFrames(FrameReader):
         else:
             self._file = file
         try:
-            self._header = self._read_header(frames)
+            self._read_header(frames)
         except MediaError:
             self.close()
             raise
-        self.frames = len(self._header.sizes)
+        self.frames = len(self._sizes)
         self.facts = StreamFacts(
             codec=CODEC_NAME,
             pixel_format=self.clip.pixel_format,
@@ -362,14 +293,9 @@ class DepthFrames(FrameReader):
         )
 
     @property
-    def clip(self) -> StoredClip:
-        """Facts of the depth video that was packed."""
-        return self._header.clip
-
-    @property
     def chunk_bounds(self) -> tuple[int, ...]:
         """Where each frame's bytes begin, and the end of the file, which belongs to the last."""
-        return (*self._header.offsets, self._file_bytes)
+        return (*self._offsets, self._file_bytes)
 
     def chunk(self, index: int) -> bytes:
         """Return the compressed bytes of a frame, empty for a frame of zeros.
@@ -378,15 +304,15 @@ class DepthFrames(FrameReader):
             MediaError: If there is no such frame, or its bytes are not those that were packed.
         """
         self.require_frame(index)
-        size = self._header.sizes[index]
+        size = self._sizes[index]
         if size == 0:
             return b""
-        self._file.seek(self._header.offsets[index])
+        self._file.seek(self._offsets[index])
         chunk = self._read(size)
         require_chunk(
             chunk,
             clip=self.clip,
-            crc32=self._header.crc32s[index],
+            crc32=self._crc32s[index],
             name=f"{self.name}: frame {index}",
         )
         return chunk
@@ -423,30 +349,51 @@ class DepthFrames(FrameReader):
             data += more
         return data
 
-    def _read_header(self, frames: int | Literal["any"]) -> FrameHeader:
-        file_bytes = self._file_bytes = self._file.seek(0, 2)
+    def _read_header(self, frames: int | Literal["any"]) -> None:
+        """Read where each chunk lies, after checking that this module wrote the header."""
+        name = self.name
+        self._file_bytes = file_bytes = self._file.seek(0, 2)
         self._file.seek(0)
-        start = self._file.read(FIXED_BYTES)
-        size = header_bytes(
-            start, frames=MOST_FRAMES if frames == "any" else frames, name=self.name
+        header = self._file.read(FIXED_BYTES)
+        if len(header) < _NAME_AT or header[2 : 2 + len(_MAGIC)] != _MAGIC:
+            raise _unfit(name, f"its first bytes are {header[:10]!r}, not those of a blosc2 frame")
+        _, size, told_bytes, units, chunks, typesize, _, chunk_bytes, *_ = _FIXED.unpack_from(
+            header
         )
-        if size > len(start):
-            start += self._read(size - len(start))
-        if len(start) < size:
+        most_frames = MOST_FRAMES if frames == "any" else frames
+        if not _NAME_AT < size <= FIXED_BYTES + most_frames * _BYTES_A_FRAME:
+            raise _unfit(name, f"its header claims {size} bytes")
+        header += self._read(size - len(header)) if size > len(header) else b""
+        if len(header) < size or told_bytes != file_bytes:
             raise MediaError(
-                f"{self.name}: is cut short: its header has {size} bytes, and only {len(start)} "
-                f"are there: fetch it again."
+                f"{name}: is cut short or damaged: its header has {size} bytes of {told_bytes}, "
+                f"and the file {file_bytes}: fetch it again."
             )
-        header = parse_header(start[:size], file_bytes=file_bytes, name=self.name)
-        if frames not in ("any", len(header.sizes)):
+        description = _description(header[:size], name=name)
+        try:
+            clip = self.clip = _clip(description["clip"])
+            sizes, crc32s = (tuple(map(int, description[key])) for key in ("sizes", "crc32s"))
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            reason = shortened(repr(error))
+            raise _unfit(name, f"its description is malformed or incomplete ({reason})") from error
+        self._sizes, self._crc32s = sizes, crc32s
+        self._offsets = tuple(accumulate(sizes, initial=size))[:-1]
+        expected = (len(sizes) * clip.frame_bytes, sum(sizes), UNIT_BYTES, clip.frame_bytes)
+        found = (units, chunks, typesize, chunk_bytes)
+        counts = {len(sizes), len(crc32s), len(clip.pts)}
+        largest = clip.frame_bytes + _CHUNK.size
+        if found != expected or len(counts) != 1 or not all(0 <= each <= largest for each in sizes):
+            raise _unfit(name, f"its header claims units and chunks of {found}, not {expected}")
+        if size + chunks > file_bytes:
+            raise _unfit(name, f"its chunks would end at byte {size + chunks} of {file_bytes}")
+        if frames not in ("any", len(sizes)):
             raise MediaError(
-                f"{self.name}: holds {len(header.sizes)} frames where {frames} are expected. "
+                f"{name}: holds {len(sizes)} frames where {frames} are expected. "
                 f"It belongs to another scene: fetch it again."
             )
-        if header.clip.frame_bytes > LARGEST_FRAME_BYTES:
+        if clip.frame_bytes > LARGEST_FRAME_BYTES:
             raise MediaError(
-                f"{self.name}: claims frames of {header.clip.width_px}x{header.clip.height_px} "
-                f"pixels, {header.clip.frame_bytes:,} bytes each, and at most "
-                f"{LARGEST_FRAME_BYTES:,} are read: it is not depth of this release."
+                f"{name}: claims frames of {clip.width_px}x{clip.height_px} pixels, "
+                f"{clip.frame_bytes:,} bytes each, and at most {LARGEST_FRAME_BYTES:,} are read: "
+                f"it is not depth of this release."
             )
-        return header

@@ -155,15 +155,16 @@ def write_pictures(
             container.metadata[TAG] = reserved_checksums(len(pictures))
             converter = Converter()
             for index, picture in enumerate(pictures):
+                pixels = np.ascontiguousarray(picture.transpose(1, 2, 0))
                 if codec.codec == "mjpeg":
-                    packet = av.Packet(_jpeg(picture, codec))
+                    packet = av.Packet(_jpeg(pixels, codec))
                     packet.stream, packet.is_keyframe = stream, True
                     packet.pts = packet.dts = index
                     packet.duration, packet.time_base = 1, 1 / rate_hz
                     container.mux(packet)
                 else:
                     frame = converter.convert(
-                        _planar(picture),
+                        VideoFrame.from_ndarray(pixels, format="rgb24"),
                         size=(height, width),
                         pixel_format=codec.pixel_format,
                         flags=f"{_TO_YUV}:out_color_matrix=smpte170m:out_range=tv"
@@ -190,13 +191,9 @@ def _is_codecs(error: OSError) -> bool:
     return isinstance(error, av.FFmpegError) and (error.errno or 0) < 0
 
 
-def _planar(picture: UInt8[np.ndarray, "3 h w"]) -> VideoFrame:
-    return VideoFrame.from_ndarray(np.ascontiguousarray(picture.transpose(1, 2, 0)), format="rgb24")
-
-
-def _jpeg(picture: UInt8[np.ndarray, "3 h w"], codec: PictureCodec) -> bytes:
+def _jpeg(pixels: UInt8[np.ndarray, "h w 3"], codec: PictureCodec) -> bytes:
     file = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(picture.transpose(1, 2, 0))).save(
+    Image.fromarray(pixels).save(
         file,
         "jpeg",
         quality=int(codec.options["quality"]),

@@ -8,7 +8,6 @@ A table only says which bytes to fetch. Frames are still found by the times in t
 table costs time and never gives another frame. Tables may come from strangers, and are checked.
 """
 
-import io
 import json
 import struct
 import zlib
@@ -25,8 +24,14 @@ import numpy as np
 from av.container import InputContainer
 
 from stereogenbench_data.errors import MediaError
-from stereogenbench_data.media.clock import INTRA_ONLY, steady_clock
-from stereogenbench_data.media.container import VideoFile, frames_by_duration, open_container
+from stereogenbench_data.media.clock import steady_clock
+from stereogenbench_data.media.container import (
+    SeekableFile,
+    VideoFile,
+    frames_by_duration,
+    open_container,
+    stream_codec,
+)
 from stereogenbench_data.media.decoder import BLIND_JUMP
 from stereogenbench_data.media.depth_frames import PACKED_SUFFIX, DepthFrames
 
@@ -148,36 +153,18 @@ class Position:
         return self._table.key_before(frame) >= self._end
 
 
-class HeaderFile(io.RawIOBase):
+class HeaderFile(SeekableFile):
     """A video without its packets: where these are, the file seems to end."""
 
     def __init__(self, table: SeekTable) -> None:
         """Begin at the start."""
+        super().__init__(table.bounds[-1] + len(table.tail))
         self._table = table
-        self._at = 0
-
-    def readable(self) -> bool:
-        """Return that it can be read."""
-        return True
-
-    def seekable(self) -> bool:
-        """Return that positions can be set."""
-        return True
-
-    def tell(self) -> int:
-        """Return the position of the next byte."""
-        return self._at
-
-    def seek(self, offset: int, whence: int = 0, /) -> int:
-        """Set the position, relative to the start, to itself or to the end; return it."""
-        end = self._table.bounds[-1] + len(self._table.tail)
-        self._at = offset + (0, self._at, end)[whence]
-        return self._at
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Return the next bytes of the header, none at a packet."""
-        data = self._table.header_bytes(self._at, size)
-        self._at += len(data)
+        data = self._table.header_bytes(self._position, size)
+        self._position += len(data)
         return data
 
 
@@ -248,7 +235,7 @@ def _listed(container: InputContainer) -> SeekTable | None:
         (*(entry.pos for entry in entries), entries[-1].pos + entries[-1].size),
         tuple(number for number, each in enumerate(entries) if each.is_keyframe),
         delay=min(max(before, stream.codec_context.reorder_depth), len(entries)),
-        has_neighbours=_is_intra_only(container),
+        has_neighbours=stream_codec(container).is_intra_only,
     )
 
 
@@ -279,7 +266,7 @@ def _gone_through(container: InputContainer, file: VideoFile) -> SeekTable | Non
         (entries[0].pos, *ends),
         tuple(keys),
         delay=ahead,
-        has_neighbours=_is_intra_only(container),
+        has_neighbours=stream_codec(container).is_intra_only,
         opening=1,
         blind_jump=BLIND_JUMP,
     )
@@ -313,15 +300,10 @@ def _by_clusters(container: InputContainer, file: VideoFile) -> SeekTable | None
     return SeekTable(
         (*bounds, end),
         tuple(keys),
-        has_neighbours=_is_intra_only(container),
+        has_neighbours=stream_codec(container).is_intra_only,
         opening=1,
         blind_jump=BLIND_JUMP,
     )
-
-
-def _is_intra_only(container: InputContainer) -> bool:
-    codec = container.streams.video[0].codec_context.codec
-    return codec.canonical_name in INTRA_ONLY
 
 
 def _read(file: VideoFile, start: int, stop: int) -> bytes:

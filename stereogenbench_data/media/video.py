@@ -17,7 +17,6 @@ from jaxtyping import UInt8, UInt16
 
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.clock import (
-    INTRA_ONLY,
     MOST_EXTRA_FRAMES,
     Clock,
     TableClock,
@@ -29,6 +28,7 @@ from stereogenbench_data.media.container import (
     FrameReader,
     StreamFacts,
     VideoFile,
+    codec_of,
     exact,
     frames_by_duration,
     is_colour_format,
@@ -90,7 +90,7 @@ def probe(
         require_whole_payload(container, name=name)
         frames = _frames_in_header(container)
         facts = stream_facts(container, name=name, frames=frames, pixel_format=pixel_format)
-    is_intra_only = facts.codec in INTRA_ONLY
+    is_intra_only = codec_of(facts.codec).is_intra_only
     if frames and not (is_intra_only and isinstance(file, str | Path)):
         return facts
     with open_container(file, name=name, pixel_format="later") as container:

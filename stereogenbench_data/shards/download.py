@@ -7,14 +7,15 @@ them lists only what is there. Whole files are kept, so a run that was stopped c
 import shutil
 import zlib
 from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
 from typing import Final
 
 from stereogenbench_data.engine import Progress, advance_of
-from stereogenbench_data.errors import StorageError, describe_os_error
+from stereogenbench_data.errors import StorageError, explain_os_errors
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.index.tree import ListedTree
@@ -28,10 +29,6 @@ from stereogenbench_data.sources.ranged_file import require_crc32
 from stereogenbench_data.sources.remote import RemoteObject
 
 _SPARE_BYTES: Final = 16 * 1024 * 1024
-
-
-class _Cancelled(Exception):
-    """Another file failed, so this one is not fetched any further."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,15 +152,7 @@ def download(
         if dest == local_path(index.root):
             raise StorageError(f"{dest}: is the folder of the data. Choose another folder.")
         require_own_files(index.root, sorted({each.member.path for each in wanted.files}))
-    existing = dest
-    while not existing.exists():
-        existing = existing.parent
-    try:
-        _fetch_missing(index, wanted, dest, workers=workers, progress=progress)
-    except BaseException:
-        for key in {each.key for each in wanted.files}:
-            _remove_empty(dest / key, up_to=existing)
-        raise
+    _fetch_missing(index, wanted, dest, workers=workers, progress=progress)
     scenes = [
         replace(
             scene,
@@ -188,32 +177,19 @@ def _fetch_missing(
     _require_room(dest, needed)
     total = wanted.size_bytes
     advance = advance_of(progress, done=total - needed, total=total)
+    advance(0)
     stop = Event()
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
-        futures = {pool.submit(_fetch, index, each, dest, stop): each for each in missing}
-        waiting = set(futures)
+        futures = {
+            pool.submit(_fetch, index, each, dest, stop): each.member.size for each in missing
+        }
         try:
-            advance(0)
-            while waiting:
-                finished, waiting = wait(waiting, timeout=0.5, return_when=FIRST_EXCEPTION)
-                for future in finished:
-                    future.result()
-                advance(sum(futures[future].member.size for future in finished))
+            for future in as_completed(futures):
+                future.result()
+                advance(futures[future])
         finally:
             stop.set()
-            pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _remove_empty(folder: Path, *, up_to: Path) -> None:
-    """Remove a folder and those around it, as far as they are empty."""
-    while folder != up_to:
-        try:
-            folder.rmdir()
-        except FileNotFoundError:
-            pass
-        except OSError:
-            return
-        folder = folder.parent
+            pool.shutdown(cancel_futures=True)
 
 
 def _is_whole(wanted: WantedFile, dest: Path) -> bool:
@@ -230,11 +206,9 @@ def _is_whole(wanted: WantedFile, dest: Path) -> bool:
 
 
 def _require_room(dest: Path, needed: int) -> None:
-    try:
+    with _named_errors(dest):
         dest.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(dest).free
-    except OSError as error:
-        raise _not_written(dest, error) from error
     if needed + _SPARE_BYTES > free:
         raise StorageError(
             f"{dest}: needs {needed} bytes, and the disk has {free} left. Choose fewer scenes or "
@@ -242,9 +216,8 @@ def _require_room(dest: Path, needed: int) -> None:
         )
 
 
-def _not_written(place: Path, error: OSError) -> StorageError:
-    what = f"{place}: cannot be written"
-    return StorageError(describe_os_error(what, error, "Choose another folder."))
+def _named_errors(place: Path) -> AbstractContextManager[None]:
+    return explain_os_errors(f"{place}: cannot be written", "Choose another folder.")
 
 
 def _fetch(index: SceneIndex, wanted: WantedFile, dest: Path, stop: Event) -> None:
@@ -252,21 +225,15 @@ def _fetch(index: SceneIndex, wanted: WantedFile, dest: Path, stop: Event) -> No
 
     def write(chunk: bytes) -> None:
         if stop.is_set():
-            raise _Cancelled
+            raise StorageError(f"{place}: is not fetched any further.")
         file.write(chunk)
 
-    try:
+    with _named_errors(place):
         place.parent.mkdir(parents=True, exist_ok=True)
         with open_atomic(place) as file:
             crc32 = copy_with_crc32(_chunks(index, wanted.member), write)
             name = f"{wanted.key}/{wanted.name}"
             require_crc32(crc32, expected=wanted.member.crc32, name=name)
-    except _Cancelled:
-        return
-    except OSError as error:
-        if isinstance(error, StorageError):
-            raise
-        raise _not_written(place, error) from error
 
 
 def _chunks(index: SceneIndex, member: Member) -> Iterator[bytes]:

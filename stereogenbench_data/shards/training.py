@@ -11,7 +11,7 @@ import io
 import time
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
@@ -28,7 +28,6 @@ from stereogenbench_data.media.depth_frames import blosc2_module
 from stereogenbench_data.media.depth_packing import packed_depth
 from stereogenbench_data.media.picture_encoding import (
     QUALITIES,
-    PictureError,
     Quality,
     key_frames_of,
     measured_error,
@@ -239,7 +238,15 @@ def derive_scene(
             target, error = folder / name, None
             if is_picture:
                 pictures = source_pictures(content, scene, settings, name=where, after_frame=step)
-                error = _write_checked(pictures, target, scene, settings, after_frame=step)
+                rate = Fraction(scene.frame_rate_hz or FRAME_RATE_HZ)
+                write_pictures(
+                    pictures,
+                    target,
+                    quality=settings.quality,
+                    rate_hz=rate.limit_denominator(_LARGEST_DENOMINATOR),
+                    after_frame=step,
+                )
+                error = measured_error(pictures, target, name=str(target), after_frame=step)
                 found_keys = key_frames_of(target, name=str(target))
                 key_frames = set(found_keys) & (key_frames or set(found_keys))
             else:
@@ -253,12 +260,12 @@ def derive_scene(
                         after_frame=step,
                     )
                 )
-            files[name] = _derived_file(target, error)
-    except (MediaError, SchemaError) as error:
-        raise ShardError(f"{scene.id.key}: {error}") from error
-    except StorageError as error:
-        if isinstance(error, ShardError):
-            raise
+            made = target.read_bytes()
+            measured = () if error is None else astuple(error)
+            files[name] = DerivedFile(len(made), zlib.crc32(made), *measured)
+    except ShardError:
+        raise
+    except (MediaError, SchemaError, StorageError) as error:
         raise ShardError(f"{scene.id.key}: {error}") from error
     document = _document(derivation, scene, files, tuple(sorted(key_frames or {0})))
     write_atomic(folder / TRAINING_JSON, document.text())
@@ -315,35 +322,6 @@ def source_pictures(
     return pictures
 
 
-def _write_checked(
-    pictures: np.ndarray,
-    target: Path,
-    scene: Scene,
-    settings: TrainingSettings,
-    *,
-    after_frame: Callable[[], None] = lambda: None,
-) -> PictureError:
-    """Write pictures, decode them again and return their error."""
-    rate = Fraction(scene.frame_rate_hz or FRAME_RATE_HZ).limit_denominator(_LARGEST_DENOMINATOR)
-    write_pictures(
-        pictures, target, quality=settings.quality, rate_hz=rate, after_frame=after_frame
-    )
-    return measured_error(pictures, target, name=str(target), after_frame=after_frame)
-
-
-def _derived_file(path: Path, error: PictureError | None) -> DerivedFile:
-    content = path.read_bytes()
-    if error is None:
-        return DerivedFile(len(content), zlib.crc32(content))
-    return DerivedFile(
-        len(content),
-        zlib.crc32(content),
-        error.psnr_db,
-        error.worst_psnr_db,
-        error.worst_frame,
-    )
-
-
 def _document(
     derivation: Derivation,
     scene: Scene,
@@ -392,15 +370,18 @@ def _finished(
     videos = {name for name in names if name not in (*METADATA_FILES, TRAINING_JSON)}
     if document.text() != expected.text() or set(document.files) != videos:
         return None
+    source = derivation.source()
     try:
-        for name, file in document.files.items():
-            content = (folder / name).read_bytes()
-            if (len(content), zlib.crc32(content)) != (file.size, file.crc32):
-                return None
-        source = derivation.source()
         for name in names:
-            is_text = name in METADATA_FILES
-            if is_text and (folder / name).read_bytes() != source.read(scene, name):
+            if name == TRAINING_JSON:
+                continue
+            content = (folder / name).read_bytes()
+            if name in METADATA_FILES:
+                is_same = content == source.read(scene, name)
+            else:
+                file = document.files[name]
+                is_same = (len(content), zlib.crc32(content)) == (file.size, file.crc32)
+            if not is_same:
                 return None
     except OSError:
         return None

@@ -7,6 +7,7 @@ FFV1 video again, whose pictures, times and tags are compared with what was pack
 import io
 import shutil
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -158,7 +159,8 @@ def unpack_scene(
                 if name in _RELEASED_NAMES:
                     content = file.read()
                     require_crc32(zlib.crc32(content), expected=member.crc32, name=where)
-                    _write_video(content, target, frames=scene.frames, where=where)
+                    with DepthFrames(io.BytesIO(content), name=where, frames=scene.frames) as depth:
+                        write_depth_video(depth, target)
                     after_bytes(member.size)
                     continue
                 chunks = read_chunks(file, member.size, after_bytes=after_bytes)
@@ -166,17 +168,11 @@ def unpack_scene(
                     crc32 = copy_with_crc32(chunks, output.write)
                 require_crc32(crc32, expected=member.crc32, name=where)
         task.temporary.rename(task.folder)
+    except MediaError as error:
+        raise ShardError(str(error)) from error
     finally:
         shutil.rmtree(task.temporary, ignore_errors=True)
     return scene.id.key, "unpacked"
-
-
-def _write_video(content: bytes, target: Path, *, frames: int, where: str) -> None:
-    try:
-        with DepthFrames(io.BytesIO(content), name=where, frames=frames) as packed:
-            write_depth_video(packed, target)
-    except MediaError as error:
-        raise ShardError(str(error)) from error
 
 
 def _require_unpacked(task: _UnpackTask) -> None:
@@ -190,22 +186,16 @@ def _require_unpacked(task: _UnpackTask) -> None:
     odd = sorted(there ^ expected.keys())
     for name in sorted(there & expected.keys()):
         member = scene.members[expected[name]]
-        if expected[name] == name:
-            is_same = (folder / name).stat().st_size == member.size
-        else:
-            is_same = _has_frames(folder / name, scene)
+        is_same = (folder / name).stat().st_size == member.size
+        if expected[name] != name:
+            with suppress(MediaError):
+                facts = probe(folder / name, name=name)
+                size = (scene.rig.image_width_px, scene.rig.image_height_px)
+                found = (facts.frames, facts.width_px, facts.height_px)
+                is_same = found == (scene.frames, *size)
         odd += [] if is_same else [name]
     if odd:
         raise ShardError(
             f"{folder}: already exists, and is not what the shards hold ({', '.join(odd[:3])} "
             f"differ). Move it away, or unpack into another folder."
         )
-
-
-def _has_frames(path: Path, scene: Scene) -> bool:
-    try:
-        facts = probe(path, name=str(path))
-    except MediaError:
-        return False
-    size = (scene.rig.image_width_px, scene.rig.image_height_px)
-    return (facts.frames, facts.width_px, facts.height_px) == (scene.frames, *size)

@@ -28,9 +28,9 @@ from stereogenbench_data.media.depth import (
     read_depth_units,
     require_depth_stream,
     resized_nearest,
+    resolve_encoding,
 )
 from stereogenbench_data.media.depth_frames import DepthFrames
-from stereogenbench_data.media.depth_meaning import resolve_encoding
 from stereogenbench_data.media.picture_encoding import measured_error
 from stereogenbench_data.media.video import VideoReader, probe, require_pixel_aspect
 from stereogenbench_data.schema.conventions import depth_of

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.media.container import SeekableFile
 from stereogenbench_data.media.seek_table import SeekTable
 from stereogenbench_data.schema.records import Member
 
@@ -24,7 +25,7 @@ KEPT_BYTES: Final = 2 * LARGEST_BLOCK
 """Bytes of a member that are kept for reading again: a file's header, nearby frames."""
 
 
-class MemberFile(io.RawIOBase):
+class MemberFile(SeekableFile):
     """A file of the bytes of one member; subclasses read them.
 
     Attributes:
@@ -33,30 +34,8 @@ class MemberFile(io.RawIOBase):
 
     def __init__(self, size: int) -> None:
         """Begin at the start of so many bytes."""
-        super().__init__()
-        self.size = size
+        super().__init__(size)
         self.failure: StorageError | None = None
-        self._position = 0
-
-    def readable(self) -> bool:
-        """Return that it can be read."""
-        return True
-
-    def seekable(self) -> bool:
-        """Return that positions can be set."""
-        return True
-
-    def tell(self) -> int:
-        """Return the position of the next byte."""
-        return self._position
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Set the position, relative to the start, to itself or to the end; return it."""
-        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self.size}[whence]
-        if start + offset < 0:
-            raise ValueError(f"a file has no position {start + offset}: seek to 0 or later.")
-        self._position = start + offset
-        return self._position
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Return the next bytes, fewer than asked for only at the end; all the rest for -1."""

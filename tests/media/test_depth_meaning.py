@@ -14,8 +14,8 @@ from stereogenbench_data.media.depth import (
     depth_frame_index,
     depth_m_from_units,
     measured,
+    resolve_encoding,
 )
-from stereogenbench_data.media.depth_meaning import resolve_encoding
 from stereogenbench_data.schema.records import DepthEncoding
 
 

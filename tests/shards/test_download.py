@@ -103,25 +103,6 @@ def test_a_full_disk_is_reported_before_anything_is_fetched(
         fetched(shards_on_the_web, tmp_path / "part")
 
 
-def test_a_refused_download_leaves_no_empty_folder(shards_on_the_web, web, tmp_path, monkeypatch):
-    kept = tmp_path / "kept"
-    kept.mkdir()
-    dest, elsewhere = kept / "new" / "part", tmp_path / "part"
-    with monkeypatch.context() as patched:
-        patched.setattr(shutil, "disk_usage", lambda folder: shutil._ntuple_diskusage(9, 9, 0))
-        with pytest.raises(StorageError, match="the disk has 0 left"):
-            fetched(shards_on_the_web, dest)
-    index = SceneIndex.open(shards_on_the_web)
-    for shard in (web.folder / "shards").glob("*.tar"):
-        shard.unlink()
-    for place in (dest, elsewhere):
-        with pytest.raises(StorageError, match="404"):
-            download(index, plan_download(index, (0, 1), cameras=(0,), streams=("rgb",)), place)
-
-    assert [*kept.iterdir()] == []
-    assert not elsewhere.exists()
-
-
 def test_the_folder_of_the_data_is_refused(small_release):
     index = SceneIndex.open(small_release)
     wanted = plan_download(index, [0], cameras=[0], streams=["rgb"])
