@@ -6,9 +6,9 @@ them lists only what is there. Whole files are kept, so a run that was stopped c
 
 import shutil
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
@@ -230,13 +230,13 @@ def _fetch(index: SceneIndex, wanted: WantedFile, dest: Path, stop: Event) -> No
 
     with _named_errors(place):
         place.parent.mkdir(parents=True, exist_ok=True)
-        with open_atomic(place) as file:
-            crc32 = copy_with_crc32(_chunks(index, wanted.member), write)
+        with open_atomic(place) as file, closing(_chunks(index, wanted.member)) as chunks:
+            crc32 = copy_with_crc32(chunks, write)
             name = f"{wanted.key}/{wanted.name}"
             require_crc32(crc32, expected=wanted.member.crc32, name=name)
 
 
-def _chunks(index: SceneIndex, member: Member) -> Iterator[bytes]:
+def _chunks(index: SceneIndex, member: Member) -> Generator[bytes, None, None]:
     if is_remote(index.root):
         remote = RemoteObject(joined(index.root, member.path), retry=index.retry)
         yield from remote.chunks(member.offset, member.offset + member.size)
