@@ -110,7 +110,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
         report_of,
     )
     from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
-    from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING
+    from stereogenbench_data.synthesis.render import RAY_CASTING
     from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
     from stereogenbench_data.synthesis.review import hold_out, write_sheets
 

@@ -120,22 +120,16 @@ class Decisions:
 
     def __init__(self, out: Path, request: SynthRequest, *, renderer: Renderer) -> None:
         """Name the folder of a request's decisions in a tree. Scenes can be added to a request."""
-        self.asked = {
+        self.asked = asdict(request) | {
             "version": _VERSION,
-            "family": request.family,
-            "split": request.split,
-            "subset": request.subset,
-            "maps": list(request.maps),
-            "seed": request.seed,
-            "frames": request.frames,
-            "picture_px": list(request.picture_px),
-            "focal_mm": request.focal_mm,
-            "check": request.check,
-            "sensors_mm": [list(sensor_mm) for sensor_mm in renderer.sensors_mm],
+            "maps": request.maps,
+            "sensors_mm": renderer.sensors_mm,
             "renderer": renderer.name,
             "fingerprint": renderer.fingerprint,
             "limits": asdict(LIMITS),
         }
+        for name in ("scenes", "map_name", "contract"):  # No decision depends on them.
+            del self.asked[name]
         digest = hashlib.sha256(json.dumps(self.asked, sort_keys=True).encode()).hexdigest()
         self.folder = out / FOLDER / f"{request.family}_{digest[:16]}"
 

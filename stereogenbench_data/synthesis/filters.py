@@ -15,25 +15,6 @@ from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.synthesis.proposal import Proposal, Rig
 from stereogenbench_data.synthesis.renderer import Spawn, World
 
-Reason = Literal[
-    "spawn_support",
-    "spawn_space",
-    "framing",
-    "collision",
-    "visibility",
-    "valid_depth",
-    "border_occluder",
-    "transition",
-    "motion",
-    "subject_motion",
-    "invalid_depth",
-    "dark",
-    "flat",
-    "audit",
-    "doctor",
-]
-"""Why a proposal is refused. The last five are found in what was rendered."""
-
 Array = Any
 
 
@@ -99,14 +80,14 @@ class Refusal:
     """Why a proposal was refused.
 
     Attributes:
-        reason: The filter that refused it.
+        reason: The filter that refused it, such as "collision"; ``docs/generation.md`` has them.
         value: What was measured.
         limit: What the filter allows.
         text: The same in words.
         rendered: Whether it was found in what was rendered.
     """
 
-    reason: Reason
+    reason: str
     value: float
     limit: float
     text: str
@@ -266,11 +247,13 @@ class PoseChecks:
         """Which poses no filter refuses."""
         return np.asarray(self.reasons == "")
 
-    def refusal(self, number: int, *, where: str) -> Refusal:
-        """Return why a pose is refused, given how messages name it."""
-        reason: Reason = self.reasons[number]
-        value, limit = float(self.values[number]), float(self.limits[number])
-        return Refusal(reason, value, limit, f"{where}: {reason} {value:.3g}, limit {limit:.3g}")
+    def refusal(self, frame: int) -> Refusal:
+        """Return why the pose of a frame is refused."""
+        reason = str(self.reasons[frame])
+        value, limit = float(self.values[frame]), float(self.limits[frame])
+        return Refusal(
+            reason, value, limit, f"frame {frame}: {reason} {value:.3g}, limit {limit:.3g}"
+        )
 
 
 def check_poses(
@@ -308,7 +291,7 @@ def check_poses(
     return result
 
 
-Measured = tuple[Reason, Array, float, Literal["least", "most"]]
+Measured = tuple[str, Array, float, Literal["least", "most"]]
 """A filter, what it measured for each pose, its limit, and which side of it is allowed."""
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Float64
 from stereogenbench_data.schema.release import FRAME_RATE_HZ, TRAIN_MAPS, UNSEEN_MAPS
 from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.renderer import Bounds, Spawn, unknown_map
-from stereogenbench_data.synthesis.scene import Figure, Material, SceneModel, Shape
+from stereogenbench_data.synthesis.scene import Figure, Kind, Material, SceneModel, Shape
 
 STAGE: Final = "SynthStage"
 CHARACTERS: Final = tuple(f"SK_Synth{number:02d}" for number in range(1, 20))
@@ -68,20 +68,16 @@ class RayWorld:
 
     def subject_points_m(self, spawn: Spawn, *, frame: int) -> Float64[np.ndarray, "p 3"]:
         """Return both ends of every limb; see `World.subject_points_m`."""
-        return self.figure.points_m(**self._walk(spawn, frame=frame))
+        rise = self._rise(spawn)
+        return self.figure.points_m(spawn, rise=rise, moment_s=frame / FRAME_RATE_HZ)
 
     def limbs(self, spawn: Spawn, *, frame: int) -> list[Shape]:
         """Return the figure's limbs at a frame."""
-        return self.figure.limbs(**self._walk(spawn, frame=frame))
+        return self.figure.limbs(spawn, rise=self._rise(spawn), moment_s=frame / FRAME_RATE_HZ)
 
-    def _walk(self, spawn: Spawn, *, frame: int) -> dict[str, Any]:
+    def _rise(self, spawn: Spawn) -> float:
         yaw = np.radians(spawn.yaw_deg)
-        return {
-            "start_m": spawn.place_m,
-            "yaw_deg": spawn.yaw_deg,
-            "rise": float(self.scene.slope @ (np.cos(yaw), np.sin(yaw))),
-            "moment_s": frame / FRAME_RATE_HZ,
-        }
+        return float(self.scene.slope @ (np.cos(yaw), np.sin(yaw)))
 
 
 def open_map(proposal: Proposal) -> RayWorld:
@@ -138,6 +134,14 @@ def _rotated_axes(*, yaw: float, tilt: float = 0.0) -> Array:
     upright = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     c, s = np.cos(tilt), np.sin(tilt)
     return np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]]) @ upright
+
+
+def _solid(
+    kind: Kind, centre: Array, half_m: Array, material: Material, axes: Array | None = None
+) -> Shape:
+    """Return a shape, along the axes of the map unless others are given."""
+    axes = np.eye(3) if axes is None else axes
+    return Shape(kind, np.array(centre), axes, np.array(half_m), material)
 
 
 def _bounds(low: tuple[float, ...], high: tuple[float, ...]) -> Bounds:
@@ -216,15 +220,9 @@ def _backdrop(rng: np.random.Generator, *, framing: _Framing) -> list[Shape]:
         view_m = framing.width_m(radius_m)
         half_m = view_m * rng.uniform((0.05, 0.08, 0.08), (0.1, 0.22, 0.3))
         x_m, y_m = _around(rng, radius_m)
-        shapes.append(
-            Shape(
-                "box",
-                np.array([x_m, y_m, half_m[2] * 0.98]),
-                _rotated_axes(yaw=np.arctan2(y_m, x_m) + rng.uniform(-0.5, 0.5)),
-                half_m,
-                _material(rng, textures=_WALLS, tile_m=(2.0, 4.0)),
-            )
-        )
+        axes = _rotated_axes(yaw=np.arctan2(y_m, x_m) + rng.uniform(-0.5, 0.5))
+        wall = _material(rng, textures=_WALLS, tile_m=(2.0, 4.0))
+        shapes.append(_solid("box", [x_m, y_m, half_m[2] * 0.98], half_m, wall, axes))
     return shapes
 
 
@@ -237,15 +235,11 @@ def _objects(rng: np.random.Generator, *, framing: _Framing) -> list[Shape]:
         x_m, y_m = _around(rng, np.sign(beyond_m) * max(abs(beyond_m), 0.6 + 2 * half_m.max()))
         is_box = rng.random() < 0.55
         tilt = rng.uniform(-0.6, 0.6) if rng.random() < 0.4 else 0.0
-        shapes.append(
-            Shape(
-                "box" if is_box else "ellipsoid",
-                np.array([x_m, y_m, half_m[2] * rng.uniform(0.75, 0.98)]),
-                _rotated_axes(yaw=rng.uniform(0, np.pi), tilt=tilt),
-                half_m,
-                _material(rng, textures=_THINGS, tile_m=(0.6, 2.0)),
-            )
-        )
+        height_m = half_m[2] * rng.uniform(0.75, 0.98)
+        axes = _rotated_axes(yaw=rng.uniform(0, np.pi), tilt=tilt)
+        material = _material(rng, textures=_THINGS, tile_m=(0.6, 2.0))
+        kind: Kind = "box" if is_box else "ellipsoid"
+        shapes.append(_solid(kind, [x_m, y_m, height_m], half_m, material, axes))
     return shapes
 
 
@@ -259,15 +253,10 @@ def _poles(rng: np.random.Generator, *, framing: _Framing) -> list[Shape]:
         width_m = view_m / framing.width_per_m * max(relative, 2.2 * framing.pixel_per_m)
         height_m = view_m * rng.uniform(0.3, 0.8) + 0.5
         x_m, y_m = _around(rng, beyond_m)
-        shapes.append(
-            Shape(
-                "box",
-                np.array([x_m, y_m, 0.48 * height_m]),
-                _rotated_axes(yaw=rng.uniform(0, np.pi), tilt=rng.uniform(-0.12, 0.12)),
-                np.array([width_m / 2, width_m / 2, height_m / 2]),
-                _material(rng, textures=_WALLS, tile_m=(0.3, 0.8)),
-            )
-        )
+        axes = _rotated_axes(yaw=rng.uniform(0, np.pi), tilt=rng.uniform(-0.12, 0.12))
+        half_m = (width_m / 2, width_m / 2, height_m / 2)
+        material = _material(rng, textures=_WALLS, tile_m=(0.3, 0.8))
+        shapes.append(_solid("box", [x_m, y_m, 0.48 * height_m], half_m, material, axes))
     return shapes
 
 
@@ -342,30 +331,19 @@ def _shell(rng: np.random.Generator, *, place: _Place) -> list[Shape]:
     """Return four walls, and a ceiling where the place is closed."""
     thick = 0.2
     (long_m, wide_m), high_m = place.size_m, place.wall_m
+    long, wide = long_m / 2 + thick, wide_m / 2 + thick
     walls = [
-        (sign * (long_m / 2 + thick), 0.0, thick, wide_m / 2 + 2 * thick) for sign in (-1, 1)
-    ] + [(0.0, sign * (wide_m / 2 + thick), long_m / 2, thick) for sign in (-1, 1)]
-    shapes = [
-        Shape(
-            "box",
-            np.array([x, y, high_m / 2]),
-            np.eye(3),
-            np.array([half_x, half_y, high_m / 2]),
-            _material(rng, textures=_WALLS, tile_m=(2.0, 4.0)),
-        )
-        for x, y, half_x, half_y in walls
+        *(((sign * long, 0.0), (thick, wide_m / 2 + 2 * thick)) for sign in (-1, 1)),
+        *(((0.0, sign * wide), (long_m / 2, thick)) for sign in (-1, 1)),
     ]
+    places = [((x, y, high_m / 2), (*half, high_m / 2)) for (x, y), half in walls]
     if place.roof == "closed":
-        shapes.append(
-            Shape(
-                "box",
-                np.array([0.0, 0.0, high_m + thick]),
-                np.eye(3),
-                np.array([long_m / 2 + 2 * thick, wide_m / 2 + 2 * thick, thick]),
-                _material(rng, textures=_WALLS, tile_m=(2.0, 4.0)),
-            )
-        )
-    return shapes
+        over = (long_m / 2 + 2 * thick, wide_m / 2 + 2 * thick, thick)
+        places.append(((0.0, 0.0, high_m + thick), over))
+    return [
+        _solid("box", centre, half_m, _material(rng, textures=_WALLS, tile_m=(2.0, 4.0)))
+        for centre, half_m in places
+    ]
 
 
 def _crates(rng: np.random.Generator, *, place: _Place) -> list[Shape]:
@@ -378,15 +356,11 @@ def _crates(rng: np.random.Generator, *, place: _Place) -> list[Shape]:
         across = rng.uniform(-1, 1, (3, 2))
         place_xy = across[np.abs(across).max(axis=1).argmax()] * (half - half_m[:2].max() - 0.1)
         is_box = rng.random() < 0.65
-        shapes.append(
-            Shape(
-                "box" if is_box else "ellipsoid",
-                np.array([*place_xy, half_m[2] * (1.0 if is_box else 0.97)]),
-                _rotated_axes(yaw=rng.uniform(0, np.pi)),
-                half_m,
-                _material(rng, textures=_THINGS, tile_m=(0.6, 2.0)),
-            )
-        )
+        axes = _rotated_axes(yaw=rng.uniform(0, np.pi))
+        material = _material(rng, textures=_THINGS, tile_m=(0.6, 2.0))
+        kind: Kind = "box" if is_box else "ellipsoid"
+        height_m = half_m[2] * (1.0 if is_box else 0.97)
+        shapes.append(_solid(kind, [*place_xy, height_m], half_m, material, axes))
     return shapes
 
 
@@ -404,18 +378,9 @@ def _posts(rng: np.random.Generator, *, place: _Place) -> list[Shape]:
         column, row = divmod(number, 2)
         grid = np.array([(column + 0.5) / columns * 2 - 1, row - 0.5])
         x, y = (grid + rng.uniform(-0.1, 0.1, 2)) * half
-        shapes.append(
-            Shape(
-                "box",
-                np.array([x, y, high / 2]),
-                _rotated_axes(yaw=rng.uniform(0, np.pi)),
-                np.array([thick / 2, thick / 2, high / 2]),
-                wood,
-            )
-        )
+        axes = _rotated_axes(yaw=rng.uniform(0, np.pi))
+        shapes.append(_solid("box", [x, y, high / 2], [thick / 2, thick / 2, high / 2], wood, axes))
         if place.crowns:
             size = place.crowns * rng.uniform(0.7, 1.2, 3)
-            shapes.append(
-                Shape("ellipsoid", np.array([x, y, high + 0.5 * size[2]]), np.eye(3), size, leaves)
-            )
+            shapes.append(_solid("ellipsoid", [x, y, high + 0.5 * size[2]], size, leaves))
     return shapes

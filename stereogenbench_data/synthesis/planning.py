@@ -11,7 +11,7 @@ from stereogenbench_data.synthesis.proposal import (
     random_gaps_cm,
     random_stream,
 )
-from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING
+from stereogenbench_data.synthesis.render import RAY_CASTING
 from stereogenbench_data.synthesis.renderer import Renderer, ScenePlan
 from stereogenbench_data.synthesis.request import SynthRequest
 from stereogenbench_data.synthesis.trajectory import examine

@@ -39,7 +39,7 @@ from stereogenbench_data.sources.files import try_locked
 from stereogenbench_data.synthesis.decisions import Decision, Decisions, Drawn
 from stereogenbench_data.synthesis.filters import Refusal
 from stereogenbench_data.synthesis.planning import plan_scene, propose
-from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING
+from stereogenbench_data.synthesis.render import RAY_CASTING
 from stereogenbench_data.synthesis.renderer import Renderer, ScenePlan
 from stereogenbench_data.synthesis.request import SynthRequest
 from stereogenbench_data.synthesis.review import HOLDOUT

@@ -14,7 +14,6 @@ from jaxtyping import Float64
 from stereogenbench_data.schema.release import CAMERA_COUNT, CAMERA_PAIRS
 from stereogenbench_data.synthesis.request import SynthRequest
 
-_FIRST_LABEL: Final = 1000
 _PARTS: Final = ("draw", "map", "spawn", "path")
 _IPD_CM: Final = {"loc": 6.38, "scale": 0.5}
 _IPD_RANGE_CM: Final = (4.5, 8.5)
@@ -123,16 +122,6 @@ class Proposal:
     def key(self) -> str:
         """The scene's whole path below the root."""
         return self.request.key(self.index, map_name=self.map_name)
-
-    @property
-    def label_number(self) -> int:
-        """The number in the scene's label, which differs from that of its folder."""
-        return _FIRST_LABEL + self.index
-
-    @property
-    def label(self) -> str:
-        """The scene's label."""
-        return f"{self.map_name}_scene_{self.label_number}"
 
     @property
     def focal_px(self) -> tuple[float, float]:

@@ -1,10 +1,11 @@
-"""Pictures and depth of a scene: matte textured surfaces, lit by one sun.
+"""The built-in renderer: matte textured surfaces, lit by one sun.
 
 Colours depend on the place on the surface and on the size of a pixel there, but not on the viewing
 direction. So a view that is warped into another view by its depth agrees with that view.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -12,6 +13,8 @@ import torch
 from jaxtyping import Float32, Float64, Int32, UInt8
 from torch.nn.functional import grid_sample
 
+from stereogenbench_data.synthesis.maps import ANIMATIONS, CHARACTERS, MAPS, RayWorld, open_map
+from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.ray_casting import (
     GROUND,
     SKY,
@@ -21,7 +24,8 @@ from stereogenbench_data.synthesis.ray_casting import (
     in_unit_solid,
     shape_of,
 )
-from stereogenbench_data.synthesis.renderer import View
+from stereogenbench_data.synthesis.renderer import RenderedView, ScenePlan, View
+from stereogenbench_data.synthesis.request import SENSOR_MM
 from stereogenbench_data.synthesis.scene import Material, SceneModel, Shape, entry_depth
 from stereogenbench_data.synthesis.textures import sample_atlas, sample_tile, texture_row
 
@@ -61,8 +65,8 @@ class SceneState:
 
 
 def static_light(scene: SceneModel) -> Float64[np.ndarray, "side side"]:
-    """Return the map of sunlight on the ground, with the shadows of things."""
-    light = full_light()
+    """Return the map of sunlight on the ground, with the shadows of things; rows y, columns x."""
+    light = np.ones((_LIGHT_TEXELS, _LIGHT_TEXELS))
     for shape in scene.static_shapes[scene.shell :]:
         cast_shadow(light, shape=shape, scene=scene)
     return light
@@ -334,11 +338,6 @@ def _sunlight_at(
     return found[0, 0, 0].numpy()
 
 
-def full_light() -> Float64[np.ndarray, "side side"]:
-    """Return the map of sunlight on an empty ground; rows are y, columns are x."""
-    return np.ones((_LIGHT_TEXELS, _LIGHT_TEXELS))
-
-
 def cast_shadow(
     light: Float64[np.ndarray, "side side"], *, shape: Shape, scene: SceneModel
 ) -> None:
@@ -371,3 +370,57 @@ def _texel_of(place_m: Array, *, scene: SceneModel) -> Array:
 
 def _metres_at(texel: Array, *, scene: SceneModel) -> Array:
     return ((texel + 0.5) * (2 / _LIGHT_TEXELS) - 1) * scene.shadow_range_m
+
+
+@dataclass(frozen=True, slots=True)
+class RayCasting:
+    """The built-in renderer; see `Renderer`."""
+
+    name: str = "ray-casting"
+    maps: tuple[str, ...] = MAPS
+    characters: tuple[str, ...] = CHARACTERS
+    animations: tuple[str, ...] = ANIMATIONS
+    sensors_mm: tuple[tuple[float, float], ...] = (SENSOR_MM,)
+    fingerprint: str = "1"
+    cameras_per_task: int = 1
+
+    def world(self, proposal: Proposal) -> RayWorld:
+        """See `Renderer.world`. A map of the release is a stage."""
+        return open_map(proposal)
+
+    def views(self, plan: ScenePlan, *, cameras: tuple[int, ...]) -> Iterator[RenderedView]:
+        """See `Renderer.views`."""
+        world = open_map(plan.proposal)
+        light = static_light(world.scene)
+        for frame in range(plan.request.frames):
+            state = SceneState(
+                world.scene, walker=world.limbs(plan.spawn, frame=frame), static_light=light
+            )
+            for camera in cameras:
+                yield RenderedView(*render_frame(state, view=plan.view(camera=camera, frame=frame)))
+
+    def description(self, plan: ScenePlan) -> dict[str, object]:
+        """See `Renderer.description`."""
+        scene = open_map(plan.proposal).scene
+        ground, walls = scene.ground.texture, scene.static_shapes[0].material.texture
+        things = len(scene.static_shapes)
+        shell = scene.static_shapes[: scene.shell]
+        has_ceiling = any(shape.centre[2] - shape.half_m[2] > 2 for shape in shell)
+        place = "room" if has_ceiling else "yard"
+        detailed = (
+            f"A figure walks over a ground of {ground}, among crates, balls and poles ({things} "
+            f"things in all), before walls of {walls}."
+        )
+        return {
+            "scene_type": "indoor" if has_ceiling else "outdoor",
+            "setting": place,
+            "primary_elements": ["figure", "crates", "balls", "poles", "walls"],
+            "spatial_layout": "a figure in the middle, things scattered around it",
+            "lighting_materials": "sunlight, matte procedural textures",
+            "short_caption": f"A figure walks over {ground}.",
+            "detailed_caption": detailed,
+            "tags": [place, "figure", ground, walls],
+        }
+
+
+RAY_CASTING = RayCasting()

@@ -27,8 +27,8 @@ _UNSEEN_MAP_FOLDER: Final = "MapUnseenInTrain"
 _LARGEST_PX: Final = 8192
 _FOCAL_RANGE_MM: Final = (4.0, 1000.0)
 """Shorter lenses see 140 degrees and more; longer ones frame a subject beyond the depth's range."""
-_LEAST_RANGE_M: Final = 1.0
-_LARGEST_UNIT_M: Final = 1.0
+_UNIT_RANGE_M: Final = (1 / LARGEST_UNITS, 1.0)
+"""The smallest unit reaches to 1 m in 16 bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +52,7 @@ class ExportContract:
     def __post_init__(self) -> None:
         """Refuse values that cannot be written."""
         _require_choice("rotation", self.rotation, choices=get_args(RotationForm))
-        _require_positive("depth_unit_m", self.depth_unit_m)
-        range_m = LARGEST_UNITS * self.depth_unit_m
-        if not (self.depth_unit_m <= _LARGEST_UNIT_M and range_m >= _LEAST_RANGE_M):
-            raise SynthesisError(
-                f"depth_unit_m {self.depth_unit_m:g}: depth would have steps of "
-                f"{self.depth_unit_m:g} m up to {range_m:g} m. Choose a unit of at most "
-                f"{_LARGEST_UNIT_M:g} m that reaches to {_LEAST_RANGE_M:g} m."
-            )
+        _require_range("depth_unit_m", self.depth_unit_m, *_UNIT_RANGE_M)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,25 +98,18 @@ class SynthRequest:
         _require_choice("subset", self.subset, choices=get_args(Subset))
         _require_choice("check", self.check, choices=get_args(Check))
         _require_split(self)
-        for name, value in (("scenes", self.scenes), ("frames", self.frames)):
-            if value < 1:
-                raise SynthesisError(f"{name} must be at least 1, got {value}.")
-        if self.seed < 0:
-            raise SynthesisError(f"seed must be 0 or more, got {self.seed}.")
+        _require_range("scenes", self.scenes, 1, math.inf)
+        _require_range("frames", self.frames, 1, math.inf)
+        _require_range("seed", self.seed, 0, math.inf)
         for name, value in zip(("size_px", "height_px"), self.picture_px, strict=True):
-            if not 2 <= value <= _LARGEST_PX or value % 2:
+            _require_range(name, value, 2, _LARGEST_PX)
+            if value % 2:
                 raise SynthesisError(
-                    f"{name} must be an even number of pixels in 2..{_LARGEST_PX} (yuv420p "
-                    f"halves the colour), got {value}."
+                    f"{name} must be even (yuv420p halves the colour), got {value}."
                 )
         _require_maps(self.maps)
         if self.focal_mm is not None:
-            _require_positive("focal_mm", self.focal_mm)
-            shortest, longest = _FOCAL_RANGE_MM
-            if not shortest <= self.focal_mm <= longest:
-                raise SynthesisError(
-                    f"focal_mm must be in {shortest:g}..{longest:g}, got {self.focal_mm:g}."
-                )
+            _require_range("focal_mm", self.focal_mm, *_FOCAL_RANGE_MM)
 
     @property
     def picture_px(self) -> tuple[int, int]:
@@ -181,6 +167,6 @@ def _require_choice(name: str, value: object, *, choices: tuple[object, ...]) ->
         )
 
 
-def _require_positive(name: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0):
-        raise SynthesisError(f"{name} must be a positive number, got {value!r}.")
+def _require_range(name: str, value: float, least: float, most: float) -> None:
+    if not least <= value <= most:
+        raise SynthesisError(f"{name} must be from {least:.6g} to {most:.6g}, got {value!r}.")

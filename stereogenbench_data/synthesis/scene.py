@@ -13,7 +13,10 @@ from typing import Any, Final, Literal
 import numpy as np
 from jaxtyping import Float64
 
+from stereogenbench_data.synthesis.renderer import Spawn
+
 Array = Any
+Kind = Literal["box", "ellipsoid"]
 
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _SIGNS: Final = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T
@@ -41,7 +44,7 @@ class Shape:
         half_m: (3,) half the solid's size along each of its axes.
     """
 
-    kind: Literal["box", "ellipsoid"]
+    kind: Kind
     centre: Float64[np.ndarray, "3"]
     axes: Float64[np.ndarray, "3 3"]
     half_m: Float64[np.ndarray, "3"]
@@ -190,19 +193,16 @@ class Figure:
     stride_s: float
     scale: float
 
-    def limbs(
-        self, *, start_m: Float64[np.ndarray, "3"], yaw_deg: float, rise: float, moment_s: float
-    ) -> list[Shape]:
+    def limbs(self, spawn: Spawn, *, rise: float, moment_s: float) -> list[Shape]:
         """Return its limbs at a time.
 
         Args:
-            start_m: Its place on the ground at time 0.
-            yaw_deg: Where it faces.
+            spawn: Where it starts, and the direction in which it goes.
             rise: Rise of the ground per metre in that direction.
             moment_s: The time.
         """
-        first, second, radii_m = self._bones(start_m, yaw_deg, rise, moment_s)
-        yaw = np.radians(yaw_deg)
+        first, second, radii_m = self._bones(spawn, rise, moment_s)
+        yaw = np.radians(spawn.yaw_deg)
         side = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
         skin, upper, lower = self.clothes
         materials = (upper, lower, skin, *(lower, lower, skin, upper, skin) * 2)
@@ -213,23 +213,19 @@ class Figure:
             )
         ]
 
-    def points_m(
-        self, *, start_m: Float64[np.ndarray, "3"], yaw_deg: float, rise: float, moment_s: float
-    ) -> Float64[np.ndarray, "p 3"]:
+    def points_m(self, spawn: Spawn, *, rise: float, moment_s: float) -> Float64[np.ndarray, "p 3"]:
         """Return both ends of every limb at a time, given what `limbs` is given."""
-        first, second, radii_m = self._bones(start_m, yaw_deg, rise, moment_s)
+        first, second, radii_m = self._bones(spawn, rise, moment_s)
         along = second - first
         along *= (0.5 * radii_m / np.sqrt((along * along).sum(axis=1)))[:, None]
         return np.stack([first - along, second + along], axis=1).reshape(-1, 3)
 
-    def _bones(
-        self, start_m: Array, yaw_deg: float, rise: float, moment_s: float
-    ) -> tuple[Array, Array, Array]:
+    def _bones(self, spawn: Spawn, rise: float, moment_s: float) -> tuple[Array, Array, Array]:
         """Return where the limbs start and end, (13, 3) each, and their radii."""
-        yaw, swing = np.radians(yaw_deg), 2 * np.pi * moment_s / self.stride_s
+        yaw, swing = np.radians(spawn.yaw_deg), 2 * np.pi * moment_s / self.stride_s
         ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
         side = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
-        feet = start_m + self.walk_m_s * moment_s * (ahead + rise * _UP)
+        feet = spawn.place_m + self.walk_m_s * moment_s * (ahead + rise * _UP)
         # The limbs of a figure of scale 1 whose hips are at the origin.
         neck = 0.52 * _UP + 0.03 * ahead
         bones = [

@@ -33,7 +33,7 @@ from stereogenbench_data.schema.release import (
     depth_name,
     rgb_name,
 )
-from stereogenbench_data.synthesis.filters import LIMITS, Reason, Refusal
+from stereogenbench_data.synthesis.filters import LIMITS, Refusal
 from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.renderer import RenderedView, Renderer, ScenePlan
 from stereogenbench_data.synthesis.request import LARGEST_UNITS, RotationForm
@@ -119,7 +119,7 @@ def check_pictures(measured: Mapping[int, Float64[np.ndarray, "frames 4"]]) -> R
     """Return why a scene is refused by what `write_cameras` measured of it, if it is."""
     for camera, rows in sorted(measured.items()):
         invalid, mean, sd, near = rows.T
-        found: list[tuple[Reason, float, float, int, str]] = [
+        found: list[tuple[str, float, float, int, str]] = [
             ("invalid_depth", invalid.mean(), LIMITS.invalid_share, 1,
              "{:.0%} of its pixels have no depth"),
             ("dark", mean.min(), LIMITS.dark_mean, -1,
@@ -138,12 +138,9 @@ def check_pictures(measured: Mapping[int, Float64[np.ndarray, "frames 4"]]) -> R
 
 # Metadata.
 
-_REPRESENTATIONS: Final = {
-    "rotator": "unreal_rotator_degrees",
-    "quaternion_xyzw": "quaternion_xyzw",
-    "quaternion_wxyz": "quaternion_wxyz",
-    "matrix": "matrix_3x3",
-}
+_FIRST_LABEL: Final = 1000
+"""The number in the label of scene 0; labels differ from the names of folders."""
+_REPRESENTATIONS: Final = {"rotator": "unreal_rotator_degrees", "matrix": "matrix_3x3"}
 
 
 def completion_text(proposal: Proposal, *, renderer: str) -> str:
@@ -186,15 +183,17 @@ def metadata_texts(
 
 
 def _labels(proposal: Proposal) -> dict[str, Any]:
+    number = _FIRST_LABEL + proposal.index
     return {
-        "scene_label": proposal.label,
-        "scene_index": proposal.label_number,
+        "scene_label": f"{proposal.map_name}_scene_{number}",
+        "scene_index": number,
         "map_name": proposal.map_name,
     }
 
 
 def _camera_names(proposal: Proposal) -> list[str]:
-    return [f"{proposal.label}_Cam_{camera:02d}" for camera in range(CAMERA_COUNT)]
+    label = _labels(proposal)["scene_label"]
+    return [f"{label}_Cam_{camera:02d}" for camera in range(CAMERA_COUNT)]
 
 
 def _primary_pair(proposal: Proposal) -> dict[str, str]:
@@ -251,7 +250,7 @@ def _trajectory(plan: ScenePlan) -> dict[str, Any]:
     return _labels(proposal) | {
         "character_id": proposal.character,
         "unit": "cm",
-        "rotation_representation": _REPRESENTATIONS[form],
+        "rotation_representation": _REPRESENTATIONS.get(form, form),
         "camera_count": CAMERA_COUNT,
         "primary_stereo_pair": _primary_pair(proposal),
         "camera_order": names,

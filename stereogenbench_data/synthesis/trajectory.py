@@ -11,8 +11,7 @@ decisions.
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -22,7 +21,6 @@ from stereogenbench_data.schema.release import FRAME_RATE_HZ
 from stereogenbench_data.synthesis.filters import (
     LIMITS,
     PoseChecks,
-    Reason,
     Refusal,
     check_poses,
     check_spawn,
@@ -65,19 +63,19 @@ def examine(proposal: Proposal, *, world: World) -> ScenePlan | Refusal:
     path = search.path()
     if isinstance(path, Refusal):
         return path
-    centres_m, rotators_deg = search.poses(path)
-    refusal = search.check_motion(centres_m, rotators_deg) or search.check_all(
-        centres_m, rotators_deg
-    )
+    centres_m, rotators_deg = search.poses(path, np.arange(frames))
+    refusal = search.check_motion(centres_m, rotators_deg)
     if refusal is not None:
         return refusal
+    checks = search.checks(centres_m, rotators_deg, frames=slice(None))
+    if not checks.passed.all():
+        return checks.refusal(int(checks.passed.argmin()))
     ahead = rotation_from_rotator_deg(rotators_deg)[..., 0]
     subject_m = ((body_m.mean(axis=1) - centres_m) * ahead).sum(axis=1)
     return ScenePlan(proposal, spawn, centres_m, rotators_deg, subject_m, search.splices)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Knot:
+class _Knot(NamedTuple):
     """A place of the path from which it can go on: the frame, the viewpoint and its speed."""
 
     frame: int
@@ -116,11 +114,8 @@ class _Search:
 
     # Viewpoints.
 
-    def poses(self, path: Array, *, first: int = 0) -> tuple[Array, Array]:
-        """Return centres and rotators of viewpoints at consecutive frames."""
-        return self._poses_at(path, np.arange(first, first + len(path)))
-
-    def _poses_at(self, viewpoints: Array, frames: Array) -> tuple[Array, Array]:
+    def poses(self, viewpoints: Array, frames: Array) -> tuple[Array, Array]:
+        """Return centres and rotators of viewpoints at frames."""
         azimuth, elevation = np.radians(viewpoints[:, 0]), np.radians(viewpoints[:, 1])
         flat = np.cos(elevation)
         out = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
@@ -142,11 +137,11 @@ class _Search:
         farthest_m = max(min(0.9 * self.height_m / least, 2 * self.nearest_m), self.nearest_m)
         candidates[:, 2] = rng.uniform(self.nearest_m, farthest_m, _CANDIDATES)
         pool = np.round(candidates, _DIGITS)
-        refused: Counter[Reason] = Counter()
+        refused: Counter[str] = Counter()
         for frame in sorted({0, self.frames // 2, self.frames - 1}):
             at = np.full(len(pool), frame)
-            centres_m, rotators_deg = self._poses_at(pool, at)
-            checks = self._checks(centres_m, rotators_deg, frames=at)
+            centres_m, rotators_deg = self.poses(pool, at)
+            checks = self.checks(centres_m, rotators_deg, frames=at)
             refused.update(checks.reasons[~checks.passed].tolist())
             pool = pool[checks.passed]
             if len(pool) < LIMITS.viewpoints:
@@ -157,7 +152,7 @@ class _Search:
                 )  # fmt: skip
         return pool
 
-    def _checks(self, centres_m: Array, rotators_deg: Array, *, frames: Any) -> PoseChecks:
+    def checks(self, centres_m: Array, rotators_deg: Array, *, frames: Any) -> PoseChecks:
         """Ask all filters about poses at frames."""
         body_m = self.body_m[frames]
         return check_poses(centres_m, rotators_deg, body_m=body_m, rig=self.rig, world=self.world)
@@ -227,14 +222,12 @@ class _Search:
 
     def _held(self, viewpoints: Array, *, first: int) -> int:
         """Return how many of the viewpoints after the first hold, with the ways between them."""
-        frames = slice(first, first + len(viewpoints))
-        centres_m, rotators_deg = self.poses(np.round(viewpoints, _DIGITS), first=first)
-        checks = self._checks(centres_m, rotators_deg, frames=frames)
+        frames = np.arange(first, first + len(viewpoints))
+        centres_m, rotators_deg = self.poses(np.round(viewpoints, _DIGITS), frames)
+        checks = self.checks(centres_m, rotators_deg, frames=frames)
         eyes = self.rig.eyes(centres_m, rotation_from_rotator_deg(rotators_deg))
         held = checks.passed[1:] & ~obstructed(eyes, world=self.world)
         return len(held) if held.all() else int(held.argmin())
-
-    # All its frames.
 
     def check_motion(self, centres_m: Array, rotators_deg: Array) -> Refusal | None:
         """Refuse a path with a jump."""
@@ -252,14 +245,6 @@ class _Search:
                     f"{values.max():.3g} {name} at frame {int(values.argmax()) + 1}",
                 )  # fmt: skip
         return None
-
-    def check_all(self, centres_m: Array, rotators_deg: Array) -> Refusal | None:
-        """Ask all filters about the six cameras at every frame."""
-        checks = self._checks(centres_m, rotators_deg, frames=slice(None))
-        if checks.passed.all():
-            return None
-        frame = int(checks.passed.argmin())
-        return checks.refusal(frame, where=f"frame {frame}")
 
 
 def steps(

@@ -29,7 +29,7 @@ from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from stereogenbench_data.synthesis.produce import synthesise
-from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING, RayCasting
+from stereogenbench_data.synthesis.render import RAY_CASTING, RayCasting
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 from tests.audit.corruption import (
     as_inverse,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.synthesis.produce import synthesise
-from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING
+from stereogenbench_data.synthesis.render import RAY_CASTING
 from stereogenbench_data.synthesis.request import SynthRequest
 
 UNIT_M = 0.001

@@ -24,8 +24,9 @@ from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.synthesis.blender.assets import read_assets
 from stereogenbench_data.synthesis.blender.process import blender
 from stereogenbench_data.synthesis.blender.renderer import BlenderAssetWarning, BlenderRenderer
+from stereogenbench_data.synthesis.filters import check_poses
 from stereogenbench_data.synthesis.produce import synthesise
-from stereogenbench_data.synthesis.proposal import Proposal
+from stereogenbench_data.synthesis.proposal import Proposal, Rig
 from stereogenbench_data.synthesis.renderer import Renderer, ScenePlan, Spawn, World
 from stereogenbench_data.synthesis.request import SENSOR_MM, SynthRequest
 from tests.synthesis.conftest import Drawn
@@ -131,13 +132,23 @@ def test_rays_meet_the_walls_of_a_room_where_they_were_built(renderer):
     np.testing.assert_allclose(down_m, [3.0 - 1.35, 3.0], atol=1e-6)
 
 
-def test_a_ray_that_starts_in_a_solid_goes_nowhere_but_a_room_is_no_solid(renderer):
+def test_a_camera_inside_a_solid_sees_nothing(renderer):
+    """The filter of visibility refuses it; a pose with the same view beside the solid passes."""
     world = renderer.world(proposal(on="Room"))
-    origins = np.array([[2.4, -2.0, 0.3], [-4.2, -1.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 20.0]])
+    body_m = np.tile(np.linspace([0.0, 0.0, 0.1], [0.0, 0.0, 1.7], 12), (2, 1, 1))
+    centres_m = np.array([[2.4, -2.0, 0.3], [2.4, 0.0, 1.0]])
+    aims = np.array([0.0, 0.0, 0.9]) - centres_m
+    rotators_deg = np.degrees(
+        [[np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x), 0.0] for x, y, z in aims]
+    )
 
-    met_m = world.cast(origins, np.tile([0.0, 0.0, 1.0], (4, 1)))
+    checks = check_poses(
+        centres_m, rotators_deg,
+        body_m=body_m, rig=Rig(np.linspace(-0.01, 0.01, 6), (1.5, 1.5)), world=world,
+    )  # fmt: skip
 
-    np.testing.assert_allclose(met_m, [0, 0, 2.2, np.inf], atol=1e-6)
+    assert checks.reasons.tolist()[0] in ("collision", "visibility")
+    assert checks.reasons.tolist()[1] == ""
 
 
 def test_cameras_stay_below_a_ceiling_and_may_rise_above_a_yard(renderer):

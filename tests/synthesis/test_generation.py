@@ -26,7 +26,7 @@ from stereogenbench_data.synthesis.filters import LIMITS, Refusal, check_poses
 from stereogenbench_data.synthesis.maps import MAPS, open_map
 from stereogenbench_data.synthesis.planning import plan_scene, propose
 from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
-from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING, RayCasting
+from stereogenbench_data.synthesis.render import RAY_CASTING, RayCasting
 from stereogenbench_data.synthesis.renderer import RenderedView
 from stereogenbench_data.synthesis.request import SynthRequest
 from stereogenbench_data.synthesis.review import hold_out, write_sheets

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from stereogenbench_data.synthesis.render import cast_shadow, full_light
+from stereogenbench_data.synthesis.render import cast_shadow, static_light
 from stereogenbench_data.synthesis.scene import Material, SceneModel, Shape
 from stereogenbench_data.synthesis.textures import TEXTURES, sample_atlas, texture_row
 
@@ -44,7 +44,7 @@ def test_a_box_shades_the_ground_on_the_side_away_from_the_sun():
     sun = np.array([-0.6, 0.48, 0.64])
     scene = SceneModel(np.array([0.05, -0.02]), stone, (), 0, sun, shadow_range_m=16.0)
     box = Shape("box", np.array([0.0, 0.0, 1.0]), np.eye(3), np.full(3, 1.0), stone)
-    light = full_light()
+    light = static_light(scene)
 
     cast_shadow(light, shape=box, scene=scene)
 

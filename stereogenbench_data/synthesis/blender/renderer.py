@@ -49,13 +49,15 @@ class BlenderAssetWarning(UserWarning):
 
 @dataclass(frozen=True, slots=True)
 class BlenderRenderer:
-    """Renders users' own assets by Cycles.
+    """Renders users' own assets by Cycles; all cameras of a frame from one evaluated scene.
 
     Attributes:
         assets: What there is to render.
     """
 
     assets: Assets
+    name: str = "blender"
+    cameras_per_task: int = CAMERA_COUNT
 
     @classmethod
     def from_file(cls, path: str | Path) -> "BlenderRenderer":
@@ -69,11 +71,6 @@ class BlenderRenderer:
         if find_spec("bpy") is None:
             raise missing_extra("Blender", "blender", "bpy is not installed; it needs Python 3.13")
         return renderer
-
-    @property
-    def name(self) -> str:
-        """What the command calls it."""
-        return "blender"
 
     @property
     def maps(self) -> tuple[str, ...]:
@@ -99,11 +96,6 @@ class BlenderRenderer:
     def fingerprint(self) -> str:
         """A digest of the assets, and the version of this code."""
         return f"blender {_VERSION} {self.assets.digest[:32]}"
-
-    @property
-    def cameras_per_task(self) -> int:
-        """All cameras of a frame are rendered from one evaluated scene."""
-        return CAMERA_COUNT
 
     def world(self, proposal: Proposal) -> "BlenderWorld":
         """Return the map of a proposal, with its subject."""
@@ -193,8 +185,7 @@ class BlenderWorld:
     ) -> Float64[np.ndarray, " n"]:
         """Return how many metres each ray goes until it meets the map, see `World.cast`.
 
-        A ray starts inside a solid if backs of faces are around it, along one axis less than 2 m
-        apart; so a room whose faces look outwards is not taken for a solid.
+        The insides of solids are not known: the filter of visibility refuses what is in them.
         """
         root, asset, *_ = self._asked
         found_m: Float64[np.ndarray, " n"] = blender(asset.file).call(

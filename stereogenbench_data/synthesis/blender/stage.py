@@ -36,13 +36,10 @@ Array = Any
 _RATE_HZ: Final = 15.0
 _MESHES: Final = frozenset({"MESH", "CURVE", "SURFACE", "FONT", "META"})
 _WITHOUT_MESH: Final = frozenset({"CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL"})
-_SOLID_M: Final = 2.0
-"""Closed surfaces that are wider than this in every direction are rooms, not solids."""
 _OPEN_SKY_M: Final = 20.0
 """How far above its highest point cameras may be in a map without a ceiling."""
 _OPEN_SHARE: Final = 0.3
 _GRID: Final = 12
-_BACKS: Final = 5
 _MAP_SIZE_M: Final = (2.0, 500.0)
 _ROOM_HEIGHT_M: Final = (1.8, 40.0)
 _HEIGHT_M: Final = (0.5, 3.0)
@@ -185,8 +182,8 @@ def triangles_of(depsgraph: Any, *, subject: frozenset[str]) -> list[Mesh]:
             continue
         matrix = np.array(instance.matrix_world)
         owner = (instance.parent or shown).original.name
-        cut = [slot.material is not None and _lets_through(slot.material) for slot in
-               shown.material_slots] or [False]  # fmt: skip
+        slots = [slot.material for slot in shown.material_slots] or [None]
+        cut = [each is not None and _lets_through(each.node_tree) for each in slots]
         found.append(
             Mesh(
                 name=f"{owner}/{shown.name}/{tuple(instance.persistent_id)}",
@@ -215,24 +212,17 @@ def _mesh_of(shown: Any) -> tuple[Array, Array, Array]:
     return vertices.reshape(-1, 3).astype(np.float64), corners.reshape(-1, 3).astype(int), materials
 
 
-def _lets_through(material: Any) -> bool:
-    """Return whether a material is transparent somewhere; refraction is not transparency."""
-    trees = [material.node_tree]
-    seen = set()
-    while trees:
-        tree = trees.pop()
-        if tree is None or tree.name in seen:
-            continue
-        seen.add(tree.name)
-        for node in tree.nodes:
-            if node.bl_idname == "ShaderNodeGroup":
-                trees.append(node.node_tree)
-            elif node.bl_idname == "ShaderNodeBsdfTransparent":
+def _lets_through(tree: Any) -> bool:
+    """Return whether nodes of a material are transparent; refraction is not transparency."""
+    for node in tree.nodes if tree is not None else ():
+        if node.bl_idname == "ShaderNodeBsdfTransparent":
+            return True
+        if node.bl_idname == "ShaderNodeGroup" and _lets_through(node.node_tree):
+            return True
+        if node.bl_idname == "ShaderNodeBsdfPrincipled":
+            alpha = node.inputs["Alpha"]
+            if alpha.is_linked or alpha.default_value < 1:
                 return True
-            elif node.bl_idname == "ShaderNodeBsdfPrincipled":
-                alpha = node.inputs["Alpha"]
-                if alpha.is_linked or alpha.default_value < 1:
-                    return True
     return False
 
 
@@ -241,24 +231,22 @@ class Surfaces:
 
     def __init__(self) -> None:
         self._first: dict[str, Array] = {}
-        self._moving: set[str] = set()
-        self._still: Triangles | None = None
+        self._names: set[str] = set()
+        self._still = Triangles([])
 
     def at_frame(self, meshes: list[Mesh]) -> list[Triangles]:
         """Return what is to be searched: what stands still, and what moves."""
-        placed = {mesh.name: mesh.vertices for mesh in meshes if not mesh.is_subject}
-        if not self._first:
-            self._first = placed
-        moved = {
-            name
-            for name in self._first.keys() | placed.keys()
-            if name not in self._moving
-            and not np.array_equal(self._first.get(name, ()), placed.get(name, ()))
-        }
-        self._moving |= moved
-        moving = [mesh for mesh in meshes if mesh.is_subject or mesh.name in self._moving]
-        if self._still is None or moved:
-            self._still = Triangles([mesh for mesh in meshes if mesh not in moving])
+        map_meshes = [mesh for mesh in meshes if not mesh.is_subject]
+        self._first = self._first or {mesh.name: mesh.vertices for mesh in map_meshes}
+        still = [
+            mesh
+            for mesh in map_meshes
+            if np.array_equal(mesh.vertices, self._first.get(mesh.name, ()))
+        ]
+        names = {mesh.name for mesh in still}
+        if names != self._names:
+            self._names, self._still = names, Triangles(still)
+        moving = [mesh for mesh in meshes if mesh.is_subject or mesh.name not in names]
         return [self._still, *([Triangles(moving)] if moving else [])]
 
 
@@ -834,22 +822,18 @@ class Stage:
         )
         bottom = np.full(across.size, low[2] - 1.0)
         at = self.mirror.to_blender(np.stack([across.ravel(), along.ravel(), bottom], axis=1))
+        upwards = np.broadcast_to([0.0, 0.0, 1.0], at.shape)
         floors, ceilings = np.full((2, len(at)), np.inf)
-        left = np.arange(len(at))
         for _ in range(_MOST_LAYERS):
-            upwards = np.broadcast_to([0.0, 0.0, 1.0], (len(left), 3))
-            hits = first_hits(self.still, at[left], upwards)
-            at[left, 2] += hits.distance
-            looks_up = hits.normals[:, 2] > 0
-            has_floor = np.isfinite(floors[left])
-            is_ceiling = has_floor & (hits.normals[:, 2] < 0)
-            ceilings[left[is_ceiling]] = at[left[is_ceiling], 2]
-            is_floor = looks_up & ~has_floor
-            floors[left[is_floor]] = at[left[is_floor], 2]
-            left = left[np.isfinite(hits.distance) & ~is_ceiling]
-            at[left, 2] += 1e-5 / self.mirror.unit_m
-            if not left.size:
+            hits = first_hits(self.still, at, upwards)
+            is_met = np.isfinite(hits.distance)
+            if not is_met.any():
                 break
+            at[is_met, 2] += hits.distance[is_met]
+            is_floor = (hits.normals[:, 2] > 0) & np.isinf(floors)
+            is_ceiling = (hits.normals[:, 2] < 0) & np.isfinite(floors) & np.isinf(ceilings)
+            floors[is_floor], ceilings[is_ceiling] = at[is_floor, 2], at[is_ceiling, 2]
+            at[:, 2] += 1e-5 / self.mirror.unit_m
         found = ceilings[np.isfinite(floors)]
         if not found.size or np.isinf(found).mean() > _OPEN_SHARE:
             return float(low[2]), math.inf
@@ -857,34 +841,10 @@ class Stage:
         return float(floors.min()) * self.mirror.unit_m, ceiling * self.mirror.unit_m
 
     def cast(self, origins_m: Array, directions: Array) -> Array:
-        """Return how many metres each ray goes until it meets the map; 0 inside a solid."""
-        origins = self.mirror.to_blender(origins_m)
+        """Return how many metres each ray goes until it meets the map."""
         ways = directions * self.mirror.flip
-        hits = first_hits(self.still, origins, ways)
-        distance = hits.distance
-        behind = np.einsum("ni,ni->n", hits.normals, ways) > 0
-        inside = np.flatnonzero(behind)
-        if inside.size:
-            places, back = np.unique(origins[inside], axis=0, return_inverse=True)
-            is_solid = self._in_solid(places)
-            distance[inside[is_solid[back.reshape(-1)]]] = 0.0
-        return distance * self.mirror.unit_m
-
-    def _in_solid(self, places: Array) -> Array:
-        """Tell places that see backs of faces both ways along the axes, and nearby along one.
-
-        One of the six may be a front: a thing that stands on a floor shares a face with it.
-        """
-        axes = np.concatenate([np.eye(3), -np.eye(3)])
-        is_back = np.empty((6, len(places)), bool)
-        distance = np.empty((6, len(places)))
-        for way, axis in enumerate(axes):
-            ways = np.broadcast_to(axis, places.shape)
-            hits = first_hits(self.still, places, ways)
-            distance[way], is_back[way] = hits.distance, hits.normals @ axis > 0
-        thickness_m = (distance[:3] + distance[3:]).min(axis=0) * self.mirror.unit_m
-        solid: Array = (is_back.sum(axis=0) >= _BACKS) & (thickness_m < _SOLID_M)
-        return solid
+        hits = first_hits(self.still, self.mirror.to_blender(origins_m), ways)
+        return hits.distance * self.mirror.unit_m
 
     def set_subject(self, character: CharacterAsset, animation: AnimationAsset) -> Subject:
         """Put a character with an animation into the scene, in place of the one before."""
