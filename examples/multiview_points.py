@@ -13,7 +13,8 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
-from stereogenbench_data.bridges.multiview import VGGTViews
+from stereogenbench_data import SceneViews
+from stereogenbench_data.bridges.multiview import VIEW_FIELDS, vggt_record
 
 SHARDS = Path(sys.argv[1] if len(sys.argv) > 1 else Path(__file__).parents[1] / "shards")
 
@@ -22,13 +23,14 @@ class Moments(Dataset):
     """Four views of each moment, drawn anew each time."""
 
     def __init__(self) -> None:
-        self.views = VGGTViews(SHARDS, split="train", frames=("every", 40))
+        options = {"split": "train", "frames": ("every", 40), "fields": VIEW_FIELDS}
+        self.views = SceneViews(SHARDS, **options)
 
     def __len__(self) -> int:
         return len(self.views)
 
     def __getitem__(self, number: int) -> list[torch.Tensor]:
-        record = self.views.get_data(seq_index=number, img_per_seq=4)
+        record = vggt_record(self.views[number], ids=torch.randperm(6)[:4])
         rotation, shift = np.split(np.float32(record["extrinsics"][0]), [3], axis=1)
         points = np.stack(record["world_points"]) @ rotation.T + shift[:, 0]
         arrays = (np.stack(record["images"]), points, np.stack(record["point_masks"]))

@@ -4,10 +4,8 @@ Copy the class into ``training/data/datasets/stereogenbench.py`` and name it in 
 
     - _target_: data.datasets.stereogenbench.StereoGenBench
       len_train: 100000
-      views:
-        _target_: stereogenbench_data.bridges.multiview.VGGTViews
-        data: /data/shards
-        frames: all
+      data: /data/shards
+      frames: all
 
 The base's ``process_one_image`` crops and scales a picture and computes its points.
 Source: facebookresearch/vggt, training/data/base_dataset.py and datasets/vkitti.py.
@@ -17,18 +15,20 @@ import numpy as np
 import torch
 from data.base_dataset import BaseDataset
 
-from stereogenbench_data.bridges.multiview import VGGTViews
+from stereogenbench_data import SceneViews
+from stereogenbench_data.bridges.multiview import VIEW_FIELDS, vggt_record
 
 PREPARED = ("images", "depths", "extrinsics", "intrinsics", "world_points", "cam_points",
             "point_masks")  # fmt: skip
 
 
 class StereoGenBench(BaseDataset):
-    """Views of StereoGenBench."""
+    """Moments of StereoGenBench, each a sequence by its number."""
 
-    def __init__(self, common_conf, views: VGGTViews, len_train: int | None = None) -> None:
+    def __init__(self, common_conf, data, frames="first", len_train: int | None = None) -> None:
         super().__init__(common_conf=common_conf)
-        self.views, self.len_train = views, len_train or len(views)
+        self.moments = SceneViews(data, split="train", frames=frames, fields=VIEW_FIELDS)
+        self.len_train = len_train or len(self.moments)
         self.training = common_conf.training
         self.inside_random = common_conf.inside_random
         self.allow_duplicate_img = common_conf.allow_duplicate_img
@@ -37,11 +37,14 @@ class StereoGenBench(BaseDataset):
         self, seq_index=None, img_per_seq=None, seq_name=None, ids=None, aspect_ratio=1.0
     ) -> dict:
         if self.inside_random:
-            seq_index, seq_name = int(torch.randint(len(self.views), ())), None
-        if ids is None and seq_name is None and img_per_seq and self.allow_duplicate_img:
-            count = self.views.view_count(seq_index % len(self.views))
-            ids = torch.randint(count, (img_per_seq,)).numpy()
-        record = self.views.get_data(seq_index, img_per_seq, seq_name, ids)
+            seq_index = int(torch.randint(len(self.moments), ()))
+        moment = self.moments[seq_index % len(self.moments)]
+        count = len(moment["image"])
+        if ids is None and img_per_seq:
+            draws_twice = self.allow_duplicate_img or img_per_seq > count
+            drawn = torch.randint(count, (img_per_seq,)) if draws_twice else torch.randperm(count)
+            ids = drawn[:img_per_seq].numpy()
+        record = vggt_record(moment, ids=ids)
         plain = [record.pop(name) for name in ("images", "depths", "extrinsics", "intrinsics")]
         shape = self.get_target_shape(aspect_ratio)
         prepared = [

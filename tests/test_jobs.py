@@ -8,10 +8,10 @@ import pytest
 
 JOBS = {
     "clips": """
-from stereogenbench_data.bridges.clips import ClipForm, ExportRun, export_clips
+from stereogenbench_data.bridges.clips import export_clips
 from stereogenbench_data.media.encoder import Encoding
-form = ClipForm(size=(size, size), encoding=Encoding(preset="ultrafast"))
-export_clips(data, out, layout="diffsynth", form=form, run=ExportRun(workers=1))
+form = dict(size=(size, size), encoding=Encoding(preset="ultrafast"))
+export_clips(data, out, layout="diffsynth", **form, workers=1)
 """,
     "inputs": """
 from stereogenbench_data.evaluation.inputs import export_inputs

@@ -2,19 +2,34 @@
 
 ``load_dataset("ORG/NAME", "Uniform", split="train", streaming=True)`` reads from its YAML head
 which shards to load, and that videos stay bytes. The rest is for people: the template `card.md`.
+
+The Hub's viewer shows one row a scene, with a small picture. It reads all configs of a card in the
+format of the first one, which is of tars, so the rows are tars too: a member for each column.
+
+    viewer/train.tar              train/Uniform/Town/scene_000001.preview.jpg, ...map.txt, ...
+    viewer/eval_seen_map.tar      eval/MapSeenInTrain/Uniform/Town/scene_000000.preview.jpg, ...
 """
 
 import fnmatch
+import io
+import json
+import tarfile
 from collections import Counter
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from PIL import Image
 
-from stereogenbench_data.bridges import dataset_facts, viewer
-from stereogenbench_data.engine import Progress
+from stereogenbench_data.bridges import dataset_facts
+from stereogenbench_data.datasets.mapped import StereoPairs
+from stereogenbench_data.engine import Advance, Progress, advance_of
 from stereogenbench_data.errors import DescriptorError, explain_os_errors, missing_extra
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.samples.picture import contact_sheet
+from stereogenbench_data.schema.records import Scene, SceneId
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     CAMERA_PAIRS,
@@ -23,7 +38,114 @@ from stereogenbench_data.schema.release import (
     TRAINING_JSON,
 )
 from stereogenbench_data.schema.text import counted, markdown_text
-from stereogenbench_data.sources.files import write_atomic
+from stereogenbench_data.sources.files import open_atomic, write_atomic
+
+_COLUMNS: Final[dict[str, tuple[str, Callable[[Scene], Any]]]] = {
+    "map.txt": ("string", lambda scene: scene.id.map_name),
+    "family.txt": ("string", lambda scene: scene.id.family),
+    "description.txt": ("string", lambda scene: scene.caption),
+    "shard.txt": ("string", lambda scene: next(iter(scene.members.values())).path),
+    "frames.json": ("int64", lambda scene: scene.frames),
+    "width_px.json": ("int64", lambda scene: scene.rig.image_width_px),
+    "height_px.json": ("int64", lambda scene: scene.rig.image_height_px),
+    "focal_mm.json": ("float64", lambda scene: scene.rig.focal_mm),
+    "shortest_baseline_cm.json": ("float64", lambda scene: min(scene.rig.baselines_cm)),
+    "longest_baseline_cm.json": ("float64", lambda scene: max(scene.rig.baselines_cm)),
+}
+FEATURES: Final[dict[str, str]] = {
+    "preview.jpg": "image",
+    **{name: kind for name, (kind, _) in _COLUMNS.items()},
+    "__key__": "string",
+    "__url__": "string",
+}
+"""Columns and their types, as `datasets` writes them."""
+_WIDEST_PX: Final = 240
+_MARK: Final = "stereogenbench.index"
+
+
+def split_name(scene: SceneId) -> str:
+    """Return the name of a scene's split on the Hub, which has no subsets."""
+    return scene.split if scene.subset is None else f"{scene.split}_{scene.subset}"
+
+
+def viewer_tar(split: str) -> str:
+    """Return the path of a split's tar below the shards."""
+    return f"viewer/{split}.tar"
+
+
+def viewer_tars(index: SceneIndex) -> dict[str, list[int]]:
+    """Return the scenes' rows of the index for each tar, by its path below the shards."""
+    rows: dict[str, list[int]] = {}
+    for row in range(len(index)):
+        path = viewer_tar(split_name(index.scene(row).id))
+        rows.setdefault(path, []).append(row)
+    return rows
+
+
+def write_viewer_rows(
+    index: SceneIndex, folder: Path, *, progress: Progress | None = None
+) -> list[Path]:
+    """Write a tar of rows for each split below a folder of shards, and return their paths.
+
+    A tar that was written from the same index is left as it is.
+
+    Args:
+        index: The index of the shards.
+        folder: The folder below which ``viewer/`` is written.
+        progress: Called with (scenes done, scenes in all).
+
+    Raises:
+        DescriptorError: If a file cannot be written.
+        StorageError, MediaError: If a scene's pictures cannot be read.
+    """
+    rows_of = {folder / name: rows for name, rows in viewer_tars(index).items()}
+    advance = advance_of(progress, total=len(index))
+    cannot = f"{folder / 'viewer'}: cannot be written"
+    with explain_os_errors(cannot, "Check the disk.", kind=DescriptorError):
+        for path, rows in rows_of.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if _digest_of(path) == index.digest:
+                advance(len(rows))
+            else:
+                _write(index, rows, path, advance=advance)
+    return [*rows_of]
+
+
+def _digest_of(path: Path) -> str:
+    """Return the digest of the index that a tar was written from, empty if there is no such tar."""
+    try:
+        with tarfile.open(path) as tar:
+            return tar.pax_headers.get(_MARK, "")
+    except (FileNotFoundError, tarfile.TarError):
+        return ""
+
+
+def _write(index: SceneIndex, rows: list[int], path: Path, *, advance: Advance) -> None:
+    rig = index.scene(rows[0]).rig
+    width = min(_WIDEST_PX, rig.image_width_px)
+    size = (round(rig.image_height_px * width / rig.image_width_px), width)
+    pairs = StereoPairs(
+        index, frames=[0], size=size, fields=("left", "right", "disparity"), check="metadata"
+    )
+    options: dict[str, Any] = {"format": tarfile.PAX_FORMAT, "pax_headers": {_MARK: index.digest}}
+    with (
+        closing(pairs),
+        open_atomic(path) as file,
+        tarfile.open(fileobj=file, mode="w", **options) as tar,
+    ):
+        for row in rows:
+            scene, picture = index.scene(row), io.BytesIO()
+            Image.fromarray(contact_sheet([pairs[row]])).save(picture, format="JPEG", quality=85)
+            contents = {"preview.jpg": picture.getvalue()}
+            for name, (kind, value) in _COLUMNS.items():
+                text = value(scene) if kind == "string" else json.dumps(value(scene))
+                contents[name] = text.encode()
+            for name, content in contents.items():
+                member = tarfile.TarInfo(f"{scene.id.key}.{name}")
+                member.size = len(content)
+                tar.addfile(member, io.BytesIO(content))
+            advance(1)
+
 
 CARD_NAME: Final = "README.md"
 MARK: Final = "<!-- made by stereogenbench publish card -->"
@@ -79,7 +201,7 @@ def card(index: SceneIndex, *, repository: str, about: dataset_facts.About | Non
         config=family,
         split=next(iter(configs[family])),
         derived=dataset_facts.derivation_facts(index) if index.is_derived else None,
-        derived_text=dataset_facts.DERIVED,
+        derived_text=dataset_facts.STEPS["derived_text"],
         provenance=[step for steps in provenance for step in dataset_facts.listed(steps)],
         responsible_use=[use for each in uses for use in each],
         **_numbers(index),
@@ -119,7 +241,7 @@ def write_card(
                 f"{path}: exists and was not written by this package. Move it away, or add "
                 f"{MARK!r} to it to have it replaced."
             )
-        viewer.write_viewer_rows(index, folder, progress=progress)
+        write_viewer_rows(index, folder, progress=progress)
         write_atomic(path, text.encode())
     return path
 
@@ -135,7 +257,7 @@ def _head(index: SceneIndex, facts: dataset_facts.Facts, configs: _Configs) -> d
     """
     licence = _LICENCES.get(facts["license"])
     other = {"license": "other", "license_name": "other", "license_link": facts["license"]}
-    features = {name: viewer.FEATURES if name == _SCENES else _features(index) for name in configs}
+    features = {name: FEATURES if name == _SCENES else _features(index) for name in configs}
     return {
         "pretty_name": facts["name"],
         **(other if licence is None else {"license": licence}),
@@ -179,12 +301,12 @@ def _configs(index: SceneIndex) -> _Configs:
         path = next(iter(scene.members.values())).path
         for config in ("all", scene.id.family):
             splits = found.setdefault(config, {})
-            splits.setdefault(viewer.split_name(scene.id), set()).add(path)
+            splits.setdefault(split_name(scene.id), set()).add(path)
     configs = {}
     for config in ["all", *sorted(found.keys() - {"all"})]:
         names = sorted(found[config], key=lambda split: (split != "train", split))
         configs[config] = {split: _patterns(found[config][split], index) for split in names}
-    return configs | {_SCENES: {split: [viewer.viewer_tar(split)] for split in configs["all"]}}
+    return configs | {_SCENES: {split: [viewer_tar(split)] for split in configs["all"]}}
 
 
 def _patterns(paths: set[str], index: SceneIndex) -> list[str]:

@@ -1,65 +1,174 @@
 """Clips of stereo pairs as video files, in the layouts that trainers of video models read.
 
     OUT/export.json          what the folder holds; a run with other settings is refused
-    OUT/<kind>/<clip>.mp4    the videos of each clip: right, left, warped, mask, depth, disparity
+    OUT/<kind>/<clip>.mp4    the videos of each clip: right, left, warped, mask; or grid and right
     OUT/clips/<clip>.json    what is known of a finished clip; written after its videos
     OUT/clips.jsonl          the same of all clips, one a line
-    OUT/...                  the manifests of the layout (`clip_layouts`); written last
+    OUT/...                  the manifests of the layout (`LAYOUTS`); written last
 
 The right view is what is to be generated. ``warped`` is the left view splatted into the right one,
-black in holes; ``mask`` is white in holes, and lossless. ``depth`` is grey by inverse depth, white
-at the clip's nearest point; ``disparity`` is grey by pixels, white at the clip's largest. ``grid``,
-StereoCrafter's input, has left and depth above mask and warped.
+black in holes; ``mask`` is white in holes, and lossless. ``grid``, StereoCrafter's input, has left
+and depth above mask and warped; depth is grey by inverse depth, white at the clip's nearest point.
 """
 
+import csv
 import json
 import math
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass, replace
+from io import StringIO
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, Unpack, cast, get_args
+from typing import Any, Final, Literal, NamedTuple, Unpack, cast
 
 import numpy as np
 
-from stereogenbench_data.bridges.clip_layouts import (
-    LAYOUTS,
-    ClipLayout,
-    Kind,
-    LayoutName,
-    lines,
-)
-from stereogenbench_data.bridges.exports import alone, scene_filters, training_selection
+from stereogenbench_data.bridges.exports import scene_filters, training_selection
 from stereogenbench_data.bridges.generation import Captions, describe_pair
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
-from stereogenbench_data.errors import (
-    MediaError,
-    SelectionError,
-)
+from stereogenbench_data.errors import MediaError, SelectionError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.jobs import (
-    do_items,
-    job_folder,
-    json_bytes,
-    named_errors,
-    read_json,
-)
+from stereogenbench_data.jobs import do_items, job_folder, json_bytes, named_errors, read_json
 from stereogenbench_data.media.encoder import Encoding, VideoEncoder
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.samples.request import Request
-from stereogenbench_data.samples.size import require_size
-from stereogenbench_data.samples.transforms import Crop
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.selection.options import require_options
-from stereogenbench_data.selection.plan import Address, PairOptions, Plan
+from stereogenbench_data.selection.plan import Address, PairOptions
 from stereogenbench_data.selection.windows import FramesSpec, parse_frames
 from stereogenbench_data.sources.files import open_atomic, write_atomic
 
-_FORMAT: Final = 1
+Kind = Literal["right", "left", "warped", "mask", "grid"]
+"""What a video of a clip shows: see `clips`."""
+
+LayoutName = Literal["diffsynth", "finetrainers", "musubi", "stereocrafter"]
+
+Record = Mapping[str, Any]
+"""What is known of a finished clip: scene, split, pair, frames, frame_rate_hz, baseline_m, caption,
+height, width, and ``videos``, the file of each kind, relative to the folder of the export."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClipLayout:
+    """What a trainer is given, and what it takes.
+
+    Attributes:
+        manifests: Makes the manifests of a folder and its clips.
+        kinds: The videos of every clip.
+        frames_step: Clips have a multiple of this many frames, and one more: the trainer cuts
+            others.
+    """
+
+    manifests: Callable[[Path, Sequence[Record]], dict[str, str]]
+    kinds: tuple[Kind, ...] = ("right", "left", "warped", "mask")
+    frames_step: int = 4
+
+
+def lines(texts: Iterable[str]) -> str:
+    """Return texts as lines."""
+    return "".join(f"{text}\n" for text in texts)
+
+
+_DIFFSYNTH: Final[Mapping[str, Kind]] = {
+    "video": "right",
+    "vace_video": "warped",
+    "vace_video_mask": "mask",
+    "control_video": "warped",
+    "left_video": "left",
+}
+"""The columns of videos, which are inputs of the pipelines."""
+
+
+def _diffsynth(root: Path, clips: Sequence[Record]) -> dict[str, str]:
+    """Return metadata.csv.
+
+    Source: modelscope/DiffSynth-Studio, diffsynth/core/data/unified_dataset.py.
+    """
+    rows = [
+        {name: clip["videos"][kind] for name, kind in _DIFFSYNTH.items()}
+        | {"prompt": _csv_text(clip["caption"])}
+        | {name: clip[name] for name in ("baseline_m", "frame_rate_hz", "height", "width", "scene")}
+        | {"num_frames": len(clip["frames"])}
+        for clip in clips
+    ]
+    text = StringIO()
+    writer = csv.DictWriter(text, fieldnames=[*rows[0]], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return {"metadata.csv": text.getvalue()}
+
+
+def _csv_text(text: str) -> str:
+    """Return a text that pandas reads as one: an empty cell, or "NA", would become a number."""
+    return text if " " in text else f"{text} "
+
+
+def _finetrainers(root: Path, clips: Sequence[Record]) -> dict[str, str]:
+    """Return two lists of captions and files, and the configuration.
+
+    Source: a-r-r-o-w/finetrainers, finetrainers/data/dataset.py and docs/dataset/README.md.
+    """
+    sizes = {(len(clip["frames"]), clip["height"], clip["width"]) for clip in clips}
+    dataset = {
+        "data_root": str(root.resolve()),
+        "dataset_type": "video",
+        "video_resolution_buckets": sorted(map(list, sizes)),
+        "reshape_mode": "bicubic",
+    }
+    return {
+        "dataset.json": json.dumps({"datasets": [dataset]}, indent=1) + "\n",
+        "prompt.txt": lines(clip["caption"] for clip in clips),
+        "videos.txt": lines(clip["videos"]["right"] for clip in clips),
+    }
+
+
+def _musubi(root: Path, clips: Sequence[Record]) -> dict[str, str]:
+    """Return the dataset's configuration, and a caption beside each video.
+
+    Source: kohya-ss/musubi-tuner, docs/dataset_config.md.
+    """
+    folder = root.resolve()
+    dataset = {
+        "video_directory": str(folder / "right"),
+        "control_directory": str(folder / "warped"),
+        "cache_directory": str(folder / "cache"),
+        "target_frames": sorted({len(clip["frames"]) for clip in clips}),
+        "frame_extraction": "head",
+    }
+    general = {
+        "resolution": [clips[0]["width"], clips[0]["height"]],
+        "caption_extension": ".txt",
+        "batch_size": 1,
+        "enable_bucket": True,
+        "bucket_no_upscale": False,
+    }
+    # JSON writes such texts, numbers and lists as TOML does, but for one control character.
+    texts = []
+    for header, values in (("[general]", general), ("[[datasets]]", dataset)):
+        pairs = (
+            f"{name} = {json.dumps(each, ensure_ascii=False)}" for name, each in values.items()
+        )
+        texts += [header, *pairs, ""]
+    toml = lines(texts).replace("\x7f", "\\u007f")
+    captions = {
+        str(Path(clip["videos"]["right"]).with_suffix(".txt")): lines([clip["caption"]])
+        for clip in clips
+    }
+    return captions | {"dataset.toml": toml}
+
+
+LAYOUTS: Final[Mapping[LayoutName, ClipLayout]] = {
+    "diffsynth": ClipLayout(_diffsynth),
+    "finetrainers": ClipLayout(_finetrainers),
+    "musubi": ClipLayout(_musubi),
+    # It takes the grids one by one. Source: TencentARC/StereoCrafter, inpainting_inference.py.
+    "stereocrafter": ClipLayout(lambda root, clips: {}, kinds=("grid", "right"), frames_step=1),
+}
+
+_FORMAT: Final = 2
 _CLIPS_JSONL: Final = "clips.jsonl"
 _CLIPS: Final = "clips"
 
@@ -68,74 +177,42 @@ _FIELDS: Final[Mapping[Kind, tuple[str, ...]]] = {
     "left": ("left",),
     "warped": ("warped_right",),
     "mask": ("hole",),
-    "depth": ("depth", "valid"),
-    "disparity": ("disparity", "valid"),
     "grid": ("left", "warped_right", "hole", "depth", "valid"),
 }
 _FACTS: Final = ("scene", "split", "pair", "caption", "baseline_m", "frame_rate_hz")
 
 
-Fit = Literal["stretch", "crop"]
-
-
-class ClipSizeWarning(UserWarning):
-    """Pictures of this size are cut or scaled by the trainer."""
-
-
-@dataclass(frozen=True, slots=True)
-class ClipForm:
-    """What a clip is.
+class ClipOptions(SceneFilters, PairOptions, total=False):
+    """What a clip is, which pairs of which scenes clips are made of, and how they are written.
 
     Attributes:
-        length: Its frames; None for the longest that every scene has and the layout takes.
+        length: Its frames; the longest that every scene has and the layout takes unless given.
         stride: Every so many frames of the video is one of the clip.
-        step: Frames of the video from one clip's first to the next one's; None for no overlap.
+        step: Frames of the video from one clip's first to the next one's; no overlap unless given.
         size: (height, width) in pixels, or a text "WIDTHxHEIGHT"; None for the stored size.
-        fit: What becomes of pictures of another shape than the size: "stretch", or "crop" to scale
-            them until they cover it and cut to the middle.
-        rate_hz: The rate that the files state; None for the video's own, divided by the stride. No
-            frame is dropped or repeated for it.
-        length_rule: "layout" for lengths that the trainer takes whole (4N+1, of StereoCrafter
-            any), or "any".
-        also: Kinds of videos besides those of the layout, such as "depth" and "disparity".
-        control: The kind that the manifest names as control; "layout" for the layout's own, or
-            "none".
+        rate_hz: The rate that the files state; the video's own, divided by the stride, unless
+            given. No frame is dropped or repeated for it.
         captions: "plain", or "with baseline" for captions that tell it.
         encoding: How videos are encoded; masks are lossless in any case.
-    """
-
-    length: int | None = None
-    stride: int = 1
-    step: int | None = None
-    size: tuple[int, int] | str | None = None
-    fit: Fit = "stretch"
-    rate_hz: float | None = None
-    length_rule: Literal["layout", "any"] = "layout"
-    also: tuple[Kind, ...] = ()
-    control: str = "layout"
-    captions: Captions = "plain"
-    encoding: Encoding = field(default_factory=Encoding)
-
-
-@dataclass(frozen=True, slots=True)
-class ExportRun:
-    """How clips are exported; it changes nothing in a file, but for the depth contract.
-
-    Attributes:
+        seed: That of a balanced subsample.
         depth: A depth contract instead of the one that files and release state.
         workers: How many processes write, None for one a core.
         engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called with (frames written, frames in all).
     """
 
-    depth: DepthEncoding | None = None
-    workers: int | None = None
-    engine: Engine = LOCAL
-    progress: Progress | None = None
-
-
-_USUAL_FORM: Final = ClipForm()
-_USUAL_RUN: Final = ExportRun()
+    length: int | None
+    stride: int
+    step: int | None
+    size: tuple[int, int] | str | None
+    rate_hz: float | None
+    captions: Captions
+    encoding: Encoding
+    seed: int
+    depth: DepthEncoding | None
+    workers: int | None
+    engine: Engine
+    progress: Progress | None
 
 
 class ClipReport(NamedTuple):
@@ -156,20 +233,8 @@ class ClipReport(NamedTuple):
     without_caption: int
 
 
-class ClipSelection(SceneFilters, PairOptions, total=False):
-    """Which pairs of which scenes clips are made of; ``seed`` is that of a balanced subsample."""
-
-    seed: int
-
-
 def export_clips(
-    data: Data,
-    out: str | Path,
-    *,
-    layout: LayoutName,
-    form: ClipForm = _USUAL_FORM,
-    run: ExportRun = _USUAL_RUN,
-    **selection: Unpack[ClipSelection],
+    data: Data, out: str | Path, *, layout: LayoutName, **options: Unpack[ClipOptions]
 ) -> ClipReport:
     """Write clips and the manifests of a layout.
 
@@ -182,45 +247,62 @@ def export_clips(
         data: As for `StereoPairs`.
         out: A new or empty folder, or one that this export was begun in.
         layout: "diffsynth", "finetrainers", "musubi" or "stereocrafter".
-        form: What a clip is.
-        run: How the export is run.
-        **selection: Filters on scenes (`SceneFilters`), pairs, baseline_cm, balance and limit.
+        **options: What clips are, of what they are made, and how (`ClipOptions`).
 
     Raises:
-        SelectionError: If nothing matches; if there is no such layout or kind of video; if the
-            trainer would cut a clip of this length; or if all that match are evaluation scenes,
-            and ``split`` does not name them.
+        SelectionError: If nothing matches; if there is no such layout or option; if the trainer
+            would cut a clip of this length; or if all that match are evaluation scenes, and
+            ``split`` does not name them.
         StorageError: If the folder holds something else, another process exports into it, or
             something cannot be read or written.
         MediaError: If a video cannot be decoded, or not be encoded as asked.
     """
-    require_options(export_clips, selection)
+    require_options(export_clips, options)
     root = Path(out)
     if layout not in LAYOUTS:
         raise SelectionError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}.")
     rules = LAYOUTS[layout]
-    kinds, control = _require_kinds(form, rules=rules, layout=layout)
-    size = None if form.size is None else require_size(form.size)
     index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
-    chosen, evaluation_scenes = training_selection(index, selection)
-    chosen["frames"] = _windows(index, form, rules=rules, layout=layout, selection=chosen)
-    fields = dict.fromkeys(name for kind in kinds for name in _FIELDS[kind])
-    stretched = size if form.fit == "stretch" else None
-    plan = StereoPairs(index, fields=fields, size=stretched, depth=run.depth, **chosen).plan
-    _require_left_to_right(plan)
-    _warn_of_sizes(index, plan, size=size, rules=rules, layout=layout)
+    chosen, evaluation_scenes = training_selection(index, options)
+    names = {*SceneFilters.__annotations__, *PairOptions.__annotations__, "seed"}
+    chosen = {name: value for name, value in chosen.items() if name in names}
+    chosen["frames"] = _windows(index, layout, options, selection=chosen)
+    fields = dict.fromkeys(name for kind in rules.kinds for name in _FIELDS[kind])
+    pairs = StereoPairs(
+        index, fields=fields, size=options.get("size"), depth=options.get("depth"), **chosen
+    )
+    targets = pairs.plan.pairs.targets
+    if targets.shape[1] != 1 or (pairs.plan.pairs.source > targets[:, 0]).any():
+        raise SelectionError(
+            "a right view is generated from the view to its left: choose pairs='primary', "
+            "'adjacent', 'all' or (left, right) numbers."
+        )
+    encoding = options.get("encoding", Encoding())
     settings = {
         "format": _FORMAT,
         "layout": layout,
-        "videos": list(kinds),
-        "control": control,
-        "form": asdict(form) | {"size": size and list(size), "also": None, "control": None},
-        "depth": repr(run.depth),
+        "frames": chosen["frames"],
+        "size": pairs.request.size,
+        "rate_hz": options.get("rate_hz"),
+        "captions": options.get("captions", "plain"),
+        "encoding": asdict(encoding),
+        "depth": repr(options.get("depth")),
         "data": index.digest,
-        "selection": plan.digest,
+        "selection": pairs.plan.digest,
     }
-    facts = StereoPairs(index, fields=_FACTS, **chosen)
-    works = _works(facts, _Export(root, form, kinds, size, run.depth))
+    clips_facts = StereoPairs(index, fields=_FACTS, **chosen)
+    scenes: dict[int, SceneIndex] = {}
+    works = []
+    for number in range(len(clips_facts)):
+        address = clips_facts.plan.locate(number, epoch=0)
+        if address.row not in scenes:
+            scenes = {address.row: index.only([address.row])}
+        facts = _facts(clips_facts[number], address.frames, options)
+        name, scene = _clip_name(number, facts), scenes[address.row]
+        place = Address(0, address.source, address.targets, address.frames)
+        works.append(
+            _ClipWork(root, rules.kinds, pairs.request, encoding, scene, place, facts, name)
+        )
     with job_folder(root, settings):
         due = [work for work in works if not _is_finished(work)]
         still, total = (sum(len(work.address.frames) for work in each) for each in (due, works))
@@ -228,15 +310,15 @@ def export_clips(
             _write_clip,
             due,
             name=lambda work: work.name,
-            workers=run.workers,
-            engine=run.engine,
-            progress=run.progress,
+            workers=options.get("workers"),
+            engine=options.get("engine", LOCAL),
+            progress=options.get("progress"),
             done=total - still,
             total=total,
         )
         clips = [read_json(work.record) for work in works]
         texts = {_CLIPS_JSONL: lines(json.dumps(clip, ensure_ascii=False) for clip in clips)}
-        texts |= rules.manifests(root, clips, control)
+        texts |= rules.manifests(root, clips)
         with named_errors(root):
             for name, text in texts.items():
                 write_atomic(root / name, text.encode())
@@ -250,177 +332,37 @@ def export_clips(
     )
 
 
-# What is asked for.
-
-
-def _require_kinds(
-    form: ClipForm, *, rules: ClipLayout, layout: LayoutName
-) -> tuple[tuple[Kind, ...], Kind | None]:
-    """Return the kinds of videos of each clip, and which of them is the control."""
-    known = [kind for kind in get_args(Kind) if kind != "grid"]
-    if form.fit not in get_args(Fit):
-        raise SelectionError(f"fit must be one of {get_args(Fit)}, got {form.fit!r}.")
-    for kind in form.also:
-        if kind not in known:
-            raise SelectionError(f"also: videos are {', '.join(known)}; got {kind!r}.")
-    control: Any = {"layout": rules.control, "none": None}.get(form.control, form.control)
-    if control is not None and control not in rules.controls:
-        raise SelectionError(
-            f"control={control!r}: the layout {layout} takes {', '.join(rules.controls) or 'none'}."
-        )
-    kinds = (*rules.kinds, *form.also, *([control] if control else []))
-    return tuple(dict.fromkeys(kinds)), control
-
-
 def _windows(
-    index: SceneIndex,
-    form: ClipForm,
-    *,
-    rules: ClipLayout,
-    layout: LayoutName,
-    selection: Mapping[str, Any],
+    index: SceneIndex, layout: LayoutName, options: ClipOptions, *, selection: Mapping[str, Any]
 ) -> FramesSpec:
     """Return the frames of clips, as `StereoPairs` takes them."""
-    unit = 1 if form.length_rule == "any" else rules.frames_step
-    length = form.length
+    unit, stride = LAYOUTS[layout].frames_step, options.get("stride", 1)
+    length, step = options.get("length"), options.get("step")
     if length is None:
-        parse_frames(("clips", 1, form.stride))
+        parse_frames(("clips", 1, stride))
         rows = filter_scenes(index, scene_filters(selection))
         shortest = int(index.column("frames")[rows].min())
-        length = (shortest - 1) // form.stride // unit * unit + 1
+        length = (shortest - 1) // stride // unit * unit + 1
     elif (length - 1) % unit:
         below = max(0, length - 1) // unit * unit + 1
         raise SelectionError(
             f"length={length}: {layout} takes clips of {unit}N+1 frames and cuts others: give "
-            f"{below} or {below + unit}, or length_rule='any'."
+            f"{below} or {below + unit}."
         )
-    step = () if form.step is None else (form.step,)
-    spec = cast("FramesSpec", ("clips", length, form.stride, *step))
-    parse_frames(spec)
-    return spec
+    spec = ("clips", length, stride) if step is None else ("clips", length, stride, step)
+    parse_frames(cast("FramesSpec", spec))
+    return cast("FramesSpec", spec)
 
 
-def _require_left_to_right(plan: Plan) -> None:
-    pairs = plan.pairs
-    if pairs.targets.shape[1] != 1 or (pairs.source > pairs.targets[:, 0]).any():
-        raise SelectionError(
-            "a right view is generated from the view to its left: choose pairs='primary', "
-            "'adjacent', 'all' or (left, right) numbers."
-        )
-
-
-def _warn_of_sizes(
-    index: SceneIndex,
-    plan: Plan,
-    *,
-    size: tuple[int, int] | None,
-    rules: ClipLayout,
-    layout: LayoutName,
-) -> None:
-    side = rules.side_px
-    columns = (index.column(f"image_{name}_px")[plan.scene_rows] for name in ("height", "width"))
-    for height, width in [size] if size is not None else sorted(set(zip(*columns, strict=True))):
-        if height % side or width % side:
-            cut = f"{max(1, width // side) * side}x{max(1, height // side) * side}"
-            warnings.warn(
-                f"pictures of {width}x{height} pixels: the trainer of the layout {layout} takes "
-                f"sides that are multiples of {side} and cuts or scales others. Give a size such "
-                f"as {cut}.",
-                ClipSizeWarning,
-                stacklevel=3,
-            )
-
-
-# One clip.
-
-
-@dataclass(frozen=True, slots=True)
-class _Export:
-    """What all clips of an export have in common.
-
-    Attributes:
-        root: The folder of the export.
-        form: What a clip is.
-        kinds: The videos of a clip.
-        size: (height, width) in pixels, or None.
-        depth: A depth contract that overrides what the index says, or None.
-    """
-
-    root: Path
-    form: ClipForm
-    kinds: tuple[Kind, ...]
-    size: tuple[int, int] | None
-    depth: DepthEncoding | None
-
-
-@dataclass(frozen=True, slots=True)
-class _ClipWork:
-    """One clip to be written, by whatever process.
-
-    Attributes:
-        export: What it has in common with others.
-        index: An index of its scene alone.
-        address: Its cameras and frames, of row 0.
-        facts: What is known of it before its videos are read.
-        name: The name of its files.
-    """
-
-    export: _Export
-    index: SceneIndex
-    address: Address
-    facts: dict[str, Any]
-    name: str
-
-    @property
-    def record(self) -> Path:
-        """The file that says that the clip is finished."""
-        return self.export.root / _CLIPS / f"{self.name}.json"
-
-    @property
-    def videos(self) -> dict[Kind, str]:
-        """The file of each kind of video, relative to the folder."""
-        # The ending of a grid is StereoCrafter's own.
-        ends = {"grid": "_splatting_results"}
-        return {kind: f"{kind}/{self.name}{ends.get(kind, '')}.mp4" for kind in self.export.kinds}
-
-    def request(self, fields: Sequence[str]) -> Request:
-        """Return what is read of every frame."""
-        size, transform = self.export.size, None
-        if size is not None and self.export.form.fit == "crop":
-            rig, (height, width) = self.index.scene(0).rig, size
-            scale = max(height / rig.image_height_px, width / rig.image_width_px)
-            size = (
-                max(height, round(rig.image_height_px * scale)),
-                max(width, round(rig.image_width_px * scale)),
-            )
-            top, left = (size[0] - height) // 2, (size[1] - width) // 2
-            transform = Crop(top, left, height, width)
-        depth = self.export.depth
-        return Request(
-            "pairs", tuple(fields), "single", size=size, depth=depth, transform=transform
-        )
-
-
-def _works(clips: StereoPairs, export: _Export) -> list[_ClipWork]:
-    """Return all clips of a selection with the fields `_FACTS`, in its order."""
-    index, works, scenes = clips.index, [], {}
-    for number in range(len(clips)):
-        row, source, targets, frames, _ = clips.plan.locate(number, epoch=0)
-        if row not in scenes:
-            scenes = {row: alone(index, row)}
-        facts = _facts(clips[number], frames=frames, form=export.form)
-        address = Address(0, source, targets, frames)
-        works.append(_ClipWork(export, scenes[row], address, facts, _clip_name(number, facts)))
-    return works
-
-
-def _facts(sample: Sample, *, frames: tuple[int, ...], form: ClipForm) -> dict[str, Any]:
+def _facts(sample: Sample, frames: tuple[int, ...], options: ClipOptions) -> dict[str, Any]:
+    """Return what is known of a clip before its videos are read."""
     # Trainers read captions by line: all that Python takes to end one becomes a space.
     caption = " ".join(sample["caption"].split())
     baseline_m = float(sample["baseline_m"])
-    if form.captions == "with baseline":
+    if options.get("captions") == "with baseline":
         caption = describe_pair(caption, baseline_m=baseline_m)
-    rate_hz = float(sample["frame_rate_hz"] if form.rate_hz is None else form.rate_hz)
+    asked_hz = options.get("rate_hz")
+    rate_hz = float(sample["frame_rate_hz"] if asked_hz is None else asked_hz)
     if not 0 < rate_hz < math.inf:
         raise MediaError(
             f"{sample['scene']}: the clip's rate is {rate_hz:g} frames a second: give rate_hz "
@@ -435,6 +377,43 @@ def _facts(sample: Sample, *, frames: tuple[int, ...], form: ClipForm) -> dict[s
         "baseline_m": baseline_m,
         "caption": caption,
     }
+
+
+@dataclass(frozen=True, slots=True)
+class _ClipWork:
+    """One clip to be written, by whatever process.
+
+    Attributes:
+        root: The folder of the export.
+        kinds: The videos of the clip.
+        request: What is read of every frame.
+        encoding: How videos are encoded.
+        index: An index of its scene alone.
+        address: Its cameras and frames, of row 0.
+        facts: What is known of it before its videos are read.
+        name: The name of its files.
+    """
+
+    root: Path
+    kinds: tuple[Kind, ...]
+    request: Request
+    encoding: Encoding
+    index: SceneIndex
+    address: Address
+    facts: dict[str, Any]
+    name: str
+
+    @property
+    def record(self) -> Path:
+        """The file that says that the clip is finished."""
+        return self.root / _CLIPS / f"{self.name}.json"
+
+    @property
+    def videos(self) -> dict[Kind, str]:
+        """The file of each kind of video, relative to the folder."""
+        # The ending of a grid is StereoCrafter's own.
+        ends = {"grid": "_splatting_results"}
+        return {kind: f"{kind}/{self.name}{ends.get(kind, '')}.mp4" for kind in self.kinds}
 
 
 def _clip_name(number: int, facts: Mapping[str, Any]) -> str:
@@ -452,7 +431,7 @@ def _is_finished(work: _ClipWork) -> bool:
     if not work.record.is_file():
         return False
     sizes = read_json(work.record).get("bytes", {})
-    paths = {kind: work.export.root / path for kind, path in work.videos.items()}
+    paths = {kind: work.root / path for kind, path in work.videos.items()}
     return all(
         path.is_file() and path.stat().st_size == sizes.get(kind) for kind, path in paths.items()
     )
@@ -460,95 +439,70 @@ def _is_finished(work: _ClipWork) -> bool:
 
 def _write_clip(work: _ClipWork, advance: Advance) -> None:
     """Write the videos of a clip, then its record."""
-    fields = dict.fromkeys(name for kind in work.videos for name in _FIELDS[kind])
-    draws_maps = {"depth", "disparity", "grid"} & work.videos.keys()
-    ranges = _map_ranges(work) if draws_maps else _MapRanges(0.0, 0.0, 0.0)
-    with (
-        named_errors(work.export.root),
-        closing(SampleLoader(work.index, work.request([*fields]), check="opened")) as loader,
-        ExitStack() as stack,
-    ):
-        encoders = {kind: stack.enter_context(_encoder(work, kind)) for kind in work.videos}
-        for sample in _frames(work, loader):
+    draws_depth = "grid" in work.kinds
+    nearness = _nearness(work) if draws_depth else (0.0, 0.0)
+    with named_errors(work.root), ExitStack() as stack:
+        encoders = {}
+        for kind, path in work.videos.items():
+            (work.root / path).parent.mkdir(exist_ok=True)
+            file = stack.enter_context(open_atomic(work.root / path))
+            encoders[kind] = stack.enter_context(
+                VideoEncoder(
+                    file,
+                    rate_hz=work.facts["frame_rate_hz"],
+                    encoding=work.encoding,
+                    quality="lossless" if kind == "mask" else "as set",
+                )
+            )
+        for sample in _frames(work, work.request):
             for kind, encoder in encoders.items():
-                encoder.write_picture(_picture(kind, sample, ranges))
+                encoder.write_picture(_picture(kind, sample, nearness))
             advance(1)
         height, width = sample["right"].shape[-2:]
     record: dict[str, Any] = work.facts | {"height": height, "width": width}
-    if draws_maps:
-        record["depth_m"] = [1 / each if each else None for each in ranges[:2][::-1]]
-        record["disparity_max_px"] = ranges.largest_px
+    if draws_depth:
+        record["depth_m"] = [1 / each if each else None for each in nearness[::-1]]
     record["videos"] = work.videos
     record["bytes"] = {
-        kind: (work.export.root / path).stat().st_size for kind, path in work.videos.items()
+        kind: (work.root / path).stat().st_size for kind, path in work.videos.items()
     }
     with named_errors(work.record):
         work.record.parent.mkdir(exist_ok=True)
         write_atomic(work.record, json_bytes(record))
 
 
-def _frames(work: _ClipWork, loader: SampleLoader) -> Iterator[Sample]:
-    for frame in work.address.frames:
-        address = Address(0, work.address.source, work.address.targets, (frame,))
-        yield loader.load(address, clip="frame")
+def _frames(work: _ClipWork, request: Request) -> Iterator[Sample]:
+    with closing(SampleLoader(work.index, request, check="opened")) as loader:
+        for frame in work.address.frames:
+            yield loader.load(work.address._replace(frames=(frame,)), clip="frame")
 
 
-@contextmanager
-def _encoder(work: _ClipWork, kind: Kind) -> Iterator[VideoEncoder]:
-    path = work.export.root / work.videos[kind]
-    path.parent.mkdir(exist_ok=True)
-    with (
-        open_atomic(path) as file,
-        VideoEncoder(
-            file,
-            rate_hz=work.facts["frame_rate_hz"],
-            encoding=work.export.form.encoding,
-            quality="lossless" if kind == "mask" else "as set",
-        ) as encoder,
-    ):
-        yield encoder
+def _nearness(work: _ClipWork) -> tuple[float, float]:
+    """Return the least and the largest inverse depth of a clip in 1/m: what is black and white."""
+    found = [
+        1 / sample["depth"][sample["valid"]]
+        for sample in _frames(work, replace(work.request, fields=("depth", "valid")))
+        if sample["valid"].any()
+    ]
+    return (
+        min((float(each.min()) for each in found), default=0.0),
+        max((float(each.max()) for each in found), default=0.0),
+    )
 
 
-class _MapRanges(NamedTuple):
-    """What of a clip is drawn black and white: inverse depth in 1/m, disparity in px."""
-
-    farthest: float
-    nearest: float
-    largest_px: float
-
-
-def _map_ranges(work: _ClipWork) -> _MapRanges:
-    inverse, disparity = [], [0.0]
-    request = work.request(("depth", "disparity", "valid"))
-    with closing(SampleLoader(work.index, request)) as loader:
-        for sample in _frames(work, loader):
-            if sample["valid"].any():
-                found = 1 / sample["depth"][sample["valid"]]
-                inverse += [float(found.min()), float(found.max())]
-                disparity.append(float(np.abs(sample["disparity"]).max()))
-    return _MapRanges(min(inverse, default=0.0), max(inverse, default=0.0), max(disparity))
-
-
-def _picture(kind: Kind, sample: Sample, ranges: _MapRanges) -> Any:
+def _picture(kind: Kind, sample: Sample, nearness: tuple[float, float]) -> Any:
     """Return one frame of a kind of video as (h, w, 3) uint8."""
     if kind == "grid":
-        rows: tuple[tuple[Kind, Kind], ...] = (("left", "depth"), ("mask", "warped"))
-        cells = [[_picture(each, sample, ranges) for each in row] for row in rows]
-        return np.concatenate([np.concatenate(row, axis=1) for row in cells], axis=0)
-    if kind in ("left", "right", "warped"):
-        name = "warped_right" if kind == "warped" else kind
-        return np.ascontiguousarray(sample[name].transpose(1, 2, 0))
-    is_mask = kind == "mask"
-    grey = sample["hole"][0] * np.uint8(255) if is_mask else _grey_map(kind, sample, ranges)
-    return np.repeat(grey[..., None], 3, axis=-1)
-
-
-def _grey_map(kind: Kind, sample: Sample, ranges: _MapRanges) -> Any:
-    valid = sample["valid"][0]
-    if kind == "depth":
+        mask, warped, left = (
+            _picture(each, sample, nearness) for each in ("mask", "warped", "left")
+        )
+        low, high = nearness
+        valid = sample["valid"][0]
         inverse = 1 / np.where(valid, sample["depth"][0], 1)
-        low, high = ranges.farthest, ranges.nearest
         share = (inverse - low) / (high - low) if high > low else np.ones_like(inverse)
-    else:
-        share = np.abs(sample["disparity"][0]) / (ranges.largest_px or 1.0)
-    return np.rint(np.where(valid, share, 0).clip(0, 1) * 255).astype(np.uint8)
+        grey = np.rint(np.where(valid, share, 0).clip(0, 1) * 255).astype(np.uint8)
+        return np.block([[[left], [np.repeat(grey[..., None], 3, axis=-1)]], [[mask], [warped]]])
+    if kind == "mask":
+        return np.repeat((sample["hole"][0] * np.uint8(255))[..., None], 3, axis=-1)
+    name = "warped_right" if kind == "warped" else kind
+    return np.ascontiguousarray(sample[name].transpose(1, 2, 0))

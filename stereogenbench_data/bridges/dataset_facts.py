@@ -36,16 +36,8 @@ RELEASE: Final = _stored("release")
 DRAWN: Final = _stored("drawn")
 """The properties of scenes that `stereogenbench synth` made."""
 
-DERIVED: Final = (
-    "These shards were derived from other scenes for training, and do not replace them: pictures "
-    "are smaller and were encoded again, with an error; depth has the nearest pixels of the source "
-    "depth, without loss. Scores of the benchmark need the released pictures."
-)
-_WITHOUT_FILES: Final = (
-    "This descriptor is made from the paper, without the files: the release states no version and "
-    "no day of publication, so 1.0.0 and the month of the paper stand for them; how many scenes "
-    "each part has are the paper's counts."
-)
+STEPS: Final = _stored("steps")
+"""What packing, deriving and a description without the files add."""
 _BUILT_IN: Final = "ray-casting"
 """How marks of completion name the renderer of `DRAWN` scenes; the earliest name none."""
 _BLANK: Final = "FILL IN:"
@@ -89,7 +81,7 @@ def facts_of(index: SceneIndex | None, *, about: About | None = None) -> Facts:
         StorageError: If the scenes' marks of completion cannot be read.
     """
     if index is None:
-        description = f"{RELEASE['description']} {_WITHOUT_FILES}"
+        description = f"{RELEASE['description']} {STEPS['without_files']}"
         stated = {"datePublished": "2026-05", "version": "1.0.0", "description": description}
         facts = RELEASE | stated
     else:
@@ -139,39 +131,25 @@ def packing_facts(index: SceneIndex, facts: Facts) -> Facts:
         index: The index of the shards.
         facts: What is said of the scenes that are in them.
     """
+    step = dict(STEPS["derived" if index.is_derived else "packed"])
+    made = {"prov:wasGeneratedBy": [*listed(facts["prov:wasGeneratedBy"]), step]}
     if not index.is_derived:
         packed = any(name.endswith(".b2frame") for name in index.scene(0).held_videos)
         how = ", depth packed by blosc2 without loss" if packed else ""
-        about = f"Files of the scenes put into WebDataset shards, unchanged{how}."
-        return _made(facts, "Packing", about, by="stereogenbench pack")
+        step["description"] = step["description"].format(how=how)
+        return made
     derived = derivation_facts(index)
-    about = (
-        f"Pictures scaled to {derived['size']} and encoded by {derived['codec']} (quality "
-        f"{derived['quality']}, settings {json.dumps(derived['settings'], sort_keys=True)}), PSNR "
-        f"{derived['mean_db']:.2f} dB on average and {derived['worst_db']:.2f} dB in the worst "
-        f"frame; depth of the nearest pixels, by blosc2 without loss."
-    )
+    words = derived | {"settings": json.dumps(derived["settings"], sort_keys=True)}
+    step["description"] = step["description"].format(**words)
     source = {
         "@type": "prov:Entity",
         "prov:label": facts["name"],
         "description": f"The scenes with the index {derived['source_digest']}.",
     }
-    return _made(facts, "Derivation for training", about, by="stereogenbench pack --size") | {
-        "description": f"{facts['description']} {DERIVED}",
+    return made | {
+        "description": f"{facts['description']} {STEPS['derived_text']}",
         "prov:wasDerivedFrom": [*listed(facts["prov:wasDerivedFrom"]), source],
     }
-
-
-def _made(facts: Facts, label: str, about: str, *, by: str) -> Facts:
-    """Return the provenance of data with one more step."""
-    step = {
-        "@type": "prov:Activity",
-        "prov:type": {"@id": "https://www.wikidata.org/wiki/Q1172378"},
-        "prov:label": label,
-        "description": about,
-        "prov:wasAttributedTo": {"@type": "prov:Agent", "prov:label": by},
-    }
-    return {"prov:wasGeneratedBy": [*listed(facts["prov:wasGeneratedBy"]), step]}
 
 
 def derivation_facts(index: SceneIndex) -> Facts:

@@ -1,38 +1,306 @@
 """Export scenes to what reads several views: COLMAP, nerfstudio and gsplat, PLY, MoGe.
 
-    OUT/export.json                            the layout and the settings, the same for all of OUT
-    OUT/<key of a scene>/frame_000/...         the views of one moment
-    OUT/<key of a scene>/...                   with ``group="scene"``: those of all chosen frames
-    OUT/.index.txt                             of MoGe: its folders
+    OUT/export.json                        the layout and the settings, the same for all of OUT
+    OUT/<key of a scene>/frame_000/...     the views of one moment
+    OUT/.index.txt                         of MoGe: its folders
 
 Each of these folders is written beside its place and renamed, so that a stopped run goes on and a
-killed one leaves nothing that is incomplete. `view_formats` has what is in them.
+killed one leaves nothing that is incomplete. Each writer of a format states its own axes and pixel
+centres; all but MoGe's put the world's origin at the centre of the first camera, and say in
+``stereogenbench.json`` how to come back to the scene's world.
 """
 
-from collections.abc import Mapping, Sequence
+import json
+import zlib
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, Unpack, get_args
+from typing import Any, Final, Literal, Unpack
 
-from stereogenbench_data.bridges.exports import alone, scene_filters, training_selection
-from stereogenbench_data.bridges.posed_images import PosedImageReader, index_of
-from stereogenbench_data.bridges.view_formats import INDEX_TXT, WRITERS, Layout
-from stereogenbench_data.datasets.mapped import Data
+import numpy as np
+from jaxtyping import Float64, Int64
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+
+from stereogenbench_data.bridges.exports import scene_filters, training_selection
+from stereogenbench_data.bridges.multiview import (
+    CENTRE_PX,
+    VIEW_FIELDS,
+    PosedImage,
+    origin_at,
+    posed_images,
+)
+from stereogenbench_data.datasets.mapped import Data, SceneViews
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import atomic_folder, do_items, job_folder, named_errors
-from stereogenbench_data.samples.checks import check_samples
-from stereogenbench_data.schema.conventions import depth_of
+from stereogenbench_data.samples.load import SampleLoader
+from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters
 from stereogenbench_data.selection.options import require_options
-from stereogenbench_data.selection.plan import plan_views
+from stereogenbench_data.selection.plan import Address
 from stereogenbench_data.selection.windows import FramesSpec
 from stereogenbench_data.sources.files import write_atomic
 
-Group = Literal["moment", "scene"]
+ABOUT_JSON: Final = "stereogenbench.json"
+"""What a folder shows, and the way back to the scene's world."""
+INDEX_TXT: Final = ".index.txt"
+"""MoGe's list of its folders."""
+
+_FAST: Final = 1
+"""zlib's level of the PNGs: three times as fast as the default, a tenth larger."""
+_JPEG_QUALITY: Final = 95
+_OPENGL_FROM_OPENCV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
+_Z_UP_FROM_Y_DOWN: Final = np.array(
+    [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+_POINT: Final = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
+)
+
+ViewWriter = Callable[[Path, Sequence[PosedImage], int | None], None]
+"""Fills an empty folder with pictures; given how many points are taken from each, None for all."""
+
+
+def _placed(
+    folder: Path, images: Sequence[PosedImage], *, axes: Float64[np.ndarray, "4 4"]
+) -> tuple[list[PosedImage], Float64[np.ndarray, "4 4"]]:
+    """Write `ABOUT_JSON`; return the pictures in the folder's world, and that from the scene's.
+
+    Args:
+        folder: The folder.
+        images: The pictures; the origin of the folder's world is at the first one's camera.
+        axes: Turns the scene's axes into those of the folder's world.
+    """
+    export_from_scene = axes @ origin_at(images[0])
+    moved = [image.in_world(export_from_scene) for image in images]
+    about = {
+        "scene": images[0].scene,
+        "frame": images[0].frame,
+        "scene_from_export": np.linalg.inv(export_from_scene).tolist(),
+    }
+    _write_json(folder / ABOUT_JSON, about)
+    return moved, export_from_scene
+
+
+def sampled_pixels(
+    image: PosedImage, points: int | None
+) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
+    """Return rows and columns of measured pixels, row by row: all, or so many drawn at random.
+
+    The same picture gives the same pixels each time.
+    """
+    measured = np.flatnonzero(image.depth_m > 0)
+    if points is not None and points < len(measured):
+        seed = (zlib.crc32(image.scene.encode()), image.camera, image.frame)
+        generator = np.random.default_rng(np.random.SeedSequence(seed))
+        measured = np.sort(generator.choice(measured, size=points, replace=False))
+    rows, columns = np.divmod(measured, image.size[1])
+    return rows, columns
+
+
+def quaternion_wxyz(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "4"]:
+    """Return the unit quaternion of a rotation, with w >= 0.
+
+    Source: Bar-Itzhack, New method for extracting the quaternion from a rotation matrix, 2000: the
+    eigenvector of the largest eigenvalue, exact for every angle.
+    """
+    r = rotation
+    upper = np.array(
+        [
+            [np.trace(r), r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+            [0.0, r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
+            [0.0, 0.0, r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
+            [0.0, 0.0, 0.0, r[2, 2] - r[0, 0] - r[1, 1]],
+        ]
+    )
+    _, vectors = np.linalg.eigh(upper, UPLO="U")
+    return np.asarray(vectors[:, -1] * (-1.0 if vectors[0, -1] < 0 else 1.0))
+
+
+def write_colmap(folder: Path, images: Sequence[PosedImage], points: int | None) -> None:
+    """Write ``sparse/0/cameras.txt``, ``images.txt``, ``points3D.txt``, pictures in ``images/``.
+
+    Pixel centres are at 0.5 and cameras have OpenCV's axes, as here. A point comes from a pixel's
+    depth, and is observed at that pixel's centre.
+
+    Source: colmap/colmap, doc/format.rst, doc/faq.rst.
+    """
+    images, _ = _placed(folder, images, axes=np.eye(4))
+    point_lines: list[str] = []
+    observed: list[list[str]] = []
+    for number, image in enumerate(images):
+        rows, columns = sampled_pixels(image, points)
+        seen: list[str] = []
+        for position, colour, row, column in zip(
+            image.points_world(rows, columns).tolist(),
+            image.rgb[rows, columns].tolist(),
+            rows.tolist(),
+            columns.tolist(),
+            strict=True,
+        ):
+            point_id = len(point_lines) + 1
+            line = " ".join([str(point_id), *map(repr, position), *map(str, colour), "0"])
+            point_lines.append(f"{line} {number + 1} {len(seen)}\n")
+            seen.append(f"{column + CENTRE_PX!r} {row + CENTRE_PX!r} {point_id}")
+        observed.append(seen)
+    (folder / "images").mkdir()
+    image_lines = []
+    for number, image in enumerate(images):
+        _write_png(folder / "images" / f"{image.name}.png", image)
+        pose = image.cam_from_world
+        numbers = [*quaternion_wxyz(pose[:3, :3]).tolist(), *pose[:3, 3].tolist()]
+        image_lines.append(
+            f"{number + 1} {' '.join(map(repr, numbers))} 1 {image.name}.png\n"
+            f"{' '.join(observed[number])}\n"
+        )
+    (fx, _, cx), (_, fy, cy), _ = images[0].intrinsics.tolist()
+    height, width = images[0].size
+    camera = f"1 PINHOLE {width} {height} {fx!r} {fy!r} {cx!r} {cy!r}\n"
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True)
+    for name, head, lines in (
+        ("cameras", "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n", [camera]),
+        (
+            "images",
+            "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
+            "# POINTS2D[] as (X, Y, POINT3D_ID)\n",
+            image_lines,
+        ),
+        (
+            "points3D",
+            "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n",
+            point_lines,
+        ),
+    ):
+        with (model / f"{name}.txt").open("w", encoding="utf-8") as file:
+            file.writelines([head, *lines])
+
+
+def write_transforms(folder: Path, images: Sequence[PosedImage], points: int | None) -> None:
+    """Write ``transforms.json``, ``images/``, ``depth/`` and ``sparse_pc.ply``, for nerfstudio.
+
+    Cameras have OpenGL's axes (x right, y up, z back), the world's z points up, pixel centres are
+    at 0.5. Depth is float32 in millimetres in .npy files, 0 where it is not measured: a 16-bit
+    picture would end at 65.5 m.
+
+    Source: nerfstudio-project/nerfstudio, docs/quickstart/data_conventions.md,
+    nerfstudio/data/dataparsers/nerfstudio_dataparser.py, nerfstudio/data/utils/data_utils.py.
+    """
+    images, export_from_scene = _placed(folder, images, axes=_Z_UP_FROM_Y_DOWN)
+    for name in ("images", "depth"):
+        (folder / name).mkdir()
+    frames = []
+    for image in images:
+        picture, depth = f"images/{image.name}.png", f"depth/{image.name}.npy"
+        _write_png(folder / picture, image)
+        np.save(folder / depth, image.depth_m * np.float32(1000), allow_pickle=False)
+        pose = image.world_from_cam @ _OPENGL_FROM_OPENCV
+        frames.append(
+            {"file_path": picture, "depth_file_path": depth, "transform_matrix": pose.tolist()}
+        )
+    _write_points(folder / "sparse_pc.ply", images, points)
+    (fx, _, cx), (_, fy, cy), _ = images[0].intrinsics.tolist()
+    height, width = images[0].size
+    transforms = {
+        "camera_model": "OPENCV",
+        "w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy,
+        "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0,
+        "camera_angle_x": 2 * float(np.arctan(width / (2 * fx))),
+        "camera_angle_y": 2 * float(np.arctan(height / (2 * fy))),
+        "applied_transform": export_from_scene[:3].tolist(),
+        "ply_file_path": "sparse_pc.ply",
+        "frames": frames,
+    }  # fmt: skip
+    _write_json(folder / "transforms.json", transforms)
+
+
+def write_ply(folder: Path, images: Sequence[PosedImage], points: int | None) -> None:
+    """Write ``points.ply``: measured pixels as coloured points, in the scene's axes (y down)."""
+    images, _ = _placed(folder, images, axes=np.eye(4))
+    _write_points(folder / "points.ply", images, points)
+
+
+def _write_points(path: Path, images: Sequence[PosedImage], points: int | None) -> None:
+    """Write the points of pictures as a binary PLY file."""
+    clouds = []
+    for image in images:
+        rows, columns = sampled_pixels(image, points)
+        cloud = np.empty(len(rows), dtype=_POINT)
+        cloud["x"], cloud["y"], cloud["z"] = image.points_world(rows, columns).T
+        cloud["red"], cloud["green"], cloud["blue"] = image.rgb[rows, columns].T
+        clouds.append(cloud)
+    kinds = {"<f4": "float", "|u1": "uchar"}
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {sum(map(len, clouds))}",
+        *(f"property {kinds[_POINT[name].str]} {name}" for name in _POINT.names or ()),
+        "end_header",
+    ]
+    with path.open("wb") as file:
+        file.write(("\n".join(lines) + "\n").encode("ascii"))
+        file.writelines(cloud.tobytes() for cloud in clouds)
+
+
+def write_moge(folder: Path, images: Sequence[PosedImage], points: int | None) -> None:
+    """Write a folder a picture: ``image.jpg``, ``depth.png``, ``meta.json``.
+
+    Depth is 16 bits on a logarithmic scale between the nearest and the farthest of the picture, 0
+    where it is not measured. Intrinsics are those of a picture of width and height 1.
+
+    Source: microsoft/MoGe, docs/train.md, moge/utils/io.py.
+    """
+    for image in images:
+        place = folder / f"cam_{image.camera:02d}"
+        place.mkdir()
+        Image.fromarray(image.rgb).save(place / "image.jpg", quality=_JPEG_QUALITY, subsampling=0)
+        _write_log_depth(place / "depth.png", image.depth_m)
+        height, width = image.size
+        meta = {
+            "intrinsics": (np.diag([1 / width, 1 / height, 1.0]) @ image.intrinsics).tolist(),
+            "scene": image.scene,
+            "camera": image.camera,
+            "frame": image.frame,
+        }
+        _write_json(place / "meta.json", meta)
+
+
+Layout = Literal["colmap", "transforms", "ply", "moge"]
+WRITERS: Final[Mapping[Layout, ViewWriter]] = {
+    "colmap": write_colmap,
+    "transforms": write_transforms,
+    "ply": write_ply,
+    "moge": write_moge,
+}
+
+
+def _write_log_depth(path: Path, depth_m: Any) -> None:
+    """Write depth as MoGe reads it: near ** (1 - t) * far ** t, where t = (number - 1) / 65533."""
+    measured = depth_m > 0
+    near_m, far_m = 1.0, 1.1
+    if measured.any():
+        near_m = float(depth_m[measured].min())
+        far_m = max(float(depth_m[measured].max()), near_m * 1.1)
+    numbers = np.zeros(depth_m.shape, dtype=np.uint16)
+    place = np.log(depth_m[measured].astype(np.float64) / near_m) / np.log(far_m / near_m)
+    numbers[measured] = 1 + np.round(np.clip(place, 0, 1) * 65533).astype(np.uint16)
+    about = PngInfo()
+    about.add_text("near", repr(near_m))
+    about.add_text("far", repr(far_m))
+    Image.fromarray(numbers).save(path, pnginfo=about, compress_level=_FAST)
+
+
+def _write_png(path: Path, image: PosedImage) -> None:
+    Image.fromarray(image.rgb).save(path, compress_level=_FAST)
+
+
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=1), encoding="utf-8")
+
 
 USUAL_POINTS: Final[dict[str, int]] = {"colmap": 5_000, "transforms": 5_000, "ply": 100_000}
 """How many points are taken from each picture, unless another number is asked for."""
@@ -42,8 +310,6 @@ class ViewExportOptions(SceneFilters, total=False):
     """Which scenes and views are exported, and how.
 
     Attributes:
-        group: "moment" (the default): a folder for each frame, in which nothing moves; "scene": one
-            for all the chosen frames, between which characters move.
         cameras: Numbers of cameras, or "all" (the default).
         frames: As for `StereoPairs`, but no clips.
         size: (height, width) in pixels, or a text WIDTHxHEIGHT; None for the stored size.
@@ -55,7 +321,6 @@ class ViewExportOptions(SceneFilters, total=False):
         progress: Called with (pictures done, pictures in all).
     """
 
-    group: Group
     cameras: Sequence[int] | Literal["all"]
     frames: FramesSpec
     size: tuple[int, int] | str | None
@@ -89,56 +354,53 @@ def export_views(
         MediaError: If depth cannot have been stored whole, or a video does not decode.
     """
     require_options(export_views, options)
-    root, group = Path(out), options.get("group", "moment")
-    _require_layout(layout, group)
-    points = _points(layout, options.get("points"))
-    size, depth = options.get("size"), options.get("depth")
-    index = index_of(data)
+    root = Path(out)
+    if layout not in WRITERS:
+        known = ", ".join(map(repr, WRITERS))
+        raise SelectionError(f"layout must be one of {known}, got {layout!r}.")
+    points, depth = _points(layout, options.get("points")), options.get("depth")
+    index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
     filters = scene_filters(training_selection(index, options)[0])
     frames = options.get("frames", "first")
-    plan = plan_views(
-        index, cameras=options.get("cameras", "all"), frames=frames, seed=0, filters=filters
+    views = SceneViews(
+        index,
+        cameras=options.get("cameras", "all"),
+        frames=frames,
+        fields=VIEW_FIELDS,
+        size=options.get("size"),
+        depth=depth,
+        **filters,
     )
-    if plan.windows.is_clip:
+    if views.plan.windows.is_clip:
         raise SelectionError(
             f"frames={frames!r} are clips: exports take 'all', 'first', ('every', k) or numbers of "
-            "frames; group='scene' puts the chosen frames of a scene together."
+            "frames."
         )
-    request = PosedImageReader(index, size=size, depth=depth).request
-    check_samples(index, plan, request)
-    folders: dict[Path, tuple[int, tuple[int, ...]]] = {}
-    for number in range(len(plan)):
-        address = plan.locate(number, epoch=0)
-        folder = root / index.scene(address.row).id.key
-        if group == "moment":
-            folder /= f"frame_{address.frames[0]:03d}"
-        chosen = (*folders.get(folder, (0, ()))[1], *address.frames)
-        folders[folder] = (address.row, chosen)
+    folders: dict[Path, Address] = {}
+    missing: dict[int, dict[Path, Address]] = {}
+    for number in range(len(views)):
+        address = views.plan.locate(number, epoch=0)
+        folder = root / index.scene(address.row).id.key / f"frame_{address.frames[0]:03d}"
+        folders[folder] = address
+        if not folder.is_dir():
+            missing.setdefault(address.row, {})[folder] = address._replace(row=0)
     cameras = (address.source, *address.targets)
     split = filters["split"]
     settings: dict[str, Any] = {
         "layout": layout,
         "split": sorted([split] if isinstance(split, str) else split or ()),
-        "group": group,
         "cameras": cameras,
-        "size": request.size,
+        "size": views.request.size,
         "points": points,
         "depth": depth
         and asdict(depth) | {"no_depth": depth.no_depth, "accept": sorted(depth.accept)},
         "data": index.digest,
     }
-    if group == "scene":
-        settings["frames"] = sorted({chosen for _, chosen in folders.values()})
+    works = [
+        _SceneWork(index.only([row]), found, layout, views.request, points)
+        for row, found in missing.items()
+    ]
     with job_folder(root, settings):
-        missing: dict[int, dict[Path, tuple[int, ...]]] = {}
-        for folder, (row, chosen) in folders.items():
-            if not folder.is_dir():
-                missing.setdefault(row, {})[folder] = chosen
-        works = [
-            _SceneWork(alone(index, row), found, layout, cameras, request.size, depth, points)
-            for row, found in missing.items()
-        ]
-        total = len(cameras) * sum(len(chosen) for _, chosen in folders.values())
         do_items(
             _export_scene,
             works,
@@ -146,8 +408,8 @@ def export_views(
             workers=options.get("workers"),
             engine=options.get("engine", LOCAL),
             progress=options.get("progress"),
-            done=total - sum(work.pictures for work in works),
-            total=total,
+            done=len(cameras) * (len(folders) - sum(len(work.addresses) for work in works)),
+            total=len(cameras) * len(folders),
         )
         if layout == "moge":
             with named_errors(root):
@@ -155,23 +417,9 @@ def export_views(
     return [*folders]
 
 
-def _require_layout(layout: Layout, group: Group) -> None:
-    if layout not in WRITERS:
-        known = ", ".join(map(repr, WRITERS))
-        raise SelectionError(f"layout must be one of {known}, got {layout!r}.")
-    if group not in get_args(Group):
-        raise SelectionError(f"group must be 'moment' or 'scene', got {group!r}.")
-    if layout == "moge" and group != "moment":
-        raise SelectionError(f"layout='moge' has no group={group!r}: leave it out.")
-
-
 def _points(layout: Layout, points: Any) -> int | None:
-    """Return how many points are taken from each picture, None for all."""
-    if layout == "moge":
-        if points is not None:
-            raise SelectionError(f"layout='moge' has no points={points!r}: leave them out.")
-        return None
-    if points == "all":
+    """Return how many points are taken from each picture, None for all; MoGe takes none."""
+    if layout == "moge" or points == "all":
         return None
     points = USUAL_POINTS[layout] if points is None else points
     if isinstance(points, bool) or not isinstance(points, int) or points < 1:
@@ -181,46 +429,31 @@ def _points(layout: Layout, points: Any) -> int | None:
 
 @dataclass(frozen=True, slots=True)
 class _SceneWork:
-    """The folders of one scene that are yet to be written, with the frames of each.
+    """The folders of one scene that are yet to be written.
 
     Attributes:
         index: An index of the scene alone.
-        frames_of: The frames of each folder.
+        addresses: The cameras and the frame of each folder.
         layout: The format.
-        cameras: Numbers of cameras.
-        size: (height, width) in pixels, None for the stored size.
-        depth: A depth contract instead of the one that files and release state.
+        request: What is read of the views.
         points: How many points are taken from each picture, None for all.
     """
 
     index: SceneIndex
-    frames_of: Mapping[Path, tuple[int, ...]]
+    addresses: Mapping[Path, Address]
     layout: Layout
-    cameras: tuple[int, ...]
-    size: tuple[int, int] | str | None
-    depth: DepthEncoding | None
+    request: Request
     points: int | None
-
-    @property
-    def pictures(self) -> int:
-        return len(self.cameras) * sum(map(len, self.frames_of.values()))
 
 
 def _export_scene(work: _SceneWork, advance: Advance) -> None:
     """Write the missing folders of one scene, each whole or not at all."""
-    scene = work.index.scene(0)
-    encodings = {
-        camera: scene.depth_encoding(camera, work.depth or depth_of(scene))
-        for camera in work.cameras
-    }
-    with closing(PosedImageReader(work.index, size=work.size, depth=work.depth)) as reader:
-        for folder, frames in work.frames_of.items():
+    with closing(SampleLoader(work.index, work.request)) as loader:
+        for folder, address in work.addresses.items():
+            images = posed_images(loader.load(address, clip="frame"))
             with named_errors(folder), atomic_folder(folder) as unfinished:
-                writer = WRITERS[work.layout](unfinished, points=work.points, encodings=encodings)
-                for frame in frames:
-                    writer.add([reader.read(0, camera, frame) for camera in work.cameras])
-                    advance(len(work.cameras))
-                writer.finish()
+                WRITERS[work.layout](unfinished, images, work.points)
+                advance(len(images))
 
 
 def _list_pictures(root: Path, folders: Sequence[Path], cameras: Sequence[int]) -> None:

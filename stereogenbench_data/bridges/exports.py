@@ -35,9 +35,3 @@ def training_selection(
             "made of these only if you say so: split='eval', on the command line --split eval."
         )
     return {**selection, "split": "train"}, evaluation
-
-
-def alone(index: SceneIndex, row: int) -> SceneIndex:
-    """Return an index of one scene, small enough to be sent to a process with its work."""
-    scene = index.scene(row)
-    return SceneIndex.from_scenes([scene], index.root, shards=index.shards, retry=index.retry)

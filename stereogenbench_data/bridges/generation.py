@@ -5,7 +5,6 @@ the right view by its disparity, nearest wins; it is -1 in holes, where the mask
 """
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, Final, Literal, Unpack, get_args
 
 import numpy as np
@@ -51,6 +50,8 @@ class GenStereo(AdaptedPairs[dict[str, torch.Tensor]]):
     Source: Qjizhi/GenStereo, genstereo/dataset/dataset_genstereo.py and train.py.
     """
 
+    fields = ("left", "right", "disparity", "valid", "depth", "hole")
+
     def __init__(self, data: Data, **options: Unpack[PairsOptions]) -> None:
         """Select the samples; no video is opened before the first item is asked for.
 
@@ -63,13 +64,7 @@ class GenStereo(AdaptedPairs[dict[str, torch.Tensor]]):
                 rectified: the item is warped along the rows.
             StereoGenBenchError: As `StereoPairs` does.
         """
-        super().__init__(
-            data,
-            fields=("left", "right", "disparity", "valid", "depth", "hole"),
-            adapt=_genstereo_item,
-            frames="frame",
-            options=options,
-        )
+        super().__init__(data, **options)
         index, rows = self.pairs.index, self.pairs.plan.scene_rows
         odd = rows[index.column("rig_residual_px")[rows] > RECTIFIED_PX]
         if len(odd):
@@ -80,6 +75,33 @@ class GenStereo(AdaptedPairs[dict[str, torch.Tensor]]):
                 f"along the rows. Leave them out by scenes=..., or take StereoClips or the field "
                 f"warped_right, which are warped by the poses."
             )
+
+    def item(self, sample: Sample) -> dict[str, torch.Tensor]:
+        """Return the dict."""
+        source, disparity = _from_minus_one(sample["left"]), sample["disparity"]
+        coordinates = _embedded_coordinates(*disparity.shape[-2:])
+        front, hole = front_pixels(
+            project_rectified(sample["depth"][0].numpy(), disparity[0].numpy()),
+            measured=sample["valid"][0].numpy(),
+        )
+        # Of rectified rigs the two differ in what a transform padded alone.
+        is_hole = torch.from_numpy(hole) | sample["hole"][0]
+        pixels = torch.from_numpy(front)
+        warped_coordinates, warped = (
+            torch.where(is_hole, empty, values.flatten(1)[:, pixels])
+            for values, empty in ((coordinates, 0.0), (source, -1.0))
+        )
+        mask = is_hole.to(torch.uint8)[None]
+        return {
+            "source": source,
+            "correspondence": disparity,
+            "target": _from_minus_one(sample["right"]),
+            "src_coords_embed": torch.cat([coordinates, torch.zeros_like(mask), source]),
+            "trg_coords_embed": torch.cat([warped_coordinates, mask, warped]),
+            "clip_images": _clip_picture(sample["left"]),
+            "converted_right": warped,
+            "mask": mask,
+        }
 
 
 class StereoClips(AdaptedPairs[dict[str, Any]]):
@@ -98,6 +120,12 @@ class StereoClips(AdaptedPairs[dict[str, Any]]):
 
     With ``layout="cthw"`` the first two axes are exchanged: (3, T, H, W).
     """
+
+    fields = (
+        "left", "right", "warped_right", "hole", "disparity", "caption", "baseline_m",
+        "frame_rate_hz", "__key__",
+    )  # fmt: skip
+    frames = "clip"
 
     def __init__(
         self,
@@ -126,16 +154,25 @@ class StereoClips(AdaptedPairs[dict[str, Any]]):
         ):
             if value not in known:
                 raise FieldError(f"{name} must be one of {known}, got {value!r}.")
-        super().__init__(
-            data,
-            fields=(
-                "left", "right", "warped_right", "hole", "disparity", "caption", "baseline_m",
-                "frame_rate_hz", "__key__",
-            ),
-            adapt=partial(_clip_item, layout=layout, captions=captions),
-            frames="clip",
-            options=options,
-        )  # fmt: skip
+        super().__init__(data, **options)
+        self.layout, self.captions = layout, captions
+
+    def item(self, sample: Sample) -> dict[str, Any]:
+        """Return the dict."""
+        clips: Mapping[str, torch.Tensor] = {
+            "source": _from_minus_one(sample["left"]),
+            "target": _from_minus_one(sample["right"]),
+            "warped": _from_minus_one(sample["warped_right"]),
+            "mask": sample["hole"].float(),
+            "correspondence": sample["disparity"],
+        }
+        if self.layout == "cthw":
+            clips = {name: clip.transpose(0, 1).contiguous() for name, clip in clips.items()}
+        caption = sample["caption"]
+        if self.captions == "with baseline":
+            caption = describe_pair(caption, baseline_m=float(sample["baseline_m"]))
+        rest = {name: sample[name] for name in ("baseline_m", "frame_rate_hz", "__key__")}
+        return {**clips, "caption": caption, **rest}
 
 
 def describe_pair(caption: str, *, baseline_m: float) -> str:
@@ -145,50 +182,6 @@ def describe_pair(caption: str, *, baseline_m: float) -> str:
     'A quiet street. Stereo baseline 6.3 cm.'
     """
     return f"{caption} Stereo baseline {baseline_m * 100:.1f} cm.".strip()
-
-
-def _clip_item(sample: Sample, *, layout: Layout, captions: Captions) -> dict[str, Any]:
-    clips: Mapping[str, torch.Tensor] = {
-        "source": _from_minus_one(sample["left"]),
-        "target": _from_minus_one(sample["right"]),
-        "warped": _from_minus_one(sample["warped_right"]),
-        "mask": sample["hole"].float(),
-        "correspondence": sample["disparity"],
-    }
-    if layout == "cthw":
-        clips = {name: clip.transpose(0, 1).contiguous() for name, clip in clips.items()}
-    caption = sample["caption"]
-    if captions == "with baseline":
-        caption = describe_pair(caption, baseline_m=float(sample["baseline_m"]))
-    rest = {name: sample[name] for name in ("baseline_m", "frame_rate_hz", "__key__")}
-    return {**clips, "caption": caption, **rest}
-
-
-def _genstereo_item(sample: Sample) -> dict[str, torch.Tensor]:
-    source, disparity = _from_minus_one(sample["left"]), sample["disparity"]
-    coordinates = _embedded_coordinates(*disparity.shape[-2:])
-    front, hole = front_pixels(
-        project_rectified(sample["depth"][0].numpy(), disparity[0].numpy()),
-        measured=sample["valid"][0].numpy(),
-    )
-    # Of rectified rigs the two differ in what a transform padded alone.
-    is_hole = torch.from_numpy(hole) | sample["hole"][0]
-    pixels = torch.from_numpy(front)
-    warped_coordinates, warped = (
-        torch.where(is_hole, empty, values.flatten(1)[:, pixels])
-        for values, empty in ((coordinates, 0.0), (source, -1.0))
-    )
-    mask = is_hole.to(torch.uint8)[None]
-    return {
-        "source": source,
-        "correspondence": disparity,
-        "target": _from_minus_one(sample["right"]),
-        "src_coords_embed": torch.cat([coordinates, torch.zeros_like(mask), source]),
-        "trg_coords_embed": torch.cat([warped_coordinates, mask, warped]),
-        "clip_images": _clip_picture(sample["left"]),
-        "converted_right": warped,
-        "mask": mask,
-    }
 
 
 def _from_minus_one(pictures: torch.Tensor) -> torch.Tensor:

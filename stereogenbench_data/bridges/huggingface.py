@@ -1,6 +1,7 @@
 """Stereo samples as a Hugging Face ``datasets.IterableDataset``, and the features of raw shards."""
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Unpack
 
 from stereogenbench_data.bridges.in_memory import SampleOptions, samples_of, to_arrays
@@ -202,40 +203,34 @@ def decode(
         **options: pairs, frames, direction, baseline_cm, size, transform, depth, seed, as
             for `StereoPairs`.
     """
-    return _RowDecoder(tuple(fields), options)
+    return partial(_decoded, fields=tuple(fields), options=options)
 
 
-class _RowDecoder:
-    def __init__(self, fields: tuple[str, ...], options: SampleOptions) -> None:
-        self._fields = fields
-        self._options = options
-
-    def __repr__(self) -> str:
-        chosen = "".join(f", {name}={value!r}" for name, value in self._options.items())
-        return f"decode({self._fields!r}{chosen})"
-
-    def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
-        if isinstance(row["__key__"], str):
-            samples = self._samples(row)
-            if len(samples) != 1:
-                raise SelectionError(
-                    f"{row['__key__']}: the scene gives {len(samples)} samples, but map takes "
-                    "one per row. Pass batched=True, batch_size=1."
-                )
-            return samples[0]
-        rows = [dict(zip(row, values, strict=True)) for values in zip(*row.values(), strict=True)]
-        found = [sample for each in rows for sample in self._samples(each)]
-        return {name: [sample[name] for sample in found] for name in self._fields}
-
-    def _samples(self, row: dict[str, Any]) -> list[Sample]:
-        absent = [name for name in VIDEO_FILES if name in row and row[name] is None]
-        if absent and row.get(TRAINING_JSON) is None:
-            raise StorageError(
-                f"{row['__key__']}: the shard has no {', '.join(absent)}. If it was packed with "
-                '--depth-codec blosc2, read it with features(depth_suffix="b2frame").'
+def _decoded(
+    row: dict[str, Any], *, fields: tuple[str, ...], options: SampleOptions
+) -> dict[str, Any]:
+    if isinstance(row["__key__"], str):
+        samples = _samples(row, fields, options)
+        if len(samples) != 1:
+            raise SelectionError(
+                f"{row['__key__']}: the scene gives {len(samples)} samples, but map takes one per "
+                "row. Pass batched=True, batch_size=1."
             )
-        found = samples_of(row["__key__"], row, fields=self._fields, epoch=0, options=self._options)
-        return [to_arrays(sample) for sample in found]
+        return samples[0]
+    rows = [dict(zip(row, values, strict=True)) for values in zip(*row.values(), strict=True)]
+    found = [sample for each in rows for sample in _samples(each, fields, options)]
+    return {name: [sample[name] for sample in found] for name in fields}
+
+
+def _samples(row: dict[str, Any], fields: tuple[str, ...], options: SampleOptions) -> list[Sample]:
+    absent = [name for name in VIDEO_FILES if name in row and row[name] is None]
+    if absent and row.get(TRAINING_JSON) is None:
+        raise StorageError(
+            f"{row['__key__']}: the shard has no {', '.join(absent)}. If it was packed with "
+            '--depth-codec blosc2, read it with features(depth_suffix="b2frame").'
+        )
+    found = samples_of(row["__key__"], row, fields=fields, epoch=0, options=options)
+    return [to_arrays(sample) for sample in found]
 
 
 def _missing(error: ImportError) -> ExtraError:

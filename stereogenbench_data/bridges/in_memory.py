@@ -12,12 +12,7 @@ from pathlib import Path
 from typing import Any, Final, TypedDict
 
 from stereogenbench_data.datasets.mapped import StereoPairs
-from stereogenbench_data.errors import (
-    FieldError,
-    SelectionError,
-    StorageError,
-    explain_os_errors,
-)
+from stereogenbench_data.errors import SelectionError, StorageError, explain_os_errors
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Sample
@@ -127,18 +122,7 @@ def _bytes(key: str, name: str, content: Any) -> bytes:
 
 
 def to_arrays(sample: Sample) -> Sample:
-    """Return a sample with numpy arrays of the same dtypes instead of tensors; texts stay.
-
-    Raises:
-        FieldError: If a tensor's dtype has no numpy counterpart.
-    """
-    try:
-        return {
-            name: value if isinstance(value, str) else value.numpy()
-            for name, value in sample.items()
-        }
-    except TypeError as error:
-        raise FieldError(
-            f"a field cannot be converted to a numpy array ({error}). Leave it out of fields, or "
-            "convert its dtype in transform."
-        ) from error
+    """Return a sample with numpy arrays of the same dtypes instead of tensors; texts stay."""
+    return {
+        name: value if isinstance(value, str) else value.numpy() for name, value in sample.items()
+    }

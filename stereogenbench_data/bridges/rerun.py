@@ -1,6 +1,6 @@
 """A scene for Rerun's viewer: cameras, pictures, depth and disparity over time.
 
-    /scene                  a text: the scene's key, facts and caption
+    /scene                  a text: the scene's key and caption
     /world                  x right, y down, z forward, metres; the origin is camera 0 in the first
                             frame that is shown
     /world/cam_00           Transform3D (world from camera) and Pinhole
@@ -14,20 +14,13 @@ pixel centres at 0.5, which Rerun's pictures have; its cloud of depth lies half 
 Source: rerun-io/rerun, docs/snippets, crates/viewer/re_renderer/shader/depth_cloud.wgsl.
 """
 
-import re
 import sys
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
-from stereogenbench_data.bridges.posed_images import (
-    PosedImage,
-    PosedImageReader,
-    index_of,
-    origin_at,
-)
-from stereogenbench_data.datasets.mapped import Data, StereoPairs
+from stereogenbench_data.bridges.multiview import VIEW_FIELDS, origin_at, posed_images
+from stereogenbench_data.datasets.mapped import Data, SceneViews, StereoPairs
 from stereogenbench_data.engine import Progress
 from stereogenbench_data.errors import (
     ExtraError,
@@ -35,19 +28,17 @@ from stereogenbench_data.errors import (
     explain_os_errors,
     missing_extra,
 )
-from stereogenbench_data.schema.records import DepthEncoding, Scene
-from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.text import markdown_text
 from stereogenbench_data.selection.filters import find_scene
-from stereogenbench_data.selection.windows import FramesSpec, parse_frames
+from stereogenbench_data.selection.windows import FramesSpec
 from stereogenbench_data.sources.files import open_output
 
 USUAL_WIDTH_PX: Final = 512
 """How wide pictures are at most, unless a size is asked for."""
 
 _JPEG_QUALITY: Final = 90
-_OF_VIEWER: Final = re.compile(r"Viewer|gRPC")
-"""What Rerun's errors name if its viewer does not start or does not answer."""
 
 
 def write_recording(
@@ -78,7 +69,7 @@ def write_recording(
         MediaError: If a video does not decode to what the index says.
     """
     # Rerun's own writer of files may wait for ever once a disk is full.
-    with _recording() as recording:
+    with _rerun().RecordingStream("stereogenbench") as recording:
         stream = recording.binary_stream()
         key = log_scene(recording, data, scene, progress=progress, **options)
         content = stream.read() or b""
@@ -105,18 +96,15 @@ def view_live(
     """
     here = Path(sys.executable).with_name("rerun")
     viewer = str(here) if here.is_file() else None  # else it is looked for in PATH
-    with _recording() as recording:
+    with _rerun().RecordingStream("stereogenbench") as recording:
         try:
             _rerun().spawn(recording=recording, executable_path=viewer)
-            return log_scene(recording, data, scene, progress=progress, **options)
         except RuntimeError as error:
-            if not _OF_VIEWER.search(str(error)):
-                raise
-            reason = str(error).partition("\n")[0]
             raise ExtraError(
-                f"Rerun's viewer cannot be reached ({reason}). Write an .rrd file instead, and "
-                "open it where there is a screen."
+                f"Rerun's viewer does not start ({str(error).partition(chr(10))[0]}). Write an "
+                f".rrd file instead, and open it where there is a screen."
             ) from error
+        return log_scene(recording, data, scene, progress=progress, **options)
 
 
 def log_scene(  # noqa: PLR0913 - each names one thing that a user chooses
@@ -150,103 +138,49 @@ def log_scene(  # noqa: PLR0913 - each names one thing that a user chooses
         MediaError: If a video does not decode to what the index says.
     """
     rerun = _rerun()
-    index = index_of(data)
-    row = 0 if scene is None else find_scene(index, scene)
-    facts = index.scene(row)
+    index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
+    facts = index.scene(0 if scene is None else find_scene(index, scene))
+    key, rig = facts.id.key, facts.rig
     if size is None:
-        width, height = facts.rig.image_width_px, facts.rig.image_height_px
-        shrunk = min(1.0, USUAL_WIDTH_PX / width)
-        size = (max(1, round(height * shrunk)), max(1, round(width * shrunk)))
-    pair = pair or facts.rig.primary_pair
-    windows = parse_frames(frames)
-    if windows.is_clip:
+        shrunk = min(1.0, USUAL_WIDTH_PX / rig.image_width_px)
+        sides = (rig.image_height_px, rig.image_width_px)
+        size = (max(1, round(sides[0] * shrunk)), max(1, round(sides[1] * shrunk)))
+    read: dict[str, Any] = {"scenes": key, "frames": frames, "size": size, "depth": depth}
+    views = SceneViews(index, fields=VIEW_FIELDS, **read)
+    pairs = StereoPairs(index, pairs=[pair or rig.primary_pair], fields=("disparity",), **read)
+    if views.plan.windows.is_clip:
         raise SelectionError(f"frames={frames!r} are clips: give 'all', a step or numbers.")
-    disparities = StereoPairs(
-        index, scenes=facts.id.key, fields=("disparity", "frame_index"),
-        pairs=[pair], frames=frames, size=size, depth=depth,
-    )  # fmt: skip
     recording.log("world", rerun.ViewCoordinates.RDF, static=True)
-    recording.send_blueprint(_blueprint(pair))
+    about = f"# {markdown_text(key)}\n\n{markdown_text(facts.caption)}"
+    recording.log("scene", rerun.TextDocument(about, media_type="text/markdown"), static=True)
     shift = None
-    with closing(PosedImageReader(index, size=size, depth=depth)) as reader, closing(disparities):
-        for number in range(len(disparities)):
-            sample = disparities[number]
-            frame = int(sample["frame_index"])
-            recording.set_time("frame", sequence=frame)
-            recording.set_time("time", duration=frame / facts.frame_rate_hz)
-            disparity = rerun.DepthImage(sample["disparity"][0].numpy(), colormap="turbo")
-            recording.log("pair/disparity", disparity)
-            for camera in range(CAMERA_COUNT):
-                image = reader.read(row, camera, frame)
-                if shift is None:
-                    shift = origin_at(image)
-                    about = _about(facts, pair=pair, origin_m=-shift[:3, 3])
-                    text = rerun.TextDocument(about, media_type="text/markdown")
-                    recording.log("scene", text, static=True)
+    with closing(views), closing(pairs):
+        for number in range(len(views)):
+            images = posed_images(views[number])
+            shift = origin_at(images[0]) if shift is None else shift
+            recording.set_time("frame", sequence=images[0].frame)
+            recording.set_time("time", duration=images[0].frame / facts.frame_rate_hz)
+            disparity = pairs[number]["disparity"][0].numpy()
+            recording.log("pair/disparity", rerun.DepthImage(disparity, colormap="turbo"))
+            for image in images:
+                place, pose = f"world/cam_{image.camera:02d}", image.in_world(shift).world_from_cam
                 if number == 0:
                     lens = rerun.Pinhole(
                         image_from_camera=image.intrinsics,
                         resolution=image.size[::-1],
                         camera_xyz=rerun.ViewCoordinates.RDF,
                     )
-                    recording.log(f"world/cam_{camera:02d}", lens, static=True)
-                _log_view(rerun, recording, image.in_world(shift))
+                    recording.log(place, lens, static=True)
+                recording.log(
+                    place, rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3])
+                )
+                picture = rerun.Image(image.rgb).compress(jpeg_quality=_JPEG_QUALITY)
+                recording.log(f"{place}/rgb", picture)
+                recording.log(f"{place}/depth", rerun.DepthImage(image.depth_m, meter=1.0))
             recording.flush()
             if progress is not None:
-                progress(number + 1, len(disparities))
-    return facts.id.key
-
-
-def _log_view(rerun: Any, recording: Any, image: PosedImage) -> None:
-    place = f"world/cam_{image.camera:02d}"
-    rotation, centre = image.world_from_cam[:3, :3], image.world_from_cam[:3, 3]
-    recording.log(place, rerun.Transform3D(translation=centre, mat3x3=rotation))
-    picture = rerun.Image(image.rgb).compress(jpeg_quality=_JPEG_QUALITY)
-    recording.log(f"{place}/rgb", picture)
-    recording.log(f"{place}/depth", rerun.DepthImage(image.depth_m, meter=1.0))
-
-
-def _about(scene: Scene, *, pair: tuple[int, int], origin_m: Any) -> str:
-    """Return what the viewer tells of a scene, as Markdown."""
-    baseline_cm = scene.rig.baseline_cm(*pair)
-    lines = [
-        f"# {markdown_text(scene.id.key)}",
-        f"- {scene.frames} frames at {scene.frame_rate_hz:g} Hz",
-        f"- focal length {scene.rig.focal_mm:g} mm",
-        f"- disparity of cameras {pair[0]}-{pair[1]}, baseline {baseline_cm:.2f} cm",
-        f"- origin at {', '.join(f'{each:.6f}' for each in origin_m)} m of the scene's world",
-    ]
-    return "\n".join([*lines, "", markdown_text(scene.caption)])
-
-
-def _blueprint(pair: tuple[int, int]) -> Any:
-    """Return how the viewer arranges a scene."""
-    import rerun.blueprint as layout
-
-    left, right = (f"world/cam_{camera:02d}" for camera in pair)
-    return layout.Blueprint(
-        layout.Horizontal(
-            layout.Spatial3DView(origin="world", name="cameras and depth"),
-            layout.Vertical(
-                layout.Spatial2DView(origin=f"{left}/rgb", name=f"camera {pair[0]}"),
-                layout.Spatial2DView(origin=f"{right}/rgb", name=f"camera {pair[1]}"),
-                layout.Spatial2DView(origin="pair/disparity", name="disparity, px"),
-                layout.TextDocumentView(origin="scene", name="scene"),
-            ),
-            column_shares=[2, 1],
-        ),
-        collapse_panels=True,
-    )
-
-
-@contextmanager
-def _recording() -> Iterator[Any]:
-    """Yield a new recording, which is closed when the block ends."""
-    recording = _rerun().RecordingStream("stereogenbench")
-    try:
-        yield recording
-    finally:
-        recording.disconnect()
+                progress(number + 1, len(views))
+    return key
 
 
 def _rerun() -> Any:

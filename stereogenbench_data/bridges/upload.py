@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.bridges.card import CARD_NAME, write_card
+from stereogenbench_data.bridges.card import CARD_NAME, viewer_tars, write_card
 from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
 from stereogenbench_data.bridges.dataset_facts import About
-from stereogenbench_data.bridges.viewer import viewer_tars
 from stereogenbench_data.engine import Progress
 from stereogenbench_data.errors import DescriptorError, StorageError
 from stereogenbench_data.index.parquet import INDEX_NAME
@@ -39,63 +38,42 @@ class Upload:
     files: int
 
 
-def prepare_upload(
+def upload(
     shards: str | Path,
     repository: str,
     *,
+    branch: str = "main",
     about: About | None = None,
     progress: Progress | None = None,
-) -> tuple[SceneIndex, str]:
-    """Write the card, the rows of the Hub's viewer and the descriptor into a folder of shards.
-
-    Args:
-        shards: The folder that ``pack`` wrote.
-        repository: "ORG/NAME" of a dataset on the Hub.
-        about: What the user states of the scenes, as for `dataset_facts.facts_of`.
-        progress: Called with (scenes done, scenes in all) while pictures of scenes are written.
-
-    Returns:
-        The index of the shards and the name of the dataset.
-
-    Raises:
-        ExtraError: If huggingface_hub is not installed.
-        DescriptorError: If the folder has a README.md that this package did not write, or who made
-            the scenes is not known.
-        StorageError: If the folder has no shards or lacks one.
-    """
-    folder = local_path(shards)
-    index = SceneIndex.open(folder)
-    _require_whole(index, folder)
-    write_card(index, folder, repository=repository, about=about, progress=progress)
-    stated = Publication(about=about)
-    return index, write_descriptor(index, folder / DESCRIPTOR_NAME, publication=stated)["name"]
-
-
-def upload(
-    shards: str | Path, repository: str, *, branch: str = "main", about: About | None = None
 ) -> Upload:
     """Upload a folder of packed shards.
 
-    `prepare_upload` writes its files into the folder first. The descriptor names the commit of the
-    other files, so it has a commit of its own. To continue after an interruption, call it again.
+    The card, the rows of the Hub's viewer and the descriptor are written into the folder first. The
+    descriptor names the commit of the other files, so it has a commit of its own. To continue after
+    an interruption, call it again.
 
     Args:
         shards: The folder that ``pack`` wrote.
         repository: "ORG/NAME" of a dataset on the Hub; created if it does not exist.
         branch: The branch to commit to.
         about: What the user states of the scenes, as for `dataset_facts.facts_of`.
+        progress: Called with (scenes done, scenes in all) while pictures of scenes are written.
 
     Raises:
         ExtraError: If huggingface_hub is not installed.
-        DescriptorError: As `prepare_upload` does.
+        DescriptorError: If the folder has a README.md that this package did not write, or who made
+            the scenes is not known.
         StorageError: If the folder has no shards or lacks one, or the Hub refuses the upload.
     """
-    index, name = prepare_upload(shards, repository, about=about)
+    folder = local_path(shards)
+    index = SceneIndex.open(folder)
+    _require_whole(index, folder)
+    write_card(index, folder, repository=repository, about=about, progress=progress)
+    descriptor = folder / DESCRIPTOR_NAME
+    name = write_descriptor(index, descriptor, publication=Publication(about=about))["name"]
     from huggingface_hub import HfApi
     from huggingface_hub.errors import HfHubHTTPError
 
-    folder = local_path(shards)
-    descriptor = folder / DESCRIPTOR_NAME
     api = HfApi(library_name="stereogenbench-data")
     patterns = [*sorted(index.shards), *viewer_tars(index), *_COMPANIONS]
     found = [path for pattern in patterns for path in folder.glob(pattern)]
@@ -114,7 +92,7 @@ def upload(
         )
         revision = str(api.dataset_info(repository, revision=branch).sha)
         address = f"{api.endpoint}/datasets/{repository}/resolve/{revision}"
-        pinned = Publication(data_url=address, tables_url=f"{address}/croissant", about=about)
+        pinned = Publication(data_url=address, about=about)
         write_descriptor(index, descriptor, publication=pinned)
         api.upload_file(
             path_or_fileobj=descriptor,

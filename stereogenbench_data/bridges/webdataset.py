@@ -10,7 +10,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Unpack
 
 from stereogenbench_data.bridges.in_memory import SampleOptions, samples_of
-from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS, Sample
 from stereogenbench_data.selection.filters import SceneFilters
 from stereogenbench_data.selection.options import require_options
@@ -25,38 +24,25 @@ class SceneDecoder:
         self._options = options
         self._epoch = 0
 
-    def __repr__(self) -> str:
-        """Return a summary."""
-        chosen = "".join(f", {name}={value!r}" for name, value in self._options.items())
-        return f"SceneDecoder({self._fields!r}{chosen})"
-
     def set_epoch(self, epoch: int) -> None:
-        """Draw new random frames and transforms in iterations that start after this call.
-
-        Raises:
-            SelectionError: If it is negative.
-        """
-        if epoch < 0:
-            raise SelectionError(f"epoch must be 0 or a positive whole number, got {epoch!r}.")
+        """Draw new random frames and transforms in iterations that start after this call."""
         self._epoch = epoch
 
     def __call__(self, scenes: Iterable[Mapping[str, Any]]) -> Iterator[Sample]:
         """Yield the samples of every scene.
 
         Raises:
-            StorageError: If a scene has no key or lacks a file.
+            StorageError: If a scene lacks a file.
             SchemaError: If a metadata file does not follow the format.
             MediaError: If a video does not decode to what its header says.
         """
         for scene in scenes:
-            key = scene.get("__key__")
-            if not isinstance(key, str):
-                raise StorageError(
-                    f"a scene has no __key__ (its keys are {', '.join(map(str, scene))}). Put this "
-                    "stage directly after the WebDataset."
-                )
             for sample in samples_of(
-                key, scene, fields=self._fields, epoch=self._epoch, options=self._options
+                scene["__key__"],
+                scene,
+                fields=self._fields,
+                epoch=self._epoch,
+                options=self._options,
             ):
                 if "__url__" in sample and "__url__" in scene:
                     sample["__url__"] = scene["__url__"]

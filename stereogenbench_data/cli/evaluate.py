@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -29,7 +29,6 @@ from stereogenbench_data.schema.text import counted
 
 if TYPE_CHECKING:
     from stereogenbench_data.evaluation.aggregate import Scores
-    from stereogenbench_data.evaluation.controls import Relation
     from stereogenbench_data.evaluation.protocol import EvaluationProtocol
     from stereogenbench_data.evaluation.tables import Table
 
@@ -167,28 +166,30 @@ class ReportOptions:
         results: "Sequence[Scores]",
         tables: "Sequence[Table]",
         *,
-        found: "Sequence[Relation]" = (),
+        plots: Literal["write", "skip"] = "write",
     ) -> None:
         """Print the report as a page or as JSON, write its files, and compare it.
 
         Raises:
             typer.Exit: If it is not what it is compared with.
         """
-        from stereogenbench_data.evaluation.compare import differences
-        from stereogenbench_data.evaluation.report import document, page, write_report
+        from stereogenbench_data.evaluation.report import (
+            differences,
+            document,
+            page,
+            write_report,
+        )
         from stereogenbench_data.jobs import read_json
 
         there = None
         if self.compare is not None:  # The files that are written next may replace it.
             there = read_json(self.compare, cure="Give the results.json of an evaluation.")
-        content = document(results, tables, found=found)
+        content = document(results, tables)
         if self.as_json:
             typer.echo(json.dumps(content, allow_nan=False))
         else:
-            typer.echo(page(results, tables, found=found).rstrip())
-        files = write_report(
-            folder, results, tables, found=found, plots="skip" if found else "write"
-        )
+            typer.echo(page(results, tables).rstrip())
+        files = write_report(folder, results, tables, plots=plots)
         names = ", ".join(str(path.relative_to(folder)) for path in files)
         typer.echo(f"{folder}: {names}", err=True)
         if there is None:
@@ -267,8 +268,8 @@ def score(  # noqa: PLR0913 - one parameter an option
     """Score a method's right views by the paper's protocol.
 
     `stereogenbench eval inputs` writes what the method is given. PREDICTIONS holds, for each
-    item, a folder of PNGs or a video of the same name. The report (Markdown, LaTeX, CSV, JSON,
-    plots) and partial results go to --out [evaluation/NAME-TIER]. To continue a stopped run, run it
+    item, a folder of PNGs or a video of the same name. The report (Markdown, JSON, CSV, plots)
+    and partial results go to --out [evaluation/NAME-TIER]. To continue a stopped run, run it
     again.
 
     Example: `stereogenbench eval score shards/ predictions/ --tier G1`
@@ -311,13 +312,12 @@ def controls(
     """Score a perfect, a copied, a wrong and a random right view.
 
     The controls are the rendered target, the left view, the view of the next camera (02 for 01),
-    and the right view of another scene. The report shows the paper's own controls beside them, and
-    whether the relations between them hold; the exit status is 1 if one does not. It goes to --out
-    [evaluation/controls]. To continue a stopped run, run it again.
+    and the right view of another scene. The report shows the paper's own controls beside them. It
+    goes to --out [evaluation/controls]. To continue a stopped run, run it again.
 
     Example: `stereogenbench eval controls shards/ --frames every:20`
     """
-    from stereogenbench_data.evaluation.controls import relations, score_controls
+    from stereogenbench_data.evaluation.controls import score_controls
     from stereogenbench_data.evaluation.tables import table_of
 
     protocol, selection = scoring.protocol(), chosen.selection()
@@ -332,8 +332,5 @@ def controls(
             progress=progress,
             **selection,
         )
-    found = relations(results)
     tables = [table_of(results, name) for name in ("controls", "branches", "explanations")]
-    report.write(folder, results, tables, found=found)
-    if any(each.holds is False for each in found):
-        raise typer.Exit(FINDINGS)
+    report.write(folder, results, tables, plots="skip")

@@ -2,7 +2,7 @@
 
 import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -14,14 +14,10 @@ from stereogenbench_data.cli.options import (
     SceneOptions,
     SizeOption,
     WorkOptions,
-    complete_from,
     flag,
     grouped,
 )
 from stereogenbench_data.cli.progress import progress_bar
-
-if TYPE_CHECKING:
-    from stereogenbench_data.bridges.clips import ClipForm
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,57 +40,32 @@ class ClipOptions:
         int | None, typer.Option(help="Start a clip every so many frames [no overlap].")
     ] = None
     size: SizeOption = None
-    fit: Annotated[
-        Literal["stretch", "crop"],
-        typer.Option(help="crop: scale until the size is covered, and cut to the middle."),
-    ] = "stretch"
     rate_hz: Annotated[
         float | None,
         typer.Option(help="Frames a second that files state [the video's, by the stride]."),
     ] = None
-    also: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--also",
-            metavar="VIDEO",
-            help="Write depth or disparity too. May be repeated.",
-            autocompletion=complete_from(("depth", "disparity")),
-        ),
-    ] = None
-    control: Annotated[
-        str,
-        typer.Option(
-            help="What the manifest names as control: left, warped, mask, depth, disparity, none, "
-            "or the layout's own."
-        ),
-    ] = "layout"
     baseline_in_caption: Annotated[
         bool, flag("--baseline-in-caption", "Tell the baseline in the captions.")
     ] = False
     crf: Annotated[int, typer.Option(help="Constant rate factor, 0 to 51; fewer is better.")] = 12
 
-    def form(self) -> "ClipForm":
+    def form(self) -> dict[str, Any]:
         """Return what a clip is.
 
         Raises:
             MediaError: If the rate factor is out of range.
         """
-        from stereogenbench_data.bridges.clips import ClipForm
         from stereogenbench_data.media.encoder import Encoding
 
-        also: Any = tuple(self.also or ())
-        return ClipForm(
-            length=self.length,
-            stride=self.stride,
-            step=self.step,
-            size=self.size,
-            fit=self.fit,
-            rate_hz=self.rate_hz,
-            also=also,
-            control=self.control,
-            captions="with baseline" if self.baseline_in_caption else "plain",
-            encoding=Encoding(crf=self.crf),
-        )
+        return {
+            "length": self.length,
+            "stride": self.stride,
+            "step": self.step,
+            "size": self.size,
+            "rate_hz": self.rate_hz,
+            "captions": "with baseline" if self.baseline_in_caption else "plain",
+            "encoding": Encoding(crf=self.crf),
+        }
 
 
 @grouped
@@ -118,7 +89,7 @@ def clips(  # noqa: PLR0913 - one parameter an option
 
     Example: `stereogenbench export clips shards/ clips/ --layout musubi --size 832x480`
     """
-    from stereogenbench_data.bridges.clips import ExportRun, export_clips
+    from stereogenbench_data.bridges.clips import export_clips
     from stereogenbench_data.schema.text import counted
 
     form, selection = clip.form(), chosen.filters() | {"pairs": chosen.pairs}
@@ -128,8 +99,9 @@ def clips(  # noqa: PLR0913 - one parameter an option
             index,
             out,
             layout=layout,
-            form=form,
-            run=ExportRun(progress=progress, **work.options()),
+            progress=progress,
+            **form,
+            **work.options(),
             **selection,
         )
     if report.evaluation_scenes:

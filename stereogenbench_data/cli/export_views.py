@@ -1,7 +1,7 @@
 """``stereogenbench export colmap``, ``transforms``, ``ply``, ``moge``: several views, as files."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
@@ -54,12 +54,8 @@ class ViewOptions(SceneOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class FolderOptions(ViewOptions):
-    """The same, with what makes a folder and how many points are in it."""
+    """The same, with how many points are in a folder."""
 
-    group: Annotated[
-        Literal["moment", "scene"],
-        typer.Option(help="A folder for each moment, in which nothing moves, or for each scene."),
-    ] = "moment"
     points: Annotated[
         Any,
         typer.Option(
@@ -71,7 +67,7 @@ class FolderOptions(ViewOptions):
 
     def selection(self) -> dict[str, Any]:
         """Return the options of `export_views` that were given."""
-        return super().selection() | {"group": self.group, "points": self.points}
+        return super().selection() | {"points": self.points}
 
 
 @grouped
@@ -108,7 +104,8 @@ def ply(source: DataOptions, out: OutArgument, *, chosen: FolderOptions, work: W
     """Write coloured point clouds from depth as PLY.
 
     Points are in metres, x right, y down, z forward. Each folder has points.ply, and
-    stereogenbench.json with the cameras. A stopped run goes on if it is run again.
+    stereogenbench.json with the way back to the scene's world. A stopped run goes on if it is run
+    again.
 
     Example: `stereogenbench export ply shards/ clouds/ --points all`
     """

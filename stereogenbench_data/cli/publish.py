@@ -68,7 +68,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Descriptor to write, with tables beside.")
     ] = None,
-    check: Annotated[bool, flag("--check", "Check a descriptor and its files.")] = False,
+    check: Annotated[bool, flag("--check", "Check a descriptor.")] = False,
     base_url: Annotated[
         str | None,
         typer.Option(help="URL of the data, pinned to a revision [paths from the descriptor]."),
@@ -93,8 +93,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
 ) -> None:
     """Write a Croissant 1.1 descriptor, or check one.
 
-    The check is mlcroissant's own (extra 'croissant'), and of the properties on responsible use
-    and the files that are beside the descriptor: size and checksum.
+    The check is mlcroissant's own (extra 'croissant'), and of the properties on responsible use.
 
     Example: `stereogenbench publish croissant shards/ -o croissant/sample.json`
     """
@@ -198,13 +197,13 @@ def upload(
 
     Example: `stereogenbench publish upload packed/ ORG/NAME`
     """
-    from stereogenbench_data.bridges.upload import prepare_upload
     from stereogenbench_data.bridges.upload import upload as uploaded
 
     # The Hub's client has progress bars of its own.
     with progress_bar("picturing", unit="scenes") as progress:
-        prepare_upload(Path(shards), repository, about=_stated(about), progress=progress)
-    report = uploaded(Path(shards), repository, branch=branch, about=_stated(about))
+        report = uploaded(
+            Path(shards), repository, branch=branch, about=_stated(about), progress=progress
+        )
     if as_json:
         typer.echo(json.dumps(asdict(report), indent=2))
         return

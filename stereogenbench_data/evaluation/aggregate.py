@@ -5,11 +5,14 @@ Every scene counts once, whatever the number of its frames and pairs. Intervals 
 
 import hashlib
 import math
-from bisect import bisect_right
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
+from operator import attrgetter
 from statistics import median
 from typing import Any, Final, TypeVar
+
+import numpy as np
 
 from stereogenbench_data.errors import EvaluationError, missing_extra
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
@@ -18,7 +21,6 @@ from stereogenbench_data.index.table import SceneIndex
 
 CONFIDENCE: Final = 0.95
 _DISTINCT_VALUES: Final = 6
-_QUARTERS: Final = 4
 
 Group = TypeVar("Group", bound=Hashable)
 
@@ -38,6 +40,11 @@ class Tally:
     finite: int
     infinite: int
     undefined: int
+
+    @property
+    def text(self) -> str:
+        """The mean in full, "inf" where all are infinite, empty where there is none."""
+        return repr(self.mean) if self.finite else "inf" if self.infinite else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,17 +144,14 @@ def half_interval(means: Sequence[float]) -> float | None:
     >>> round(half_interval([1.0, 2.0, 3.0]), 4)
     2.4841
     """
-    count = len(means)
-    if count < 2:
+    if len(means) < 2:
         return None
     try:
-        from scipy.stats import t as student_t
+        from scipy import stats
     except ImportError as error:
         raise missing_extra("confidence intervals", "evaluation", error) from None
-    centre = math.fsum(means) / count
-    variance = math.fsum((each - centre) ** 2 for each in means) / (count - 1)
-    quantile = float(student_t.ppf((1 + CONFIDENCE) / 2, count - 1))
-    return quantile * math.sqrt(variance / count)
+    quantile = stats.t.ppf((1 + CONFIDENCE) / 2, len(means) - 1)
+    return float(quantile * stats.sem(means))
 
 
 def group_by(
@@ -184,26 +188,23 @@ def strata(values: Sequence[Any], *, name: str, edges: Sequence[float] = ()) -> 
         raise EvaluationError(
             f"edges of {name} must be at least two ascending numbers, got {edges}."
         )
+    if not edges and len(set(known)) <= _DISTINCT_VALUES:
+        return [f"{number:g}" if math.isfinite(number) else "not known" for number in values]
     if not edges:
-        if len(set(known)) <= _DISTINCT_VALUES:
-            return [f"{number:g}" if math.isfinite(number) else "not known" for number in values]
-        last = len(known) - 1
-        quarters = (known[round(part * last / _QUARTERS)] for part in range(1, _QUARTERS))
-        inner = {float(f"{number:.4g}") for number in quarters}
+        inner = {float(f"{each:.4g}") for each in np.quantile(known, (0.25, 0.5, 0.75))}
         edges = sorted(inner | {known[0], known[-1]})
-    return [_between(number, edges) for number in values]
-
-
-def _between(number: float, edges: Sequence[float]) -> str:
-    if not math.isfinite(number):
-        return "not known"
-    if number < edges[0]:
-        return f"(-inf,{edges[0]:g})"
-    if number > edges[-1]:
-        return f"({edges[-1]:g},inf)"
-    last = len(edges) - 2
-    place = min(bisect_right(edges, number) - 1, last)
-    return f"[{edges[place]:g},{edges[place + 1]:g}" + ("]" if place == last else ")")
+    names = [f"[{low:g},{high:g})" for low, high in pairwise(edges)]
+    names = [
+        f"(-inf,{edges[0]:g})",
+        *names[:-1],
+        f"{names[-1][:-1]}]",
+        f"({edges[-1]:g},inf)",
+        "not known",
+    ]
+    places = np.searchsorted(edges, values, side="right")
+    places[np.asarray(values) == edges[-1]] -= 1
+    places[~np.isfinite(values)] = len(names) - 1
+    return [names[place] for place in places]
 
 
 Labels = tuple[str, ...]
@@ -251,11 +252,8 @@ def require_comparable(results: Sequence[Scores]) -> None:
         raise EvaluationError("a table needs the scores of at least one method, got none.")
     first = results[0]
     for other in results[1:]:
-        for what, here, there in (
-            ("tier", first.tier, other.tier),
-            ("protocol", first.protocol, other.protocol),
-            ("data", first.index.digest, other.index.digest),
-        ):
+        for what in ("tier", "protocol", "index.digest"):
+            here, there = (attrgetter(what)(one) for one in (first, other))
             if here != there:
                 raise EvaluationError(
                     f"{first.name} and {other.name} cannot share a table: their {what} differs "

@@ -29,7 +29,7 @@ _SD_FITS: Final = {"filtered": "filtered", "least_squares": "least squares"}
 """The fits of SD and what tables call them; the first is the one beside the paper's numbers."""
 
 
-_EXPLAIN_A_FIT: Final = {
+EXPLAIN_A_FIT: Final = {
     "slope": ("a", 4, "slope of true on found disparity"),
     "offset_px": ("b", 2, "px; offset of the fit"),
     "valid": ("fit pixels", 3, "share of pixels in the fit"),
@@ -37,6 +37,7 @@ _EXPLAIN_A_FIT: Final = {
     "residual_px": ("residual", 2, "px; standard deviation of the residuals"),
     "r2": ("R2", 3, "share of variance explained"),
 }
+"""What explains a fit of SD: the attribute of a `ScaleFit`, its label, decimals and meaning."""
 
 COLUMNS: Final[dict[str, Column]] = {
     "psnr": Column("PSNR", "higher", 2, "dB; identical pictures are counted, not averaged"),
@@ -73,7 +74,7 @@ COLUMNS: Final[dict[str, Column]] = {
     **{
         f"sd_{fit}_{name}": Column(f"{label} {words}", "neither", digits, meaning, "stereo_matcher")
         for fit, words in _SD_FITS.items()
-        for name, (label, digits, meaning) in _EXPLAIN_A_FIT.items()
+        for name, (label, digits, meaning) in EXPLAIN_A_FIT.items()
     },
 }
 """Columns of frames, headline columns first."""
@@ -97,16 +98,17 @@ the paper leaves outliers out, though it does not state by which rule.
 HEAVY_TAILED: Final = frozenset(f"sd_{fit}" for fit in _SD_FITS)
 """Columns whose mean a few scenes can dominate: their median is shown and judged."""
 
-PAIR_METRICS: Final[dict[str, str]] = {"lpips": "lpips"}
-"""Learned metrics of pairs of pictures, and the models that they are computed with."""
+LEARNED: Final[dict[str, tuple[str, str]]] = {
+    "lpips": ("pair metric", "lpips"),
+    "fid": ("image features", "inception"),
+    "fvd": ("video features", "i3d"),
+}
+"""The learned metrics, with the kind and the name of the model that computes each.
 
-IMAGE_DISTANCES: Final[dict[str, str]] = {"fid": "inception"}
-"""Distances between sets of frames, and the features that each is of."""
+Features make distances between sets: of frames, or of clips, one clip a pair.
+"""
 
-VIDEO_DISTANCES: Final[dict[str, str]] = {"fvd": "i3d"}
-"""Distances between sets of clips, one clip a pair, and the features that each is of."""
-
-METRICS: Final = (*FRAME_METRICS, *IMAGE_DISTANCES, *VIDEO_DISTANCES)
+METRICS: Final = (*FRAME_METRICS, *(name for name in LEARNED if name not in FRAME_METRICS))
 OFFLINE_METRICS: Final = ("psnr", "ssim", "e_match", "p_psnr", "sd")
 """What is computed by default: nothing that needs weights."""
 

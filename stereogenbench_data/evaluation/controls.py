@@ -16,8 +16,7 @@ import numpy as np
 
 from stereogenbench_data.datasets.mapped import Data
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.aggregate import CONTROL, Scores, cell
-from stereogenbench_data.evaluation.columns import COLUMNS, HEAVY_TAILED
+from stereogenbench_data.evaluation.aggregate import CONTROL, Scores
 from stereogenbench_data.evaluation.evaluate import (
     EvaluationOptions,
     Run,
@@ -46,25 +45,20 @@ class SameFrame:
 
     Attributes:
         name: What tables call it.
-        view: "right" or "left".
+        inputs: The view, "right" or "left".
     """
 
     name: str
-    view: str
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """The view."""
-        return (self.view,)
+    inputs: tuple[str, ...]
 
     def stamp(self, wanted: PairFrames) -> str:
         """Return what it is."""
-        return f"its {self.view} view"
+        return f"its {self.inputs[0]} view"
 
     @contextmanager
     def open(self, index: SceneIndex) -> Iterator[Read]:
         """Yield a function that returns the view of each sample."""
-        yield lambda wanted, samples: [sample[self.view] for sample in samples]
+        yield lambda wanted, samples: [sample[self.inputs[0]] for sample in samples]
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,8 +164,8 @@ def score_controls(
     run = Run(
         protocol=protocol,
         sources=(
-            SameFrame(TARGET, "right"),
-            SameFrame(COPIED_LEFT, "left"),
+            SameFrame(TARGET, ("right",)),
+            SameFrame(COPIED_LEFT, ("left",)),
             OtherView(WRONG_BASELINE, protocol.size),
             OtherView(RANDOM_RIGHT, protocol.size, donors=donors),
         ),
@@ -180,113 +174,3 @@ def score_controls(
         settings={"seed": seed},
     )
     return score_workload(workload, run, options)
-
-
-_SLOPE_TOLERANCE: Final = 0.1
-"""How far from the ratio of baselines a matcher may put the wrong baseline's slope."""
-_TRUSTED_R2: Final = 0.8
-"""The least share of variance that a fit must explain for its slope to be judged: a matcher whose
-search is too short for a wide baseline answers with wrong disparities."""
-
-
-@dataclass(frozen=True, slots=True)
-class Relation:
-    """One relation between controls, over all scenes that were scored.
-
-    Attributes:
-        what: The relation, in words.
-        holds: Whether it does; None if undecided.
-        found: The numbers that it was judged by.
-    """
-
-    what: str
-    holds: bool | None
-    found: str
-
-
-def relations(results: Sequence[Scores]) -> list[Relation]:
-    """Judge the relations between the four controls, as far as their metrics allow.
-
-    Args:
-        results: The scores of all of `CONTROLS`.
-    """
-    by_name = {one.name: one for one in results}
-    target, copied, wrong, random = (by_name[name] for name in CONTROLS)
-    metrics = target.protocol.metrics
-    judged: list[Relation] = []
-    if "psnr" in metrics:
-        identical = cell(target.pairs, "psnr").infinite
-        frames = sum(pair.frames for pair in target.pairs)
-        what = f"every frame of the {TARGET} is identical"
-        judged.append(Relation(what, identical == frames, f"{identical} of {frames}"))
-        judged.append(_ordered("psnr", [random], below=[copied, wrong]))
-    if "ssim" in metrics:
-        judged.append(_ordered("ssim", [copied, wrong, random], below=[target]))
-        judged.append(_ordered("ssim", [random], below=[copied, wrong]))
-    if "p_psnr" in metrics:
-        judged.append(_ordered("p_psnr", [random], below=[target, copied, wrong]))
-    if "e_match" in metrics:
-        for one, what in ((target, "is 0"), (copied, "is above 0")):
-            mean = _middle("e_match", one)
-            holds = None if mean is None else mean == 0 if one is target else mean > 0
-            what = f"{_label('e_match')} of {one.name} {what}"
-            judged.append(Relation(what, holds, _means_text("e_match", [one])))
-        judged.append(_ordered("e_match", [target, copied, wrong], below=[random]))
-    if "sd" in metrics:
-        judged.append(_ordered("sd_filtered", [target], below=[copied]))
-        judged.append(_ordered("sd_filtered", [target], below=[wrong]))
-        judged.append(_slope(wrong))
-    return judged
-
-
-def _ordered(column: str, lower: Sequence[Scores], *, below: Sequence[Scores]) -> Relation:
-    lows, highs = ([_middle(column, one) for one in side] for side in (lower, below))
-    names = [", ".join(one.name for one in side) for side in (lower, below)]
-    low, high = ([mean for mean in side if mean is not None] for side in (lows, highs))
-    return Relation(
-        f"{_label(column)} of {names[0]} is below that of {names[1]}",
-        None if None in lows + highs else max(low) < min(high),
-        _means_text(column, [*lower, *below]),
-    )
-
-
-def _slope(wrong: Scores) -> Relation:
-    """Judge whether the wrong camera's disparity is too large by the ratio of the baselines."""
-    label = _label("sd_filtered_slope")
-    what = f"the slope {label} of {WRONG_BASELINE} is the ratio of the two baselines"
-    off = []
-    for pair in wrong.pairs:
-        slope, r2 = pair.tallies["sd_filtered_slope"], pair.tallies["sd_filtered_r2"]
-        if slope.finite and r2.mean >= _TRUSTED_R2:
-            rig = wrong.index.scene(pair.row).rig
-            other_cm = rig.baseline_cm(pair.pair[0], wrong_camera(*pair.pair))
-            off.append(abs(slope.mean - pair.baseline_cm / other_cm))
-    if not off:
-        return Relation(what, None, "no fit explains enough of the variance")
-    off.sort()
-    middle = off[len(off) // 2]
-    return Relation(
-        what,
-        middle <= _SLOPE_TOLERANCE,
-        f"off by {middle:.3f} in the middle of {len(off)} pairs, {off[-1]:.3f} at most",
-    )
-
-
-def _middle(column: str, one: Scores) -> float | None:
-    """Return the mean over scenes; of SD, whose tail is heavy, the median."""
-    found = cell(one.pairs, column)
-    return found.median if column in HEAVY_TAILED else found.mean
-
-
-def _label(column: str) -> str:
-    label = COLUMNS[column].label
-    return f"median {label}" if column in HEAVY_TAILED else label
-
-
-def _means_text(column: str, sides: Sequence[Scores]) -> str:
-    digits = COLUMNS[column].digits
-    texts = []
-    for one in sides:
-        mean = _middle(column, one)
-        texts.append(f"{one.name} {'undefined' if mean is None else format(mean, f'.{digits}f')}")
-    return ", ".join(texts)

@@ -13,15 +13,13 @@ from typing import Any, Final, TypedDict, Unpack
 from stereogenbench_data.datasets.mapped import Data, StereoPairs, opened
 from stereogenbench_data.engine import LOCAL, Engine, Progress
 from stereogenbench_data.errors import EvaluationError, PredictionError, StorageError
-from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, group_by, tally
-from stereogenbench_data.evaluation.columns import IMAGE_DISTANCES, VIDEO_DISTANCES
+from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, tally
 from stereogenbench_data.evaluation.frame_metrics import fields_of, models_of
 from stereogenbench_data.evaluation.metrics.frechet import (
     FeatureStatistics,
     FrechetDistance,
     frechet_distance,
 )
-from stereogenbench_data.evaluation.partial import EVALUATION, FORMAT, PartialResults
 from stereogenbench_data.evaluation.predictions import (
     CalledMethod,
     Method,
@@ -30,7 +28,14 @@ from stereogenbench_data.evaluation.predictions import (
     PredictionSource,
 )
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, require_tier
-from stereogenbench_data.evaluation.scene_scores import SceneScores, SceneWork, score_scene
+from stereogenbench_data.evaluation.scene_scores import (
+    EVALUATION,
+    FORMAT,
+    PartialResults,
+    SceneScores,
+    SceneWork,
+    score_scene,
+)
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import do_items, job_folder
 from stereogenbench_data.schema.conventions import Conventions
@@ -42,7 +47,6 @@ from stereogenbench_data.selection.plan import Selection
 from stereogenbench_data.selection.windows import Random
 
 _PROBLEMS_SHOWN: Final = 2
-_BRANCH: Final = ("subset", "family")
 
 
 class RunOptions(TypedDict, total=False):
@@ -112,13 +116,12 @@ def evaluate(
         source = CalledMethod(called, predictions, known)
         options["workers"], options["engine"] = 1, LOCAL
     else:
-        root = Path(predictions)
+        root = Path(predictions).resolve()
         if not root.is_dir():
             raise EvaluationError(
-                f"{root}: is not a folder. Pass the folder that holds the predicted right views, "
-                f"ITEM/000.png ... or ITEM.mp4."
+                f"{root}: is not a folder. Pass the folder that holds the predicted right views."
             )
-        source = PredictionFolder(name or root.resolve().name, root.resolve())
+        source = PredictionFolder(name or root.name, root)
     workload = select_workload(
         data, protocol, inputs=source.inputs, options=options, conventions=conventions
     )
@@ -145,15 +148,6 @@ class Workload:
         """How many frames of pairs there are."""
         return sum(len(pair.frames) for pairs in self.pairs for pair in pairs)
 
-    def index_of(self, rows: Sequence[int]) -> SceneIndex:
-        """Return an index of a few rows, small enough to be sent to a process with its work."""
-        return SceneIndex.from_scenes(
-            [self.index.scene(row) for row in rows],
-            self.index.root,
-            shards=self.index.shards,
-            retry=self.index.retry,
-        )
-
 
 def select_workload(
     data: Data,
@@ -178,22 +172,16 @@ def select_workload(
         EvaluationError: If the samples are clips, random frames, sweeps or right to left.
         StorageError: If the data were derived for training, whose pictures have an error.
     """
-    selection: dict[str, Any] = {
-        key: value for key, value in options.items() if key not in RunOptions.__optional_keys__
-    }
+    selection = {name: options[name] for name in options.keys() - RunOptions.__optional_keys__}
     selection.setdefault("frames", "all")
     wanted = may_pass(selection)
     data = opened(data, selection, conventions, rows="read")
     lost = [] if data.is_from_file else [
-        key for key in data.broken if wanted is None or wanted(parse_scene_key(key))
+        f"{key}: {why}"
+        for key, why in data.broken.items()
+        if wanted is None or wanted(parse_scene_key(key))
     ]  # fmt: skip
-    if lost:
-        raise StorageError(
-            f"{data.where}: {counted(len(lost), 'scene')} cannot be used, such as {lost[0]}: "
-            f"{data.broken[lost[0]]} A score is not computed on fewer scenes unless you ask for "
-            f"it: mend them, choose others with filters, or leave them out on purpose by an index "
-            f"of the others (`stereogenbench index`)."
-        )
+    _require_whole(data, len(lost), *lost[:1])
     data.require_released("The evaluation")
     # Tables group pairs by their baselines, whatever metrics and inputs need.
     needed = (*fields_of(protocol), *inputs, "baseline_m")
@@ -205,12 +193,7 @@ def select_workload(
         **selection,
     )
     plan, index = dataset.plan, dataset.index
-    if dataset.left_out:
-        raise StorageError(
-            f"{index.where}: {counted(dataset.left_out, 'selected scene')} cannot be scored, as "
-            f"the warning says, and a score is not computed on fewer scenes unless you ask for it: "
-            f"leave them out with filters, such as scenes=..., or mend their files."
-        )
+    _require_whole(index, dataset.left_out, "the warning says why.")
     chosen, windows = plan.pairs, plan.windows
     if windows.is_clip or isinstance(windows, Random):
         raise EvaluationError(
@@ -225,26 +208,35 @@ def select_workload(
             f"'all' or (left, right) numbers."
         )
     rows = tuple(int(row) for row in plan.scene_rows)
-    pairs = []
-    for place, scene in enumerate(map(index.scene, rows)):
-        frames = tuple(
-            windows.window(number, frames=scene.frames, draw=(0,))[0]
-            for number in range(windows.count(scene.frames))
-        )
-        pairs.append(
-            tuple(
-                PairFrames(
-                    scene=scene.id.key,
-                    pair=(int(chosen.source[number]), int(chosen.targets[number, 0])),
-                    frames=frames,
-                    scene_frames=scene.frames,
-                    size=protocol.size,
-                    stored_size=(scene.rig.image_height_px, scene.rig.image_width_px),
-                )
-                for number in range(int(plan.first_pair[place]), int(plan.first_pair[place + 1]))
+    pairs: dict[int, list[PairFrames]] = {row: [] for row in rows}
+    for row, left, right in zip(
+        chosen.row.tolist(), chosen.source.tolist(), chosen.targets[:, 0].tolist(), strict=True
+    ):
+        scene = index.scene(row)
+        pairs[row].append(
+            PairFrames(
+                scene=scene.id.key,
+                pair=(left, right),
+                frames=tuple(
+                    windows.window(number, frames=scene.frames, draw=(0,))[0]
+                    for number in range(windows.count(scene.frames))
+                ),
+                scene_frames=scene.frames,
+                size=protocol.size,
+                stored_size=(scene.rig.image_height_px, scene.rig.image_width_px),
             )
         )
-    return Workload(index=index, rows=rows, pairs=tuple(pairs))
+    return Workload(index=index, rows=rows, pairs=tuple(map(tuple, pairs.values())))
+
+
+def _require_whole(index: SceneIndex, lost: int, why: str = "") -> None:
+    if lost:
+        raise StorageError(
+            f"{index.where}: {counted(lost, 'selected scene')} cannot be scored: {why} A score is "
+            f"not computed on fewer scenes unless you ask for it: mend their files, leave them out "
+            f"with filters, such as scenes=..., or by an index of the others (`stereogenbench "
+            f"index`)."
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,22 +291,9 @@ def score_workload(
             stack.enter_context(job_folder(Path(out), state, kind=EVALUATION))
             partial = PartialResults(Path(out))
             _score_missing_scenes(workload, run, partial, options)
-            results = []
-            for source in run.sources:
-                means = _pair_means(workload, partial, source.name)
-                distances = _distances(workload.index, partial, source.name, means, run.protocol)
-                results.append(
-                    Scores(
-                        name=source.name,
-                        tier=run.tier,
-                        protocol=run.protocol,
-                        settings=settings,
-                        index=workload.index,
-                        pairs=means,
-                        distances=distances,
-                    )
-                )
-        return results
+            return [
+                _scores(workload, run, partial, source.name, settings) for source in run.sources
+            ]
     finally:
         models_of.cache_clear()
 
@@ -344,18 +323,17 @@ def _score_missing_scenes(
                     stamp = ""
                     missing.append(str(problem))
                 stamps[scene][source.name, pair.pair] = stamp
-        known = partial.problems(scene, stamps=stamps[scene], columns=run.protocol.columns)
+        known = partial.problems(scene, stamps=stamps[scene])
         if known is not None:
             done_frames += sum(len(pair.frames) for pair in pairs)
             problems.extend(known)
             continue
         works.append(
             SceneWork(
-                index=workload.index_of(sorted({row, rows[run.donors.get(scene, scene)]})),
+                index=workload.index.only({row, rows[run.donors.get(scene, scene)]}),
                 pairs=pairs,
                 protocol=run.protocol,
                 sources=run.sources,
-                on_problem="count" if allowed else "raise",
             )
         )
     _require_few(missing, allowed=allowed)
@@ -363,9 +341,9 @@ def _score_missing_scenes(
 
     def keep(result: tuple[str, SceneScores]) -> None:
         scene, scores = result
-        partial.write(scene, scores, stamps=stamps[scene])
         problems.extend(found.problem for found in scores.values() if found.problem)
         _require_few(problems, allowed=allowed)
+        partial.write(scene, scores, stamps=stamps[scene])
 
     do_items(
         score_scene,
@@ -381,32 +359,33 @@ def _score_missing_scenes(
 
 
 def _require_few(problems: Sequence[str], *, allowed: int) -> None:
-    if len(problems) <= allowed:
-        return
-    shown = "; ".join(each.rstrip(".") for each in problems[:_PROBLEMS_SHOWN])
-    more = (
-        f"; and {len(problems) - _PROBLEMS_SHOWN} more" if len(problems) > _PROBLEMS_SHOWN else ""
-    )
-    raise EvaluationError(
-        f"{counted(len(problems), 'prediction')} missing or unusable, and {allowed} allowed "
-        f"(--allow-missing): {shown}{more}."
-    )
+    if len(problems) > allowed:
+        shown = "; ".join(each.rstrip(".") for each in problems[:_PROBLEMS_SHOWN])
+        raise PredictionError(
+            f"{counted(len(problems), 'prediction')} missing or unusable, and {allowed} allowed "
+            f"(--allow-missing), such as: {shown}."
+        )
 
 
-def _pair_means(workload: Workload, partial: PartialResults, name: str) -> tuple[PairMeans, ...]:
-    """Return the averages of every pair; one scene's frames are in memory at a time."""
-    means = []
+def _scores(
+    workload: Workload, run: Run, partial: PartialResults, name: str, settings: Mapping[str, Any]
+) -> Scores:
+    """Return what a source scored; one scene's frames and features are in memory at a time."""
+    index, means = workload.index, []
+    gathered: dict[tuple[Labels, str], tuple[FeatureStatistics, FeatureStatistics]] = {}
     for row, pairs in zip(workload.rows, workload.pairs, strict=True):
-        scene = workload.index.scene(row)
+        scene = index.scene(row)
+        branch: Labels = (scene.id.subset or "", scene.id.family)
         found = partial.read(scene.id.key, [(name, each.pair) for each in pairs])
         for each in pairs:
             scores = found[name, each.pair]
+            is_primary = each.pair == scene.rig.primary_pair
             means.append(
                 PairMeans(
                     row=row,
                     scene=each.scene,
                     pair=each.pair,
-                    is_primary=each.pair == scene.rig.primary_pair,
+                    is_primary=is_primary,
                     baseline_cm=scene.rig.baseline_cm(*each.pair),
                     frames=len(each.frames),
                     tallies={column: tally(numbers) for column, numbers in scores.columns.items()},
@@ -414,37 +393,15 @@ def _pair_means(workload: Workload, partial: PartialResults, name: str) -> tuple
                     views_sha256=scores.views_sha256,
                 )
             )
-    return tuple(means)
-
-
-def _distances(
-    index: SceneIndex,
-    partial: PartialResults,
-    name: str,
-    pairs: Sequence[PairMeans],
-    protocol: EvaluationProtocol,
-) -> dict[Labels, dict[str, FrechetDistance]]:
-    """Return the distances between sets of each branch; features are merged scene by scene."""
-    metrics = [each for each in protocol.metrics if each in IMAGE_DISTANCES | VIDEO_DISTANCES]
-    if not metrics:
-        return {}
-
-    def branch_of(pair: PairMeans) -> Labels:
-        return tuple(str(index.column(key)[pair.row] or "") for key in _BRANCH)
-
-    distances = {}
-    scored_pairs = (pair for pair in pairs if pair.is_primary and not pair.problem)
-    for labels, group in group_by(scored_pairs, branch_of).items():
-        sides: dict[tuple[str, str], FeatureStatistics] = {}
-        for pair in group:
-            found = partial.read(pair.scene, [(name, pair.pair)])[name, pair.pair]
-            for side, statistics in (("predicted", found.predicted), ("target", found.target)):
-                for metric in metrics:
-                    new = statistics[metric]
-                    before = sides.get((metric, side), FeatureStatistics.empty(new.dim))
-                    sides[metric, side] = before.merged(new)
-        distances[labels] = {
-            metric: frechet_distance(sides[metric, "predicted"], sides[metric, "target"])
-            for metric in metrics
-        }
-    return distances
+            for metric in scores.predicted if is_primary else ():
+                sides = scores.predicted[metric], scores.target[metric]
+                before = gathered.get((branch, metric))
+                gathered[branch, metric] = (
+                    sides
+                    if before is None
+                    else (before[0].merged(sides[0]), before[1].merged(sides[1]))
+                )
+    distances: dict[Labels, dict[str, FrechetDistance]] = {}
+    for (branch, metric), sides in gathered.items():
+        distances.setdefault(branch, {})[metric] = frechet_distance(*sides)
+    return Scores(name, run.tier, run.protocol, settings, index, tuple(means), distances)

@@ -4,23 +4,20 @@ A new metric is a new row of `FRAME_METRIC_ROWS`, and its columns in `columns`. 
 stands what its rows are computed from: the models of a protocol, and a frame of the target.
 """
 
+from collections import ChainMap
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final
 
 from av.video.reformatter import VideoReformatter
 
-from stereogenbench_data.evaluation.columns import (
-    IMAGE_DISTANCES,
-    PAIR_METRICS,
-    VIDEO_DISTANCES,
-)
+from stereogenbench_data.evaluation.columns import EXPLAIN_A_FIT, LEARNED
 from stereogenbench_data.evaluation.metrics import matching, pixels, scale
 from stereogenbench_data.evaluation.models import interfaces
-from stereogenbench_data.evaluation.models.registry import ModelKind, load_model
+from stereogenbench_data.evaluation.models.registry import load_model
 from stereogenbench_data.evaluation.predictions import scaled_rgb
 from stereogenbench_data.evaluation.protocol import PROTOCOL_VERSION, EvaluationProtocol
 from stereogenbench_data.samples.fields import Sample
@@ -36,56 +33,34 @@ _VERSIONS: Final = ("stereogenbench-data", "numpy", "opencv-python-headless", "o
 
 
 class MetricModels:
-    """The models that a protocol's metrics are computed with, loaded when first used."""
+    """The models that a protocol's metrics are computed with, loaded when first used.
+
+    Attributes:
+        protocol: The protocol.
+    """
 
     def __init__(self, protocol: EvaluationProtocol) -> None:
         """Take the protocol; nothing is loaded yet."""
         self.protocol = protocol
 
-    def __repr__(self) -> str:
-        """Return a summary."""
-        return f"MetricModels({', '.join(self.protocol.metrics)})"
+    @cached_property
+    def keypoint_matcher(self) -> Any:
+        """What finds the matches of E_match, a `KeypointMatcher`."""
+        return load_model("keypoint matcher", self.protocol.keypoint_matcher, self.protocol.models)
 
     @cached_property
-    def keypoint_matcher(self) -> interfaces.KeypointMatcher:
-        """What finds the matches of E_match."""
-        matcher: interfaces.KeypointMatcher = self._load(
-            "keypoint matcher", self.protocol.keypoint_matcher
-        )
-        return matcher
+    def stereo_matcher(self) -> Any:
+        """What finds the disparity of SD, a `StereoMatcher`."""
+        return load_model("stereo matcher", self.protocol.stereo_matcher, self.protocol.models)
 
     @cached_property
-    def stereo_matcher(self) -> interfaces.StereoMatcher:
-        """What finds the disparity of SD."""
-        matcher: interfaces.StereoMatcher = self._load(
-            "stereo matcher", self.protocol.stereo_matcher
-        )
-        return matcher
-
-    @cached_property
-    def pair_metrics(self) -> dict[str, interfaces.PairMetric]:
-        """The learned metrics of pairs of pictures, by column."""
-        return self._load_metrics("pair metric", PAIR_METRICS)
-
-    @cached_property
-    def image_features(self) -> dict[str, interfaces.ImageFeatures]:
-        """The features of each distance between sets of frames."""
-        return self._load_metrics("image features", IMAGE_DISTANCES)
-
-    @cached_property
-    def video_features(self) -> dict[str, interfaces.VideoFeatures]:
-        """The features of each distance between sets of clips."""
-        return self._load_metrics("video features", VIDEO_DISTANCES)
-
-    def _load(self, kind: ModelKind, name: str) -> Any:
-        return load_model(kind, name, self.protocol.models)
-
-    def _load_metrics(self, kind: ModelKind, names: Mapping[str, str]) -> dict[str, Any]:
-        return {
-            metric: self._load(kind, names[metric])
-            for metric in self.protocol.metrics
-            if metric in names
-        }
+    def learned(self) -> dict[str, dict[str, Any]]:
+        """The models of the learned metrics, by kind and metric."""
+        found: dict[str, dict[str, Any]] = {kind: {} for kind, _ in LEARNED.values()}
+        for metric, (kind, name) in LEARNED.items():
+            if metric in self.protocol.metrics:
+                found[kind][metric] = load_model(kind, name, self.protocol.models)
+        return found
 
     def settings(self) -> dict[str, Any]:
         """Return every choice that the scores depend on, as plain values.
@@ -107,14 +82,10 @@ class MetricModels:
         for package in _VERSIONS:
             with suppress(PackageNotFoundError):
                 settings["versions"][package] = version(package)
-        learned: Mapping[str, Any] = self.pair_metrics | self.image_features | self.video_features
+        learned = ChainMap(*self.learned.values())
         for name in protocol.metrics:
-            found = (
-                FRAME_METRIC_ROWS[name].settings(self)
-                if name in FRAME_METRIC_ROWS
-                else learned[name].settings
-            )
-            settings[name] = dict(found)
+            row = FRAME_METRIC_ROWS.get(name)
+            settings[name] = dict(row.settings(self) if row else learned[name].settings)
         return settings
 
 
@@ -127,33 +98,21 @@ def models_of(protocol: EvaluationProtocol) -> MetricModels:
     return MetricModels(protocol)
 
 
-@dataclass(frozen=True, slots=True)
 class CachedKeypoints:
-    """The models' keypoint matcher; it detects the keypoints of one and the same array once."""
+    """A keypoint matcher that detects the keypoints of one and the same array once."""
 
-    models: MetricModels
-    found: dict[int, tuple[Any, interfaces.Keypoints]] = field(default_factory=dict)
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-        return self.models.keypoint_matcher.name
-
-    @property
-    def settings(self) -> interfaces.Settings:
-        """Its settings."""
-        return self.models.keypoint_matcher.settings
+    def __init__(self, matcher: interfaces.KeypointMatcher) -> None:
+        """Take the matcher."""
+        self.name, self.settings, self.match = matcher.name, matcher.settings, matcher.match
+        self._detect = matcher.detect
+        self._found: dict[int, tuple[Any, interfaces.Keypoints]] = {}
 
     def detect(self, picture: interfaces.Picture) -> interfaces.Keypoints:
         """Return the keypoints of a picture."""
-        if id(picture) not in self.found:
+        if id(picture) not in self._found:
             # The picture is kept too, so that no other takes its identity.
-            self.found[id(picture)] = picture, self.models.keypoint_matcher.detect(picture)
-        return self.found[id(picture)][1]
-
-    def match(self, left: interfaces.Keypoints, right: interfaces.Keypoints) -> Any:
-        """Return indices of matched keypoints."""
-        return self.models.keypoint_matcher.match(left, right)
+            self._found[id(picture)] = picture, self._detect(picture)
+        return self._found[id(picture)][1]
 
 
 class TargetFrame:
@@ -163,12 +122,10 @@ class TargetFrame:
         sample: Its fields, pictures at the evaluated size.
         left: The left view, uint8 (3, h, w).
         right: The rendered right view, uint8 (3, h, w).
-        matcher: The matcher of keypoints.
+        matcher: The matcher of keypoints; None where no metric needs one.
     """
 
-    def __init__(
-        self, sample: Sample, matcher: CachedKeypoints, *, load_stored: Callable[[], Sample]
-    ) -> None:
+    def __init__(self, sample: Sample, matcher: Any, *, load_stored: Callable[[], Sample]) -> None:
         """Take the sample; ``load_stored`` returns the one whose right view has its stored size."""
         self.sample = sample
         self.left, self.right = sample["left"], sample["right"]
@@ -227,16 +184,8 @@ def _sd(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, fl
             scored=target.sample["visible"][0],
             method=method,
         )
-        found |= {
-            f"sd_{method}": fit.drift,
-            f"sd_{method}_slope": fit.slope,
-            f"sd_{method}_offset_px": fit.offset_px,
-            f"sd_{method}_valid": fit.valid_ratio,
-            f"sd_{method}_outliers": fit.outlier_ratio,
-            f"sd_{method}_residual_px": fit.residual_std_px,
-            f"sd_{method}_r2": fit.r_squared,
-            "sd_answered": fit.answered_ratio,
-        }
+        found |= {f"sd_{method}": fit.drift, "sd_answered": fit.answered}
+        found |= {f"sd_{method}_{name}": getattr(fit, name) for name in EXPLAIN_A_FIT}
     return found
 
 
@@ -274,7 +223,7 @@ FRAME_METRIC_ROWS: Final[dict[str, FrameMetric]] = {
         ("disparity", "visible"),
     ),
 }
-"""Every metric of a frame but learned distances (`MetricModels.pair_metrics`), by name."""
+"""Every metric of a frame but the learned (`MetricModels.learned`), by name."""
 
 
 def fields_of(protocol: EvaluationProtocol) -> tuple[str, ...]:

@@ -115,7 +115,7 @@ def export_inputs(
     }
     with job_folder(root, settings, kind=INPUTS):
         works = [
-            _ItemWork(workload.index_of([row]), pair, known, depth, root / pair.item)
+            _ItemWork(workload.index.only([row]), pair, known, depth, root / pair.item)
             for row, pairs in zip(workload.rows, workload.pairs, strict=True)
             for pair in pairs
             if not (root / pair.item).is_dir()

@@ -236,24 +236,18 @@ def _read_png(path: Path, wanted: PairFrames) -> Any:
         with path.open("rb") as file:
             bits = file.read(_PNG_BITS_AT + 1)[_PNG_BITS_AT:]
             with Image.open(file, formats=["PNG"]) as image:
-                if image.mode != "RGB" or bits != b"\x08":
-                    depth = f" of {bits[0]} bits" if bits else ""
-                    raise PredictionError(
-                        f"{wanted.label}: {path} has pixels of mode {image.mode}{depth}: write "
-                        f"8-bit RGB."
-                    )
-                _require_size((image.height, image.width), path, wanted)
-                pixels = np.asarray(image)
-    except (OSError, SyntaxError, ValueError, zlib.error) as error:
-        if isinstance(error, PredictionError):
-            raise
+                mode, pixels = image.mode, np.asarray(image)
+    except (OSError, SyntaxError, ValueError, zlib.error, Image.DecompressionBombError) as error:
         if isinstance(error, OSError) and cure_of(error):
             raise StorageError(describe_os_error(f"{path}: cannot be read", error)) from error
         raise PredictionError(
             f"{wanted.label}: {path} cannot be read as a picture ({error})."
         ) from error
-    except Image.DecompressionBombError as error:
-        raise PredictionError(f"{wanted.label}: {path} is too large ({error}).") from error
+    if mode != "RGB" or bits != b"\x08":
+        raise PredictionError(
+            f"{wanted.label}: {path} has pixels of mode {mode} of {bits[0]} bits: write 8-bit RGB."
+        )
+    _require_size((pixels.shape[0], pixels.shape[1]), path, wanted)
     return np.ascontiguousarray(pixels.transpose(2, 0, 1))
 
 
@@ -388,34 +382,25 @@ class CalledMethod:
                 for name in self.inputs
             }
         )
-        if hasattr(given, "detach"):
-            tensor = given.detach().cpu()
-            given = (tensor.float() if tensor.is_floating_point() else tensor).numpy()
-        count, expected = len(samples), (3, *wanted.size)
-        where = f"{wanted.label}: {self.name}"
+        expected, where = (len(samples), 3, *wanted.size), f"{wanted.label}: {self.name}"
         try:
-            array = np.asarray(given)
+            views = torch.as_tensor(given).detach().cpu()
         except (RuntimeError, TypeError, ValueError) as error:
             raise PredictionError(
                 f"{where} returned a {type(given).__name__} that is not one array ({error}); "
-                f"expected {(count, *expected)}."
+                f"expected {expected}."
             ) from error
-        if array.ndim != 4 or len(array) != count or array.size == 0:
-            what = "None" if given is None else f"{array.dtype} {array.shape}"
-            raise PredictionError(
-                f"{where} was given {count} frames and returned {what}; "
-                f"expected {(count, *expected)}."
-            )
-        if array.dtype.kind == "f":
-            if not (np.isfinite(array).all() and array.min() >= 0 and array.max() <= 1):
+        if views.is_floating_point() and views.numel():
+            low, high = float(views.min()), float(views.max())
+            if not (low >= 0 and high <= 1):
                 raise PredictionError(
-                    f"{where} returned floats of {array.min():g} to {array.max():g}; "
-                    f"expected 0 to 1, or uint8."
+                    f"{where} returned floats of {low:g} to {high:g}; expected 0 to 1, or uint8."
                 )
-            array = (array * 255).round().astype(np.uint8)
-        if array.shape[1:] != expected or array.dtype != np.uint8:
+            precise = views.to(torch.promote_types(views.dtype, torch.float32))
+            views = (precise * 255).round().to(torch.uint8)
+        if views.shape != expected or views.dtype != torch.uint8:
             raise PredictionError(
-                f"{where} gave {array.dtype} {array.shape[1:]} for a frame; "
-                f"expected uint8 {expected}."
+                f"{where} was given {len(samples)} frames and returned {views.dtype} "
+                f"{tuple(views.shape)}; expected uint8, or floats of 0 to 1, {expected}."
             )
-        return list(array)
+        return list(views.numpy())

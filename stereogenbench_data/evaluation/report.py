@@ -1,52 +1,31 @@
-"""The report of an evaluation: a Markdown page, LaTeX, CSV and JSON tables, and plots."""
+"""The report of an evaluation: results.json, a page for people, plots; and two of them compared."""
 
 import csv
 import io
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from stereogenbench_data.errors import StorageError, describe_os_error
-from stereogenbench_data.evaluation.aggregate import CONTROL, Cell, PairMeans, Scores
+from stereogenbench_data.errors import EvaluationError, explain_os_errors
+from stereogenbench_data.evaluation.aggregate import CONTROL, Cell, Scores
 from stereogenbench_data.evaluation.columns import COLUMNS, HEAVY_TAILED
-from stereogenbench_data.evaluation.controls import Relation
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.predictions import pair_name
 from stereogenbench_data.evaluation.protocol import PROTOCOL_VERSION, TIERS
-from stereogenbench_data.evaluation.reference import DISCREPANCIES, PAPER
-from stereogenbench_data.evaluation.tables import Table, TableRow
+from stereogenbench_data.evaluation.tables import Table, Value
 from stereogenbench_data.schema.text import counted, markdown_text
 from stereogenbench_data.sources.files import write_atomic
 
-FORMAT: Final = 3
+FORMAT: Final = 4
 _GAPS_SHOWN: Final = 20
-_VERDICTS: Final[Mapping[bool | None, str]] = {
-    True: "holds",
-    False: "DOES NOT HOLD",
-    None: "cannot be told",
-}
 ABSENT: Final = "-"
 _ARROWS: Final = {"higher": "↑", "lower": "↓", "neither": ""}
-_LATEX: Final = {
-    "\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$",
-    "{": r"\{", "}": r"\}", "±": r"$\pm$", "↑": r"$\uparrow$", "↓": r"$\downarrow$",
-    "∞": r"$\infty$", "†": r"$^\dagger$", "≤": r"$\le$", "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$", "|": "$|$", "[": "{[}", "*": "{*}",
-}  # fmt: skip
-_CSV_HEAD: Final = (
-    "table", "method", "source", "group", "column", "mean", "ci95", "median", "scenes", "frames",
-    "infinite", "undefined", "missing_pairs", "printed",
-)  # fmt: skip
-_CSV_CELL: Final = ("mean", "ci95", "median", "scenes", "finite", "infinite", "undefined")
-"""The attributes of a `Cell` from "mean" to "undefined"."""
 
 
-def document(
-    results: Sequence[Scores], tables: Sequence[Table], *, found: Sequence[Relation] = ()
-) -> dict[str, Any]:
+def document(results: Sequence[Scores], tables: Sequence[Table]) -> dict[str, Any]:
     """Return an evaluation as plain values, to be written as JSON; no number in it is nan.
 
     It names what the scores are of: the data's digest, the protocol's version and every choice with
@@ -55,34 +34,29 @@ def document(
     Args:
         results: Each method's scores, of one tier.
         tables: Their tables.
-        found: Relations of calibration controls.
     """
     first = results[0]
-    content: dict[str, Any] = {
+    return {
         "format": FORMAT,
         "tier": first.tier,
-        "methods": [one.name for one in results],
         "data": {"root": first.index.where, "digest": first.index.digest},
         "settings": dict(first.settings),
         "coverage": [_coverage(one) for one in results],
-        "tables": [plain(table) for table in tables],
-        "paper": {"title": PAPER, "discrepancies": dict(DISCREPANCIES)},
+        "tables": [_plain_table(table) for table in tables],
     }
-    if found:
-        content["relations"] = [
-            {"what": each.what, "holds": each.holds, "found": each.found} for each in found
-        ]
-    return content
 
 
-def page(
-    results: Sequence[Scores], tables: Sequence[Table], *, found: Sequence[Relation] = ()
-) -> str:
+def page(results: Sequence[Scores], tables: Sequence[Table]) -> str:
     """Return an evaluation as a Markdown page: what was scored, the tables, every choice."""
     first = results[0]
     names = ", ".join(markdown_text(one.name) for one in results)
     tier = "" if first.tier == CONTROL else f", tier {first.tier}: {TIERS[first.tier].meaning}"
-    lines = [f"# {names}{tier}", "", *(f"- {each}" for each in _provenance(first))]
+    lines = [
+        f"# {names}{tier}",
+        "",
+        f"- protocol: version {PROTOCOL_VERSION}",
+        f"- data: sha256 {first.index.digest}, at {markdown_text(first.index.where)}",
+    ]
     for one in results:
         covered = _coverage(one)
         missing = covered["missing"]
@@ -94,19 +68,12 @@ def page(
         )
         lines += [f"  - missing: {markdown_text(each)}" for each in missing[:_GAPS_SHOWN]]
     lines += ["", *map(markdown, tables)]
-    if found:
-        lines += ["### Relations between the controls", ""]
-        lines += [f"- {_VERDICTS[each.holds]}: {each.what} ({each.found})" for each in found]
-        lines.append("")
     lines += ["### Every choice", ""]
     for name, value in first.settings.items():
         parts = value if isinstance(value, list) else [value]
         if isinstance(value, Mapping):
             parts = [f"{key} {each}" for key, each in value.items()]
         lines.append(f"- {name}: {', '.join(map(str, parts))}")
-    lines.append("")
-    lines += ["### Where the paper's tables disagree", ""]
-    lines += [f"- {name}: {text}" for name, text in DISCREPANCIES.items()]
     return "\n".join(lines) + "\n"
 
 
@@ -115,10 +82,9 @@ def write_report(
     results: Sequence[Scores],
     tables: Sequence[Table],
     *,
-    found: Sequence[Relation] = (),
     plots: Literal["write", "skip"] = "write",
 ) -> list[Path]:
-    """Write results.json, report.md, tables.tex, tables.csv, pairs.csv and plots; return the files.
+    """Write results.json, report.md, pairs.csv and plots; return the files.
 
     Raises:
         StorageError: If a file cannot be written.
@@ -126,21 +92,16 @@ def write_report(
     """
     written = {
         "results.json": json.dumps(
-            document(results, tables, found=found), indent=1, allow_nan=False, ensure_ascii=False
+            document(results, tables), indent=1, allow_nan=False, ensure_ascii=False
         ),
-        "report.md": page(results, tables, found=found),
-        "tables.tex": "\n".join([*_tex_comments(results), *map(latex, tables)]),
-        "tables.csv": csv_text(tables),
+        "report.md": page(results, tables),
         "pairs.csv": pairs_csv(results),
     }
-    try:
+    cannot = f"{folder}: the report cannot be written"
+    with explain_os_errors(cannot, "Choose another folder with --out."):
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in written.items():
             write_atomic(folder / name, text.encode())
-    except OSError as error:
-        what = f"{folder}: the report cannot be written"
-        cure = "Choose another folder with --out."
-        raise StorageError(describe_os_error(what, error, cure)) from error
     files = [folder / name for name in written]
     if plots == "skip":
         return files
@@ -152,33 +113,21 @@ def write_report(
 def pairs_csv(results: Sequence[Scores]) -> str:
     """Return the scores of every pair of every scene as CSV, empty where there is no score."""
     columns = list(dict.fromkeys(name for one in results for p in one.pairs for name in p.tallies))
-    head = ["method", "scene", "cameras", "primary", "baseline_cm", "frames", "missing"]
-    head += ["views_sha256", *columns]
-    lines = (
-        [
-            one.name, pair.scene, pair_name(pair.pair), int(pair.is_primary),
-            repr(pair.baseline_cm), pair.frames, pair.problem,
-            pair.views_sha256, *(_mean_text(pair, name) for name in columns),
-        ]
-        for one in results
-        for pair in one.pairs
+    out = io.StringIO()
+    head = (
+        "method", "scene", "cameras", "primary", "baseline_cm", "frames", "missing", "views_sha256",
     )  # fmt: skip
-    return _csv(head, lines)
-
-
-def _mean_text(pair: PairMeans, column: str) -> str:
-    found = pair.tallies.get(column)
-    if found is None or not found.finite:
-        return "inf" if found is not None and found.infinite else ""
-    return repr(found.mean)
-
-
-def _provenance(one: Scores) -> list[str]:
-    """Return what scores are of, but for the right views."""
-    return [
-        f"protocol: version {PROTOCOL_VERSION}",
-        f"data: sha256 {one.index.digest}, at {markdown_text(one.index.where)}",
-    ]
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([*head, *columns])
+    for one in results:
+        for pair in one.pairs:
+            facts = (
+                one.name, pair.scene, pair_name(pair.pair), int(pair.is_primary),
+                repr(pair.baseline_cm), pair.frames, pair.problem, pair.views_sha256,
+            )  # fmt: skip
+            tallies = [pair.tallies.get(name) for name in columns]
+            writer.writerow([*facts, *("" if each is None else each.text for each in tallies)])
+    return out.getvalue()
 
 
 def _coverage(one: Scores) -> dict[str, Any]:
@@ -195,82 +144,20 @@ def _coverage(one: Scores) -> dict[str, Any]:
 
 def markdown(table: Table) -> str:
     """Return a table in Markdown, with its title and notes."""
-    head, rows = _texts(table)
-    texts = 1 + len(table.keys)
-    rule = ["---"] * texts + ["---:"] * (len(head) - texts)
-    lines = [f"### {table.title}", "", _pipes(head), _pipes(rule)]
-    lines += [_pipes(list(map(markdown_text, row))) for row in rows]
-    if table.notes:
-        lines += ["", *(f"- {note}" for note in table.notes)]
-    return "\n".join(lines) + "\n"
-
-
-def latex(table: Table) -> str:
-    """Return a table in LaTeX, for the package booktabs; its caption has the notes."""
-    head, rows = _texts(table)
-    texts = 1 + len(table.keys)
-    caption = " ".join([f"{table.title}.", *table.notes])
-    lines = [
-        r"\begin{table}",
-        r"  \centering",
-        f"  \\caption{{{_tex(caption)}}}",
-        f"  \\begin{{tabular}}{{{'l' * texts}{'r' * (len(head) - texts)}}}",
-        r"    \toprule",
-        "    " + " & ".join(map(_tex, head)) + r" \\",
-        r"    \midrule",
-        *("    " + " & ".join(map(_tex, row)) + r" \\" for row in rows),
-        r"    \bottomrule",
-        r"  \end{tabular}",
-        r"\end{table}",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _tex_comments(results: Sequence[Scores]) -> list[str]:
-    views = [f"{one.name}: right views sha256 {one.views_sha256}" for one in results]
-    return [f"% {' '.join(text.split())}" for text in [*_provenance(results[0]), *views]]
-
-
-def csv_text(tables: Sequence[Table]) -> str:
-    """Return tables as one CSV, a line for each row and column; empty where there is no number."""
-    lines: list[list[Any]] = []
-    for table in tables:
-        for row in table.rows:
-            group = "; ".join(f"{k}={v}" for k, v in zip(table.keys, row.labels, strict=True))
-            for name in table.columns:
-                start = [table.name, row.method, row.source, group, heading(table, name)]
-                match row.values.get(name):
-                    case FrechetDistance() as distance:
-                        value = _plain(distance)["value"]
-                        counts = [row.scenes, row.frames, "", "", row.missing, ""]
-                        lines.append([*start, value, "", "", *counts])
-                    case Cell() as found:
-                        numbers = [getattr(found, each) for each in _CSV_CELL]
-                        lines.append([*start, *numbers, row.missing, ""])
-                    case printed if row.source == "paper":
-                        lines.append([*start, *[""] * 8, printed or ""])
-    return _csv(_CSV_HEAD, lines)
-
-
-def _csv(head: Sequence[str], lines: Iterable[Sequence[Any]]) -> str:
-    """Return CSV; None is an empty field."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(head)
-    writer.writerows(lines)
-    return out.getvalue()
-
-
-def plain(table: Table) -> dict[str, Any]:
-    """Return a table as plain values for JSON: numbers in full, null where there is none."""
-    return {
-        "name": table.name,
-        "title": table.title,
-        "keys": list(table.keys),
-        "columns": {name: heading(table, name) for name in table.columns},
-        "notes": list(table.notes),
-        "rows": [_plain_row(table, row) for row in table.rows],
-    }
+    has_gaps = any(row.missing for row in table.rows)
+    head = ["Method", *table.keys, "N_s", "N_f", *(["missing"] if has_gaps else [])]
+    head += [heading(table, name) for name in table.columns]
+    rule = ["---"] * (1 + len(table.keys)) + ["---:"] * (len(head) - 1 - len(table.keys))
+    lines = [head, rule]
+    for row in table.rows:
+        counts = [row.scenes, row.frames, *([row.missing] if has_gaps else [])]
+        texts = [row.method, *(label or ABSENT for label in row.labels)]
+        texts += [ABSENT if count is None else str(count) for count in counts]
+        texts += [_cell_text(table, row.values.get(name), name) for name in table.columns]
+        lines.append(list(map(markdown_text, texts)))
+    pipes = ["| " + " | ".join(texts) + " |" for texts in lines]
+    notes = ["", *(f"- {note}" for note in table.notes)] if table.notes else []
+    return "\n".join([f"### {table.title}", "", *pipes, *notes]) + "\n"
 
 
 def heading(table: Table, column: str) -> str:
@@ -281,28 +168,15 @@ def heading(table: Table, column: str) -> str:
     return f"{table.protocol.label(column)}{_ARROWS[COLUMNS[column].better]}{median}"
 
 
-def _texts(table: Table) -> tuple[list[str], list[list[str]]]:
-    """Return the head and the rows of a table as texts."""
-    has_gaps = any(row.missing for row in table.rows)
-    head = ["Method", *table.keys, "N_s", "N_f", *(["missing"] if has_gaps else [])]
-    head += [heading(table, name) for name in table.columns]
-    rows = []
-    for row in table.rows:
-        texts = [row.method, *(label or ABSENT for label in row.labels)]
-        texts += [ABSENT if count is None else str(count) for count in (row.scenes, row.frames)]
-        if has_gaps:
-            texts.append(ABSENT if row.source == "paper" else str(row.missing))
-        texts += [_cell_text(table, row, name) for name in table.columns]
-        rows.append(texts)
-    return head, rows
-
-
-def _cell_text(table: Table, row: TableRow, column: str) -> str:
-    match row.values.get(column):
+def _cell_text(table: Table, value: Value | None, column: str) -> str:
+    match value:
         case None:
             return ABSENT
-        case FrechetDistance() as distance:
-            return _distance_text(distance)
+        case FrechetDistance(value=None, samples=samples):
+            return f"{ABSENT} (N {min(samples)})"
+        case FrechetDistance(value=distance, samples=samples, dim=dim, underdetermined=is_under):
+            compared, mark = ("≤", " !") if is_under else (">", "")
+            return f"{distance:.2f} (N {min(samples)} {compared} D {dim}){mark}"
         case Cell() as found:
             return _number_text(found, column)
         case printed:
@@ -314,60 +188,96 @@ def _cell_text(table: Table, row: TableRow, column: str) -> str:
 def _number_text(found: Cell, column: str) -> str:
     """Return a cell's mean and interval, and what is not in them."""
     digits = COLUMNS[column].digits
-    if found.mean is None:
-        if found.infinite and not found.undefined:
-            return f"∞ ({found.infinite} identical)"
-        return f"{ABSENT} ({found.undefined} undefined)" if found.undefined else ABSENT
-    text = f"{found.mean:.{digits}f}"
-    if found.ci95 is not None:
-        text += f" ± {found.ci95:.{digits}f}"
-    if column in HEAVY_TAILED:
-        text += f" [{found.median:.{digits}f}]"
-    left_out = [
-        f"{count} {what}"
-        for count, what in ((found.infinite, "identical"), (found.undefined, "undefined"))
-        if count
-    ]
+    text = "∞" if found.infinite and not found.undefined else ABSENT
+    if found.mean is not None:
+        text = f"{found.mean:.{digits}f}"
+        text += "" if found.ci95 is None else f" ± {found.ci95:.{digits}f}"
+        text += f" [{found.median:.{digits}f}]" if column in HEAVY_TAILED else ""
+    counts = ((found.infinite, "identical"), (found.undefined, "undefined"))
+    left_out = [f"{count} {what}" for count, what in counts if count]
     return f"{text} ({', '.join(left_out)})" if left_out else text
 
 
-def _distance_text(found: FrechetDistance) -> str:
-    fewer = min(found.samples)
-    if not math.isfinite(found.value):
-        return f"{ABSENT} (N {fewer})"
-    compared, mark = ("≤", " !") if found.underdetermined else (">", "")
-    return f"{found.value:.2f} (N {fewer} {compared} D {found.dim}){mark}"
-
-
-def _pipes(texts: Sequence[str]) -> str:
-    return "| " + " | ".join(text.replace("|", r"\|") for text in texts) + " |"
-
-
-def _tex(text: str) -> str:
-    return "---" if text == ABSENT else "".join(_LATEX.get(letter, letter) for letter in text)
-
-
-def _plain_row(table: Table, row: TableRow) -> dict[str, Any]:
-    plain_row: dict[str, Any] = {
-        "method": row.method,
-        "source": row.source,
-        "group": dict(zip(table.keys, row.labels, strict=True)),
-        "scenes": row.scenes,
-        "frames": row.frames,
+def _plain_table(table: Table) -> dict[str, Any]:
+    """Return a table as plain values for JSON: numbers in full, null where there is none."""
+    return {
+        "name": table.name,
+        "title": table.title,
+        "columns": {name: heading(table, name) for name in table.columns},
+        "notes": list(table.notes),
+        "rows": [
+            {
+                "method": row.method,
+                "source": row.source,
+                "group": dict(zip(table.keys, row.labels, strict=True)),
+                "scenes": row.scenes,
+                "frames": row.frames,
+                "missing": row.missing,
+                "values": {
+                    name: value if isinstance(value, str) else asdict(value)
+                    for name, value in row.values.items()
+                    if name in table.columns
+                },
+            }
+            for row in table.rows
+        ],
     }
-    if row.source == "paper":
-        return plain_row | {"printed": dict(row.values)}
-    shown = {name: row.values[name] for name in table.columns if name in row.values}
-    cells = {name: _plain(each) for name, each in shown.items() if isinstance(each, Cell)}
-    distances = {name: _plain(each) for name, each in shown.items() if name not in cells}
-    plain_row |= {"missing_pairs": row.missing, "cells": cells}
-    return plain_row | ({"distances": distances} if distances else {})
 
 
-def _plain(found: Any) -> dict[str, Any]:
-    """Return the numbers of a cell or of a distance; null where there is none."""
-    content = asdict(found)
-    if isinstance(found, FrechetDistance):
-        value = found.value if math.isfinite(found.value) else None
-        return content | {"value": value, "samples": list(found.samples)}
-    return content
+RELATIVE: Final = 1e-6
+"""How far numbers may be apart: other processors and releases of libraries round differently."""
+_LEFT_OUT: Final = frozenset({"data.root", "settings.versions", "format"})
+"""Where the data lay and which releases computed the scores; what no score depends on."""
+
+
+def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> list[str]:
+    """Return where two documents (`document`) differ; empty where one reproduces the other.
+
+    The data, the protocol, every choice with the hashes of weights, the right views and each cell
+    of each table are compared.
+
+    Args:
+        ours: The evaluation that was made now.
+        theirs: The one that it is to reproduce.
+
+    Raises:
+        EvaluationError: If the second is not such a document.
+    """
+    if theirs.get("format") != ours["format"]:
+        raise EvaluationError(
+            f"to be compared, results.json must have format {ours['format']}, and this one has "
+            f"{theirs.get('format')!r}: make it again by this version of the package."
+        )
+    return [
+        f"{place}: {_shown(here)} here, {_shown(there)} there"
+        for place, here, there in _leaves(ours, theirs, "")
+    ]
+
+
+def _leaves(ours: Any, theirs: Any, place: str) -> Iterator[tuple[str, Any, Any]]:
+    if place in _LEFT_OUT:
+        return
+    if isinstance(ours, list) and isinstance(theirs, list) and len(ours) == len(theirs):
+        for number, (here, there) in enumerate(zip(ours, theirs, strict=True)):
+            yield from _leaves(here, there, f"{place}[{_name(here, number)}]")
+    elif isinstance(ours, Mapping) and isinstance(theirs, Mapping):
+        for key in dict.fromkeys([*ours, *theirs]):
+            inner = f"{place}.{key}" if place else key
+            yield from _leaves(ours.get(key), theirs.get(key), inner)
+    elif isinstance(ours, float) and isinstance(theirs, int | float):
+        if not math.isclose(ours, theirs, rel_tol=RELATIVE, abs_tol=RELATIVE):
+            yield place, ours, theirs
+    elif ours != theirs:
+        yield place, ours, theirs
+
+
+def _name(row: Any, number: int) -> str:
+    """Return what a row of a list is called."""
+    if not isinstance(row, Mapping):
+        return str(number)
+    group = ", ".join(row.get("group", {}).values())
+    return " ".join(filter(None, [row.get("name") or row.get("method") or str(number), group]))
+
+
+def _shown(value: Any) -> str:
+    return f"{len(value)} values" if isinstance(value, list | Mapping) else repr(value)

@@ -3,8 +3,14 @@
 A table holds methods of one tier only: rows of different tiers answer different questions.
 """
 
-from collections.abc import Mapping, Sequence
+import csv
+import math
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 from typing import Final, Literal, NamedTuple
 
 from stereogenbench_data.errors import EvaluationError
@@ -23,23 +29,90 @@ from stereogenbench_data.evaluation.columns import COLUMNS, FRAME_METRICS
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.metrics.scale import SD_OF_THE_PAPER
 from stereogenbench_data.evaluation.protocol import PAPER_SIZE, EvaluationProtocol
-from stereogenbench_data.evaluation.reference import (
-    SOURCES,
-    ReferenceRow,
-    TableName,
-    reference_table,
-    release_difference,
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.release import (
+    BASELINE_BINS,
+    FAMILIES,
+    FRAME_COUNT,
+    TRAIN_MAPS,
+    UNSEEN_MAPS,
+    baseline_bin,
 )
-from stereogenbench_data.schema.release import BASELINE_BINS, FAMILIES, FRAME_COUNT, baseline_bin
+
+TableName = Literal["main", "unseen", "bins", "controls"]
+ReferenceRow = Mapping[str, str]
+
+
+SOURCES: Final[dict[str, str]] = {
+    "main": "tab:main-results, reference results on the seen-map evaluation split",
+    "unseen": "tab:app-unseen-results, unseen-map evaluation",
+    "bins": "tab:app-baseline-bins, baseline-stratified diagnostics of the seen-map Uniform branch",
+    "controls": "tab:metric-calibration, calibration controls on the full evaluation split",
+}
+"""Where each table stands in the paper: its LaTeX label and what it is."""
+
+SCENES_SCORED: Final[Mapping[tuple[str, str], int]] = {
+    ("seen_map", "IPD_Gaussian"): 265,
+    ("seen_map", "Uniform"): 281,
+    ("unseen_map", "IPD_Gaussian"): 91,
+    ("unseen_map", "Uniform"): 102,
+}
+"""How many scenes the paper's numbers are of, by subset and family."""
+
+
+@cache
+def reference_table(name: TableName) -> tuple[ReferenceRow, ...]:
+    """Return the rows of one of the paper's tables, by column, as printed.
+
+    Args:
+        name: "main" (seen maps), "unseen", "bins" (baseline bins of seen-map Uniform) or
+            "controls".
+
+    Raises:
+        EvaluationError: If there is no such table.
+
+    >>> reference_table("controls")[0]["psnr"]
+    'inf'
+    """
+    if name not in SOURCES:
+        raise EvaluationError(f"there is no table {name!r}: there are {', '.join(SOURCES)}.")
+    text = files(__package__).joinpath("reference_tables", f"{name}.csv").read_text("utf-8")
+    return tuple(csv.DictReader(text.splitlines()))
+
+
+def release_difference(index: SceneIndex, rows: Collection[int], *, scored: str = "some") -> str:
+    """Return how scored scenes differ from those that the paper scored, empty if they do not.
+
+    By their maps, subsets and numbers: what the index tells.
+
+    Args:
+        index: The scenes.
+        rows: Which of them were scored.
+        scored: "some" of the branches of subset and family, or "all" of them.
+    """
+    names, subsets, families = (
+        index.column(name)[sorted(set(rows))].tolist() for name in ("map_name", "subset", "family")
+    )
+    others = [name for name in names if name not in TRAIN_MAPS | UNSEEN_MAPS]
+    if others:
+        named = ", ".join(sorted(set(others))[:3])
+        return (
+            f"{len(others)} of {len(names)} scenes on maps that the release does not have ({named})"
+        )
+    branches = Counter(zip(subsets, families, strict=True))
+    for branch in {**branches, **(SCENES_SCORED if scored == "all" else {})}:
+        found, expected = branches[branch], SCENES_SCORED.get(branch, 0)
+        if found != expected:
+            name = " ".join(filter(None, branch))
+            return f"{found} scenes of {name}, of which the paper scored {expected or 'none'}"
+    return ""
+
 
 PairsShown = Literal["primary", "all"]
 _BRANCH: Final = ("subset", "family")
 _BINS: Final = (*_BRANCH, "baseline")
-_ORDERS: Final[Mapping[str, Sequence[str]]] = {
-    "subset": ("seen_map", "unseen_map", ""),
-    "family": FAMILIES,
-    "baseline": tuple(BASELINE_BINS),
-}
+_ORDER: Final = ("seen_map", "unseen_map", *FAMILIES, *BASELINE_BINS)
+"""The release's order of what groups are called."""
 
 
 class TableForm(NamedTuple):
@@ -140,11 +213,6 @@ def tables_of(
     ]
 
 
-def table_of(results: Sequence[Scores], name: str) -> Table:
-    """Return one of `TABLES`."""
-    return _table(results, name, TABLES[name])
-
-
 def stratum_table(results: Sequence[Scores], column: str, *, edges: Sequence[float] = ()) -> Table:
     """Return primary pairs by a column of the index.
 
@@ -161,25 +229,25 @@ def stratum_table(results: Sequence[Scores], column: str, *, edges: Sequence[flo
     plain = ["" if value is None else value for value in values[used].tolist()]
     strata_of = dict(zip(used, strata(plain, name=column, edges=edges), strict=True))
     form = TableForm(f"By {column}, primary pairs", (*_BRANCH, column))
-    return _table(results, f"by_{column}", form, strata_of=strata_of)
+    return table_of(results, f"by_{column}", form=form, strata_of=strata_of)
 
 
-def _table(
+def table_of(
     results: Sequence[Scores],
     name: str,
-    form: TableForm,
     *,
+    form: TableForm | None = None,
     strata_of: Mapping[int, str] | None = None,
 ) -> Table:
     """Return a table: headline columns, or those that explain them, and distances of branches.
 
     Args:
         results: Each method's scores.
-        name: Its name.
+        name: Its name, one of `TABLES` unless a form is given.
         form: What it shows.
         strata_of: For a key that is a column of the index, the group of each row of the index.
     """
-    first = results[0]
+    first, form = results[0], form or TABLES[name]
     scored_rows = {pair.row for one in results for pair in one.pairs if not pair.problem}
     scored = "all" if name == "controls" else "some"
     differs = release_difference(first.index, scored_rows, scored=scored) if form.paper else ""
@@ -221,31 +289,26 @@ def _rows(
             return str(index.column(key)[pair.row] or "")
         return strata_of[pair.row]
 
-    by_method = [
-        (
-            one,
-            group_by(
-                (pair for pair in one.pairs if form.pairs == "all" or pair.is_primary),
-                lambda pair: tuple(label_of(pair, key) for key in form.keys),
-            ),
+    groups_of = [
+        group_by(
+            (pair for pair in one.pairs if form.pairs == "all" or pair.is_primary),
+            lambda pair: tuple(label_of(pair, key) for key in form.keys),
         )
         for one in results
     ]
     rows = []
     for labels in sorted(
-        {labels for _, groups in by_method for labels in groups},
-        key=lambda labels: [
-            _rank(key, label) for key, label in zip(form.keys, labels, strict=True)
-        ],
+        {labels for groups in groups_of for labels in groups},
+        key=lambda labels: list(map(_rank, labels)),
     ):
         where = dict(zip(form.keys, labels, strict=True)) | {"tier": results[0].tier}
         paper = [
             _paper_row(row, labels, differs=differs)
             for name in form.paper
             for row in reference_table(name)
-            if all(where.get(key, value) == value for key, value in _place(name, row).items())
+            if all(where.get(key, value) == value for key, value in row.items())
         ]
-        for one, groups in by_method:
+        for one, groups in zip(results, groups_of, strict=True):
             if labels in groups:
                 rows.append(_row(one, labels, groups[labels]))
                 if not form.keys:  # A control of the paper stands below the one of its name.
@@ -254,24 +317,13 @@ def _rows(
     return rows
 
 
-def _place(name: TableName, row: ReferenceRow) -> dict[str, str]:
-    """Return the group of a row of the paper, by the keys of tables."""
-    place = {key: row[key] for key in ("tier", *_BRANCH) if key in row}
-    if name == "bins":
-        place |= {"subset": "seen_map", "family": "Uniform", "baseline": row["baseline_bin_cm"]}
-    return place
-
-
-def _rank(key: str, label: str) -> tuple[float, str]:
+def _rank(label: str) -> tuple[float, str]:
     """Return what orders labels: the release's order, else the first number in them."""
-    order = list(_ORDERS.get(key, ()))
-    if label in order:
-        return float(order.index(label)), ""
-    start = label.lstrip("[(").partition(",")[0]
-    try:
-        return float(start), label
-    except ValueError:
-        return float(len(order)), label
+    if label in _ORDER:
+        return _ORDER.index(label), ""
+    with suppress(ValueError):
+        return float(label.lstrip("[(").partition(",")[0]), label
+    return math.inf, label
 
 
 def _row(one: Scores, labels: Labels, pairs: Sequence[PairMeans]) -> TableRow:
@@ -317,39 +369,37 @@ def _notes(
 ) -> list[str]:
     """Return the notes of a table: its sources, and what is not comparable."""
     protocol, of_frames = results[0].protocol, [each for each in columns if each in COLUMNS]
+    paper = [row for row in rows if row.source == "paper"]
     notes = []
     if any(column.startswith("sd_filtered") for column in of_frames):
         notes.append(f"SD: {SD_OF_THE_PAPER}.")
-    if any(row.source == "paper" for row in rows):
-        if differs:
-            notes.append(
-                f"NOT COMPARABLE WITH THE PAPER: these scores are not of the release's evaluation "
-                f"scenes, but of {differs}. Its rows are of other pictures: nothing here is better "
-                f"or worse than they."
-            )
+    if paper and differs:
+        notes.append(
+            f"NOT COMPARABLE WITH THE PAPER: these scores are not of the release's evaluation "
+            f"scenes, but of {differs}. Its rows are of other pictures: nothing here is better or "
+            f"worse than they."
+        )
+    if paper:
         sources = "; ".join(SOURCES[each] for each in form.paper)
         notes.append(f"Rows of the paper as printed: {sources}.")
-        others = [
-            protocol.label(column)
-            for column in of_frames
-            if any(column in row.values for row in rows if row.source == "paper")
-            and not protocol.is_papers(column)
-        ]
-        if others:
-            notes.append(
-                f"† The paper measures this by DeDoDe (E_match) or FoundationStereo (SD), not by "
-                f"what the head of the column names ({', '.join(others)}): not comparable."
-            )
-        if protocol.size != PAPER_SIZE:
-            notes.append(
-                f"The paper scores at {PAPER_SIZE[1]}x{PAPER_SIZE[0]}, this at "
-                f"{protocol.size[1]}x{protocol.size[0]}: not comparable."
-            )
-        frames = {pair.frames for one in results for pair in one.pairs if not pair.problem}
-        if frames - {FRAME_COUNT}:
-            ours = ", ".join(map(str, sorted(frames)))
-            notes.append(f"The paper scores {FRAME_COUNT} frames a scene, this {ours}.")
-    found = [row.values.get(each) for row in rows for each in columns if each not in COLUMNS]
+    others = [
+        protocol.label(column)
+        for column in of_frames
+        if any(column in row.values for row in paper) and not protocol.is_papers(column)
+    ]
+    if others:
+        notes.append(
+            f"† The paper measures this by DeDoDe (E_match) or FoundationStereo (SD), not by what "
+            f"the head of the column names ({', '.join(others)}): not comparable."
+        )
+    frames = {pair.frames for one in results for pair in one.pairs if not pair.problem}
+    if paper and (protocol.size != PAPER_SIZE or frames - {FRAME_COUNT}):
+        (height, width), ours = protocol.size, ", ".join(map(str, sorted(frames)))
+        notes.append(
+            f"The paper scores {FRAME_COUNT} frames a scene at {PAPER_SIZE[1]}x{PAPER_SIZE[0]}, "
+            f"this {ours} at {width}x{height}: not comparable."
+        )
+    found = [row.values.get(each) for row in rows for each in columns]
     if any(isinstance(each, FrechetDistance) and each.underdetermined for each in found):
         notes.append(
             "! No more samples than dimensions: the distance is biased upwards, and more so the "

@@ -173,6 +173,11 @@ class SceneIndex:
         head = IndexHead(str(root), shards=dict(shards or {}))
         return cls(table, head, retry=retry, seek_tables=seek_tables_of(scenes))
 
+    def only(self, rows: Iterable[int]) -> "SceneIndex":
+        """Return an index of a few rows, small enough to be sent to a process with its work."""
+        scenes = [self.scene(row) for row in rows]
+        return SceneIndex.from_scenes(scenes, self.root, shards=self.shards, retry=self.retry)
+
     @classmethod
     def from_report(cls, report: "TreeReport") -> "SceneIndex":
         """Return the index of the scenes that a walk found, and of those that it left out."""

@@ -16,10 +16,8 @@ import yaml
 from PIL import Image
 
 from stereogenbench_data import SceneIndex
-from stereogenbench_data.bridges.card import MARK, card, write_card
-from stereogenbench_data.bridges.viewer import write_viewer_rows
+from stereogenbench_data.bridges.card import MARK, card, write_card, write_viewer_rows
 from stereogenbench_data.errors import DescriptorError, StorageError
-from stereogenbench_data.shards.download import download, plan_download
 from stereogenbench_data.shards.pack import pack
 from tests.servers.failing_server import serving
 from tests.servers.hub import REPOSITORY, HubHandler
@@ -165,19 +163,6 @@ def test_a_scene_that_cannot_be_read_is_named(small_shards, tmp_path):
     with pytest.raises(StorageError, match=re.escape(shard)):
         write_viewer_rows(index, tmp_path)
     assert list((tmp_path / "viewer").glob("*.tar*")) == []
-
-
-def test_a_part_without_the_primary_pair_has_white_pictures(small_shards, tmp_path):
-    whole = SceneIndex.open(small_shards)
-    part = plan_download(whole, [0, 1], cameras=(2, 3), streams=("rgb",))
-    download(whole, part, tmp_path / "tree")
-    pack(tmp_path / "tree", tmp_path / "shards", workers=1)
-
-    (path, *_) = write_viewer_rows(SceneIndex.open(tmp_path / "shards"), tmp_path)
-
-    with tarfile.open(path) as tar:
-        (name, *_) = tar.getnames()
-        assert np.asarray(Image.open(io.BytesIO(tar.extractfile(name).read()))).min() == 255
 
 
 def test_a_card_is_replaced_but_another_readme_is_not(tmp_path):

@@ -148,7 +148,7 @@ def test_the_shipped_descriptors_are_those_of_make_descriptors(tmp_path, monkeyp
         [require_tool("make"), "--dry-run", "--old-file", ".venv/.ready", "descriptors"],
         cwd=HOME, capture_output=True, text=True, check=True,
     ).stdout.replace("\\\n", " ")  # fmt: skip
-    commands = re.findall(r"^\S*stereogenbench (croissant .*)", planned, re.MULTILINE)
+    commands = re.findall(r"^\S*stereogenbench (publish croissant .*)", planned, re.MULTILINE)
     monkeypatch.chdir(tmp_path)
 
     done = [invoke(*shlex.split(command)) for command in commands]
@@ -175,11 +175,8 @@ def contents(path):
 def test_absolute_addresses_pass_the_steps_of_the_conference_checker(web, index, tmp_path):
     """It takes a dict, so paths must be URLs, and reads the first record of every set."""
     shutil.copytree(index.root, web.folder / "rev1" / "shards")
-    place = web.folder / "rev1" / "metadata.json"
-    publication = Publication(
-        published=date(2026, 11, 21), data_url=f"{web.url}/rev1/shards",
-        tables_url=f"{web.url}/rev1/metadata",
-    )  # fmt: skip
+    place = web.folder / "rev1" / "shards" / "metadata.json"
+    publication = Publication(published=date(2026, 11, 21), data_url=f"{web.url}/rev1/shards")
     write_descriptor(index, place, publication=publication)
 
     records = loaded(place, tmp_path / "cache")
@@ -270,7 +267,7 @@ def test_shards_of_any_folder_are_named_relative_to_the_descriptor(index, tmp_pa
 
 def test_many_shards_are_listed_in_a_file(index, tmp_path, monkeypatch):
     for limit in ("MOST_SHARD_FILES", "MOST_MEDIA_BYTES"):
-        monkeypatch.setattr(f"stereogenbench_data.bridges.croissant.shards.{limit}", 1)
+        monkeypatch.setattr(f"stereogenbench_data.bridges.croissant.descriptor.{limit}", 1)
     path = tmp_path / "many.json"
 
     written = write_descriptor(index, path, publication=DAY)
@@ -315,7 +312,6 @@ def test_a_tree_of_ones_own_needs_the_url_of_its_repository(small_release, tmp_p
     [
         ({"version": "one"}, "'one' is not a version: it must be MAJOR.MINOR.PATCH"),
         ({"data_url": "packed"}, "'packed' is not a URL"),
-        ({"tables_url": "packed/tables"}, "'packed/tables' is not a URL"),
     ],
 )
 def test_what_the_check_would_refuse_is_not_written(small_shards, tmp_path, stated, message):
@@ -326,12 +322,11 @@ def test_what_the_check_would_refuse_is_not_written(small_shards, tmp_path, stat
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["data_url", "tables_url"])
-def test_no_login_is_published(small_shards, tmp_path, name):
-    publication = Publication(**{name: "https://me:word@host/data?key=word"})
+def test_no_login_is_published(small_shards, tmp_path):
+    publication = Publication(data_url="https://me:word@host/data?key=word")
 
     with pytest.raises(
-        DescriptorError, match=r"^https://host/data : the URL contains a login or a query"
+        DescriptorError, match=r"^'https://host/data ?' is not .*without a login or a query"
     ):
         write_descriptor(
             SceneIndex.open(small_shards), tmp_path / "a.json", publication=publication

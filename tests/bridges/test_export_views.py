@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from stereogenbench_data import DepthEncoding, SceneViews
-from stereogenbench_data.bridges.export_views import export_views
-from stereogenbench_data.bridges.posed_images import PosedImage
-from stereogenbench_data.bridges.view_formats import MogeWriter, quaternion_wxyz
+from stereogenbench_data.bridges.export_views import export_views, quaternion_wxyz, write_moge
+from stereogenbench_data.bridges.multiview import PosedImage
 from stereogenbench_data.errors import FieldError, SelectionError, StorageError
 from stereogenbench_data.geometry.pose import rotation_from_quaternion_xyzw
 from stereogenbench_data.index.table import SceneIndex
@@ -133,25 +132,6 @@ def test_points_of_a_colmap_model_project_onto_their_observations(
         assert abs(depth_m - moment["depth"][camera, 0, row, column].item()) < 1e-9
 
 
-def test_other_pictures_observe_a_point_where_their_own_depth_agrees(
-    detailed_release, moment, tmp_path
-):
-    (folder,) = exported(detailed_release, tmp_path, layout="colmap", points=200)
-    _, _, images, points = read_colmap(folder)
-    lengths = []
-    for position, _, track in points.values():
-        lengths.append(len(track))
-        assert len({image for image, _ in track.tolist()}) == len(track)
-        for image, place in track[1:]:
-            name, rotation, step, observed = images[image]
-            u, v = observed[place, :2]
-            there_m = moment["depth"][int(name[4:6]), 0, int(v), int(u)].item()
-            here_m = (rotation @ position + step)[2]
-            assert abs(there_m - here_m) <= 0.02 * here_m + 0.2 + 1e-6
-
-    assert np.mean(lengths) > 3
-
-
 def test_poses_of_a_colmap_model_are_those_of_the_scene_from_its_first_camera(
     detailed_release, moment, tmp_path
 ):
@@ -160,27 +140,22 @@ def test_poses_of_a_colmap_model_are_those_of_the_scene_from_its_first_camera(
     about = json.loads((folder / "stereogenbench.json").read_text())
     scene_from_export = np.array(about["scene_from_export"])
 
-    for number, (name, rotation, step, _) in images.items():
+    for name, rotation, step, _ in images.values():
         cam_from_export = np.eye(4)
         cam_from_export[:3, :3], cam_from_export[:3, 3] = rotation, step
         scene_from_cam = scene_from_export @ np.linalg.inv(cam_from_export)
         expected = moment["world_from_cam"][int(name[4:6])].numpy()
         np.testing.assert_allclose(scene_from_cam, expected, atol=1e-9)
-        stated = np.array(about["pictures"][number - 1]["export_from_cam"])
-        np.testing.assert_allclose(stated @ cam_from_export, np.eye(4), atol=1e-9)
-    assert about["scene"] == "train/IPD_Gaussian/SynthStage/scene_000000"
+    assert (about["scene"], about["frame"]) == ("train/IPD_Gaussian/SynthStage/scene_000000", 0)
 
 
 @pytest.mark.skipif(sys.version_info >= (3, 15), reason="pycolmap has no wheel for Python 3.15 yet")
 def test_colmap_reads_the_model(shared_scenes, tmp_path):
     pycolmap = require_module("pycolmap")
-    (folder,) = exported(
-        shared_scenes, tmp_path, layout="colmap", frames=[0, 40], group="scene", points=300
-    )
+    (folder,) = exported(shared_scenes, tmp_path, layout="colmap", points=300)
     model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
 
-    assert (len(model.cameras), len(model.images), len(model.points3D)) == (1, 12, 3600)
-    assert model.compute_mean_track_length() > 3
+    assert (len(model.cameras), len(model.images), len(model.points3D)) == (1, 6, 1800)
     for image in model.images.values():
         assert (folder / "images" / image.name).is_file()
         for observed in image.points2D:
@@ -244,16 +219,17 @@ def test_the_world_of_transforms_has_its_z_axis_upwards(detailed_release, moment
 def test_points_of_a_cloud_project_onto_the_pixels_they_are_of(detailed_release, moment, tmp_path):
     (folder,) = exported(detailed_release, tmp_path, layout="ply", points="all", cameras=(3, 1))
     world, _ = read_ply(folder / "points.ply")
-    pictures = json.loads((folder / "stereogenbench.json").read_text())["pictures"]
+    about = json.loads((folder / "stereogenbench.json").read_text())
+    export_from_scene = np.linalg.inv(about["scene_from_export"])
     first = 0
-    for picture, camera in zip(pictures, (3, 1), strict=True):
-        intrinsics = np.array(picture["intrinsics"])
-        cam_from_export = np.linalg.inv(np.array(picture["export_from_cam"]))
+    for camera in (3, 1):
+        cam_from_export = np.linalg.inv(
+            export_from_scene @ moment["world_from_cam"][camera].numpy()
+        )
         expected, _ = measured_pixels(moment["depth"][camera, 0].numpy())
         cam = world[first : first + len(expected)] @ cam_from_export[:3, :3].T
-        lens = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]
+        lens = moment["intrinsics"].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]
         landed = pixels_of(cam + cam_from_export[:3, 3], lens)
-        assert (picture["camera"], picture["width"]) == (camera, 160)
         assert np.abs(landed - expected).max() < CLOSE_PX
         first += len(expected)
     assert first == len(world)
@@ -324,9 +300,8 @@ def test_moges_folders_hold_depth_picture_and_normalised_intrinsics(
 def test_moges_depth_is_read_back_whatever_its_range(tmp_path, values, close):
     depth_m = np.array([values], dtype=np.float32)
     picture = np.zeros((1, 2, 3), dtype=np.uint8)
-    MogeWriter(tmp_path).add(
-        [PosedImage("train/a/b/c", 0, 0, picture, depth_m, np.eye(3), np.eye(4))]
-    )
+    posed = PosedImage("train/a/b/c", 0, 0, picture, depth_m, np.eye(3), np.eye(4))
+    write_moge(tmp_path, [posed], None)
 
     found = read_moge_depth(tmp_path / "cam_00" / "depth.png")
     np.testing.assert_allclose(np.nan_to_num(found, nan=0.0), depth_m, rtol=close)
@@ -364,23 +339,17 @@ def test_a_depth_contract_is_followed(detailed_release, tmp_path):
     np.testing.assert_allclose((world @ rotation)[:, 2], depth_m, rtol=1e-5)
 
 
-def test_every_moment_has_a_folder_of_its_own_or_a_scene_has_one(indexed_release, tmp_path):
+def test_every_moment_has_a_folder_of_its_own(indexed_release, tmp_path):
     chosen = {"layout": "colmap", "frames": ("every", 3), "family": "Uniform", "points": 5}
-    moments = exported(indexed_release, tmp_path / "moments", **chosen)
-    scenes = exported(indexed_release, tmp_path / "scenes", group="scene", **chosen)
-    scene = tmp_path / "moments" / "train" / "Uniform" / "SynthStage" / "scene_000000"
+    moments = exported(indexed_release, tmp_path, **chosen)
+    scene = tmp_path / "train" / "Uniform" / "SynthStage" / "scene_000000"
 
     assert moments[:3] == [scene / f"frame_{frame:03d}" for frame in (0, 3, 6)]
-    assert (len(moments), len(scenes)) == (6, 2)
-    assert scenes[0] == tmp_path / "scenes" / "train" / "Uniform" / "SynthStage" / "scene_000000"
-    for folder, pictures in ((moments[1], 6), (scenes[1], 18)):
-        _, _, images, points = read_colmap(folder)
-        assert (len(images), len(points)) == (pictures, 5 * pictures)
-        names = {name for name, *_ in images.values()}
-        assert names == {path.name for path in (folder / "images").iterdir()}
-        # A track stays in one moment: between moments, characters move.
-        for _, _, track in points.values():
-            assert len({images[image][0][-7:] for image, _ in track.tolist()}) == 1
+    assert len(moments) == 6
+    _, _, images, points = read_colmap(moments[1])
+    assert (len(images), len(points)) == (6, 30)
+    names = {name for name, *_ in images.values()}
+    assert names == {path.name for path in (moments[1] / "images").iterdir()}
 
 
 def test_processes_write_the_same_files_as_one(indexed_release, tmp_path):
@@ -417,7 +386,7 @@ def test_what_was_exported_before_is_kept(indexed_release, tmp_path, layout):
 
 
 def test_an_export_that_was_killed_goes_on_and_is_whole(indexed_release, tmp_path):
-    options = {"layout": "transforms", "frames": "all", "points": 2000}
+    options = {"layout": "transforms", "frames": "all", "points": 2000, "family": "Uniform"}
     expected = tmp_path / "expected"
     exported(indexed_release, expected, **options)
     killed = tmp_path / "killed"
@@ -428,7 +397,7 @@ def test_an_export_that_was_killed_goes_on_and_is_whole(indexed_release, tmp_pat
         "    if done >= int(sys.argv[3]): os.kill(os.getpid(), signal.SIGKILL)\n"
         f"export_views(sys.argv[1], sys.argv[2], workers=1, progress=kill, **{options!r})"
     )
-    for pictures, whole in ((6, 0), (126, 20)):
+    for pictures, whole in ((6, 0), (60, 9)):
         ended = subprocess.run(
             [sys.executable, "-c", code, str(indexed_release), str(killed), str(pictures)],
             cwd=Path(__file__).resolve().parents[2], check=False,
@@ -441,7 +410,7 @@ def test_an_export_that_was_killed_goes_on_and_is_whole(indexed_release, tmp_pat
 
     folders = exported(indexed_release, killed, **options)
     assert files_of(killed) == files_of(expected)
-    assert len(folders) == 21
+    assert len(folders) == 14
 
 
 def test_moges_index_keeps_what_was_exported_before(indexed_release, tmp_path):
@@ -485,7 +454,6 @@ def test_both_splits_and_a_contract_go_on_in_their_folder(indexed_release, tmp_p
         ({"size": (20, 20)}, "size"),
         ({"points": 7}, "points"),
         ({"cameras": (0, 1)}, "cameras"),
-        ({"group": "scene"}, "group"),
         ({"depth": DepthEncoding(unit_m=0.5)}, "depth"),
     ],
 )
@@ -495,14 +463,6 @@ def test_a_folder_holds_one_kind_of_export(indexed_release, tmp_path, changed, n
 
     with pytest.raises(StorageError, match=rf"an export of other {name}: .*another folder"):
         exported(indexed_release, tmp_path, **(options | changed))
-
-
-def test_scenes_as_one_hold_the_same_frames(indexed_release, tmp_path):
-    options = {"layout": "ply", "size": (16, 16), "group": "scene"}
-    exported(indexed_release, tmp_path, frames=[0], **options)
-
-    with pytest.raises(StorageError, match=r"other frames: .*another folder"):
-        exported(indexed_release, tmp_path, frames=[0, 1], **options)
 
 
 def test_other_data_go_elsewhere(indexed_release, detailed_release, tmp_path):
@@ -542,11 +502,8 @@ def test_two_processes_do_not_export_into_one_folder(indexed_release, tmp_path):
     [
         ({"layout": "colmap", "frames": ("clips", 3)}, SelectionError, r"are clips: exports take"),
         ({"layout": "nerf"}, SelectionError, r"layout must be one of 'colmap'.*got 'nerf'"),
-        ({"layout": "ply", "group": "clip"}, SelectionError, r"'moment' or 'scene', got 'clip'"),
         ({"layout": "ply", "points": 0}, SelectionError, r"points must be .* 'all', got 0"),
         ({"layout": "ply", "points": True}, SelectionError, r"points must be .*got True"),
-        ({"layout": "moge", "points": 5}, SelectionError, r"'moge' has no points=5: leave"),
-        ({"layout": "moge", "group": "scene"}, SelectionError, r"has no group='scene': leave"),
         ({"layout": "ply", "family": "none"}, SelectionError, r"family none matches none"),
         ({"layout": "ply", "colour": "red"}, SelectionError, r"no option 'colour'"),
         ({"layout": "ply", "cameras": (0, 6)}, SelectionError, r"cameras must be"),

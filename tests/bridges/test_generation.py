@@ -178,15 +178,3 @@ def test_the_frame_rate_is_a_field(indexed_release, frames, stride):
     rate = pair.index.scene(0).frame_rate_hz / stride
     assert pair[0]["frame_rate_hz"].dtype == torch.float64
     assert float(pair[0]["frame_rate_hz"]) == float(views[0]["frame_rate_hz"]) == rate > 0
-
-
-def test_a_misspelled_option_is_answered_with_all_options_of_the_class(indexed_release):
-    with pytest.raises(SelectionError, match="StereoClips has no option 'layot'") as caught:
-        StereoClips(indexed_release, frames=("clips", 3), layot="cthw")
-
-    message = str(caught.value)
-    assert "did you mean 'layout'? It has layout, " in message
-    assert {"captions", "frames", "baseline_cm", "fetch_ahead_bytes"} <= set(
-        message.split("It has ")[1].rstrip(".").split(", ")
-    )
-    assert " fields," not in message

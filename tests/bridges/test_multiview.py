@@ -2,7 +2,6 @@
 
 import runpy
 import sys
-from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -13,15 +12,16 @@ from PIL import Image
 
 from stereogenbench_data import SceneViews, StereoPairs
 from stereogenbench_data.bridges.multiview import (
-    DUSt3RViews,
-    VGGTViews,
+    PAIR_FIELDS,
+    VIEW_FIELDS,
     dust3r_views,
+    posed_images,
+    vggt_record,
 )
-from stereogenbench_data.bridges.posed_images import PAIR_FIELDS, VIEW_FIELDS, posed_images
-from stereogenbench_data.errors import FieldError, SelectionError
+from stereogenbench_data.errors import FieldError
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
-UNIFORM = {"family": "Uniform"}
+TRAIN = {"split": "train"}
 
 
 def points_at(centre_px, depth, intrinsics):
@@ -84,7 +84,7 @@ def test_a_point_of_the_left_view_lands_a_disparity_to_the_left_in_the_right_one
     detailed_release,
 ):
     pairs = {"pairs": [(1, 4)], "size": (120, 152)}
-    left, right = DUSt3RViews(detailed_release, **pairs)[0]
+    left, right = dust3r_views(StereoPairs(detailed_release, fields=PAIR_FIELDS, **pairs)[0])
     sample = StereoPairs(detailed_release, fields=("disparity", "valid"), **pairs)[0]
     world = moved(points_at(0.0, left["depthmap"], left["camera_intrinsics"]), left["camera_pose"])
     cam = moved(world, np.linalg.inv(right["camera_pose"].astype(np.float64)))
@@ -111,43 +111,12 @@ def test_a_scene_far_from_the_origin_keeps_its_points_in_float32(moment, far_m):
         assert np.abs(found - points)[valid.numpy()].max() < 1e-5
 
 
-def test_pairs_are_those_of_the_selection(indexed_release):
-    options = {"pairs": "all", "frames": "all", "baseline_cm": (0, 8)}
-    views = DUSt3RViews(indexed_release, **options)
-    pairs = StereoPairs(indexed_release, split="train", **options)
+def test_views_come_in_the_order_of_the_sample(indexed_release):
+    sample = SceneViews(indexed_release, cameras=(4, 0, 2), frames=[3], **TRAIN)[1]
+    views = dust3r_views(sample)
 
-    assert (len(views), views.num_views) == (len(pairs), 2)
-    for number in range(0, len(pairs), 5):
-        cameras = [view["instance"] for view in views[number]]
-        assert cameras == [f"cam_{camera:02d}" for camera in pairs[number]["pair"]]
-
-
-def test_several_cameras_make_one_list(indexed_release):
-    views = DUSt3RViews(indexed_release, cameras=(4, 0, 2), frames=[3], **UNIFORM)
-
-    assert (len(views), views.num_views) == (2, 3)
-    assert [view["instance"] for view in views[1]] == ["cam_04", "cam_00", "cam_02"]
-    np.testing.assert_array_equal(views[1][0]["camera_pose"][:3, 3], 0)
-
-
-@pytest.fixture(scope="module")
-def evaluation_release(indexed_release, tmp_path_factory):
-    """The same tree without its training scenes."""
-    root = tmp_path_factory.mktemp("evaluation")
-    (root / "eval").symlink_to(indexed_release / "eval")
-    return root
-
-
-@pytest.mark.parametrize("views_of", [DUSt3RViews, VGGTViews])
-def test_evaluation_scenes_are_left_out_unless_they_are_asked_for(
-    indexed_release, evaluation_release, views_of
-):
-    assert len(views_of(indexed_release)) == 3
-    assert len(views_of(indexed_release, split="eval")) == 1
-    assert len(views_of(indexed_release, split=("train", "eval"))) == 4
-    assert len(views_of(evaluation_release, split="eval")) == 1
-    with pytest.raises(SelectionError, match=r"only evaluation scenes \(1\).*split='eval'"):
-        views_of(evaluation_release)
+    assert [view["instance"] for view in views] == ["cam_04", "cam_00", "cam_02"]
+    np.testing.assert_array_equal(views[0]["camera_pose"][:3, 3], 0)
 
 
 @pytest.mark.parametrize(
@@ -156,11 +125,11 @@ def test_evaluation_scenes_are_left_out_unless_they_are_asked_for(
         (lambda data: StereoPairs(data)[0], r"has no .*world_from_left.*load pair with fields="),
         (
             lambda data: SceneViews(data, fields=VIEW_FIELDS, frames=("clips", 2))[0],
-            r"frames of shape \(2,\)",
+            r"not clips, sweeps or batches",
         ),
         (
             lambda data: StereoPairs(data, fields=PAIR_FIELDS, pairs="sweep")[0],
-            r"not sweeps",
+            r"not clips, sweeps or batches",
         ),
     ],
     ids=["fields", "clip", "sweep"],
@@ -214,11 +183,11 @@ def trained_on_dust3r(monkeypatch):
 
 
 def test_dust3rs_base_class_crops_the_views(indexed_release, trained_on_dust3r):
-    views = DUSt3RViews(indexed_release, pairs="adjacent")
-    dataset = trained_on_dust3r(views, split="train", resolution=(48, 32))
-    whole, cropped = views[7], dataset[7]
+    pairs = StereoPairs(indexed_release, pairs="adjacent", fields=PAIR_FIELDS, **TRAIN)
+    dataset = trained_on_dust3r(pairs, split="train", resolution=(48, 32))
+    whole, cropped = dust3r_views(pairs[7]), dataset[7]
 
-    assert (len(dataset), dataset.split) == (len(views), "train")
+    assert (len(dataset), dataset.split) == (len(pairs), "train")
     for before, after in zip(whole, cropped, strict=True):
         assert after["img"].size == (48, 32)
         np.testing.assert_array_equal(after["depthmap"], before["depthmap"][4:36, 4:52])
@@ -227,9 +196,9 @@ def test_dust3rs_base_class_crops_the_views(indexed_release, trained_on_dust3r):
 
 
 def test_more_than_two_views_are_what_the_base_expects(indexed_release, trained_on_dust3r):
-    views = DUSt3RViews(indexed_release, cameras="all")
+    moments = SceneViews(indexed_release, fields=VIEW_FIELDS, **TRAIN)
 
-    assert len(trained_on_dust3r(views, resolution=(16, 16))[0]) == 6
+    assert len(trained_on_dust3r(moments, resolution=(16, 16))[0]) == 6
 
 
 class CUT3RBase(BaseStereoViewDataset):
@@ -249,7 +218,7 @@ class CUT3RBase(BaseStereoViewDataset):
 
 
 def test_cut3r_is_given_as_many_views_of_a_moment_as_it_asks_for(indexed_release, monkeypatch):
-    views = DUSt3RViews(indexed_release, cameras="all", frames="all")
+    views = SceneViews(indexed_release, frames="all", fields=VIEW_FIELDS, **TRAIN)
     base = type("BaseStereoViewDataset", (CUT3RBase,), {})
     module = "dust3r.datasets.base.base_stereo_view_dataset"
     dataset = example(monkeypatch, "dust3r_dataset.py", module, base)(
@@ -268,9 +237,9 @@ def test_cut3r_is_given_as_many_views_of_a_moment_as_it_asks_for(indexed_release
 
 
 @pytest.mark.parametrize("centre_px", [0.0, 0.5])
-def test_vggt_unprojects_to_the_points_of_the_record(detailed_release, moment, centre_px):
+def test_vggt_unprojects_to_the_points_of_the_record(moment, centre_px):
     sample, truth = moment
-    record = VGGTViews(detailed_release, pixel_centre_px=centre_px).get_data(seq_index=0)
+    record = vggt_record(sample, pixel_centre_px=centre_px)
 
     for number, points in enumerate(truth):
         cam = points_at(centre_px, record["depths"][number], record["intrinsics"][number])
@@ -284,7 +253,7 @@ def test_vggt_unprojects_to_the_points_of_the_record(detailed_release, moment, c
 
 
 def test_a_record_of_vggt_stacks_as_its_composed_dataset_stacks_it(indexed_release):
-    record = VGGTViews(indexed_release, size=(32, 48)).get_data(seq_index=1, img_per_seq=4)
+    record = vggt_record(SceneViews(indexed_release, size=(32, 48), **TRAIN)[1], ids=[3, 0, 5, 3])
     expected = {
         "images": ((4, 32, 48, 3), np.uint8),
         "depths": ((4, 32, 48), np.float32),
@@ -299,101 +268,21 @@ def test_a_record_of_vggt_stacks_as_its_composed_dataset_stacks_it(indexed_relea
     for name, (shape, dtype) in expected.items():
         stacked = np.stack(record[name])
         assert (stacked.shape, stacked.dtype) == (shape, dtype), name
-    assert torch.from_numpy(record["ids"]).shape == (4,)
+    assert torch.from_numpy(record["ids"]).tolist() == [3, 0, 5, 3]
     assert record["frame_num"] == 4
     assert record["tracks"] is None
     assert record["seq_name"] == "StereoGenBench_train/Uniform/SynthStage/scene_000000/000"
 
 
-def test_views_are_drawn_by_torchs_generator_without_repeats_while_there_are_enough(
-    indexed_release,
-):
-    views = VGGTViews(indexed_release)
-    draws = []
-    for seed in (0, 0, 1):
-        torch.manual_seed(seed)
-        draws.append(views.get_data(seq_index=0, img_per_seq=5)["ids"].tolist())
-        assert len(set(draws[-1])) == 5
-
-    assert draws[0] == draws[1] != draws[2]
-    torch.manual_seed(0)
-    assert len(views.get_data(seq_index=0, img_per_seq=9)["ids"]) == 9
-
-
 def test_the_views_of_a_record_are_those_of_its_ids(indexed_release):
-    views = VGGTViews(indexed_release, sequence="scene", frames=[1, 5], **UNIFORM)
-    record = views.get_data(seq_index=1, ids=[7, 0, 7])
-    expected = SceneViews(indexed_release, frames=[1, 5], split="train", **UNIFORM)
+    sample = SceneViews(indexed_release, frames=[5], **TRAIN)[1]
+    record = vggt_record(sample, ids=[4, 0, 4])
 
-    np.testing.assert_array_equal(record["images"][1], expected[2]["image"][0].permute(1, 2, 0))
-    for place in (0, 2):
-        picture = expected[3]["image"][1].permute(1, 2, 0)
+    for place, camera in enumerate((4, 0, 4)):
+        picture = sample["image"][camera].permute(1, 2, 0)
         np.testing.assert_array_equal(record["images"][place], picture)
     centre = -record["extrinsics"][0][:, :3].T @ record["extrinsics"][0][:, 3]
     assert np.abs(centre).max() < 1e-12
-
-
-def test_a_scene_as_a_sequence_has_all_its_frames(indexed_release):
-    scenes = VGGTViews(indexed_release, sequence="scene", frames="all", cameras=(0, 5))
-    moments = VGGTViews(indexed_release, frames="all", cameras=(0, 5))
-
-    assert (len(scenes), scenes.view_count(0), len(moments), moments.view_count(0)) == (
-        3,
-        14,
-        21,
-        2,
-    )
-    assert scenes.sequence_name(2) == "train/Uniform/SynthStage/scene_000001"
-    assert moments.sequence_name(20) == "train/Uniform/SynthStage/scene_000001/006"
-
-
-@pytest.mark.parametrize("sequence", ["moment", "scene"])
-def test_a_sequence_is_found_by_its_name(indexed_release, sequence):
-    views = VGGTViews(indexed_release, sequence=sequence, frames=[0, 3, 5])
-
-    for number in range(len(views)):
-        by_number = views.get_data(seq_index=number, ids=[2])
-        by_name = views.get_data(seq_name=by_number["seq_name"], ids=[2])
-        assert by_name["seq_name"] == by_number["seq_name"]
-        np.testing.assert_array_equal(by_name["images"][0], by_number["images"][0])
-
-
-def test_numbers_beyond_the_last_sequence_begin_anew(indexed_release):
-    views = VGGTViews(indexed_release)
-
-    assert (
-        views.get_data(seq_index=3, ids=[0])["seq_name"]
-        == views.get_data(seq_index=0, ids=[0])["seq_name"]
-    )
-
-
-@pytest.mark.parametrize(
-    ("asked", "message"),
-    [
-        ({"seq_index": 0, "ids": [6]}, r"has views 0 to 5, got ids=\[6\]"),
-        ({"seq_index": 0, "ids": []}, r"has views 0 to 5, got ids=\[\]"),
-        ({"seq_index": 0, "img_per_seq": 0}, r"img_per_seq must be at least 1, got 0"),
-        ({"seq_name": "StereoGenBench_train/none/000"}, r"no sequence .*the first of 3"),
-        ({"seq_name": "eval/MapSeenInTrain/Uniform/SynthStage/scene_000000/000"}, r"no sequence"),
-        ({}, r"give seq_index or seq_name"),
-    ],
-)
-def test_what_a_sequence_does_not_have_is_refused(indexed_release, asked, message):
-    with pytest.raises(SelectionError, match=message):
-        VGGTViews(indexed_release).get_data(**asked)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"sequence": "clip"}, r"'moment' or 'scene', got 'clip'"),
-        ({"frames": ("clips", 3)}, r"clips.*sequence='scene'"),
-        ({"cameras": (0, 9)}, r"cameras must be"),
-    ],
-)
-def test_sequences_that_cannot_be_made_are_refused(indexed_release, options, message):
-    with pytest.raises(SelectionError, match=message):
-        VGGTViews(indexed_release, **options)
 
 
 class BaseDataset:
@@ -439,10 +328,10 @@ def configuration(**changed):
 
 
 def test_vggts_base_class_crops_the_views(indexed_release, trained_on_vggt):
-    views = VGGTViews(indexed_release)
-    dataset = trained_on_vggt(configuration(), views=views, len_train=100)
+    dataset = trained_on_vggt(configuration(), indexed_release, len_train=100)
     record = dataset[17, 3, 0.5]
-    plain = views.get_data(seq_index=17, ids=record["ids"])
+    moment = SceneViews(indexed_release, fields=VIEW_FIELDS, **TRAIN)[17 % 3]
+    plain = vggt_record(moment, ids=record["ids"])
 
     assert len(dataset) == 100
     for number in range(3):
@@ -457,11 +346,11 @@ def test_vggts_base_class_crops_the_views(indexed_release, trained_on_vggt):
 def test_vggts_configuration_decides_whether_views_are_drawn_twice(
     indexed_release, trained_on_vggt
 ):
-    views = VGGTViews(indexed_release)
-    once = trained_on_vggt(configuration(allow_duplicate_img=False), views=views)
-    twice = trained_on_vggt(configuration(), views=views)
+    once = trained_on_vggt(configuration(allow_duplicate_img=False), indexed_release)
+    twice = trained_on_vggt(configuration(), indexed_release)
 
     assert sorted(once[0, 6, 1.0]["ids"].tolist()) == [0, 1, 2, 3, 4, 5]
+    assert len(once[0, 9, 1.0]["ids"]) == 9
     assert len(twice[0, 24, 1.0]["ids"]) == 24
     assert any(len(set(twice[0, 6, 1.0]["ids"].tolist())) < 6 for _ in range(20))
 
@@ -469,45 +358,15 @@ def test_vggts_configuration_decides_whether_views_are_drawn_twice(
 def test_vggts_configuration_decides_whether_the_number_of_a_sequence_counts(
     indexed_release, trained_on_vggt
 ):
-    dataset = trained_on_vggt(configuration(inside_random=True), views=VGGTViews(indexed_release))
+    dataset = trained_on_vggt(configuration(inside_random=True), indexed_release)
     torch.manual_seed(0)
 
     assert len({dataset[0, 1, 1.0]["seq_name"] for _ in range(30)}) == 3
 
 
-def test_workers_of_a_loader_draw_different_views(indexed_release):
-    class Numbered(torch.utils.data.Dataset):
-        def __len__(self):
-            return 8
-
-        def __getitem__(self, number):
-            return views.get_data(seq_index=0, img_per_seq=4)["ids"]
-
-    views = VGGTViews(indexed_release)
-    loader = torch.utils.data.DataLoader(
-        Numbered(), batch_size=4, num_workers=2, multiprocessing_context="fork"
-    )
-
-    first, second = (batch.tolist() for batch in loader)
-    assert first != second
-
-
-@pytest.mark.parametrize("views_of", [DUSt3RViews, VGGTViews])
-def test_views_travel_to_processes_that_are_started_afresh(indexed_release, views_of):
-    views = views_of(indexed_release, frames=[0, 1])
-    travelled = ForkingPickler.loads(ForkingPickler.dumps(views))
-
-    assert len(travelled) == len(views) == 6
-    for each in (travelled, views):
-        picture = (
-            each[1][0]["img"] if views_of is DUSt3RViews else each.get_data(1, ids=[0])["images"][0]
-        )
-        assert np.asarray(picture).shape == (64, 64, 3)
-
-
 def test_the_records_of_the_real_scene_are_those_of_its_views(shared_scenes):
-    record = VGGTViews(shared_scenes, frames=[20]).get_data(seq_index=0)
     sample = SceneViews(shared_scenes, frames=[20])[0]
+    record = vggt_record(sample)
 
     for number in range(6):
         mask = record["point_masks"][number]

@@ -116,11 +116,10 @@ def test_disparity_is_that_of_the_pair(recorded, indexed_release):
         np.testing.assert_array_equal(disparity, pairs[number]["disparity"][0])
 
 
-def test_a_text_says_what_is_shown(recorded):
+def test_a_text_says_which_scene_is_shown(recorded):
     (text,) = recorded["/scene", "TextDocument:text"].values()
 
-    for fact in (SCENE, "7 frames at 15 Hz", "cameras 1-4, baseline", "origin at"):
-        assert fact.replace("_", "\\_") in text or fact in text
+    assert SCENE in text
 
 
 def test_the_time_of_a_frame_follows_from_its_rate(rerun, indexed_release, tmp_path):
@@ -214,7 +213,7 @@ def test_a_viewer_that_does_not_start_is_named(rerun, indexed_release, monkeypat
         raise RuntimeError("Failed to find Rerun Viewer executable in PATH.\nInstall it ...")
 
     monkeypatch.setattr(rerun, "spawn", refuse)
-    with pytest.raises(ExtraError, match=r"viewer cannot be reached \(Failed .*an \.rrd file"):
+    with pytest.raises(ExtraError, match=r"viewer does not start \(Failed .*an \.rrd file"):
         bridge.view_live(indexed_release)
 
 

@@ -109,11 +109,6 @@ def test_a_decoded_video_is_refused(scenes):
         list(decode(("left",))(scenes[:1]))
 
 
-def test_a_sample_without_a_key_is_refused():
-    with pytest.raises(StorageError, match="a scene has no __key__"):
-        list(decode(("left",))([{"cam_00_rgb.mp4": b""}]))
-
-
 def test_an_unknown_option_is_named():
     with pytest.raises(
         SelectionError, match=r"decode has no option 'split'; it is an option of an earlier stage"

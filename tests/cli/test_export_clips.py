@@ -7,8 +7,6 @@ from typer.testing import CliRunner
 
 from stereogenbench_data.cli.commands import app
 
-pytestmark = pytest.mark.filterwarnings("ignore::stereogenbench_data.bridges.clips.ClipSizeWarning")
-
 
 def run(*words):
     return CliRunner().invoke(app, ["export", "clips", *map(str, words)], env={"COLUMNS": "300"})
@@ -35,9 +33,8 @@ def test_every_option_reaches_the_export(indexed_release, tmp_path):
     shown = run(
         indexed_release, tmp_path / "out", "--layout", "diffsynth", "--where", "family=Uniform",
         "--where", "baseline_cm=0:500", "--split", "train", "--pairs", "0-1,1-2", "--length", "5",
-        "--stride", "1", "--step", "1", "--size", "48x32", "--fit", "crop", "--rate-hz", "16",
-        "--also", "depth", "--also", "disparity", "--control", "left", "--baseline-in-caption",
-        "--crf", "20", "--workers", "1",
+        "--stride", "1", "--step", "1", "--size", "48x32", "--rate-hz", "16",
+        "--baseline-in-caption", "--crf", "20", "--workers", "1",
     )  # fmt: skip
 
     assert shown.exit_code == 0, shown.output
@@ -46,10 +43,8 @@ def test_every_option_reaches_the_export(indexed_release, tmp_path):
     assert (found[0]["width"], found[0]["height"], found[0]["frame_rate_hz"]) == (48, 32, 16)
     assert found[0]["frames"] == [0, 1, 2, 3, 4]
     assert found[0]["caption"].endswith(" cm.")
-    assert {"depth", "disparity"} < found[0]["videos"].keys()
     settings = json.loads((tmp_path / "out" / "export.json").read_text())
-    assert (settings["control"], settings["form"]["fit"]) == ("left", "crop")
-    assert settings["form"]["encoding"]["crf"] == 20
+    assert settings["encoding"]["crf"] == 20
 
 
 def test_evaluation_scenes_are_left_out_unless_their_split_is_named(indexed_release, tmp_path):
@@ -77,7 +72,6 @@ def test_evaluation_scenes_are_left_out_unless_their_split_is_named(indexed_rele
         (["--length", "7"], ["length=7", "4N+1", "5 or 9"]),
         (["--crf", "52"], ["crf", "0 to 51", "52"]),
         (["--stride", "0"], ["at least 1", "got 0"]),
-        (["--also", "sound"], ["also", "'sound'", "disparity"]),
         (["--where", "family=Narrow"], ["family", "Narrow", "Uniform"]),
     ],
 )

@@ -43,18 +43,17 @@ def test_evaluation_scenes_are_exported_if_the_split_names_them(indexed_release,
     assert "left out" not in done.stderr
 
 
-def test_filters_cameras_frames_group_and_points_are_taken(indexed_release, tmp_path):
+def test_filters_cameras_frames_and_points_are_taken(indexed_release, tmp_path):
     done = run(
         "export", "ply", indexed_release, tmp_path, *USUAL, "--where", "family=Uniform",
-        "--cameras", "0,5", "--frames", "every:3", "--group", "scene", "--points", "all",
+        "--cameras", "0,5", "--frames", "every:3", "--points", "all",
     )  # fmt: skip
     settings = json.loads((tmp_path / "export.json").read_text())
 
-    assert done.stdout == f"{tmp_path}: 2 folders\n"
+    assert done.stdout == f"{tmp_path}: 6 folders\n"
     assert "1 evaluation scene left out" in done.stderr
     assert settings["cameras"] == [0, 5]
-    assert (settings["group"], settings["points"], settings["size"]) == ("scene", None, [16, 16])
-    assert settings["frames"] == [[0, 3, 6]]
+    assert (settings["points"], settings["size"]) == (None, [16, 16])
 
 
 def test_evaluation_scenes_that_would_not_match_are_not_counted(indexed_release, tmp_path):

@@ -31,7 +31,7 @@ def test_predictions_are_scored_and_reported(scenes, other_views, tmp_path):
     assert "StereoSpace (paper, other scenes) | seen_map | Uniform" in shown.stdout
     assert "By map_name" in shown.stdout
     assert {path.name for path in out.iterdir()} == {
-        "results.json", "report.md", "tables.tex", "tables.csv", "pairs.csv", "plots", "partial",
+        "results.json", "report.md", "pairs.csv", "plots", "partial",
     }  # fmt: skip
     assert {path.name for path in (out / "plots").iterdir()} == {
         "psnr_by_baseline.png", "ssim_by_baseline.png",
@@ -57,7 +57,7 @@ def test_a_second_run_says_whether_it_reproduces_the_first(scenes, other_views, 
     results = tmp_path / "results.json"
     same = run(*command, *SMALL, "--compare", results)
     told = json.loads(results.read_text())
-    told["tables"][0]["rows"][0]["cells"]["ssim"]["mean"] += 1e-3
+    told["tables"][0]["rows"][0]["values"]["ssim"]["mean"] += 1e-3
     told["data"]["digest"] = "0" * 64
     results.write_text(json.dumps(told))
     other = run(*command, *SMALL, "--compare", results)
@@ -65,7 +65,7 @@ def test_a_second_run_says_whether_it_reproduces_the_first(scenes, other_views, 
     assert (first.exit_code, same.exit_code, other.exit_code) == (0, 0, 1)
     assert "results.json: reproduced" in same.stderr
     assert "differs: data.digest: " in other.stderr
-    assert "cells.ssim.mean: " in other.stderr
+    assert "values.ssim.mean: " in other.stderr
     assert "results.json: 2 differences" in other.stderr
 
 
@@ -129,23 +129,11 @@ def test_inputs_are_exported(scenes, tmp_path):
     assert len(list((tmp_path / "in").glob("*/left/*.png"))) == 6
 
 
-def test_controls_that_hold_end_with_0(scenes, tmp_path):
+def test_controls_stand_beside_the_papers(scenes, tmp_path):
     shown = run("eval", "controls", scenes, "--frames", "first", "--out", tmp_path, *SMALL)
 
     assert shown.exit_code == 0, shown.output
-    assert "- holds: every frame of the rendered target is identical (3 of 3)" in shown.stdout
     assert "rendered target (paper, other scenes)" in shown.stdout
-
-
-def test_controls_that_do_not_hold_end_with_1(scenes, tmp_path, monkeypatch):
-    from stereogenbench_data.evaluation import controls as relations
-
-    broken = relations.Relation("up is up", False, "down")  # noqa: FBT003
-    monkeypatch.setattr(relations, "relations", lambda results: [broken])
-    shown = run("eval", "controls", scenes, "--frames", "first", "--out", tmp_path, *SMALL)
-
-    assert shown.exit_code == 1
-    assert "DOES NOT HOLD: up is up (down)" in shown.stdout
 
 
 def test_a_stop_says_how_to_go_on(scenes, right_views, tmp_path, monkeypatch):

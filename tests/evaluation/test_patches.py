@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.metrics.pixels import PATCH_SETTINGS, outside_window, patch_psnr
 
 FLOOR_DB = 10 * math.log10(255**2 * 12)
@@ -48,8 +47,6 @@ def test_every_patch_finds_what_a_search_by_loops_finds(height, width, seed, con
     score = patch_psnr(left, right)
 
     floored = np.maximum(errors, 1 / 12)
-    assert score.patches == len(errors)
-    assert score.floored == np.count_nonzero(errors < 1 / 12)
     assert score.mean_db == pytest.approx(np.mean(10 * np.log10(255**2 / floored)), abs=1e-9)
     assert score.pooled_db == pytest.approx(10 * np.log10(255**2 / np.mean(floored)), abs=1e-9)
 
@@ -72,9 +69,8 @@ def test_a_shift_is_found_from_2_to_48_pixels(shift, found):
 
     score = patch_psnr(left, right)
 
-    # Patches nearer to the left border than the shift have no counterpart inside the picture.
-    reachable = score.patches - 2 * (math.ceil(shift / 16) - 1)
-    assert score.floored == (reachable if found else 0)
+    # Few patches are nearer to the left border than the shift and so have no counterpart.
+    assert 50 < score.mean_db <= FLOOR_DB if found else score.mean_db < 20
 
 
 def test_one_level_off_is_48_db_and_patches_at_the_left_border_are_not_scored():
@@ -83,7 +79,6 @@ def test_one_level_off_is_48_db_and_patches_at_the_left_border_are_not_scored():
 
     score = patch_psnr(left, right)
 
-    assert score.patches == 3
     assert score.mean_db == pytest.approx(48.1308036086791, abs=1e-9)
     assert score.pooled_db == pytest.approx(48.1308036086791, abs=1e-9)
 
@@ -96,7 +91,6 @@ def test_a_picture_without_patches_to_search_has_no_score(size):
 
     assert math.isnan(score.mean_db)
     assert math.isnan(score.pooled_db)
-    assert (score.patches, score.floored) == (0, 0)
 
 
 def test_content_outside_the_window_is_counted_where_disparity_is_known():
@@ -105,13 +99,6 @@ def test_content_outside_the_window_is_counted_where_disparity_is_known():
     assert outside_window(disparity, np.ones((2, 3), dtype=bool)) == 0.5
     assert outside_window(disparity, disparity < 40) == pytest.approx(1 / 3)
     assert math.isnan(outside_window(disparity, disparity < 0))
-
-
-def test_maps_and_pictures_of_different_sizes_are_refused():
-    with pytest.raises(EvaluationError, match=r"shape \(2, 3\), but its valid map of \(3, 2\)"):
-        outside_window(np.zeros((2, 3)), np.ones((3, 2), dtype=bool))
-    with pytest.raises(EvaluationError, match="of one size, got 40x16 and 40x17"):
-        patch_psnr(np.zeros((3, 16, 40), dtype=np.uint8), np.zeros((3, 17, 40), dtype=np.uint8))
 
 
 def test_every_choice_is_named():

@@ -87,7 +87,7 @@ def test_the_scale_of_the_target_is_right_and_of_a_wrong_baseline_the_ratio_of_t
 
     assert scores["target"]["scale"].drift < 0.1
     assert scores["wrong baseline"]["scale"].slope == pytest.approx(ratio, abs=0.1)
-    assert scores["copied left"]["scale"].r_squared < 0.05
+    assert scores["copied left"]["scale"].r2 < 0.05
     assert scores["random"]["scale"].drift == pytest.approx(1, abs=0.2)
 
 
@@ -108,7 +108,7 @@ def measured(left, right, *, threads):
             patch_psnr(left, noisy).mean_db,
             match_error(noisy, against=against, matcher=Sift()).e_match,
             fit.slope,
-            fit.residual_std_px,
+            fit.residual_px,
         ]
     finally:
         cv2.setNumThreads(before[0])

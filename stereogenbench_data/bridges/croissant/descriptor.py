@@ -7,6 +7,9 @@ Its files and record sets are templates, one for each kind of data:
     release.json    the public release, whose record sets hold their data themselves
     common.json     the context and the enumerations of all three
 
+mlcroissant parses no JSON inside a tar, so what the shards' JSON files hold is written once as
+Parquet tables, from the index. Where there are many shards, record sets of files use only a few.
+
 A word such as ``@rgb@`` in a template is filled in here. A regex that takes the scene of a path
 does not change a scene's key, because mlcroissant's joins apply it twice. Where mlcroissant 1.1
 reads a narrower form than the specification allows, the narrower form is written. What a descriptor
@@ -15,26 +18,152 @@ says of the dataset as a whole is in `dataset_facts`.
 Source: the Croissant 1.1 and RAI 1.0 specifications.
 """
 
+import hashlib
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
 from stereogenbench_data.bridges import dataset_facts
-from stereogenbench_data.bridges.croissant.shards import (
-    SHARD_LIST,
-    WrittenTable,
-    bound_shards,
-    write_tables,
-)
 from stereogenbench_data.errors import DescriptorError, explain_os_errors
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.sources.files import write_atomic
+from stereogenbench_data.schema.release import CAMERA_PAIRS, baseline_bin
+from stereogenbench_data.sources.files import open_atomic, write_atomic
 from stereogenbench_data.sources.location import is_remote, shown
+
+SHARD_LIST: Final = "shards.txt"
+MOST_SHARD_FILES: Final = 3000
+"""Above this number, shards are named in a list, with their checksums in a table."""
+MOST_MEDIA_BYTES: Final = 1_000_000_000
+"""Above this size of all shards, record sets of files use the smallest shard of each family."""
+
+_TEXT, _WHOLE, _NUMBER = pa.string(), pa.int64(), pa.float64()
+_SCENE_COLUMNS: Final = {
+    "scene_id": ("key", _TEXT),
+    "split": ("split", _TEXT),
+    "eval_subset": ("subset", _TEXT),
+    "family": ("family", _TEXT),
+    "map": ("map_name", _TEXT),
+    "scene_label": ("scene_label", _TEXT),
+    "character": ("character", _TEXT),
+    "animation": ("animation", _TEXT),
+    "frames": ("frames", _WHOLE),
+    "frame_rate_hz": ("frame_rate_hz", _NUMBER),
+    "image_width_px": ("image_width_px", _WHOLE),
+    "image_height_px": ("image_height_px", _WHOLE),
+    "focal_mm": ("focal_mm", _NUMBER),
+    "sensor_width_mm": ("sensor_width_mm", _NUMBER),
+    "sensor_height_mm": ("sensor_height_mm", _NUMBER),
+    "primary_left": ("primary_left", _WHOLE),
+    "primary_right": ("primary_right", _WHOLE),
+    "pairwise_baselines_cm": ("baselines_cm", pa.list_(_NUMBER)),
+    "depth_unit_m": ("depth_unit_m", pa.list_(_NUMBER)),
+    "description": ("caption", _TEXT),
+}
+"""Columns of the table of scenes: the index's column and the type."""
+
+
+def bound_shards(index: SceneIndex) -> list[str]:
+    """Return the shards that record sets of files use: all, or the smallest of each family."""
+    sizes = {path: index.shards[path].size for path in sorted(index.shards)}
+    if sum(sizes.values()) <= MOST_MEDIA_BYTES:
+        return [*sizes]
+    smallest: dict[str, str] = {}
+    for path in sorted(sizes, key=lambda path: sizes[path]):
+        smallest.setdefault(path.rpartition("-")[0], path)
+    return sorted(smallest.values())
+
+
+def write_tables(index: SceneIndex, folder: Path) -> dict[str, bytes]:
+    """Write the tables of shards into a folder, and return their bytes by name.
+
+    Args:
+        index: The index of shards. If there are too many for a descriptor, their paths are
+            written as ``shards.txt``.
+        folder: Where to write; created if it does not exist.
+
+    Raises:
+        DescriptorError: If the folder cannot be written.
+    """
+    tables = {
+        "scenes.parquet": scenes_table(index),
+        "pairs.parquet": pairs_table(index),
+        "shards.parquet": shards_table(index),
+    }
+    names = [*tables]
+    cannot = f"{folder}: tables cannot be written"
+    with explain_os_errors(cannot, "Choose another place with --out.", kind=DescriptorError):
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, table in tables.items():
+            with open_atomic(folder / name) as file:
+                pq.write_table(table, file, compression="zstd")
+        if len(index.shards) > MOST_SHARD_FILES:
+            listed = "".join(f"{path}\n" for path in sorted(index.shards))
+            write_atomic(folder / SHARD_LIST, listed.encode())
+            names.append(SHARD_LIST)
+        return {name: (folder / name).read_bytes() for name in names}
+
+
+def scenes_table(index: SceneIndex) -> pa.Table:
+    """Return one row per scene: identity, camera, 15 baselines, description, shard."""
+    columns = {
+        name: pa.array(index.column(source).tolist(), kind)
+        for name, (source, kind) in _SCENE_COLUMNS.items()
+    }
+    return pa.table(columns | {"shard": pa.array(_shards_of(index))})
+
+
+def pairs_table(index: SceneIndex) -> pa.Table:
+    """Return one row per camera pair, 15 per scene, in the order of `CAMERA_PAIRS`."""
+    scenes, count = len(index), len(CAMERA_PAIRS)
+    left, right = np.array(CAMERA_PAIRS, dtype=np.int64).T
+    baselines_cm = index.column("baselines_cm").reshape(-1)
+    primary = np.stack([index.column("primary_left"), index.column("primary_right")], axis=-1)
+    is_primary = (np.array(CAMERA_PAIRS)[None] == np.sort(primary, axis=-1)[:, None]).all(axis=-1)
+    keys = np.repeat(index.column("key"), count)
+    lefts, rights = np.tile(left, scenes), np.tile(right, scenes)
+    return pa.table(
+        {
+            "pair_id": [f"{key}:{a}-{b}" for key, a, b in zip(keys, lefts, rights, strict=True)],
+            "scene_id": pa.array(keys, pa.string()),
+            "camera_left": lefts,
+            "camera_right": rights,
+            "baseline_cm": baselines_cm,
+            "baseline_bin": [baseline_bin(float(each)) for each in baselines_cm],
+            "is_adjacent": rights - lefts == 1,
+            "is_primary": is_primary.reshape(-1),
+        }
+    )
+
+
+def shards_table(index: SceneIndex) -> pa.Table:
+    """Return one row per shard: path, size, checksum, and the number of scenes and members."""
+    paths, scenes = sorted(index.shards), Counter(_shards_of(index))
+    return pa.table(
+        {
+            "shard": paths,
+            "size_bytes": [index.shards[path].size for path in paths],
+            "sha256": [index.shards[path].sha256 for path in paths],
+            "scenes": [scenes[path] for path in paths],
+            "members": [index.shards[path].members for path in paths],
+        }
+    )
+
+
+def _shards_of(index: SceneIndex) -> list[str]:
+    """Return the shard of each scene."""
+    scenes = (index.scene(row) for row in range(len(index)))
+    return [next(iter(scene.members.values())).path for scene in scenes]
+
 
 Node = dict[str, Any]
 
@@ -63,8 +192,6 @@ class Publication:
         data_url: URL of the folder of shards, pinned to a revision, or of the git repository of a
             tree. With None, shards have paths relative to the descriptor, and a tree of the
             release has the URL of the release's own repository.
-        tables_url: URL of the folder of tables. None for the folder in ``data_url`` with the name
-            of the descriptor, or for paths relative to the descriptor.
         about: What the user states of the scenes, as for `dataset_facts.facts_of`.
     """
 
@@ -72,7 +199,6 @@ class Publication:
     version: str | None = None
     published: date | None = None
     data_url: str | None = None
-    tables_url: str | None = None
     about: dataset_facts.About | None = None
 
 
@@ -113,8 +239,7 @@ def write_descriptor(
         files = template("release", repository=data_url)
     elif index.shards:
         data_url = publication.data_url or _relative(index.root, to=path.parent)
-        beside = publication.data_url and f"{publication.data_url}/{path.stem}"
-        tables_url = publication.tables_url or beside or path.stem
+        tables_url = f"{publication.data_url}/{path.stem}" if publication.data_url else path.stem
         tables = write_tables(index, path.with_suffix(""))
         files = _shard_nodes(index, tables, data_url=data_url, tables_url=tables_url)
         facts = facts | dataset_facts.packing_facts(index, facts)
@@ -151,17 +276,12 @@ def _require_valid(publication: Publication) -> None:
         raise DescriptorError(
             f"{version!r} is not a version: it must be MAJOR.MINOR.PATCH, such as 1.0.0."
         )
-    for url in (publication.data_url, publication.tables_url):
-        if url is not None and not is_remote(url):
-            raise DescriptorError(
-                f"{url!r} is not a URL, under which others find the data: give one such as "
-                "https://HOST/PATH, or leave it out."
-            )
-        if url is not None and shown(url) != url:
-            raise DescriptorError(
-                f"{shown(url)}: the URL contains a login or a query, which must not be published. "
-                f"Give the URL without them."
-            )
+    url = publication.data_url
+    if url is not None and (not is_remote(url) or shown(url) != url):
+        raise DescriptorError(
+            f"{shown(url)!r} is not a URL under which others find the data, such as "
+            "https://HOST/PATH, without a login or a query: give one, or leave it out."
+        )
 
 
 def _of_videos(name: str, index: SceneIndex, **words: str) -> Node:
@@ -185,18 +305,18 @@ def _of_videos(name: str, index: SceneIndex, **words: str) -> Node:
 
 
 def _shard_nodes(
-    index: SceneIndex, tables: Sequence[WrittenTable], *, data_url: str, tables_url: str
+    index: SceneIndex, tables: Mapping[str, bytes], *, data_url: str, tables_url: str
 ) -> Node:
     """Return the files and record sets of shards."""
     nodes = _of_videos("shards", index)
     bound = bound_shards(index)
-    is_listed = any(table.name == SHARD_LIST for table in tables)
+    is_listed = SHARD_LIST in tables
     files = []
-    for table in tables:
-        kind = "text/plain" if table.name == SHARD_LIST else "application/x-parquet"
-        about = {"description": _TABLES[table.name]}
-        place = f"{tables_url}/{table.name}"
-        files.append(_file(table.name, place, kind, table.sha256, table.size, about))
+    for name, content in tables.items():
+        kind = "text/plain" if name == SHARD_LIST else "application/x-parquet"
+        sha256, about = hashlib.sha256(content).hexdigest(), {"description": _TABLES[name]}
+        place = f"{tables_url}/{name}"
+        files.append(_file(name, place, kind, sha256, len(content), about))
     for shard in bound if is_listed else sorted(index.shards):
         facts = index.shards[shard]
         files.append(_file(shard, f"{data_url}/{shard}", _TAR, facts.sha256, facts.size, {}))

@@ -33,21 +33,12 @@ class FeatureStatistics:
     root: Float64[np.ndarray, "rows dim"]
 
     @classmethod
-    def empty(cls, dim: int) -> "FeatureStatistics":
-        """Return the statistics of an empty set."""
-        return cls(count=0, mean=np.zeros(dim), root=np.zeros((0, dim)))
-
-    @classmethod
     def of(cls, features: Float[np.ndarray, "n dim"]) -> "FeatureStatistics":
         """Return the statistics of samples.
 
         Raises:
-            EvaluationError: If they are not a table of finite numbers.
+            EvaluationError: If a number is not finite.
         """
-        if features.ndim != 2:
-            raise EvaluationError(
-                f"features must be of shape (n, dim), got {features.shape}: pass one row a sample."
-            )
         samples = features.astype(np.float64)
         if not np.isfinite(samples).all():
             bad = np.flatnonzero(~np.isfinite(samples).all(axis=1))
@@ -55,8 +46,6 @@ class FeatureStatistics:
                 f"{len(bad)} of {len(samples)} samples have features that are not finite, "
                 f"sample {bad[0]} first: the extractor overflowed or its weights are damaged."
             )
-        if len(samples) == 0:
-            return cls.empty(samples.shape[1])
         mean = samples.mean(axis=0)
         root = _compressed(samples - mean, at_most=2 * samples.shape[1])
         return cls(count=len(samples), mean=mean, root=root)
@@ -67,14 +56,7 @@ class FeatureStatistics:
         return len(self.mean)
 
     def merged(self, other: "FeatureStatistics") -> "FeatureStatistics":
-        """Return the statistics of the union of both sets.
-
-        Raises:
-            EvaluationError: If their samples have different numbers of features.
-        """
-        _require_alike(self, other)
-        if self.count == 0 or other.count == 0:
-            return other if self.count == 0 else self
+        """Return the statistics of the union of both sets."""
         count = self.count + other.count
         between = other.mean - self.mean
         apart = math.sqrt(self.count * other.count / count) * between
@@ -90,7 +72,7 @@ class FrechetDistance:
     """A Fréchet distance, with the sample sizes needed to interpret it.
 
     Attributes:
-        value: The distance (squared, as FID and FVD are); nan below two samples on a side.
+        value: The distance (squared, as FID and FVD are); None below two samples on a side.
         samples: How many samples the predicted and the target side have.
         dim: How many features a sample has.
         underdetermined: Whether the smaller side has no more samples than features. Its covariance
@@ -98,7 +80,7 @@ class FrechetDistance:
             are: compare it only with values of as many samples.
     """
 
-    value: float
+    value: float | None
     samples: tuple[int, int]
     dim: int
     underdetermined: bool
@@ -109,14 +91,10 @@ def frechet_distance(predicted: FeatureStatistics, target: FeatureStatistics) ->
 
     ||m1 - m2||^2 + tr S1 + tr S2 - 2 tr (S1 S2)^(1/2), with covariances over n - 1.
 
-    Raises:
-        EvaluationError: If their samples have different numbers of features.
-
     Source: Dowson & Landau, Journal of Multivariate Analysis 12(3), 1982; Heusel et al., NIPS 2017.
     """
-    _require_alike(predicted, target)
     samples = (predicted.count, target.count)
-    value = math.nan
+    value = None
     if min(samples) > 1:
         one, two = (
             _compressed(side.root, at_most=side.dim) / math.sqrt(side.count - 1)
@@ -124,9 +102,10 @@ def frechet_distance(predicted: FeatureStatistics, target: FeatureStatistics) ->
         )
         between = predicted.mean - target.mean
         shared = np.linalg.svd(one @ two.T, compute_uv=False).sum()
-        value = float(between @ between + np.sum(one**2) + np.sum(two**2) - 2 * shared)
+        distance = between @ between + np.sum(one**2) + np.sum(two**2) - 2 * shared
+        value = max(float(distance), 0.0)
     return FrechetDistance(
-        value=max(value, 0.0) if math.isfinite(value) else value,
+        value=value,
         samples=samples,
         dim=predicted.dim,
         underdetermined=min(samples) <= predicted.dim,
@@ -140,11 +119,3 @@ def _compressed(
     if len(root) <= at_most:
         return root
     return np.asarray(np.linalg.qr(root, mode="r"))
-
-
-def _require_alike(one: FeatureStatistics, other: FeatureStatistics) -> None:
-    if one.dim != other.dim:
-        raise EvaluationError(
-            f"sets of {one.dim} and of {other.dim} features cannot be compared: "
-            "they come from different extractors."
-        )

@@ -8,13 +8,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Int64
 
-from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.models.interfaces import (
     KeypointMatcher,
     Keypoints,
     Picture,
     Settings,
-    require_pictures,
 )
 
 EPIPOLAR_PX: Final = 2.0
@@ -49,14 +47,10 @@ class TargetMatches:
     Attributes:
         left: Keypoints of the left picture.
         matched: Which of them are found again in the target.
-        size_px: Height and width of the pictures.
-        matcher: The name of the matcher they were found by.
     """
 
     left: Keypoints
     matched: Bool[np.ndarray, " n"]
-    size_px: tuple[int, int]
-    matcher: str
 
 
 def target_matches(left: Picture, target: Picture, *, matcher: KeypointMatcher) -> TargetMatches:
@@ -64,36 +58,15 @@ def target_matches(left: Picture, target: Picture, *, matcher: KeypointMatcher) 
 
     The left keypoints are detected once, so the two sets that E_match compares are of the same
     keypoints.
-
-    Raises:
-        EvaluationError: If the two are not pictures of one size.
     """
-    require_pictures(left, target)
     keypoints = matcher.detect(left)
-    return TargetMatches(
-        left=keypoints,
-        matched=_matched(keypoints, target, matcher=matcher),
-        size_px=(left.shape[1], left.shape[2]),
-        matcher=matcher.name,
-    )
+    return TargetMatches(keypoints, _matched(keypoints, target, matcher=matcher))
 
 
 def match_error(
     predicted: Picture, *, against: TargetMatches, matcher: KeypointMatcher
 ) -> MatchScore:
-    """Return E_match of a predicted right picture.
-
-    Raises:
-        EvaluationError: If it is not a picture of the target's size, or the matcher another.
-    """
-    require_pictures(predicted)
-    height, width = against.size_px
-    if predicted.shape[1:] != against.size_px or matcher.name != against.matcher:
-        raise EvaluationError(
-            f"the target was matched at {width}x{height} by {against.matcher}, and the prediction "
-            f"is {predicted.shape[2]}x{predicted.shape[1]}, by {matcher.name}: match both at one "
-            f"size by one matcher."
-        )
+    """Return E_match of a predicted right picture, by the matcher that matched the target."""
     matched = _matched(against.left, predicted, matcher=matcher)
     common = int(np.count_nonzero(matched & against.matched))
     union = int(np.count_nonzero(matched | against.matched))

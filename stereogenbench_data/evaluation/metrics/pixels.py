@@ -4,19 +4,14 @@ P-PSNR asks how well each patch of the left picture is found again along its row
 """
 
 import math
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 from numpy.lib.stride_tricks import as_strided
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.models.interfaces import (
-    Picture,
-    Settings,
-    require_pictures,
-)
+from stereogenbench_data.evaluation.models.interfaces import Picture, Settings
 from stereogenbench_data.evaluation.models.opencv import require_opencv
 
 _PEAK: Final = 255.0
@@ -53,11 +48,7 @@ def psnr_db(predicted: Picture, target: Picture) -> float:
 
     Returns:
         Infinity where the two are identical: count these, since an average of them says nothing.
-
-    Raises:
-        EvaluationError: If they are not pictures of one size.
     """
-    require_pictures(predicted, target)
     error = predicted.astype(np.int32)
     error -= target
     flat = error.reshape(-1)
@@ -74,12 +65,11 @@ def ssim(predicted: Picture, target: Picture) -> float:
     with gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255.
 
     Raises:
-        EvaluationError: If they are not pictures of one size, or smaller than the window.
+        EvaluationError: If they are smaller than the window.
         ExtraError: If OpenCV is not installed.
 
     Source: Wang, Bovik, Sheikh & Simoncelli, IEEE TIP 13(4), 2004.
     """
-    require_pictures(predicted, target)
     height, width = predicted.shape[1:]
     if min(height, width) < _WINDOW_PX:
         raise EvaluationError(
@@ -156,21 +146,16 @@ PATCH_SETTINGS: Final[Settings] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class PatchScore:
-    """P-PSNR of one pair.
+class PatchScore(NamedTuple):
+    """P-PSNR of one pair; nan without patches.
 
     Attributes:
-        mean_db: Mean over the patches of the PSNR of their best match; nan without patches.
+        mean_db: Mean over the patches of the PSNR of their best match.
         pooled_db: PSNR of the mean squared error of all patches' best matches.
-        patches: How many patches have a candidate.
-        floored: How many of them had their squared error raised to the floor.
     """
 
     mean_db: float
     pooled_db: float
-    patches: int
-    floored: int
 
 
 def patch_psnr(left: Picture, right: Picture) -> PatchScore:
@@ -179,21 +164,14 @@ def patch_psnr(left: Picture, right: Picture) -> PatchScore:
     Both are uint8 (3, h, w). Patches of 16 x 16 pixels stand side by side from the top left. What
     is left over at the right and at the bottom is not scored, nor is a patch all of whose
     candidates leave the picture.
-
-    Raises:
-        EvaluationError: If they are not pictures of one size.
     """
-    require_pictures(left, right)
     squared = _least_squared_error(left, right).reshape(-1)
     if squared.size == 0:
-        return PatchScore(mean_db=math.nan, pooled_db=math.nan, patches=0, floored=0)
-    mse = squared / (3 * _PATCH_PX**2)
-    floored = np.maximum(mse, _MSE_FLOOR)
+        return PatchScore(math.nan, math.nan)
+    mse = np.maximum(squared / (3 * _PATCH_PX**2), _MSE_FLOOR)
     return PatchScore(
-        mean_db=float(np.mean(10 * np.log10(_PEAK**2 / floored))),
-        pooled_db=float(10 * np.log10(_PEAK**2 / np.mean(floored))),
-        patches=squared.size,
-        floored=int(np.count_nonzero(mse < _MSE_FLOOR)),
+        mean_db=float(np.mean(10 * np.log10(_PEAK**2 / mse))),
+        pooled_db=float(10 * np.log10(_PEAK**2 / np.mean(mse))),
     )
 
 
@@ -206,15 +184,7 @@ def outside_window(disparity_px: Float[np.ndarray, "h w"], valid: Bool[np.ndarra
 
     Returns:
         Between 0 and 1; nan if nothing is valid.
-
-    Raises:
-        EvaluationError: If the maps are of different sizes.
     """
-    if disparity_px.shape != valid.shape:
-        raise EvaluationError(
-            f"disparity is of shape {disparity_px.shape}, but its valid map of {valid.shape}: pass "
-            f"maps of one size."
-        )
     known = disparity_px[valid]
     if len(known) == 0:
         return math.nan

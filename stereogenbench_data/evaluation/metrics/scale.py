@@ -7,7 +7,6 @@ from typing import Final, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.models.interfaces import Settings, StereoMatcher
 
 FitMethod = Literal["filtered", "least_squares"]
@@ -37,7 +36,7 @@ FITS: Final[dict[FitMethod, str]] = {
 }
 """The fits of SD: reports show both, because SD depends on the choice and the paper leaves it open.
 
-The first stands beside the paper's numbers, and relations between controls are judged by it.
+The first stands beside the paper's numbers.
 """
 
 
@@ -45,36 +44,29 @@ The first stands beside the paper's numbers, and relations between controls are 
 class ScaleFit:
     """The line true = slope * estimated + offset through the disparities of one pair.
 
-    Where there is no line, its numbers are nan and ``reason`` says why.
+    Where there is no line, its numbers are nan.
 
     Attributes:
         drift: SD, |slope - 1|.
         slope: Below 1 where the predicted pair's disparity is too large.
         offset_px: True disparity where none is estimated.
         pixels: How many pixels the line was fitted to.
-        outliers: How many answered pixels were left out of the fit.
-        valid_ratio: The share of the picture's pixels that the line was fitted to.
-        answered_ratio: The share of the scored pixels for which the matcher had an answer.
-        residual_std_px: Root mean squared residual of the fitted pixels.
-        r_squared: The share of the fitted pixels' true variance that the line explains.
-        reason: Why there is no line; empty where there is one.
+        outliers: The share of the answered pixels that were left out of the fit.
+        valid: The share of the picture's pixels that the line was fitted to.
+        answered: The share of the scored pixels for which the matcher had an answer.
+        residual_px: Root mean squared residual of the fitted pixels.
+        r2: The share of the fitted pixels' true variance that the line explains.
     """
 
     drift: float = math.nan
     slope: float = math.nan
     offset_px: float = math.nan
     pixels: int = 0
-    outliers: int = 0
-    valid_ratio: float = 0.0
-    answered_ratio: float = math.nan
-    residual_std_px: float = math.nan
-    r_squared: float = math.nan
-    reason: str = ""
-
-    @property
-    def outlier_ratio(self) -> float:
-        """The share of the answered pixels that were left out of the fit; nan without a fit."""
-        return self.outliers / (self.pixels + self.outliers) if self.pixels else math.nan
+    outliers: float = math.nan
+    valid: float = 0.0
+    answered: float = math.nan
+    residual_px: float = math.nan
+    r2: float = math.nan
 
 
 def fit_scale(
@@ -95,23 +87,15 @@ def fit_scale(
         true_px: The true disparity at the same resolution.
         scored: Where the truth is known and the point is seen by both cameras.
         method: How to fit; `FITS` says what each does.
-
-    Raises:
-        EvaluationError: If the maps differ in size.
     """
-    if not estimated_px.shape == true_px.shape == scored.shape:
-        raise EvaluationError(
-            "estimated disparity, true disparity and where to score must have the same size, "
-            f"got {estimated_px.shape}, {true_px.shape} and {scored.shape}."
-        )
     answered = np.flatnonzero(scored & np.isfinite(estimated_px) & np.isfinite(true_px))
     estimated, true = (
         values.reshape(-1)[answered].astype(np.float64) for values in (estimated_px, true_px)
     )
     wanted = int(np.count_nonzero(scored))
     kept = np.ones(true.size, dtype=bool)
-    reason = _no_line(estimated, wanted=wanted)
-    if not reason and method == "filtered":
+    has_line = _has_line(estimated, wanted=wanted)
+    if has_line and method == "filtered":
         some = slice(None, None, max(1, len(answered) // _MEDIAN_PIXELS))
         if estimated[some].min() == estimated[some].max():
             some = slice(None)
@@ -119,10 +103,10 @@ def fit_scale(
         apart = np.abs(true - slope * estimated - offset)
         sigma = _MAD_TO_SIGMA * float(np.median(apart[some]))
         kept = apart <= max(_OUTLIER_SIGMAS * sigma, _OUTLIER_PX)
-        reason = _no_line(estimated[kept], wanted=wanted)
-    answered_ratio = estimated.size / wanted if wanted else math.nan
-    if reason:
-        return ScaleFit(answered_ratio=answered_ratio, reason=reason)
+        has_line = _has_line(estimated[kept], wanted=wanted)
+    share = estimated.size / wanted if wanted else math.nan
+    if not has_line:
+        return ScaleFit(answered=share)
     slope, offset = _least_squares(estimated[kept], true[kept])
     residual = (true - slope * estimated - offset)[kept]
     pixels = int(np.count_nonzero(kept))
@@ -133,11 +117,11 @@ def fit_scale(
         slope=slope,
         offset_px=offset,
         pixels=pixels,
-        outliers=estimated.size - pixels,
-        valid_ratio=pixels / scored.size,
-        answered_ratio=answered_ratio,
-        residual_std_px=math.sqrt(mean_squared),
-        r_squared=1 - mean_squared / variance if variance else math.nan,
+        outliers=(estimated.size - pixels) / estimated.size,
+        valid=pixels / scored.size,
+        answered=share,
+        residual_px=math.sqrt(mean_squared),
+        r2=1 - mean_squared / variance if variance else math.nan,
     )
 
 
@@ -155,19 +139,13 @@ def scale_settings(matcher: StereoMatcher) -> Settings:
     }
 
 
-def _no_line(estimated: Float64[np.ndarray, " n"], *, wanted: int) -> str:
-    """Return why no line can be fitted, or an empty text.
+def _has_line(estimated: Float64[np.ndarray, " n"], *, wanted: int) -> bool:
+    """Return whether a line can be fitted.
 
     A matcher answers few pixels of unlike pictures, and a line through those can have any slope.
     """
-    if estimated.size < max(_FEWEST_PIXELS, _FEWEST_SHARE * wanted):
-        return (
-            f"{estimated.size} of {wanted} scored pixels to fit, fewer than "
-            f"{_FEWEST_PIXELS} or {_FEWEST_SHARE:.0%}"
-        )
-    if estimated.min() == estimated.max():
-        return f"the estimated disparity is {estimated[0]:g} px everywhere"
-    return ""
+    enough = max(_FEWEST_PIXELS, _FEWEST_SHARE * wanted)
+    return estimated.size >= enough and bool(estimated.min() < estimated.max())
 
 
 def _least_squares(

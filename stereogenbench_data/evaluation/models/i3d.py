@@ -12,13 +12,8 @@ from jaxtyping import Float64
 from torch import nn
 from torch.nn import functional
 
-from stereogenbench_data.evaluation.models.interfaces import (
-    Clips,
-    NamedModel,
-    Settings,
-    require_clips,
-)
-from stereogenbench_data.evaluation.models.weights import Weights, load_weights
+from stereogenbench_data.evaluation.models.interfaces import Clips, Settings
+from stereogenbench_data.evaluation.models.weights import Weights, in_batches, load_weights
 
 I3D: Final = Weights(
     what="FVD's I3D",
@@ -32,7 +27,7 @@ _CLASSES: Final = 400
 Size = tuple[int, int, int]
 
 
-class I3dFeatures(NamedModel):
+class I3dFeatures:
     """FVD's features of clips; `VideoFeatures`."""
 
     name = "I3D (Kinetics-400)"
@@ -56,22 +51,18 @@ class I3dFeatures(NamedModel):
         self._device = device
 
     def __call__(self, clips: Clips) -> Float64[np.ndarray, "n dim"]:
-        """Return the features of each clip.
-
-        Raises:
-            EvaluationError: If they are not clips, or too short.
-        """
-        require_clips(clips, frames=self.min_frames, name=self.name)
-        features = np.empty((len(clips), _CLASSES))
-        with torch.inference_mode():
-            for index, clip in enumerate(clips):
-                frames = torch.from_numpy(clip.copy()).to(self._device).float()
-                small = functional.interpolate(
-                    frames, size=(_SIDE_PX, _SIDE_PX), mode="bilinear", align_corners=False
-                )
-                video = (2 * small / 255 - 1).transpose(0, 1)[None]
-                features[index] = self._network(video)[0].cpu().numpy()
+        """Return the features of each clip."""
+        features: Float64[np.ndarray, "n dim"] = in_batches(
+            self._logits, clips, device=self._device, rows=1
+        )
         return features
+
+    def _logits(self, clips: torch.Tensor) -> torch.Tensor:
+        small = functional.interpolate(
+            clips[0], size=(_SIDE_PX, _SIDE_PX), mode="bilinear", align_corners=False
+        )
+        logits: torch.Tensor = self._network((2 * small / 255 - 1).transpose(0, 1)[None])
+        return logits
 
 
 class InflatedInception(nn.Module):

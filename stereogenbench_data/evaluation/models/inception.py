@@ -20,13 +20,8 @@ from jaxtyping import Float64
 from torch import nn
 from torch.nn import functional
 
-from stereogenbench_data.evaluation.models.interfaces import (
-    NamedModel,
-    Pictures,
-    Settings,
-    require_batch,
-)
-from stereogenbench_data.evaluation.models.weights import Weights, load_weights
+from stereogenbench_data.evaluation.models.interfaces import Pictures, Settings
+from stereogenbench_data.evaluation.models.weights import Weights, in_batches, load_weights
 
 INCEPTION: Final = Weights(
     what="FID's Inception",
@@ -41,7 +36,7 @@ _CLASSES: Final = 1008
 _BATCH: Final = 8
 
 
-class InceptionFeatures(NamedModel):
+class InceptionFeatures:
     """FID's features of pictures; `ImageFeatures`."""
 
     name = "Inception-v3 (TensorFlow, 2015-12-05)"
@@ -64,17 +59,10 @@ class InceptionFeatures(NamedModel):
         self._device = device
 
     def __call__(self, pictures: Pictures) -> Float64[np.ndarray, "n dim"]:
-        """Return the features of each picture.
-
-        Raises:
-            EvaluationError: If they are not pictures.
-        """
-        require_batch(pictures)
-        features = np.empty((len(pictures), _DIM))
-        with torch.inference_mode():
-            for start in range(0, len(pictures), _BATCH):
-                some = torch.from_numpy(pictures[start : start + _BATCH].copy()).to(self._device)
-                features[start : start + _BATCH] = self._network(some.float()).cpu().numpy()
+        """Return the features of each picture."""
+        features: Float64[np.ndarray, "n dim"] = in_batches(
+            self._network, pictures, device=self._device, rows=_BATCH
+        )
         return features
 
 

@@ -10,8 +10,6 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-from stereogenbench_data.errors import EvaluationError
-
 Picture = UInt8[np.ndarray, "3 h w"]
 Pictures = UInt8[np.ndarray, "n 3 h w"]
 Clips = UInt8[np.ndarray, "n t 3 h w"]
@@ -41,16 +39,6 @@ class Model(Protocol):
     @property
     def settings(self) -> Settings:
         """Every choice that its answers depend on, so that scores of other choices differ."""
-
-
-class NamedModel:
-    """The base of this package's models: it only gives them a repr."""
-
-    name: str
-
-    def __repr__(self) -> str:
-        """Return the class and what tables call the model."""
-        return f"<{type(self).__name__}: {self.name}>"
 
 
 @runtime_checkable
@@ -101,48 +89,3 @@ class VideoFeatures(Model, Protocol):
 
     def __call__(self, clips: Clips) -> Float64[np.ndarray, "n dim"]:
         """Return the features of each clip."""
-
-
-def require_rgb(pixels: Picture | Pictures | Clips, what: str, *, axes: str) -> None:
-    """Raise unless these are uint8 pixels with the given axes, three channels before the last two.
-
-    Args:
-        pixels: What was given.
-        what: What messages call them, with the verb: "a picture".
-        axes: Names of the axes, such as "(n, 3, h, w)".
-
-    Raises:
-        EvaluationError: Naming the dtype and the shape that were found.
-    """
-    dims = axes.count(",") + 1
-    if pixels.dtype != np.uint8 or pixels.ndim != dims or pixels.shape[-3] != 3:
-        raise EvaluationError(
-            f"{what} must be uint8 RGB of shape {axes}, got {pixels.dtype} of shape {pixels.shape}."
-        )
-
-
-def require_pictures(*pictures: Picture) -> None:
-    """Raise unless all are uint8 pictures (3, h, w) of one size.
-
-    Raises:
-        EvaluationError: Naming what was found.
-    """
-    for picture in pictures:
-        require_rgb(picture, "a picture", axes="(3, h, w)")
-    if len({picture.shape for picture in pictures}) > 1:
-        sizes = " and ".join("x".join(map(str, picture.shape[:0:-1])) for picture in pictures)
-        raise EvaluationError(f"the pictures of one score must be of one size, got {sizes}.")
-
-
-def require_batch(pictures: Pictures) -> None:
-    """Raise EvaluationError unless these are uint8 pictures (n, 3, h, w)."""
-    require_rgb(pictures, "pictures", axes="(n, 3, h, w)")
-
-
-def require_clips(clips: Clips, *, frames: int, name: str) -> None:
-    """Raise EvaluationError unless these are uint8 clips (n, t, 3, h, w) of enough frames."""
-    require_rgb(clips, "clips", axes="(n, t, 3, h, w)")
-    if clips.shape[1] < frames:
-        raise EvaluationError(
-            f"{name} needs clips of at least {frames} frames, got {clips.shape[1]}."
-        )

@@ -15,16 +15,12 @@ from jaxtyping import Float64
 from torch import nn
 from torch.nn import functional
 
-from stereogenbench_data.errors import EvaluationError, ExtraError, missing_extra
-from stereogenbench_data.evaluation.models.interfaces import (
-    NamedModel,
-    Pictures,
-    Settings,
-    require_batch,
-)
+from stereogenbench_data.errors import ExtraError, missing_extra
+from stereogenbench_data.evaluation.models.interfaces import Pictures, Settings
 from stereogenbench_data.evaluation.models.weights import (
     Weights,
     fingerprint,
+    in_batches,
     load_into,
     read_weights,
     weights_path,
@@ -44,7 +40,7 @@ _CHANNELS: Final = (64, 192, 384, 256, 256)
 _BATCH: Final = 8
 
 
-class Lpips(NamedModel):
+class Lpips:
     """LPIPS of pictures against their targets; a `PairMetric`."""
 
     name = "LPIPS"
@@ -87,32 +83,15 @@ class Lpips(NamedModel):
         }
 
     def __call__(self, predicted: Pictures, target: Pictures) -> Float64[np.ndarray, " n"]:
-        """Return the distance of each picture from its target.
-
-        Raises:
-            EvaluationError: If they are not pictures of one size and number.
-        """
-        require_batch(predicted)
-        require_batch(target)
-        if predicted.shape != target.shape:
-            raise EvaluationError(
-                f"LPIPS compares pictures one by one: {predicted.shape} against {target.shape}. "
-                f"Pass as many predicted pictures as targets, of one size."
-            )
-        scores = np.empty(len(predicted))
-        with torch.inference_mode():
-            for start in range(0, len(predicted), _BATCH):
-                pair = (
-                    torch.from_numpy(side[start : start + _BATCH].copy()).to(self._device).float()
-                    for side in (predicted, target)
-                )
-                one, two = (side / 127.5 - 1 for side in pair)
-                scores[start : start + _BATCH] = self._network(one, two).cpu().numpy()
-        return scores
+        """Return the distance of each picture from its target."""
+        distances: Float64[np.ndarray, " n"] = in_batches(
+            self._network, predicted, target, device=self._device, rows=_BATCH
+        )
+        return distances
 
 
 class PerceptualDistance(nn.Module):
-    """From two batches of pictures (n, 3, h, w) of -1 to 1 to n distances.
+    """From two batches of pictures (n, 3, h, w) of 0 to 255 to n distances.
 
     Source: Zhang, Isola, Efros, Shechtman & Wang, CVPR 2018.
     """
@@ -153,7 +132,7 @@ class PerceptualDistance(nn.Module):
             torch.tensor(values, device=pictures.device)[:, None, None]
             for values in (_SHIFT, _SCALE)
         )
-        x = (pictures - shift) / scale
+        x = (pictures / 127.5 - 1 - shift) / scale
         found = []
         for step in self.features:
             x = step(x)

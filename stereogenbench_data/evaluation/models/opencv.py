@@ -10,10 +10,8 @@ from stereogenbench_data.errors import EvaluationError, missing_extra
 from stereogenbench_data.evaluation.metrics.matching import KEYPOINTS, RATIO, mutual_matches
 from stereogenbench_data.evaluation.models.interfaces import (
     Keypoints,
-    NamedModel,
     Picture,
     Settings,
-    require_pictures,
 )
 
 _DESCRIPTOR_DIM: Final = 128
@@ -32,7 +30,7 @@ def require_opencv() -> ModuleType:
     return cv2
 
 
-class Sift(NamedModel):
+class Sift:
     """SIFT keypoints of the luma, described upright, as rectified views are not turned.
 
     Points that SIFT finds in several orientations are kept once, and of all points those with the
@@ -58,12 +56,7 @@ class Sift(NamedModel):
         }
 
     def detect(self, picture: Picture) -> Keypoints:
-        """Return the strongest keypoints of a picture.
-
-        Raises:
-            EvaluationError: If it is not a picture.
-        """
-        require_pictures(picture)
+        """Return the strongest keypoints of a picture."""
         grey = self._cv2.cvtColor(
             np.ascontiguousarray(picture.transpose(1, 2, 0)), self._cv2.COLOR_RGB2GRAY
         )
@@ -97,7 +90,7 @@ _LEAST_PX: Final = -16
 _BLOCK_PX: Final = 5
 
 
-class Sgbm(NamedModel):
+class Sgbm:
     """Semi-global matching with left-right check, disparities from -16 up to 175 px.
 
     The negative ones distinguish a view that is shifted the wrong way, or not at all, from one that
@@ -114,30 +107,18 @@ class Sgbm(NamedModel):
         self._cv2 = require_opencv()
         self._disparities = disparities
         chosen = {
-            "least_disparity_px": _LEAST_PX,
-            "disparities": disparities,
-            "block_px": _BLOCK_PX,
-            "p1": 8 * 3 * _BLOCK_PX**2,
-            "p2": 32 * 3 * _BLOCK_PX**2,
-            "left_right_px": 1,
-            "uniqueness_percent": 10,
-            "speckle_pixels": 100,
-            "speckle_px": 2,
-            "prefilter_cap": 63,
+            "minDisparity": _LEAST_PX,
+            "numDisparities": disparities,
+            "blockSize": _BLOCK_PX,
+            "P1": 8 * 3 * _BLOCK_PX**2,
+            "P2": 32 * 3 * _BLOCK_PX**2,
+            "disp12MaxDiff": 1,
+            "preFilterCap": 63,
+            "uniquenessRatio": 10,
+            "speckleWindowSize": 100,
+            "speckleRange": 2,
         }
-        self._matcher = self._cv2.StereoSGBM_create(
-            minDisparity=chosen["least_disparity_px"],
-            numDisparities=chosen["disparities"],
-            blockSize=chosen["block_px"],
-            P1=chosen["p1"],
-            P2=chosen["p2"],
-            disp12MaxDiff=chosen["left_right_px"],
-            preFilterCap=chosen["prefilter_cap"],
-            uniquenessRatio=chosen["uniqueness_percent"],
-            speckleWindowSize=chosen["speckle_pixels"],
-            speckleRange=chosen["speckle_px"],
-            mode=self._cv2.STEREO_SGBM_MODE_SGBM,
-        )
+        self._matcher = self._cv2.StereoSGBM_create(**chosen, mode=self._cv2.STEREO_SGBM_MODE_SGBM)
         self.name = f"SGBM (OpenCV {self._cv2.__version__})"
         self.settings: Settings = {**chosen, "mode": "five directions"}
 
@@ -145,9 +126,8 @@ class Sgbm(NamedModel):
         """Return the left picture's disparity in pixels; nan where it has no answer.
 
         Raises:
-            EvaluationError: If the two are not pictures of one size, or narrower than the search.
+            EvaluationError: If the two are narrower than the search.
         """
-        require_pictures(left, right)
         if left.shape[-1] <= self._disparities:
             raise EvaluationError(
                 f"SGBM searches {self._disparities} disparities, and the pictures are "

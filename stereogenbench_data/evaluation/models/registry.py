@@ -7,17 +7,12 @@ Your own is a class with the members of its kind in `interfaces`, named as "modu
 
 from dataclasses import asdict, dataclass
 from importlib import import_module
-from importlib.util import module_from_spec, spec_from_file_location
 from inspect import signature
 from pathlib import Path
-from types import ModuleType
-from typing import Any, Final, Literal
+from runpy import run_path
+from typing import Any, Final
 
 from stereogenbench_data.errors import EvaluationError, ExtraError
-
-ModelKind = Literal[
-    "keypoint matcher", "stereo matcher", "pair metric", "image features", "video features"
-]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +28,7 @@ class ModelOptions:
     weights: Path | None = None
 
 
-MODELS: Final[dict[ModelKind, dict[str, str]]] = {
+MODELS: Final[dict[str, dict[str, str]]] = {
     "keypoint matcher": {"sift": f"{__package__}.opencv:Sift"},
     "stereo matcher": {"sgbm": f"{__package__}.opencv:Sgbm"},
     "pair metric": {"lpips": f"{__package__}.lpips:Lpips"},
@@ -43,7 +38,7 @@ MODELS: Final[dict[ModelKind, dict[str, str]]] = {
 """The class of every model of this package, by kind and name, as "module:Class"."""
 
 
-def load_model(kind: ModelKind, name: str, options: ModelOptions | None = None) -> Any:
+def load_model(kind: str, name: str, options: ModelOptions | None = None) -> Any:
     """Return a model of a kind, as defined in `interfaces`.
 
     Args:
@@ -63,18 +58,10 @@ def load_model(kind: ModelKind, name: str, options: ModelOptions | None = None) 
             f"own, got {name!r}."
         )
     try:
-        module = _run(Path(place)) if place.endswith(".py") else import_module(place)
-        model = getattr(module, class_name)
-    except (ImportError, OSError, AttributeError) as error:
+        names = run_path(place) if place.endswith(".py") else vars(import_module(place))
+        model = names[class_name]
+    except (ImportError, OSError, KeyError) as error:
         raise ExtraError(f"{kind} {name}: cannot be imported ({error}).") from error
     taken = signature(model).parameters
     given = asdict(options or ModelOptions())
     return model(**{option: value for option, value in given.items() if option in taken})
-
-
-def _run(path: Path) -> ModuleType:
-    """Return the module of a file."""
-    spec: Any = spec_from_file_location(path.stem, path)
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module

@@ -1,12 +1,13 @@
 """Files of learned weights: the user fetches them once, and only tensors are read from them."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
 
+import numpy as np
 import torch
 
 from stereogenbench_data.errors import EvaluationError, ExtraError
@@ -70,6 +71,18 @@ def load_weights(
     path = weights_path(weights, folder=folder)
     load_into(network, read_weights(path, what=weights.what), path=path)
     return {"weights": path.name, "weights_sha256": fingerprint(path)}
+
+
+def in_batches(
+    network: Callable[..., torch.Tensor], *arrays: np.ndarray, device: str, rows: int
+) -> Any:
+    """Return what a network makes of arrays, a few rows at a time, as float64."""
+    made = []
+    with torch.inference_mode():
+        for start in range(0, len(arrays[0]), rows):
+            some = (torch.from_numpy(each[start : start + rows].copy()) for each in arrays)
+            made.append(network(*(each.to(device).float() for each in some)).cpu().numpy())
+    return np.concatenate(made).astype(np.float64)
 
 
 def fingerprint(path: Path) -> str:
