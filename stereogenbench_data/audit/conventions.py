@@ -277,7 +277,8 @@ def _with_measured_depth(
         return shape, None
     measured = _measured(report, stated, teaching)
     if measured == stated:
-        return shape, _tested(surveyed, [*teaching, *others], stated, how)
+        known = None if others else report
+        return shape, _tested(surveyed, [*teaching, *others], stated, how, known)
     trial = replace(surveyed, problems=[], verdicts=[])
     tested = _tested(trial, others or teaching, measured, how)
     if tested is None or tested.is_wrong:
@@ -357,11 +358,18 @@ def _measured(
 
 
 def _tested(
-    surveyed: Survey, scenes: Sequence[Scene], depth: DepthEncoding | None, how: dict[str, Any]
+    surveyed: Survey,
+    scenes: Sequence[Scene],
+    depth: DepthEncoding | None,
+    how: dict[str, Any],
+    known: DoctorReport | None = None,
 ) -> DoctorReport | None:
-    """Return what pictures say of a contract and note it; None where they cannot be compared."""
+    """Return what pictures say of a contract and note it; None where they cannot be compared.
+
+    ``known`` is what they are already known to say.
+    """
     try:
-        report = _diagnosed(surveyed.root, scenes, depth, how)
+        report = known or _diagnosed(surveyed.root, scenes, depth, how)
     except StereoGenBenchError as error:
         surveyed.problems.append(str(error))
         return None

@@ -109,17 +109,20 @@ def _document_lines(folder: SceneFolder, name: str, secrets: frozenset[str]) -> 
         yield f"    and {len(kinds) - _MOST_KEYS} keys more"
 
 
+def _names(each: Examined) -> list[str]:
+    """Return the names of a scene's map, label, character and animation."""
+    names: list[str | None] = [parse_scene_key(each.key).map_name]
+    if each.scene is not None:
+        labels = each.scene.labels
+        names += [labels.map_path, labels.scene_label, labels.map_name, labels.character,
+                  labels.animation]  # fmt: skip
+    return [name for name in names if name and len(name) > 2]
+
+
 def _secrets(group: Sequence[Examined]) -> frozenset[str]:
-    """Return words of names that keys may hold: of maps, scenes, characters."""
-    found: set[str] = set()
-    for each in group:
-        names = [parse_scene_key(each.key).map_name]
-        if each.scene is not None:
-            labels = each.scene.labels
-            names += [text for text in (labels.scene_label, labels.map_name, labels.character,
-                                        labels.animation, labels.map_path) if text]  # fmt: skip
-        found |= {words(name) for name in names}
-    return frozenset(re.sub(r"[0-9]+", "#", name) for name in found if len(name) > 2)
+    """Return words of names that keys may hold."""
+    names = {words(name) for each in group for name in _names(each)}
+    return frozenset(re.sub(r"[0-9]+", "#", name) for name in names if len(name) > 2)
 
 
 def _structure(
@@ -152,14 +155,10 @@ def _kind(value: object) -> str:
     if isinstance(value, str):
         parts = words(value).split("_")
         is_shown = len(value) <= 40 and all(part in _FORM_WORDS for part in parts)
-        return f'"{"_".join(parts)}"' if is_shown else f"text of {_rounded(len(value))} letters"
+        return f'"{"_".join(parts)}"' if is_shown else "text"
     if value is None or isinstance(value, bool):
         return "null" if value is None else "boolean"
     return "whole number" if isinstance(value, int) else "number"
-
-
-def _rounded(length: int) -> str:
-    return next((f"at most {most}" for most in (10, 40, 100, 1000) if length <= most), "more")
 
 
 def _stream(facts: StreamFacts, secrets: frozenset[str]) -> str:
@@ -184,11 +183,8 @@ def _public(text: str, survey: Survey) -> str:
     text = text.replace(str(survey.root), "ROOT")
     for each in sorted(survey.examined, key=lambda each: -len(each.key)):
         text = text.replace(each.key, "SCENE")
-        text = text.replace(parse_scene_key(each.key).map_name, "MAP")
-        if each.scene is not None:
-            labels = each.scene.labels
-            for name in (labels.scene_label, labels.map_path, labels.character, labels.animation):
-                text = text.replace(name, _HIDDEN) if name and len(name) > 2 else text
+        for name in _names(each):
+            text = text.replace(name, _HIDDEN)
     text = re.sub(r"'[^']*'|\"[^\"]*\"", "TEXT", text)
     text = re.sub(r"(?<![\w.])(?:[A-Za-z]:)?[/\\][^\s:,;]+|\w+://\S+", "PATH", text)
     return " ".join(text.split())[:1000]

@@ -26,7 +26,7 @@ from stereogenbench_data.audit.paper_numbers import (
     TRAIN_MAPS_TABLE,
     map_counts,
 )
-from stereogenbench_data.audit.pictures.drawing import figure_class
+from stereogenbench_data.audit.pictures.figure import figure_class
 from stereogenbench_data.audit.statistics import (
     ADJACENT_COLUMNS,
     FOCAL_EDGES_MM,
@@ -169,9 +169,6 @@ def _map_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
         yield "eval", Line(EVAL_MAPS_TABLE, item, subset, subsets.get(name, "-"))
 
 
-_BAR: Final = 40
-
-
 def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
     """Return statistics as Markdown, with the comparison with the paper if given."""
     text = [
@@ -236,9 +233,7 @@ def _focal_rows(branches: Sequence[FamilyStatistics]) -> Iterator[Sequence[str]]
              f"above {edges[-1]}"]  # fmt: skip
     for place, (name, total) in enumerate(zip(names, totals, strict=True)):
         if total or 0 < place < len(names) - 1:
-            bar = "#" * round(_BAR * total / max(totals))
-            counts = [f"{each.focal_counts[place]:,}" for each in branches]
-            yield (name, *counts, f"{total:,} {bar}".rstrip())
+            yield (name, *(f"{each.focal_counts[place]:,}" for each in branches), f"{total:,}")
 
 
 def _map_rows(branches: Sequence[FamilyStatistics]) -> Iterator[Sequence[str]]:
@@ -275,27 +270,26 @@ def write_plots(
          index.column("focal_mm")[chosen])
         for split, family, chosen in branch_rows(index, rows)
     ]  # fmt: skip
-    figure = _figure(len(panels))
+    paths = folder / "baselines.png", folder / "focal_lengths.png"
+    figures = [_figure(len(panels)) for _ in paths]
     folder.mkdir(parents=True, exist_ok=True)
-    baselines, focals = folder / "baselines.png", folder / "focal_lengths.png"
-    for axes, (title, family, baselines_cm, _) in zip(figure.axes, panels, strict=False):
+    for number, (title, family, baselines_cm, focal_mm) in enumerate(panels):
         is_pairwise = family == "Pairwise_Uniform"
         shown_cm = baselines_cm if is_pairwise else baselines_cm[:, ADJACENT_COLUMNS]
         what = "all pairs" if is_pairwise else "adjacent"
-        _histogram(
-            axes, shown_cm.ravel(), bins=_HISTOGRAM_BINS, colour=_COLOURS.get(family, "#777777")
-        )
+        colour = _COLOURS.get(family, "#777777")
+        axes = figures[0].axes[number]
+        _histogram(axes, shown_cm.ravel(), bins=_HISTOGRAM_BINS, colour=colour)
         axes.set(title=f"{title}, {what}", xlabel="baseline (cm)", ylabel="pairs")
-    _save(figure, baselines)
-    figure = _figure(len(panels))
-    for axes, (title, family, _, focal_mm) in zip(figure.axes, panels, strict=False):
-        outer = [focal_mm.min(), focal_mm.max()]
-        beyond = [each for each in outer if not FOCAL_EDGES_MM[0] <= each <= FOCAL_EDGES_MM[-1]]
-        edges = np.union1d(FOCAL_EDGES_MM, beyond)
-        _histogram(axes, focal_mm, bins=edges, colour=_COLOURS.get(family, "#777777"))
+        edges = np.union1d(FOCAL_EDGES_MM, np.clip(focal_mm, None, FOCAL_EDGES_MM[0]).min())
+        edges = np.union1d(edges, np.clip(focal_mm, FOCAL_EDGES_MM[-1], None).max())
+        axes = figures[1].axes[number]
+        _histogram(axes, focal_mm, bins=edges, colour=colour)
         axes.set(title=title, xlabel="focal length (mm)", ylabel="scenes")
-    _save(figure, focals)
-    return baselines, focals
+    for figure, path in zip(figures, paths, strict=True):
+        with open_atomic(path) as file:
+            figure.savefig(file, format="png", dpi=100)
+    return paths
 
 
 def _histogram(axes: Any, values: Float64[np.ndarray, " n"], *, bins: Any, colour: str) -> None:
@@ -323,8 +317,3 @@ def _figure(panels: int) -> Any:
     for axes in grid.flat[panels:]:
         axes.set_axis_off()
     return figure
-
-
-def _save(figure: Any, path: Path) -> None:
-    with open_atomic(path) as file:
-        figure.savefig(file, format="png", dpi=100)

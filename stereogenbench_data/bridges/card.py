@@ -27,8 +27,9 @@ from stereogenbench_data.bridges import dataset_facts
 from stereogenbench_data.datasets.mapped import StereoPairs
 from stereogenbench_data.engine import Advance, Progress, advance_of
 from stereogenbench_data.errors import DescriptorError, explain_os_errors, missing_extra
+from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.picture import contact_sheet
+from stereogenbench_data.samples.picture import draw_sheet, pair_tiles
 from stereogenbench_data.schema.records import Scene, SceneId
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
@@ -125,8 +126,9 @@ def _write(index: SceneIndex, rows: list[int], path: Path, *, advance: Advance) 
     width = min(_WIDEST_PX, rig.image_width_px)
     size = (round(rig.image_height_px * width / rig.image_width_px), width)
     pairs = StereoPairs(
-        index, frames=[0], size=size, fields=("left", "right", "disparity"), check="metadata"
-    )
+        index, frames=[0], size=size, check="metadata",
+        fields=("left", "right", "disparity", "valid", "baseline_m"),
+    )  # fmt: skip
     options: dict[str, Any] = {"format": tarfile.PAX_FORMAT, "pax_headers": {_MARK: index.digest}}
     with (
         closing(pairs),
@@ -135,7 +137,9 @@ def _write(index: SceneIndex, rows: list[int], path: Path, *, advance: Advance) 
     ):
         for row in rows:
             scene, picture = index.scene(row), io.BytesIO()
-            Image.fromarray(contact_sheet([pairs[row]])).save(picture, format="JPEG", quality=85)
+            fx_px = rig_intrinsics(scene.rig).fx_px * width / scene.rig.image_width_px
+            sheet = draw_sheet([], [pair_tiles(pairs[row], fx_px=fx_px)], width_px=width)
+            Image.fromarray(sheet).save(picture, format="JPEG", quality=85)
             contents = {"preview.jpg": picture.getvalue()}
             for name, (kind, value) in _COLUMNS.items():
                 text = value(scene) if kind == "string" else json.dumps(value(scene))

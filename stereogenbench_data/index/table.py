@@ -373,12 +373,11 @@ class SceneIndex:
                 )
         return "released data"
 
-    def require_released(self, doing: str, *, cure: str = "") -> None:
+    def require_released(self, doing: str) -> None:
         """Refuse derived data where released data are needed.
 
         Args:
             doing: What needs them, such as "An evaluation".
-            cure: What else to do than to pass the released data.
 
         Raises:
             StorageError: If scenes were derived for training.
@@ -386,7 +385,7 @@ class SceneIndex:
         if self.is_derived:
             raise StorageError(
                 f"{self.where}: holds {self.derivation}. {doing} needs the released pictures, and "
-                f"these have an error. Pass the released data{cure}."
+                f"these have an error. Pass the released data."
             )
 
     @property

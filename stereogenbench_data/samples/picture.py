@@ -1,15 +1,16 @@
-"""Samples as pictures to look at: contact sheets, coloured maps, anaglyphs."""
+"""Samples as pictures to look at: coloured maps, anaglyphs, and sheets of captioned tiles."""
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from stereogenbench_data.errors import FieldError
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.sources.files import open_output
 
@@ -21,9 +22,14 @@ COLOUR_STOPS: Final = np.array(
 )
 """From far (dark blue) to near (red), each lighter than the one before but for the last."""
 NOT_MEASURED: Final = (96, 96, 96)
-_CAPTION_PX: Final = 20
-_NARROWEST_PX: Final = 192
-_GAP_PX: Final = 4
+
+Colour = tuple[int, int, int]
+FRAME: Final[Colour] = (205, 207, 212)
+_PAPER: Final[Colour] = (250, 250, 248)
+_INK: Final[Colour] = (26, 28, 33)
+_FAINT: Final[Colour] = (92, 97, 107)
+_MARKS: Final = 4
+"""How many places of a colour bar are labelled."""
 
 
 def coloured(
@@ -49,36 +55,212 @@ def anaglyph(left: UInt8[np.ndarray, "3 h w"], right: UInt8[np.ndarray, "3 h w"]
     return np.stack([left[0], right[1], right[2]], axis=-1)
 
 
-def contact_sheet(samples: Sequence[Sample]) -> Picture:
-    """Return one row of captioned tiles for each sample: every picture and map that it has.
+@dataclass(frozen=True, slots=True)
+class ColourScale:
+    """The range of absolute values that a map's colours cover.
+
+    Attributes:
+        low: The smallest value with a colour of its own, above 0 for "log".
+        high: The largest such value.
+        kind: "linear", from blue to red, for disparity; or "log", from red to blue, for depth: red
+            is near in both.
+    """
+
+    low: float
+    high: float
+    kind: Literal["linear", "log"] = "linear"
+
+    @classmethod
+    def of(
+        cls,
+        values: Float[np.ndarray, "..."],
+        *,
+        measured: Bool[np.ndarray, "..."],
+        kind: Literal["linear", "log"] = "linear",
+    ) -> "ColourScale":
+        """Return a scale for the middle 96 % of measured values; linear ones start at 0 if near."""
+        found = np.abs(values[measured])
+        if found.size == 0:
+            return cls(1.0 if kind == "log" else 0.0, 2.0, kind)
+        low, high = (float(each) for each in np.percentile(found, (2, 98)))
+        if kind == "linear" and low < high / 2:
+            low = 0.0
+        return cls(low, max(high, low * 1.001, low + 1e-6), kind)
+
+    def paint(
+        self, values: Float[np.ndarray, "h w"], *, measured: Bool[np.ndarray, "h w"]
+    ) -> Picture:
+        """Return a map in this scale's colours, grey where not measured."""
+        shown = np.clip(np.abs(values), self.low, self.high)
+        places = (shown - self.low) / (self.high - self.low)
+        if self.kind == "log":
+            places = 1 - np.log(shown / self.low) / math.log(self.high / self.low)
+        return coloured(places, measured=measured, largest=1.0)
+
+    def spread(self, count: int) -> Float[np.ndarray, " count"]:
+        """Return values at equal distances along the scale, its ends included."""
+        spread = np.geomspace if self.kind == "log" else np.linspace
+        return spread(self.low, self.high, count, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Tile:
+    """A picture of a sheet, with a caption above and a legend below.
+
+    Attributes:
+        caption: One line.
+        picture: (h, w, 3) uint8.
+        key: Colours and their meanings.
+        scale: The scale of a map's colours, drawn as a bar.
+        labels: The texts below the bar, a line each, of a value of the scale.
+        frame: The colour of the frame; other colours than `FRAME` are drawn thicker.
+        shrink: "average" for photographs; "nearest" for maps, whose colours have a meaning.
+    """
+
+    caption: str
+    picture: Picture
+    key: tuple[tuple[Colour, str], ...] = ()
+    scale: ColourScale | None = None
+    labels: tuple[Callable[[float], str], ...] = ()
+    frame: Colour = FRAME
+    shrink: Literal["average", "nearest"] = "average"
+
+
+def pair_tiles(
+    sample: Sample, *, fx_px: float, scale: ColourScale | None = None
+) -> tuple[Tile, ...]:
+    """Return the tiles of a pair: left, right and disparity.
 
     Args:
-        samples: Samples of `StereoPairs` in which left, right, disparity, valid, visible, depth,
-            warped_right or hole are tiles where present; single pairs, not clips or sweeps.
-
-    Returns:
-        (h, w, 3) uint8. Disparity and depth are coloured up to their 98th percentile, which the
-        caption says; pictures too narrow for their captions are enlarged by a whole factor.
-
-    Raises:
-        FieldError: If the samples have nothing to show, or have a time axis.
+        sample: With ``left``, ``right``, ``disparity``, ``valid`` and ``baseline_m``.
+        fx_px: The focal length in pixels of the sample's pictures.
+        scale: The scale of disparity, None for that of the sample.
     """
-    rows = [_row(sample) for sample in samples]
-    if not rows or not rows[0]:
-        got = f"fields {', '.join(samples[0])}" if rows else "no sample"
-        raise FieldError(f"a contact sheet needs one of the fields {', '.join(_TILES)}; got {got}.")
-    width = max(tile.shape[1] for row in rows for _, tile in row) + _GAP_PX
-    heights = [_CAPTION_PX + _GAP_PX + max(tile.shape[0] for _, tile in row) for row in rows]
-    sheet = Image.new("RGB", (max(map(len, rows)) * width, sum(heights)), (255, 255, 255))
-    draw = ImageDraw.Draw(sheet)
-    font = ImageFont.load_default(size=13)
-    top = 0
-    for row, height in zip(rows, heights, strict=True):
-        for column, (caption, tile) in enumerate(row):
-            sheet.paste(Image.fromarray(tile), (column * width, top + _CAPTION_PX))
-            draw.text((column * width + 2, top + 2), caption, fill=(0, 0, 0), font=font)
-        top += height
+    arrays = {name: np.asarray(value) for name, value in sample.items()}
+    baseline_m = float(arrays["baseline_m"])
+    disparity, valid = arrays["disparity"][0], arrays["valid"][0]
+    scale = scale or ColourScale.of(disparity, measured=valid)
+    labels = (
+        lambda px: f"{px:.3g}",
+        lambda px: f"{fx_px * abs(baseline_m) / px:.3g}" if px else "inf",
+    )
+    painted = scale.paint(disparity, measured=valid)
+    caption = "disparity, px (below: m)"
+    return (
+        Tile("left", channels_last(arrays["left"])),
+        Tile(f"right, {baseline_m * 100:.2f} cm", channels_last(arrays["right"])),
+        Tile(caption, painted, scale=scale, labels=labels, shrink="nearest"),
+    )
+
+
+def channels_last(picture: UInt8[np.ndarray, "3 h w"]) -> Picture:
+    """Return a sample's picture as (h, w, 3)."""
+    return np.ascontiguousarray(picture.transpose(1, 2, 0))
+
+
+def draw_sheet(title: Sequence[str], rows: Sequence[Sequence[Tile]], *, width_px: int) -> Picture:
+    """Return a sheet as (h, w, 3) uint8.
+
+    Args:
+        title: Lines above the tiles, the first one larger.
+        rows: Tiles of one aspect, all rows as long as the first.
+        width_px: The width of each tile, from which sizes of text follow.
+    """
+    gap = min(max(round(width_px / 21), 13), 30)
+    line = round(gap * 1.4)
+    height, width = rows[0][0].picture.shape[:2]
+    height_px = max(1, round(height * width_px / width))
+    legend_lines = [
+        max(max(len(tile.key), (tile.scale is not None) + len(tile.labels)) for tile in tiles)
+        for tiles in rows
+    ]
+    legends = [lines * line + gap // 2 if lines else 0 for lines in legend_lines]
+    head = round(line * 1.6) + line * (len(title) - 1) + gap if title else 0
+    inner = len(rows[0]) * (width_px + gap) - gap
+    total = 2 * gap + head + sum(line + 4 + height_px + gap + legend for legend in legends)
+    sheet = Image.new("RGB", (inner + 2 * gap, total - gap // 2), _PAPER)
+    page = _Page(sheet, ImageDraw.Draw(sheet), gap, line)
+    for number, text in enumerate(title):
+        top = gap + (number > 0) * round(line * 1.6) + max(0, number - 1) * line
+        scale, ink = (1.0, _FAINT) if number else (1.3, _INK)
+        page.text((gap, top), text, width_px=inner, colour=ink, scale=scale)
+    top = gap + head
+    for tiles, legend in zip(rows, legends, strict=True):
+        for column, tile in enumerate(tiles):
+            page.tile((gap + column * (width_px + gap), top), tile, (width_px, height_px))
+        top += line + 4 + height_px + gap + legend
     return np.asarray(sheet)
+
+
+@dataclass(frozen=True, slots=True)
+class _Page:
+    """A sheet under construction; all distances follow from the height of a line of text."""
+
+    image: Any
+    draw: Any
+    font_px: int
+    line_px: int
+
+    def text(
+        self,
+        place: tuple[int, int],
+        text: str,
+        *,
+        width_px: int,
+        colour: Colour = _INK,
+        scale: float = 1.0,
+    ) -> None:
+        """Write one line from its top left corner, shortened to the width."""
+        font = _font(round(self.font_px * scale))
+        if font.getlength(text) > width_px:
+            while text and font.getlength(f"{text.rstrip()}...") > width_px:
+                text = text[:-1]
+            text = f"{text.rstrip()}..."
+        self.draw.text(place, text, fill=colour, font=font)
+
+    def framed(self, place: tuple[int, int], picture: Picture, colour: Colour) -> None:
+        """Put a picture, with a frame around it."""
+        left, top = place
+        height, width = picture.shape[:2]
+        thick = 1 if colour == FRAME else 3
+        box = (left - thick, top - thick, left + width + thick - 1, top + height + thick - 1)
+        self.draw.rectangle(box, outline=colour, width=thick)
+        self.image.paste(Image.fromarray(picture), place)
+
+    def tile(self, place: tuple[int, int], tile: Tile, size: tuple[int, int]) -> None:
+        """Put a tile with its caption and its legend."""
+        (left, top), (width_px, height_px) = place, size
+        self.text(place, tile.caption, width_px=width_px)
+        average = tile.shrink == "average" and width_px < tile.picture.shape[1]
+        how = Image.Resampling.BOX if average else Image.Resampling.NEAREST
+        drawn = np.asarray(Image.fromarray(tile.picture).resize(size, how))
+        self.framed((left, top + self.line_px + 4), drawn, tile.frame)
+        below = top + self.line_px + 4 + height_px + self.font_px // 2
+        side, inset = round(self.font_px * 0.8), self.line_px // 7
+        for number, (colour, text) in enumerate(tile.key):
+            line_top = below + number * self.line_px
+            box = (left, line_top + inset, left + side, line_top + inset + side)
+            self.draw.rectangle(box, fill=colour, outline=_FAINT)
+            place = (left + round(side * 1.6), line_top)
+            self.text(place, text, width_px=width_px - round(side * 1.6))
+        if tile.scale is not None:
+            bar_px = max(6, round(self.font_px * 0.7))
+            strip = np.broadcast_to(tile.scale.spread(width_px), (bar_px, width_px))
+            painted = tile.scale.paint(strip, measured=np.ones(strip.shape, dtype=bool))
+            self.framed((left, below), painted, FRAME)
+            for row, label in enumerate(tile.labels):
+                for number, value in enumerate(tile.scale.spread(_MARKS).tolist()):
+                    room = width_px - _font(self.font_px).getlength(label(value))
+                    at = (left + room * number / (_MARKS - 1), below + bar_px + 4)
+                    self.draw.text(
+                        (at[0], at[1] + row * self.line_px), label(value), fill=_INK,
+                        font=_font(self.font_px),
+                    )  # fmt: skip
+
+
+@cache
+def _font(size_px: int) -> Any:
+    return ImageFont.load_default(size=size_px)
 
 
 def write_png(path: Path, picture: Picture) -> None:
@@ -89,52 +271,3 @@ def write_png(path: Path, picture: Picture) -> None:
     """
     with open_output(path) as file:
         Image.fromarray(picture).save(file, format="PNG")
-
-
-def _row(sample: Sample) -> list[tuple[str, Picture]]:
-    """Return a caption and a tile, wide enough for it, of each picture and map."""
-    arrays = {name: np.asarray(value) for name, value in sample.items()}
-    timed = [name for name in _TILES if name in arrays and arrays[name].ndim != 3]
-    if timed:
-        raise FieldError(f"{timed[0]} is {arrays[timed[0]].shape}: show one pair of one frame.")
-    tiles = []
-    for name, make in _TILES.items():
-        if name in arrays:
-            caption, tile = make(name, arrays)
-            factor = math.ceil(_NARROWEST_PX / tile.shape[1])
-            tiles.append((caption, tile.repeat(factor, axis=0).repeat(factor, axis=1)))
-    return tiles
-
-
-def _rgb(name: str, sample: dict[str, Any]) -> tuple[str, Picture]:
-    caption = name
-    if "pair" in sample and name in ("left", "right"):
-        caption += f" (cam {sample['pair'][int(name == 'right')]})"
-    if "baseline_m" in sample and name == "right":
-        caption += f", {float(sample['baseline_m']) * 100:.1f} cm"
-    return caption, np.ascontiguousarray(sample[name].transpose(1, 2, 0))
-
-
-def _scaled(name: str, sample: dict[str, Any], *, unit: str) -> tuple[str, Picture]:
-    values = sample[name][0]
-    measured = sample["valid"][0] if "valid" in sample else values != 0
-    largest = float(np.percentile(np.abs(values[measured]), 98)) if measured.any() else 0.0
-    caption = f"{name}, 0 to {largest:.3g} {unit}"
-    return caption, coloured(values, measured=measured, largest=largest)
-
-
-def _yes_no(name: str, sample: dict[str, Any]) -> tuple[str, Picture]:
-    yes = sample[name][0]
-    return f"{name}, {yes.mean():.0%}", np.repeat(yes[..., None] * np.uint8(255), 3, axis=-1)
-
-
-_TILES: Final[dict[str, Callable[[str, dict[str, Any]], tuple[str, Picture]]]] = {
-    "left": _rgb,
-    "right": _rgb,
-    "disparity": lambda name, sample: _scaled(name, sample, unit="px"),
-    "depth": lambda name, sample: _scaled(name, sample, unit="m"),
-    "valid": _yes_no,
-    "visible": _yes_no,
-    "warped_right": _rgb,
-    "hole": _yes_no,
-}

@@ -100,13 +100,17 @@ def may_pass(filters: Mapping[str, Any]) -> Callable[[SceneId], bool] | None:
     of_path = {
         name: {wanted} if isinstance(wanted, str) else set(wanted)
         for name, wanted in filters.items()
-        if name in ("split", "family", "map", "scenes") and isinstance(wanted, str | list | tuple)
+        if name in ("split", "subset", "family", "map", "scenes")
+        and isinstance(wanted, str | list | tuple)
     }
     if not of_path:
         return None
 
     def passes(scene: SceneId) -> bool:
-        values = {"split": scene.split, "family": scene.family, "map": scene.map_name}
+        values = {
+            "split": scene.split, "subset": scene.subset, "family": scene.family,
+            "map": scene.map_name,
+        }  # fmt: skip
         return all(
             any(str(part).strip("/").lower() in scene.key.lower() for part in wanted)
             if name == "scenes"

@@ -261,10 +261,10 @@ def test_pictures_and_maps_are_drawn_as_they_are(page):
     assert np.abs(drawn("right") - right).mean() < 3
     wanted = np.stack([left[..., 0], right[..., 1], right[..., 2]], axis=-1)
     assert np.abs(drawn("anaglyph") - wanted).mean() < 3
-    from stereogenbench_data.audit.pictures.drawing import scale_of
+    from stereogenbench_data.samples.picture import ColourScale
 
     disparity, valid = sample["disparity"][0].numpy(), sample["valid"][0].numpy()
-    painted = scale_of(disparity, measured=valid).paint(disparity, measured=valid)
+    painted = ColourScale.of(disparity, measured=valid).paint(disparity, measured=valid)
     assert np.abs(drawn("disparity") - painted.astype(int)).mean() < 4
 
 

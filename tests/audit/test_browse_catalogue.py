@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereogenbench_data import DepthEncoding, SceneIndex, SelectionError, StereoPairs
-from stereogenbench_data.audit.browser.catalogue import Catalogue, Choice, parse_choice
+from stereogenbench_data.audit.browser.catalogue import Catalogue, parse_choice
 from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
 from tests.audit.browsing import run
 
@@ -94,7 +94,7 @@ def test_the_edges_of_bins_belong_where_the_paper_puts_them(index):
     catalogue = Catalogue(SceneIndex.from_scenes([odd], index.root), shown_data="x")
 
     found = [baseline_bin(cm) for cm in edges]
-    counts = catalogue.summary(Choice())["counts"]["bin"]
+    counts = catalogue.summary({})["counts"]["bin"]
     assert counts == {name: found.count(name) for name in BASELINE_BINS}
 
 
@@ -130,11 +130,11 @@ def test_a_list_of_thousands_comes_in_parts(index):
         for number in range(8493)
     ]
     catalogue = Catalogue(SceneIndex.from_scenes(scenes, index.root), shown_data="x")
-    listed = catalogue.listed(Choice(), first=8400, count=10_000)
+    listed = catalogue.listed({}, first=8400, count=10_000)
 
     assert (listed["total"], listed["first"], len(listed["rows"])) == (8493, 8400, 93)
-    assert len(catalogue.listed(Choice(), first=0, count=10_000)["rows"]) == 200
-    assert catalogue.place(Choice(), "train/scene_004321") == 4321
+    assert len(catalogue.listed({}, first=0, count=10_000)["rows"]) == 200
+    assert catalogue.place({}, "train/scene_004321") == 4321
 
 
 def test_a_scene_outside_the_choice_has_no_place_in_the_list(catalogue):

@@ -158,7 +158,7 @@ def test_worker_processes_give_the_same_report(indexed_release):
 def test_the_table_has_the_papers_figures_beside(exact):
     rows = {row.quantity: row for row in exact.rows}
 
-    fx = "largest deviation of fx, fy, cx, cy from f / s W (none recorded in px)"
+    fx = "largest deviation of fx, fy, cx, cy from f / s W"
     assert (rows[fx].ours, rows[fx].paper) == ("0 px", "0 px")
     both = rows["both pairs, same step: median / 95th percentile (pixels kept)"]
     assert both.paper == "1.20e-06 px / 4.39e-03 px"
@@ -252,30 +252,30 @@ def contradicting(folder):
 @pytest.mark.parametrize(
     ("change", "where", "check", "found"),
     [
-        (dark, "cam_02_rgb.mp4", "too dark", "95 % of the picture are darker than"),
-        (flat, "cam_04_rgb.mp4", "flat", "the picture's grey levels span 0 of 255"),
-        (frozen, "cam_01_rgb.mp4", "frozen", "from frame 3 to the next audited one the camera"),
+        (dark, "cam_02_rgb.mp4", "too dark", "95th percentile of luma, of 255 is "),
+        (flat, "cam_04_rgb.mp4", "flat", "of 255 is 0, frame 0 "),
+        (frozen, "cam_01_rgb.mp4", "frozen", "is 0, frame 3 (limit 0.25)"),
         (one_view_twice, "cam_03_rgb.mp4", "copied view", "the same pictures as cam_02_rgb.mp4"),
         (changed_depth(0, without_depth), "cam_00_depth.mkv", "invalid depth",
-         "frame 3 has depth at 0.0% of its pixels"),
+         "share of pixels with depth is 0 %, frame 3 "),
         (changed_depth(0, lambda units: units * 0 + 900), "cam_00_depth.mkv", "invalid depth",
-         "holds 1 different depths"),
+         "count of different depths is 1 "),
         (changed_depth(1, lambda units: units[[0] * 7]), "cam_01_depth.mkv", "frozen",
          "from frame 0 to the next audited one the camera moves and depth stays the same"),
-        (changed_depth(5, hidden), "cam_05_depth.mkv", "occluder", "31% of the picture, from the"),
-        (late_pictures, "cam_01_rgb.mp4", "picture time", "if those of the frame after are taken"),
+        (changed_depth(5, hidden), "cam_05_depth.mkv", "occluder", "is 31."),
+        (late_pictures, "cam_01_rgb.mp4", "picture time", "by those of the frame after"),
         (reversed_pictures, "cam_04_rgb.mp4", "picture content",
-         "pictures of camera 4, warped by depth to "),
+         "correlation with other cameras' pictures"),
         (changed_depth(0, lambda units: np.roll(units, 1, 2)), "cam_00_depth.mkv", "depth fit",
          "depth of camera 0 is +"),
         (changed_depth(4, scaled(1.02)), "cam_04_depth.mkv", "depth fit",
          "camera 4 differs from that of the others by +1.9"),
         (along_the_ray, "", "depth fit", "of the way from the axis to along the ray"),
         (lower_sensor, "", "motion fit", "the vertical focal length (sensor height)"),
-        (other_unit, "", "depth consistency", "of cameras 1-3, 2-3, 3-4, 3-5 contradict"),
-        (rounded, "cam_00_depth.mkv", "depth quantum", "20 units apart, so that depth was rounded"),
-        (longer_baseline, "", "pose/baseline", "differ by 0.05 cm (limit 0.001)"),
-        (turned, "", "rig rotation", "turned against camera 0 by 1 deg"),
+        (other_unit, "", "depth consistency", ", most in "),
+        (rounded, "cam_00_depth.mkv", "depth quantum", "distance of stored numbers is 20 units"),
+        (longer_baseline, "", "pose/baseline", "is 0.05 cm (limit 0.001 cm)"),
+        (turned, "", "rig rotation", "turn of a camera against camera 0 moves is "),
         (contradicting, "cam_05_depth.mkv", "unreadable", "contradict each other"),
     ],
     ids=lambda value: getattr(value, "__name__", None),
@@ -415,7 +415,7 @@ def test_limits_decide_what_is_a_finding(exact, indexed_release):
     report = audit(indexed_release, AuditRequest(frames=1, limits=strict), workers=1, scenes=SCENE)
 
     assert {each.check for each in report.findings} == {"missing frames", "too dark"}
-    assert "has 7 frames of 81" in report.findings[0].found + report.findings[1].found
+    assert any("has 7 frames of 81" in finding.found for finding in report.findings)
     with pytest.raises(SelectionError, match=r"limit 'frame=1' is not NAME=NUMBER with a name of"):
         AuditLimits.parse(["frame=1"])
     with pytest.raises(SelectionError, match="limit 'frames=many' is not NAME=NUMBER"):

@@ -40,29 +40,25 @@ def test_a_rig_that_agrees_with_itself_deviates_by_nothing():
     found = rig_audit(RIG, poses(), [])
 
     assert (found.fx_px, found.fy_px) == (200.0, 200.0)
-    assert (found.intrinsics_px, found.intrinsics_recorded) == (0.0, 0)
+    assert found.intrinsics_px == 0.0
     assert found.adjacent_max_cm == found.pairs_max_cm == 0.0
-    assert found.rotation_deg == 0.0
     assert max(found.rotation_px, found.lateral_px) < 1e-9
 
 
-def test_a_baseline_that_is_off_is_reported_by_its_mean_and_its_largest():
+def test_a_baseline_that_is_off_is_reported():
     baselines = list(RIG.baselines_cm)
     baselines[0] += 0.3
     baselines[CAMERA_PAIRS.index((0, 5))] -= 0.6
 
     found = rig_audit(dataclasses.replace(RIG, baselines_cm=tuple(baselines)), poses(), [])
 
-    assert found.adjacent_mean_cm == pytest.approx(0.3 / 5)
     assert found.adjacent_max_cm == pytest.approx(0.3)
-    assert found.pairs_mean_cm == pytest.approx(0.9 / 15)
     assert found.pairs_max_cm == pytest.approx(0.6)
 
 
-def test_a_turned_camera_is_reported_in_degrees_and_in_pixels():
+def test_a_turned_camera_is_reported_in_pixels():
     found = rig_audit(RIG, poses(turned=Rotation.from_euler("z", 1.0, degrees=True)), [])
 
-    assert found.rotation_deg == pytest.approx(1.0)
     # A corner is hypot(50, 40) px from the centre, about which the picture turns.
     assert found.rotation_px == pytest.approx(2 * math.sin(math.radians(0.5)) * math.hypot(50, 40))
     assert found.lateral_px < 1e-9
@@ -93,7 +89,6 @@ def test_intrinsics_in_pixels_are_found_at_any_depth_and_in_any_spelling():
         ("fx_px", 200.0), ("fx_px", 201.0), ("fy_px", 200.0), ("fy_px", 200.5),
     ]  # fmt: skip
     assert rig_audit(RIG, poses(), [document]).intrinsics_px == 1.0
-    assert rig_audit(RIG, poses(), [document]).intrinsics_recorded == 7
 
 
 def test_motion_is_the_turn_and_the_way_in_pixels():

@@ -6,15 +6,6 @@ import pytest
 from PIL import Image
 
 from stereogenbench_data import SceneIndex, SelectionError, StereoPairs
-from stereogenbench_data.audit.pictures.drawing import (
-    ColourScale,
-    Page,
-    disparity_rows,
-    fitted,
-    resized,
-    scale_of,
-    scale_rows,
-)
 from stereogenbench_data.audit.pictures.scene_pictures import (
     HIDDEN,
     LEFT,
@@ -25,7 +16,15 @@ from stereogenbench_data.audit.pictures.scene_pictures import (
     write_clip,
 )
 from stereogenbench_data.audit.pictures.scene_reader import SceneReader
-from stereogenbench_data.samples.picture import COLOUR_STOPS, NOT_MEASURED, anaglyph
+from stereogenbench_data.samples.picture import (
+    COLOUR_STOPS,
+    NOT_MEASURED,
+    ColourScale,
+    Tile,
+    anaglyph,
+    draw_sheet,
+    pair_tiles,
+)
 
 SCENE = "train/Uniform/SynthStage/scene_000001"
 
@@ -67,7 +66,8 @@ def test_the_views_of_a_sheet_are_the_six_cameras_pictures(reader, row, size_px)
 
     views = reader.views(row, frame=1)
     for camera in range(6):
-        wanted = resized(views[camera].transpose(1, 2, 0).copy(), width_px=width)
+        picture = Image.fromarray(views[camera].transpose(1, 2, 0).copy())
+        wanted = picture.resize((width, width), Image.Resampling.NEAREST)
         assert np.array_equal(tile(sheet, line=0, column=camera, width_px=width), wanted), camera
 
 
@@ -76,7 +76,7 @@ def test_the_maps_of_a_sheet_are_coloured_as_their_scales_say(reader, row):
     sample = reader.pair(row, pair=(0, 2), frame=0,
                          fields=("left", "right", "disparity", "valid", "visible"))  # fmt: skip
     disparity, valid = sample["disparity"][0], sample["valid"][0]
-    painted = scale_of(disparity, measured=valid).paint(disparity, measured=valid)
+    painted = ColourScale.of(disparity, measured=valid).paint(disparity, measured=valid)
     shown = {
         name: tile(sheet, line=1, column=column, width_px=256)[2::4, 2::4]
         for column, name in ((0, "disparity"), (2, "visible"), (3, "anaglyph"))
@@ -119,52 +119,44 @@ def test_a_scale_runs_from_dark_to_red_and_a_log_scale_the_other_way():
     assert log[0].tolist() == [COLOUR_STOPS[-1].tolist(), COLOUR_STOPS[0].tolist()]
 
 
+def test_the_bar_of_disparity_says_depth_in_metres_below_pixels(reader, row):
+    sample = reader.pair(row, pair=(0, 2), frame=0,
+                         fields=("left", "right", "disparity", "valid", "baseline_m"))  # fmt: skip
+
+    pixels, metres = pair_tiles(sample, fx_px=600.0)[2].labels
+
+    # 600 px of focal length: B = 10 cm would give 60 px at 1 m.
+    assert [pixels(value) for value in (0.0, 20.0)] == ["0", "20"]
+    assert metres(0.0) == "inf"
+    assert float(metres(60.0)) == pytest.approx(10 * float(sample["baseline_m"]), rel=1e-2)
+
+
 @pytest.mark.parametrize(
-    ("scale", "ticks"),
+    ("scale", "values"),
     [
-        (ColourScale(0.0, 87.0), [0, 20, 40, 60, 80]),
-        (ColourScale(0.0, 2.6), [0, 0.5, 1, 1.5, 2, 2.5]),
-        (ColourScale(101.0, 108.0), [102, 104, 106, 108]),
-        (ColourScale(1.5, 120.0, "log"), [2, 5, 10, 20, 50, 100]),
-        (ColourScale(4.0, 26.0, "log"), [5, 7, 10, 15, 20]),
+        (ColourScale(0.0, 60.0), [0, 20, 40, 60]),
+        (ColourScale(1.0, 1000.0, "log"), [1, 10, 100, 1000]),
     ],
 )
-def test_ticks_are_round_numbers_within_the_range(scale, ticks):
-    assert scale.ticks(6) == pytest.approx(ticks)
-
-
-def test_the_bar_of_disparity_says_depth_in_metres_below_pixels():
-    # 600 px of focal length and 10 cm: 60 px at 1 m, 20 px at 3 m.
-    pixels, metres = disparity_rows(ColourScale(0.0, 60.0), shift_px_m=60.0)
-
-    assert [text for _, text in pixels] == ["0", "20", "40", "60"]
-    assert [text for _, text in metres] == ["inf", "3", "1.5", "1"]
-    assert [place for place, _ in metres] == pytest.approx([0, 1 / 3, 2 / 3, 1])
-    assert scale_rows(ColourScale(0.0, 60.0)) == [pixels]
+def test_a_scale_is_labelled_at_equal_distances(scale, values):
+    assert scale.spread(4).tolist() == pytest.approx(values)
 
 
 def test_nothing_measured_has_a_scale_too():
     nothing = np.zeros((2, 2), dtype=bool)
 
-    scale = scale_of(np.zeros((2, 2)), measured=nothing, kind="log")
+    scale = ColourScale.of(np.zeros((2, 2)), measured=nothing, kind="log")
     assert (scale.paint(np.zeros((2, 2)), measured=nothing) == NOT_MEASURED).all()
 
 
 def test_a_caption_never_leaves_its_tile():
-    page = Page(400, 40, font_px=14)
-    page.text((4, 4), "disparity and very much more than there is room for", width_px=90)
-    inked = (page.finished() < 128).any(axis=-1).any(axis=0).nonzero()[0]
+    white = np.full((90, 90, 3), 250, np.uint8)
+    tiles = [Tile("disparity and very much more than there is room for", white), Tile("", white)]
 
-    assert 60 < inked.max() < 4 + 90
+    sheet = draw_sheet([], [tiles], width_px=90)
 
-
-def test_a_text_that_fits_is_not_cut():
-    class Font:
-        def getlength(self, text):
-            return 10.0 * len(text)
-
-    assert fitted("camera 0", font=Font(), width_px=80) == "camera 0"
-    assert fitted("camera 0", font=Font(), width_px=79) == "came..."
+    inked = (sheet[13:29] < 128).any(axis=-1).any(axis=0).nonzero()[0]
+    assert 60 < inked.max() < 13 + 90
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])

@@ -10,7 +10,7 @@ import torch
 
 from stereogenbench_data.audit.contract.matching import SceneFrames
 from stereogenbench_data.audit.contract.worlds import explained_shares, judge_worlds
-from stereogenbench_data.audit.scene_access import SceneAccess
+from stereogenbench_data.audit.scene_access import source_of
 from stereogenbench_data.datasets.mapped import SceneViews
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.pose_forms import readings
@@ -99,7 +99,7 @@ def test_depth_tells_which_way_a_camera_looks(small):
     with pytest.warns(AssumptionWarning, match="several readings of the poses fit"):
         index = SceneIndex.open(small)
     scene = index.scene(0)
-    source = SceneAccess.of(index, scene).source()
+    source = source_of(index, scene)
     with closing(Streams(source)) as streams:
         views = SceneFrames(scene, streams, encoding=DepthEncoding())
         text = source.read(scene, "trajectory.json")

@@ -1,11 +1,16 @@
 """Contact sheets."""
 
 import numpy as np
-import pytest
 from PIL import Image
 
-from stereogenbench_data import FieldError, StereoPairs
-from stereogenbench_data.samples.picture import COLOUR_STOPS, coloured, contact_sheet, write_png
+from stereogenbench_data import StereoPairs
+from stereogenbench_data.samples.picture import (
+    COLOUR_STOPS,
+    coloured,
+    draw_sheet,
+    pair_tiles,
+    write_png,
+)
 
 
 def test_colours_run_from_zero_to_the_largest_and_grey_is_not_measured():
@@ -20,26 +25,14 @@ def test_colours_run_from_zero_to_the_largest_and_grey_is_not_measured():
     assert picture[0, 3].tolist() == [96, 96, 96]
 
 
-def test_a_sheet_has_a_row_for_each_sample_and_a_tile_for_each_picture(indexed_release, tmp_path):
-    pairs = StereoPairs(indexed_release, fields=("left", "right", "disparity", "visible", "scene"))
-    sheet = contact_sheet([pairs[0], pairs[1], pairs[2]])
+def test_a_sheet_has_a_tile_for_each_picture_of_a_pair(indexed_release, tmp_path):
+    fields = ("left", "right", "disparity", "valid", "baseline_m")
+    pair = StereoPairs(indexed_release, fields=fields)[0]
+    sheet = draw_sheet([], [pair_tiles(pair, fx_px=70.0)], width_px=192)
     write_png(tmp_path / "sheet.png", sheet)
 
-    # tiles of 64 px are enlarged threefold, to make room for their captions
-    assert sheet.shape == (3 * (192 + 20 + 4), 4 * (192 + 4), 3)
-    left = pairs[0]["left"].numpy().transpose(1, 2, 0)
-    assert np.array_equal(sheet[20:212, :192], np.kron(left, np.ones((3, 3, 1), dtype=np.uint8)))
+    left = pair["left"].numpy().transpose(1, 2, 0)
+    assert sheet.shape[1] == 13 + 3 * (192 + 13)
+    assert np.array_equal(sheet[35:227, 13:205], np.kron(left, np.ones((3, 3, 1), dtype=np.uint8)))
     with Image.open(tmp_path / "sheet.png") as written:
         assert np.array_equal(np.asarray(written), sheet)
-
-
-def test_a_clip_is_not_a_row_of_tiles(indexed_release):
-    clip = StereoPairs(indexed_release, frames=("clips", 2))[0]
-
-    with pytest.raises(FieldError, match="show one pair of one frame"):
-        contact_sheet([clip])
-
-
-def test_nothing_to_show_says_what_could_be(indexed_release):
-    with pytest.raises(FieldError, match="needs one of the fields left, right, disparity"):
-        contact_sheet([StereoPairs(indexed_release, fields=["scene"])[0]])

@@ -27,7 +27,7 @@ from stereogenbench_data import (
     score_controls,
 )
 from stereogenbench_data.audit.contract.doctor import diagnose
-from stereogenbench_data.audit.geometry.audit import AuditRequest, audit
+from stereogenbench_data.audit.geometry.audit import audit
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import MediaError, SchemaError, ShardError, StorageError
 from stereogenbench_data.index.table import SceneIndex
@@ -490,12 +490,6 @@ def test_what_needs_released_pictures_refuses_derived_ones(packed, tmp_path, wor
     with pytest.raises(StorageError, match=r"training shards, derived at 32x24.*released data"):
         work(packed, tmp_path / "out")
     assert not list((tmp_path / "out").iterdir())
-
-
-def test_an_explicit_word_lets_the_audit_run(packed):
-    report = audit(packed, AuditRequest(sample=1, frames=1, derived="ok"), workers=1)
-
-    assert len(report.scenes) == 1
 
 
 def test_unpacked_training_shards_are_a_folder_of_derived_scenes(packed, tmp_path):

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
@@ -24,41 +23,13 @@ from stereogenbench_data.selection.pairs import PairList, baselines_cm, choose_p
 MOST_ROWS: Final = 200
 """The largest number of scenes in one response."""
 
-_KEPT_CHOICES: Final = 32
-
 FACETS: Final = {"split": "split", "subset": "subset", "family": "family", "map": "map_name"}
 """The filters whose values the page lists, and the index columns of these."""
 PairKind = Literal["primary", "adjacent", "all"]
 
 
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """The filters that are set on the page.
-
-    Attributes:
-        texts: (name, values) of `FACETS`; one of the values must match.
-        focal_mm: A closed range in mm, or None.
-        baseline_cm: A closed range in cm, names of bins, or None.
-        caption: Words that must all be in the caption.
-        pairs: Which pairs of the scenes.
-    """
-
-    texts: tuple[tuple[str, tuple[str, ...]], ...] = ()
-    focal_mm: tuple[float, float] | None = None
-    baseline_cm: tuple[float, float] | tuple[str, ...] | None = None
-    caption: str = ""
-    pairs: PairKind = "all"
-
-    def filters(self) -> dict[str, Any]:
-        """Return the filters that are set, by their names in `SceneFilters`."""
-        found: dict[str, Any] = {
-            name: values[0] if len(values) == 1 else list(values) for name, values in self.texts
-        }
-        if self.focal_mm is not None:
-            found["focal_mm"] = self.focal_mm
-        if self.caption.split():
-            found["caption"] = " ".join(self.caption.split())
-        return found
+Choice = Mapping[str, Any]
+"""The filters that are set on the page, as keyword arguments of `StereoPairs`."""
 
 
 def parse_choice(query: Mapping[str, list[str]]) -> Choice:
@@ -72,23 +43,25 @@ def parse_choice(query: Mapping[str, list[str]]) -> Choice:
     Raises:
         SelectionError: If a number is not a number, or there is no such value.
     """
-    texts = tuple((name, tuple(sorted(set(query[name])))) for name in FACETS if query.get(name))
-    bins = tuple(sorted(set(query.get("bin", ()))))
+    bins = sorted(set(query.get("bin", ())))
     unknown = [name for name in bins if name not in BASELINE_BINS]
-    pairs: Any = query.get("pairs", ["all"])[0]
+    pairs = query.get("pairs", ["all"])[0]
     if unknown or pairs not in get_args(PairKind):
         known = BASELINE_BINS if unknown else get_args(PairKind)
         raise SelectionError(
             f"there is no choice {shortened((unknown or [pairs])[0])!r}: choose among "
             f"{', '.join(known)}."
         )
-    return Choice(
-        texts=texts,
-        focal_mm=_range(query, "focal"),
-        baseline_cm=bins or _range(query, "baseline"),
-        caption=query.get("caption", [""])[0],
-        pairs=pairs,
-    )
+    texts = {name: sorted(set(query[name])) for name in FACETS if query.get(name)}
+    choice: dict[str, Any] = {
+        name: values[0] if len(values) == 1 else values for name, values in texts.items()
+    }
+    choice |= {
+        "focal_mm": _range(query, "focal"),
+        "caption": " ".join(query.get("caption", [""])[0].split()),
+        "baseline_cm": bins or _range(query, "baseline"),
+    }
+    return {name: value for name, value in choice.items() if value} | {"pairs": pairs}
 
 
 def _range(query: Mapping[str, list[str]], name: str) -> tuple[float, float] | None:
@@ -139,7 +112,6 @@ class Catalogue:
         self._data = shown_data
         self._depth = depth
         self._row_of = {str(key): row for row, key in enumerate(index.column("key"))}
-        self.choose = lru_cache(maxsize=_KEPT_CHOICES)(self._choose)
 
     def row(self, key: str) -> int:
         """Return the row of a key.
@@ -249,12 +221,7 @@ class Catalogue:
 
     def selection_line(self, choice: Choice) -> str:
         """Return Python that selects the chosen pairs with all frames; it runs as it is."""
-        options = choice.filters() | {"pairs": choice.pairs}
-        if choice.baseline_cm is not None:
-            wanted = choice.baseline_cm
-            is_bins = isinstance(wanted[0], str)
-            options["baseline_cm"] = list(wanted) if is_bins else wanted
-        return self._line("pairs", options | {"frames": "all"})
+        return self._line("pairs", {"pairs": "all", **choice, "frames": "all"})
 
     def sample_line(self, key: str, *, pair: tuple[int, int], frame: int) -> str:
         """Return Python that gives the sample shown; it runs as it is."""
@@ -272,14 +239,15 @@ class Catalogue:
             f"{name} = StereoPairs({self._data!r}{given})"
         )
 
-    def _choose(self, choice: Choice) -> ChosenPairs:
-        """Return what a choice leaves; the last results are kept."""
-        filters: Any = choice.filters()
+    def choose(self, choice: Choice) -> ChosenPairs:
+        """Return what a choice leaves."""
+        filters: Any = dict(choice)
+        wanted = {name: filters.pop(name, None) for name in ("pairs", "baseline_cm")}
         try:
+            rows = filter_scenes(self.index, filters)
             pairs = choose_pairs(
-                self.index, filter_scenes(self.index, filters), pairs=choice.pairs,
-                baseline_cm=choice.baseline_cm,
-            )  # fmt: skip
+                self.index, rows, pairs=wanted["pairs"] or "all", baseline_cm=wanted["baseline_cm"]
+            )
         except SelectionError as error:
             empty = choose_pairs(self.index, np.zeros(0, dtype=np.int64), pairs="all")
             return ChosenPairs(empty.row, empty, str(error))
@@ -287,8 +255,7 @@ class Catalogue:
 
     def _counts(self, choice: Choice, facet: str) -> dict[str, int]:
         """Return, for each value of a filter, how many scenes the other filters leave."""
-        texts = tuple((name, values) for name, values in choice.texts if name != facet)
-        others = replace(choice, texts=texts)
+        others = {name: value for name, value in choice.items() if name != facet}
         column = self.index.column(FACETS[facet])
         known = sorted({str(value) for value in column if value is not None})
         found, counts = np.unique(column[self.choose(others).rows].astype(str), return_counts=True)
@@ -296,7 +263,7 @@ class Catalogue:
         return {value: left.get(value, 0) for value in known}
 
     def _bin_counts(self, choice: Choice) -> dict[str, int]:
-        pairs = self.choose(replace(choice, baseline_cm=None)).pairs
+        pairs = self.choose({n: each for n, each in choice.items() if n != "baseline_cm"}).pairs
         found = baselines_cm(self.index, pairs)[:, 0]
         return {name: int(in_bin(found, name).sum()) for name in BASELINE_BINS}
 

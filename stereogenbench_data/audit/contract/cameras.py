@@ -9,7 +9,7 @@ The reference is the largest group of cameras that agree with one another, if it
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,9 +18,8 @@ from jaxtyping import Float64
 
 from stereogenbench_data.audit.contract.fitting import voted_scale
 from stereogenbench_data.audit.contract.hypotheses import Hypothesis, Question
-from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames, match_rows
+from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames
 from stereogenbench_data.audit.contract.scoring import Pair, ScoredContract, sample_along_rows
-from stereogenbench_data.audit.geometry.picture_check import Luma
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
 LEAST_SHARE: Final = 0.5
@@ -36,7 +35,6 @@ _LEAST_ASYMMETRY: Final = 0.1
 _LEAST_GAIN: Final = 0.01
 _LEAST_CLOSED: Final = 1 / 3
 """Least share of the points lacking that another reading of a camera's depth must explain."""
-_LEAST_LATER: Final = 0.03
 _LEAST_AWAY: Final = 0.25
 """Two depths of a point agree if their disparities differ by fewer pixels."""
 _GAIN_ERRORS: Final = 5.0
@@ -44,7 +42,6 @@ _GAIN_ERRORS: Final = 5.0
 _FEWEST_MATCHES: Final = 100
 _NARROWEST: Final = 2
 _ROWS_BESIDE: Final = 2
-_FARTHEST_FRAMES: Final = 30
 _MAJORITY: Final = CAMERA_COUNT // 2 + 1
 
 
@@ -58,7 +55,6 @@ class CameraFigures:
         agreement: Share of them that its own depth explains to a pixel; nan if untested.
         depth_scale: Its depth over that of the reference cameras at the same points.
         row_px: How far its pictures are shifted down, against the reference cameras.
-        column_px: How far they are shifted to the right, against what depth predicts.
     """
 
     camera: int
@@ -66,7 +62,6 @@ class CameraFigures:
     agreement: float
     depth_scale: float
     row_px: float
-    column_px: float
 
     @property
     def is_tested(self) -> bool:
@@ -121,9 +116,6 @@ class _Beside:
     log_ratio: float
     ratio_error: float
     row_px: float
-    column_px: float
-    log_scale: float
-    rms_px: float
 
     @property
     def share(self) -> float:
@@ -148,10 +140,10 @@ class CameraComparison:
         self._contract = contract
         self._depth_step = depth_step
         self._most_log_scale = max(MOST_LOG_SCALE, depth_step / 4)
-        self._partner: dict[int, FrameMatch] = {}
+        self._partner: dict[FrameMatch, FrameMatch] = {}
         by_pair: dict[Pair, list[tuple[FrameMatch, FrameMatch]]] = {}
         for here, there in zip(matches[::2], matches[1::2], strict=True):
-            self._partner |= {id(here): there, id(there): here}
+            self._partner |= {here: there, there: here}
             by_pair.setdefault(here.pair, []).append((here, there))
         found = {pair: self._beside(pair, both) for pair, both in by_pair.items()}
         self._pairs = {pair: beside for pair, beside in found.items() if beside is not None}
@@ -161,28 +153,19 @@ class CameraComparison:
         if not self._pairs:
             return CameraCheck()
         scales, scale_problems = self._scales()
-        rows_px, row_problems = self._shifts(
-            {p: b.row_px for p, b in self._pairs.items()}, MOST_ROWS_PX, ("lower", "higher")
-        )
-        columns_px, column_problems = self._shifts(
-            {p: b.column_px for p, b in self._pairs.items()},
-            MOST_COLUMNS_PX,
-            ("to the right", "to the left"),
-        )
+        rows_px, row_problems = self._shifts()
         figures = []
-        for camera, shifts in enumerate(zip(scales, rows_px, columns_px, strict=True)):
+        for camera, shifts in enumerate(zip(scales, rows_px, strict=True)):
             nearest = self._of(camera)[:_NARROWEST]
             count = sum(beside.count for beside in nearest)
             explained = sum(beside.count * beside.near[camera] for beside in nearest)
             share = explained / count if count else math.nan
             figures.append(CameraFigures(camera, count, share, *shifts))
-        problems = dict(column_problems)
+        problems = {}
         for camera in sorted({*row_problems, *self._behind()}):
-            problems[camera] = self._picture_problem(
-                camera, rows_px[camera], row_problems.get(camera)
-            )
+            problems[camera] = self._picture_problem(camera, row_problems.get(camera))
         problems |= self._depth_problems(scales, scale_problems, beside=set(problems))
-        found = [problems[camera] for camera in sorted(problems)] or self._width_problems()
+        found = [problems[camera] for camera in sorted(problems)]
         return CameraCheck(tuple(figures), tuple(found))
 
     def _beside(self, pair: Pair, both: Sequence[tuple[FrameMatch, FrameMatch]]) -> _Beside | None:
@@ -211,13 +194,7 @@ class CameraComparison:
         usable = left_px * right_px > 0
         log_ratios = np.log(left_px[usable] / right_px[usable])
         log_ratio, ratio_error = _median(log_ratios)
-        agreed = near[0] & near[1]
         either = near[0] | near[1]
-        column_px, _ = _median((found - (by_left + by_right) / 2)[agreed])
-        predicted = ((left_px + right_px) / 2)[agreed]
-        rms_px = float(np.sqrt((predicted**2).mean())) if agreed.any() else 0.0
-        wide = np.abs(predicted) > max(rms_px / 2, 2.0)
-        log_scale, _ = _median(np.log(np.maximum(found[agreed][wide] / predicted[wide], 1e-3)))
         return _Beside(
             pair=pair,
             width_m=abs(self._views.baseline_m(both[0][0], hypothesis)),
@@ -226,9 +203,6 @@ class CameraComparison:
             log_ratio=log_ratio,
             ratio_error=ratio_error,
             row_px=float(upward[either].sum() / max(steep[either].sum(), 1e-6)),
-            column_px=column_px,
-            log_scale=log_scale,
-            rms_px=rms_px,
         )
 
     def _of(self, camera: int) -> list[_Beside]:
@@ -253,17 +227,17 @@ class CameraComparison:
         }
         return [math.exp(value) for value in logs], _or_all(words, group, "scale of depth")
 
-    def _shifts(
-        self, values: dict[Pair, float], most_px: float, directions: tuple[str, str]
-    ) -> tuple[list[float], dict[int, str]]:
-        """Return how far each camera's pictures are shifted, and the cameras shifted too far."""
-        levels, group = _levels(values, dict.fromkeys(values, most_px))
+    def _shifts(self) -> tuple[list[float], dict[int, str]]:
+        """Return how far down each camera's pictures are, and the cameras that are too far."""
+        values = {pair: beside.row_px for pair, beside in self._pairs.items()}
+        levels, group = _levels(values, dict.fromkeys(values, MOST_ROWS_PX))
         words = {
-            camera: f"pictures of camera {camera} are {abs(value):.1f} px {directions[value < 0]}"
-            for camera, value in enumerate(levels)
-            if abs(value) > most_px
+            camera: f"pictures of camera {camera} are {abs(px):.1f} px "
+            f"{'higher' if px < 0 else 'lower'}"
+            for camera, px in enumerate(levels)
+            if abs(px) > MOST_ROWS_PX
         }
-        return levels, _or_all(words, group, f"pictures ({directions[0]} or {directions[1]})")
+        return levels, _or_all(words, group, "rows of pictures")
 
     def _behind(self) -> Iterator[int]:
         """Yield cameras all of whose pairs explain fewer matches than other pairs as wide."""
@@ -280,59 +254,30 @@ class CameraComparison:
             if len(deficits) >= _NARROWEST and min(deficits) > _LEAST_DEFICIT:
                 yield camera
 
-    def _picture_problem(self, camera: int, row_px: float, row_problem: str | None) -> str:
-        """Return what is wrong with a camera's pictures, by the reading that fits best."""
+    def _picture_problem(self, camera: int, row_problem: str | None) -> str:
+        """Return what is wrong with a camera's pictures."""
         behind = set(self._behind()) - {camera}
         own = self._of(camera)
         neighbour = next((beside for beside in own if not set(beside.pair) & behind), own[0])
-        (other,) = set(neighbour.pair) - {camera}
-        matches = [match for match in self._matches if (match.left, match.right) == (other, camera)]
-        middle = matches[len(matches) // 2]
-        frames = self._views.scene.frames
-        as_it_is = self._views.band(middle.frame, camera)
-        now = self._share([(middle, as_it_is)])
-        readings = [
-            (self._share([(middle, turned(as_it_is))]), words) for words, turned in _TURNED.items()
-        ]
-        if row_problem is not None:
-            rows = int(np.rint(row_px)) or int(np.sign(row_px))
-            readings.append((self._share([(middle, np.roll(as_it_is, -rows, axis=0))]), ""))
-        for lag in range(-_FARTHEST_FRAMES, _FARTHEST_FRAMES + 1):
-            usable = [match for match in matches if 0 <= match.frame + lag < frames]
-            if lag and usable:
-                match = min(usable, key=lambda each: abs(each.frame - middle.frame))
-                share = self._share([(match, self._views.band(match.frame + lag, camera))])
-                readings.append((share, _lateness(lag)))
-        share, words = max(readings, default=(0.0, ""))
-        elsewhere = self._share_elsewhere(matches)
-        # With small disparities another place also explains a problem of rows.
-        if elsewhere > share + _LEAST_DEFICIT:
-            share, words = elsewhere, _ELSEWHERE
-        wanted = max(
-            (beside.share for pair, beside in self._pairs.items() if camera not in pair),
-            default=1.0,
+        if row_problem is not None and neighbour.share >= LEAST_SHARE:
+            return row_problem
+        matches = [
+            match for match in self._matches
+            if match.right == camera and match.pair == neighbour.pair
+        ]  # fmt: skip
+        if self._share_elsewhere(matches) > neighbour.share + _LEAST_DEFICIT:
+            return f"camera {camera} {_ELSEWHERE}"
+        found = f", perhaps {row_problem.split(' are ')[1]}" if row_problem else ""
+        return (
+            f"pictures of camera {camera} do not fit those of the others, by the depth of "
+            f"either: other rows, another moment or another place{found}"
         )
-        if share < max(0.7 * wanted, now + _LEAST_DEFICIT / 2):
-            found = f", perhaps {row_problem.split(' are ')[1]}" if row_problem else ""
-            return (
-                f"pictures of camera {camera} do not fit those of the others, by the depth of "
-                f"either: other rows, another moment or another place{found}"
-            )
-        if words == _ELSEWHERE:
-            return f"camera {camera} {words}"
-        return f"pictures of camera {camera} are {words}" if words else row_problem or ""
 
     def _share_elsewhere(self, matches: Sequence[FrameMatch]) -> float:
         """Return the share of matches that depth explains if the cameras stand elsewhere."""
-        found, predicted = [], []
-        for match in matches:
-            prediction = self._views.predicted(match, self._contract.hypothesis)
-            if prediction is not None:
-                found.append(match.matched_px[prediction[1]])
-                predicted.append(prediction[0][prediction[1]])
-        if not sum(map(len, found)):
+        found_px, predicted_px = self._joined(matches, self._contract.hypothesis)
+        if not len(found_px):
             return 0.0
-        found_px, predicted_px = np.concatenate(found), np.concatenate(predicted)
         # The two may even stand in the other order.
         aways = [
             voted_scale(found_px, sign * predicted_px) * sign * predicted_px - found_px
@@ -340,23 +285,17 @@ class CameraComparison:
         ]
         return max(float((np.abs(away) < matches[0].grain_px).mean()) for away in aways)
 
-    def _share(self, matches: Sequence[tuple[FrameMatch, Luma]]) -> float:
-        """Return the share of matches with given right pictures that depth explains."""
-        near, count = 0, 0
-        hypothesis = self._contract.hypothesis
-        for match, right in matches:
-            found = match_rows(self._views.band(match.frame, match.left), right)
-            file = hypothesis.depth_file(match.left)
-            frame = min(max(match.frame + hypothesis.frame_lag, 0), self._views.scene.frames - 1)
-            units, known = self._views.depth(frame, file)
-            place = found.rows, found.columns
-            number = np.where(known[place], units[place], 1).astype(np.float64)
-            predicted = self._contract.scale * self._views.disparity_of(
-                number, match, hypothesis, place=place, file=file
-            )
-            near += int((np.abs(predicted - found.disparity_px) < found.grain_px).sum())
-            count += len(found.rows)
-        return near / count if count else 0.0
+    def _joined(
+        self, matches: Sequence[FrameMatch], hypothesis: Hypothesis
+    ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+        """Return the disparities of matches, found and predicted."""
+        found, predicted = [np.zeros(0)], [np.zeros(0)]
+        for match in matches:
+            prediction = self._views.predicted(match, hypothesis)
+            if prediction is not None:
+                found.append(match.matched_px[prediction[1]])
+                predicted.append(prediction[0][prediction[1]])
+        return np.concatenate(found), np.concatenate(predicted)
 
     def _depth_problems(
         self, scales: Sequence[float], scale_problems: dict[int, str], *, beside: set[int]
@@ -397,7 +336,6 @@ class CameraComparison:
         matches = [match for match in self._matches if match.left == camera]
         now = self._shares(matches, hypothesis)
         subject = f"depth of camera {camera}"
-        lagged: dict[str, int] = {}
         readings: list[tuple[str, Float64[np.ndarray, " matches"]]] = [
             (
                 f"{subject} is {scale:.4g} x that of the others",
@@ -407,11 +345,8 @@ class CameraComparison:
         for question in _READINGS:
             for other in hypothesis.alternatives(question):
                 words = _READINGS[question].format(getattr(other, question))
-                factor = self._own_factor(matches, other) if question == "form" else 1.0
                 words = f"{subject} fits better {words}"
-                if question == "frame_lag":
-                    lagged[words] = other.frame_lag
-                readings.append((words, self._shares(matches, other, factor=factor)))
+                readings.append((words, self._shares(matches, other)))
         for file in range(CAMERA_COUNT):
             if file != hypothesis.depth_file(camera):
                 readings.append(
@@ -426,42 +361,7 @@ class CameraComparison:
             # The first ones are the simplest.
             if is_clear and gain > most + _LEAST_GAIN * bool(best):
                 best, most = words, gain
-        if best in lagged:
-            lag = hypothesis.frame_lag - lagged[best]
-            if self._is_late(camera, lag):
-                return f"pictures of camera {camera} are {_lateness(lag)}"
         return best
-
-    def _is_late(self, camera: int, lag: int) -> bool:
-        """Tell whether a camera's pictures lag rather than its depth.
-
-        Late pictures fit earlier depth. If they are late, a later picture fits the depth of the
-        neighbours better.
-        """
-        (neighbour,) = set(self._of(camera)[0].pair) - {camera}
-        matches = [
-            match
-            for match in self._matches
-            if (match.left, match.right) == (neighbour, camera)
-            and 0 <= match.frame + lag < self._views.scene.frames
-        ]
-        now, then = (
-            self._share([(match, self._views.band(match.frame + by, camera)) for match in matches])
-            for by in (0, lag)
-        )
-        return then > now + _LEAST_LATER
-
-    def _own_factor(self, matches: Sequence[FrameMatch], hypothesis: Hypothesis) -> float:
-        """Return the factor that most of a camera's matches agree on."""
-        ratios = []
-        for match in matches:
-            predicted = self._views.predicted(match, hypothesis)
-            if predicted is not None:
-                disparity_px, known = predicted
-                ratio = match.matched_px[known] / (self._contract.scale * disparity_px[known])
-                ratios.append(ratio[ratio > 0])
-        positive = np.concatenate(ratios) if ratios else np.ones(1)
-        return math.exp(float(np.median(np.log(positive)))) if len(positive) else 1.0
 
     def _shares(
         self,
@@ -474,12 +374,14 @@ class CameraComparison:
         """Return for each frame match the share where a reading agrees with the other's depth.
 
         Depth agrees more sharply with depth than with matches, some of which are wrong. Disparity
-        is multiplied by ``factor``.
+        is multiplied by ``factor``; another form of depth has a factor of its own.
         """
+        if hypothesis.form != self._contract.hypothesis.form:
+            factor = voted_scale(*self._joined(matches, hypothesis)) / self._contract.scale
         shares = np.full(len(matches), np.nan)
         for place, match in enumerate(matches):
             predicted = self._views.predicted(match, hypothesis, depth_file=file)
-            other = self._views.predicted(self._partner[id(match)], self._contract.hypothesis)
+            other = self._views.predicted(self._partner[match], self._contract.hypothesis)
             if predicted is not None and other is not None:
                 known = predicted[1] & other[1]
                 expected_px = -self._contract.scale * other[0][known]
@@ -488,42 +390,12 @@ class CameraComparison:
                 shares[place] = float((np.abs(away) < allowed).mean()) if known.any() else np.nan
         return shares
 
-    def _width_problems(self) -> list[str]:
-        """Return which pairs disagree with the others on their width, and their common camera."""
-        wide = {
-            pair: beside for pair, beside in self._pairs.items()
-            if beside.rms_px > 2.0 and beside.share >= LEAST_SHARE
-        }  # fmt: skip
-        if len(wide) < _MAJORITY or self._contract.offsets_px:
-            return []
-        middle = float(np.median([beside.log_scale for beside in wide.values()]))
-        off = {
-            pair: beside.log_scale - middle
-            for pair, beside in wide.items()
-            if abs(beside.log_scale - middle) > max(0.01, 0.25 / beside.rms_px)
-        }
-        if not off:
-            return []
-        common = set.intersection(*map(set, off))
-        words = ", ".join(f"{a}-{b} by {math.expm1(v):+.1%}" for (a, b), v in off.items())
-        whose = f": camera {common.pop()} {_ELSEWHERE}" if len(common) == 1 else ""
-        return [f"distances between cameras disagree: {words}{whose}"]
 
-
-_TURNED: Final[dict[str, Callable[[Luma], Luma]]] = {
-    "mirrored": lambda band: band[:, ::-1],
-    "upside down": lambda band: band[::-1],
-    "turned by 180 degrees": lambda band: band[::-1, ::-1],
-}
 _ELSEWHERE: Final = "is not at its recorded position, or its pictures are shifted"
 _READINGS: Final[dict[Question, str]] = {
     "frame_lag": "with a lag of {:+d} frames", "flip": "flipped ({})", "form": "as {} depth",
     "kind": "along the {}",
 }  # fmt: skip
-
-
-def _lateness(lag: int) -> str:
-    return f"{abs(lag)} frame{'s' if abs(lag) > 1 else ''} {'late' if lag > 0 else 'early'}"
 
 
 def _row_terms(
@@ -538,9 +410,8 @@ def _row_terms(
     numerator, denominator = np.zeros(len(place)), np.zeros(len(place))
     for beside in range(-_ROWS_BESIDE, _ROWS_BESIDE + 1):
         rows = np.clip(match.rows + beside, 1, len(left) - 2)
-        there, inside = sample_along_rows(right, rows, place)
-        above, _ = sample_along_rows(right, rows - 1, place)
-        below, _ = sample_along_rows(right, rows + 1, place)
+        there, _, inside = sample_along_rows(right, rows, place)
+        above, below = (sample_along_rows(right, rows + by, place)[0] for by in (-1, 1))
         own = (left[rows + 1, match.columns] - left[rows - 1, match.columns]) / 2
         slope = ((below - above) / 2 + own) / 2
         numerator += np.where(inside, slope * (there - left[rows, match.columns]), 0)

@@ -11,6 +11,9 @@ from typing import Any, Final
 
 from stereogenbench_data.audit.contract.cameras import CameraCheck, CameraComparison
 from stereogenbench_data.audit.contract.fitting import (
+    NOTHING,
+    OFFSET,
+    SCALE,
     Free,
     RayPower,
     fit_hypothesis,
@@ -83,8 +86,6 @@ class SceneDiagnosis:
         parallax: By how much it is better than no disparity at all.
         agreement: Share of the matches of neighbouring cameras that the best contract explains.
         rivals: The other answers.
-        equals: (hypothesis, fitted lengths, scale) of contracts with as few changes that are not
-            clearly worse.
         disparity_px: Root mean square of the disparities found.
         spread_px: The same, less the mean of each view.
         depth_step: The `relative_step` of stored depths.
@@ -103,7 +104,7 @@ class SceneDiagnosis:
     recorded_pair: Pair | None
     declared: Hypothesis
     best: Hypothesis
-    changed: Free = "nothing"
+    changed: Free = NOTHING
     scale: float = 1.0
     scale_error: float = math.inf
     other_kind_scale: float = math.nan
@@ -112,7 +113,6 @@ class SceneDiagnosis:
     parallax: Evidence = _NOTHING
     agreement: float = math.nan
     rivals: tuple[Rival, ...] = ()
-    equals: tuple[tuple[Hypothesis, Free, float], ...] = ()
     disparity_px: float = math.inf
     spread_px: float = math.inf
     depth_step: float = 0.0
@@ -122,7 +122,7 @@ class SceneDiagnosis:
     @property
     def fits_scale(self) -> bool:
         """Whether the best contract has a scale of its own."""
-        return self.changed in ("scale", "both") or self.best.form != self.declared.form
+        return "scale" in self.changed or self.best.form != self.declared.form
 
 
 def allowed_log_scale(depth_step: float) -> float:
@@ -169,10 +169,6 @@ FEWEST_MATCHES: Final = 200
 _LEAST_PARALLAX_PX: Final = 0.3
 """Smaller disparities (root mean square) are noise."""
 
-_LENGTHS: Final[dict[Free, tuple[str, ...]]] = {
-    "nothing": (), "scale": ("scale",), "offset": ("offset",), "both": ("scale", "offset"),
-}  # fmt: skip
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
@@ -208,7 +204,7 @@ class ContractSearch:
         self._fitted: dict[tuple[Hypothesis, Free], _Candidate] = {}
         self._likely: dict[Hypothesis, tuple[Hypothesis, ...]] = {}
         self._powers: dict[tuple[Hypothesis, Free], RayPower] = {}
-        self.declared = self.candidate(Hypothesis.declared(views.encoding), free="nothing")
+        self.declared = self.candidate(Hypothesis.declared(views.encoding), free=NOTHING)
 
     def candidate(self, hypothesis: Hypothesis, *, free: Free) -> _Candidate:
         """Return a contract, fitted."""
@@ -237,7 +233,7 @@ class ContractSearch:
         A scale explains most of the difference, so the search may have chosen a scale instead.
         """
         (other,) = current.hypothesis.alternatives("kind")
-        free = _freed(current.free, "scale")
+        free = current.free | SCALE
         mine, theirs = (self.candidate(each, free=free) for each in (current.hypothesis, other))
         # A ray is longer than its depth by a limited factor; more than that is another scale.
         most = math.log(float(self._views.ray_per_planar.max())) + self._least_log_scale
@@ -247,29 +243,25 @@ class ContractSearch:
 
     def _one_change(self, current: _Candidate) -> Iterator[_Candidate]:
         """Yield contracts that change one answer, or fit one more length."""
-        for question in QUESTIONS:
-            others = current.hypothesis.alternatives(question)
-            if question == "order" and current.free != "nothing":
-                others = self._promising(current.hypothesis)
-            for hypothesis in others:
-                free = _freed(current.free, "scale") if question == "form" else current.free
-                yield self.candidate(hypothesis, free=free)
-        for length in ("scale", "offset"):
-            free = _freed(current.free, length)
-            if free != current.free:
-                yield self.candidate(current.hypothesis, free=free)
+        yield from self._other_answers(current, current.free)
+        for length in (SCALE, OFFSET):
+            if not length <= current.free:
+                yield self.candidate(current.hypothesis, free=current.free | length)
 
     def _two_changes(self, current: _Candidate) -> Iterator[_Candidate]:
         """Yield contracts that change one answer and the scale, or scale and offset."""
-        free = _freed(current.free, "scale")
+        free = current.free | SCALE
         if free != current.free:
-            for question in QUESTIONS:
-                others = current.hypothesis.alternatives(question)
-                if question == "order":
-                    others = self._promising(current.hypothesis)
-                for hypothesis in others:
-                    yield self.candidate(hypothesis, free=free)
-            yield self.candidate(current.hypothesis, free="both")
+            yield from self._other_answers(current, free)
+            yield self.candidate(current.hypothesis, free=SCALE | OFFSET)
+
+    def _other_answers(self, current: _Candidate, free: Free) -> Iterator[_Candidate]:
+        for question in QUESTIONS:
+            others = current.hypothesis.alternatives(question)
+            if question == "order" and free:
+                others = self._promising(current.hypothesis)
+            fitted = free | SCALE if question == "form" else free
+            yield from (self.candidate(hypothesis, free=fitted) for hypothesis in others)
 
     def _promising(self, current: Hypothesis) -> tuple[Hypothesis, ...]:
         """Return the orders that explain most matches, at any scale."""
@@ -305,19 +297,18 @@ class ContractSearch:
         for question in current.hypothesis.changes_from(declared):
             back = current.hypothesis.changed(question, getattr(declared, question))
             yield self.candidate(back, free=current.free)
-        fewer: dict[Free, tuple[Free, ...]] = {"nothing": (), "both": ("scale", "offset")}
-        for free in fewer.get(current.free, ("nothing",)):
-            if current.hypothesis.form == declared.form or free in ("scale", "both"):
-                yield self.candidate(current.hypothesis, free=free)
+        for length in sorted(current.free):
+            if current.hypothesis.form == declared.form or length != "scale":
+                yield self.candidate(current.hypothesis, free=current.free - {length})
 
     def simplest(self) -> _Candidate:
         """Return the declared contract, with another scale if that is clearly better."""
-        scaled = self.candidate(self.declared.hypothesis, free="scale")
+        scaled = self.candidate(self.declared.hypothesis, free=SCALE)
         return scaled if self._is_better(scaled, self.declared) else self.declared
 
     def cameras(self, contract: _Candidate, *, depth_step: float) -> CameraCheck:
         """Return how well each camera fits a contract, its scale fitted."""
-        fitted_too = self.candidate(contract.hypothesis, free=_freed(contract.free, "scale"))
+        fitted_too = self.candidate(contract.hypothesis, free=contract.free | SCALE)
         hypothesis = contract.hypothesis
         matches = self._every
         if hypothesis.order != self.declared.hypothesis.order:
@@ -330,7 +321,7 @@ class ContractSearch:
 
     def rivals(self, best: _Candidate) -> tuple[Rival, ...]:
         """Return the other answers to every question, each with its own scale."""
-        free = _freed(best.free, "scale")
+        free = best.free | SCALE
         likely = self._promising(best.hypothesis)
         found = []
         for question in QUESTIONS:
@@ -348,36 +339,6 @@ class ContractSearch:
                 found.append(Rival(question, answer, self.gain(best, other)))
         return tuple(found)
 
-    def equals(self, best: _Candidate) -> tuple[tuple[Hypothesis, Free, float], ...]:
-        """Return the contracts with one change that are not clearly worse than the best one."""
-        if best is self.declared:
-            return ()
-        return tuple(
-            (other.hypothesis, other.free, other.score.scale)
-            for other in self._one_change(self.declared)
-            if other is not best
-            and self._is_better(other, self.declared)
-            and not self.gain(best, other).is_clear()
-        )
-
-    def gain_where_they_differ(self, best: _Candidate) -> Evidence:
-        """Return by how much a contract is better than the declared one, where the two differ.
-
-        The offset of one camera leaves the pairs of the others as they are.
-        """
-        if best.hypothesis != self.declared.hypothesis or best.free != "offset":
-            return self.gain(best, self.declared)
-        moved = [
-            place
-            for place, match in enumerate(self._matches)
-            if abs(match.shift_px(best.score.offsets_px)) >= LEAST_OFFSET_PX
-        ]
-        ours, theirs = (
-            replace(score, errors=[score.errors[place] for place in moved])
-            for score in (best.score, self.declared.score)
-        )
-        return evidence([self._matches[place] for place in moved], ours, theirs)
-
     def without_parallax(self, best: _Candidate) -> Evidence:
         """Return by how much a contract is better than infinite depth everywhere."""
         flat = score_hypothesis(self._views, self._matches, best.hypothesis, scale=1e-12)
@@ -390,7 +351,7 @@ class ContractSearch:
         only_kind = better.hypothesis.changes_from(worse.hypothesis) == ("kind",)
         # Coarse depth has a shape of its own.
         is_fine = self._least_log_scale <= LEAST_LOG_SCALE
-        if is_fine and only_kind and worse.free in (better.free, _freed(better.free, "scale")):
+        if is_fine and only_kind and worse.free in (better.free, better.free | SCALE):
             power = self._power(better)
             shape_kind = power.kind
             if shape_kind is not None and (shape_kind != kind or found.mean_db > 0):
@@ -400,7 +361,7 @@ class ContractSearch:
     def _power(self, candidate: _Candidate) -> RayPower:
         """Return the power of the ray's length for a contract of any kind and scale."""
         planar = candidate.hypothesis.changed("kind", "planar")
-        free = _freed(candidate.free, "scale")
+        free = candidate.free | SCALE
         if (planar, free) not in self._powers:
             start = self.candidate(planar, free=free).score
             self._powers[planar, free] = ray_power(self._views, self._matches, start)
@@ -409,18 +370,17 @@ class ContractSearch:
     def _is_better(self, other: _Candidate, current: _Candidate) -> bool:
         """Tell whether a contract is clearly better, and its fitted lengths are significant."""
         gain = self.gain(other, current)
-        freed = (current.free, other.free)
-        if other.hypothesis == current.hypothesis and freed in (
-            ("nothing", "scale"), ("offset", "both"),
-        ):  # fmt: skip
+        new = other.free - current.free
+        is_same = other.hypothesis == current.hypothesis and current.free <= other.free
+        if is_same and new == SCALE:
             off = abs(math.log(other.score.scale))
             least = max(self._least_log_scale, self._bias)
-            if current.free == "offset":
+            if "offset" in current.free:
                 # Two errors at once need more evidence.
                 least = max(2 * self._least_log_scale, self._bias_beside_offset)
             sure = off > least + LEAST_ERRORS * min(other.score.scale_error, 1e3)
             return sure and gain.is_clear(least_db=_LEAST_SCALE_DB, errors=_SCALE_ERRORS)
-        if other.free in ("offset", "both") and current.free in ("nothing", "scale"):
+        if "offset" in new:
             largest_px = max(map(abs, other.score.offsets_px.values()), default=0.0)
             return largest_px >= LEAST_OFFSET_PX and gain.is_clear()
         return gain.is_clear()
@@ -430,13 +390,7 @@ def _new(other: _Candidate, current: _Candidate) -> set[str]:
     """Return which of "scale" and "offset" a contract fits beyond another one."""
     if other.hypothesis != current.hypothesis:
         return set()
-    return set(_LENGTHS[other.free]) - set(_LENGTHS[current.free])
-
-
-def _freed(free: Free, length: str) -> Free:
-    if free in ("nothing", length):
-        return "scale" if length == "scale" else "offset"
-    return "both"
+    return set(other.free - current.free)
 
 
 def _checked(
@@ -513,10 +467,9 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         return SceneDiagnosis(**basics, best=declared, parallax=parallax, problem=problem)
     (other_kind,) = best.hypothesis.alternatives("kind")
     with_scale, of_other_kind = (
-        search.candidate(hypothesis, free=_freed(best.free, "scale")).score
+        search.candidate(hypothesis, free=best.free | SCALE).score
         for hypothesis in (best.hypothesis, other_kind)
     )
-    shifted: Free = "offset" if best.free in ("nothing", "offset") else "both"
     return SceneDiagnosis(
         **basics,
         best=best.hypothesis,
@@ -524,11 +477,10 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         scale=with_scale.scale,
         scale_error=with_scale.scale_error,
         other_kind_scale=of_other_kind.scale,
-        offsets_px=search.candidate(best.hypothesis, free=shifted).score.offsets_px,
-        gain=search.gain_where_they_differ(best),
+        offsets_px=search.candidate(best.hypothesis, free=best.free | OFFSET).score.offsets_px,
+        gain=search.gain(best, search.declared),
         parallax=parallax,
         agreement=check.agreement,
         check=check,
         rivals=search.rivals(best),
-        equals=search.equals(best),
     )

@@ -28,16 +28,17 @@ from stereogenbench_data.audit.contract.worlds import (
     judge_worlds,
     rival_readings,
 )
-from stereogenbench_data.audit.scene_access import SceneAccess
+from stereogenbench_data.audit.scene_access import source_of
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.evidence import shape_of
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.conventions import depth_of
-from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import TRAJECTORY_JSON
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
+from stereogenbench_data.sources.members import MemberSource
 
 MOST_RESIDUAL_PX: Final = 0.5
 """Rigs with a larger rectification residual are left out: they need more than disparity."""
@@ -74,15 +75,16 @@ class DoctorReport:
 class DiagnosisTask:
     """One scene to diagnose; can be sent to worker processes."""
 
-    access: SceneAccess
+    scene: Scene
+    source: MemberSource
     frames: int
     encoding: DepthEncoding
 
     @contextmanager
     def scene_frames(self) -> Iterator[SceneFrames]:
         """Open the scene's videos."""
-        with closing(Streams(self.access.source())) as streams:
-            yield SceneFrames(self.access.scene, streams, encoding=self.encoding)
+        with closing(Streams(self.source)) as streams:
+            yield SceneFrames(self.scene, streams, encoding=self.encoding)
 
 
 def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
@@ -131,13 +133,13 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
         np.unique(np.linspace(0, len(usable) - 1, min(scenes, len(usable))).astype(int))
     ]
     tasks = [
-        DiagnosisTask(SceneAccess.of(index, scene), frames, depth or depth_of(scene))
+        DiagnosisTask(scene, source_of(index, scene), frames, depth or depth_of(scene))
         for scene in (index.scene(int(row)) for row in chosen)
     ]
     found: list[SceneDiagnosis] = []
     shares: dict[str, Shares] = {}
-    contracts = {task.access.key: task.encoding for task in tasks}
-    results = engine.map(_diagnose, tasks, name=lambda task: task.access.key, workers=workers)
+    contracts = {task.scene.id.key: task.encoding for task in tasks}
+    results = engine.map(_diagnose, tasks, name=lambda task: task.scene.id.key, workers=workers)
     with closing(results):
         for diagnosis, explained in results:
             found.append(diagnosis)
@@ -153,7 +155,7 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
     groups.sort(key=len, reverse=True)
     verdicts = tuple(judge(group, declared=contracts[group[0].key]) for group in groups)
     worlds: dict[tuple[str, str], list[Shares]] = {}
-    for scene in (task.access.scene for task in tasks if task.access.key in shares):
+    for scene in (task.scene for task in tasks if task.scene.id.key in shares):
         taken = str(scene.pose_form)
         is_one = is_stated(scene) and "|" not in taken
         about = shape_of(taken), taken if is_one else ""
@@ -165,11 +167,11 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
 def _diagnose(task: DiagnosisTask, after_bytes: Advance) -> tuple[SceneDiagnosis, Shares]:
     """Return a scene's diagnosis, and what each reading of its poses explains if several fit."""
     after_bytes(0)
-    scene = task.access.scene
+    scene = task.scene
     with task.scene_frames() as views:
         shares: Shares = {}
         if scene.pose_form and (scene.remark("world") or is_stated(scene)):
-            text = task.access.source().read(scene, TRAJECTORY_JSON)
+            text = task.source.read(scene, TRAJECTORY_JSON)
             names = rival_readings(scene, text)
             shares = explained_shares(views, text, names) if len(names) > 1 else {}
         return diagnose_scene(views, frames=task.frames), shares

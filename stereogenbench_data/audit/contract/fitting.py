@@ -24,18 +24,24 @@ from stereogenbench_data.audit.contract.scoring import (
     LEAST_ERRORS,
     Pair,
     ScoredContract,
-    sample_with_slope,
+    sample_along_rows,
     score_hypothesis,
 )
 from stereogenbench_data.schema.records import DepthKind
 
-Free = Literal["nothing", "scale", "offset", "both"]
+Free = frozenset[Literal["scale", "offset"]]
+"""The lengths that are fitted."""
+NOTHING: Final[Free] = frozenset()
+SCALE: Final[Free] = frozenset({"scale"})
+OFFSET: Final[Free] = frozenset({"offset"})
 
 _TOLERANCE_PX: Final = 1.0
 _BIN: Final = 0.02
 _LOG_RANGE: Final = 32.0
 _STEPS: Final = 10
 _LARGEST_STEP_PX: Final = 1.0
+_LARGEST_BENT: Final[dict[object, float]] = {"scale": 0.1, "ray": 0.5}
+"""Largest steps while the power of the ray is fitted, which moves wide disparities far."""
 _DRAWS: Final = 300
 _FEWEST_USABLE: Final = 10
 _NEAR_PX: Final = 3 * _TOLERANCE_PX
@@ -46,27 +52,44 @@ _NEAR_PX: Final = 3 * _TOLERANCE_PX
 class _Term:
     """The pixels of a frame match where depth is known, and the disparity predicted there.
 
-    ``large_px`` is the 90th percentile of the predicted disparities' size. ``sign`` is 1 if the
-    pixels are those of the file with the lower number, from which offsets are counted, else -1.
+    ``log_ray`` is the logarithm of each ray's length to depth 1, ``large_px`` the 90th percentile
+    of the predicted disparities' size. ``sign`` is 1 if the pixels are those of the file with the
+    lower number, from which offsets are counted, else -1.
     """
 
     match: FrameMatch
     predicted_px: Points
+    log_ray: Points
     large_px: float
     sign: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Lengths:
+    """What is fitted: disparity is scale * predicted * ray ** bend, and an offset for each pair."""
+
+    scale: float
+    offsets_px: dict[Pair, float]
+    bend: float = 0.0
+
+
+_Unknown = Literal["scale", "ray"] | Pair
 
 
 def fit_hypothesis(
     views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis, *, free: Free
 ) -> ScoredContract:
     """Return a hypothesis with the scale and the offsets that explain the pictures best."""
-    terms = [] if free == "nothing" else _fit_terms(views, matches, hypothesis)
+    terms = _fit_terms(views, matches, hypothesis) if free else []
     if not terms:
         return score_hypothesis(views, matches, hypothesis)
-    scale, offsets_px, error = _refined(views, terms, *_start(terms, free=free), free=free)
+    unknowns: list[_Unknown] = ["scale"] if "scale" in free else []
+    unknowns += _pairs(terms) if "offset" in free else []
+    lengths, errors = _refined(views, terms, _start(terms, free=free), unknowns)
     return score_hypothesis(
-        views, matches, hypothesis, scale=scale, offsets_px=offsets_px, scale_error=error
-    )
+        views, matches, hypothesis, scale=lengths.scale, offsets_px=lengths.offsets_px,
+        scale_error=errors.get("scale", math.inf),
+    )  # fmt: skip
 
 
 def _fit_terms(
@@ -77,12 +100,17 @@ def _fit_terms(
     for match in matches:
         predicted = views.predicted(match, hypothesis)
         if predicted is not None and predicted[1].any():
-            disparity_px, known = predicted
-            predicted_px = disparity_px[known]
+            known = match.at(predicted[1])
+            predicted_px = predicted[0][predicted[1]]
+            log_ray = np.log(views.ray_per_planar[known.rows, known.columns])
             large_px = float(np.percentile(np.abs(predicted_px), 90))
             sign = 1 if match.left < match.right else -1
-            terms.append(_Term(match.at(known), predicted_px, large_px, sign))
+            terms.append(_Term(known, predicted_px, log_ray, large_px, sign))
     return terms
+
+
+def _pairs(terms: Iterable[_Term]) -> list[Pair]:
+    return list(dict.fromkeys(term.match.pair for term in terms))
 
 
 def voted_agreement(
@@ -105,21 +133,20 @@ def _joined(terms: Iterable[_Term]) -> tuple[Points, Points]:
     return np.concatenate(found), np.concatenate(predicted)
 
 
-def _start(terms: Sequence[_Term], *, free: Free) -> tuple[float, dict[Pair, float]]:
+def _start(terms: Sequence[_Term], *, free: Free) -> _Lengths:
     """Return a scale and offsets from the matches alone."""
-    if free == "scale":
-        return voted_scale(*_joined(terms)), {}
+    if free == SCALE:
+        return _Lengths(voted_scale(*_joined(terms)), {})
     by_pair = {
-        pair: _joined(term for term in terms if term.match.pair == pair)
-        for pair in dict.fromkeys(term.match.pair for term in terms)
+        pair: _joined(term for term in terms if term.match.pair == pair) for pair in _pairs(terms)
     }
     scale = 1.0
-    if free == "both":
+    if "scale" in free:
         most_matches = max(terms, key=lambda term: len(term.predicted_px)).match.pair
         scale = _drawn_scale(*by_pair[most_matches])
-    return scale, {
+    return _Lengths(scale, {
         pair: _densest(found - scale * predicted) for pair, (found, predicted) in by_pair.items()
-    }
+    })  # fmt: skip
 
 
 def _agreement(found: Points, predicted: Points) -> float:
@@ -172,66 +199,51 @@ def _densest(values: Points) -> float:
 
 
 def _refined(
-    views: SceneFrames,
-    terms: Sequence[_Term],
-    scale: float,
-    offsets_px: dict[Pair, float],
-    *,
-    free: Free,
-) -> tuple[float, dict[Pair, float], float]:
-    """Return scale and offsets after Gauss-Newton steps, and the error of log(scale)."""
-    pairs = list(dict.fromkeys(term.match.pair for term in terms))
-    fits_scale = free in ("scale", "both")
-    unknowns = [*(["scale"] if fits_scale else []), *(pairs if free in ("offset", "both") else [])]
-    error = math.inf
+    views: SceneFrames, terms: Sequence[_Term], lengths: _Lengths, unknowns: Sequence[_Unknown]
+) -> tuple[_Lengths, dict[_Unknown, float]]:
+    """Return the lengths after Gauss-Newton steps, and the errors of log(scale), bend, offsets."""
+    errors: dict[_Unknown, float] = {}
+    is_bent = "ray" in unknowns
     for _ in range(_STEPS):
-        normals, rights = _equations(views, terms, scale, offsets_px, unknowns=unknowns)
+        normals = np.zeros((len(terms), len(unknowns), len(unknowns)))
+        rights = np.zeros((len(terms), len(unknowns)))
+        for number, term in enumerate(terms):
+            grown_px = lengths.scale * term.predicted_px * np.exp(lengths.bend * term.log_ray)
+            shift_px = term.match.shift_px(lengths.offsets_px)
+            difference, slope, weight = _compared(views, term, grown_px + shift_px)
+            if weight is not None:
+                moved: dict[_Unknown, Points] = {"scale": grown_px, "ray": grown_px * term.log_ray,
+                         term.match.pair: np.full(len(slope), term.sign)}  # fmt: skip
+                columns = np.stack([
+                    slope * moved.get(name, np.zeros(len(slope))) for name in unknowns
+                ])  # fmt: skip
+                normals[number] = (columns * weight) @ columns.T
+                rights[number] = (columns * weight) @ difference
         step, spread = _solved(normals, rights)
-        limit = max(_moved_px(term, scale, step, unknowns) for term in terms)
-        step *= min(1.0, _LARGEST_STEP_PX / max(limit, 1e-12))
-        for name, change in zip(unknowns, step, strict=True):
+        errors = dict(zip(unknowns, spread.tolist(), strict=True))
+        changes = dict(zip(unknowns, step.tolist(), strict=True))
+        moves_px = (_moved_px(term, lengths.scale, changes) for term in terms)
+        moved_px = max(moves_px, default=0.0)
+        part = 1.0 if is_bent else min(1.0, _LARGEST_STEP_PX / max(moved_px, 1e-12))
+        largest: dict[object, float] = _LARGEST_BENT if is_bent else {"scale": 0.3}
+        offsets_px = dict(lengths.offsets_px)
+        for name, change in changes.items():
+            most = largest.get(name, _LARGEST_STEP_PX if is_bent else math.inf)
+            changes[name] = float(np.clip(part * change, -most, most))
             if isinstance(name, tuple):
-                offsets_px = offsets_px | {name: offsets_px.get(name, 0.0) + float(change)}
-            else:
-                scale *= math.exp(float(np.clip(change, -0.3, 0.3)))
-        if fits_scale:
-            error = float(spread[0])
-        if limit < 5e-3:
+                offsets_px[name] = offsets_px.get(name, 0.0) + changes[name]
+        scale = lengths.scale * math.exp(changes.get("scale", 0.0))
+        lengths = _Lengths(scale, offsets_px, lengths.bend + changes.get("ray", 0.0))
+        if moved_px < 5e-3:
             break
-    return scale, offsets_px, error
+    return lengths, errors
 
 
-def _moved_px(term: _Term, scale: float, step: Points, unknowns: Sequence[object]) -> float:
+def _moved_px(term: _Term, scale: float, changes: Mapping[_Unknown, float]) -> float:
     """Return how far a step moves a term's matches with large disparities."""
-    of_unknown: dict[object, float] = {"scale": scale * term.large_px, term.match.pair: 1.0}
-    changes = zip(unknowns, step.tolist(), strict=True)
-    return float(abs(sum(of_unknown.get(name, 0.0) * change for name, change in changes)))
-
-
-def _equations(
-    views: SceneFrames,
-    terms: Sequence[_Term],
-    scale: float,
-    offsets_px: dict[Pair, float],
-    *,
-    unknowns: Sequence[object],
-) -> tuple[Float64[np.ndarray, "terms k k"], Float64[np.ndarray, "terms k"]]:
-    """Return each frame match's normal equations for log(scale) and the pairs' offsets."""
-    normals = np.zeros((len(terms), len(unknowns), len(unknowns)))
-    rights = np.zeros((len(terms), len(unknowns)))
-    for number, term in enumerate(terms):
-        disparity_px = scale * term.predicted_px + term.match.shift_px(offsets_px)
-        difference, slope, weight = _compared(views, term, disparity_px)
-        if weight is None:
-            continue
-        # A frame match depends on the scale and on its own pair's offset.
-        columns = {
-            place: slope * scale * term.predicted_px if name == "scale" else term.sign * slope
-            for place, name in enumerate(unknowns)
-            if name in ("scale", term.match.pair)
-        }
-        _add_columns(normals[number], rights[number], columns, weight=weight, difference=difference)
-    return normals, rights
+    ray = float(term.log_ray.max()) * changes.get("ray", 0.0)
+    grown_px = scale * term.large_px * (changes.get("scale", 0.0) + ray)
+    return abs(grown_px + changes.get(term.match.pair, 0.0))
 
 
 def _compared(
@@ -243,7 +255,7 @@ def _compared(
     is None if too few pixels are left.
     """
     match = term.match
-    there, slope, inside = sample_with_slope(
+    there, slope, inside = sample_along_rows(
         views.band(match.frame, match.right), match.rows, match.columns - disparity_px
     )
     difference = there - match.brightness
@@ -256,21 +268,6 @@ def _compared(
         usable / (1 + (difference.astype(np.float64) / (2 * spread)) ** 2) ** 2 / spread**2
     )
     return difference, slope, weight
-
-
-def _add_columns(
-    normals: Float64[np.ndarray, "k k"],
-    rights: Float64[np.ndarray, " k"],
-    columns: Mapping[int, Points],
-    *,
-    weight: Points,
-    difference: Float32[np.ndarray, " n"],
-) -> None:
-    """Fill in one frame match's weighted normal equations, from its derivatives by unknown."""
-    for place, column in columns.items():
-        rights[place] = (column * weight * difference).sum()
-        for other, beside in columns.items():
-            normals[place, other] = (column * weight * beside).sum()
 
 
 def _solved(
@@ -290,8 +287,6 @@ def _solved(
     return step, spread
 
 
-_RAY_STEPS: Final = 5
-_LARGEST_RAY_STEP: Final = 0.5
 _RAY_BIAS: Final = 0.15
 """Systematic error of the power; up to 0.19 was measured at long focal lengths."""
 
@@ -324,32 +319,6 @@ def ray_power(
 ) -> RayPower:
     """Return the power that fits the pictures best, together with the scale and the offsets."""
     terms = _fit_terms(views, matches, contract.hypothesis)
-    pairs = list(contract.offsets_px)
-    log_scale, bend = math.log(contract.scale), 0.0
-    offsets_px = dict(contract.offsets_px)
-    error = math.inf
-    for _ in range(_RAY_STEPS):
-        normals = np.zeros((len(terms), 2 + len(pairs), 2 + len(pairs)))
-        rights = np.zeros((len(terms), 2 + len(pairs)))
-        for number, term in enumerate(terms):
-            match = term.match
-            log_ray = np.log(views.ray_per_planar[match.rows, match.columns])
-            grown_px = term.predicted_px * np.exp(log_scale + bend * log_ray)
-            difference, slope, weight = _compared(
-                views, term, grown_px + match.shift_px(offsets_px)
-            )
-            if weight is None:
-                continue
-            columns = {0: slope * grown_px, 1: slope * grown_px * log_ray}
-            if match.pair in offsets_px:
-                columns[2 + pairs.index(match.pair)] = term.sign * slope
-            _add_columns(
-                normals[number], rights[number], columns, weight=weight, difference=difference
-            )
-        step, spread = _solved(normals, rights)
-        log_scale += float(np.clip(step[0], -0.1, 0.1))
-        bend += float(np.clip(step[1], -_LARGEST_RAY_STEP, _LARGEST_RAY_STEP))
-        for pair, change in zip(pairs, step[2:], strict=True):
-            offsets_px[pair] += float(np.clip(change, -1.0, 1.0))
-        error = float(spread[1])
-    return RayPower(bend + (contract.hypothesis.kind == "ray"), error)
+    start = _Lengths(contract.scale, contract.offsets_px)
+    fitted, errors = _refined(views, terms, start, ["scale", "ray", *contract.offsets_px])
+    return RayPower(fitted.bend + (contract.hypothesis.kind == "ray"), errors["ray"])

@@ -64,11 +64,6 @@ class RowMatches:
     grain_px: float = 1.0
 
 
-def match_rows(left: Luma, right: Luma) -> RowMatches:
-    """Return the matches of a rectified pair."""
-    return match_pairs({0: left, 1: right}, [(0, 1)])[0, 1]
-
-
 def match_pairs(
     pictures: Mapping[int, Luma], pairs: Sequence[tuple[int, int]]
 ) -> dict[tuple[int, int], RowMatches]:
@@ -90,9 +85,7 @@ def match_pairs(
         .mean(axis=(1, 3), dtype=np.float32)
         for number, picture in pictures.items()
     }
-    if min(height, width) <= 2 * _RADIUS_PX:
-        return {pair: _gathered([], factor=factor, textured=0) for pair in pairs}
-    inner = np.arange(_RADIUS_PX, height - _RADIUS_PX)
+    inner = np.arange(_RADIUS_PX, height - _RADIUS_PX if width > 2 * _RADIUS_PX else 0)
     rows = inner[np.unique(np.linspace(0, len(inner) - 1, min(_ROWS, len(inner))).astype(int))]
     found: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray, np.ndarray]]]
     found = {pair: [] for pair in pairs}
@@ -259,9 +252,9 @@ class SceneFrames:
         self.intrinsics: Intrinsics = rig_intrinsics(scene.rig)
         self._streams = streams
         self._bands: dict[tuple[int, int], Luma] = {}
-        self._stored: dict[tuple[int, int, int], tuple[FrameMatch, dict[Flip, _Numbers]]] = {}
+        self._stored: dict[tuple[FrameMatch, int, int], dict[Flip, _Numbers]] = {}
         self._predicted_by: Hypothesis | None = None
-        self._predictions: dict[tuple[int, int], tuple[FrameMatch, _Prediction | None]] = {}
+        self._predictions: dict[tuple[FrameMatch, int], _Prediction | None] = {}
         self._depths: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
 
     @property
@@ -310,8 +303,7 @@ class SceneFrames:
 
         Only these numbers are kept, because maps of all lags and cameras would fill the memory.
         """
-        key = (id(match), frame, file)
-        if key not in self._stored:
+        if (match, frame, file) not in self._stored:
             units, known = self.depth(frame, file)
             height, width = units.shape
             places: dict[Flip, tuple[np.ndarray, np.ndarray]] = {
@@ -319,10 +311,10 @@ class SceneFrames:
                 "vertical": (height - 1 - match.rows, match.columns),
                 "horizontal": (match.rows, width - 1 - match.columns),
             }
-            numbers = {flip: (units[place], known[place]) for flip, place in places.items()}
-            # The match is kept too, so that no other can get its id.
-            self._stored[key] = (match, numbers)
-        return self._stored[key][1]
+            self._stored[match, frame, file] = {
+                flip: (units[place], known[place]) for flip, place in places.items()
+            }
+        return self._stored[match, frame, file]
 
     @cached_property
     def ray_per_planar(self) -> Float64[np.ndarray, "h w"]:
@@ -399,12 +391,9 @@ class SceneFrames:
         file = hypothesis.depth_file(match.left) if depth_file is None else depth_file
         if hypothesis != self._predicted_by:
             self._predicted_by, self._predictions = hypothesis, {}
-        key = (id(match), file)
-        if key not in self._predictions:
-            # The match is kept too, so that no other can get its id.
-            prediction = self._predict(match, hypothesis, file=file)
-            self._predictions[key] = (match, prediction)
-        return self._predictions[key][1]
+        if (match, file) not in self._predictions:
+            self._predictions[match, file] = self._predict(match, hypothesis, file=file)
+        return self._predictions[match, file]
 
     def _predict(
         self, match: FrameMatch, hypothesis: Hypothesis, *, file: int

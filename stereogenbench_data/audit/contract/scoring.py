@@ -7,7 +7,7 @@ scores in one scene; `pooled` takes several scenes together.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -167,25 +167,10 @@ class ScoredContract:
 
 def sample_along_rows(
     band: Luma, rows: np.ndarray, columns: Points
-) -> tuple[Float32[np.ndarray, " n"], np.ndarray]:
-    """Return a picture's values between pixels along rows, and which places are inside it."""
-    here, (linear, square, cube), t, inside = _cubic(band, rows, columns)
-    return here + t * (linear + t * (square + t * cube)), inside
-
-
-def sample_with_slope(
-    band: Luma, rows: np.ndarray, columns: Points
 ) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], np.ndarray]:
-    """Return a picture's values between pixels along rows, their slope, and which are inside it."""
-    here, (linear, square, cube), t, inside = _cubic(band, rows, columns)
-    value = here + t * (linear + t * (square + t * cube))
-    return value, linear + t * (2 * square + 3 * t * cube), inside
+    """Return a picture's values between pixels along rows, their slope, and which are inside it.
 
-
-def _cubic(band: Luma, rows: np.ndarray, columns: Points) -> tuple[Any, tuple[Any, ...], Any, Any]:
-    """Return the pixel before each place, the cubic's coefficients, the fraction, and inside.
-
-    Catmull and Rom's cubic: linear interpolation would blur, which favours some places.
+    By Catmull and Rom's cubic: linear interpolation would blur, which favours some places.
     """
     width = band.shape[1]
     inside = (columns >= 0) & (columns <= width - 1)
@@ -200,7 +185,8 @@ def _cubic(band: Luma, rows: np.ndarray, columns: Points) -> tuple[Any, tuple[An
     linear = (there - before) / 2
     square = before - 2.5 * here + 2 * there - after / 2
     cube = (after - before) / 2 + 1.5 * (here - there)
-    return here, (linear, square, cube), t, inside
+    value = here + t * (linear + t * (square + t * cube))
+    return value, linear + t * (2 * square + 3 * t * cube), inside
 
 
 def score_hypothesis(
@@ -224,7 +210,7 @@ def score_hypothesis(
         if predicted is not None:
             disparity_px, known = predicted
             shift_px = match.shift_px(offsets_px)
-            there, inside = sample_along_rows(
+            there, _, inside = sample_along_rows(
                 views.band(match.frame, match.right),
                 match.rows,
                 match.columns - (scale * disparity_px + shift_px),

@@ -21,8 +21,8 @@ from stereogenbench_data.audit.contract.diagnosis import (
     SceneDiagnosis,
     allowed_log_scale,
 )
-from stereogenbench_data.audit.contract.fitting import Free
-from stereogenbench_data.audit.contract.hypotheses import LAGS, QUESTIONS, Hypothesis, Question
+from stereogenbench_data.audit.contract.fitting import NOTHING, SCALE
+from stereogenbench_data.audit.contract.hypotheses import LAGS, QUESTIONS, Question
 from stereogenbench_data.audit.contract.scoring import (
     LEAST_ERRORS,
     NORMAL_975,
@@ -126,7 +126,7 @@ def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
         named, seen = f"primary: left {left}, right {right}", f"left {right}, right {left}"
         note = "by poses and pictures alike"
         return Answer(blank.topic, named, seen, "wrong", nearest, note)
-    if question == "order" and best.startswith("depth of") and changes(first, "offset"):
+    if question == "order" and best.startswith("depth of") and "offset" in first.changed:
         note = f"a picture that is shifted against its depth looks like {describe(best)}"
         return replace(blank, behind=gains.get(declared), note=note)
     if best == declared:
@@ -202,11 +202,6 @@ def describe(answer: Any) -> str:
     return _WORDS.get(answer, f"{answer}")
 
 
-def changes(scene: SceneDiagnosis, length: str) -> bool:
-    """Tell whether a scene's best contract fits the scale, or the offset."""
-    return scene.changed in (length, "both")
-
-
 def _offset_answer(scenes: Sequence[SceneDiagnosis]) -> Answer:
     """Return whether disparity is off by a constant, and by which.
 
@@ -216,7 +211,7 @@ def _offset_answer(scenes: Sequence[SceneDiagnosis]) -> Answer:
     blank = _no_answer(scenes, "disparity offset", "0 px")
     if blank.note:
         return blank
-    if changes(first, "offset"):
+    if "offset" in first.changed:
         gain = pooled([scene.gain for scene in scenes])
         note = "or pictures of another moment, which look alike where little moves"
         found = offset_words(first.offsets_px)
@@ -286,7 +281,7 @@ def _common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
     coarse = max(allowed_log_scale(scene.depth_step) for scene in scenes)
     seen_px = max(
         # Beside an offset, only the spread of disparities determines the scale.
-        scene.spread_px if changes(scene, "offset") else scene.disparity_px
+        scene.spread_px if "offset" in scene.changed else scene.disparity_px
         for scene in scenes
     )
     bias = coarse if coarse > LEAST_LOG_SCALE else max(_BIAS, BIAS_PX / seen_px)
@@ -329,7 +324,7 @@ def _quotient(scenes: Sequence[SceneDiagnosis], unit: Unit) -> Answer:
     if first.best.form != first.declared.form:
         note = f"numbers of another form: {describe(first.best.form)} has a unit of its own"
         return replace(blank, found=found, note=note)
-    if changes(first, "scale"):
+    if "scale" in first.changed:
         blank = replace(blank, behind=pooled([scene.gain for scene in scenes]))
         if _kind_explains_scale(scenes):
             kind = describe(first.best.kind)
@@ -389,7 +384,7 @@ def _length_choices(scenes: Sequence[SceneDiagnosis], unit: Unit, pasted: str) -
 def _kind_explains_scale(scenes: Sequence[SceneDiagnosis]) -> bool:
     """Tell whether the other kind of depth explains as much as a scale, and is not ruled out."""
     first = scenes[0]
-    if first.best != first.declared or first.changed != "scale":
+    if first.best != first.declared or first.changed != SCALE:
         return False
     if any(behind(scenes, rival).is_clear for rival in first.rivals if rival.question == "kind"):
         return False
@@ -569,25 +564,7 @@ def _beside(scenes: Sequence[SceneDiagnosis], answers: Sequence[Answer]) -> list
     if _kind_explains_scale(scenes):
         (other,) = first.best.alternatives("kind")
         lines.append(f"Fits alike: depth along {describe(other.kind)}, the unit as declared.")
-    if has_camera_problems(scenes):
-        return lines
-    for equal in dict.fromkeys(first.equals):
-        lines.append(f"Fits alike: {_contract_words(*equal, declared=first.declared)}.")
     return lines
-
-
-def _contract_words(
-    hypothesis: Hypothesis, free: Free, scale: float, *, declared: Hypothesis
-) -> str:
-    words = [
-        f"{TOPICS[question]} {describe(getattr(hypothesis, question))}"
-        for question in hypothesis.changes_from(declared)
-    ]
-    if free in ("scale", "both"):
-        words.append(f"{QUOTIENT} {1 / scale:.4g} x declared")
-    if free in ("offset", "both"):
-        words.append("an offset for each pair")
-    return ", ".join(words)
 
 
 def group_by_contract(scenes: Sequence[SceneDiagnosis]) -> list[list[SceneDiagnosis]]:
@@ -611,7 +588,7 @@ def group_by_contract(scenes: Sequence[SceneDiagnosis]) -> list[list[SceneDiagno
 
 
 def _is_changed(scene: SceneDiagnosis) -> bool:
-    return scene.best != scene.declared or scene.changed != "nothing"
+    return scene.best != scene.declared or scene.changed != NOTHING
 
 
 def _fits(scene: SceneDiagnosis, leader: SceneDiagnosis) -> bool:
@@ -629,7 +606,7 @@ def _fits(scene: SceneDiagnosis, leader: SceneDiagnosis) -> bool:
         return scene.best == leader.best and scene.changed == leader.changed and same_unit
     if not _is_changed(leader):
         return True
-    if changes(leader, "offset"):
+    if "offset" in leader.changed:
         return False
     ruled_out = {
         (rival.question, rival.answer) for rival in scene.rivals if rival.behind.is_clear()

@@ -19,7 +19,6 @@ from stereogenbench_data.audit.geometry.reprojection import MeasuredDepth, repro
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.index.evidence import poses_as, same_poses, understood_poses
-from stereogenbench_data.media.depth import depth_m_from_units
 from stereogenbench_data.schema.conventions import shape_of_text
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
@@ -179,13 +178,4 @@ def _moved(poses: CameraPoses, camera: int, first: int, later: int) -> np.ndarra
 def _depth(views: SceneFrames, frame: int, camera: int) -> MeasuredDepth:
     units, measured = views.depth(frame, camera)
     encoding = replace(views.encoding, unit_m=views.unit_m(camera))
-    depth_m = depth_m_from_units(
-        units, measured=measured, encoding=encoding, intrinsics=views.intrinsics
-    )
-    known = measured & np.isfinite(depth_m)
-    return MeasuredDepth(
-        np.where(known, depth_m, 0).astype(np.float64),
-        known,
-        step_m=views.unit_m(camera),
-        form=encoding.form,
-    )
+    return MeasuredDepth.of(units, measured, encoding=encoding, intrinsics=views.intrinsics)

@@ -3,10 +3,11 @@
 import hashlib
 import json
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal, Unpack
+from typing import Any, Final, Unpack
 
 import numpy as np
 from jaxtyping import Int64
@@ -21,7 +22,7 @@ from stereogenbench_data.audit.geometry.records import (
 )
 from stereogenbench_data.audit.geometry.scene_audit import AuditTask, audit_scene, spread_frames
 from stereogenbench_data.audit.geometry.table import table_rows
-from stereogenbench_data.audit.scene_access import SceneAccess
+from stereogenbench_data.audit.scene_access import source_of
 from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
 from stereogenbench_data.index.build import walk
@@ -33,8 +34,8 @@ from stereogenbench_data.index.scene_folder import SceneFolder
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
-from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
-from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
+from stereogenbench_data.schema.records import DepthEncoding, Scene
+from stereogenbench_data.selection.filters import SceneFilters, filter_scenes, may_pass
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.sources.location import is_remote, joined, local_path
 from stereogenbench_data.sources.remote import RemoteObject
@@ -42,8 +43,6 @@ from stereogenbench_data.sources.retry import MissingObject
 
 DEFAULT_FRAMES: Final = 5
 _FORMAT: Final = 4
-_KEY_FILTERS: Final = {"split": "split", "subset": "subset", "family": "family",
-                       "map": "map_name", "scenes": "key"}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +55,6 @@ class AuditRequest:
         seed: Seed of the random draw.
         depth: A depth contract that overrides what the files state, or None.
         limits: Values beyond which a scene is a finding.
-        derived: "ok" audits training shards, too, whose pictures have an error.
 
     Raises:
         SelectionError: If a number is too small.
@@ -67,7 +65,6 @@ class AuditRequest:
     seed: int = 0
     depth: DepthEncoding | None = None
     limits: AuditLimits = field(default_factory=AuditLimits)
-    derived: Literal["refuse", "ok"] = "refuse"
 
     def __post_init__(self) -> None:
         """Refuse numbers that are too small."""
@@ -103,13 +100,12 @@ def open_for_audit(
         StorageError: If there is no such data, or it has no such scene.
     """
     if root is None and _is_plain_tree(data):
-        key_filter = _KeyFilter(filters)
         report = walk(
             data if is_remote(data) else local_path(data),
             workers=workers,
             engine=engine,
             progress=progress,
-            wanted=key_filter.matches if key_filter.wanted else None,
+            wanted=may_pass(filters),
             conventions=None if conventions is None else Conventions.read(conventions),
         )
         return SceneIndex.from_report(report)
@@ -158,8 +154,8 @@ def audit(
         **filters: Which scenes, see `SceneFilters`.
 
     Raises:
-        StorageError: If there are no such data, they were derived for training and the request
-            does not accept that, or a worker process died.
+        StorageError: If there are no such data, they were derived for training, or a worker
+            process died.
         SelectionError: If no scene passes the filters.
 
     Source: the StereoGenBench paper, section on geometry conventions and sanity checks, and on
@@ -171,11 +167,8 @@ def audit(
         index = data
     else:
         index = open_for_audit(data, workers=workers, engine=engine, **filters)
-    if request.derived == "refuse":
-        index.require_released("The audit", cure="")
-    is_wanted = _KeyFilter(filters)
-    broken = {key: text for key, text in index.broken.items() if is_wanted(key)}
-    incomplete = {key: text for key, text in index.incomplete.items() if is_wanted(key)}
+    index.require_released("The audit")
+    broken, incomplete = (_wanted(each, filters) for each in (index.broken, index.incomplete))
     rows = _chosen(index, request, filters, left_out=broken | incomplete)
     scenes = [index.scene(int(row)) for row in rows]
     stamps: dict[str, str] = {}
@@ -184,7 +177,7 @@ def audit(
         stamps = {scene.id.key: _stamp(index, scene) for scene in scenes}
         found = _known(journal, stamps)
     tasks = [
-        AuditTask(SceneAccess.of(index, scene), request.frames, request.depth)
+        AuditTask(scene, source_of(index, scene), request.frames, request.depth)
         for scene in scenes
         if scene.id.key not in found
     ]
@@ -193,7 +186,7 @@ def audit(
     )
     advance(sum(len(known.audited_frames) for known in found.values()))
     for each in engine.map(
-        audit_scene, tasks, name=lambda task: task.access.key, workers=workers, advance=advance
+        audit_scene, tasks, name=lambda task: task.scene.id.key, workers=workers, advance=advance
     ):
         found[each.key] = each
         if journal is not None:
@@ -218,33 +211,16 @@ def audit(
     )
 
 
-class _KeyFilter:
-    """Tells by its key whether the filters ask for a scene that could not be indexed."""
+def _wanted(unusable: Mapping[str, str], filters: SceneFilters) -> dict[str, str]:
+    """Return the scenes, among those that could not be indexed, whose paths pass the filters."""
+    passes = may_pass(filters)
 
-    def __init__(self, filters: Mapping[str, Any]) -> None:
-        self.wanted = {
-            attribute: [wanted] if isinstance(wanted, str) else list(wanted)
-            for name, attribute in _KEY_FILTERS.items()
-            if (wanted := filters.get(name)) is not None
-        }
+    def is_wanted(key: str) -> bool:
+        with suppress(SchemaError):
+            return passes is None or passes(parse_scene_key(key))
+        return False
 
-    def __call__(self, key: str) -> bool:
-        try:
-            return self.matches(parse_scene_key(key))
-        except SchemaError:
-            return not self.wanted
-
-    def matches(self, scene: SceneId) -> bool:
-        """Tell whether a scene's path passes the filters."""
-        return all(
-            _is_in(scene.key, values) if name == "key" else getattr(scene, name) in (*values, None)
-            for name, values in self.wanted.items()
-        )
-
-
-def _is_in(key: str, parts: Sequence[str]) -> bool:
-    """Tell whether a key has one of the parts, as `find_scene` understands them."""
-    return any(part.strip("/").lower() in key.lower() for part in parts)
+    return {key: reason for key, reason in unusable.items() if is_wanted(key)}
 
 
 def _chosen(

@@ -1,22 +1,205 @@
-"""A scene's findings: which of its figures are beyond the limits."""
+"""What an audit checks: each figure, its limit, and which figures of a scene are beyond theirs."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from operator import attrgetter
 from statistics import median
-from typing import Final
+from typing import Any, Final
 
 from stereogenbench_data.audit.geometry.alignment import CERTAIN
 from stereogenbench_data.audit.geometry.picture_check import ENOUGH_LEVELS
 from stereogenbench_data.audit.geometry.records import (
-    QUANTITIES,
     AuditLimits,
     CameraAudit,
     Estimate,
     Finding,
-    PairFit,
     SceneAudit,
 )
+from stereogenbench_data.audit.paper_numbers import AUDIT
 from stereogenbench_data.schema.release import CAMERA_COUNT, depth_name, rgb_name
+
+Figures = Iterable[tuple[str, float, str]]
+"""(file or "", figure, where in it) of a scene; the figure is nan where it was not measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """A figure with a limit.
+
+    Attributes:
+        name: The check's name.
+        what: The figure, in words.
+        limit: The limit's name in `AuditLimits`.
+        of: Returns a scene's figures.
+        worst: `max` where large figures are wrong, `min` where small ones are.
+        unit: Such as "px"; "%" for a share.
+        paper: The paper's figure.
+    """
+
+    name: str
+    what: str
+    limit: str
+    of: Callable[[SceneAudit], Figures]
+    worst: Callable[..., float] = max
+    unit: str = "px"
+    paper: str = ""
+
+    def text(self, value: float) -> str:
+        """Return a figure with its unit, a dash for nan."""
+        if math.isnan(value):
+            return "-"
+        return f"{value * 100:.4g} %" if self.unit == "%" else f"{value:.3g} {self.unit}".rstrip()
+
+    def findings(self, scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
+        """Yield the figures of a scene that are beyond the limit."""
+        limit = getattr(limits, self.limit)
+        for member, value, where in self.of(scene):
+            if value != limit and self.worst(value, limit) == value:
+                place = f", {where}" if where else ""
+                text = f"{self.what} is {self.text(value)}{place} (limit {self.text(limit)})"
+                yield Finding(scene.key, member, self.name, text)
+
+
+def _of_rig(name: str) -> Callable[[SceneAudit], Figures]:
+    return lambda scene: [("", getattr(scene.rig, name), "")]
+
+
+def _of_cameras(
+    file: Callable[[int], str], figure: Callable[[CameraAudit], Any]
+) -> Callable[[SceneAudit], Figures]:
+    """Return a function to the figures of each camera: numbers, or `At` with their frames."""
+
+    def of(scene: SceneAudit) -> Figures:
+        for number, camera in enumerate(scene.cameras):
+            value = figure(camera)
+            if isinstance(value, float | int):
+                yield file(number), value, ""
+            else:
+                yield file(number), value.value, f"frame {value.frame}"
+
+    return of
+
+
+def _see_through(scene: SceneAudit) -> Figures:
+    pairs = [pair for pair in scene.alignment.pairs if not math.isnan(pair.see_through)]
+    most = max((pair.see_through for pair in pairs), default=math.nan)
+    among = [f"{each.left}-{each.right}" for each in pairs if each.see_through > most / 2]
+    yield "", most, f"most in {', '.join(among)}"
+
+
+def _moved_through(scene: SceneAudit) -> Figures:
+    found = scene.alignment
+    if found.moved_smooth >= _ENOUGH:
+        yield "", found.moved_through / found.moved_smooth, ""
+
+
+def _other_moment(scene: SceneAudit) -> Figures:
+    for camera, lag, gained in scene.alignment.lags:
+        beside = f"by those of the frame {'before' if lag < 0 else 'after'}"
+        yield "" if camera < 0 else rgb_name(camera), gained, beside
+
+
+def _other_content(scene: SceneAudit) -> Figures:
+    seen = [pair for pair in scene.alignment.pairs if not math.isnan(pair.correlation)]
+    for camera in range(CAMERA_COUNT):
+        own = [pair.correlation for pair in seen if camera in (pair.left, pair.right)]
+        others = [pair.correlation for pair in seen if camera not in (pair.left, pair.right)]
+        if own and others:
+            yield rgb_name(camera), median(others) - max(own), f"its best is {max(own):.2f}"
+
+
+def _occluders(scene: SceneAudit) -> Figures:
+    for number, camera in enumerate(scene.cameras):
+        where = f"frame {camera.occluder.frame}, {camera.occluder_side or 'no'} border"
+        yield depth_name(number), camera.occluder.value, where
+
+
+_ENOUGH: Final = 1000
+CHECKS: Final = (
+    Check("intrinsics", "largest deviation of fx, fy, cx, cy from f / s W", "intrinsics_px",
+          _of_rig("intrinsics_px"), paper=AUDIT["intrinsics"]),
+    Check("pose/baseline", "pose-derived less recorded, adjacent cameras", "baseline_cm",
+          _of_rig("adjacent_max_cm"), unit="cm"),
+    Check("pose/baseline", "pose-derived less recorded, all 15 pairs", "baseline_cm",
+          _of_rig("pairs_max_cm"), unit="cm", paper=AUDIT["baseline"]),
+    Check("rig rotation", "what the turn of a camera against camera 0 moves", "rectified_px",
+          _of_rig("rotation_px")),
+    Check("lateral residual", "what a camera off the rig's line moves", "rectified_px",
+          _of_rig("lateral_px")),
+    Check("reprojection", "median error of the primary pair at the last tolerance",
+          "reprojection_px", lambda scene: [("", scene.pairs[0].tolerances[-1].median_px, "")]),
+    Check("depth consistency", "share of points on smooth surfaces that another camera sees "
+          "through", "see_through", _see_through, unit="%"),
+    Check("motion", "share of points on smooth surfaces that the next audited frame sees through",
+          "moved_through", _moved_through, unit="%"),
+    Check("picture time", "gain of correlation by pictures of a frame beside", "picture_lag",
+          _other_moment, unit=""),
+    Check("picture content", "correlation with other cameras' pictures, taken there by depth, "
+          "below that of others", "picture_odd", _other_content, unit=""),
+    Check("too dark", "95th percentile of luma, of 255", "brightness",
+          _of_cameras(rgb_name, attrgetter("brightness")), min, unit=""),
+    Check("flat", "span of luma (5th to 95th percentile), of 255", "contrast",
+          _of_cameras(rgb_name, attrgetter("contrast")), min, unit=""),
+    Check("frozen", "change of luma to the next audited frame while the camera moves", "change",
+          _of_cameras(rgb_name, lambda camera: camera.change
+                      if camera.contrast.value >= AuditLimits().contrast else math.nan),
+          min, unit=""),
+    Check("invalid depth", "share of pixels with depth", "valid_depth",
+          _of_cameras(depth_name, attrgetter("least_valid_depth")), min, unit="%"),
+    Check("invalid depth", "count of different depths", "depth_levels",
+          _of_cameras(depth_name, lambda camera: camera.depth_levels
+                      if camera.valid_depth > 0 else math.nan), min, unit=""),
+    Check("depth quantum", "distance of stored numbers", "depth_step",
+          _of_cameras(depth_name, lambda camera: camera.depth_step_units
+                      if camera.depth_levels >= ENOUGH_LEVELS else math.nan), unit="units"),
+    Check("occluder", "share of a picture that something near hides from its border", "occluder",
+          _occluders, unit="%"),
+)  # fmt: skip
+"""The figures that have a limit, in the order of the table."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A parameter that `alignment` estimates: in words, as a cause, and its limit's name."""
+
+    what: str
+    cause: str
+    limit: str
+
+
+_FITS: Final = "from frame to frame, depth and poses fit if"
+PARAMETERS: Final = {
+    ("depth", "scale"): Parameter(
+        "depth of one camera against the others: a factor",
+        "depth of {of} differs from that of the others by {share}", "depth_scale"),
+    ("depth", "ray"): Parameter(
+        "share of the way to depth along the ray",
+        "depth of {of} is {part} of the way from the axis to along the ray", "depth_ray"),
+    ("depth", "shift_x"): Parameter(
+        "depth of one camera: a shift to the side, px",
+        "depth of {of} is {pixels} to the right of where the others see it", "depth_shift_px"),
+    ("depth", "shift_y"): Parameter(
+        "depth of one camera: a shift up or down, px",
+        "depth of {of} is {pixels} down of where the others see it", "depth_shift_px"),
+    ("depth", "focal"): Parameter(
+        "focal length or all baselines between cameras: a factor",
+        "between cameras, depth fits if the focal length, or all baselines, are corrected {factor}",
+        "focal"),
+    ("motion", "scale"): Parameter(
+        "unit of depth or of poses from frame to frame: a factor",
+        f"{_FITS} the unit of depth or of poses is corrected {{factor}}", "focal"),
+    ("motion", "focal"): Parameter(
+        "focal length from frame to frame: a factor",
+        f"{_FITS} the focal length is corrected {{factor}}", "focal"),
+    ("motion", "focal_x"): Parameter(
+        "sensor's width from frame to frame: a factor",
+        f"{_FITS} the horizontal focal length (sensor width) is corrected {{factor}}", "focal"),
+    ("motion", "focal_y"): Parameter(
+        "sensor's height from frame to frame: a factor",
+        f"{_FITS} the vertical focal length (sensor height) is corrected {{factor}}", "focal"),
+}  # fmt: skip
+"""By check and name of an `Estimate`, in the order of the table."""
 
 
 def findings_of(scene: SceneAudit, limits: AuditLimits) -> list[Finding]:
@@ -27,37 +210,31 @@ def findings_of(scene: SceneAudit, limits: AuditLimits) -> list[Finding]:
         place, colon, rest = text.partition(f"{name}: ")
         text = rest if colon and " " not in place else text
         found.append(Finding(scene.key, name, "unreadable", text))
+    beyond = [each for check in CHECKS for each in check.findings(scene, limits)]
+    beyond += _file_findings(scene, limits)
     unreadable = {name for name, _ in scene.problems}
-    found += _rig_findings(scene, limits)
-    found += _alignment_findings(scene, limits)
+    found += [each for each in beyond if each.member not in unreadable]
+    return found + list(_fit_findings(scene, limits, beyond={each.check for each in found}))
+
+
+def _file_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
+    """Yield what is wrong with single videos beside their figures."""
+    expected = int(limits.frames) or scene.frames
     for number, camera in enumerate(scene.cameras):
-        frames = int(limits.frames) or scene.frames
-        for name, of_file in (
-            (rgb_name(number), _rgb_findings(camera, frames, limits)),
-            (depth_name(number), _depth_findings(camera, frames, limits)),
-        ):
-            if name not in unreadable:
-                found += [Finding(scene.key, name, check, text) for check, text in of_file]
-    return found
-
-
-def _rig_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
-    rig, (primary, *_) = scene.rig, scene.pairs
-    for check, value, limit, unit, what in (
-        ("intrinsics", rig.intrinsics_px, limits.intrinsics_px, "px",
-         "recorded intrinsics deviate from focal length and sensor by"),
-        ("pose/baseline", rig.pairs_max_cm, limits.baseline_cm, "cm",
-         "pose-derived and recorded baselines differ by"),
-        ("rig rotation", rig.rotation_px, limits.rectified_px, "px",
-         f"cameras are turned against camera 0 by {rig.rotation_deg:.3g} deg: points move by"),
-        ("lateral residual", rig.lateral_px, limits.rectified_px, "px",
-         "cameras stand off the rig's line: points move by"),
-        ("reprojection", primary.tolerances[-1].median_px, limits.reprojection_px, "px",
-         f"median error of pair {primary.left}-{primary.right} is"),
-    ):  # fmt: skip
-        if value > limit:
-            text = f"{what} {value:.3g} {unit} (limit {limit:g})"
-            yield Finding(scene.key, "", check, text)
+        rgb, depth = rgb_name(number), depth_name(number)
+        for name, frames in ((rgb, camera.rgb_frames), (depth, camera.depth_frames)):
+            if frames != expected:
+                text = f"has {frames} frames of {expected}"
+                yield Finding(scene.key, name, "missing frames", text)
+        if camera.twin >= 0 and camera.contrast.value >= limits.contrast:
+            text = f"shows the same pictures as {rgb_name(camera.twin)}, bit for bit"
+            yield Finding(scene.key, rgb, "copied view", text)
+        if camera.still_depth >= 0:
+            text = (
+                f"from frame {camera.still_depth} to the next audited one the camera moves and "
+                f"depth stays the same"
+            )
+            yield Finding(scene.key, depth, "frozen", text)
 
 
 _LEAST_EXPLAINED: Final = 0.35
@@ -68,152 +245,79 @@ _NEXT_BEST: Final = 0.85
 """A cause is named if no other one explains this share of what it explains."""
 _MOST_FACTOR: Final = 0.5
 """Larger factors explain depth that has nothing to do with the poses or baselines."""
-_FITS: Final = "from frame to frame, depth and poses fit if"
 _OWN_MOTION_PX: Final = 0.03
-_CAUSES: Final = {
-    ("depth", "scale"): "depth of {of} differs from that of the others by {share}",
-    ("depth", "ray"): "depth of {of} is {part} of the way from the axis to along the ray",
-    ("depth", "shift_x"): "depth of {of} is {pixels} to the right of where the others see it",
-    ("depth", "shift_y"): "depth of {of} is {pixels} down of where the others see it",
-    ("depth", "focal"): "between cameras, depth fits if the focal length, or all baselines, are "
-    "corrected {factor}",
-    ("motion", "scale"): f"{_FITS} the unit of depth or of poses is corrected {{factor}}",
-    ("motion", "focal"): f"{_FITS} the focal length is corrected {{factor}}",
-    ("motion", "focal_x"): f"{_FITS} the horizontal focal length (sensor width) is corrected "
-    "{factor}",
-    ("motion", "focal_y"): f"{_FITS} the vertical focal length (sensor height) is corrected "
-    "{factor}",
-}  # fmt: skip
-"""What an estimate says, by its check and parameter."""
+_STILL_PX: Final = 1.0
 
 
-def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
-    """Yield the misfits between cameras, frames and pictures."""
-    found = scene.alignment
-    through = [pair for pair in found.pairs if pair.see_through > limits.see_through]
-    if through:
-        worst = max(through, key=lambda pair: pair.see_through)
-        pairs = ", ".join(f"{pair.left}-{pair.right}" for pair in through)
-        text = (
-            f"the depths of cameras {pairs} contradict each other: in pair "
-            f"{worst.left}-{worst.right}, {worst.see_through:.1%} of the points on smooth surfaces "
-            f"lie in front of what the other camera sees there (limit {limits.see_through:.0%})"
-        )
-        yield Finding(scene.key, "", "depth consistency", text)
-    moved = found.moved_through / found.moved_smooth if found.moved_smooth >= 1000 else 0.0
-    if moved > limits.moved_through:
-        text = (
-            f"by the recorded poses, depth of one frame contradicts that of the next audited one "
-            f"at {moved:.0%} of its points (limit {limits.moved_through:.0%})"
-        )
-        yield Finding(scene.key, "", "motion", text)
-    first = [each for each in found.estimates if each.is_first]
-    has_wrong_depth = bool(through) or any(
+def _fit_findings(scene: SceneAudit, limits: AuditLimits, *, beyond: set[str]) -> Iterator[Finding]:
+    """Yield the misfits between cameras and between frames, ``beyond`` the checks that failed."""
+    first = [each for each in scene.alignment.estimates if each.is_first]
+    # Depth that contradicts itself or the poses cannot confirm a length.
+    is_wrong = bool(beyond & {"depth consistency", "motion"}) or any(
         each.check == "depth" and each.what != "focal" for each in first
     )
     for each in first:
-        # Depth that contradicts itself or the poses cannot confirm a length.
-        is_explained = each.check == "motion" and (has_wrong_depth or moved > limits.moved_through)
-        limit = limit_of(scene, each, limits)
-        if not is_explained and abs(each.value) > max(limit, CERTAIN * each.error):
+        limit = limit_of(scene, each.check, each.what, limits)
+        if not (each.check == "motion" and is_wrong) and abs(each.value) > max(
+            limit, CERTAIN * each.error
+        ):
             yield from _estimate_finding(scene, each, limit)
-    for camera, lag, gained in found.lags:
-        if gained > limits.picture_lag:
-            of = "all cameras" if camera < 0 else f"camera {camera}"
-            text = (
-                f"pictures of {of} fit better if those of the frame "
-                f"{'before' if lag < 0 else 'after'} are taken: correlation grows by {gained:.3f} "
-                f"(limit {limits.picture_lag:g})"
-            )
-            name = "" if camera < 0 else rgb_name(camera)
-            yield Finding(scene.key, name, "picture time", text)
-    seen = [pair for pair in found.pairs if not math.isnan(pair.correlation)]
-    for camera in range(CAMERA_COUNT):
-        own = [pair.correlation for pair in seen if camera in (pair.left, pair.right)]
-        others = [pair.correlation for pair in seen if camera not in (pair.left, pair.right)]
-        if own and others and median(others) - max(own) > limits.picture_odd:
-            text = (
-                f"pictures of camera {camera}, warped by depth to the others, have a correlation "
-                f"with theirs of {max(own):.2f} or less, and the others {median(others):.2f} with "
-                f"each other (limit {limits.picture_odd:g} less)"
-            )
-            yield Finding(scene.key, rgb_name(camera), "picture content", text)
 
 
-def limit_of(scene: SceneAudit, each: Estimate, limits: AuditLimits) -> float:
+def limit_of(scene: SceneAudit, check: str, what: str, limits: AuditLimits) -> float:
     """Return the size beyond which an estimate is a finding."""
-    if each.check == "motion":
+    limit: float = getattr(limits, PARAMETERS[check, what].limit)
+    if check == "motion":
         # The less the camera moves, the more do moving objects disturb the estimate.
-        return max(limits.focal, _OWN_MOTION_PX / max(scene.alignment.moved_px, 1e-6))
-    by_name = {"scale": limits.depth_scale, "ray": limits.depth_ray, "focal": limits.focal}
-    return by_name.get(each.what, limits.depth_shift_px)
-
-
-_STILL_PX: Final = 1.0
-_ENOUGH: Final = 1000
+        limit = max(limit, _OWN_MOTION_PX / max(scene.alignment.moved_px, 1e-6))
+    return limit
 
 
 def untested_of(scene: SceneAudit, limits: AuditLimits) -> list[Finding]:
     """Return the checks of `alignment` that the content of a scene does not allow."""
     found = scene.alignment
     untested: list[tuple[str, str]] = []
-    blind = _cameras_without(found.pairs, "see_through")
-    if blind:
-        why = f"{_cameras(blind)}: too few points of smooth surfaces"
-        untested.append(("depth consistency", why))
+    for check, figure, why in (
+        ("depth consistency", "see_through", "too few points of smooth surfaces"),
+        ("picture content", "correlation", "no texture, or no depth"),
+    ):
+        known = {
+            camera for pair in found.pairs for camera in (pair.left, pair.right)
+            if not math.isnan(getattr(pair, figure))
+        }  # fmt: skip
+        untested.append((check, _of_cameras_but(known, why)))
     if found.moved_smooth < _ENOUGH:
         untested.append(("motion", "too few points of smooth surfaces, or one frame"))
     elif found.moved_px < _STILL_PX:
         why = f"points move by {found.moved_px:.2f} px from one audited frame to the next"
         untested.append(("motion", why))
-    blind = _cameras_without(found.pairs, "correlation")
-    if blind:
-        untested.append(("picture content", f"{_cameras(blind)}: no texture, or no depth"))
-    late = [
-        camera for camera in range(CAMERA_COUNT)
-        if min((gain for of, _, gain in found.lags if of == camera), default=0.0)
-        > -limits.picture_lag
-    ]  # fmt: skip
-    if late:
-        why = "pictures of the neighbouring frames fit as well, or there are none"
-        untested.append(("picture time", f"{_cameras(late)}: {why}"))
-    untested += _untested_fits(scene, limits)
-    return [Finding(scene.key, "", *each) for each in untested]
-
-
-def _untested_fits(scene: SceneAudit, limits: AuditLimits) -> Iterator[tuple[str, str]]:
-    """Yield the quantities of which an error as large as the limit would not be certain."""
-    for check, what in _CAUSES:
-        if (check, what) == ("depth", "focal"):
-            continue
-        least = limit_of(scene, Estimate(check, what, -1), limits)
-        limit = limits.focal if check == "motion" else least
-        seen = {
-            each.camera: max(least, math.inf if math.isnan(each.error) else CERTAIN * each.error)
-            for each in scene.alignment.estimates
+    gains = {
+        camera: [gain for of, _, gain in found.lags if of == camera]
+        for camera in range(CAMERA_COUNT)
+    }
+    timed = {camera for camera, of in gains.items() if min(of, default=0.0) <= -limits.picture_lag}
+    why = "pictures of the neighbouring frames fit as well, or there are none"
+    untested.append(("picture time", _of_cameras_but(timed, why)))
+    for check, what in PARAMETERS:
+        limit = limit_of(scene, check, what, limits)
+        sizes = [
+            max(limit, math.inf if math.isnan(each.error) else CERTAIN * each.error)
+            for each in found.estimates
             if (each.check, each.what) == (check, what)
-        }
-        blind = [camera for camera, size in seen.items() if size > limit]
-        if blind or not seen:
-            from_on = max((seen[camera] for camera in blind), default=math.inf)
-            why = f"seen from {from_on:.2g} on" if math.isfinite(from_on) else "no estimate"
-            of = _cameras([camera for camera in blind if camera >= 0])
-            subject = f"{QUANTITIES[what]}{f' of {of}' if of else ''}"
-            yield f"{check} fit", f"{subject}: {why} (limit {limit:.2g})"
+        ]
+        most = max(sizes, default=math.inf)
+        if most > getattr(limits, PARAMETERS[check, what].limit):
+            why = f"seen from {most:.2g} on" if math.isfinite(most) else "no estimate"
+            untested.append((f"{check} fit", f"{PARAMETERS[check, what].what}: {why}"))
+    return [Finding(scene.key, "", check, why) for check, why in untested if why]
 
 
-def _cameras_without(pairs: tuple[PairFit, ...], figure: str) -> list[int]:
-    known = {
-        camera for pair in pairs for camera in (pair.left, pair.right)
-        if not math.isnan(getattr(pair, figure))
-    }  # fmt: skip
-    return [camera for camera in range(CAMERA_COUNT) if camera not in known]
-
-
-def _cameras(numbers: list[int]) -> str:
-    if len(numbers) == CAMERA_COUNT:
-        return "all cameras"
-    return f"camera {', '.join(map(str, sorted(numbers)))}" if numbers else ""
+def _of_cameras_but(known: set[int], why: str) -> str:
+    """Return the reason for the other cameras, empty if there are none."""
+    others = sorted(set(range(CAMERA_COUNT)) - known)
+    if len(others) == CAMERA_COUNT:
+        return f"all cameras: {why}"
+    return f"camera {', '.join(map(str, others))}: {why}" if others else ""
 
 
 def _estimate_finding(scene: SceneAudit, each: Estimate, limit: float) -> Iterator[Finding]:
@@ -226,7 +330,7 @@ def _estimate_finding(scene: SceneAudit, each: Estimate, limit: float) -> Iterat
     excess = abs(each.value - 1) if each.what == "ray" else abs(each.value)
     if each.what.startswith("shift") or (each.check == "depth" and each.what == "scale"):
         excess = 0.0
-    cause = _CAUSES[each.check, each.what].format(
+    cause = PARAMETERS[each.check, each.what].cause.format(
         of="all cameras" if each.camera < 0 else f"camera {each.camera}",
         share=f"{each.value:+.2%} ± {half:.2%}",
         factor=f"{-each.value:+.2%} ± {half:.2%}",
@@ -238,73 +342,6 @@ def _estimate_finding(scene: SceneAudit, each: Estimate, limit: float) -> Iterat
         cause = f"{each.check} does not fit between {where}, and no single cause explains it"
     name = "" if each.camera < 0 else depth_name(each.camera)
     yield Finding(scene.key, name, f"{each.check} fit", f"{cause} (limit {limit:.3g})")
-
-
-def _rgb_findings(
-    camera: CameraAudit, expected: int, limits: AuditLimits
-) -> Iterator[tuple[str, str]]:
-    is_flat = camera.contrast.value < limits.contrast
-    if camera.rgb_frames != expected:
-        yield "missing frames", f"has {camera.rgb_frames} frames of {expected}"
-    if camera.brightness.value < limits.brightness:
-        yield (
-            "too dark",
-            f"frame {camera.brightness.frame}: 95 % of the picture are darker than "
-            f"{camera.brightness.value:.0f} of 255 (limit {limits.brightness:g})",
-        )
-    elif is_flat:
-        yield (
-            "flat",
-            f"frame {camera.contrast.frame}: the picture's grey levels span "
-            f"{camera.contrast.value:.0f} of 255 (limit {limits.contrast:g})",
-        )
-    if camera.change.value < limits.change and not is_flat:
-        yield (
-            "frozen",
-            f"from frame {camera.change.frame} to the next audited one the camera moves and the "
-            f"picture changes by {camera.change.value:.2g} grey levels (limit {limits.change:g})",
-        )
-    if camera.twin >= 0 and not is_flat:
-        yield "copied view", f"shows the same pictures as {rgb_name(camera.twin)}, bit for bit"
-
-
-def _depth_findings(
-    camera: CameraAudit, expected: int, limits: AuditLimits
-) -> Iterator[tuple[str, str]]:
-    if camera.depth_frames != expected:
-        yield "missing frames", f"has {camera.depth_frames} frames of {expected}"
-    least = camera.least_valid_depth
-    if least.value < limits.valid_depth:
-        yield (
-            "invalid depth",
-            f"frame {least.frame} has depth at {least.value:.1%} of its pixels "
-            f"(limit {limits.valid_depth:.0%})",
-        )
-    elif camera.depth_levels < limits.depth_levels and not math.isnan(least.value):
-        yield (
-            "invalid depth",
-            f"holds {camera.depth_levels} different depths (limit {limits.depth_levels:g})",
-        )
-    if camera.depth_step_units > limits.depth_step and camera.depth_levels >= ENOUGH_LEVELS:
-        step_m = camera.depth_step_units * camera.depth_unit_m
-        yield (
-            "depth quantum",
-            f"its numbers are {camera.depth_step_units:g} units apart, so that depth was rounded "
-            f"to {step_m:g} m before it was stored (limit {limits.depth_step:g} units)",
-        )
-    if camera.still_depth >= 0:
-        yield (
-            "frozen",
-            f"from frame {camera.still_depth} to the next audited one the camera moves and depth "
-            f"stays the same",
-        )
-    if camera.occluder.value > limits.occluder:
-        side = "everywhere" if camera.occluder_side == "all" else f"from the {camera.occluder_side}"
-        yield (
-            "occluder",
-            f"in frame {camera.occluder.frame} something near hides {camera.occluder.value:.0%} of "
-            f"the picture, {side} (limit {limits.occluder:.0%})",
-        )
 
 
 def broken_finding(key: str, text: str) -> Finding:

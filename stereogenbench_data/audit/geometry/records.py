@@ -182,25 +182,17 @@ class RigAudit:
         fy_px: The same, vertically.
         intrinsics_px: Largest deviation from the paper's equation, of the intrinsics recorded in
             pixels for any camera and frame, and of those in samples.
-        intrinsics_recorded: How many numbers were recorded in pixels.
-        adjacent_mean_cm: Mean difference of recorded and pose-derived adjacent baselines.
-        adjacent_max_cm: Largest such difference.
-        pairs_mean_cm: Mean difference over all 15 pairs.
+        adjacent_max_cm: Largest difference of recorded and pose-derived adjacent baselines.
         pairs_max_cm: Largest difference over all 15 pairs.
-        rotation_deg: Largest angle between camera 0 and another camera in the same frame.
-        rotation_px: Largest displacement of a picture's point by these angles.
+        rotation_px: Largest displacement of a picture's point by turns against camera 0.
         lateral_px: Largest displacement by cameras off the line of the rig.
     """
 
     fx_px: float = math.nan
     fy_px: float = math.nan
     intrinsics_px: float = math.nan
-    intrinsics_recorded: int = 0
-    adjacent_mean_cm: float = math.nan
     adjacent_max_cm: float = math.nan
-    pairs_mean_cm: float = math.nan
     pairs_max_cm: float = math.nan
-    rotation_deg: float = math.nan
     rotation_px: float = math.nan
     lateral_px: float = math.nan
 
@@ -330,14 +322,6 @@ class Finding:
         where = "/".join(part for part in (self.scene, self.member) if part)
         found = " ".join(self.found.split())
         return f"{where}: {self.check}: {found}"
-
-
-QUANTITIES: Final = {
-    "scale": "a factor", "ray": "along the ray", "shift_x": "a shift to the side",
-    "shift_y": "a shift up or down", "focal": "a factor of the focal length",
-    "focal_x": "the sensor's width", "focal_y": "the sensor's height",
-}  # fmt: skip
-"""What an `Estimate` estimates, in words."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,11 +20,13 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, UInt16
 
 from stereogenbench_data.audit.geometry.records import QUANTILES, PairAudit, ToleranceAudit
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.projection import Projection, visible_from_source
+from stereogenbench_data.media.depth import depth_m_from_units
+from stereogenbench_data.schema.records import DepthEncoding
 
 _SIGNIFICANT: Final = 7
 
@@ -71,6 +73,23 @@ class MeasuredDepth:
     measured: Mask
     step_m: float
     form: str = "depth"
+
+    @classmethod
+    def of(
+        cls,
+        units: UInt16[np.ndarray, "h w"],
+        measured: Mask,
+        *,
+        encoding: DepthEncoding,
+        intrinsics: Intrinsics,
+    ) -> "MeasuredDepth":
+        """Return the depth of stored numbers, by a contract whose unit is known."""
+        depth_m = depth_m_from_units(
+            units, measured=measured, encoding=encoding, intrinsics=intrinsics
+        )
+        known = measured & np.isfinite(depth_m)
+        depth_m = np.where(known, depth_m, 0).astype(np.float64)
+        return cls(depth_m, known, step_m=encoding.known_unit_m, form=encoding.form)
 
     def steps_m(self, depth_m: Map) -> Any:
         """Return the step in metres at each depth."""

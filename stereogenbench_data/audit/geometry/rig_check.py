@@ -64,17 +64,12 @@ def rig_audit(rig: Rig, poses: CameraPoses, documents: list[dict[str, Any]]) -> 
     looking_alike = replace(
         poses, world_from_cam_rotations=np.repeat(rotations[:, :1], rotations.shape[1], axis=1)
     )
-    turned_rad = rotation_angle_rad(rotations, np.broadcast_to(rotations[:, :1], rotations.shape))
     return RigAudit(
         fx_px=fx_px,
         fy_px=fy_px,
         intrinsics_px=float(max(deviations)),
-        intrinsics_recorded=len(recorded),
-        adjacent_mean_cm=float(adjacent_cm.mean()),
         adjacent_max_cm=float(adjacent_cm.max()),
-        pairs_mean_cm=float(away_cm.mean()),
         pairs_max_cm=float(away_cm.max()),
-        rotation_deg=float(np.rad2deg(turned_rad).max()),
         rotation_px=rectification_residual_px(in_one_place, intrinsics),
         lateral_px=rectification_residual_px(looking_alike, intrinsics),
     )

@@ -30,18 +30,17 @@ from stereogenbench_data.audit.geometry.reprojection import (
     reproject,
 )
 from stereogenbench_data.audit.geometry.rig_check import motion_px, rig_audit
-from stereogenbench_data.audit.scene_access import SceneAccess
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.index.evidence import poses_as
-from stereogenbench_data.media.depth import NO_DEPTH_UNIT, depth_frame_index, depth_m_from_units
+from stereogenbench_data.media.depth import NO_DEPTH_UNIT, depth_frame_index
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.document import parse_document
-from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
     CAMERA_COUNT,
@@ -50,6 +49,7 @@ from stereogenbench_data.schema.release import (
     depth_name,
     rgb_name,
 )
+from stereogenbench_data.sources.members import MemberSource
 
 LONG_PAIR: Final = (0, CAMERA_COUNT - 1)
 """The non-adjacent pair that the paper audits beside the primary one."""
@@ -65,11 +65,10 @@ class AuditedFiles:
         problems: Maps the name of a file that cannot be read to the reason; it is not tried again.
     """
 
-    def __init__(self, access: SceneAccess, *, contract: DepthEncoding) -> None:
+    def __init__(self, scene: Scene, source: MemberSource, *, contract: DepthEncoding) -> None:
         """Prepare to read; nothing is opened yet."""
         self.problems: dict[str, str] = {}
-        self.scene = access.scene
-        self.source = access.source()
+        self.scene, self.source = scene, source
         self.contract = contract
         self.streams = Streams(self.source)
         self.intrinsics = rig_intrinsics(self.scene.rig)
@@ -132,18 +131,8 @@ class AuditedFiles:
         stored = self.streams.read_stored_depth(
             self.scene, depth_name(camera), index, encoding=encoding
         )
-        depth_m = depth_m_from_units(
-            stored.units,
-            measured=stored.measured,
-            encoding=encoding,
-            intrinsics=self.intrinsics,
-        )
-        known = stored.measured & np.isfinite(depth_m)
-        return stored.units, MeasuredDepth(
-            np.where(known, depth_m, 0).astype(np.float64),
-            known,
-            step_m=encoding.known_unit_m,
-            form=encoding.form,
+        return stored.units, MeasuredDepth.of(
+            stored.units, stored.measured, encoding=encoding, intrinsics=self.intrinsics
         )
 
     def _encoding(self, camera: int) -> DepthEncoding:
@@ -165,12 +154,14 @@ class AuditTask:
     """One scene to audit; can be sent to worker processes.
 
     Attributes:
-        access: The scene and where its files are.
+        scene: The scene.
+        source: Its files.
         frames: How many frames to audit, evenly spread; 0 for all.
         depth: The depth contract, None for what the files state.
     """
 
-    access: SceneAccess
+    scene: Scene
+    source: MemberSource
     frames: int
     depth: DepthEncoding | None = None
 
@@ -202,9 +193,11 @@ class _SceneCheck:
     """The state of one scene's audit: open videos, and the results so far."""
 
     def __init__(self, task: AuditTask) -> None:
-        self.scene = task.access.scene
+        self.scene = task.scene
         self.frames = spread_frames(self.scene.frames, task.frames)
-        self.files = AuditedFiles(task.access, contract=task.depth or depth_of(task.access.scene))
+        self.files = AuditedFiles(
+            task.scene, task.source, contract=task.depth or depth_of(task.scene)
+        )
         self.intrinsics = self.files.intrinsics
         self.light = [LightCheck() for _ in range(CAMERA_COUNT)]
         self.payload = [PayloadCheck() for _ in range(CAMERA_COUNT)]

@@ -8,15 +8,14 @@ from typing import Any, Final
 import numpy as np
 
 from stereogenbench_data.audit.geometry.alignment import CERTAIN
+from stereogenbench_data.audit.geometry.findings import CHECKS, PARAMETERS
 from stereogenbench_data.audit.geometry.records import (
     QUANTILES,
-    QUANTITIES,
     AuditLimits,
     AuditReport,
     AuditRow,
     CameraAudit,
     Finding,
-    RigAudit,
     SceneAudit,
     ToleranceAudit,
 )
@@ -26,10 +25,6 @@ from stereogenbench_data.audit.paper_numbers import AUDIT, AUDIT_TABLE, FRAMES_A
 from stereogenbench_data.schema.text import counted, markdown_table, markdown_text
 
 _LISTED: Final = 500
-_CHECKS: Final = (
-    "broken", "unreadable", "missing frames", "invalid depth", "too dark", "flat", "frozen",
-    "copied view", "occluder",
-)  # fmt: skip
 
 
 def table_rows(
@@ -40,139 +35,78 @@ def table_rows(
     untested: Sequence[Finding],
 ) -> tuple[AuditRow, ...]:
     """Return the table of an audit over scenes."""
-    checks = dict.fromkeys([*_CHECKS, *(finding.check for finding in findings)])
     counts = [
-        f"{check} {count}"
-        for check in checks
-        if (count := len({each.scene for each in findings if each.check == check}))
+        f"{check} {len({each.scene for each in findings if each.check == check})}"
+        for check in dict.fromkeys(finding.check for finding in findings)
     ]
     return (
-        *_rig_rows([scene.rig for scene in scenes], limits),
-        *_reprojection_rows(scenes, limits),
-        *_alignment_rows(scenes, limits, untested),
+        *_check_rows(scenes, limits, untested),
+        *_fit_rows(scenes, limits, untested),
+        *_reprojection_rows(scenes),
         *_frame_rows(scenes, limits),
-        *_camera_rows([camera for scene in scenes for camera in scene.cameras], limits),
+        *_depth_rows([camera for scene in scenes for camera in scene.cameras]),
         AuditRow("findings", "scenes with", ", ".join(counts) or "none", "none", "none"),
     )
 
 
-def _rig_rows(rigs: Sequence[RigAudit], limits: AuditLimits) -> Iterator[AuditRow]:
-    def most(name: str, unit: str) -> str:
-        return f"{_number(_over(max, map(attrgetter(name), rigs)))} {unit}"
-
-    def mean_cm(name: str) -> str:
-        return f"{_number(_over(np.mean, map(attrgetter(name), rigs)))} cm"
-
-    recorded = sum(rig.intrinsics_recorded for rig in rigs)
-    source = f"{recorded} numbers recorded in px" if recorded else "none recorded in px"
-    baseline, rectified = f"{limits.baseline_cm:g} cm", f"{limits.rectified_px:g} px"
-    between = "pose-derived less recorded"
-    yield AuditRow(
-        "intrinsics", f"largest deviation of fx, fy, cx, cy from f / s W ({source})",
-        most("intrinsics_px", "px"), AUDIT["intrinsics"], f"{limits.intrinsics_px:g} px",
-    )  # fmt: skip
-    yield AuditRow(
-        "pose/baseline", f"{between}, adjacent: mean / largest",
-        f"{mean_cm('adjacent_mean_cm')} / {most('adjacent_max_cm', 'cm')}", "", baseline,
-    )  # fmt: skip
-    yield AuditRow(
-        "pose/baseline", f"{between}, all 15 pairs: mean / largest",
-        f"{mean_cm('pairs_mean_cm')} / {most('pairs_max_cm', 'cm')}", AUDIT["baseline"], baseline,
-    )  # fmt: skip
-    yield AuditRow(
-        "rig rotation", "largest turn of a camera against camera 0, and what it moves",
-        f"{most('rotation_deg', 'deg')} / {most('rotation_px', 'px')}", "", rectified,
-    )  # fmt: skip
-    yield AuditRow(
-        "lateral residual", "largest shift by cameras off the rig's line",
-        most("lateral_px", "px"), "", rectified,
-    )  # fmt: skip
-
-
-def _reprojection_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
-    primary = [scene.pairs[0] for scene in scenes]
-    long = [scene.pairs[-1] for scene in scenes]
-    both = [pair for scene in scenes for pair in scene.pairs]
-    of = {"both pairs": both, "primary pair": primary, f"{LONG_PAIR[0]}-{LONG_PAIR[1]}": long}
-    for name, pairs in of.items():
-        comparable = sum(pair.comparable for pair in pairs)
-        for place, tolerance in enumerate(TOLERANCES):
-            audits = [pair.tolerances[place] for pair in pairs]
-            median_px, p95_px = pooled_px(audits, 0.5), pooled_px(audits, 0.95)
-            kept = _percent(_ratio(sum(each.kept for each in audits), comparable))
-            is_limited = name == "primary pair" and tolerance is TOLERANCES[-1]
-            yield AuditRow(
-                "reprojection",
-                f"{name}, {tolerance.name}: median / 95th percentile (pixels kept)",
-                f"{_number(median_px)} px / {_number(p95_px)} px ({kept})",
-                AUDIT["reprojection"] if name == "both pairs" else "",
-                f"median {limits.reprojection_px:g} px" if is_limited else "",
-            )
-    for name, pairs in of.items():
-        agreement = _ratio(sum(p.agreeing for p in pairs), sum(p.unhidden for p in pairs))
-        yield AuditRow(
-            "agreement",
-            f"{name}: pixels that nothing hides whose two depths agree (least of a scene)",
-            f"{_percent(agreement)} ({_percent(_over(min, (p.agreement for p in pairs)))})",
-        )
-
-
-_SIZES: Final = (
-    ("depth", "of one camera against the others: factor", ("scale",), "depth_scale"),
-    ("depth", "of one camera: shift, px", ("shift_x", "shift_y"), "depth_shift_px"),
-    ("depth", "share of the way to depth along the ray", ("ray",), "depth_ray"),
-    ("depth", "focal length or all baselines between cameras: factor", ("focal",), "focal"),
-    ("motion", "focal length or unit of depth from frame to frame: factor",
-     ("scale", "focal", "focal_x", "focal_y"), "focal"),
-)  # fmt: skip
-
-
-def _alignment_rows(
+def _check_rows(
     scenes: Sequence[SceneAudit], limits: AuditLimits, untested: Sequence[Finding]
 ) -> Iterator[AuditRow]:
-    found = [scene.alignment for scene in scenes]
-    pairs = [pair for each in found for pair in each.pairs]
+    for check in CHECKS:
+        worst = _over(check.worst, (value for scene in scenes for _, value, _ in check.of(scene)))
+        blind = {each.scene for each in untested if each.check == check.name}
+        ours = check.text(worst) + _not_testable(blind, scenes)
+        limit = check.text(getattr(limits, check.limit))
+        yield AuditRow(check.name, check.what, ours, check.paper, limit)
 
-    def row(
-        check: str, quantity: str, ours: str, limit: str, whats: Sequence[str] = ()
-    ) -> AuditRow:
-        names = tuple(QUANTITIES[what] for what in whats) or ("",)
-        blind = {
-            each.scene for each in untested
-            if each.check == check and each.found.startswith(names)
-        }  # fmt: skip
-        if blind:
-            ours = f"{ours}; not testable in {len(blind)} of {counted(len(scenes), 'scene')}"
-        return AuditRow(check, quantity, ours, "", limit)
 
-    yield row(
-        "depth consistency", "points of smooth surfaces that another camera sees through, most",
-        _percent(_over(max, (pair.see_through for pair in pairs))), _percent(limits.see_through),
-    )  # fmt: skip
-    for check, quantity, whats, name in _SIZES:
+def _fit_rows(
+    scenes: Sequence[SceneAudit], limits: AuditLimits, untested: Sequence[Finding]
+) -> Iterator[AuditRow]:
+    for (check, what), parameter in PARAMETERS.items():
         sizes = [
-            (abs(each.value), each.error) for of_scene in found for each in of_scene.estimates
-            if each.check == check and each.what in whats and abs(each.value) > CERTAIN * each.error
+            (abs(each.value), each.error) for scene in scenes for each in scene.alignment.estimates
+            if (each.check, each.what) == (check, what) and abs(each.value) > CERTAIN * each.error
         ]  # fmt: skip
         size, error = max(sizes, default=(0.0, 0.0))
         ours = f"{size:.2g} ± {1.96 * error:.2g}" if sizes else "none"
-        limit = f"{getattr(limits, name):g}"
-        yield row(f"{check} fit", f"{quantity}, largest that is certain", ours, limit, whats)
-    moved = _over(max, (_ratio(each.moved_through, each.moved_smooth) for each in found))
-    yield row(
-        "motion", "the same share from one audited frame to the next, most",
-        _percent(moved), _percent(limits.moved_through),
-    )  # fmt: skip
-    yield row(
-        "picture time", "gain of correlation by pictures of a frame beside, most",
-        _number(_over(max, (gain for each in found for _, _, gain in each.lags))),
-        f"{limits.picture_lag:g}",
-    )  # fmt: skip
-    yield row(
-        "picture content", "correlation of two cameras' pictures, taken there by depth, least",
-        _number(_over(min, (pair.correlation for pair in pairs))),
-        f"{limits.picture_odd:g} less than others",
-    )  # fmt: skip
+        blind = {
+            each.scene for each in untested
+            if each.check == f"{check} fit" and each.found.startswith(parameter.what)
+        }  # fmt: skip
+        ours += _not_testable(blind, scenes)
+        limit = f"{getattr(limits, parameter.limit):g}"
+        yield AuditRow(f"{check} fit", parameter.what, ours, "", limit)
+
+
+def _not_testable(blind: set[str], scenes: Sequence[SceneAudit]) -> str:
+    return f"; not testable in {len(blind)} of {counted(len(scenes), 'scene')}" if blind else ""
+
+
+def _reprojection_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
+    for name, pairs in (
+        ("both pairs", [pair for scene in scenes for pair in scene.pairs]),
+        ("primary pair", [scene.pairs[0] for scene in scenes]),
+        (f"{LONG_PAIR[0]}-{LONG_PAIR[1]}", [scene.pairs[-1] for scene in scenes]),
+    ):
+        comparable = sum(pair.comparable for pair in pairs)
+        for place, tolerance in enumerate(TOLERANCES):
+            audits = [pair.tolerances[place] for pair in pairs]
+            median_px, p95_px = (_number(pooled_px(audits, share)) for share in (0.5, 0.95))
+            kept = _percent(_ratio(sum(each.kept for each in audits), comparable))
+            yield AuditRow(
+                "reprojection",
+                f"{name}, {tolerance.name}: median / 95th percentile (pixels kept)",
+                f"{median_px} px / {p95_px} px ({kept})",
+                AUDIT["reprojection"] if name == "both pairs" else "",
+            )
+        agreement = _ratio(sum(p.agreeing for p in pairs), sum(p.unhidden for p in pairs))
+        least = _over(min, (pair.agreement for pair in pairs))
+        yield AuditRow(
+            "agreement",
+            f"{name}: pixels that nothing hides whose two depths agree (least of a scene)",
+            f"{_percent(agreement)} ({_percent(least)})",
+        )
 
 
 def _frame_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
@@ -193,33 +127,14 @@ def _frame_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[A
         )
 
 
-def _camera_rows(cameras: Sequence[CameraAudit], limits: AuditLimits) -> Iterator[AuditRow]:
+def _depth_rows(cameras: Sequence[CameraAudit]) -> Iterator[AuditRow]:
     valid = _percent(_over(np.mean, (camera.valid_depth for camera in cameras)))
-    least = _percent(_over(min, (camera.least_valid_depth.value for camera in cameras)))
-    yield AuditRow(
-        "depth validity",
-        "mean valid-depth ratio over audited frames and cameras (least of a picture)",
-        f"{valid} ({least})", AUDIT["valid_depth"], _percent(limits.valid_depth),
-    )  # fmt: skip
+    quantity = "mean valid-depth ratio over audited frames and cameras"
+    yield AuditRow("depth validity", quantity, valid, AUDIT["valid_depth"])
     units = _distinct(camera.depth_unit_m for camera in cameras)
     steps = _distinct(camera.depth_step_units * camera.depth_unit_m for camera in cameras)
-    yield AuditRow(
-        "depth quantum", f"step of stored depth, estimated from the numbers (unit: {units})",
-        steps, "0.1 m without a tag",
-    )  # fmt: skip
-    for check, what, figure in (
-        ("too dark", "least 95th percentile of luma", "brightness"),
-        ("flat", "least span of luma (5th to 95th percentile)", "contrast"),
-        ("frozen", "least mean change of luma while the camera moves", "change"),
-    ):
-        value = _number(_over(min, (getattr(camera, figure).value for camera in cameras)))
-        limit = f"{getattr(limits, figure):g}"
-        yield AuditRow("pictures", f"{check}: {what}", f"{value} of 255", "", limit)
-    yield AuditRow(
-        "pictures", "occluder: largest share of a picture hidden from its border",
-        _percent(_over(max, (camera.occluder.value for camera in cameras))), "",
-        _percent(limits.occluder),
-    )  # fmt: skip
+    quantity = f"step of stored depth, estimated from the numbers (unit: {units})"
+    yield AuditRow("depth quantum", quantity, steps, "0.1 m without a tag")
 
 
 def pooled_px(audits: Iterable[ToleranceAudit], share: float) -> float:
@@ -255,7 +170,8 @@ def audit_markdown(report: AuditReport) -> str:
             *((row.check, row.quantity, row.ours, row.paper, row.limit) for row in report.rows),
         ),
         "",
-        "What pictures say of depth: `stereogenbench doctor`.",
+        "A row with a limit shows the worst figure of all scenes, a fit the largest that is "
+        "certain. What pictures say of depth: `stereogenbench doctor`.",
         "",
         "Reprojection: left depth to the right camera, and back by the right depth; pixels whose "
         "two depths differ by more than the tolerance (share of depth + steps of stored depth) "

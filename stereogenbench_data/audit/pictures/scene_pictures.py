@@ -1,36 +1,32 @@
 """Pictures of a scene: all views and maps on one page, or a clip of one pair over time."""
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from fractions import Fraction
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import av
 import numpy as np
 from PIL import Image
 
-from stereogenbench_data.audit.pictures.drawing import (
-    FAINT,
-    FRAME,
-    GREY,
-    Colour,
-    ColourScale,
-    Label,
-    Page,
-    disparity_rows,
-    line_height,
-    resized,
-    scale_of,
-    scale_rows,
-)
 from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 from stereogenbench_data.engine import Progress, advance_of
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
+from stereogenbench_data.media.encoder import Encoding, VideoEncoder
 from stereogenbench_data.samples.fields import Sample
-from stereogenbench_data.samples.picture import Picture, anaglyph
+from stereogenbench_data.samples.picture import (
+    FRAME,
+    NOT_MEASURED,
+    Colour,
+    ColourScale,
+    Picture,
+    Tile,
+    anaglyph,
+    channels_last,
+    draw_sheet,
+    pair_tiles,
+)
 from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
@@ -48,16 +44,6 @@ MOST_DIFFERENT: Final = 64
 _NARROWEST_PX: Final = 200
 _USUAL_PX: Final = 320
 _WIDEST_PX: Final = 2048
-_LEGEND_LINES: Final = 3
-
-
-@dataclass(frozen=True, slots=True)
-class _Tile:
-    caption: str
-    picture: Picture
-    legend: Callable[[Page, tuple[int, int], int], None]
-    frame: Colour = FRAME
-    shrink: Literal["average", "nearest"] = "average"
 
 
 def tile_width(scene: Scene, wanted_px: int | None) -> int:
@@ -98,44 +84,10 @@ def scene_sheet(
     pair = pair or scene.rig.primary_pair
     sample = reader.pair(row, pair=pair, frame=frame, fields=SHEET_FIELDS)
     views = reader.views(row, frame=frame)
-    width = tile_width(scene, tile_px)
-    rows = [_view_tiles(scene, views, pair), _pair_tiles(scene, sample)]
     encoding = scene.depth_encoding(pair[0], reader.depth or depth_of(scene))
-    return _contact_sheet(
-        _title(scene, sample, encoding, pair=pair, frame=frame), rows, width_px=width
-    )
-
-
-def _text_sizes(width_px: int) -> tuple[int, int]:
-    """Return the font size, which is also the gap between tiles, and the height of a line."""
-    font_px = min(max(round(width_px / 21), 13), 30)
-    return font_px, line_height(font_px)
-
-
-def _contact_sheet(title: list[str], rows: list[list[_Tile]], *, width_px: int) -> Picture:
-    gap, line = _text_sizes(width_px)
-    shape = rows[0][0].picture.shape
-    height_px = max(1, round(shape[0] * width_px / shape[1]))
-    legends = [0, _LEGEND_LINES * line + gap // 2]
-    head = round(line * 1.6) + line * (len(title) - 1) + gap
-    total = 2 * gap + head + sum(line + 4 + height_px + gap + legend for legend in legends)
-    inner = len(rows[0]) * (width_px + gap) - gap
-    page = Page(inner + 2 * gap, total - gap // 2, font_px=gap)  # no gap below the last legend
-    page.text((gap, gap), title[0], width_px=inner, scale=1.3)
-    for number, text in enumerate(title[1:]):
-        place = (gap, gap + round(line * 1.6) + number * line)
-        page.text(place, text, width_px=inner, colour=FAINT)
-    top = gap + head
-    for tiles, legend in zip(rows, legends, strict=True):
-        for column, tile in enumerate(tiles):
-            left = gap + column * (width_px + gap)
-            page.text((left, top), tile.caption, width_px=width_px)
-            drawn = resized(tile.picture, width_px=width_px, shrink=tile.shrink)
-            thick = 1 if tile.frame is FRAME else 3
-            page.picture((left, top + line + 4), drawn, frame=tile.frame, frame_px=thick)
-            tile.legend(page, (left, top + line + 4 + height_px + gap // 2), width_px)
-        top += line + 4 + height_px + gap + legend
-    return page.finished()
+    title = _title(scene, sample, encoding, pair=pair, frame=frame)
+    rows = [_view_tiles(scene, views, pair), _pair_tiles(scene, sample)]
+    return draw_sheet(title, rows, width_px=tile_width(scene, tile_px))
 
 
 def _title(
@@ -166,52 +118,44 @@ def derived_text(scene: Scene) -> str:
     )
 
 
-def _view_tiles(scene: Scene, views: Any, pair: tuple[int, int]) -> list[_Tile]:
+def _view_tiles(scene: Scene, views: Any, pair: tuple[int, int]) -> list[Tile]:
     tiles = []
     for camera in range(CAMERA_COUNT):
         side, frame = {pair[1]: (": right", RIGHT), pair[0]: (": left", LEFT)}.get(
             camera, ("", FRAME)
         )
         caption = f"camera {camera}, at {scene.lateral_m[camera] * 100:.1f} cm{side}"
-        tiles.append(_Tile(caption, _channels_last(views[camera]), _key([]), frame))
+        tiles.append(Tile(caption, channels_last(views[camera]), frame=frame))
     return tiles
 
 
-def _channels_last(picture: Any) -> Picture:
-    return np.ascontiguousarray(picture.transpose(1, 2, 0))
-
-
-def _pair_tiles(scene: Scene, sample: Sample) -> list[_Tile]:
-    shift_px_m = rig_intrinsics(scene.rig).fx_px * float(sample["baseline_m"])
+def _pair_tiles(scene: Scene, sample: Sample) -> list[Tile]:
+    _, _, disparity = pair_tiles(sample, fx_px=rig_intrinsics(scene.rig).fx_px)
     valid = sample["valid"][0]
-    disparity = scale_of(sample["disparity"][0], measured=valid)
-    depth = scale_of(sample["depth"][0], measured=valid, kind="log")
+    scale = ColourScale.of(sample["depth"][0], measured=valid, kind="log")
     # The left view, faint, with what the right one does not see in one colour.
     grey_levels = sample["left"].astype(np.float32).mean(axis=0) * 0.6 + 90
     hidden = np.repeat(np.minimum(grey_levels, 255).astype(np.uint8)[..., None], 3, axis=-1)
     hidden[~sample["visible"][0]] = HIDDEN
-    hidden[~valid] = GREY
-    holes = _channels_last(sample["warped_right"])
+    hidden[~valid] = NOT_MEASURED
+    holes = channels_last(sample["warped_right"])
     holes[sample["hole"][0]] = HIDDEN
     seen = float(sample["visible"].mean())
-    empty = float(sample["hole"].mean())
     difference, median = _difference(sample)
-    grey = (GREY, f"depth not measured, {1 - valid.mean():.1%}")
     return [
-        _Tile("disparity, px (below: m)", disparity.paint(sample["disparity"][0], measured=valid),
-              _bar(disparity, disparity_rows(disparity, shift_px_m=shift_px_m)), shrink="nearest"),
-        _Tile("depth, m", depth.paint(sample["depth"][0], measured=valid),
-              _bar(depth, scale_rows(depth)), shrink="nearest"),
-        _Tile(f"visible in both, {seen:.1%}", hidden,
-              _key([(HIDDEN, f"hidden or outside, {float(valid.mean()) - seen:.1%}"), grey]),
-              shrink="nearest"),
-        _Tile("anaglyph", anaglyph(sample["left"], sample["right"]),
-              _key([(RIGHT, "red of the left view"), ((0, 160, 160), "cyan of the right view")])),
-        _Tile("left warped to right", holes,
-              _key([(HIDDEN, f"holes, {empty:.1%}")]), shrink="nearest"),
-        _Tile("warped less right", difference,
-              _key([((0, 0, 0), f"equal; median {median:.1f} of 255"),
-                    ((255, 255, 255), f"{MOST_DIFFERENT} of 255 apart or more")])),
+        disparity,
+        Tile("depth, m", scale.paint(sample["depth"][0], measured=valid), scale=scale,
+             labels=("{:.3g}".format,), shrink="nearest"),
+        Tile(f"visible in both, {seen:.1%}", hidden,
+             ((HIDDEN, f"hidden or outside, {float(valid.mean()) - seen:.1%}"),
+              (NOT_MEASURED, f"depth not measured, {1 - valid.mean():.1%}")), shrink="nearest"),
+        Tile("anaglyph", anaglyph(sample["left"], sample["right"]),
+             ((RIGHT, "red of the left view"), ((0, 160, 160), "cyan of the right view"))),
+        Tile("left warped to right", holes,
+             ((HIDDEN, f"holes, {float(sample['hole'].mean()):.1%}"),), shrink="nearest"),
+        Tile("warped less right", difference,
+             (((0, 0, 0), f"equal; median {median:.1f} of 255"),
+              ((255, 255, 255), f"{MOST_DIFFERENT} of 255 apart or more"))),
     ]  # fmt: skip
 
 
@@ -223,16 +167,6 @@ def _difference(sample: Sample) -> tuple[Picture, float]:
     level = np.minimum(apart * (255 / MOST_DIFFERENT), 255).astype(np.uint8)
     level[~landed] = 0
     return np.repeat(level[..., None], 3, axis=-1), median
-
-
-def _key(entries: list[tuple[Colour, str]]) -> Callable[[Page, tuple[int, int], int], None]:
-    return lambda page, place, width_px: page.swatches(place, entries, width_px=width_px)
-
-
-def _bar(
-    scale: ColourScale, rows: list[list[Label]]
-) -> Callable[[Page, tuple[int, int], int], None]:
-    return lambda page, place, width_px: page.bar(place, scale, rows, width_px=width_px)
 
 
 CLIP_FIELDS: Final = ("left", "right", "disparity", "valid", "baseline_m")
@@ -264,43 +198,21 @@ def clip_pages(
     found = [
         reader.pair(row, pair=pair, frame=frame, fields=("disparity", "valid")) for frame in first
     ]
-    scale = scale_of(
+    scale = ColourScale.of(
         np.stack([sample["disparity"] for sample in found]),
         measured=np.stack([sample["valid"] for sample in found]),
     )
-    width_px = tile_width(scene, tile_px)
+    width_px, fx_px = tile_width(scene, tile_px), rig_intrinsics(scene.rig).fx_px
     for frame in range(scene.frames):
         sample = reader.pair(row, pair=pair, frame=frame, fields=CLIP_FIELDS)
         heading = f"{scene.id.key}, pair {pair[0]}-{pair[1]}, frame {frame}"
-        yield _page(scene, sample, scale, heading=heading, width_px=width_px)
-
-
-def _page(
-    scene: Scene, sample: Sample, scale: ColourScale, *, heading: str, width_px: int
-) -> Picture:
-    gap, line = _text_sizes(width_px)
-    left, right = (_channels_last(sample[name]) for name in ("left", "right"))
-    baseline_m = float(sample["baseline_m"])
-    disparity = scale.paint(sample["disparity"][0], measured=sample["valid"][0])
-    tiles = [
-        ("left", resized(left, width_px=width_px)),
-        (f"right, {baseline_m * 100:.2f} cm", resized(right, width_px=width_px)),
-        ("disparity, px (below: m)", resized(disparity, width_px=width_px, shrink="nearest")),
-        ("anaglyph", resized(anaglyph(sample["left"], sample["right"]), width_px=width_px)),
-    ]
-    height_px = tiles[0][1].shape[0]
-    top = gap + 2 * line
-    size = (len(tiles) * (width_px + gap) + gap, top + height_px + gap + 3 * line)
-    page = Page(size[0] + size[0] % 2, size[1] + size[1] % 2, font_px=gap)
-    page.text((gap, gap // 2), heading, width_px=size[0] - 2 * gap, colour=FAINT)
-    for column, (caption, tile) in enumerate(tiles):
-        at = gap + column * (width_px + gap)
-        page.text((at, top - line - 4), caption, width_px=width_px)
-        page.picture((at, top), tile)
-        if caption.startswith("disparity"):
-            rows = disparity_rows(scale, shift_px_m=rig_intrinsics(scene.rig).fx_px * baseline_m)
-            page.bar((at, top + height_px + gap // 2), scale, rows, width_px=width_px)
-    return page.finished()
+        tiles = [
+            *pair_tiles(sample, fx_px=fx_px, scale=scale),
+            Tile("anaglyph", anaglyph(sample["left"], sample["right"])),
+        ]
+        page = draw_sheet([heading], [tiles], width_px=width_px)
+        height, width = page.shape[:2]
+        yield np.pad(page, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 
 def write_clip(
@@ -346,17 +258,9 @@ def write_clip(
 
 
 def _write_mp4(file: Any, pages: Iterator[Picture], rate_hz: float) -> None:
-    rate = Fraction(rate_hz).limit_denominator(1001)
-    with av.open(file, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=rate, options={"crf": "18"})
-        for number, page in enumerate(pages):
-            if number == 0:
-                stream.height, stream.width = page.shape[:2]
-                stream.pix_fmt = "yuv420p"
-            frame = av.VideoFrame.from_ndarray(page, format="rgb24")
-            frame.pts, frame.time_base = number, 1 / rate
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+    with VideoEncoder(file, rate_hz=rate_hz, encoding=Encoding(crf=18)) as video:
+        for page in pages:
+            video.write_picture(page)
 
 
 def _write_gif(file: Any, pages: Iterator[Picture], rate_hz: float) -> None:

@@ -17,7 +17,6 @@ from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.pairs import require_pairs
 from stereogenbench_data.selection.plan import Address
-from stereogenbench_data.sources.cache import ShardCache
 
 OPEN_VIDEOS: Final = 6
 """How many videos the reading of one set of fields keeps open: those of a scene of one kind."""
@@ -30,23 +29,15 @@ class SceneReader:
     parallel. Only the last frame of each open video is kept.
     """
 
-    def __init__(
-        self,
-        index: SceneIndex,
-        *,
-        depth: DepthEncoding | None = None,
-        cache: ShardCache | None = None,
-    ) -> None:
+    def __init__(self, index: SceneIndex, *, depth: DepthEncoding | None = None) -> None:
         """Prepare to read; nothing is opened yet.
 
         Args:
             index: The index of the data.
             depth: A depth contract in place of that of files and release.
-            cache: A cache for remote data, or None.
         """
         self.index = index
         self.depth = depth
-        self._cache = cache
         self._lock = threading.Lock()
         self._loaders: dict[tuple[str, ...], tuple[SampleLoader, threading.Lock, bool]] = {}
 
@@ -91,7 +82,7 @@ class SceneReader:
             if fields not in self._loaders:
                 layout: Literal["single", "stacked"] = "stacked" if kind == "views" else "single"
                 request = Request(kind=kind, fields=fields, layout=layout, depth=self.depth)
-                loader = SampleLoader(self.index, request, cache=self._cache)
+                loader = SampleLoader(self.index, request)
                 loader.keep_open(OPEN_VIDEOS)
                 needs_depth = not request.streams.isdisjoint({"source_depth", "target_depth"})
                 self._loaders[fields] = (loader, threading.Lock(), needs_depth)
