@@ -28,8 +28,6 @@ CLIP_SIZE_PX: Final = 224
 CLIP_MEAN: Final = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD: Final = (0.26862954, 0.26130258, 0.27577711)
 
-_FREQUENCIES: Final = (1, 2)
-
 
 class GenStereo(AdaptedPairs[dict[str, torch.Tensor]]):
     """Items of GenStereo's dataset: what its training loop reads of a batch.
@@ -193,7 +191,7 @@ def _embedded_coordinates(height: int, width: int) -> torch.Tensor:
     """Return (10, h, w): x/w and y/h of each pixel, with their sines and cosines at 1 and 2 rad."""
     y, x = torch.meshgrid(torch.arange(height) / height, torch.arange(width) / width, indexing="ij")
     place = torch.stack([x, y])
-    waves = [wave(place * rate) for rate in _FREQUENCIES for wave in (torch.sin, torch.cos)]
+    waves = [wave(place * rate) for rate in (1, 2) for wave in (torch.sin, torch.cos)]
     return torch.cat([place, *waves])
 
 

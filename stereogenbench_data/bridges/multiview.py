@@ -165,27 +165,21 @@ def posed_images(sample: Sample) -> list[PosedImage]:
             f"the sample's pictures have shape {views[0][0].shape}: give samples of one frame and "
             "of single pairs or the views of one moment, not clips, sweeps or batches."
         )
-    return [_posed(arrays, int(camera), *view) for camera, view in zip(cameras, views, strict=True)]
-
-
-def _posed(
-    arrays: dict[str, Any], camera: int, picture: Any, depth: Any, world_from_cam: Any
-) -> PosedImage:
-    return PosedImage(
-        scene=arrays["scene"],
-        camera=camera,
-        frame=int(arrays["frame_index"]),
-        rgb=np.ascontiguousarray(picture.transpose(1, 2, 0)),
-        depth_m=depth[0],
-        intrinsics=arrays["intrinsics"],
-        world_from_cam=world_from_cam,
-    )
+    return [
+        PosedImage(
+            scene=arrays["scene"],
+            camera=int(camera),
+            frame=int(arrays["frame_index"]),
+            rgb=np.ascontiguousarray(picture.transpose(1, 2, 0)),
+            depth_m=depth[0],
+            intrinsics=arrays["intrinsics"],
+            world_from_cam=world_from_cam,
+        )
+        for camera, (picture, depth, world_from_cam) in zip(cameras, views, strict=True)
+    ]
 
 
 DATASET: Final = "StereoGenBench"
-
-DUST3R_CENTRE_PX: Final = 0.0
-"""Where DUSt3R puts the centre of the top-left pixel: `depthmap_to_camera_coordinates`."""
 
 
 def dust3r_views(sample: Sample) -> list[dict[str, Any]]:
@@ -212,7 +206,7 @@ def dust3r_views(sample: Sample) -> list[dict[str, Any]]:
             "img": Image.fromarray(image.rgb),
             "depthmap": np.ascontiguousarray(image.depth_m),
             "camera_pose": image.in_world(origin_at(images[0])).world_from_cam.astype(np.float32),
-            "camera_intrinsics": image.intrinsics_for(centre_px=DUST3R_CENTRE_PX).astype("f4"),
+            "camera_intrinsics": image.intrinsics_for(centre_px=0.0).astype("f4"),
             "dataset": DATASET,
             "label": f"{image.scene}/{image.frame:03d}",
             "instance": f"cam_{image.camera:02d}",
