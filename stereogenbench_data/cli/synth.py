@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -25,12 +25,11 @@ from stereogenbench_data.schema.release import (
     Subset,
 )
 from stereogenbench_data.schema.text import counted
+from stereogenbench_data.synthesis.request import Check, ExportContract, RotationForm, SynthRequest
 
 if TYPE_CHECKING:
     from stereogenbench_data.synthesis.renderer import Renderer
 
-RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
-"""The same as in `synthesis.request`, which the help does not import."""
 _ALL: str = "all"
 
 
@@ -77,7 +76,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
     ] = None,
     part: PartOption = "1/1",
     check: Annotated[
-        Literal["pictures", "audit"],
+        Check,
         typer.Option(help="What rendered scenes must pass; audit: also the audit and the doctor."),
     ] = "pictures",
     plan_only: Annotated[bool, flag("--plan-only", "Propose and filter, render nothing.")] = False,
@@ -111,7 +110,6 @@ def synth(  # noqa: PLR0913 - one parameter an option
     )
     from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
     from stereogenbench_data.synthesis.render import RAY_CASTING
-    from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
     from stereogenbench_data.synthesis.review import hold_out, write_sheets
 
     _require_options_agree(

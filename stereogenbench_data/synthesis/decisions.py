@@ -20,14 +20,12 @@ from typing import Any, Final
 import numpy as np
 
 from stereogenbench_data.errors import SynthesisError
-from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.jobs import json_bytes, read_json
 from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.synthesis.filters import LIMITS, Refusal
 from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.renderer import Renderer, ScenePlan
 from stereogenbench_data.synthesis.request import SynthRequest
-from stereogenbench_data.synthesis.trajectory import steps
 
 FOLDER: Final = ".generation"
 ALL_MAPS: Final = "all maps"
@@ -88,16 +86,9 @@ class Decision:
     @classmethod
     def of(cls, plan: ScenePlan, refused: list[Drawn]) -> "Decision":
         """Return the decision for a plan, after the proposals that were refused before it."""
-        axes = rotation_from_rotator_deg(plan.rotators_deg)
-        step_m, turn_deg = steps(plan.proposal.rig.eyes(plan.centres_m, axes), axes)
-        moved = len(step_m) > 0
-        return cls(
-            index=plan.proposal.index,
-            proposals=[*refused, Drawn.of(plan.proposal, None)],
-            step_m=float(step_m.mean()) if moved else 0.0,
-            turn_deg=float(turn_deg.mean()) if moved else 0.0,
-            splices=plan.splices,
-        )
+        step_m, turn_deg = (float(each.mean()) if len(each) else 0.0 for each in plan.steps())
+        accepted = Drawn.of(plan.proposal, None)
+        return cls(plan.proposal.index, [*refused, accepted], step_m, turn_deg, plan.splices)
 
     @property
     def refused(self) -> list[Drawn]:

@@ -6,18 +6,16 @@ map chooses. Angles are degrees; yaw turns from x towards y.
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64, UInt8
 
 from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
-from stereogenbench_data.selection.options import nearest_first
+from stereogenbench_data.selection.options import did_you_mean
 from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.request import SynthRequest
-
-_NEAREST: Final = 3
 
 Array = Any
 
@@ -160,6 +158,15 @@ class ScenePlan:
             size_px=self.request.picture_px,
         )
 
+    def steps(self) -> tuple[Float64[np.ndarray, " s"], Float64[np.ndarray, " s"]]:
+        """Return the largest way of a camera (m) and the rotation (degrees) from frame to frame."""
+        axes = rotation_from_rotator_deg(self.rotators_deg)
+        way = np.diff(self.proposal.rig.eyes(self.centres_m, axes), axis=0)
+        step_m = np.sqrt((way * way).sum(axis=2)).max(axis=1, initial=0)
+        apart = np.diff(axes, axis=0)
+        half_sine = np.sqrt((apart * apart).sum(axis=(1, 2)) / 8)
+        return step_m, 2 * np.degrees(np.arcsin(np.minimum(half_sine, 1)))
+
     def world_locations_cm(self, frame: int) -> Float64[np.ndarray, "6 3"]:
         """Return the six camera centres in the recorded world.
 
@@ -241,10 +248,8 @@ def unknown_map(where: str, name: str, known: Iterable[str], *, choose: str) -> 
     Args:
         where: What should have it.
         name: The map.
-        known: The maps that may be meant; the three nearest are named.
+        known: The maps that may be meant.
         choose: What there is to choose from.
     """
-    near = ", ".join(nearest_first(name, known)[:_NEAREST])
-    return SynthesisError(
-        f"{where}: there is no map {name!r}. Nearest: {near}. Choose by --map {choose}."
-    )
+    meant = did_you_mean(name, known)
+    return SynthesisError(f"{where}: there is no map {name!r}{meant} Choose by --map {choose}.")

@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
 
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import FRAME_RATE_HZ
@@ -64,15 +63,14 @@ def examine(proposal: Proposal, *, world: World) -> ScenePlan | Refusal:
     if isinstance(path, Refusal):
         return path
     centres_m, rotators_deg = search.poses(path, np.arange(frames))
-    refusal = search.check_motion(centres_m, rotators_deg)
-    if refusal is not None:
-        return refusal
-    checks = search.checks(centres_m, rotators_deg, frames=slice(None))
-    if not checks.passed.all():
-        return checks.refusal(int(checks.passed.argmin()))
     ahead = rotation_from_rotator_deg(rotators_deg)[..., 0]
     subject_m = ((body_m.mean(axis=1) - centres_m) * ahead).sum(axis=1)
-    return ScenePlan(proposal, spawn, centres_m, rotators_deg, subject_m, search.splices)
+    plan = ScenePlan(proposal, spawn, centres_m, rotators_deg, subject_m, search.splices)
+    refusal = _check_motion(plan)
+    checks = search.checks(centres_m, rotators_deg, frames=slice(None))
+    if refusal is None and not checks.passed.all():
+        refusal = checks.refusal(int(checks.passed.argmin()))
+    return refusal or plan
 
 
 class _Knot(NamedTuple):
@@ -229,33 +227,21 @@ class _Search:
         held = checks.passed[1:] & ~obstructed(eyes, world=self.world)
         return len(held) if held.all() else int(held.argmin())
 
-    def check_motion(self, centres_m: Array, rotators_deg: Array) -> Refusal | None:
-        """Refuse a path with a jump."""
-        axes = rotation_from_rotator_deg(rotators_deg)
-        eyes = self.rig.eyes(centres_m, axes)
-        step_m, turn_deg = steps(eyes, axes)
-        for name, values, limit in (
-            ("m a frame", step_m, LIMITS.step_m),
-            ("degrees a frame", turn_deg, LIMITS.turn_deg),
-            ("degrees a frame more or less", np.abs(np.diff(turn_deg)), LIMITS.jerk_deg),
-        ):
-            if values.max(initial=0) > limit:
-                return Refusal(
-                    "motion", float(values.max()), limit,
-                    f"{values.max():.3g} {name} at frame {int(values.argmax()) + 1}",
-                )  # fmt: skip
-        return None
 
-
-def steps(
-    eyes: Float64[np.ndarray, "t 6 3"], axes: Float64[np.ndarray, "t 3 3"]
-) -> tuple[Float64[np.ndarray, " s"], Float64[np.ndarray, " s"]]:
-    """Return the largest way of a camera, in metres, and the rotation in degrees, a frame."""
-    way = np.diff(eyes, axis=0)
-    step_m = np.sqrt((way * way).sum(axis=2)).max(axis=1, initial=0)
-    apart = np.diff(axes, axis=0)
-    half_sine = np.sqrt((apart * apart).sum(axis=(1, 2)) / 8)
-    return step_m, 2 * np.degrees(np.arcsin(np.minimum(half_sine, 1)))
+def _check_motion(plan: ScenePlan) -> Refusal | None:
+    """Refuse a path with a jump."""
+    step_m, turn_deg = plan.steps()
+    for name, values, limit in (
+        ("m a frame", step_m, LIMITS.step_m),
+        ("degrees a frame", turn_deg, LIMITS.turn_deg),
+        ("degrees a frame more or less", np.abs(np.diff(turn_deg)), LIMITS.jerk_deg),
+    ):
+        if values.max(initial=0) > limit:
+            return Refusal(
+                "motion", float(values.max()), limit,
+                f"{values.max():.3g} {name} at frame {int(values.argmax()) + 1}",
+            )  # fmt: skip
+    return None
 
 
 def _pulled(knot: _Knot, *, target: Array, frames: int) -> tuple[Array, Array]:

@@ -5,13 +5,11 @@ import re
 import shlex
 import subprocess
 import sys
-from typing import get_args
 
 import pytest
 import typer
 
 from stereogenbench_data.cli.commands import app
-from stereogenbench_data.cli.synth import RotationForm
 from stereogenbench_data.schema.release import FAMILIES
 from tests.cli.command import invoke, one_line, run
 
@@ -65,12 +63,6 @@ def test_every_option_says_what_it_is_and_a_flag_takes_no_value(path):
 def test_sixteen_commands_stand_at_the_top():
     assert len(COMMANDS) <= 16
     assert sum(len(call.params) for call in CALLS.values()) < 290
-
-
-def test_the_forms_of_rotations_are_those_that_can_be_written():
-    from stereogenbench_data.synthesis import request
-
-    assert get_args(RotationForm) == get_args(request.RotationForm)
 
 
 def completed(line):

@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 
 from stereogenbench_data.cli.synth import synth
 from stereogenbench_data.errors import SynthesisError
-from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import FAMILIES
 from stereogenbench_data.synthesis.decisions import (
     ALL_MAPS,
@@ -30,7 +29,6 @@ from stereogenbench_data.synthesis.render import RAY_CASTING, RayCasting
 from stereogenbench_data.synthesis.renderer import RenderedView
 from stereogenbench_data.synthesis.request import SynthRequest
 from stereogenbench_data.synthesis.review import hold_out, write_sheets
-from stereogenbench_data.synthesis.trajectory import steps
 
 app = typer.Typer()
 app.command()(synth)
@@ -55,8 +53,7 @@ def test_every_accepted_frame_passes_all_filters_and_moves_little(map_name):
         body_m = np.stack([world.subject_points_m(plan.spawn, frame=frame) for frame in frames])
 
         checks = check_poses(plan.centres_m, plan.rotators_deg, body_m=body_m, rig=rig, world=world)
-        axes = rotation_from_rotator_deg(plan.rotators_deg)
-        step_m, turn_deg = steps(rig.eyes(plan.centres_m, axes), axes)
+        step_m, turn_deg = plan.steps()
 
         assert checks.passed.all()
         assert step_m.max() <= LIMITS.step_m

@@ -92,7 +92,7 @@ class BlenderProcess:
         self._home.cleanup()
 
 
-_running: dict[tuple[int, str], BlenderProcess] = {}
+_running: dict[str, BlenderProcess] = {}
 
 
 def blender(place: str) -> BlenderProcess:
@@ -100,11 +100,11 @@ def blender(place: str) -> BlenderProcess:
 
     The three that were used last are kept, because proposals go from map to map.
     """
-    found = _running.pop((os.getpid(), place), None)
+    found = _running.pop(place, None)
     if found is None or not found.is_running:
         found = BlenderProcess()
-    _running[os.getpid(), place] = found
-    for old in [each for each in _running if each[0] == os.getpid()][:-_KEPT]:
+    _running[place] = found
+    for old in list(_running)[:-_KEPT]:
         _running.pop(old).close()
     return found
 
