@@ -14,8 +14,8 @@ from typing import Any, Final
 
 from stereogenbench_data.audit.conventions import Survey
 from stereogenbench_data.errors import StereoGenBenchError
+from stereogenbench_data.index.folders import SceneFolder, folder_of
 from stereogenbench_data.index.learning import Examined
-from stereogenbench_data.index.scene_folder import SceneFolder
 from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.schema.document import parse_object
 from stereogenbench_data.schema.parse import parse_scene_key
@@ -69,12 +69,12 @@ def _shape_lines(root: str, number: int, group: Sequence[Examined]) -> Iterator[
     yield f"shape {number}: {counted(len(group), 'scene')} ({', '.join(told)})"
     sizes: dict[str, list[int]] = {}
     for each in group:
-        for name, (size, _) in SceneFolder(root, each.key).stamps().items():
+        for name, (size, _) in folder_of(root, each.key).stamps().items():
             sizes.setdefault(re.sub(r"cam_\d\d", "cam_##", name), []).append(size)
     for name, found in sorted(sizes.items()):
         yield f"  {name}: {counted(len(found), 'file')}, {min(found):,} to {max(found):,} bytes"
     secrets = _secrets(group)
-    folder = SceneFolder(root, first.key)
+    folder = folder_of(root, first.key)
     for name in METADATA_FILES:
         if name in folder.stamps() and name.endswith(".json"):
             yield f"  {name}:"

@@ -51,6 +51,7 @@ AXES: Final[dict[str, tuple[tuple[int, int], ...]]] = {
 cameras are those of OpenGL."""
 
 _ALIASES: Final = {
+    "gltf": "opengl",
     "blender": "opengl", "gl": "opengl", "nerf": "opengl", "cv": "opencv", "colmap": "opencv",
     "ue": "unreal", "ue4": "unreal", "ue5": "unreal", "rotator": "unreal",
 }  # fmt: skip

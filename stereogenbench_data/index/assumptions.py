@@ -17,6 +17,7 @@ _PHRASES: Final = {
     "baselines": "baselines that are not recorded are sums of their neighbours",
     "pair": "the primary pair of baseline.json counts, where trajectory.json has another",
     "frames": "the frames that all videos have are used",
+    "lens": "a pinhole lens is assumed, where baseline.json states another model",
     "marker": "no scene has _scene_complete.json, so it is not known which were finished",
     "world": "several readings of the poses fit the baselines, and fields that depend on the "
     "reading are refused",

@@ -18,15 +18,15 @@ from stereogenbench_data.errors import (
     StorageError,
 )
 from stereogenbench_data.index.evidence import agreed_forms
+from stereogenbench_data.index.folders import folder_of, stamp_of
 from stereogenbench_data.index.journal import Journal
+from stereogenbench_data.index.parquet import IndexHead
 from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, json_of, scene_of_json
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
-    SceneFolder,
     ValidDepth,
     as_agreed,
     describe_scene,
-    stamp_of,
     unfinished,
 )
 from stereogenbench_data.index.tree import FoundScenes, find_remote_scenes, find_scene_folders
@@ -71,6 +71,13 @@ class TreeReport:
     broken: dict[str, str]
     notes: tuple[str, ...]
     is_part: bool
+
+    @property
+    def head(self) -> IndexHead:
+        """What an index of the scenes knows besides them."""
+        return IndexHead(
+            self.root, incomplete=self.incomplete, broken=self.broken, is_part=self.is_part
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,11 +224,13 @@ class DescribeTask:
         """Return what the scene is."""
         advance(0)
         files: dict[str, tuple[int, int]] = {}
+        folder = folder_of(self.root, key)
         try:
-            files = SceneFolder(self.root, key).stamps()
+            files = folder.stamps()
             scene = describe_scene(
-                self.root, key, valid_depth=self.valid_depth, conventions=self.conventions
-            )
+                self.root, key, valid_depth=self.valid_depth, conventions=self.conventions,
+                folder=folder,
+            )  # fmt: skip
         except StereoGenBenchError as error:
             return Outcome.of_error(key, error, files=files)
         return Outcome.of_scene(scene, stamp_of(files))
@@ -234,7 +243,7 @@ def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> d
         with suppress(
             StorageError, ValueError, KeyError, TypeError, IndexError, AttributeError
         ):  # of the folder, or of a damaged row: the scene is described again
-            stamp = stamp_of(SceneFolder(root, key).stamps())
+            stamp = stamp_of(folder_of(root, key).stamps())
             row = None if journal is None else journal.value(key, stamp=stamp)
             if row is not None:
                 outcomes[key] = Outcome.of_scene(scene_of_json(row), stamp)

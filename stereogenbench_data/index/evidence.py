@@ -36,6 +36,9 @@ most 25 degrees from the line on which they stand."""
 _EXACT: Final = 1e-3
 """How far the line of the cameras may be from their x axis, as a sine, in a form that no name
 supports; a rig that is recorded without rounding has 1e-9 or less."""
+_OFF_AXIS: Final = 0.0044
+"""The sine of a quarter of a degree: so far cameras that are parallel may stand off their x axis,
+where rotations are rounded to three digits."""
 _SAME: Final = 1e-4
 _UNREAL_M: Final = 0.01
 """Metres in the unit of poses whose file names none: Unreal's."""
@@ -285,6 +288,7 @@ def _checked(reading: Reading, rig: Rig) -> _Passed | str:
     distances = np.linalg.norm(steps, axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = float(np.median(baselines_cm / 100 / distances))
+        scaled_cm = distances * ratio * 100
     stated_m = reading.trajectory.unit_m
     unit_m = _unit_of(ratio, stated_m) or (stated_m if np.isfinite(stated_m) else _UNREAL_M)
     allowed_cm = _DEVIATION_CM + _DEVIATION_SHARE * baselines_cm
@@ -293,13 +297,12 @@ def _checked(reading: Reading, rig: Rig) -> _Passed | str:
         worst = int(np.argmax(away_cm - allowed_cm))
         frame, pair = divmod(worst, len(CAMERA_PAIRS))
         a, b = CAMERA_PAIRS[pair]
-        power = np.log10(ratio / unit_m) if 0 < ratio < np.inf else np.nan
-        scaled_cm = distances * unit_m * 100 * 10.0 ** np.round(power)
-        is_of_ten = bool((np.abs(scaled_cm - baselines_cm) <= allowed_cm).all())
+        is_scaled = bool((np.abs(scaled_cm - baselines_cm) <= allowed_cm).all())
+        is_told = is_scaled and np.isfinite(stated_m) and not 0.5 < ratio / unit_m < 2
         return (
             f"baseline.json says that cameras {a} and {b} are {baselines_cm[pair]:.6g} cm apart, "
             f"and by the poses they are {distances[frame, pair] * unit_m * 100:.6g} cm apart in "
-            f"frame {frame}{_IN_ANOTHER_UNIT if is_of_ten else ''}"
+            f"frame {frame}{_IN_ANOTHER_UNIT if is_told else ''}"
         )
     poses = replace(poses, unit_m=unit_m)
     lateral_m = lateral_offsets_m(poses)
@@ -315,7 +318,14 @@ def _checked(reading: Reading, rig: Rig) -> _Passed | str:
         )
     axes = poses.world_from_cam_rotations[..., 0][:, _LEFT]
     along = np.sum((steps @ OPENCV_FROM_UNREAL.T) * axes, axis=-1) / distances
-    return _Passed(reading, poses, float(np.sqrt(np.maximum(0.0, 1 - np.square(along))).max()))
+    off = float(np.sqrt(np.maximum(0.0, 1 - np.square(along))).max())
+    turns = poses.world_from_cam_rotations
+    if off > _OFF_AXIS and np.abs(turns - turns[:, :1]).max() <= _EXACT:
+        return (
+            f"the cameras look one way, and stand {np.degrees(np.arcsin(off)):.3g} degrees off "
+            f"the axis to their right"
+        )
+    return _Passed(reading, poses, off)
 
 
 def _unit_of(ratio: float, stated_m: float) -> float | None:

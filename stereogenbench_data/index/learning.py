@@ -17,7 +17,8 @@ import numpy as np
 from stereogenbench_data.errors import MediaError, SchemaError, StereoGenBenchError
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.index.evidence import understood_poses
-from stereogenbench_data.index.scene_folder import IncompleteScene, SceneFolder, describe_scene
+from stereogenbench_data.index.folders import SceneFolder, folder_of
+from stereogenbench_data.index.scene_folder import IncompleteScene, describe_scene
 from stereogenbench_data.index.tree import find_remote_scenes, find_scene_folders
 from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.media.video import probe
@@ -120,10 +121,10 @@ def chosen_scenes(
     spread = [key for each in rounds for key in each if key is not None]
     chosen, others = spread[:count], spread[count:]
     if not is_remote(root) and others:
-        known = {_keys(SceneFolder(root, key), (BASELINE_JSON,)) for key in chosen}
+        known = {_keys(folder_of(root, key), (BASELINE_JSON,)) for key in chosen}
         step = max(1, len(others) // _KEYS_READ)
         for key in others[::step][:_KEYS_READ]:
-            keys_there = _keys(SceneFolder(root, key), (BASELINE_JSON,))
+            keys_there = _keys(folder_of(root, key), (BASELINE_JSON,))
             if keys_there not in known and len(chosen) < count + _MORE_SHAPES:
                 known.add(keys_there)
                 chosen.append(key)
@@ -149,7 +150,7 @@ def examine(root: str | Path, key: str, *, conventions: Conventions | None = Non
         IncompleteScene: If it has no videos.
         StorageError: If its folder cannot be read.
     """
-    folder = SceneFolder(root, key)
+    folder = folder_of(root, key)
     files = folder.stamps()
     scene, problem = None, ""
     try:
@@ -158,7 +159,7 @@ def examine(root: str | Path, key: str, *, conventions: Conventions | None = Non
         raise
     except StereoGenBenchError as error:
         problem = str(error)
-    shape, notes, unknown = Shape(numbers={}), Notes(), list[str]()
+    shape, notes, unknown = Shape(), Notes(), list[str]()
     with suppress(StereoGenBenchError, KeyError):  # `describe_scene` has told the problem
         seen = see_rig(folder.read(BASELINE_JSON), where=f"{key}/{BASELINE_JSON}")
         shape, notes, unknown = seen.shape, seen.found, seen.unknown
@@ -180,8 +181,8 @@ def _sized(shape: Shape, scene: Scene) -> Shape:
     """Return a shape without an image size that the videos contradict, as theirs counts."""
     if not scene.remark("size"):
         return shape
-    numbers = {name: at for name, at in shape.numbers.items() if not name.startswith("image_")}
-    return replace(shape, numbers=numbers)
+    at = {name: each for name, each in shape.at.items() if not name.startswith("image_")}
+    return replace(shape, at=at)
 
 
 def _note_camera(scene: Scene, notes: Notes) -> None:

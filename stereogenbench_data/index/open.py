@@ -9,6 +9,7 @@ An index file may come from a stranger: it opens data beside itself, and any oth
 user's own word.
 """
 
+import functools
 import gc
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -115,16 +116,10 @@ def open_table(
     at the caller's caller.
     """
     named_root = None if root is None else _require_root(root)
+    open_tree = functools.partial(_open_tree, wanted=wanted, conventions=conventions, rows=rows)
     if is_remote(data):
         where = shown(data)
-        opened = _open_url(
-            str(data),
-            root=named_root,
-            retry=retry,
-            wanted=wanted,
-            conventions=conventions,
-            rows=rows,
-        )
+        opened = _open_url(str(data), root=named_root, retry=retry, open_tree=open_tree)
     else:
         path = local_path(data)
         where = str(path)
@@ -135,7 +130,7 @@ def open_table(
             raise StorageError(describe_os_error(f"{path}: cannot be looked at", error)) from error
         if is_tree:
             _require_no_root(path, named_root)
-            opened = _open_tree(path, wanted, rows=rows, conventions=conventions)
+            opened = open_tree(path)
         elif is_folder or is_file:
             file = path / INDEX_NAME if is_folder else path
             opened = _open_file(file, root=named_root)
@@ -193,9 +188,7 @@ def _open_url(
     *,
     root: str | None,
     retry: RetryPolicy | None,
-    wanted: Callable[[SceneId], bool] | None,
-    conventions: Conventions | None,
-    rows: Rows,
+    open_tree: Callable[[str], Opened],
 ) -> Opened:
     """Fetch an index. Its data are beside it, unless the user names another root."""
     beside, name = split_name(url)
@@ -209,7 +202,7 @@ def _open_url(
         if not is_folder:
             raise
         _require_no_root(shown(beside), root)
-        return _open_tree(beside, wanted, rows=rows, conventions=conventions)
+        return open_tree(beside)
     if size > MAX_INDEX_BYTES:
         raise StorageError(
             f"{remote.where}: an index may have {MAX_INDEX_BYTES:,} bytes, this one has "
@@ -225,8 +218,8 @@ def _open_url(
 
 def _open_tree(
     root: str | Path,
-    wanted: Callable[[SceneId], bool] | None,
     *,
+    wanted: Callable[[SceneId], bool] | None,
     rows: Rows,
     conventions: Conventions | None,
 ) -> Opened:
@@ -356,16 +349,10 @@ def _of_report(report: "TreeReport") -> Opened:
             f"{where}: {_listed(report.broken)}\nRepair or remove them; or leave them out on "
             f"purpose: `stereogenbench index {where}` makes an index without them."
         )
-    head = IndexHead(
-        root=report.root,
-        incomplete=report.incomplete,
-        broken=report.broken,
-        is_part=report.is_part,
-    )
     table = table_of_scenes(report.scenes, where=where)
     return Opened(
         table,
-        head,
+        report.head,
         seek_tables=seek_tables_of(report.scenes),
         assumed=_assumed_of(table, where=where),
     )

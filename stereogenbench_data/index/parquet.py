@@ -9,7 +9,6 @@ import json
 import math
 import os
 import re
-import sys
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -27,13 +26,19 @@ from stereogenbench_data.errors import (
 )
 from stereogenbench_data.index import compute as pc
 from stereogenbench_data.index.arrow import as_numpy, one_array
-from stereogenbench_data.index.rows import ADDED, SCHEMA, SEEK_COLUMN, TRAINING_COLUMNS, row_of
+from stereogenbench_data.index.rows import (
+    ADDED,
+    COLUMNS,
+    SCHEMA,
+    SEEK_COLUMN,
+    TRAINING_COLUMNS,
+    row_of,
+)
 from stereogenbench_data.schema.conventions import shape_of_text
 from stereogenbench_data.schema.document import MOST_LETTERS
 from stereogenbench_data.schema.records import REMARKS, Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.text import shortened
-from stereogenbench_data.schema.training import MOST_PSNR_DB
 from stereogenbench_data.sources.files import open_atomic
 from stereogenbench_data.sources.location import is_remote, local_path, shown
 from stereogenbench_data.sources.members import UNSAFE_PATH
@@ -217,8 +222,7 @@ def _with_added(table: pa.Table) -> pa.Table:
     missing = [SCHEMA.field(name) for name in ADDED if name not in table.column_names]
     for added in missing:
         table = table.append_column(added, pa.nulls(table.num_rows, added.type))
-    is_whole = {*table.column_names} == {*SCHEMA.names}
-    return table.select(SCHEMA.names) if missing and is_whole else table
+    return table.select(SCHEMA.names)
 
 
 def write_index_file(
@@ -343,19 +347,7 @@ def _are_shard_facts(value: Any) -> bool:
 
 def require_sound(table: pa.Table, *, where: str) -> None:
     """Refuse a table that is not an index, or whose paths could lead out of the root."""
-    if not table.schema.equals(SCHEMA):
-        odd = [
-            field.name
-            for field in SCHEMA
-            if field.name not in table.schema.names
-            or not table.schema.field(field.name).equals(field)
-        ]
-        raise StorageError(
-            f"{where}: its columns are not those of an index (see {', '.join(odd) or 'order'}). "
-            f"{made_again(where)}"
-        )
     members = pc.list_flatten(table.column("members"))
-    _require_lengths(table, members, where=where)
     keys = table.column("key").to_pylist()
     for key, following in itertools.pairwise(keys):
         if key >= following:
@@ -374,101 +366,75 @@ def require_sound(table: pa.Table, *, where: str) -> None:
                 f"{where}: {shortened(unsafe[0].as_py())!r} is not a path inside the data's root. "
                 f"The index was altered. {made_again(where)}"
             )
-    _require_texts(table, where=where)
-    for text in pc.unique(table.column("conventions")).drop_null().to_pylist():
-        try:
-            shape_of_text(text)
-        except SchemaError as error:
-            raise _odd(where, "conventions", text, f"not understood ({error})") from error
-    about = pc.struct_field(pc.list_flatten(table.column("remarks")), "about")
-    odd = [text for text in pc.unique(about).to_pylist() if text not in REMARKS]
-    if odd:
-        raise _odd(where, "remarks", odd[0], f"not about one of {', '.join(REMARKS)}")
-    _require_numbers(table, members, where=where)
+    remarks = pc.list_flatten(table.column("remarks"))
+    checks: list[tuple[str, Any, tuple[float, float] | str | None]] = [
+        (name, table.column(name), column.allowed) for name, column in COLUMNS.items()
+    ]
+    checks += [(name, pc.struct_field(members, name), None) for name in ("name", "path")]
+    checks += [(name, pc.struct_field(members, name), _OF_BYTES) for name in ("offset", "size")]
+    about = f"^({'|'.join(REMARKS)})$"
+    for name, known in (("text", None), ("about", about)):
+        checks.append((name, pc.struct_field(remarks, name), known))
+    for name, values, allowed in checks:
+        _require_allowed(name, values, allowed, where=where)
+    _require_whole(table, where=where)
 
 
-def _require_lengths(table: pa.Table, members: Any, *, where: str) -> None:
-    columns = {name: table.column(name) for name in SCHEMA.names}
-    texts = {name: column for name, column in columns.items() if pa.types.is_string(column.type)}
-    for name in ("depth_unit_source", "depth_codec", "depth_pixel_format"):
-        texts[name] = pc.list_flatten(columns[name])
-    remarks = pc.list_flatten(columns["remarks"])
-    texts |= {f"a remark's {name}": pc.struct_field(remarks, name) for name in ("about", "text")}
-    texts |= {f"a member's {name}": pc.struct_field(members, name) for name in ("name", "path")}
-    for name, column in texts.items():
-        most = _LONGEST_NAME if name in ("family", "map_name") else MOST_LETTERS
-        length = pc.max(pc.utf8_length(column)).as_py() or 0
-        if length > most:
+def _require_allowed(
+    name: str, values: Any, allowed: tuple[float, float] | str | None, *, where: str
+) -> None:
+    """Refuse numbers out of bounds, and texts of another pattern."""
+    values = one_array(values).drop_null()
+    kind = values.type
+    if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
+        is_of_cameras = pa.types.is_list(kind) and allowed is not None
+        if is_of_cameras and (as_numpy(pc.list_value_length(values)) != CAMERA_COUNT).any():
+            raise _odd(where, name, values[0].as_py(), "not a number for each camera")
+        values = values.flatten()
+    if pa.types.is_string(values.type):
+        length = pc.max(pc.utf8_length(values)).as_py() or 0
+        if length > MOST_LETTERS:
             raise StorageError(
-                f"{where}: {name} of a scene has {length:,} letters, and it may have {most:,}. "
-                f"The index was altered. {made_again(where)}"
+                f"{where}: {name} of a scene has {length:,} letters, and it may have "
+                f"{MOST_LETTERS:,}. The index was altered. {made_again(where)}"
             )
-
-
-def _require_texts(table: pa.Table, *, where: str) -> None:
-    for name, known in _KNOWN.items():
-        texts = table.column(name) if name in _PLAIN_TEXTS else pc.list_flatten(table.column(name))
-        odd = [text for text in pc.unique(texts).to_pylist() if text not in known]
+    if isinstance(allowed, str):
+        odd = values.filter(pc.invert(pc.match_substring_regex(values, allowed))).to_pylist()
         if odd:
-            options = ", ".join(str(each) for each in known)
-            raise _odd(where, name, odd[0], f"none of {options}")
-    for name, form in _FORMS.items():
-        texts = table.column(name)
-        odd = texts.filter(pc.invert(pc.match_substring_regex(texts, form)))
-        if len(odd):
-            raise _odd(where, name, odd[0].as_py(), "not what training shards say")
-    for text in pc.unique(table.column("training_settings")).drop_null().to_pylist():
-        try:
-            is_object = isinstance(json.loads(text), dict)
-        except (ValueError, RecursionError):
-            is_object = False
-        if not is_object:
-            raise _odd(where, "training_settings", text, "not a JSON object")
-    for name in ("family", "map_name"):
-        texts = table.column(name)
-        odd = texts.filter(pc.match_substring_regex(texts, r"^$|[/\\\x00-\x1f]"))
-        if len(odd):
-            raise _odd(where, name, odd[0].as_py(), "not a folder's name")
-
-
-def _require_numbers(table: pa.Table, members: Any, *, where: str) -> None:
-    # In numpy: compared with a number, Arrow would import pandas.
-    columns = {name: table.column(name) for name in _BOUNDS}
-    columns |= {name: pc.struct_field(members, name) for name in ("offset", "size")}
-    numbers = {name: as_numpy(column.drop_null()) for name, column in columns.items()}
-    sources = as_numpy(table.column("depth_unit_source"))
-    numbers["depth_unit_m"] = as_numpy(table.column("depth_unit_m"))[sources != "unreadable"]
-    for name, (least, most) in (_BOUNDS | _MEMBER_BOUNDS).items():
-        flat = numbers[name].ravel()
-        odd = flat[~((flat >= least) & (flat <= most))]
+            raise _odd(where, name, odd[0], f"not {allowed}")
+    elif allowed is not None:
+        numbers, (least, most) = as_numpy(values), allowed
+        is_unknown = np.isnan(numbers) if name in _MAY_BE_NAN else False
+        odd = numbers[~(is_unknown | ((numbers >= least) & (numbers <= most)))]
         if len(odd):
             bounds = [each if isinstance(each, int) else f"{each:g}" for each in (least, most)]
             raise _odd(where, name, odd[0].item(), f"not {bounds[0]} to {bounds[1]}")
+
+
+_OF_BYTES: Final = (0, 2**61)
+_MAY_BE_NAN: Final = ("depth_unit_m", "psnr_db", "worst_psnr_db")
+
+
+def _require_whole(table: pa.Table, *, where: str) -> None:
+    """Refuse texts that are not understood, and columns that contradict each other."""
+    for name, parse in (("conventions", shape_of_text), ("training_settings", json.loads)):
+        for text in pc.unique(table.column(name)).drop_null().to_pylist():
+            try:
+                parse(text)
+            except (SchemaError, ValueError, RecursionError) as error:
+                raise _odd(where, name, text, f"not understood ({error})") from error
     if pc.any(pc.equal(table.column("primary_left"), table.column("primary_right"))).as_py():
         raise StorageError(f"{where}: a primary pair has a camera twice. {made_again(where)}")
-    _require_key_frames(table, where=where)
+    unknown = np.isnan(as_numpy(table.column("depth_unit_m")))
+    if (unknown & (as_numpy(table.column("depth_unit_source")) != "unreadable")).any():
+        raise _odd(where, "depth_unit_m", math.nan, "not a unit, though files state one")
     for what, names in (
         ("a principal point has one number only", ("principal_x_px", "principal_y_px")),
         ("a recorded size has one number only", ("recorded_width_px", "recorded_height_px")),
         ("what training shards say of a scene is there in part only", TRAINING_COLUMNS),
     ):
-        unknown = [pc.is_null(table.column(name)) for name in names]
-        if any(pc.any(pc.not_equal(unknown[0], other)).as_py() for other in unknown[1:]):
+        if len({tuple(pc.is_null(table.column(name)).to_pylist()) for name in names}) > 1:
             raise StorageError(f"{where}: {what}. {made_again(where)}")
-    offsets = one_array(table.column("depth_offset_m")).drop_null()
-    flat = as_numpy(offsets.flatten())
-    is_whole = (as_numpy(pc.list_value_length(offsets)) == CAMERA_COUNT).all()
-    if not (is_whole and np.isfinite(flat).all()):
-        raise _odd(where, "depth_offset_m", flat[:1].tolist(), "not metres for each camera")
-    for name in ("psnr_db", "worst_psnr_db"):
-        lists = one_array(table.column(name)).drop_null()
-        flat = as_numpy(lists.flatten())
-        odd = flat[~(np.isnan(flat) | ((flat >= 0) & (flat <= MOST_PSNR_DB)))].tolist()
-        if odd or (as_numpy(pc.list_value_length(lists)) != CAMERA_COUNT).any():
-            raise _odd(where, name, odd[:1], f"not one of 0 to {MOST_PSNR_DB:g} dB for each camera")
-
-
-def _require_key_frames(table: pa.Table, *, where: str) -> None:
     lists = one_array(table.column("key_frames"))
     flat = as_numpy(lists.flatten()).astype(np.int64)
     scenes = as_numpy(pc.list_parent_indices(lists))
@@ -486,43 +452,3 @@ def _odd(where: str, name: str, found: Any, why: str) -> StorageError:
         f"{where}: {name} is {shortened(repr(found))}, {why}. The index was altered. "
         f"{made_again(where)}"
     )
-
-
-_FORMS: Final = {
-    "training_source": r"^[0-9a-f]{64}$",
-    "training_quality": r"^[A-Za-z0-9_.+-]{1,40}$",
-    "training_codec": r"^[A-Za-z0-9_.+-]{1,40}$",
-}
-"""What texts about training shards look like: they are shown."""
-_PLAIN_TEXTS: Final = ("split", "subset", "image_size_source")
-_KNOWN: Final = {
-    "split": ("train", "eval"),
-    "subset": ("seen_map", "unseen_map", None),
-    "image_size_source": ("recorded", "default"),
-    "depth_unit_source": ("tag", "metadata", "default", "conventions", "unreadable"),
-}
-_OF_BYTES: Final = (0, 2**61)
-_ABOVE: Final = (sys.float_info.min, sys.float_info.max)
-_FINITE: Final = (-sys.float_info.max, sys.float_info.max)
-_LONGEST_NAME: Final = 255
-_BOUNDS: Final = {
-    "focal_mm": _ABOVE,
-    "sensor_width_mm": _ABOVE,
-    "sensor_height_mm": _ABOVE,
-    "image_width_px": (1, 2**16),
-    "image_height_px": (1, 2**16),
-    "recorded_width_px": (1, 2**16),
-    "recorded_height_px": (1, 2**16),
-    "baselines_cm": _ABOVE,
-    "primary_left": (0, CAMERA_COUNT - 1),
-    "primary_right": (0, CAMERA_COUNT - 1),
-    "frames": (1, 2**17),
-    "frame_rate_hz": (0, sys.float_info.max),
-    "lateral_m": _FINITE,
-    "rig_residual_px": (0, math.inf),
-    "principal_x_px": _FINITE,
-    "principal_y_px": _FINITE,
-    "valid_depth_ratio": (0, 1),
-}
-"""The least and the greatest number of a column. Nan is refused; unknown values are null."""
-_MEMBER_BOUNDS: Final = {"offset": _OF_BYTES, "size": _OF_BYTES, "depth_unit_m": _ABOVE}

@@ -24,7 +24,6 @@ import numpy as np
 
 from stereogenbench_data.errors import SchemaError, StereoGenBenchError, StorageError
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
-from stereogenbench_data.index.alike_rigs import Parsed, RigReader
 from stereogenbench_data.index.build import (
     ALIKE,
     POOL_FROM,
@@ -34,10 +33,15 @@ from stereogenbench_data.index.build import (
     report_of,
 )
 from stereogenbench_data.index.evidence import agreed_forms
-from stereogenbench_data.index.remote_tree import Files, RemoteFolder, RemoteTree, in_parallel
+from stereogenbench_data.index.folders import (
+    Files,
+    RemoteFolder,
+    SceneFolder,
+    in_parallel,
+    stamp_of,
+)
 from stereogenbench_data.index.scene_folder import (
     DESCRIPTIONS,
-    SceneFolder,
     as_agreed,
     as_kept,
     assumed_places_m,
@@ -48,14 +52,25 @@ from stereogenbench_data.index.scene_folder import (
     missing_video,
     require_finished,
     sized_as_videos,
-    stamp_of,
     unfinished,
 )
-from stereogenbench_data.index.tree import FoundScenes
+from stereogenbench_data.index.tree import FoundScenes, RemoteTree
 from stereogenbench_data.index.tree_cache import TreeCache
 from stereogenbench_data.schema.conventions import Conventions
-from stereogenbench_data.schema.parse import parse_complete, parse_scene_key, require_unit
-from stereogenbench_data.schema.records import Member, Remark, Scene, SceneId, SceneLabels
+from stereogenbench_data.schema.parse import (
+    parse_complete,
+    parse_rig,
+    parse_scene_key,
+    require_unit,
+)
+from stereogenbench_data.schema.records import (
+    Member,
+    Remark,
+    Rig,
+    Scene,
+    SceneId,
+    SceneLabels,
+)
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
     CAMERA_PAIRS,
@@ -152,8 +167,7 @@ class ListedTree:
         try:
             folder = self.folder(key)
             files = folder.stamps()
-            if isinstance(folder, RemoteFolder):
-                folder.fetch([BASELINE_JSON, COMPLETE_JSON, TRAJECTORY_JSON, *VIDEO_FILES])
+            folder.fetch([BASELINE_JSON, COMPLETE_JSON, TRAJECTORY_JSON, *VIDEO_FILES])
             scene = describe_scene(self.root, key, conventions=self.conventions, folder=folder)
         except StereoGenBenchError as error:
             return Outcome.of_error(key, error, files=files)
@@ -224,7 +238,7 @@ class _Metadata:
 
     id: SceneId
     files: Files
-    parsed: Parsed | None
+    parsed: tuple[Rig, SceneLabels, tuple[Remark, ...]] | None
     marked: SceneLabels
 
 
@@ -292,7 +306,7 @@ def _listed(tree: ListedTree) -> Iterator[tuple[str, _Metadata | StereoGenBenchE
 
 def _metadata(tree: ListedTree) -> Iterator[tuple[str, _Metadata | StereoGenBenchError]]:
     """Yield what the small JSON files of each scene say, or why the scene cannot be used."""
-    rigs = RigReader(None if tree.conventions is None else tree.conventions.shapes[0])
+    shape = None if tree.conventions is None else tree.conventions.shapes[0]
 
     def baseline_text(key: str) -> tuple[Files, bytes] | StereoGenBenchError:
         try:
@@ -315,7 +329,7 @@ def _metadata(tree: ListedTree) -> Iterator[tuple[str, _Metadata | StereoGenBenc
             continue
         try:
             scene_id, where = parse_scene_key(key), f"{key}/{BASELINE_JSON}"
-            rig, labels, odd = rigs.read(read[1], where=where)
+            rig, labels, odd = parse_rig(read[1], where=where, shape=shape)
             parsed = rig, labels, (*odd, *require_unit(rig, family=scene_id.family, where=where))
             marked = SceneLabels()
             is_lacking = labels.character is None or labels.animation is None
@@ -500,9 +514,8 @@ class Presumption:
             stamp = stamp_of(folder.stamps())
             scene = tree.cache.scene(key, stamp=stamp, part=part)
             if scene is None:
-                if isinstance(folder, RemoteFolder):
-                    texts = BASELINE_JSON, COMPLETE_JSON, TRAJECTORY_JSON, *DESCRIPTIONS
-                    folder.fetch([*texts, *(videos or ())])
+                texts = BASELINE_JSON, COMPLETE_JSON, TRAJECTORY_JSON, *DESCRIPTIONS
+                folder.fetch([*texts, *(videos or ())])
                 scene = describe_scene(
                     tree.root, key, conventions=tree.conventions, folder=folder, videos=videos
                 )

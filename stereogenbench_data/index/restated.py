@@ -4,7 +4,6 @@ The rows were described before, so that only what they say can be confirmed: the
 some scenes are read again by the conventions. The depth contract is taken over by all rows.
 """
 
-import math
 from dataclasses import replace
 from typing import Any, Final
 
@@ -15,12 +14,13 @@ from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.parquet import IndexHead, made_again
 from stereogenbench_data.index.rows import SCHEMA, scene_of
 from stereogenbench_data.index.scene_folder import metadata_differences
-from stereogenbench_data.schema.conventions import Conventions, Shape
+from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.release import BASELINE_JSON, CAMERA_COUNT, TRAJECTORY_JSON
 from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.members import MemberSource
 from stereogenbench_data.sources.retry import RetryPolicy
 
+_OF_DEPTH: Final = ("key", "depth_unit_m", "depth_offset_m", "depth_unit_source")
 _READ_AGAIN: Final = 3
 """How many scenes' files are read again by the conventions."""
 
@@ -57,8 +57,13 @@ def restated(
             )
     replaced: dict[str, Any] = {"conventions": texts[0]}
     encoding = None if shape.depth is None else shape.depth.encoding
-    if encoding is not None and encoding.unit_m is not None:
-        _require_tags(table, shape, where=where)
+    if shape.depth is not None and encoding is not None and encoding.unit_m is not None:
+        columns = (table.column(name).to_pylist() for name in _OF_DEPTH)
+        for key, units_m, offsets_m, sources in zip(*columns, strict=True):
+            stated = zip(units_m, offsets_m or [0.0] * CAMERA_COUNT, sources, strict=True)
+            for unit_m, stored_m, source in stated:
+                if source not in ("default", "unreadable"):
+                    shape.depth.require(unit_m, stored_m, where=f"{where}: {key}")
         offset_m = encoding.offset_m
         replaced["depth_unit_m"] = [encoding.unit_m] * CAMERA_COUNT
         replaced["depth_unit_source"] = ["conventions"] * CAMERA_COUNT
@@ -67,19 +72,3 @@ def restated(
         column = pa.array([value] * table.num_rows, type=SCHEMA.field(name).type)
         table = table.set_column(SCHEMA.get_field_index(name), SCHEMA.field(name), column)
     return table.combine_chunks()
-
-
-def _require_tags(table: pa.Table, shape: Shape, *, where: str) -> None:
-    depth = shape.depth
-    if depth is None:
-        return
-    known_m = depth.instead_of_tag_m or depth.encoding.unit_m or math.nan
-    columns = (table.column(name) for name in ("key", "depth_unit_m", "depth_unit_source"))
-    for key, units_m, sources in zip(*(column.to_pylist() for column in columns), strict=True):
-        for unit_m, source in zip(units_m, sources, strict=True):
-            if source not in ("default", "unreadable") and not math.isclose(unit_m, known_m):
-                raise StorageError(
-                    f"{where}: {key}: a {source} states {unit_m:g} m in a stored unit of depth, "
-                    f"and the conventions expect {known_m:g} m. Correct unit_m in [depth]; or, if "
-                    f"the tag is known to be wrong, add instead_of_tag_m = {unit_m:g}."
-                )

@@ -4,8 +4,10 @@
 """
 
 import base64
+import math
+import sys
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Final
 
 import pyarrow as pa
@@ -20,6 +22,7 @@ from stereogenbench_data.schema.records import (
     TrainingFacts,
 )
 from stereogenbench_data.schema.release import CAMERA_COUNT, CAMERA_PAIRS
+from stereogenbench_data.schema.training import MOST_PSNR_DB
 
 _MEMBER: Final = pa.struct(
     [
@@ -45,61 +48,92 @@ _NUMBER: Final = pa.float64()
 _TEXTS: Final = _list(_TEXT, CAMERA_COUNT)
 _NUMBERS: Final = _list(_NUMBER, CAMERA_COUNT)
 
-_REQUIRED: Final = False
-_NULLABLE: Final = True
-_COLUMNS: Final[dict[str, tuple[pa.DataType, bool, tuple[str | int, ...]]]] = {
-    "key": (_TEXT, _REQUIRED, ("id", "key")),
-    "split": (_TEXT, _REQUIRED, ("id", "split")),
-    "subset": (_TEXT, _NULLABLE, ("id", "subset")),
-    "family": (_TEXT, _REQUIRED, ("id", "family")),
-    "map_name": (_TEXT, _REQUIRED, ("id", "map_name")),
-    "scene_label": (_TEXT, _NULLABLE, ("labels", "scene_label")),
-    "scene_index": (_INTEGER, _NULLABLE, ("labels", "scene_index")),
-    "label_map_name": (_TEXT, _NULLABLE, ("labels", "map_name")),
-    "map_path": (_TEXT, _NULLABLE, ("labels", "map_path")),
-    "character": (_TEXT, _NULLABLE, ("labels", "character")),
-    "animation": (_TEXT, _NULLABLE, ("labels", "animation")),
-    "aperture_fstop": (_NUMBER, _NULLABLE, ("labels", "aperture_fstop")),
-    "caption": (_TEXT, _REQUIRED, ("caption",)),
-    "focal_mm": (_NUMBER, _REQUIRED, ("rig", "focal_mm")),
-    "sensor_width_mm": (_NUMBER, _REQUIRED, ("rig", "sensor_width_mm")),
-    "sensor_height_mm": (_NUMBER, _REQUIRED, ("rig", "sensor_height_mm")),
-    "image_width_px": (_INTEGER, _REQUIRED, ("rig", "image_width_px")),
-    "image_height_px": (_INTEGER, _REQUIRED, ("rig", "image_height_px")),
-    "image_size_source": (_TEXT, _REQUIRED, ("rig", "image_size_source")),
-    "principal_x_px": (_NUMBER, _NULLABLE, ("rig", "principal_point_px", 0)),
-    "principal_y_px": (_NUMBER, _NULLABLE, ("rig", "principal_point_px", 1)),
-    "baselines_cm": (_list(_NUMBER, len(CAMERA_PAIRS)), _REQUIRED, ("rig", "baselines_cm")),
-    "primary_left": (_INTEGER, _REQUIRED, ("rig", "primary_pair", 0)),
-    "primary_right": (_INTEGER, _REQUIRED, ("rig", "primary_pair", 1)),
-    "frames": (_INTEGER, _REQUIRED, ("frames",)),
-    "frame_rate_hz": (_NUMBER, _REQUIRED, ("frame_rate_hz",)),
-    "lateral_m": (_NUMBERS, _REQUIRED, ("lateral_m",)),
-    "rig_residual_px": (_NUMBER, _REQUIRED, ("rig_residual_px",)),
-    "depth_unit_m": (_NUMBERS, _REQUIRED, ("depth_unit_m",)),
-    "depth_unit_source": (_TEXTS, _REQUIRED, ("depth_unit_source",)),
-    "depth_codec": (_TEXTS, _REQUIRED, ("depth_codec",)),
-    "depth_pixel_format": (_TEXTS, _REQUIRED, ("depth_pixel_format",)),
-    "valid_depth_ratio": (_NUMBER, _NULLABLE, ("valid_depth_ratio",)),
-    "key_frames": (_list(pa.int32()), _NULLABLE, ("key_frames",)),
-    "recorded_width_px": (_INTEGER, _NULLABLE, ("rig", "recorded_size_px", 0)),
-    "recorded_height_px": (_INTEGER, _NULLABLE, ("rig", "recorded_size_px", 1)),
-    "training_source": (_TEXT, _NULLABLE, ("training", "source_digest")),
-    "training_quality": (_TEXT, _NULLABLE, ("training", "quality")),
-    "training_codec": (_TEXT, _NULLABLE, ("training", "codec")),
-    "training_settings": (_TEXT, _NULLABLE, ("training", "settings")),
-    "psnr_db": (_list(_NUMBER), _NULLABLE, ("training", "psnr_db")),
-    "worst_psnr_db": (_list(_NUMBER), _NULLABLE, ("training", "worst_psnr_db")),
-    "remarks": (_list(_REMARK), _NULLABLE, ("remarks",)),
-    "pose_form": (_TEXT, _NULLABLE, ("pose_form",)),
-    "depth_offset_m": (_list(_NUMBER), _NULLABLE, ("depth_offset_m",)),
-    "conventions": (_TEXT, _NULLABLE, ("conventions",)),
-    "members": (_list(_MEMBER), _REQUIRED, ("members",)),
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of the index.
+
+    Attributes:
+        kind: Its type; lists of any length are of numbers, one for each camera, but for key frames.
+        place: Where `Scene` holds its value: fields, and the number of a part of a tuple.
+        allowed: The least and the greatest number, or the pattern of texts; None for any.
+        is_nullable: Whether its value may be unknown.
+    """
+
+    kind: pa.DataType
+    place: str
+    allowed: tuple[float, float] | str | None = None
+    is_nullable: bool = False
+
+    @property
+    def parts(self) -> list[str | int]:
+        """The steps of the place."""
+        return [int(part) if part.isdigit() else part for part in self.place.split(".")]
+
+
+_LARGEST: Final = sys.float_info.max
+_ABOVE: Final = (sys.float_info.min, _LARGEST)
+_FINITE: Final = (-_LARGEST, _LARGEST)
+_SIDE: Final = (1, 2**16)
+_CAMERA: Final = (0, CAMERA_COUNT - 1)
+_DECIBELS: Final = (0, MOST_PSNR_DB)
+_NAME: Final = r"^[^/\\\x00-\x1f]{1,255}$"
+_UNIT_SOURCES: Final = "^(tag|metadata|default|conventions|unreadable)$"
+_WORD: Final = r"^[A-Za-z0-9_.+-]{1,40}$"
+
+COLUMNS: Final = {
+    "key": Column(_TEXT, "id.key"),
+    "split": Column(_TEXT, "id.split", "^(train|eval)$"),
+    "subset": Column(_TEXT, "id.subset", "^(seen_map|unseen_map)$", is_nullable=True),
+    "family": Column(_TEXT, "id.family", _NAME),
+    "map_name": Column(_TEXT, "id.map_name", _NAME),
+    "scene_label": Column(_TEXT, "labels.scene_label", is_nullable=True),
+    "scene_index": Column(_INTEGER, "labels.scene_index", is_nullable=True),
+    "label_map_name": Column(_TEXT, "labels.map_name", is_nullable=True),
+    "map_path": Column(_TEXT, "labels.map_path", is_nullable=True),
+    "character": Column(_TEXT, "labels.character", is_nullable=True),
+    "animation": Column(_TEXT, "labels.animation", is_nullable=True),
+    "aperture_fstop": Column(_NUMBER, "labels.aperture_fstop", is_nullable=True),
+    "caption": Column(_TEXT, "caption"),
+    "focal_mm": Column(_NUMBER, "rig.focal_mm", _ABOVE),
+    "sensor_width_mm": Column(_NUMBER, "rig.sensor_width_mm", _ABOVE),
+    "sensor_height_mm": Column(_NUMBER, "rig.sensor_height_mm", _ABOVE),
+    "image_width_px": Column(_INTEGER, "rig.image_width_px", _SIDE),
+    "image_height_px": Column(_INTEGER, "rig.image_height_px", _SIDE),
+    "image_size_source": Column(_TEXT, "rig.image_size_source", "^(recorded|default)$"),
+    "principal_x_px": Column(_NUMBER, "rig.principal_point_px.0", _FINITE, is_nullable=True),
+    "principal_y_px": Column(_NUMBER, "rig.principal_point_px.1", _FINITE, is_nullable=True),
+    "baselines_cm": Column(_list(_NUMBER, len(CAMERA_PAIRS)), "rig.baselines_cm", _ABOVE),
+    "primary_left": Column(_INTEGER, "rig.primary_pair.0", _CAMERA),
+    "primary_right": Column(_INTEGER, "rig.primary_pair.1", _CAMERA),
+    "frames": Column(_INTEGER, "frames", (1, 2**17)),
+    "frame_rate_hz": Column(_NUMBER, "frame_rate_hz", (0, _LARGEST)),
+    "lateral_m": Column(_NUMBERS, "lateral_m", _FINITE),
+    "rig_residual_px": Column(_NUMBER, "rig_residual_px", (0, math.inf)),
+    "depth_unit_m": Column(_NUMBERS, "depth_unit_m", _ABOVE),
+    "depth_unit_source": Column(_TEXTS, "depth_unit_source", _UNIT_SOURCES),
+    "depth_codec": Column(_TEXTS, "depth_codec"),
+    "depth_pixel_format": Column(_TEXTS, "depth_pixel_format"),
+    "valid_depth_ratio": Column(_NUMBER, "valid_depth_ratio", (0, 1), is_nullable=True),
+    "key_frames": Column(_list(pa.int32()), "key_frames", is_nullable=True),
+    "recorded_width_px": Column(_INTEGER, "rig.recorded_size_px.0", _SIDE, is_nullable=True),
+    "recorded_height_px": Column(_INTEGER, "rig.recorded_size_px.1", _SIDE, is_nullable=True),
+    "training_source": Column(_TEXT, "training.source_digest", "^[0-9a-f]{64}$", is_nullable=True),
+    "training_quality": Column(_TEXT, "training.quality", _WORD, is_nullable=True),
+    "training_codec": Column(_TEXT, "training.codec", _WORD, is_nullable=True),
+    "training_settings": Column(_TEXT, "training.settings", is_nullable=True),
+    "psnr_db": Column(_list(_NUMBER), "training.psnr_db", _DECIBELS, is_nullable=True),
+    "worst_psnr_db": Column(_list(_NUMBER), "training.worst_psnr_db", _DECIBELS, is_nullable=True),
+    "remarks": Column(_list(_REMARK), "remarks", is_nullable=True),
+    "pose_form": Column(_TEXT, "pose_form", is_nullable=True),
+    "depth_offset_m": Column(_list(_NUMBER), "depth_offset_m", _FINITE, is_nullable=True),
+    "conventions": Column(_TEXT, "conventions", is_nullable=True),
+    "members": Column(_list(_MEMBER), "members"),
 }
-"""Name of a column to its type, whether it may be null, and where `Scene` holds its value."""
+"""The columns by name. Nan is not allowed in numbers, but where a PSNR or a unit is not known."""
 
 TRAINING_COLUMNS: Final = tuple(
-    name for name, (_, _, place) in _COLUMNS.items() if place[0] == "training"
+    name for name, column in COLUMNS.items() if column.place.startswith("training.")
 )
 """Columns of what training shards say; all are null for released scenes."""
 
@@ -110,10 +144,10 @@ ADDED: Final = (
 """Columns that indexes of earlier versions lack: null means what these knew."""
 
 SCHEMA: Final = pa.schema(
-    pa.field(name, kind, nullable=nullable)
-    for wanted in (_REQUIRED, _NULLABLE)
-    for name, (kind, nullable, _) in _COLUMNS.items()
-    if nullable == wanted
+    pa.field(name, column.kind, nullable=is_nullable)
+    for is_nullable in (False, True)
+    for name, column in COLUMNS.items()
+    if column.is_nullable == is_nullable
 )
 """The columns of an index; those at the end may be null."""
 
@@ -126,9 +160,9 @@ is no part of the digest, so that data indexed again are the same data."""
 def row_of(scene: Scene) -> dict[str, Any]:
     """Return a scene as plain values, one for each column."""
     row: dict[str, Any] = {}
-    for name, (_, _, place) in _COLUMNS.items():
+    for name, parts in _PARTS.items():
         value: Any = scene
-        for part in place:
+        for part in parts:
             if value is not None:
                 value = getattr(value, part) if isinstance(part, str) else value[part]
         row[name] = list(value) if isinstance(value, tuple) else value
@@ -138,21 +172,17 @@ def row_of(scene: Scene) -> dict[str, Any]:
         row["depth_offset_m"] = None
     row["remarks"] = [asdict(remark) for remark in scene.remarks] or None
     row["members"] = [
-        {
-            "name": name,
-            "path": member.path,
-            "offset": member.offset,
-            "size": member.size,
-            "crc32": member.crc32,
-        }
+        {"name": name} | {field: getattr(member, field) for field in _OF_MEMBER}
         for name, member in sorted(scene.members.items())
     ]
     return row
 
 
-_FIELDS: Final[dict[tuple[str, ...], dict[str, str]]] = {
-    owner: {str(place[-1]): name for name, (_, _, place) in _COLUMNS.items() if place[:-1] == owner}
-    for owner in [(), ("id",), ("labels",), ("rig",), ("training",)]
+_OF_MEMBER: Final = tuple(field.name for field in fields(Member))
+_PARTS: Final = {name: column.parts for name, column in COLUMNS.items()}
+_FIELDS: Final[dict[str, dict[str, str]]] = {
+    owner: {str(parts[-1]): name for name, parts in _PARTS.items() if parts[:-1] == owner.split()}
+    for owner in ("", "id", "labels", "rig", "training")
 }
 """A part of `Scene` to its fields and their columns."""
 
@@ -160,7 +190,7 @@ _FIELDS: Final[dict[tuple[str, ...], dict[str, str]]] = {
 def scene_of(row: Mapping[str, Any]) -> Scene:
     """Return the scene of a row's plain values."""
 
-    def values(*owner: str) -> dict[str, Any]:
+    def values(owner: str = "") -> dict[str, Any]:
         found = ((field, row[name]) for field, name in _FIELDS[owner].items())
         return {field: tuple(value) if type(value) is list else value for field, value in found}
 

@@ -14,7 +14,7 @@ from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.index import compute as pc
 from stereogenbench_data.index.arrow import one_array
 from stereogenbench_data.index.parquet import IndexHead
-from stereogenbench_data.index.tree import ListedTree
+from stereogenbench_data.index.tree import PlacedFolders
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import COMPLETE_JSON, VIDEO_FILES
 from stereogenbench_data.schema.text import counted
@@ -42,7 +42,7 @@ def stale_message(table: pa.Table, head: IndexHead, *, index_file: Path) -> str:
     root = Path(head.root)
     # Folders of scenes may have other names than the scenes' keys.
     keys = table.column("key").to_pylist() if head.shards else _folders_of(table)
-    keys, listed = set(keys), ListedTree(root)
+    keys, listed = set(keys), PlacedFolders(root)
     found = []
     if not head.is_part:
         left_out = head.broken.keys() | set(head.passed_over)

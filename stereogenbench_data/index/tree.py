@@ -4,17 +4,24 @@
     ROOT/eval/<subset>/<family>/<map>/<scene>/
 
 `find_scene_folders` searches a folder of this machine and says where misplaced scenes belong;
-`find_remote_scenes` and `ListedTree` list only folders where scenes belong.
+`find_remote_scenes` and `PlacedFolders` list only folders where scenes belong. The Hub lists a
+thousand files a request, so `RemoteTree` lists a whole release in some hundred, and keeps the
+listing of a commit in the user's cache.
 """
 
 import os
-from collections.abc import Callable, Iterator
+import re
+import sys
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from stereogenbench_data.errors import SchemaError, StorageError, describe_os_error
+from stereogenbench_data.index.folders import FILES, Files, in_parallel
+from stereogenbench_data.index.tree_cache import TreeCache
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
@@ -31,6 +38,8 @@ _SCENE_DEPTH: Final = {"train": 4, "eval": 5}
 """How many parts a scene's path has, by its split."""
 _LISTERS: Final = 8
 """Folders of a server that are listed at a time."""
+_FEW: Final = 32
+"""Of fewer scenes of a folder each is listed by itself."""
 _DEEPEST: Final = 8
 """How many levels below the root are searched."""
 
@@ -161,17 +170,9 @@ def find_remote_scenes(url: str) -> FoundScenes:
 
     def folders(path: str) -> list[str]:
         entries = RemoteObject(joined(url, path) if path else url).entries()
-        found = [name for name, size in entries.items() if size is None and name[0] != "."]
-        return [f"{path}/{name}" if path else name for name in found]
+        return [name for name, size in entries.items() if size is None and name[0] != "."]
 
-    keys: list[str] = []
-    with ThreadPoolExecutor(_LISTERS) as pool:
-        paths = [name for name in folders("") if name in _SCENE_DEPTH]
-        while paths:
-            below = [path for listed in pool.map(folders, paths) for path in listed]
-            depths = [(path, _SCENE_DEPTH[path.partition("/")[0]]) for path in below]
-            keys += [path for path, depth in depths if path.count("/") + 1 == depth]
-            paths = [path for path, depth in depths if path.count("/") + 1 < depth]
+    keys = _keys_below([name for name in folders("") if name in _SCENE_DEPTH], folders)
     if not keys:
         raise StorageError(
             f"{shown(url)}: holds no scene and no index.parquet; looked for folders {_LAYOUT}. "
@@ -180,7 +181,25 @@ def find_remote_scenes(url: str) -> FoundScenes:
     return FoundScenes(tuple(sorted(parse_scene_key(key).key for key in keys)), {})
 
 
-class ListedTree:
+def _keys_below(splits: Iterable[str], folders: Callable[[str], list[str]]) -> list[str]:
+    """Return the paths where scenes belong, listed level by level; several wait at a time.
+
+    Args:
+        splits: "train" and "eval", or one of them.
+        folders: Called with a path below the root; returns the names of the folders there.
+    """
+    keys: list[str] = []
+    with ThreadPoolExecutor(_LISTERS) as pool:
+        for split in splits:
+            paths = [split]
+            for _ in range(_SCENE_DEPTH[split] - 1):
+                listed = zip(paths, pool.map(folders, paths), strict=True)
+                paths = [f"{path}/{name}" for path, names in listed for name in names]
+            keys += paths
+    return keys
+
+
+class PlacedFolders:
     """The folders of this machine where scenes belong, finished or not.
 
     Attributes:
@@ -191,36 +210,83 @@ class ListedTree:
         """List them; folders that may not be listed are ignored."""
         self._root = root
         self._unlisted: list[str] = []
-        self.keys = {key for split in _SCENE_DEPTH for key in _keys_of(split, self._names)}
+        self.keys = set(_keys_below(_SCENE_DEPTH, self._folders))
 
     def may_hold(self, key: str) -> bool:
         """Return whether a scene is below a folder that could not be listed."""
         return any(key.startswith(f"{folder}/") for folder in self._unlisted)
 
-    def _names(self, folder: str, is_last: bool) -> list[str]:  # noqa: FBT001 - as `_keys_of` calls
+    def _folders(self, path: str) -> list[str]:
         try:
-            with os.scandir(self._root / folder) as entries:
-                return [
-                    entry.name
-                    for entry in entries
-                    if not entry.name.startswith(".") and (is_last or entry.is_dir())
-                ]
+            with os.scandir(self._root / path) as entries:
+                return [each.name for each in entries if each.name[0] != "." and each.is_dir()]
         except (FileNotFoundError, NotADirectoryError):
             return []
         except OSError:
-            self._unlisted.append(folder)
+            self._unlisted.append(path)
             return []
 
 
-def _keys_of(split: str, names: Callable[[str, bool], list[str]]) -> list[str]:
-    """Return the paths of a split's scenes, listed level by level.
+class RemoteTree:
+    """The scenes of a tree behind a URL, and their files."""
 
-    Args:
-        split: "train" or "eval".
-        names: Called with a path, and whether its folders are scenes; returns their names.
-    """
-    paths = [split]
-    for level in range(2, _SCENE_DEPTH[split] + 1):
-        is_last = level == _SCENE_DEPTH[split]
-        paths = [f"{path}/{name}" for path in paths for name in names(path, is_last)]
-    return paths
+    def __init__(self, url: str) -> None:
+        """Ask for the commit of a tree of the Hub; nothing else is requested yet.
+
+        Raises:
+            StorageError: If the server cannot be asked.
+        """
+        self.url = url
+        pinned = RemoteObject(url).pinned()
+        self._kept = TreeCache(pinned) if pinned else None
+
+    def scenes(self) -> FoundScenes:
+        """Return the keys of all scenes.
+
+        Raises:
+            StorageError: If the tree cannot be listed, or no scene is where it belongs.
+        """
+        keys = self._once("scenes", lambda: find_remote_scenes(self.url).keys)
+        return FoundScenes(tuple(keys), {})
+
+    def files(self, keys: Sequence[str]) -> dict[str, Files]:
+        """Return the files of scenes.
+
+        Raises:
+            StorageError: If they cannot be listed.
+        """
+        by_folder: dict[str, list[str]] = {}
+        for key in keys:
+            by_folder.setdefault(key.rsplit("/", 2)[0], []).append(key)
+        folders: list[str] = []
+        for folder, own in by_folder.items():
+            folders += [folder] if len(own) >= _FEW else own
+        found: dict[str, dict[str, tuple[int, int]]] = {key: {} for key in keys}
+        for folder, listed in zip(folders, in_parallel(self._listed, folders), strict=True):
+            for path, (size, version) in listed.items():
+                key, _, name = f"{folder}/{path}".rpartition("/")
+                if key in found and name in FILES:
+                    found[key][sys.intern(name)] = size, version
+        return {key: dict(sorted(files.items())) for key, files in found.items()}
+
+    def _listed(self, folder: str) -> dict[str, tuple[int, int]]:
+        def listed() -> dict[str, tuple[int, int]]:
+            files = RemoteObject(joined(self.url, folder)).files()
+            return {path: (size, _number(version)) for path, (size, version) in files.items()}
+
+        return {path: (size, number) for path, (size, number) in self._once(folder, listed).items()}
+
+    def _once(self, name: str, ask: Callable[[], Any]) -> Any:
+        """Return an answer as JSON holds it; that of a commit is kept."""
+        kept = None if self._kept is None else self._kept.document(name)
+        if kept is None:
+            kept = ask()
+            if self._kept is not None:
+                self._kept.keep_document(name, kept)
+        return kept
+
+
+def _number(version: str) -> int:
+    """Return a number that stands for an ETag or a digest."""
+    digits = re.match(r"[0-9a-f]{15}", version)
+    return int(digits[0], 16) if digits else zlib.crc32(version.encode())

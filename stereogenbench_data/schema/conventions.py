@@ -30,8 +30,8 @@ from stereogenbench_data.schema.document import is_number
 from stereogenbench_data.schema.quantities import (
     OTHER_UNITS,
     UNITS_M,
-    Node,
-    nodes_of,
+    Stated,
+    as_stated,
     value_at,
     words,
 )
@@ -45,54 +45,29 @@ UNKNOWN: Final = "unknown"
 """The form of poses that nobody understands: rigs are assumed rectified, and poses are not read."""
 
 _MOST: Final = 64
+_LEAST_OFFSET_M: Final = 1e-4
 _LONGEST: Final = 500
 _PLACE: Final = re.compile(r"\$.+", re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NumberAt:
-    """Where a number stands in ``baseline.json``, or which one it is in every scene.
+class At:
+    """Where a quantity stands in ``baseline.json``; `_KEYS` says what each table may have.
 
     Attributes:
-        place: Its JSON path.
+        place: The JSON path of a number, or of the list or object that holds the baselines.
         value: The number itself, for files that do not have it.
         unit: Its unit; None takes that of the key, or the usual one.
+        left: The JSON path of the name or number of the primary pair's left camera.
+        right: That of the right camera.
         ignored: JSON paths of other values of the quantity, which do not count.
     """
 
     place: str | None = None
     value: float | None = None
     unit: str | None = None
-    ignored: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BaselinesAt:
-    """Where the baselines of the camera pairs stand in ``baseline.json``.
-
-    Attributes:
-        place: The JSON path of the list, or object, that holds them.
-        unit: Their unit; None takes that of the key, or the file's.
-        ignored: JSON paths of other baselines, which do not count.
-    """
-
-    place: str
-    unit: str | None = None
-    ignored: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PrimaryPairAt:
-    """Where ``baseline.json`` names the left and the right camera of the primary pair.
-
-    Attributes:
-        left: The JSON path of the left camera's name or number.
-        right: That of the right camera.
-        ignored: JSON paths of other pairs, which do not count.
-    """
-
-    left: str
-    right: str
+    left: str | None = None
+    right: str | None = None
     ignored: tuple[str, ...] = ()
 
 
@@ -146,6 +121,26 @@ class DepthAs:
     encoding: DepthEncoding
     instead_of_tag_m: float | None = None
 
+    def require(self, unit_m: float, offset_m: float, *, where: str) -> None:
+        """Refuse what files state, if it is neither the contract's nor what that replaces.
+
+        Raises:
+            SchemaError: With both figures.
+        """
+        known_m, expected_m = self.instead_of_tag_m or self.encoding.unit_m, self.encoding.offset_m
+        told, is_replaced = "", self.instead_of_tag_m is not None
+        if known_m is not None and not math.isclose(unit_m, known_m):
+            told = (
+                f"{unit_m:g} m in a stored unit of depth, and the conventions expect {known_m:g} m"
+            )
+        elif not is_replaced and not math.isclose(offset_m, expected_m, abs_tol=_LEAST_OFFSET_M):
+            told = f"a range from {offset_m:g} m, and the conventions expect {expected_m:g} m"
+        if told:
+            raise SchemaError(
+                f"{where}: states {told}. Correct unit_m and offset_m in [depth]; or, if the files "
+                f"are known to be wrong, add instead_of_tag_m = {unit_m:g}."
+            )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shape:
@@ -153,75 +148,69 @@ class Shape:
 
     Attributes:
         has: Keys that tell these scenes from others, as `keys_of` names them; () is all scenes.
-        numbers: The quantities that are one number, by the names of `NUMBERS`.
-        baselines: Where the baselines stand.
-        primary_pair: Where the primary pair stands.
+        at: Where quantities of ``baseline.json`` stand, by the names of tables.
         poses: How poses are read.
         depth: The depth contract.
     """
 
     has: tuple[str, ...] = ()
-    numbers: Mapping[str, NumberAt]
-    baselines: BaselinesAt | None = None
-    primary_pair: PrimaryPairAt | None = None
+    at: Mapping[str, At] = field(default_factory=dict)
     poses: PosesAs | None = None
     depth: DepthAs | None = None
 
     def table(self) -> dict[str, Any]:
         """Return the shape as a TOML or JSON document has it."""
         table: dict[str, Any] = {"has": list(self.has)} if self.has else {}
-        others = {name: getattr(self, name) for name in ("baselines", "primary_pair", "poses")}
-        for name, record in (*self.numbers.items(), *others.items()):
-            if record is not None:
-                table[name] = _plain_table(record)
+        table |= {name: _plain_table(at) for name, at in self.at.items()}
+        if self.poses is not None:
+            table["poses"] = _plain_table(self.poses)
         if self.depth is not None:
-            changed = _plain_table(self.depth.encoding, beside=_USUAL)
-            table["depth"] = changed | {
-                name: value
-                for name, value in (("instead_of_tag_m", self.depth.instead_of_tag_m),)
-                if value is not None
-            }
+            table["depth"] = _plain_table(self.depth.encoding, beside=_USUAL)
+            if self.depth.instead_of_tag_m is not None:
+                table["depth"]["instead_of_tag_m"] = self.depth.instead_of_tag_m
         return table
 
     def text(self) -> str:
         """Return the shape as one line of JSON, as an index keeps it beside each scene."""
         return json.dumps(self.table(), sort_keys=True)
 
-    def nodes(self, document: dict[str, Any], *, where: str) -> list[Node]:
-        """Return the values below a document, with those that are stated, without ignored ones.
+    def known(self, document: dict[str, Any], *, where: str) -> dict[str, Stated]:
+        """Return the numbers that are stated, or stand where it is stated, by their quantities.
 
         Raises:
             SchemaError: If a place that is stated is not in the document.
         """
-        nodes = []
-        for name, at in self.numbers.items():
-            value, path = at.value, at.place or f"[{name}] of the conventions"
+        known = {}
+        for name, quantity in NUMBERS.items():
+            at = self.at.get(name, At())
             if at.place is not None:
-                value = self.value_at(document, at.place, table=name, where=where)
-            if at.place is not None or at.value is not None:
-                nodes.append(Node("", at.unit or "", "", "", value, path, means=NUMBERS[name]))
-        return nodes + [node for node in nodes_of(document) if not self.ignores(node.path)]
+                value = self.value_at(document, at.place, name, where=where)
+                known[quantity] = as_stated(value, at.unit or "", at.place)
+            elif at.value is not None:
+                known[quantity] = Stated(at.value, at.unit or "", f"[{name}] of the conventions")
+        return known
 
-    def value_at(self, document: dict[str, Any], path: str, *, table: str, where: str) -> Any:
+    def value_at(
+        self, document: dict[str, Any], path: str | None, table: str, *, where: str
+    ) -> Any:
         """Return the value at a place that is stated.
 
         Raises:
             SchemaError: If it is not in the document.
         """
         try:
-            return value_at(document, path)
+            return value_at(document, str(path))
         except LookupError as error:
             keys = plain_line(shortened(", ".join(sorted(document)), 400))
             raise SchemaError(
-                f"{where}: {plain_line(path)} is not in the file, and the conventions say that "
-                f"[{table}] stands there; its keys are: {keys}. Correct the place, or state "
+                f"{where}: {plain_line(str(path))} is not in the file, and the conventions say "
+                f"that [{table}] stands there; its keys are: {keys}. Correct the place, or state "
                 f"another [[shape]] for such files."
             ) from error
 
     def ignores(self, path: str) -> bool:
         """Return whether what stands at a JSON path, or the object around it, does not count."""
-        records = [*self.numbers.values(), self.baselines, self.primary_pair]
-        listed = {each for record in records if record is not None for each in record.ignored}
+        listed = {each for at in self.at.values() for each in at.ignored}
         return any(path == each or path.startswith((f"{each}.", f"{each}[")) for each in listed)
 
 
@@ -299,13 +288,14 @@ _UNITS: Final[dict[str, tuple[str, ...]]] = {
 }
 """The units that a table may have, where it is no length."""
 
-_KINDS: Final[dict[str, Any]] = {
-    **dict.fromkeys(NUMBERS, NumberAt),
-    "baselines": BaselinesAt,
-    "primary_pair": PrimaryPairAt,
-    "poses": PosesAs,
-    "depth": DepthAs,
+_KEYS: Final = {
+    **dict.fromkeys(NUMBERS, "place value unit ignored"),
+    "baselines": "place unit ignored",
+    "primary_pair": "left right ignored",
+    "poses": "location rotation form axes unit",
+    "depth": "unit_m offset_m kind form frame_lag no_depth accept instead_of_tag_m",
 }
+"""The tables, and what each may have."""
 
 
 def depth_of(scene: Scene) -> DepthEncoding:
@@ -377,56 +367,46 @@ def parse_conventions(text: bytes, *, where: str) -> Conventions:
 
 
 def _shape(table: dict[str, Any], *, where: str) -> Shape:
-    _require_known(table, ("has", *_KINDS), where=where)
-    records: dict[str, Any] = {}
-    for name, content in table.items():
-        place = f"{where}: [{name}]"
-        if name == "has":
-            records[name] = _texts(content, where=f"{where}: has")
-        elif not isinstance(content, dict):
+    _require_known(table, ("has", *_KEYS), where=where)
+    tables: dict[str, dict[str, Any]] = {}
+    for name in (each for each in table if each != "has"):
+        content, place = table[name], f"{where}: [{name}]"
+        if not isinstance(content, dict):
             raise SchemaError(f"{place} must be a table, found {_shown(content)}.")
-        elif name == "depth":
-            records[name] = _depth(content, where=place)
-        else:
-            records[name] = _record(_KINDS[name], content, where=place)
-    numbers = {name: records.pop(name) for name in NUMBERS if name in records}
-    for name, record in {**numbers, **records}.items():
-        unit, known = getattr(record, "unit", None), _UNITS.get(name, UNITS_M)
+        _require_known(content, _KEYS[name].split(), where=place)
+        tables[name] = values = {
+            key: _checked(key, value, where=place) for key, value in content.items()
+        }
+        unit, known = values.get("unit"), _UNITS.get(name, UNITS_M)
         if unit is not None and unit not in known:
+            options = ", ".join(sorted(known))
+            raise SchemaError(f"{place}: unit must be one of {options}, found {_shown(unit)}.")
+        needed = {"baselines": ["place"], "primary_pair": ["left", "right"]}.get(name, [])
+        for key in needed:
+            if key not in values:
+                raise SchemaError(f"{place}: {key} is missing. Write a JSON path, such as $.pairs.")
+        if (
+            name in NUMBERS
+            and ("place" in values) == ("value" in values)
+            and not ("ignored" in values and "place" not in values)
+        ):
             raise SchemaError(
-                f"{where}: [{name}]: unit must be one of {', '.join(sorted(known))}, found "
-                f"{_shown(unit)}."
-            )
-    for name, number in numbers.items():
-        if (number.place is None) == (number.value is None) and not number.ignored:
-            raise SchemaError(
-                f"{where}: [{name}] must have either a place, such as "
+                f"{place} must have either a place, such as "
                 f'place = "$.camera_intrinsics.{name}", or the value that it has in every scene.'
             )
-    return Shape(**records, numbers=numbers)
+    poses, depth = tables.pop("poses", None), tables.pop("depth", None)
+    return Shape(
+        has=_checked("has", table.get("has", []), where=where),
+        at={name: At(**tables[name]) for name in _KEYS if name in tables},
+        poses=None if poses is None else PosesAs(**poses),
+        depth=None if depth is None else _depth(depth, where=f"{where}: [depth]"),
+    )
 
 
-def _record(kind: Any, table: dict[str, Any], *, where: str) -> Any:
-    known = {field.name: field for field in fields(kind)}
-    _require_known(table, known, where=where)
-    values = {name: _CHECKS[name](value, where=f"{where}: {name}") for name, value in table.items()}
-    missing = [name for name in ("place", "left", "right") if name in known and name not in values]
-    if missing and kind is not NumberAt:
-        raise SchemaError(f"{where}: {missing[0]} is missing. Write a JSON path, such as $.pairs.")
-    return kind(**values)
-
-
-def _depth(table: dict[str, Any], *, where: str) -> DepthAs:
-    names = {field.name for field in fields(DepthEncoding)} - {"source"}
-    _require_known(table, (*sorted(names), "instead_of_tag_m"), where=where)
-    values = dict(table)
+def _depth(values: dict[str, Any], *, where: str) -> DepthAs:
     instead_m = values.pop("instead_of_tag_m", None)
-    if instead_m is not None:
-        instead_m = _positive(instead_m, where=f"{where}: instead_of_tag_m")
-        if "unit_m" not in values:
-            raise SchemaError(f"{where}: instead_of_tag_m needs the right unit_m beside it.")
-    for name, value in values.items():
-        values[name] = _DEPTH_CHECKS.get(name, _no_bool)(value, where=f"{where}: {name}")
+    if instead_m is not None and "unit_m" not in values:
+        raise SchemaError(f"{where}: instead_of_tag_m needs the right unit_m beside it.")
     try:
         encoding = DepthEncoding(**values, source="conventions")
     except SchemaError as error:
@@ -442,69 +422,56 @@ def _require_known(names: Iterable[str], known: Iterable[str], *, where: str) ->
             raise SchemaError(f"{where}: {plain_line(shortened(name))!r} is not known; {cure}")
 
 
-def _text(value: object, *, where: str) -> str:
-    if not isinstance(value, str) or not 0 < len(value) <= _LONGEST:
-        raise SchemaError(f"{where} must be a text, found {_shown(value)}.")
-    return value
+def _is_text(value: object) -> bool:
+    return isinstance(value, str) and 0 < len(value) <= _LONGEST
 
 
-def _path(value: object, *, where: str) -> str:
-    text = _text(value, where=where)
-    if not _PLACE.fullmatch(text):
-        raise SchemaError(
-            f"{where} must be a JSON path, such as $.camera_intrinsics.focal_length_mm, found "
-            f"{_shown(value)}."
-        )
-    return text
+def _are_texts(value: object) -> bool:
+    return isinstance(value, list) and len(value) <= _MOST and all(map(_is_text, value))
 
 
-def _texts(value: object, *, where: str) -> tuple[str, ...]:
-    if not isinstance(value, list) or len(value) > _MOST:
-        raise SchemaError(f"{where} must be a list of texts, found {_shown(value)}.")
-    return tuple(_text(each, where=where) for each in value)
+def _is_path(value: object) -> bool:
+    return _is_text(value) and _PLACE.fullmatch(str(value)) is not None
 
 
-def _paths(value: object, *, where: str) -> tuple[str, ...]:
-    return tuple(_path(each, where=where) for each in _texts(value, where=where))
+_RULES: Final[dict[str, tuple[Callable[[Any], bool], str]]] = {
+    **dict.fromkeys(("kind", "form", "location", "rotation", "axes", "unit"), (_is_text, "a text")),
+    **dict.fromkeys(
+        ("place", "left", "right"),
+        (_is_path, "a JSON path, such as $.camera_intrinsics.focal_length_mm"),
+    ),
+    **dict.fromkeys(
+        ("value", "instead_of_tag_m"),
+        (lambda value: is_number(value) and value > 0, "a number above zero"),
+    ),
+    **dict.fromkeys(
+        ("unit_m", "offset_m", "frame_lag"),
+        (lambda value: not isinstance(value, bool), "a number"),
+    ),
+    "has": (_are_texts, "a list of texts"),
+    "accept": (_are_texts, "a list of texts"),
+    "ignored": (lambda value: _are_texts(value) and all(map(_is_path, value)), "JSON paths"),
+    "no_depth": (
+        lambda value: isinstance(value, list) and len(value) <= _MOST,
+        'a list of stored numbers, such as [0, "max"]',
+    ),
+}
+"""What a key's value must be."""
 
 
-def _positive(value: object, *, where: str) -> float:
-    if not is_number(value) or value <= 0:
-        raise SchemaError(f"{where} must be a number above zero, found {_shown(value)}.")
-    return float(value)
-
-
-def _unit(value: object, *, where: str) -> str:
-    return words(_text(value, where=where))
-
-
-def _no_bool(value: object, *, where: str) -> object:
-    if isinstance(value, bool):
-        raise SchemaError(f"{where} must not be {_shown(value)}.")
-    return value
-
-
-def _risks(value: object, *, where: str) -> frozenset[str]:
-    accepted = _texts(value, where=where)
-    _require_known(accepted, get_args(DepthRisk), where=where)
-    return frozenset(accepted)
-
-
-def _stored_numbers(value: object, *, where: str) -> tuple[Any, ...]:
-    if not isinstance(value, list) or len(value) > _MOST:
-        raise SchemaError(
-            f'{where} must be a list of stored numbers, such as [0, "max"], found {_shown(value)}.'
-        )
-    return tuple(value)
-
-
-_DEPTH_CHECKS: Final[dict[str, Callable[..., Any]]] = {
-    "accept": _risks, "no_depth": _stored_numbers, "kind": _text, "form": _text,
-}  # fmt: skip
-_CHECKS: Final[dict[str, Callable[..., Any]]] = {
-    "place": _path, "value": _positive, "unit": _unit, "ignored": _paths, "left": _path,
-    "right": _path, "location": _text, "rotation": _text, "form": _text, "axes": _text,
-}  # fmt: skip
+def _checked(key: str, value: Any, *, where: str) -> Any:
+    """Return the value of a key as records hold it."""
+    is_right, what = _RULES[key]
+    if not is_right(value):
+        raise SchemaError(f"{where}: {key} must be {what}, found {_shown(value)}.")
+    if key == "accept":
+        _require_known(value, get_args(DepthRisk), where=f"{where}: {key}")
+        return frozenset(value)
+    if key == "unit":
+        return words(value)
+    if key in ("value", "instead_of_tag_m"):
+        return float(value)
+    return tuple(value) if isinstance(value, list) else value
 
 
 def _shown(value: object) -> str:
@@ -543,7 +510,7 @@ def write_toml(conventions: Conventions, notes: Mapping[tuple[int, str], Iterabl
             lines += ["[[shape]]"]
             lines += [f"has = {_toml(table.pop('has', []))}"]
         noted = [name for at, name in notes if at == number and name and name not in table]
-        for name in sorted({*table, *noted}, key=[*_KINDS].index):
+        for name in sorted({*table, *noted}, key=[*_KEYS].index):
             lines += ["", *_comments(notes.get((number, name), ()))]
             if name in table:
                 lines += [f"[{name}]" if is_one else f"[shape.{name}]"]

@@ -70,9 +70,17 @@ _RANGES: Final = frozenset({"range", "limits", "bounds"})
 _NAMED_RANGE: Final = frozenset({"near", "far", "znear", "zfar"})
 _OTHER_MEANING: Final = re.compile(
     r"(?<![a-z])(?:inv(?:erse[d]?)?|disparit\w+|log(?:arithm\w*)?|non-?linear|gamma|sqrt|radial|"
-    r"euclid\w*|reversed?|z-?buffer|device|perspective|rays?(?![ _-]?(?:trac|cast|march)))(?![a-z])"
+    r"euclid\w*|reversed?|z-?buffer|device|perspective|rays?(?![ _-]?(?:trac|cast|march))|"
+    r"spherical|l2|distance to (?:the )?cam\w*|range image|1 ?/ ?(?:z|depth))(?![a-z])|"
+    r"[a-z] [-+] [\d.]+ ?\)|[a-z] ?[-+] ?\d+\.\d+ ?\)"
 )
 """Words of a depth that is no length along the optical axis, or no linear one."""
+_KINDS: Final = frozenset({"kind", "type", "definition", "projection", "annotator"})
+"""Words of keys whose texts say what depth is."""
+_PLANAR: Final = re.compile(
+    r"planar|plane|axi|ortho|perpendicular|linear|metric|depth|\bz\b|\d|float|int|half|video|none"
+)
+"""Texts under such a key that are of depth along the optical axis, or of how it is stored."""
 _NORMALISED: Final = re.compile(r"normali[sz]")
 _STATISTICS: Final = frozenset(
     {"stat", "stats", "statistics", "valid", "observed", "mean", "median", "std", "percentile",
@@ -360,6 +368,8 @@ class _Source:
     def read(self, name: str, value: object) -> list[Statement]:
         """Return what a value under a key, in snake_case, says."""
         text = value.strip() if isinstance(value, str) else json.dumps(value)
+        if value is False and "planar" in name:
+            return [self._make("other meaning", (), text)]
         if value is None or value is False or text.lower() in ("", "false", "no", "none"):
             is_scale = text == "" and not _SCALES.isdisjoint(name.split("_"))
             return [self._make("unclear", (), text)] if is_scale else []
@@ -377,7 +387,9 @@ class _Source:
         where = set((self.path or name).split("_"))
         if self.origin == "tag" and not _TECHNICAL.isdisjoint(parts):
             return
-        if _OTHER_MEANING.search(name.replace("_", " ")):
+        is_kind = not _KINDS.isdisjoint(parts) and isinstance(value, str)
+        is_other_kind = is_kind and not _PLANAR.search(text.lower())
+        if is_other_kind or _OTHER_MEANING.search(name.replace("_", " ")):
             yield self._make("other meaning", (), text)
             return
         if _NORMALISED.search(self.path or name):
@@ -390,6 +402,8 @@ class _Source:
         elif number is not None and (not rest or words(rest) in UNITS_M):
             unit_m = UNITS_M[words(rest)] if rest else None
             yield from self._number(parts, number, unit_m=unit_m, where=where, text=text)
+        elif number is not None and re.fullmatch("[a-z]+", rest):
+            yield self._make("unclear" if _SCALES.isdisjoint(parts) else "unit", (), text)
         elif number is not None:
             sentence = f"{name.replace('_', ' ')} {text.lower()}"
             yield from self._sentence(sentence, is_about_unit=True)
@@ -488,7 +502,9 @@ class _Source:
         units = [UNITS_M[words(each[0])] if each else None
                  for each in (_METRES.search(left), _METRES.search(right))]  # fmt: skip
         is_depth = [bool(_DEPTH_VARIABLE.search(each)) for each in (left, right)]
-        if match["more"] or not (math.isfinite(factor) and factor > 0):
+        if match["more"]:
+            yield self._make("other meaning", (), text)
+        elif not (math.isfinite(factor) and factor > 0):
             yield self._make("unclear", (), text)
         elif units[0] is not None and units[1] is None:
             yield self._unit(factor, "metres", units[0], text)
@@ -567,7 +583,7 @@ def _object_of(text: str) -> dict[str, Any] | None:
     if not text.startswith("{"):
         return None
     try:
-        found = json.loads(text)
+        found = json.loads(text if '"' in text else text.replace("'", '"'))
     except (ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None

@@ -8,10 +8,12 @@ end (``focalLengthMM``, ``sensor_width (cm)``) do not matter, and the key above 
 
 import functools
 import json
-import math
 import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
+from types import MappingProxyType
 from typing import Any, Final
 
 from stereogenbench_data.schema.document import child_path, is_number
@@ -21,11 +23,11 @@ NAMES: Final[dict[str, str]] = {
     "focal": "focal_length current_focal_length focal lens_focal_length lens f_mm",
     "focal_px": "focal_length focal fx focal_length_x fl_x",
     "sensor_width": "sensor_width film_width filmback_width sensor_size_x film_back_width "
-    "horizontal_aperture horizontal_film_aperture",
+    "horizontal_aperture horizontal_film_aperture sw_mm sensor_w",
     "sensor_height": "sensor_height film_height filmback_height sensor_size_y "
-    "film_back_height vertical_aperture vertical_film_aperture",
+    "film_back_height vertical_aperture vertical_film_aperture sh_mm sensor_h",
     "fov": "fov hfov fov_x horizontal_fov field_of_view horizontal_field_of_view fov_horizontal "
-    "fov_angle angle_of_view angle_x camera_angle_x",
+    "fov_angle angle_of_view angle_x camera_angle_x camera_fov",
     "fov_y": "vfov fov_y vertical_fov vertical_field_of_view fov_vertical angle_y camera_angle_y",
     "focal_y_px": "fy focal_length_y fl_y",
     "image_width": "image_width image_size_x resolution_x resolution_width width_px render_width "
@@ -34,6 +36,7 @@ NAMES: Final[dict[str, str]] = {
     "render_height frame_height image_size_height",
     "principal_x": "cx c_x principal_point_x principal_x optical_center_x optical_centre_x",
     "principal_y": "cy c_y principal_point_y principal_y optical_center_y optical_centre_y",
+    "sensor_fit": "sensor_fit",
     "unit": "unit units length_unit unit_of_length world_unit location_unit position_unit "
     "translation_unit units_of_length",
     "primary_pair": "primary_stereo_pair primary_pair stereo_pair primary",
@@ -54,7 +57,7 @@ NAMES: Final[dict[str, str]] = {
 """The words of the keys under which a quantity may stand, the likeliest first."""
 
 PAIRS: Final[dict[str, tuple[str, str]]] = {
-    "sensor_size": ("sensor_width", "sensor_height"),
+    **dict.fromkeys(("sensor_size", "sensor"), ("sensor_width", "sensor_height")),
     "filmback": ("sensor_width", "sensor_height"),
     "image_size": ("image_width", "image_height"),
     "image_resolution": ("image_width", "image_height"),
@@ -75,6 +78,8 @@ UNITS_M: Final = {
     **dict.fromkeys(("dm", "decimeter", "decimeters", "decimetre", "decimetres"), 1e-1),
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1.0),
     **dict.fromkeys(("uu", "unreal_unit", "unreal_units"), 1e-2),
+    **dict.fromkeys(("inch", "inches"), 0.0254),
+    **dict.fromkeys(("ft", "foot", "feet"), 0.3048),
 }
 """Metres in a unit of length; a unit of Unreal is a centimetre."""
 
@@ -88,38 +93,65 @@ _MOST_NODES: Final = 20_000
 """How many values of a document are searched: a released one has some hundreds."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
+class Node:
+    """A value below a document, and where it stands.
+
+    Attributes:
+        key: Its key in an object, or its place in a list.
+        up: What holds it; None for the document itself.
+        value: The JSON value.
+        plain: The key in words, without a unit at its end; "" in lists.
+        unit: That unit, "" without one.
+        name: The key in words, with the unit.
+        parent: The nearest key above, in words without a unit.
+    """
+
+    key: str | int
+    up: "Node | None"
+    value: Any
+    plain: str = ""
+    unit: str = ""
+    name: str = ""
+    parent: str = ""
+
+    @property
+    def path(self) -> str:
+        """The JSON path."""
+        return "$" if self.up is None else child_path(self.up.path, self.key)
+
+
+@dataclass(slots=True)
 class Stated:
     """A value as it stands in a file.
 
     Attributes:
         value: The JSON value; a text such as "32.5 mm" is its number.
         unit: The last words of its key, or of the text, that name a unit; "" without one.
-        path: Its JSON path.
+        at: Where it stands: a node, a place, or the place of what holds it and its key there.
     """
 
     value: Any
     unit: str
-    path: str
+    at: Node | str | tuple[str, str | int]
+
+    @property
+    def path(self) -> str:
+        """Its JSON path."""
+        if isinstance(self.at, tuple):
+            return child_path(*self.at)
+        return self.at if isinstance(self.at, str) else self.at.path
 
     @property
     def rounding(self) -> float:
-        """Half of the last digit that is written, for numbers."""
-        return rounding_of(self.value)
+        """Half of the last digit that is written, for numbers; at least a float32's rounding.
 
-
-def rounding_of(value: float) -> float:
-    """Return half of the last digit of a number as JSON writes it, at least a float32's rounding.
-
-    >>> rounding_of(6.35), rounding_of(7)
-    (0.005, 0.5)
-    """
-    try:
-        exponent = Decimal(repr(value)).as_tuple().exponent
-    except InvalidOperation:
-        return 0.0
-    half = 0.5 * 10.0**exponent if isinstance(exponent, int) else 0.0
-    return max(half, abs(value) * 2**-23)
+        >>> Stated(6.35, "", "$").rounding, Stated(7, "", "$").rounding
+        (0.005, 0.5)
+        """
+        exponent = Decimal(repr(self.value)).as_tuple().exponent
+        half = 0.5 * 10.0**exponent if isinstance(exponent, int) else 0.0
+        return max(half, float(abs(self.value)) * 2**-23)
 
 
 @functools.lru_cache(maxsize=4096)  # thousands of files have the same keys
@@ -141,55 +173,128 @@ def without_unit(name: str) -> tuple[str, str]:
     (('sensor_width', 'mm'), ('roll', 'deg'), ('m', ''))
     """
     head, _, last = name.rpartition("_")
+    last = "inch" if last == "in" else last
     if head and (last in UNITS_M or last in OTHER_UNITS):
         return head.removesuffix("_in"), last
     return name, ""
 
 
-@dataclass(frozen=True, slots=True)
-class Node:
-    """A value below a document: its key in words, without and with the unit, and its place.
+def nodes_of(document: Any, *, closed: re.Pattern[str] | None = None) -> list[Node]:
+    """Return the values below a document, the outermost first; long lists are not searched.
 
-    ``means`` is the quantity that conventions say it is, "" where only its name says it.
+    Args:
+        document: The document.
+        closed: What the keys of other lists that are not searched have.
+    """
+    waiting = [Node("", None, document)]
+    depths = [0]
+    for node, depth in zip(waiting, depths, strict=False):  # both grow
+        value = node.value
+        if not isinstance(value, dict | list) or depth > _DEEPEST:
+            continue
+        if isinstance(value, list) and (
+            len(value) > _LONGEST or (closed is not None and closed.search(node.name))
+        ):
+            continue
+        above = node.plain or node.parent
+        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            if len(waiting) > _MOST_NODES:
+                break
+            name = words(key.rpartition(".")[2]) if isinstance(key, str) else ""
+            if name or isinstance(inner, dict | list):
+                waiting.append(Node(key, node, inner, *without_unit(name), name, above))
+                depths.append(depth + 1)
+    return [node for node in waiting if node.name and node.value is not None]
+
+
+class Values:
+    """The values below a document, by the quantities that their keys may name.
+
+    Attributes:
+        nodes: All of them.
     """
 
-    plain: str
-    unit: str
-    name: str
-    parent: str
-    value: Any
-    path: str
-    means: str = ""
+    def __init__(
+        self,
+        document: Any,
+        *,
+        known: Mapping[str, Stated] = MappingProxyType({}),
+        ignores: Callable[[str], bool] | None = None,
+        closed: re.Pattern[str] | None = None,
+    ) -> None:
+        """Find them.
+
+        Args:
+            document: The document.
+            known: Values that conventions state. They come first, and know the unit of a key that
+                names none.
+            ignores: Whether what stands at a JSON path does not count.
+            closed: As for `nodes_of`.
+        """
+        nodes = nodes_of(document, closed=closed)
+        self.nodes = [node for node in nodes if not ignores(node.path)] if ignores else nodes
+        found: dict[str, list[tuple[int, Stated]]] = {}
+        for node in self.nodes:
+            for quantity, rank in _quantities(node.plain, node.parent, node.name):
+                found.setdefault(quantity, []).append(
+                    (rank, as_stated(node.value, node.unit, node))
+                )
+            for rank, quantity, stated in _parts(node):
+                found.setdefault(quantity, []).append((rank, stated))
+        self._stated = {
+            quantity: [each for _, each in sorted(ranked, key=lambda each: each[0])]
+            for quantity, ranked in found.items()
+        }
+        for quantity, first in known.items():
+            others = [
+                each for each in self.stated(quantity) if each.unit or each.path != first.path
+            ]
+            self._stated[quantity] = [first, *others]
+
+    def stated(self, quantity: str) -> list[Stated]:
+        """Return the values of a quantity, the likeliest name and the outermost first."""
+        return self._stated.get(quantity, [])
+
+    def numbers(self, quantity: str) -> list[Stated]:
+        """Return the finite numbers that are stated for a quantity."""
+        return [each for each in self.stated(quantity) if is_number(each.value)]
+
+    @property
+    def length_unit_m(self) -> float | None:
+        """The metres in the unit that the document names for its lengths, None without one."""
+        named = (words(each.value) for each in self.stated("unit") if isinstance(each.value, str))
+        known = (UNITS_M.get(name, UNITS_M.get(name.partition("_")[0])) for name in named)
+        return next((unit_m for unit_m in known if unit_m is not None), None)
 
 
-def nodes_of(document: dict[str, Any]) -> list[Node]:
-    """Return the values below a document, the outermost first; long lists are not searched."""
-    found: list[Node] = []
-    waiting: list[tuple[Any, str, str, int]] = [(document, "", "$", 0)]
-    for node, parent, path, depth in waiting:
-        for key, value in node.items() if isinstance(node, dict) else enumerate(node):
-            if len(found) >= _MOST_NODES:
-                return found
-            name = words(key) if isinstance(key, str) else ""
-            plain, unit = without_unit(name)
-            place = child_path(path, key)
-            if name and value is not None:
-                found.append(Node(plain, unit, name, parent, value, place))
-                found += _of_matrix(value, place) if plain in MATRICES else []
-            is_long = isinstance(value, list) and len(value) > _LONGEST
-            if isinstance(value, dict | list) and depth < _DEEPEST and not is_long:
-                waiting.append((value, plain or parent, place, depth + 1))
+@functools.lru_cache(maxsize=4096)
+def _quantities(plain: str, parent: str, name: str) -> list[tuple[str, int]]:
+    """Return the quantities that a key may name, and which of their names it is."""
+    found = []
+    for quantity, listed in NAMES.items():
+        known = listed.split()
+        ranks = [known.index(key) for key in (plain, f"{parent}_{plain}", name) if key in known]
+        found += [(quantity, ranks[0])] if ranks else []
     return found
 
 
-def _of_matrix(value: Any, path: str) -> list[Node]:
-    """Return the focal lengths and the principal point in a camera matrix, if it is one."""
-    if isinstance(value, list) and len(value) == 3 and all(isinstance(v, list) for v in value):
-        value = [number for row in value for number in row]
-    if not isinstance(value, list) or len(value) != 9 or value[8] != 1:
-        return []
-    places = {"fx": 0, "fy": 4, "cx": 2, "cy": 5}
-    return [Node(name, "px", name, "", value[at], path) for name, at in places.items()]
+def _parts(node: Node) -> Iterator[tuple[int, str, Stated]]:
+    """Yield the quantities in a list of two numbers or in a camera matrix, with their ranks."""
+    value, pair = node.value, PAIRS.get(node.plain, ())
+    for at, quantity in enumerate(pair if not isinstance(value, dict) else ()):
+        if isinstance(value, list) and len(value) == len(pair):
+            yield 0, quantity, Stated(value[at], node.unit, child_path(node.path, at))
+        else:
+            yield 0, quantity, Stated(value, node.unit, node)
+    if node.plain in MATRICES and isinstance(value, dict):
+        value = value.get("data")  # as OpenCV writes it
+    if node.plain in MATRICES and isinstance(value, list):
+        if len(value) in (3, 4) and all(isinstance(row, list) for row in value):
+            value = [number for row in value[:3] for number in row[:3]]
+        if len(value) == 9 and value[8] == 1:
+            for name, at in (("fx", 0), ("fy", 4), ("cx", 2), ("cy", 5)):
+                for quantity, rank in _quantities(name, "", name):
+                    yield rank, quantity, Stated(value[at], "px", node)
 
 
 _STEP: Final = re.compile(r'\.([A-Za-z_][A-Za-z0-9_]*)|\[([0-9]{1,6})\]|\[("(?:[^"\\]|\\.)*")\]')
@@ -210,72 +315,26 @@ def value_at(document: Any, path: str) -> Any:
         if step is None:
             raise LookupError(path)
         plain, number, quoted = step.groups()
-        key: Any = int(number) if number else json.loads(quoted) if quoted else plain
-        is_there = key < len(node) if number and isinstance(node, list) else (
-            isinstance(node, dict) and key in node
-        )  # fmt: skip
-        if not is_there:
+        if isinstance(node, dict) and not number:
+            node = node[json.loads(quoted) if quoted else plain]
+        elif isinstance(node, list) and number:
+            node = node[int(number)]
+        else:
             raise LookupError(path)
-        node, at = node[key], step.end()
+        at = step.end()
     return node
 
 
-def stated(nodes: list[Node], quantity: str) -> list[Stated]:
-    """Return the values of a quantity in a document, the likeliest name and the outermost first.
-
-    What conventions state comes first, and they know the unit of a key that names none.
-    """
-    names = NAMES[quantity].split()
-    known = {node.path for node in nodes if node.means == quantity}
-    found: list[tuple[int, Stated]] = []
-    for node in nodes:
-        if node.means:
-            if node.means == quantity:
-                found.append((-1, as_stated(node.value, node.unit, node.path)))
-            continue
-        for key in (node.plain, f"{node.parent}_{node.plain}", node.name):
-            if key in names:
-                found.append((names.index(key), as_stated(node.value, node.unit, node.path)))
-                break
-        if quantity in PAIRS.get(node.plain, ()) and not isinstance(node.value, dict):
-            at, value, path = PAIRS[node.plain].index(quantity), node.value, node.path
-            if isinstance(value, list) and len(value) == 2:
-                value, path = value[at], child_path(path, at)
-            found.append((0, Stated(value, node.unit, path)))
-    return [
-        each
-        for rank, each in sorted(found, key=lambda each: each[0])
-        if rank < 0 or each.unit or each.path not in known
-    ]
-
-
-def numbers(nodes: list[Node], quantity: str) -> list[Stated]:
-    """Return the finite numbers that a document states for a quantity."""
-    return [each for each in stated(nodes, quantity) if is_number(each.value)]
-
-
-def length_unit_m(nodes: list[Node]) -> float | None:
-    """Return the metres in the unit that a document names for its lengths, None without one."""
-    for each in stated(nodes, "unit"):
-        if isinstance(each.value, str):
-            unit = UNITS_M.get(words(each.value))
-            if unit is not None:
-                return unit
-    return None
-
-
-def as_stated(value: Any, unit: str, path: str) -> Stated:
+def as_stated(value: Any, unit: str, at: Node | str | tuple[str, str | int]) -> Stated:
     """Return a value with its unit, which may stand in it: "32.5 mm", or {"value", "unit"}."""
+    if type(value) is float or type(value) is int:
+        return Stated(value, unit, at)
     if isinstance(value, dict) and isinstance(value.get("unit"), str) and "value" in value:
         value, unit = value["value"], words(value["unit"])
     if isinstance(value, list) and len(value) == CAMERA_COUNT and is_number(value[0]):
         value = value[0] if value.count(value[0]) == CAMERA_COUNT else value
     text = _TEXT_NUMBER.match(value) if isinstance(value, str) else None
-    if text is not None:
-        try:
-            number = float(text[1])
-        except ValueError:
-            return Stated(value, unit, path)
-        if math.isfinite(number) and (text[2].lower() or unit):
-            return Stated(number, text[2].lower() or unit, path)
-    return Stated(value, unit, path)
+    if text is not None and (text[2] or unit):
+        with suppress(ValueError):
+            value, unit = float(text[1]), text[2].lower() or unit
+    return Stated(value, unit, at)

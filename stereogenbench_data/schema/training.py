@@ -15,18 +15,19 @@ because it is stored without loss.
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.document import brief, is_number, parse_object
+from stereogenbench_data.schema.document import parse_object
 from stereogenbench_data.schema.records import TrainingFacts
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
     PACKED_DEPTH_NAMES,
     rgb_name,
 )
+from stereogenbench_data.schema.text import shortened
 
 MOST_PSNR_DB: Final = 100.0
 """The PSNR that is stored for pictures without any error, and the largest."""
@@ -128,121 +129,60 @@ def parse_training(text: bytes, *, where: str) -> TrainingDocument:
         where: The file's path, for messages.
 
     Raises:
-        SchemaError: If the file is not what `TrainingDocument.text` writes; it names the place.
+        SchemaError: If the file is not what `TrainingDocument.text` writes.
     """
     document = parse_object(text, where=where)
-    _require(document, _FORM, "$", where)
-    source, derived, pictures = document["source"], document["derived"], document["pictures"]
-    for name, file in document["files"].items():
-        is_picture = name in _PICTURES
-        _require(file, _PICTURE if is_picture else _FILE, f"$.files.{name}", where)
-        if is_picture and file["worst_psnr_db"] > file["psnr_db"]:
-            path = f"$.files.{name}.worst_psnr_db"
-            raise _wrong(file["worst_psnr_db"], "must not exceed psnr_db", path, where)
-    return TrainingDocument(
-        key=source["key"],
-        source_digest=source["index_digest"],
-        source_size_px=(source["width_px"], source["height_px"]),
-        size_px=(derived["width_px"], derived["height_px"]),
-        quality=derived["quality"],
-        key_frames=tuple(derived["key_frames"]),
-        pictures=pictures,
-        versions=document["versions"],
-        files={
-            name: DerivedFile(
-                file["bytes"], int(file["crc32"], 16), float(file.get("psnr_db", math.nan)),
-                float(file.get("worst_psnr_db", math.nan)), file.get("worst_frame", -1),
-            )
-            for name, file in document["files"].items()
-        },
-    )  # fmt: skip
+    try:
+        source, derived = document["source"], document["derived"]
+        found = TrainingDocument(
+            key=source["key"],
+            source_digest=source["index_digest"],
+            source_size_px=(source["width_px"], source["height_px"]),
+            size_px=(derived["width_px"], derived["height_px"]),
+            quality=derived["quality"],
+            key_frames=tuple(derived["key_frames"]),
+            pictures=document["pictures"],
+            versions=document["versions"],
+            files={
+                name: DerivedFile(
+                    file["bytes"], int(file["crc32"], 16), file.get("psnr_db", math.nan),
+                    file.get("worst_psnr_db", math.nan), file.get("worst_frame", -1),
+                )
+                for name, file in document["files"].items()
+            },
+        )  # fmt: skip
+        odd = _odd_value(found)
+        if not odd and json.loads(found.text()) != document:
+            odd = "its keys"
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+        odd = f"a value ({error!r})"
+    if odd:
+        raise SchemaError(
+            f"{where}: {shortened(odd, 200)} is not as this package writes it. The file was "
+            f"altered: fetch it again, or run `stereogenbench pack` again."
+        )
+    return found
 
 
-_Check = tuple[Callable[[Any], bool], str]
-_Form = dict[str, Any]
+def _odd_value(found: TrainingDocument) -> str:
+    """Return a value that the package does not write, with its name; "" if there is none."""
+    frames, sides_px = found.key_frames, (*found.source_size_px, *found.size_px)
+    names = (found.quality, *(str(found.pictures[name]) for name in ("codec", "pixel_format")))
+    files = found.files.values()
+    decibels = [each for file in files for each in (file.worst_psnr_db, file.psnr_db)
+                if not math.isnan(each)]  # fmt: skip
+    for what, value, is_right in (
+        ("width_px or height_px", sides_px, all(0 < side <= 2**16 for side in sides_px)),
+        ("key_frames", frames, frames[:1] == (0,) and list(frames) == sorted(set(frames))),
+        ("index_digest", found.source_digest, re.fullmatch("[0-9a-f]{64}", found.source_digest)),
+        ("quality or codec", names, all(re.fullmatch(r"[\w.+-]{1,40}", name) for name in names)),
+        ("files", [*found.files], files and {*found.files} <= _DERIVED),
+        ("bytes", "", all(file.size > 0 for file in files)),
+        ("psnr_db", decibels, all(0 <= each <= MOST_PSNR_DB for each in decibels)),
+    ):
+        if not is_right:
+            return f"{what} {value}"
+    return ""
 
 
-def _whole(least: int, most: int = 2**53) -> _Check:
-    what = f"must be a whole number of at least {least}"
-    return lambda value: type(value) is int and least <= value <= most, what
-
-
-def _like(pattern: str, what: str) -> _Check:
-    return lambda value: isinstance(value, str) and bool(re.fullmatch(pattern, value)), what
-
-
-def _are_texts(value: Any) -> bool:
-    return isinstance(value, dict) and all(map(_is_text, value.values()))
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and value.isprintable()
-
-
-def _is_ascending(value: Any) -> bool:
-    return (
-        isinstance(value, list)
-        and all(type(each) is int and each < 2**53 for each in value)
-        and value[:1] == [0]
-        and value == sorted(set(value))
-    )
-
-
-_PICTURES: Final = {rgb_name(camera) for camera in range(CAMERA_COUNT)}
-_DERIVED: Final = _PICTURES | set(PACKED_DEPTH_NAMES.values())
-_SIZE: Final = {name: _whole(1, 2**16) for name in ("width_px", "height_px")}
-_WORD: Final = _like(r"[A-Za-z0-9_.+-]{1,40}", "must be a name of letters, digits and _ . + -")
-_TEXTS: Final = (_are_texts, "must be an object of printable texts")
-_DECIBELS: Final = (
-    lambda value: is_number(value) and 0 <= value <= MOST_PSNR_DB,
-    f"must be 0 to {MOST_PSNR_DB:g} dB",
-)
-_FORM: Final[_Form] = {
-    "format": (lambda value: type(value) is int and value == _FORMAT, f"must be {_FORMAT}"),
-    "source": {
-        "key": (_is_text, "must be a printable text"),
-        "index_digest": _like("[0-9a-f]{64}", "must be a sha256 in hex"),
-        **_SIZE,
-    },
-    "derived": {
-        **_SIZE,
-        "quality": _WORD,
-        "key_frames": (_is_ascending, "must be frames ascending from 0"),
-    },
-    "pictures": {
-        "codec": _WORD, "pixel_format": _WORD, "options": _TEXTS, "key_frame_distance": _whole(1),
-    },
-    "versions": _TEXTS,
-    "files": (
-        lambda value: isinstance(value, dict) and bool(value) and set(value) <= _DERIVED,
-        f"must name some of {', '.join(sorted(_DERIVED))}",
-    ),
-}  # fmt: skip
-"""What each value must be: a form of its own, or a check and what it asks for."""
-_FILE: Final[_Form] = {"bytes": _whole(1), "crc32": _like("[0-9a-f]{8}", "must be 8 hex digits")}
-_PICTURE: Final = _FILE | {
-    "psnr_db": _DECIBELS, "worst_psnr_db": _DECIBELS, "worst_frame": _whole(0),
-}  # fmt: skip
-
-
-def _require(value: Any, form: _Form | _Check, path: str, where: str) -> None:
-    """Refuse a value that does not have a form."""
-    if not isinstance(form, dict):
-        fits, what = form
-        if not fits(value):
-            raise _wrong(value, what, path, where)
-    elif not isinstance(value, dict):
-        raise _wrong(value, "must be an object", path, where)
-    elif odd := sorted(set(value) ^ set(form)):
-        what = f"must be there, and only {', '.join(form)}"
-        raise _wrong(value.get(odd[0]), what, f"{path}.{odd[0]}", where)
-    else:
-        for name, inner in form.items():
-            _require(value[name], inner, f"{path}.{name}", where)
-
-
-def _wrong(value: Any, what: str, path: str, where: str) -> SchemaError:
-    return SchemaError(
-        f"{where}: {path} {what}, found {brief(value)}. The file was altered: fetch it again, or "
-        f"run `stereogenbench pack` again."
-    )
+_DERIVED: Final = {*map(rgb_name, range(CAMERA_COUNT)), *PACKED_DEPTH_NAMES.values()}

@@ -17,13 +17,7 @@ import numpy as np
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.schema.document import brief, camera_of, is_number, parse_document
 from stereogenbench_data.schema.parse import named_pair
-from stereogenbench_data.schema.quantities import (
-    length_unit_m,
-    nodes_of,
-    stated,
-    without_unit,
-    words,
-)
+from stereogenbench_data.schema.quantities import Values, without_unit, words
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
 _COUNTING: Final = re.compile(r"(.*?)(\d+)\Z")
@@ -130,7 +124,7 @@ def record_poses(text: bytes, *, where: str) -> RecordedPoses:
         )
         raise SchemaError(f"{where}: {reason}.")
     head = {key: value for key, value in document.items() if "pair" in words(key)}
-    pairs = [(each.path, named_pair(each.value)) for each in stated(nodes_of(head), "primary_pair")]
+    pairs = [(each.path, named_pair(each.value)) for each in Values(head).stated("primary_pair")]
     known = tuple((path, pair) for path, pair in pairs if pair is not None)
     return RecordedPoses(tuple(blocks), _hints(document), _unit_m(document, where), known)
 
@@ -146,9 +140,9 @@ def _first_of_lists(node: Any) -> Any:
 
 
 def _unit_m(document: dict[str, Any], where: str) -> float | None:
-    nodes = nodes_of(_first_of_lists(document))
-    unit_m = length_unit_m(nodes)
-    for each in stated(nodes, "unit"):
+    values = Values(_first_of_lists(document))
+    unit_m = values.length_unit_m
+    for each in values.stated("unit"):
         if unit_m is None and isinstance(each.value, str):
             raise SchemaError(
                 f"{where}: {each.path}: {brief(each.value)} is not a unit of length that is known "
@@ -340,7 +334,9 @@ def _ordered(
         ) else 1  # fmt: skip
     else:
         camera_axis = 0 if is_of_cameras[0] else 1
-    if values.shape[camera_axis] != CAMERA_COUNT:
+    before = place[: axes[camera_axis]][-1:]
+    is_of_frames = "frame" in "".join(before) and not is_of_cameras[camera_axis]
+    if values.shape[camera_axis] != CAMERA_COUNT or is_of_frames:
         return None
     # Cameras first: each frame may list them in an order of its own.
     for axis in (camera_axis, 1 - camera_axis):
@@ -366,13 +362,13 @@ def _order(numbers: np.ndarray, what: str) -> np.ndarray:
     """
     order = np.argsort(numbers, kind="stable")
     ascending = numbers[order]
-    is_odd = what == "cameras" and ascending[0] not in (0, 1)
+    is_odd = ascending[0] not in (0, 1) if what == "cameras" else ascending[0] < 0
     if is_odd or (np.diff(ascending) != 1).any():
         repeated = ascending[1:][np.diff(ascending) == 0]
         found = f"{repeated[0]} is there twice" if len(repeated) else (
             f"there are {len(numbers)} of {ascending[0]} to {ascending[-1]}"
         )  # fmt: skip
-        start = " from 0 or 1" if what == "cameras" else ""
+        start = " from 0 or 1" if what == "cameras" else " from 0 or above"
         raise _Odd(f"{what} must be numbered{start} without a gap, and {found}")
     return order
 

@@ -18,7 +18,7 @@ from stereogenbench_data.engine import Progress, advance_of
 from stereogenbench_data.errors import StorageError, explain_os_errors
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.index.tree import ListedTree
+from stereogenbench_data.index.tree import PlacedFolders
 from stereogenbench_data.schema.records import Member, Scene
 from stereogenbench_data.shards.plan import SCENE_TEXTS
 from stereogenbench_data.shards.tar import read_chunks
@@ -164,7 +164,7 @@ def download(
         for scene in wanted.scenes
     ]
     here = SceneIndex.from_scenes(scenes, dest)
-    here.passed_over = tuple(sorted(ListedTree(dest).keys - {scene.id.key for scene in scenes}))
+    here.passed_over = tuple(sorted(PlacedFolders(dest).keys - {scene.id.key for scene in scenes}))
     here.write(dest / INDEX_NAME)
     return here
 

@@ -126,7 +126,7 @@ def test_the_range_of_tags_is_learned_with_its_offset(detailed_release, tmp_path
     assert shape.depth.encoding.unit_m == pytest.approx(69.5 / 65535)
     out.write_text(f"[depth]\nunit_m = {shape.depth.encoding.unit_m!r}\n")
     assert re.search(
-        r"begins at 0\.5 m.* is 0 m", invoke("conventions", root, "--check", out).stderr
+        r"a range from 0\.5 m.* expect 0 m", invoke("conventions", root, "--check", out).stderr
     )
 
 

@@ -153,7 +153,7 @@ def test_two_shapes_of_files_are_two_decisions(make_scene, root, rewrite):
 
     assert learned.problems == []
     assert text.count("[[shape]]") == 2
-    places = {shape.numbers["focal_length"].place for shape in learned.conventions.shapes}
+    places = {shape.at["focal_length"].place for shape in learned.conventions.shapes}
     assert places == {"$.camera_intrinsics.focal_length_mm", "$.lens.focal_length_cm"}
     index = SceneIndex.open(root, conventions=stated(text))
     assert [index.scene(row).rig.focal_mm for row in (0, 1)] == [30.0, 30.0]
@@ -255,12 +255,14 @@ def test_opening_says_in_a_line_what_it_took_for_granted(make_scene, root, rewri
     assert "\n" not in str(warning.message)
 
 
-def test_rows_of_an_index_take_over_the_offset_of_depth(indexed_release, tmp_path):
-    stated_m = SceneIndex.open(indexed_release).scene(0).depth_unit_m[0]
-    file = tmp_path / "conventions.toml"
-    file.write_text(f"[depth]\nunit_m = {stated_m}\noffset_m = 0.5\n")
+def test_rows_of_an_index_take_over_the_offset_of_depth(make_scene, root):
+    make_scene()
+    SceneIndex.open(root).write(root / INDEX_NAME)
 
-    index = SceneIndex.open(indexed_release, conventions=file)
+    index = SceneIndex.open(
+        root,
+        conventions=stated("[depth]\nunit_m = 0.001\noffset_m = 0.5\ninstead_of_tag_m = 0.001\n"),
+    )
 
     assert index.scene(0).depth_unit_source == ("conventions",) * 6
     assert index.scene(0).depth_offset_m == (0.5,) * 6

@@ -45,13 +45,13 @@ def with_texts(table, name, texts):
     return table.set_column(place, table.schema.field(name), pa.array(texts))
 
 
-def test_one_row_two_million_times_is_refused_by_the_footer(file):
+def test_one_row_many_times_is_refused_by_the_footer(file):
     table = pq.read_table(file)
-    rewritten(file, table.slice(0, 1).take(pa.array([0] * 2_000_000)))
+    rewritten(file, table.slice(0, 1).take(pa.array([0] * 200_000)))
 
     told = run_bounded(OPEN, file, memory_mb=600)
 
-    assert "its 2,000,000 rows take" in told
+    assert "its 200,000 rows take" in told
     assert "may take" in told
 
 
@@ -75,12 +75,12 @@ def test_captions_of_300_mb_are_refused_by_the_footer(file):
 
 def test_one_long_caption_of_many_rows_is_added_up_before_it_is_spread_out(file):
     table = pq.read_table(file)
-    many = table.slice(0, 1).take(pa.array([0] * 10_000))
-    rewritten(file, with_texts(many, "caption", ["x" * 200_000] * 10_000))
+    many = table.slice(0, 1).take(pa.array([0] * 2_000))
+    rewritten(file, with_texts(many, "caption", ["x" * 200_000] * 2_000))
 
     told = run_bounded(OPEN, file, memory_mb=600)
 
-    assert "its 10,000 rows take 2,0" in told
+    assert "its 2,000 rows take 40" in told
 
 
 def test_seek_tables_that_take_more_than_the_file_allows_are_as_good_as_none(file):
@@ -102,7 +102,7 @@ def test_seek_tables_that_take_more_than_the_file_allows_are_as_good_as_none(fil
 
 @pytest.mark.parametrize(
     ("name", "letters", "most"),
-    [("map_name", 35_000, 255), ("family", 256, 255), ("caption", 65_537, "65,536")],
+    [("map_name", 65_537, "65,536"), ("caption", 65_537, "65,536")],
 )
 def test_a_long_text_is_refused_with_its_length_alone(file, name, letters, most):
     table = pq.read_table(file)

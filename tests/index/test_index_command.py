@@ -148,12 +148,12 @@ def test_a_stopped_run_keeps_its_journal_and_a_second_one_uses_it(
     describe = walk_module.describe_scene
     described = []
 
-    def stopping(folder, key, **how):
+    def stopping(place, key, **how):
         if key.endswith("2") and len(described) == 2:
             described.append("stopped")
             raise KeyboardInterrupt
         described.append(key)
-        return describe(folder, key, **how)
+        return describe(place, key, **how)
 
     monkeypatch.setattr(walk_module, "describe_scene", stopping)
 

@@ -8,12 +8,11 @@ import pytest
 
 from stereogenbench_data.errors import SchemaError, StorageError
 from stereogenbench_data.index.assumptions import assumptions
+from stereogenbench_data.index.folders import SceneFolder, stamp_of
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
-    SceneFolder,
     describe_scene,
     metadata_differences,
-    stamp_of,
 )
 from stereogenbench_data.schema.records import Member
 
@@ -179,6 +178,47 @@ def test_a_trajectory_of_fewer_frames_is_not_used(make_scene, root, rewrite):
 
     assert scene.frames == 4
     assert "has poses of 3 frames, and the videos have 4" in scene.remark("poses")
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda frames: [pose["rotation"].update(yaw=pose["rotation"]["yaw"] + 2.0)
+                        for frame in frames for pose in frame["cameras"]],
+        lambda frames: frames.extend([frames[-1] | {"frame_index": 4 + more} for more in range(3)]),
+        lambda frames: [frame.update(frame_index=frame["frame_index"] - 4) for frame in frames],
+    ],
+    ids=["all cameras turned", "three entries more", "numbers below 0"],
+)  # fmt: skip
+def test_poses_that_no_lateral_rig_of_these_frames_has_are_not_used(
+    make_scene, root, rewrite, edit
+):
+    rewrite(make_scene() / "trajectory.json", lambda document: edit(document["frames"]))
+
+    scene = describe_scene(root, KEY)
+
+    assert scene.remark("poses")
+    assert scene.rig_residual_px == 0
+
+
+def test_objects_beside_the_cameras_are_no_poses(make_scene, root, rewrite):
+    def add_lights(document):
+        for frame in document["frames"]:
+            frame["lights"] = frame["cameras"][:2]
+
+    rewrite(make_scene() / "trajectory.json", add_lights)
+
+    assert describe_scene(root, KEY).remark("poses") == ""
+
+
+def test_units_of_depth_that_differ_by_a_scale_within_a_rig_are_not_used(make_scene, root, video):
+    other = video("depth.mkv", tags={"DEPTH_SCALE": "0.01"})
+    shutil.copy(other, make_scene() / "cam_00_depth.mkv")
+
+    scene = describe_scene(root, KEY)
+
+    assert scene.depth_unit_source == ("unreadable",) * 6
+    assert "0.01, 0.001" in scene.remark("depth")
 
 
 def test_a_video_of_another_size_is_named(make_scene, root, video):

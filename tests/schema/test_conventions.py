@@ -67,7 +67,7 @@ def test_all_that_can_be_stated_is_read_and_written_again():
     assert read(written.encode()) == conventions
     assert written.startswith("# head\n")
     first, second = conventions.shapes
-    assert (first.has, first.numbers["sensor_width"].value) == (
+    assert (first.has, first.at["sensor_width"].value) == (
         ("baseline.json: $.lens.mm",),
         23.76,
     )
@@ -130,8 +130,8 @@ def test_a_rig_is_the_same_by_the_places_where_it_was_seen(rig_document, dumped)
     seen = see_rig(text, where="b")
 
     assert parse_rig(text, where="b", shape=seen.shape) == parse_rig(text, where="b")
-    assert seen.shape.numbers["focal_length"].place == "$.camera_intrinsics.focal_length_mm"
-    assert seen.shape.baselines.place == "$.pairwise_pairs"
+    assert seen.shape.at["focal_length"].place == "$.camera_intrinsics.focal_length_mm"
+    assert seen.shape.at["baselines"].place == "$.pairwise_pairs"
     assert seen.unknown == []
 
 

@@ -131,7 +131,8 @@ def test_a_range_gives_unit_and_offset(statements):
     [
         {"scale": ""}, {"scale": "0"}, {"scale": "-1"}, {"scale": "nan"}, {"scale": "x0.001"},
         {"units_per_meter": "0.001"}, {"meters_per_unit": "1000"},
-        {"DEPTH_FOO": "0.001"}, {"zscale2": "0.001"}, {"DEPTH_UNIT": "m"}, {"unit": "inch"},
+        {"DEPTH_FOO": "0.001"}, {"zscale2": "0.001"}, {"DEPTH_UNIT": "m"},
+        {"unit": "furlong"}, {"scale": "0.03937 in"},
         {"scale": "0.1", "DEPTH_UNIT": "mm"}, {"scale": "0.1", "unit": "cm"},
         {"depth_scale": "0.001", "scale": "0.002"},
         {"depth_scale": "0.1", "near": "0.5 m", "far": "80.5 m"},
@@ -142,6 +143,11 @@ def test_a_range_gives_unit_and_offset(statements):
         {"scale": "0.001", "offset": "0.5"}, {"max_depth": "100"}, {"normalized": "1"},
         {"near": "10", "far": "10000"}, {"unit": "mm", "depth_min": "312", "depth_max": "60000"},
         {"comment": "depth clipped at 100 m"}, {"comment": "depth / 7 + 3"},
+        {"comment": "depth_m = raw*0.001 + 1.0", "scale": "0.001"},
+        {"comment": "stored = (depth - 1.0) / 0.001", "scale": "0.001"},
+        {"comment": "uint16 mm, distance to camera"}, {"comment": "range image, mm"},
+        {"comment": "1/z", "scale": "0.001"}, {"DEPTH_TYPE": "distance", "scale": "0.001"},
+        {"projection": "distance_to_camera", "scale": "0.001"},
     ],
     ids=str,
 )  # fmt: skip
@@ -157,6 +163,10 @@ def test_tags_that_do_not_tell_the_unit_are_refused_by_name(tags):
         {"depth": {"type": "ray_distance", "scale": 0.001}},
         {"depth_scale": 0.1, "depth": {"unit": "mm"}},
         {"depth_foo": 0.001},
+        {"depth": {"annotator": "distance_to_camera", "unit": "mm"}},
+        {"depth_kind": "spherical", "depth_scale": 0.001},
+        {"depth_is_planar": False, "depth_scale": 0.001},
+        {"depth_definition": "L2 norm of the point", "depth_scale": 0.001},
     ],
     ids=json.dumps,
 )

@@ -68,6 +68,7 @@ def test_without_a_sensor_height_pixels_are_square(rig_document, dumped):
         ({"left_camera": "Town_Cam_02", "right_camera": "Town_cam4"}, (2, 4)),
         ({"left_camera": 3, "right_camera": 5}, (3, 5)),
         ([1, 2], (1, 2)),
+        ({"L": "Cam_01", "R": "Cam_02"}, (1, 2)),
         (["Cam_00", "Cam_05"], (0, 5)),
         ("1-3", (1, 3)),
         ({"camera_index_a": 2, "camera_index_b": 3, "baseline_cm": 5.75}, (2, 3)),
@@ -234,7 +235,13 @@ def test_a_principal_point_is_found_under_likely_keys(rig_document, dumped, writ
 
 
 @pytest.mark.parametrize(
-    "written", [{"cx": 320.0, "cy": 240.0}, {"cx": 0.5, "cy": 0.5}, {"cx": 319.5, "cy": 239.5}]
+    "written",
+    [
+        {"cx": 320.0, "cy": 240.0},
+        {"cx": 0.5, "cy": 0.5},
+        {"cx": 319.5, "cy": 239.5},
+        {"principal_point": "image_center"},
+    ],
 )
 def test_a_principal_point_at_the_centre_is_none(rig_document, dumped, written):
     rig, _, remarks = parse_rig(dumped(rig_document | written), where="baseline.json")
@@ -244,8 +251,12 @@ def test_a_principal_point_at_the_centre_is_none(rig_document, dumped, written):
 
 
 @pytest.mark.parametrize(
-    "written", [{"cx": 300.5}, {"principal_point": "left"}, {"cx": 1e9, "cy": 1}]
-)
+    "written",
+    [
+        {"cx": 300.5}, {"principal_point": "left"}, {"cx": 1e9, "cy": 1}, {"shift_x": 0.05},
+        {"principal_point_normalized": [0.53, 0.5]}, {"principal_point_offset_px": [4, 0]},
+    ],
+)  # fmt: skip
 def test_a_principal_point_that_is_not_understood_stops_no_disparity(rig_document, dumped, written):
     rig, _, (remark,) = parse_rig(dumped(rig_document | written), where="baseline.json")
 
@@ -279,6 +290,10 @@ def test_a_principal_point_that_is_not_understood_stops_no_disparity(rig_documen
         ({"FOVAngle": 40.15832, "sensor_width_mm": 23.76}, {}),
         ({"horizontal_fov": 0.70089489, "sensor_width_mm": 23.76}, {}),
         ({"camera_angle_x": 0.70089489, "sensor_width_mm": 23.76}, {}),
+        ({"f_mm": 32.5, "sw_mm": 23.76, "sh_mm": 17.82}, {}),
+        ({"camera.focal_length_mm": 32.5, "sensor_mm": [23.76, 17.82], "fov": 40.2}, {}),
+        ({"camera_matrix": {"rows": 3, "data": [875.4208754, 0, 320, 0, 875.4208754, 240, 0, 0, 1]},
+          "sensor_width_mm": 23.76}, {}),
         ({"vertical_fov_degrees": 30.66233813, "sensor_width_mm": 23.76}, {}),
         ({"focal_length": {"value": 3.25, "unit": "cm"}, "sensor_width_mm": 23.76}, {}),
     ],
@@ -309,6 +324,24 @@ def test_a_lens_that_no_camera_has_is_refused_with_its_angle(
 
     assert f"{metres:g} mm" in problem
     assert angle in problem
+
+
+def test_the_side_that_a_sensor_is_fitted_to_counts(rig_document, dumped):
+    rig_document["camera_intrinsics"] |= {"sensor_width_mm": 36.0, "sensor_height_mm": 24.0}
+
+    for fit, width_mm, height_mm in (("VERTICAL", 32.0, 24.0), ("AUTO", 36.0, 27.0)):
+        document = rig_document | {"sensor_fit": fit}
+        rig, _, _ = parse_rig(dumped(document), where="baseline.json")
+        assert (rig.sensor_width_mm, rig.sensor_height_mm) == pytest.approx((width_mm, height_mm))
+
+
+@pytest.mark.parametrize(
+    "written", [{"distortion": {"k1": -0.12}}, {"camera_model": "fisheye"}, {"overscan": 0.1}]
+)
+def test_a_model_of_the_lens_is_told(rig_document, dumped, written):
+    _, _, (remark,) = parse_rig(dumped(rig_document | written), where="baseline.json")
+
+    assert remark.about == "lens"
 
 
 def test_a_lens_that_is_stated_twice_must_agree(rig_document, dumped):
@@ -384,6 +417,29 @@ def pairs_as(document, write):
             lambda pairs: {"camera_offsets_m": [0.0, *(cm / 100 for a, _, cm in pairs if a == 0)]},
             id="places along the rig"),
         pytest.param(lambda pairs: {"pairwise_pairs": [*pairs]}, id="two cameras and a length"),
+        pytest.param(
+            lambda pairs: {"pairwise_pairs": dict(zip(
+                ("camera_index_a", "camera_index_b", "baseline_cm"),
+                map(list, zip(*pairs, strict=True)),
+                strict=True,
+            ))}, id="columns"),
+        pytest.param(
+            lambda pairs: {"pairwise_pairs": [
+                {"camera_index_a": a, "camera_index_b": b, "baseline_in": cm / 2.54}
+                for a, b, cm in pairs
+            ]}, id="inches"),
+        pytest.param(
+            lambda pairs: {"pairwise_pairs": [
+                {"camera_index_a": a, "camera_index_b": b, "baseline": cm / 2.54, "unit": "inch"}
+                for a, b, cm in pairs
+            ]}, id="a unit beside the number"),
+        pytest.param(
+            lambda pairs: {"pairwise_pairs": [
+                {"camera_index_a": a, "camera_index_b": b, "baseline_cm": cm, "fx_px": 875.4,
+                 "baseline_bin": "[1,10)", "focal_length_mm": 32.5, "baseline_error_cm": 3e-12,
+                 "target_baseline_cm": 7.0, "fx_times_baseline": 9.0}
+                for a, b, cm in pairs
+            ]}, id="figures beside the baseline"),
         pytest.param(
             lambda pairs: {"baselines": {f"{a}-{b}": f"{cm / 100!r} m" for a, b, cm in pairs}},
             id="a unit behind the number"),

@@ -179,7 +179,10 @@ def change(path, value):
         (change(["frames", 2, "frame_index"], 5), "frames must be .*, and there are 3 of 0 to 5"),
         (change(["frames", 1, "cameras", 3, "camera_index"], 2), "cameras must .*, and 2 is there"),
         (change(["frames", 1, "cameras", 3, "camera_index"], 6), "there are 6 of 0 to 6"),
-        (change(["unit"], "feet"), r"\$\.unit: 'feet' is not a unit of length that is known"),
+        (
+            change(["unit"], "furlongs"),
+            r"\$\.unit: 'furlongs' is not a unit of length that is known",
+        ),
     ],
 )
 def test_poses_that_cannot_be_put_in_order_are_refused(trajectory_document, changes, reason):

@@ -26,11 +26,11 @@ from stereogenbench_data.audit.scene_access import source_of
 from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
 from stereogenbench_data.index.build import walk
+from stereogenbench_data.index.folders import SceneFolder
 from stereogenbench_data.index.journal import Journal
 from stereogenbench_data.index.open import IncompleteSceneWarning
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.rows import row_of
-from stereogenbench_data.index.scene_folder import SceneFolder
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key

@@ -15,7 +15,7 @@ from stereogenbench_data.audit.geometry.records import RigAudit
 from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses, rotation_angle_rad
 from stereogenbench_data.geometry.rig import rectification_residual_px
-from stereogenbench_data.schema.quantities import nodes_of, numbers
+from stereogenbench_data.schema.quantities import Values
 from stereogenbench_data.schema.records import Rig
 from stereogenbench_data.schema.release import ADJACENT_PAIRS, CAMERA_PAIRS
 
@@ -26,9 +26,9 @@ _QUANTITIES: Final = {
 
 def recorded_px(document: dict[str, Any]) -> Iterator[tuple[str, float]]:
     """Yield the name (of `Intrinsics`) and value of each number in pixels, at any depth."""
-    nodes = nodes_of(document)
+    values = Values(document)
     for name, quantity in _QUANTITIES.items():
-        for each in numbers(nodes, quantity):
+        for each in values.numbers(quantity):
             # A focal length without a unit may be in millimetres.
             if each.unit == "px" or (not each.unit and "focal" not in each.path.lower()):
                 yield name, float(each.value)
