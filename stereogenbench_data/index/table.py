@@ -14,7 +14,7 @@ import pyarrow as pa
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import compute as pc
 from stereogenbench_data.index.arrow import as_categories, as_numpy, one_array, table_digest
-from stereogenbench_data.index.open import Rows, SeekTables, open_table, with_baselines
+from stereogenbench_data.index.open import Opened, Rows, open_table, with_baselines
 from stereogenbench_data.index.parquet import (
     IndexHead,
     read_seek_tables,
@@ -31,7 +31,6 @@ from stereogenbench_data.sources.retry import RetryPolicy
 
 if TYPE_CHECKING:
     from stereogenbench_data.index.build import TreeReport
-    from stereogenbench_data.index.presumed import Presumption
 
 _OF_BASELINES: Final = frozenset(
     {
@@ -64,17 +63,9 @@ class SceneIndex:
         presumption: What reads the scenes whose rows are presumed; None where all were read.
     """
 
-    def __init__(
-        self,
-        table: pa.Table,
-        head: IndexHead,
-        *,
-        retry: RetryPolicy | None = None,
-        stale: str = "",
-        seek_tables: SeekTables = None,
-        presumption: "Presumption | None" = None,
-    ) -> None:
+    def __init__(self, opened: Opened, *, retry: RetryPolicy | None = None) -> None:
         """Take a checked table; use `open` or `from_scenes` to make an index."""
+        head = opened.head
         self.root = head.root
         self.retry = retry
         self.incomplete = head.incomplete
@@ -82,13 +73,13 @@ class SceneIndex:
         self.shards = head.shards
         self.is_part = head.is_part
         self.passed_over = head.passed_over
-        self.stale = stale
+        self.stale = opened.stale
         self.is_from_file = bool(head.digest)
-        self._table = table
+        self._table = opened.table
         self._columns: dict[str, np.ndarray] = {}
         self._digest = head.digest
-        self._seek_tables = seek_tables
-        self.presumption = presumption
+        self._seek_tables = opened.seek_tables
+        self.presumption = opened.presumption
 
     @classmethod
     def open(
@@ -139,14 +130,7 @@ class SceneIndex:
         opened = open_table(
             data, root=root, retry=retry, wanted=wanted, conventions=stated, rows=rows
         )
-        return cls(
-            opened.table,
-            opened.head,
-            retry=retry,
-            stale=opened.stale,
-            seek_tables=opened.seek_tables,
-            presumption=opened.presumption,
-        )
+        return cls(opened, retry=retry)
 
     @classmethod
     def from_scenes(
@@ -171,7 +155,7 @@ class SceneIndex:
         scenes = tuple(scenes)
         table = table_of_scenes(scenes, where=shown(root))
         head = IndexHead(str(root), shards=dict(shards or {}))
-        return cls(table, head, retry=retry, seek_tables=seek_tables_of(scenes))
+        return cls(Opened(table, head, seek_tables=seek_tables_of(scenes)), retry=retry)
 
     def only(self, rows: Iterable[int]) -> "SceneIndex":
         """Return an index of a few rows, small enough to be sent to a process with its work."""
@@ -182,7 +166,7 @@ class SceneIndex:
     def from_report(cls, report: "TreeReport") -> "SceneIndex":
         """Return the index of the scenes that a walk found, and of those that it left out."""
         table = table_of_scenes(report.scenes, where=shown(report.root))
-        return cls(table, report.head, seek_tables=seek_tables_of(report.scenes))
+        return cls(Opened(table, report.head, seek_tables=seek_tables_of(report.scenes)))
 
     def __repr__(self) -> str:
         """Return the root without secrets, and the number of scenes and shards."""
