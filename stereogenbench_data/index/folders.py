@@ -181,10 +181,10 @@ class RemoteFolder(SceneFolder):
         name, start, stop = part
         if name.startswith("cam_"):
             return self._objects[name].read(start, stop)
-        where, number = f"{self._key}/{name}", self._files[name][1]
-        kept = None if self._kept is None else self._kept.file(where, size=stop, number=number)
+        version = f"{self._key}/{name} {self._files[name]}"
+        kept = None if self._kept is None else self._kept.read("files", version)
         if kept is None:
             kept = self._objects[name].read(start, stop)
             if self._kept is not None:
-                self._kept.keep_file(where, kept, number=number)
+                self._kept.keep("files", version, kept)
         return kept

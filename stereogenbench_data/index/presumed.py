@@ -11,6 +11,7 @@ of a scene only the videos that its samples need are opened, ahead of them where
 """
 
 import hashlib
+import json
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -40,6 +41,7 @@ from stereogenbench_data.index.folders import (
     in_parallel,
     stamp_of,
 )
+from stereogenbench_data.index.rows import json_of, scene_of_json
 from stereogenbench_data.index.scene_folder import (
     DESCRIPTIONS,
     as_agreed,
@@ -512,14 +514,17 @@ class Presumption:
         try:
             folder = tree.folder(key)
             stamp = stamp_of(folder.stamps())
-            scene = tree.cache.scene(key, stamp=stamp, part=part)
+            kept, scene = tree.cache.read("scenes", f"{key} {part} {stamp}"), None
+            with suppress(ValueError, KeyError, TypeError, IndexError, AttributeError):
+                scene = None if kept is None else scene_of_json(json.loads(kept))
             if scene is None:
                 texts = BASELINE_JSON, COMPLETE_JSON, TRAJECTORY_JSON, *DESCRIPTIONS
                 folder.fetch([*texts, *(videos or ())])
                 scene = describe_scene(
                     tree.root, key, conventions=tree.conventions, folder=folder, videos=videos
                 )
-                tree.cache.keep_scene(scene, stamp=stamp, part=part)
+                row = json.dumps(json_of(scene)).encode()
+                tree.cache.keep("scenes", f"{key} {part} {stamp}", row)
         except StereoGenBenchError as error:
             raise StorageError(self._contradicted(key, [str(error)])) from error
         return scene

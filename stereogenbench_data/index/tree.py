@@ -9,6 +9,7 @@ thousand files a request, so `RemoteTree` lists a whole release in some hundred,
 listing of a commit in the user's cache.
 """
 
+import json
 import os
 import re
 import sys
@@ -278,12 +279,13 @@ class RemoteTree:
 
     def _once(self, name: str, ask: Callable[[], Any]) -> Any:
         """Return an answer as JSON holds it; that of a commit is kept."""
-        kept = None if self._kept is None else self._kept.document(name)
-        if kept is None:
-            kept = ask()
-            if self._kept is not None:
-                self._kept.keep_document(name, kept)
-        return kept
+        kept = None if self._kept is None else self._kept.read("listing", name)
+        if kept is not None:
+            return json.loads(kept)
+        found = ask()
+        if self._kept is not None:
+            self._kept.keep("listing", name, json.dumps(found).encode())
+        return found
 
 
 def _number(version: str) -> int:

@@ -2,9 +2,9 @@
 
     <cache>/stereogenbench/trees/<digest of the root>/
         presumed-<digest of the listing>.parquet   the rows, as an index file
-        scenes/ab/<digest of the key>.json         the row of a scene that was described
-        listing/ab/<digest of the folder>.json     what a commit of the Hub holds
-        files/ab/<digest of path and ETag>.json    a small file of a scene behind a URL
+        scenes/ab/<digest of the scene's files>    the row of a scene that was described
+        listing/ab/<digest of the folder>          what a commit of the Hub holds
+        files/ab/<digest of path and ETag>         a small file of a scene behind a URL
 
 The listing is the path, size and modification time of every file, so what is kept is used only for
 unchanged files. Any number of processes, of several machines too, may read and write: files are
@@ -20,7 +20,7 @@ import zlib
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import pyarrow as pa
 
@@ -32,15 +32,14 @@ from stereogenbench_data.index.parquet import (
     read_seek_tables,
     write_index_file,
 )
-from stereogenbench_data.index.rows import SCHEMA, json_of, scene_of_json
-from stereogenbench_data.schema.records import Scene
+from stereogenbench_data.index.rows import SCHEMA
 from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.sources.location import is_remote
 
 VARIABLE: Final = "STEREOGENBENCH_CACHE"
 """The environment variable that names another folder for the cache, or is "off"."""
 
-_FORMAT: Final = 1
+_FORMAT: Final = 2
 _MOST_TABLES: Final = 8
 """So many selections of a tree are kept: each has a table of its own."""
 
@@ -97,64 +96,24 @@ class TreeCache:
             for old in tables[:-_MOST_TABLES]:
                 old.unlink(missing_ok=True)
 
-    def scene(self, key: str, *, stamp: str, part: str = "") -> Scene | None:
-        """Return the row of a scene that was described, None if its files have changed since.
-
-        Args:
-            key: Its path.
-            stamp: The digest of its files.
-            part: Which part of its videos was opened, "" for all.
-        """
-        if self._folder is None:
-            return None
-        try:
-            kept = json.loads(self._place(f"{key}{part}").read_bytes())
-            return scene_of_json(kept["row"]) if kept["stamp"] == stamp else None
-        except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError):
-            return None
-
-    def keep_scene(self, scene: Scene, *, stamp: str, part: str = "") -> None:
-        """Keep the row of a scene; see `scene`."""
-        row = json.dumps({"stamp": stamp, "row": json_of(scene)})
-        self._keep(self._place(f"{scene.id.key}{part}"), row.encode())
-
-    def document(self, name: str) -> Any:
-        """Return the JSON that was kept under a name; None if there is none."""
-        if self._folder is None:
-            return None
-        with suppress(OSError, ValueError, zlib.error):
-            return json.loads(zlib.decompress(self._place(name, kind="listing").read_bytes()))
+    def read(self, kind: str, name: str) -> bytes | None:
+        """Return what was kept under a kind and a name; None if there is none, or it is damaged."""
+        if self._folder is not None:
+            with suppress(OSError, zlib.error):
+                return zlib.decompress(self._place(kind, name).read_bytes())
         return None
 
-    def keep_document(self, name: str, document: Any) -> None:
-        """Keep JSON under a name."""
-        self._keep(
-            self._place(name, kind="listing"), zlib.compress(json.dumps(document).encode(), 1)
-        )
-
-    def file(self, path: str, *, size: int, number: int) -> bytes | None:
-        """Return a small file that was kept; None if there is none of that size and number."""
-        if self._folder is None:
-            return None
-        try:
-            found = self._place(f"{path} {number}", kind="files").read_bytes()
-        except OSError:
-            return None
-        return found if len(found) == size else None
-
-    def keep_file(self, path: str, content: bytes, *, number: int) -> None:
-        """Keep a small file, under a number that changes with it."""
-        self._keep(self._place(f"{path} {number}", kind="files"), content)
-
-    def _keep(self, place: Path, content: bytes) -> None:
+    def keep(self, kind: str, name: str, content: bytes) -> None:
+        """Keep bytes under a kind and a name, which changes with what they were made of."""
         if self._folder is not None:
+            place = self._place(kind, name)
             with suppress(OSError):
                 place.parent.mkdir(parents=True, exist_ok=True)
-                write_atomic(place, content)
+                write_atomic(place, zlib.compress(content, 1))
 
-    def _place(self, key: str, *, kind: str = "scenes") -> Path:
-        name = _digest(key)
-        return Path(self._folder or "", kind, name[:2], f"{name}.json")
+    def _place(self, kind: str, name: str) -> Path:
+        digest = _digest(name)
+        return Path(self._folder or "", kind, digest[:2], digest)
 
 
 def _digest(text: str) -> str:
