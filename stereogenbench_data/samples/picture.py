@@ -32,24 +32,6 @@ _MARKS: Final = 4
 """How many places of a colour bar are labelled."""
 
 
-def coloured(
-    values: Float[np.ndarray, "h w"],
-    *,
-    measured: Bool[np.ndarray, "h w"],
-    largest: float,
-) -> Picture:
-    """Return the absolute values of a map as colours, grey where not measured.
-
-    Colours run from 0 (dark blue) to ``largest`` (red), which also stands for larger values.
-    """
-    place = np.clip(np.abs(values) / max(largest, 1e-12), 0, 1) * (len(COLOUR_STOPS) - 1)
-    stops = np.arange(len(COLOUR_STOPS))
-    channels = [np.interp(place, stops, colours) for colours in COLOUR_STOPS.T]
-    picture = np.stack(channels, axis=-1).round().astype(np.uint8)
-    picture[~measured] = NOT_MEASURED
-    return picture
-
-
 def anaglyph(left: UInt8[np.ndarray, "3 h w"], right: UInt8[np.ndarray, "3 h w"]) -> Picture:
     """Return a picture for red-cyan glasses: red of the left view, green and blue of the right."""
     return np.stack([left[0], right[1], right[2]], axis=-1)
@@ -95,7 +77,11 @@ class ColourScale:
         places = (shown - self.low) / (self.high - self.low)
         if self.kind == "log":
             places = 1 - np.log(shown / self.low) / math.log(self.high / self.low)
-        return coloured(places, measured=measured, largest=1.0)
+        stops = np.linspace(0, 1, len(COLOUR_STOPS))
+        channels = [np.interp(places, stops, colours) for colours in COLOUR_STOPS.T]
+        picture = np.stack(channels, axis=-1).round().astype(np.uint8)
+        picture[~measured] = NOT_MEASURED
+        return picture
 
     def spread(self, count: int) -> Float[np.ndarray, " count"]:
         """Return values at equal distances along the scale, its ends included."""

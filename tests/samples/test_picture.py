@@ -6,18 +6,16 @@ from PIL import Image
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.samples.picture import (
     COLOUR_STOPS,
-    coloured,
+    ColourScale,
     draw_sheet,
     pair_tiles,
     write_png,
 )
 
 
-def test_colours_run_from_zero_to_the_largest_and_grey_is_not_measured():
-    picture = coloured(
-        np.array([[0.0, 10.0, 20.0, 5.0]]),
-        measured=np.array([[True, True, True, False]]),
-        largest=10.0,
+def test_colours_run_from_the_low_end_to_the_high_one_and_grey_is_not_measured():
+    picture = ColourScale(0.0, 10.0).paint(
+        np.array([[0.0, 10.0, 20.0, 5.0]]), measured=np.array([[True, True, True, False]])
     )
 
     assert picture[0, 0].tolist() == COLOUR_STOPS[0].tolist()

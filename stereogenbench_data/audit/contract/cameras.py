@@ -256,34 +256,14 @@ class CameraComparison:
 
     def _picture_problem(self, camera: int, row_problem: str | None) -> str:
         """Return what is wrong with a camera's pictures."""
-        behind = set(self._behind()) - {camera}
-        own = self._of(camera)
-        neighbour = next((beside for beside in own if not set(beside.pair) & behind), own[0])
-        if row_problem is not None and neighbour.share >= LEAST_SHARE:
+        explained = max(beside.share for beside in self._of(camera))
+        if row_problem is not None and explained >= LEAST_SHARE:
             return row_problem
-        matches = [
-            match for match in self._matches
-            if match.right == camera and match.pair == neighbour.pair
-        ]  # fmt: skip
-        if self._share_elsewhere(matches) > neighbour.share + _LEAST_DEFICIT:
-            return f"camera {camera} {_ELSEWHERE}"
         found = f", perhaps {row_problem.split(' are ')[1]}" if row_problem else ""
         return (
             f"pictures of camera {camera} do not fit those of the others, by the depth of "
             f"either: other rows, another moment or another place{found}"
         )
-
-    def _share_elsewhere(self, matches: Sequence[FrameMatch]) -> float:
-        """Return the share of matches that depth explains if the cameras stand elsewhere."""
-        found_px, predicted_px = self._joined(matches, self._contract.hypothesis)
-        if not len(found_px):
-            return 0.0
-        # The two may even stand in the other order.
-        aways = [
-            voted_scale(found_px, sign * predicted_px) * sign * predicted_px - found_px
-            for sign in (1, -1)
-        ]
-        return max(float((np.abs(away) < matches[0].grain_px).mean()) for away in aways)
 
     def _joined(
         self, matches: Sequence[FrameMatch], hypothesis: Hypothesis
@@ -391,7 +371,6 @@ class CameraComparison:
         return shares
 
 
-_ELSEWHERE: Final = "is not at its recorded position, or its pictures are shifted"
 _READINGS: Final[dict[Question, str]] = {
     "frame_lag": "with a lag of {:+d} frames", "flip": "flipped ({})", "form": "as {} depth",
     "kind": "along the {}",
