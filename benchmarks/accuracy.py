@@ -101,7 +101,7 @@ def _errors(run: Callable[[np.ndarray, Pair], np.ndarray], cases: int) -> dict[s
         size_px = np.abs(true_px[kept]).astype(np.float64)
         bound_px = disparity_error_px(
             (units * pair.unit_m)[kept][None],
-            focal_px=pair.focal_px, baseline_m=pair.baseline_m, quantum_m=pair.unit_m,
+            shift_px_m=pair.focal_px * abs(pair.baseline_m), half_step_m=pair.unit_m / 2,
         )[0]  # fmt: skip
         all_px.append(error_px)
         screen_px.append(error_px[size_px <= SCREEN_PX])

@@ -3,6 +3,10 @@
 from stereogenbench_data.datasets.adapters import to_raft_stereo as to_raft_stereo
 from stereogenbench_data.datasets.adapters import to_torchvision as to_torchvision
 from stereogenbench_data.datasets.batches import EpochBatches as EpochBatches
+from stereogenbench_data.datasets.batches import OpenVideosWarning as OpenVideosWarning
+from stereogenbench_data.datasets.batches import (
+    RepeatedDecodingWarning as RepeatedDecodingWarning,
+)
 from stereogenbench_data.datasets.derive import DERIVE_FIELDS as DERIVE_FIELDS
 from stereogenbench_data.datasets.derive import DERIVED_FIELDS as DERIVED_FIELDS
 from stereogenbench_data.datasets.derive import derive as derive
@@ -12,10 +16,6 @@ from stereogenbench_data.datasets.mapped import MixedSplitsWarning as MixedSplit
 from stereogenbench_data.datasets.mapped import SceneViews as SceneViews
 from stereogenbench_data.datasets.mapped import SeekTableWarning as SeekTableWarning
 from stereogenbench_data.datasets.mapped import StereoPairs as StereoPairs
-from stereogenbench_data.datasets.open_videos import OpenVideosWarning as OpenVideosWarning
-from stereogenbench_data.datasets.open_videos import (
-    RepeatedDecodingWarning as RepeatedDecodingWarning,
-)
 from stereogenbench_data.datasets.shared_epoch import RepeatedEpochWarning as RepeatedEpochWarning
 from stereogenbench_data.datasets.streamed import StereoPairStream as StereoPairStream
 from stereogenbench_data.datasets.tensors import collate as collate

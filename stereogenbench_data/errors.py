@@ -24,8 +24,8 @@ IncompleteSceneWarning   index.open           some scenes of the data cannot be 
 AssumptionWarning        index.assumptions    files are not as the paper prints them
 OddSceneWarning          samples.checks       selected scenes differ from what the release promises
 SwappedSizeWarning       samples.size         a size looks like (width, height)
-OpenVideosWarning        datasets.open_videos more videos are needed than may be open
-RepeatedDecodingWarning  datasets.open_videos several processes decode the same videos
+OpenVideosWarning        datasets.batches more videos are needed than may be open
+RepeatedDecodingWarning  datasets.batches several processes decode the same videos
 FewerPairsWarning        selection.pairs      the data hold some cameras alone
 MixedSplitsWarning       datasets.mapped      train and eval scenes come together
 RepeatedEpochWarning     datasets.shared_epoch a pass repeats the random frames of another

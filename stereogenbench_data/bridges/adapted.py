@@ -3,37 +3,16 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, ClassVar, Generic, Literal, TypeVar, Unpack
 
 from torch.utils.data import Dataset, default_collate
 
-from stereogenbench_data.datasets.batch_buffers import Buffers
 from stereogenbench_data.datasets.loader import LoaderOptions, PairsLoader
-from stereogenbench_data.datasets.mapped import Check, Data, StereoPairs
+from stereogenbench_data.datasets.mapped import Data, PairsOptions, StereoPairs
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.samples.fields import Sample
-from stereogenbench_data.samples.request import Transform
-from stereogenbench_data.schema.conventions import Conventions
-from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.selection.plan import Selection
-from stereogenbench_data.sources.cache import ShardCache
 
 Item = TypeVar("Item")
-
-
-class PairsOptions(Selection, total=False):
-    """What `StereoPairs` takes, except data and fields."""
-
-    size: tuple[int, int] | str | None
-    transform: Transform | None
-    depth: DepthEncoding | None
-    conventions: str | Path | Conventions | None
-    seed: int
-    cache: ShardCache | None
-    check: Check
-    buffers: Buffers
-    fetch_ahead_bytes: int
 
 
 class AdaptedPairs(Dataset[Item], ABC, Generic[Item]):

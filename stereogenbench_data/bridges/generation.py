@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from stereogenbench_data.bridges.adapted import AdaptedPairs, PairsOptions
-from stereogenbench_data.datasets.mapped import Data
+from stereogenbench_data.bridges.adapted import AdaptedPairs
+from stereogenbench_data.datasets.mapped import Data, PairsOptions
 from stereogenbench_data.errors import FieldError, SelectionError
 from stereogenbench_data.geometry.projection import front_pixels, project_rectified
 from stereogenbench_data.geometry.rig import RECTIFIED_PX

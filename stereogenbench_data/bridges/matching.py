@@ -18,9 +18,9 @@ from typing import Final, Unpack
 import numpy as np
 import torch
 
-from stereogenbench_data.bridges.adapted import AdaptedPairs, Item, PairsOptions
+from stereogenbench_data.bridges.adapted import AdaptedPairs, Item
 from stereogenbench_data.datasets.adapters import to_raft_stereo
-from stereogenbench_data.datasets.mapped import Data
+from stereogenbench_data.datasets.mapped import Data, PairsOptions
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.samples.fields import Sample
 

@@ -366,7 +366,7 @@ class ShareOptions:
             ShardError: If the size cannot be parsed.
             SelectionError: If there are fewer scenes, or none fits.
         """
-        from stereogenbench_data.selection.share import balanced_share
+        from stereogenbench_data.selection.balance import balanced_share
         from stereogenbench_data.shards.plan import parse_bytes
 
         limit = None if self.max_bytes is None else parse_bytes(self.max_bytes)

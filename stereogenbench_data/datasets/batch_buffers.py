@@ -26,7 +26,7 @@ import multiprocessing
 import os
 import weakref
 from collections.abc import Callable, Sequence
-from typing import Any, Final, Literal, NamedTuple, Self, get_args
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -77,11 +77,6 @@ class BatchArrays:
             return whole[number, ...]
 
         return allocate
-
-    def put(self, number: int, name: str, value: torch.Tensor) -> torch.Tensor:
-        """Return a value as a sample's slice of the field, written there."""
-        self._whole(name, tuple(value.shape), value.numpy().dtype)
-        return self._slices[name][number].copy_(value)
 
     def as_tensors(self, number: int, sample: Sample) -> Sample:
         """Return a sample with tensors for arrays, slices of the batch's where it was written."""
@@ -165,10 +160,6 @@ class BatchBuffers:
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what another process makes buffers of its own from."""
         return BatchBuffers, (self.kind,)
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        """Return buffers that share no memory with these."""
-        return type(self)(self.kind)
 
 
 def _give_back(free: list[np.ndarray], buffer: np.ndarray) -> None:

@@ -5,9 +5,11 @@ counts what was taken of it. `Passes` says where the next one begins and which o
 """
 
 import copy
+import math
 import sys
+import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final, Literal, Protocol, TypedDict, Unpack
 
@@ -15,13 +17,18 @@ import numpy as np
 import torch.distributed
 from torch.utils.data import Sampler
 
-from stereogenbench_data.datasets.open_videos import fitting_rule
 from stereogenbench_data.datasets.shared_epoch import SharedEpoch, require_epoch
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.samples.fields import Stream
+from stereogenbench_data.samples.streams import OPEN_STREAMS
+from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.order import (
+    GROUPS_OF_LARGE,
+    OPEN_SCENES,
     ORDER_VERSION,
+    SHUFFLE_GROUPS,
     DropLast,
     EpochOrder,
     OrderRule,
@@ -124,53 +131,44 @@ class EpochBatch(list[int]):
         self.group = group
 
 
+@dataclass(eq=False)
 class Pass:
     """One pass over batches of an epoch, and how many were taken.
 
     Attributes:
         epoch: The epoch.
-        start: The global batch at which all ranks began.
         share: The global numbers of its batches.
-        taken: How many of them were taken.
+        start: The global batch at which all ranks began.
+        end: The global batch at which the epoch ends.
+        world_size: How many ranks take turns.
+        taken: How many of its batches were taken.
         part: How many samples of the next one were taken, where samples are taken one by one.
         is_read_ahead: Whether "taken" counts what was given out to another `DataLoader`, whose
             workers read ahead of its loop.
+        is_exhausted: Whether its loop is over: the epoch is, for ranks with fewer batches, too.
     """
 
-    is_read_ahead = False
-
-    def __init__(self, epoch: int, share: range, *, start: int, end: int, world_size: int) -> None:
-        """Begin before the first batch.
-
-        Args:
-            epoch: The epoch.
-            share: The global numbers of its batches.
-            start: The global batch at which all ranks begin.
-            end: The global batch at which the epoch ends.
-            world_size: How many ranks take turns.
-        """
-        self.epoch = epoch
-        self.start = start
-        self.share = share
-        self.taken = self.part = 0
-        self._end, self._world_size = end, world_size
-        self._is_exhausted = False
+    epoch: int
+    share: range
+    start: int
+    end: int
+    world_size: int
+    taken: int = 0
+    part: int = 0
+    is_read_ahead: bool = False
+    is_exhausted: bool = False
 
     @property
     def is_complete(self) -> bool:
         """Whether all of its batches were taken."""
         return self.taken >= len(self.share)
 
-    def exhaust(self) -> None:
-        """Record that its loop is over: the epoch is, for ranks with fewer batches, too."""
-        self._is_exhausted = True
-
     @property
     def position(self) -> Position:
         """The position after the batch taken last."""
-        if self._is_exhausted:
-            return self.epoch, self._end
-        return self.epoch, min(self.start + self.taken * self._world_size, self._end)
+        if self.is_exhausted:
+            return self.epoch, self.end
+        return self.epoch, min(self.start + self.taken * self.world_size, self.end)
 
 
 class Passes:
@@ -427,7 +425,7 @@ class EpochBatches(Sampler[list[int]]):
                 if begun.is_complete:
                     self.passes.end(begun)
                 yield self.batch(number, epoch=begun.epoch)
-            begun.exhaust()
+            begun.is_exhausted = True
         finally:
             self.passes.end(begun)
 
@@ -438,8 +436,7 @@ class EpochBatches(Sampler[list[int]]):
 
     def pass_from(self, epoch: int, start: int) -> Pass:
         """Return a pass over this rank's batches of an epoch from a global batch on."""
-        share, end = self.share(start), self.end(start)
-        return Pass(epoch, share, start=start, end=end, world_size=self.world_size)
+        return Pass(epoch, self.share(start), start, self.end(start), self.world_size)
 
     def set_epoch(self, epoch: int) -> None:
         """Go to another epoch, which begins at its beginning; the dataset goes with it.
@@ -570,10 +567,6 @@ class EpochBatches(Sampler[list[int]]):
                 "version of the package that saved it."
             )
         own = {"version": ORDER_VERSION, **self._identity}
-        state = _in_present_words(state)
-        if "start_of_streams" in state:
-            # Of states that were saved while there was a choice.
-            own["start_of_streams"] = "anywhere"
         missing = sorted({*own, "epoch", "batches_consumed"} - state.keys())
         if missing:
             raise StateError(
@@ -636,17 +629,6 @@ def _batches_behind(sampler: Sampler[Any]) -> EpochBatches:
     return batches
 
 
-def _in_present_words(state: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a state in today's options: it may have been saved with ``order`` and ``tail``."""
-    if not {"order", "tail"} <= state.keys():
-        return state
-    shuffle = {"shuffled": True, "sequential": False}.get(str(state["order"]), state["order"])
-    drop_last = {"drop": True, "wrap": "pad", "uneven": False}.get(
-        str(state["tail"]), state["tail"]
-    )
-    return {**state, "shuffle": shuffle, "drop_last": drop_last}
-
-
 def require_count(state: Mapping[str, Any], name: str, *, most: int | None = None) -> int:
     """Return a whole number from 0 of a state.
 
@@ -679,3 +661,133 @@ def _require_group(rank: int | None, world_size: int | None) -> tuple[int, int]:
             f"world_size={world_size!r}."
         )
     return rank, world_size
+
+
+SPARE_FILES = 128
+"""Open files that are left to everything else."""
+
+
+GROUP_BYTES: Final = 900_000_000
+"""Memory for the open scenes of a shuffle group, where nobody asks for a number of them."""
+
+_DECODER_BYTES: Final = 17
+"""Of a camera's decoders for each pixel: 12.6 of H.264 with its reference pictures, 4.3 of FFV1,
+measured at 1280x1280."""
+
+_KEPT_BYTES: Final = 4
+"""Of the current picture and what is measured in it, kept for each pixel for other pairs."""
+
+FRAMES_BYTES: Final = 500_000_000
+"""Memory for further frames of a shuffle group's open scenes, where several samples show one."""
+
+_FRAME_BYTES: Final = 6
+"""Of a further frame for each pixel: the picture, stored depth and where it is measured."""
+
+
+class OpenVideosWarning(UserWarning):
+    """More videos are needed at a time than this process may open: some are opened repeatedly."""
+
+
+class RepeatedDecodingWarning(UserWarning):
+    """Several processes read the same shuffle group, so each of them decodes its videos."""
+
+
+def videos_to_keep(
+    plan: Plan, rule: OrderRule, *, streams: frozenset[Stream], processes: int
+) -> int:
+    """Return how many videos one of so many processes keeps open for its share of an epoch.
+
+    A process reads every shuffle group of which it gets batches, each with its open scenes. A
+    warning says what to do if the process may not open so many files, or if several processes
+    decode the same videos and more groups would avoid it.
+    """
+    lengths = plan.runs.lengths
+    groups = rule.groups_of(lengths)
+    together = processes // math.gcd(rule.shuffle_groups, processes)
+    spared = replace(rule, shuffle_groups=math.lcm(rule.shuffle_groups, processes))
+    if together > 1 and lengths.max() > 1 and spared.groups_of(lengths) % processes == 0:
+        warnings.warn(
+            f"every video is decoded by {together} processes, as {processes} (ranks times workers) "
+            f"read {rule.shuffle_groups} shuffle groups: give shuffle_groups={processes}, or a "
+            "multiple of it. This is another order of the epoch; each group has its own open "
+            "scenes.",
+            RepeatedDecodingWarning,
+            stacklevel=5,
+        )
+    scenes = groups // math.gcd(groups, processes) * rule.most_open(lengths)
+    wanted = max(OPEN_STREAMS, scenes * videos_per_scene(plan, streams))
+    allowed = max(OPEN_STREAMS, _most_files() - SPARE_FILES)
+    if wanted > allowed:
+        warnings.warn(
+            f"up to {wanted} videos would be open at a time, and this process may open {allowed}: "
+            "they will be closed and opened again, which is slow. Raise the limit (`ulimit -n "
+            f"{wanted + SPARE_FILES}`), use more workers, or fewer open_scenes than "
+            f"{rule.open_scenes}.",
+            OpenVideosWarning,
+            stacklevel=5,
+        )
+    return min(wanted, allowed)
+
+
+def fitting_rule(
+    rule: OrderRule, index: SceneIndex, plan: Plan, *, open_scenes: int | None
+) -> OrderRule:
+    """Return a rule with as many open scenes and frames as fit into the memory of a shuffle group.
+
+    They depend on the selected pairs and the stored size of their pictures alone, not on fields,
+    ranks or workers: so does the order.
+
+    Args:
+        rule: The rule without them.
+        index: The scenes.
+        plan: The selection.
+        open_scenes: How many scenes the user asks for; None for as many as fit.
+    """
+    shares_moments = bool((plan.runs.pairs > 1).any())
+    of_cameras = _camera_pixels(index, plan)
+    # About what the decoders of an open scene take, at the most.
+    scene_bytes = of_cameras * (_DECODER_BYTES + (_KEPT_BYTES if shares_moments else 0))
+    fitting = max(2, GROUP_BYTES // max(1, scene_bytes))
+    if open_scenes is None:
+        open_scenes = min(max(OPEN_SCENES, rule.batch_size), fitting)
+    rule = replace(rule, open_scenes=open_scenes)
+    frames = 1
+    if shares_moments:
+        further = FRAMES_BYTES // max(1, open_scenes * of_cameras * _FRAME_BYTES)
+        frames = max(1, min(1 + further, -(-rule.batch_size // open_scenes)))
+    return replace(
+        rule,
+        shuffle_groups=SHUFFLE_GROUPS if fitting >= OPEN_SCENES else GROUPS_OF_LARGE,
+        open_frames=frames,
+    )
+
+
+def _camera_pixels(index: SceneIndex, plan: Plan) -> int:
+    """Return how many pixels the pictures of the needed cameras have, at the most."""
+    rows = plan.scene_rows
+    pixels = (index.column("image_width_px")[rows] * index.column("image_height_px")[rows]).max()
+    return int(pixels) * videos_per_scene(plan, frozenset({"source_rgb", "target_rgb"}))
+
+
+def _most_files() -> int:
+    """Return how many files this process may open; 512 where the system does not say."""
+    try:
+        import resource
+    except ImportError:
+        return 512
+    return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+
+
+def videos_per_scene(plan: Plan, streams: frozenset[Stream]) -> int:
+    """Return how many videos the samples of one scene are made from, at the most."""
+    pairs = plan.pairs
+    scene = np.repeat(np.arange(len(plan.scene_rows)), np.diff(plan.first_pair))
+    used = np.zeros((len(plan.scene_rows), 2, CAMERA_COUNT), dtype=bool)
+    for kind, suffix in enumerate(("rgb", "depth")):
+        if f"source_{suffix}" in streams:
+            used[scene, kind, pairs.source] = True
+        if f"target_{suffix}" in streams:
+            for targets in pairs.targets.T:
+                there = targets >= 0
+                used[scene[there], kind, targets[there]] = True
+    return int(used.sum(axis=(1, 2)).max())

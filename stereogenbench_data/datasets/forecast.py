@@ -1,6 +1,6 @@
 """What will limit a training: bytes by the index, decoding by this machine, the rest by a formula.
 
-A worker decodes while it fetches ahead, so a sample takes it the longer of two times:
+A worker decodes while it fetches ahead, so the slower of the two decides:
 
     fetching_s = (requests * delay_s + bytes / connection_bytes_s) / 8
     worker_s   = max(decoding_s, fetching_s)
@@ -21,18 +21,14 @@ import statistics
 import time
 import timeit
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from stereogenbench_data.datasets.batches import EpochBatches
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
-from stereogenbench_data.datasets.open_videos import videos_to_keep
 from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.coming import Step
 from stereogenbench_data.samples.load import SampleLoader
-from stereogenbench_data.selection.plan import Plan
 from stereogenbench_data.sources.fetch_ahead import CONNECTIONS, PlannedFetches
 from stereogenbench_data.sources.location import is_remote, joined
 from stereogenbench_data.sources.remote import RemoteObject
@@ -194,29 +190,21 @@ def planned_bytes(pairs: StereoPairs, batch_size: int, *, workers: int) -> tuple
     if not is_remote(index.root):
         index = copy.copy(index)
         index.root = "https://forecast.invalid"  # stands for their place, and is never asked
-    batches, plan = pairs.loader(batch_size, drop_last=False).batches, pairs.plan
-    videos = videos_to_keep(plan, batches.rule, streams=pairs._streams, processes=workers)
+    batches, own = pairs.loader(batch_size, drop_last=False).batches, pairs.with_own_videos()
+    own.keep_open(batches, processes=workers)
     requests = count = samples = 0
-    for worker in range(workers):
+    for worker in range(min(workers, batches.end())):
         ahead = PlannedFetches()
         decoder = SampleLoader(index, pairs.request, check="metadata", frames="shared", ahead=ahead)
-        decoder.keep_open(videos, frames=batches.rule.open_frames)
-        numbers = range(worker, batches.end(), workers)
-        decoder.expect(_steps(plan, batches, numbers))
-        for step in itertools.islice(_steps(plan, batches, numbers), _MOST_PLANNED - samples):
+        decoder.keep_open(own.stats().videos_limit, frames=batches.rule.open_frames)
+        first = batches.batch(worker, epoch=0)
+        decoder.expect(own.steps(first, first))
+        for step in itertools.islice(own.steps(first, first), _MOST_PLANNED - samples):
             decoder.begin(step.address)
             decoder.end(step.address)
             samples += 1
         requests, count = requests + ahead.requests, count + ahead.bytes
     return requests / samples, count / samples
-
-
-def _steps(plan: Plan, batches: EpochBatches, numbers: Iterable[int]) -> Iterator[Step]:
-    for number in numbers:
-        batch = batches.batch(number, epoch=0)
-        for each in batch:
-            address = plan.locate(each, epoch=0, group=batch.group)
-            yield Step(address, each in batch.ends_of_runs)
 
 
 def _decoding_s(pairs: StereoPairs, batch_size: int, *, workers: int, seconds: float) -> float:

@@ -1,6 +1,11 @@
 """A torch `DataLoader` over the batches of an epoch, which counts what its loop has taken.
 
 The loader starts passes. A `LoaderPass` owns its position, its workers and their memory.
+
+Accelerate and Lightning give each rank its share of a torch `DataLoader`. Our loaders have already
+done that; dividing them again would silently lose samples. Lightning leaves loaders alone whose
+sampler is torch's `DistributedSampler`, Accelerate those that say they are prepared. Batches and
+streams that are divided twice all the same are refused (`EpochBatches`).
 """
 
 import copy
@@ -15,7 +20,7 @@ from weakref import WeakSet
 
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, DistributedSampler, Sampler, SequentialSampler
 
 from stereogenbench_data.datasets.batch_buffers import BatchBuffers, forget_slots, held_batches
 from stereogenbench_data.datasets.batches import (
@@ -26,12 +31,9 @@ from stereogenbench_data.datasets.batches import (
     Pass,
     State,
 )
-from stereogenbench_data.datasets.frameworks import AcceleratedLoader, share_sampler
-from stereogenbench_data.datasets.shared_epoch import FetchedCounts
 from stereogenbench_data.datasets.workers import WorkerContext
 from stereogenbench_data.errors import (
     PassError,
-    SelectionError,
     StateError,
     StereoGenBenchError,
     WorkerError,
@@ -43,14 +45,6 @@ from stereogenbench_data.selection.plan import Plan
 _DESCRIBED_SAMPLES: Final = 100_000
 _DESCRIBED_BATCHES: Final = 200
 """`LoaderStats.mixing` is computed for so many samples at most, from so many batches."""
-
-_ORDERED: Final = "or torch's own DataLoader over the dataset"
-_INSTEAD: Final = {
-    "sampler": f"use seed= and shuffle=, {_ORDERED}",
-    "lanes": "use shuffle_groups",
-    "batch_sampler": f"use seed= and shuffle=, {_ORDERED} with EpochBatches",
-}
-"""Options that a loader does not take, and what to use instead."""
 
 
 class LoaderOptions(EpochOptions, total=False):
@@ -70,7 +64,6 @@ class Loadable(Numbered, Protocol):
     """A numbered dataset that a loader loads."""
 
     buffers: BatchBuffers
-    fetched: FetchedCounts
 
     def keep_open(self, batches: EpochBatches, *, processes: int) -> None:
         """Keep videos open for the scenes that one of so many processes reads at a time."""
@@ -96,9 +89,6 @@ class LoaderStats(NamedTuple):
         videos_limit: How many videos a process opens for it at most.
         batches_held: How many batches of its workers are open in shared slots: the loop holds a
             part of them, or they arrived early.
-        requests: How many ranges its processes have fetched from a URL, as far as their batches
-            have arrived; what went into a cache is not counted.
-        bytes_fetched: How many bytes these had.
         mixing: How many scenes and moments a batch shows, beside one of a fully shuffled sampler,
             in one line (of the first batches of epoch 0); empty of more than 100,000 samples.
     """
@@ -109,12 +99,38 @@ class LoaderStats(NamedTuple):
     videos_open: int
     videos_limit: int
     batches_held: int
-    requests: int
-    bytes_fetched: int
     mixing: str
 
 
-class PairsLoader(AcceleratedLoader, DataLoader[Any]):
+class ShareSampler(DistributedSampler[Any]):
+    """The samples of one rank, as a sampler that tells frameworks that they are divided already."""
+
+    def __init__(self, batches: EpochBatches) -> None:
+        """Stand for the samples of these batches."""
+        # torch asks a sampler's dataset for its length alone.
+        samples: Any = range(batches.samples_of_epoch)
+        super().__init__(samples, num_replicas=batches.world_size, rank=batches.rank)
+        self.batches = batches
+
+    def __iter__(self) -> Iterator[int]:
+        """Yield the numbers of the samples of this rank's batches."""
+        for batch in self.batches:
+            yield from batch
+
+    def __len__(self) -> int:
+        """The number of samples in this rank's full batches."""
+        return len(self.batches) * self.batches.batch_size
+
+    def set_epoch(self, epoch: int) -> None:
+        """Set the epoch of the batches: Lightning does before each epoch."""
+        self.batches.set_epoch(epoch)
+
+
+class OrderedShareSampler(ShareSampler, SequentialSampler):
+    """The samples of one rank in order: Lightning's ``overfit_batches`` leaves them as they are."""
+
+
+class PairsLoader(DataLoader[Any]):
     """The batches of an epoch, loaded: what ``loader(...)`` of a dataset returns.
 
     It is a torch `DataLoader`. `state_dict` counts the batches that the loop has taken, not those
@@ -142,9 +158,18 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
 
     Attributes:
         batches: The samples of its batches, in their order.
+        use_stateful_dataloader: That Accelerate's ``save_state`` keeps the loader's ``state_dict``.
+        end_of_dataloader: Whether the batch given last is the last of its pass.
+        remainder: How many samples of all ranks' last batches are not padding; 0 where none is
+            padding. Accelerate reads these.
     """
 
     batches: EpochBatches
+    use_stateful_dataloader: Final = True
+    end_of_dataloader = False
+    remainder = 0
+    _device: torch.device | None = None
+    _gradient_state: Any = None
 
     def __init__(
         self,
@@ -184,7 +209,8 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
 
     def _set_sampler(self) -> None:
         # Past torch's guard against another sampler: it says that the batches are a rank's share.
-        object.__setattr__(self, "sampler", share_sampler(self.batches))
+        kind = ShareSampler if self.batches.rule.shuffle else OrderedShareSampler
+        object.__setattr__(self, "sampler", kind(self.batches))
 
     @property
     def epoch(self) -> int:
@@ -243,7 +269,6 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         """Return what the loader has and holds now: open videos, workers, batches."""
         pids = {pid for each in self._workers for pid in each.pids}
         videos = self._loadable.stats()
-        requests, bytes_fetched = self._loadable.fetched.total
         epoch, taken = self.batches.passes.position
         return LoaderStats(
             epoch=epoch,
@@ -252,8 +277,6 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
             videos_open=videos.videos_open,
             videos_limit=videos.videos_limit,
             batches_held=held_batches(pids),
-            requests=requests,
-            bytes_fetched=bytes_fetched,
             mixing=self._mixing,
         )
 
@@ -277,6 +300,48 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
             f"<{type(self).__name__}: epoch {self.epoch} of {self.dataset!r} by "
             f"{self.num_workers} workers, {self.batches!r}>"
         )
+
+    @property
+    def total_batch_size(self) -> int:
+        """How many samples the batches of all ranks hold together."""
+        return self.batches.batch_size * self.batches.world_size
+
+    @property
+    def total_dataset_length(self) -> int:
+        """How many samples an epoch has."""
+        return self.batches.samples_of_epoch
+
+    @property
+    def _is_accelerate_prepared(self) -> bool:
+        """Whether Accelerate need not divide the batches; ``accelerator.prepare`` reads it.
+
+        Raises:
+            SelectionError: If the batches are shared out otherwise than Accelerate's processes are.
+        """
+        states = sys.modules.get("accelerate.state")
+        if states is None:
+            return False
+        state = states.PartialState()
+        self.batches.require_group(state.process_index, state.num_processes)
+        return True
+
+    @_is_accelerate_prepared.setter
+    def _is_accelerate_prepared(self, value: bool) -> None:
+        """Give batches on Accelerate's device from now on: ``accelerator.prepare`` sets it."""
+        states = sys.modules["accelerate.state"]
+        self._device = states.PartialState().device if value else None
+        self._gradient_state = states.GradientState() if value else None
+
+    def on_device(self, batch: Any) -> Any:
+        """Return a batch on the device of Accelerate's process; as it is without Accelerate."""
+        if self._device is None:
+            return batch
+        from accelerate.utils import send_to_device
+
+        pinned = isinstance(batch, dict) and any(
+            isinstance(value, torch.Tensor) and value.is_pinned() for value in batch.values()
+        )
+        return send_to_device(batch, self._device, non_blocking=pinned)
 
     def close(self) -> None:
         """End workers that persist, and close this process's videos; it can be used again."""
@@ -316,15 +381,18 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         self.batches.passes.begin(begun)
         self.end_of_dataloader = False
         self._begun_passes += 1
-        if self._begun_passes == 1:
-            self._enter_loop()
+        if self._begun_passes == 1 and self._gradient_state is not None:
+            self.remainder = 0
+            if not self.batches.drop_last:
+                self.remainder = self.total_dataset_length % self.total_batch_size
+            self._gradient_state._add_dataloader(self)
 
     def _end(self, ended: Pass) -> None:
         """Record that a pass is over."""
         self.batches.passes.end(ended)
         self._begun_passes -= 1
-        if self._begun_passes == 0:
-            self._leave_loop()
+        if self._begun_passes == 0 and self._gradient_state is not None:
+            self._gradient_state._remove_dataloader(self)
 
 
 def _scenes_and_moments(batches: list[Numbers], plan: Plan) -> str:
@@ -450,7 +518,7 @@ class LoaderPass(Iterator[Any]):
             yield
         except BaseException as error:
             if isinstance(error, StopIteration) and self._pass is not None:
-                self._pass.exhaust()
+                self._pass.is_exhausted = True
             else:
                 self._error = (
                     f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} "
@@ -589,22 +657,15 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_keep_inherited)
 
 
-def require_no_sampler(options: Mapping[str, Any]) -> None:
-    """Refuse options of torch's `DataLoader` that order the epoch, naming what to use instead.
+def accelerates_epoch(dataset: object) -> int | None:
+    """Return the epoch of the pass that Accelerate begins over a map-style dataset, None if none.
 
-    Raises:
-        SelectionError: If there is such an option.
+    Accelerate counts its passes, and calls ``set_epoch`` of a dataset in some of its loops only:
+    neither where it shares batches among processes nor where it goes on in mid-epoch.
     """
-    for name in options:
-        if name in _INSTEAD:
-            raise SelectionError(
-                f"a loader orders the epoch and takes no {name}: {_INSTEAD[name]}."
-            )
-
-
-def split_options(options: Mapping[str, Any]) -> tuple[EpochOptions, dict[str, Any]]:
-    """Return the options that order an epoch, and the others."""
-    names = EpochOptions.__annotations__
-    ordering = cast("EpochOptions", {name: options[name] for name in options if name in names})
-    others = {name: value for name, value in options.items() if name not in names}
-    return ordering, others
+    states = sys.modules.get("accelerate.state")
+    active = None if states is None else states.GradientState().active_dataloader
+    if active is None or getattr(active, "dataset", None) is not dataset:
+        return None
+    iteration = getattr(active, "iteration", None)
+    return iteration if isinstance(iteration, int) else None

@@ -6,23 +6,26 @@ import operator
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Literal, Self, Unpack, get_args
+from typing import Any, Final, Literal, Self, TypedDict, Unpack, get_args
 
 import numpy as np
-import torch
 from torch.utils.data import Dataset, get_worker_info
 
 from stereogenbench_data.datasets.batch_buffers import BatchArrays, BatchBuffers, Buffers
-from stereogenbench_data.datasets.batches import EpochBatch, EpochBatches, KnownOrder, Passes
-from stereogenbench_data.datasets.frameworks import accelerates_epoch
+from stereogenbench_data.datasets.batches import (
+    EpochBatch,
+    EpochBatches,
+    EpochOptions,
+    KnownOrder,
+    Passes,
+    videos_to_keep,
+)
 from stereogenbench_data.datasets.loader import (
     LoaderOptions,
     PairsLoader,
-    require_no_sampler,
-    split_options,
+    accelerates_epoch,
 )
-from stereogenbench_data.datasets.open_videos import videos_to_keep
-from stereogenbench_data.datasets.shared_epoch import DrawnSamples, FetchedCounts, SharedEpoch
+from stereogenbench_data.datasets.shared_epoch import DrawnSamples, SharedEpoch
 from stereogenbench_data.datasets.tensors import to_tensors
 from stereogenbench_data.errors import FieldError, SelectionError, text_without_secrets
 from stereogenbench_data.index.open import Rows
@@ -35,15 +38,14 @@ from stereogenbench_data.samples.fields import (
     Sample,
 )
 from stereogenbench_data.samples.load import SampleLoader
-from stereogenbench_data.samples.request import Request, Transform, parse_request
+from stereogenbench_data.samples.request import Layout, Request, Transform, parse_request
 from stereogenbench_data.samples.streams import StreamStats
-from stereogenbench_data.samples.transforms import Compose, Crop, Letterbox, Resize
 from stereogenbench_data.samples.writer import Allocate, new_array
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import SceneFilters, may_pass
-from stereogenbench_data.selection.options import options_of, require_options
+from stereogenbench_data.selection.options import options_of, require_options, split_options
 from stereogenbench_data.selection.plan import Address, Plan, Selection, plan_pairs, plan_views
 from stereogenbench_data.selection.windows import FramesSpec, Random
 from stereogenbench_data.sources.cache import ShardCache
@@ -58,6 +60,52 @@ Check = Literal["read", "opened", "metadata"]
 
 _OF_CACHE: Final = 16
 """The part of a cache that a process may fill ahead."""
+
+
+class ReadOptions(TypedDict, total=False):
+    """How the samples of a dataset are read.
+
+    Attributes:
+        size: (height, width) in pixels, or a text "WIDTHxHEIGHT", that pictures are scaled to while
+            they are decoded; intrinsics and disparity follow. None keeps the stored size.
+            `SwappedSizeWarning` is given where the two look exchanged.
+        transform: What changes pictures and cameras together, such as `Compose`.
+        depth: A depth contract instead of the one that files and release state.
+        conventions: Where quantities stand in the files and how they are read, as
+            ``stereogenbench conventions`` writes it; see `SceneIndex.open`. ``depth`` counts more.
+        seed: Seed of random frames, transforms and the balanced subsample; 0 if left out.
+        cache: Where to keep on disk what is read from a URL; None fetches, each time, just the
+            bytes that samples need.
+        check: Which videos of shards are compared whole with the checksums of the index, by each
+            process that opens them: "opened" all; "read" (the default) where at least half the
+            frames of a scene are asked for, so that it costs little beside decoding them;
+            "metadata" none. Those in shards on disk and in the cache are compared before a frame is
+            given, those from a URL when their last byte has come. Metadata files are always
+            compared; the files of a released folder have no checksums.
+        buffers: "reused", the default: the memory of a batch is used for a later one once nobody
+            holds any part of it. "fresh": each batch has memory of its own, which costs speed.
+        fetch_ahead_bytes: How many bytes each process fetches from a URL before they are needed,
+            256 MB by default; 0 fetches only what the current sample needs. With a cache, what is
+            fetched ahead fills it.
+    """
+
+    size: tuple[int, int] | str | None
+    transform: Transform | None
+    depth: DepthEncoding | None
+    conventions: str | Path | Conventions | None
+    seed: int
+    cache: ShardCache | None
+    check: Check
+    buffers: Buffers
+    fetch_ahead_bytes: int
+
+
+class PairsOptions(ReadOptions, Selection, total=False):
+    """What `StereoPairs` takes, except data and fields."""
+
+
+class ViewsOptions(ReadOptions, SceneFilters, total=False):
+    """What `SceneViews` takes, except data, cameras, frames and fields."""
 
 
 class SeekTableWarning(UserWarning):
@@ -75,16 +123,8 @@ class _MappedScenes(Dataset[Sample]):
         left_out: How many scenes were selected and cannot give what is requested.
     """
 
-    def __init__(  # noqa: PLR0913 - what its subclasses take
-        self,
-        index: SceneIndex,
-        plan: Plan,
-        request: Request,
-        *,
-        cache: ShardCache | None,
-        check: Check,
-        buffers: Buffers,
-        fetch_ahead_bytes: int,
+    def __init__(
+        self, index: SceneIndex, plan: Plan, request: Request, options: ReadOptions
     ) -> None:
         selected = len(plan.scene_rows)
         plan = without_odd_scenes(index, plan, request)
@@ -93,11 +133,11 @@ class _MappedScenes(Dataset[Sample]):
         self.plan = plan
         self.left_out = selected - len(plan.scene_rows)
         self.request = request
-        opened = _opens_checked(check, plan)
-        ahead = FetchAhead(limit_bytes=fetch_ahead_bytes)
+        cache = options.get("cache")
+        ahead = FetchAhead(limit_bytes=options.get("fetch_ahead_bytes", FETCH_AHEAD_BYTES))
         if cache is not None:
             # Several processes fill it: what one fetches ahead must not evict what another needs.
-            ahead.limit_bytes = min(fetch_ahead_bytes, cache.limit_bytes // _OF_CACHE)
+            ahead.limit_bytes = min(ahead.limit_bytes, cache.limit_bytes // _OF_CACHE)
         if is_remote(index.root) and not index.load_seek_tables() and cache is None:
             warnings.warn(
                 f"{index.where} : its index does not say where the packets of videos lie, so a "
@@ -111,19 +151,17 @@ class _MappedScenes(Dataset[Sample]):
             index,
             request,
             cache=cache,
-            check="opened" if opened else "metadata",
+            check=_check_of(options.get("check", "read"), plan),
             frames="shared" if (np.diff(plan.first_pair) > 1).any() else "used once",
             ahead=ahead if is_remote(index.root) else None,
         )
-        self.buffers = BatchBuffers(buffers)
+        self.buffers = BatchBuffers(options.get("buffers", "reused"))
         self._streams = request.streams
-        self._access: Literal["random", "in order"] = "random"
         self.shared_epoch = SharedEpoch()
         self._drawn = DrawnSamples(len(plan)) if _is_random(plan, request) else None
         self._known_order: KnownOrder | None = None
         self._step = self._stop = 0
         self._next_batch: tuple[int, int] | None = None
-        self.fetched = FetchedCounts()
 
     @property
     def epoch(self) -> int:
@@ -185,10 +223,9 @@ class _MappedScenes(Dataset[Sample]):
         reading = list(enumerate(numbers))
         if not isinstance(numbers, EpochBatch):
             reading.sort(key=operator.itemgetter(1))
-        self._expect(batch, read="as they come" if isinstance(numbers, EpochBatch) else "by number")
+        self._expect(batch, [number for _, number in reading])
         for place, number in reading:
             loaded[place] = self._load_into(arrays, place, number, batch=batch)
-        self.fetched.publish(self._loader.fetched)
         return [loaded[place] for place in range(len(numbers))]
 
     def _mark_drawn(self, batch: EpochBatch) -> None:
@@ -204,55 +241,47 @@ class _MappedScenes(Dataset[Sample]):
 
         They lie side by side in memory where `BatchBuffers.collate` makes batches of them.
         """
-        self.fetched.publish(self._loader.fetched)
-        self._expect(batch, read="as they come")
+        self._expect(batch, batch)
         arrays = self.buffers.allocate(len(batch)) if self.buffers.makes_batches else None
         for place in range(start, len(batch)):
             yield self._load_into(arrays, place, batch[place], batch=batch)
 
-    def _expect(self, batch: EpochBatch, *, read: Literal["by number", "as they come"]) -> None:
-        """Let the bytes of a batch's samples, and of the batches after it, be fetched ahead."""
+    def _expect(self, batch: EpochBatch, reading: Sequence[int]) -> None:
+        """Let the bytes of a batch, in the order of reading, and of those after it be fetched."""
         this = (batch.epoch, batch.number)
         if batch.number is None or this != self._next_batch or not self._loader.has_order:
-            self._loader.expect(self._steps(batch, read=read))
+            self._loader.expect(self.steps(batch, reading))
         self._next_batch = None
         if batch.number is not None and self._known_order is not None:
             self._next_batch = (batch.epoch, batch.number + self._step)
 
-    def _steps(
-        self, batch: EpochBatch, *, read: Literal["by number", "as they come"]
-    ) -> Iterator[Step]:
+    def steps(self, batch: EpochBatch, reading: Sequence[int]) -> Iterator[Step]:
         """Yield the samples of a batch, and of those that this process gets after it."""
         known, number = self._known_order, batch.number
         while True:
-            for each in sorted(batch) if read == "by number" else batch:
+            for each in reading:
                 if -len(self.plan) <= each < len(self.plan):
                     address = self._address(each, batch.epoch, group=batch.group)
                     yield Step(address, each in batch.ends_of_runs)
             if number is None or known is None or number + self._step >= self._stop:
                 return
             number += self._step
-            batch = known.batch(self.plan.runs, number, epoch=batch.epoch)
+            batch = reading = known.batch(self.plan.runs, number, epoch=batch.epoch)
 
     def _address(self, number: int, epoch: int, *, group: int) -> Address:
         address = self.plan.locate(number % len(self.plan), epoch=epoch, group=group)
-        return address._replace(run=0) if self._access == "random" else address
+        return address._replace(run=0) if self._known_order is None else address
 
     def _load_into(
         self, arrays: BatchArrays | None, place: int, number: int, *, batch: EpochBatch
     ) -> Sample:
         """Return a sample of a batch, as slices of the batch's arrays if they are given."""
-        if arrays is None:
-            sample = to_tensors(self._sample(number, batch))
-        else:
-            allocate = arrays.of_sample(place)
-            sample = arrays.as_tensors(place, self._sample(number, batch, allocate))
+        allocate = new_array if arrays is None else arrays.of_sample(place)
+        sample = self._sample(number, batch, allocate)
         if batch.is_padding is not None:
-            is_padding = torch.tensor(batch.is_padding[place])
-            if arrays is not None:
-                is_padding = arrays.put(place, "is_padding", is_padding)
-            sample["is_padding"] = is_padding
-        return sample
+            sample["is_padding"] = allocate("is_padding", (), np.bool_)
+            sample["is_padding"][...] = batch.is_padding[place]
+        return to_tensors(sample) if arrays is None else arrays.as_tensors(place, sample)
 
     def _sample(self, number: int, batch: EpochBatch, allocate: Allocate = new_array) -> Sample:
         """Return a sample of a batch as arrays, written into what is allocated for them."""
@@ -305,9 +334,8 @@ class _MappedScenes(Dataset[Sample]):
             SelectionError: If there is no such option, it is out of its range, or every batch would
                 be dropped.
         """
-        require_no_sampler(options)
         require_options(self.loader, options)
-        ordering, others = split_options(options)
+        ordering, others = split_options(options, EpochOptions)
         own = self.with_own_videos()
         own._drawn = None  # a loader's passes are each of the next epoch
         batches = EpochBatches(own, batch_size, **ordering)
@@ -326,7 +354,6 @@ class _MappedScenes(Dataset[Sample]):
             twin.shared_epoch = SharedEpoch(epoch)
             twin._drawn = None
         twin._known_order = twin._next_batch = None
-        twin.fetched = FetchedCounts()
         return twin
 
     def keep_open(self, batches: EpochBatches, *, processes: int) -> None:
@@ -340,7 +367,6 @@ class _MappedScenes(Dataset[Sample]):
                 self.plan, batches.rule, streams=self._streams, processes=processes
             )
             self._loader.keep_open(videos, frames=batches.rule.open_frames)
-        self._access = "in order"
         self._known_order, self._step, self._stop = batches.known_order, processes, batches.end()
         self._next_batch = None
 
@@ -382,21 +408,12 @@ class StereoPairs(_MappedScenes):
     torch.Size([1, 64, 64])
     """
 
-    def __init__(  # noqa: PLR0913 - each names one thing that a user chooses
+    def __init__(
         self,
         data: Data,
         *,
         fields: Iterable[str] = DEFAULT_PAIR_FIELDS,
-        size: tuple[int, int] | str | None = None,
-        transform: Transform | None = None,
-        depth: DepthEncoding | None = None,
-        conventions: str | Path | Conventions | None = None,
-        seed: int = 0,
-        cache: ShardCache | None = None,
-        check: Check = "read",
-        buffers: Buffers = "reused",
-        fetch_ahead_bytes: int = FETCH_AHEAD_BYTES,
-        **selection: Unpack[Selection],
+        **options: Unpack[PairsOptions],
     ) -> None:
         """Select the samples; no video is opened before the first sample is read.
 
@@ -404,30 +421,10 @@ class StereoPairs(_MappedScenes):
             data: A folder in the released layout; a folder of shards, or its URL; an index of
                 either; or a `SceneIndex`.
             fields: Names of the fields wanted; only what they need is read and decoded.
-            size: (height, width) in pixels, or a text "WIDTHxHEIGHT", that pictures are scaled to
-                while they are decoded; intrinsics and disparity follow. None keeps the stored size.
-                `SwappedSizeWarning` is given where the two look exchanged.
-            transform: What changes pictures and cameras together, such as `Compose`.
-            depth: A depth contract instead of the one that files and release state.
-            conventions: Where quantities stand in the files and how they are read, as
-                ``stereogenbench conventions`` writes it; see `SceneIndex.open`. ``depth`` counts
-                more.
-            seed: Seed of random frames, transforms and the balanced subsample.
-            cache: Where to keep on disk what is read from a URL; None fetches, each time, just the
-                bytes that samples need.
-            check: Which videos of shards are compared whole with the checksums of the index, by
-                each process that opens them: "opened" all; "read" (the default) where at least half
-                the frames of a scene are asked for, so that it costs little beside decoding them;
-                "metadata" none. Those in shards on disk and in the cache are compared before a
-                frame is given, those from a URL when their last byte has come. Metadata files are
-                always compared; the files of a released folder have no checksums.
-            buffers: "reused": the memory of a batch is used for a later one once nobody holds any
-                part of it. "fresh": each batch has memory of its own, which costs speed.
-            fetch_ahead_bytes: How many bytes each process fetches from a URL before they are
-                needed, 256 MB by default; 0 fetches only what the current sample needs. With a
-                cache, what is fetched ahead fills it.
-            **selection: Filters on scenes (`SceneFilters`), pairs, direction, baseline_cm,
-                balance and limit (`PairOptions`), and frames (`parse_frames`).
+            **options: Filters on scenes (`SceneFilters`); pairs, direction, baseline_cm, balance
+                and limit (`PairOptions`); frames (`parse_frames`); and how samples are read: size,
+                transform, depth, conventions, seed, cache, check, buffers and fetch_ahead_bytes
+                (`ReadOptions`).
 
         Raises:
             SelectionError: If nothing matches, naming the filter that left nothing and what
@@ -437,28 +434,14 @@ class StereoPairs(_MappedScenes):
             MediaError: If depth that a field needs cannot have been stored whole (8 bits, a lossy
                 codec, chroma) and the depth contract does not accept it.
         """
-        of_loader = options_of(self.loader)
-        require_options(StereoPairs, selection, elsewhere={"loader": of_loader})
-        index = opened(data, selection, conventions)
-        plan = plan_pairs(index, seed=seed, **selection)
+        require_options(StereoPairs, options, elsewhere={"loader": options_of(self.loader)})
+        reading, selection = split_options(options, ReadOptions)
+        index = opened(data, selection, reading.get("conventions"))
+        plan = plan_pairs(index, seed=reading.get("seed", 0), **selection)
         _warn_of_mixed_splits(index, plan, selection)
-        request = parse_request(
-            "pairs",
-            "stacked" if str(selection.get("pairs")) == "sweep" else "single",
-            fields=fields,
-            size=size,
-            depth=depth,
-            transform=transform,
-        )
-        super().__init__(
-            index,
-            plan,
-            request,
-            cache=cache,
-            check=check,
-            buffers=buffers,
-            fetch_ahead_bytes=fetch_ahead_bytes,
-        )
+        layout: Layout = "stacked" if str(selection.get("pairs")) == "sweep" else "single"
+        request = parse_request("pairs", layout, fields=fields, options=reading)
+        super().__init__(index, plan, request, reading)
 
 
 class SceneViews(_MappedScenes):
@@ -470,23 +453,14 @@ class SceneViews(_MappedScenes):
     The fields are in `stereogenbench_data.VIEW_FIELDS`.
     """
 
-    def __init__(  # noqa: PLR0913 - each names one thing that a user chooses
+    def __init__(
         self,
         data: Data,
         *,
         cameras: Sequence[int] | Literal["all", "each"] = "all",
         frames: FramesSpec = "first",
         fields: Iterable[str] = DEFAULT_VIEW_FIELDS,
-        size: tuple[int, int] | str | None = None,
-        transform: Transform | None = None,
-        depth: DepthEncoding | None = None,
-        conventions: str | Path | Conventions | None = None,
-        seed: int = 0,
-        cache: ShardCache | None = None,
-        check: Check = "read",
-        buffers: Buffers = "reused",
-        fetch_ahead_bytes: int = FETCH_AHEAD_BYTES,
-        **filters: Unpack[SceneFilters],
+        **options: Unpack[ViewsOptions],
     ) -> None:
         """Select the samples; no video is opened before the first sample is read.
 
@@ -495,45 +469,22 @@ class SceneViews(_MappedScenes):
             cameras: Camera numbers to stack, "all" six, or "each" as a sample by itself.
             frames: As for `StereoPairs`.
             fields: Names of the fields wanted; only what they need is read and decoded.
-            size: As for `StereoPairs`.
-            transform: As for `StereoPairs`; a flip, which swaps the views of a pair, is refused.
-            depth: A depth contract instead of the one that files and release state.
-            conventions: As for `StereoPairs`.
-            seed: Seed of random frames and transforms.
-            cache: As for `StereoPairs`.
-            check: As for `StereoPairs`.
-            buffers: As for `StereoPairs`.
-            fetch_ahead_bytes: As for `StereoPairs`.
-            **filters: Filters on scenes (`SceneFilters`).
+            **options: Filters on scenes (`SceneFilters`), and how samples are read (`ReadOptions`).
+                A transform that swaps the views of a pair is refused.
 
         Raises:
             SelectionError: If nothing matches, or a camera does not exist.
             FieldError: If a field does not exist, or the transform swaps views.
             StorageError: If the data are not there, or hold more than a few broken scenes.
         """
-        of_loader = options_of(self.loader)
-        require_options(SceneViews, filters, elsewhere={"loader": of_loader})
-        each = isinstance(cameras, str) and cameras == "each"
-        request = parse_request(
-            "views",
-            "single" if each else "stacked",
-            fields=fields,
-            size=size,
-            depth=depth,
-            transform=transform,
-        )
-        index = opened(data, filters, conventions)
+        require_options(SceneViews, options, elsewhere={"loader": options_of(self.loader)})
+        reading, filters = split_options(options, ReadOptions)
+        layout: Layout = "single" if str(cameras) == "each" else "stacked"
+        request = parse_request("views", layout, fields=fields, options=reading)
+        index, seed = opened(data, filters, reading.get("conventions")), reading.get("seed", 0)
         plan = plan_views(index, cameras=cameras, frames=frames, seed=seed, filters=filters)
         _warn_of_mixed_splits(index, plan, filters)
-        super().__init__(
-            index,
-            plan,
-            request,
-            cache=cache,
-            check=check,
-            buffers=buffers,
-            fetch_ahead_bytes=fetch_ahead_bytes,
-        )
+        super().__init__(index, plan, request, reading)
 
 
 def opened(
@@ -578,13 +529,17 @@ def _warn_of_mixed_splits(index: SceneIndex, plan: Plan, filters: SceneFilters) 
 def _is_random(plan: Plan, request: Request) -> bool:
     """Return whether the samples of an epoch may differ from those of another."""
     transform = request.transform
+    if transform is None:
+        return isinstance(plan.windows, Random)
+    from stereogenbench_data.samples.transforms import Compose, Crop, Letterbox, Resize
+
     steps = transform.transforms if isinstance(transform, Compose) else [transform]
-    fixed = (type(None), Crop, Letterbox, Resize)
+    fixed = (Crop, Letterbox, Resize)
     return isinstance(plan.windows, Random) or not all(isinstance(step, fixed) for step in steps)
 
 
-def _opens_checked(check: Check, plan: Plan) -> bool:
-    """Return whether videos are compared with their checksums when they are opened.
+def _check_of(check: Check, plan: Plan) -> Literal["opened", "metadata"]:
+    """Return when videos are compared with their checksums.
 
     Raises:
         SelectionError: If the check is none of those.
@@ -595,4 +550,6 @@ def _opens_checked(check: Check, plan: Plan) -> bool:
     frames = int(plan.frame_counts[0])
     clip = len(plan.windows.window(0, frames=frames, draw=(0,)))
     is_mostly_read = 2 * clip * plan.windows.count(frames) >= frames
-    return check == "opened" or (check == "read" and is_mostly_read)
+    if check == "read":
+        return "opened" if is_mostly_read else "metadata"
+    return check

@@ -4,7 +4,6 @@ Forked workers see the rows of an index anyway. Workers that are spawned get the
 which is freed when the last of them ends.
 """
 
-import os
 import warnings
 from collections.abc import Sequence
 from multiprocessing.reduction import ForkingPickler
@@ -18,9 +17,6 @@ from torch.utils.data import get_worker_info
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
-
-_COUNTED: Final = 255
-"""Workers with a place of their own in `FetchedCounts`."""
 
 _WATCHED: Final = 1 << 14
 """Of so many samples `DrawnSamples` knows whether they were drawn."""
@@ -57,20 +53,16 @@ class SharedNumbers:
         """Return what a copy is made from: numbers of its own."""
         return SharedNumbers, (self.tensor.tolist(),)
 
-    @classmethod
-    def over(cls, tensor: torch.Tensor) -> "SharedNumbers":
-        """Return the numbers that lie in shared memory."""
-        numbers = cls.__new__(cls)
-        numbers.tensor = tensor
-        return numbers
 
-
-def _sent_to_worker(numbers: SharedNumbers) -> tuple[Any, ...]:
-    return SharedNumbers.over, (numbers.tensor,)
+def _over(tensor: torch.Tensor) -> SharedNumbers:
+    """Return the numbers that lie in shared memory."""
+    numbers = SharedNumbers.__new__(SharedNumbers)
+    numbers.tensor = tensor
+    return numbers
 
 
 # Of processes of this machine alone, such as workers that are spawned.
-ForkingPickler.register(SharedNumbers, _sent_to_worker)
+ForkingPickler.register(SharedNumbers, lambda numbers: (_over, (numbers.tensor,)))
 
 
 class SharedEpoch:
@@ -154,35 +146,6 @@ class DrawnSamples:
                 stacklevel=3,
             )
         self._drawn.tensor[places] = 1
-
-
-class FetchedCounts:
-    """How many requests the processes of a loader made, and how many bytes they fetched."""
-
-    def __init__(self) -> None:
-        """Begin with nothing."""
-        self._of_worker = SharedNumbers([0] * 2 * (_COUNTED + 1))
-        self._before: tuple[int, torch.Tensor] | None = None
-
-    def publish(self, fetched: tuple[int, int]) -> None:
-        """Take what this process has fetched since it began."""
-        if fetched == (0, 0):
-            return
-        info = get_worker_info()
-        row = self._rows[0 if info is None else 1 + info.id % _COUNTED]
-        if self._before is None or self._before[0] != os.getpid():
-            self._before = os.getpid(), row.clone()
-        row[:] = self._before[1] + torch.tensor(fetched)
-
-    @property
-    def total(self) -> tuple[int, int]:
-        """Requests and bytes of all processes, after the last batch that each has made."""
-        requests, count = self._rows.sum(dim=0).tolist()
-        return requests, count
-
-    @property
-    def _rows(self) -> torch.Tensor:
-        return self._of_worker.tensor.view(-1, 2)
 
 
 def _parted(index: SceneIndex) -> tuple[Any, ...]:

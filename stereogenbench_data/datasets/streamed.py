@@ -3,12 +3,10 @@
 import os
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, Final, Unpack, cast
 
 from torch.utils.data import IterableDataset, get_worker_info
 
-from stereogenbench_data.datasets.batch_buffers import Buffers
 from stereogenbench_data.datasets.batches import (
     EpochBatches,
     EpochOptions,
@@ -18,8 +16,7 @@ from stereogenbench_data.datasets.batches import (
     State,
     require_count,
 )
-from stereogenbench_data.datasets.loader import split_options
-from stereogenbench_data.datasets.mapped import Check, Data, StereoPairs
+from stereogenbench_data.datasets.mapped import Data, PairsOptions, StereoPairs
 from stereogenbench_data.datasets.shared_epoch import (
     RepeatedEpochWarning,
     SharedEpoch,
@@ -27,29 +24,16 @@ from stereogenbench_data.datasets.shared_epoch import (
 )
 from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.fields import Sample
-from stereogenbench_data.samples.request import Transform
-from stereogenbench_data.schema.conventions import Conventions
-from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.selection.options import require_options
-from stereogenbench_data.selection.plan import Selection
-from stereogenbench_data.sources.cache import ShardCache
+from stereogenbench_data.selection.options import require_options, split_options
 
 _MOST_WORKERS: Final = 4096
 """Workers with a number of their own in `StreamPasses`."""
 
 
-class StreamOptions(Selection, EpochOptions, total=False):
+class StreamOptions(PairsOptions, EpochOptions, total=False):
     """What `StereoPairs` takes, and `EpochOptions`; ``seed`` is the seed of both."""
 
     fields: Iterable[str]
-    size: tuple[int, int] | str | None
-    transform: Transform | None
-    depth: DepthEncoding | None
-    conventions: str | Path | Conventions | None
-    cache: ShardCache | None
-    check: Check
-    buffers: Buffers
-    fetch_ahead_bytes: int
 
 
 class StreamPasses(Passes):
@@ -142,7 +126,7 @@ class StereoPairStream(IterableDataset[Sample]):
             MediaError: If depth that a field needs cannot have been stored whole.
         """
         require_options(StereoPairStream, options)
-        ordering, others = split_options(options)
+        ordering, others = split_options(options, EpochOptions)
         if "seed" in ordering:
             others["seed"] = ordering["seed"]
         self.pairs = StereoPairs(data, **others)
@@ -196,17 +180,19 @@ class StereoPairStream(IterableDataset[Sample]):
             SelectionError: If Accelerate would share these samples among ranks a second time.
         """
         self.batches.require_shared_once(self)
-        self.pairs.keep_open(
-            self.batches, processes=self._place["world_size"] * self._place["workers"]
-        )
-        if self._passes.is_second_of_unset_epoch and self._place["worker"] == 0:
+        place = self._place
+        self.pairs.keep_open(self.batches, processes=place["world_size"] * place["workers"])
+        if self._passes.is_second_of_unset_epoch and place["worker"] == 0:
             warnings.warn(
                 f"{self!r} begins epoch {self.epoch} a second time: with the same order, random "
                 "frames and transforms. Call set_epoch(epoch) of the stream before each pass.",
                 RepeatedEpochWarning,
                 stacklevel=2,
             )
-        begun = self._next_pass()
+        begun, pid = self._resumed or (None, 0)
+        self._resumed = None
+        if begun is None or pid != os.getpid() or begun.epoch != self.epoch:
+            begun = self._pass_of_worker(*self._passes.next_position)
         self._passes.begin(begun)
         return self._samples(begun)
 
@@ -218,14 +204,7 @@ class StereoPairStream(IterableDataset[Sample]):
                 if begun.part == len(batch):
                     begun.taken, begun.part = begun.taken + 1, 0
                 yield sample
-        begun.exhaust()
-
-    def _next_pass(self) -> Pass:
-        """Return the pass that this worker begins next: where it was itself, or its epoch's."""
-        (loaded, pid), self._resumed = self._resumed or (None, 0), None
-        if loaded is not None and pid == os.getpid() and loaded.epoch == self.epoch:
-            return loaded
-        return self._pass_of_worker(*self._passes.next_position)
+        begun.is_exhausted = True
 
     def _pass_of_worker(self, epoch: int, start: int) -> Pass:
         """Return a pass over this worker's part of the rank's batches."""

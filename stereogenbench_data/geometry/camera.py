@@ -32,19 +32,17 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        for name, value in (("width_px", self.width_px), ("height_px", self.height_px)):
-            if value < 1:
-                raise GeometryError(
-                    f"{name} must be at least 1, got {value!r}: choose a size of one pixel or more."
-                )
-        require_positive(self.fx_px, name="fx_px")
-        require_positive(self.fy_px, name="fy_px")
-        for name, place_px in (("cx_px", self.cx_px), ("cy_px", self.cy_px)):
-            if not math.isfinite(place_px):
-                raise GeometryError(
-                    f"{name} must be finite, got {place_px!r}: "
-                    "give the principal point in pixels of the image."
-                )
+        places = (self.fx_px, self.fy_px, self.cx_px, self.cy_px)
+        is_finite = all(map(math.isfinite, places))
+        if (
+            not is_finite
+            or min(self.fx_px, self.fy_px) <= 0
+            or min(self.width_px, self.height_px) < 1
+        ):
+            raise GeometryError(
+                f"focal lengths must be positive, the principal point finite, and a size one pixel "
+                f"or more, all in pixels of the image; got {self}."
+            )
 
     @classmethod
     def from_mm(
@@ -71,9 +69,10 @@ class Intrinsics:
         >>> Intrinsics.from_mm(focal_mm=32.6, sensor_mm=(23.76, 23.76), size_px=(1280, 1280)).fx_px
         1756.2289562289561
         """
-        require_positive(focal_mm, name="focal_mm")
-        for name, length_mm in zip(("sensor width", "sensor height"), sensor_mm, strict=True):
-            require_positive(length_mm, name=f"{name} in mm")
+        if not min(sensor_mm) > 0:
+            raise GeometryError(
+                f"a sensor's width and height must be positive, got {sensor_mm} mm."
+            )
         width_px, height_px = size_px
         cx_px, cy_px = principal_point_px or (width_px / 2, height_px / 2)
         return cls(
@@ -149,15 +148,6 @@ def recorded_intrinsics(rig: Rig) -> Intrinsics:
         size_px=rig.recorded_size_px or (rig.image_width_px, rig.image_height_px),
         principal_point_px=rig.principal_point_px,
     )
-
-
-def require_positive(value: float, *, name: str) -> None:
-    """Raise GeometryError unless a quantity is positive and finite."""
-    if not (math.isfinite(value) and value > 0):
-        raise GeometryError(
-            f"{name} must be a positive finite number, got {value!r}: "
-            "correct it in the metadata or in the call."
-        )
 
 
 def require_picture_size(shape: tuple[int, ...], intrinsics: Intrinsics, *, name: str) -> None:

@@ -217,7 +217,10 @@ def _exact_quotients(
 
 
 def disparity_error_px(
-    depth_m: Float[Any, "*batch h w"], *, focal_px: float, baseline_m: float, quantum_m: float
+    depth_m: Float[Any, "*batch h w"],
+    *,
+    shift_px_m: float | Float[Any, "*#batch h1 w1"],
+    half_step_m: float | Float[Any, "*#batch h1 w1"],
 ) -> Float[Any, "*batch h w"]:
     """Return the largest error of disparity due to the steps in which depth is stored.
 
@@ -227,9 +230,10 @@ def disparity_error_px(
 
     Args:
         depth_m: Stored depth along the optical axis, in metres.
-        focal_px: Horizontal focal length in pixels of this image.
-        baseline_m: Signed baseline in metres.
-        quantum_m: The step q between neighbouring depths in metres; 0 for exact depth.
+        shift_px_m: Focal length in pixels of this image times baseline in metres, not negative: one
+            number, or one of each rig in the depth's dtype.
+        half_step_m: Half the step q between neighbouring depths in metres, likewise; 0 for exact
+            depth.
 
     Returns:
         The bound in pixels, never negative, in the depth's dtype: inf where depth is half a
@@ -237,27 +241,8 @@ def disparity_error_px(
         not measured.
 
     >>> depth_m = np.array([[10.0, np.inf, 0.0]])
-    >>> error_px = disparity_error_px(depth_m, focal_px=800.0, baseline_m=0.1, quantum_m=0.1)
-    >>> error_px.round(4)
+    >>> disparity_error_px(depth_m, shift_px_m=80.0, half_step_m=0.05).round(4)
     array([[0.0402, 0.    , 0.    ]])
-    """
-    return error_bound_px(depth_m, shift_px_m=focal_px * abs(baseline_m), half_step_m=quantum_m / 2)
-
-
-def error_bound_px(
-    depth_m: Float[Any, "*batch h w"],
-    *,
-    shift_px_m: float | Float[Any, "*#batch h1 w1"],
-    half_step_m: float | Float[Any, "*#batch h1 w1"],
-) -> Float[Any, "*batch h w"]:
-    """Return the bound of `disparity_error_px` for one rig or several.
-
-    Args:
-        depth_m: Stored depth along the optical axis, in metres.
-        shift_px_m: Focal length in pixels times baseline in metres, not negative. Several are of
-            the depth's dtype.
-        half_step_m: Half the step between neighbouring depths in metres. Several are of the depth's
-            dtype.
     """
     xp = array_namespace(depth_m)
     eps = float(xp.finfo(depth_m.dtype).eps)

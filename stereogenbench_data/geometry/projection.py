@@ -76,7 +76,7 @@ def by_rows(make: Callable[..., Any], projection: Projection, *maps: Any, height
     parts = []
     for top in range(0, rows, step):
         here = (..., slice(top, top + step), slice(None))
-        of_rows = [each if isinstance(each, float) else each[here] for each in maps]
+        of_rows = [each[here] if np.ndim(each) > 1 else each for each in maps]
         parts.append(make(Projection(u_px[here], None, depth_m[here]), *of_rows))
     if isinstance(parts[0], tuple):
         return tuple(np.concatenate(each, axis=-2) for each in zip(*parts, strict=True))

@@ -82,7 +82,10 @@ class ComingSamples:
         self._waiting: deque[_Planned] = deque()  # for their requests
         self._number = self._begun = 0
         self._planned_bytes = self._read_bytes = 0
-        self._positions: OrderedDict[tuple[str, int, int], _Video] = OrderedDict()
+        # Of each open video, and which of its frames are kept.
+        self._positions: OrderedDict[tuple[str, int, int], tuple[Position | None, deque[int]]] = (
+            OrderedDict()
+        )
         self._read_texts: set[str] = set()
         self._is_filling = True
         self._has_order = False
@@ -202,31 +205,18 @@ class ComingSamples:
         if place not in self._positions:
             while len(self._positions) >= self._streams.limit > 0:
                 self._positions.popitem(last=False)
-            self._positions[place] = _Video(self._source.position(scene, name))
+            kept_frames: deque[int] = deque(maxlen=self._streams.kept_frames)
+            self._positions[place] = (self._source.position(scene, name), kept_frames)
             if self._source.is_cached:
                 return self._source.wanted(scene, name)
         self._positions.move_to_end(place)
-        ranges = self._positions[place].needed(frames, kept=self._streams.kept_frames)
-        return self._source.wanted(scene, name, ranges) if ranges else []
-
-
-class _Video:
-    """An open video, and which of its frames are kept."""
-
-    def __init__(self, position: Position | None) -> None:
-        self._position = position
-        self._kept: deque[int] = deque()
-
-    def needed(self, frames: list[int], *, kept: int) -> list[tuple[int, int]]:
+        position, kept = self._positions[place]
         ranges: list[tuple[int, int]] = []
-        for frame in frames if self._position is not None else ():
-            if frame in self._kept or self._position is None:
-                continue
-            ranges += self._position.needed(frame)
-            self._kept.append(frame)
-            while len(self._kept) > kept:
-                self._kept.popleft()
-        return _joined(ranges)
+        for frame in frames:
+            if position is not None and frame not in kept:
+                ranges += position.needed(frame)
+                kept.append(frame)
+        return self._source.wanted(scene, name, _joined(ranges)) if ranges else []
 
 
 def _joined(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:

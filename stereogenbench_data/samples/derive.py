@@ -16,8 +16,8 @@ from stereogenbench_data.geometry.arrays import (
     take_flat,
 )
 from stereogenbench_data.geometry.disparity import (
+    disparity_error_px,
     disparity_from_depth,
-    error_bound_px,
     write_disparity,
 )
 from stereogenbench_data.geometry.pose import CameraPoses
@@ -163,10 +163,10 @@ class Direction:
     def disparity_error(self) -> Any:
         """How far quantised depth can put disparity off, in pixels; 0 where it is not known."""
         shift_px_m = abs(self.shift_px_m)
-        known = array_namespace(self.known).astype(self.known, self.depth_m.dtype)
         if self.is_inverse:
+            known = array_namespace(self.known).astype(self.known, self.depth_m.dtype)
             return known * self.of_maps(shift_px_m / self.unit_m / 2, like=self.depth_m)
-        bound_px = error_bound_px(
+        bound_px = disparity_error_px(
             self.depth_m,
             shift_px_m=self.of_maps(shift_px_m, like=self.depth_m),
             half_step_m=self.of_maps(self.unit_m / 2, like=self.depth_m),

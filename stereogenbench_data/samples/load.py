@@ -193,11 +193,6 @@ class SampleLoader:
         self._streams.limit, self._streams.kept_frames = videos, frames
 
     @property
-    def fetched(self) -> tuple[int, int]:
-        """How many ranges this process has fetched, and how many bytes."""
-        return self._source.fetched
-
-    @property
     def has_order(self) -> bool:
         """Whether samples were decoded as they were expected; True where none is fetched."""
         return self._coming is None or self._coming.has_order

@@ -1,6 +1,6 @@
 """What a dataset asks of every sample, and the interface of transforms."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol, runtime_checkable
 
@@ -78,11 +78,9 @@ def parse_request(
     layout: Layout,
     *,
     fields: Iterable[str],
-    size: Any,
-    depth: Any,
-    transform: Any,
+    options: Mapping[str, Any],
 ) -> Request:
-    """Return what a user asks of every sample.
+    """Return what a user asks of every sample; of the options, size, depth and transform.
 
     Raises:
         FieldError: If a field does not exist, is named twice, or none is named; if the size is not
@@ -100,6 +98,7 @@ def parse_request(
         )
     if not names or len(set(names)) < len(names):
         raise FieldError(f"fields must be at least one and each only once, got {names!r}.")
+    size, depth, transform = (options.get(name) for name in ("size", "depth", "transform"))
     if size is not None:
         size = require_size(size)
     if depth is not None and not isinstance(depth, DepthEncoding):

@@ -239,9 +239,7 @@ class HorizontalFlip:
 
         return _mapped(
             views,
-            pictures=mirrored,
-            maps=mirrored,
-            marks=mirrored,
+            mirrored,
             source=views.targets[0],
             targets=(views.source,),
             intrinsics=views.intrinsics.flipped(),
@@ -369,13 +367,17 @@ def _own(maps: Any, views: Views) -> Any:
 
 def _mapped(
     views: Views,
-    *,
     pictures: Callable[[Any], Any],
-    maps: Callable[[Any], Any],
-    marks: Callable[[Any], Any],
+    *,
+    maps: Callable[[Any], Any] | None = None,
+    marks: Callable[[Any], Any] | None = None,
     **changes: Any,
 ) -> Views:
-    """Return views with all pictures, stored depth maps and marks of erased pixels mapped."""
+    """Return views with all pictures, stored depth maps and marks of erased pixels mapped alike.
+
+    ``maps`` and ``marks`` map depth and marks otherwise than pictures.
+    """
+    maps, marks = maps or pictures, marks or pictures
     return replace(
         views,
         pictures={camera: pictures(found) for camera, found in views.pictures.items()},
@@ -398,7 +400,7 @@ def _resized(views: Views, *, height: int, width: int) -> Views:
 
     return _mapped(
         views,
-        pictures=partial(_resized_pictures, size=size),
+        partial(_resized_pictures, size=size),
         maps=nearest,
         marks=partial(_resized_marks, size=size),
         intrinsics=views.intrinsics.resized(width_px=width, height_px=height),
@@ -438,9 +440,7 @@ def _windowed(views: Views, *, top: int, left: int, size: tuple[int, int]) -> Vi
     window = partial(_window, top=top, left=left, size=size)
     return _mapped(
         views,
-        pictures=window,
-        maps=window,
-        marks=window,
+        window,
         intrinsics=old.cropped(left_px=left, top_px=top, width_px=width, height_px=height),
         padded=None if padded is None else ~window(~padded),
     )

@@ -60,6 +60,15 @@ def options_of(call: Callable[..., Any]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
+def split_options(options: Mapping[str, Any], kind: Any) -> tuple[Any, Any]:
+    """Return the options that a typed dictionary declares, and the others."""
+    own = kind.__annotations__
+    return (
+        {name: options[name] for name in options if name in own},
+        {name: options[name] for name in options if name not in own},
+    )
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return how a message about an unknown name goes on: with the name that was meant, or a dot.
 

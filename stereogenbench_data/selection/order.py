@@ -108,15 +108,8 @@ class OrderRule:
 
     def __post_init__(self) -> None:
         """Require numbers in their ranges."""
-        least_of = {
-            "batch_size": 1,
-            "seed": 0,
-            "shuffle_groups": 1,
-            "open_scenes": 1,
-            "open_frames": 1,
-        }
-        for name, least in least_of.items():
-            value = getattr(self, name)
+        for name in ("batch_size", "seed", "shuffle_groups", "open_scenes", "open_frames"):
+            value, least = getattr(self, name), int(name != "seed")
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise SelectionError(f"{name} must be a whole number from {least}, got {value!r}.")
         if not isinstance(self.shuffle, bool):

@@ -78,7 +78,6 @@ class MemberSource:
         self._tables: OrderedDict[bytes, dict[str, SeekTable]] = OrderedDict()
         self._sound: set[tuple[str, int]] = set()
         self._objects: dict[str, RemoteObject] = {}
-        self._requests = self._bytes = 0
 
     def __repr__(self) -> str:
         """Return the root without secrets, and what is compared with its checksum."""
@@ -108,7 +107,6 @@ class MemberSource:
             if found is not None and found[0] + len(found[1]) >= offset + stop:
                 begin = offset + start - found[0]
                 return found[1][begin : begin + stop - start]
-            self._requests, self._bytes = self._requests + 1, self._bytes + stop - start
             return remote.read(offset + start, offset + stop)
 
         def fetched(at: int) -> tuple[int, bytes] | None:
@@ -126,15 +124,8 @@ class MemberSource:
     def fetching_by(self, ahead: FetchAhead) -> "MemberSource":
         """Return the same source, for another reader."""
         twin = copy.copy(self)
-        twin._ahead, twin._requests, twin._bytes = ahead, 0, 0
+        twin._ahead = ahead
         return twin
-
-    @property
-    def fetched(self) -> tuple[int, int]:
-        """How many ranges were fetched, and their bytes, without what went into a cache."""
-        if self._ahead is None:
-            return self._requests, self._bytes
-        return self._requests + self._ahead.requests, self._bytes + self._ahead.bytes
 
     @property
     def is_cached(self) -> bool:
@@ -264,8 +255,7 @@ class MemberSource:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy in another process, which checks sizes for itself."""
-        anew = {"_objects": {}, "_tables": OrderedDict(), "_requests": 0, "_bytes": 0}
-        return self.__dict__ | anew
+        return self.__dict__ | {"_objects": {}, "_tables": OrderedDict()}
 
 
 def _cached(member: Member) -> tuple[str, int]:

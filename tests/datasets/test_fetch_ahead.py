@@ -128,13 +128,10 @@ def test_a_pass_gives_what_local_shards_give_in_few_requests(
 
     for batch, other in zip(loader, expected, strict=True):
         assert same(batch, other)
-    stats = loader.stats()
     loader.close()
 
     asked = parts_asked(served)
     assert len(asked) <= 3 * 2 * len(loader.batches.dataset.plan.scene_rows) + 6
-    assert stats.requests == len(asked)
-    assert stats.bytes_fetched == sum(each.sent for each in asked)
 
 
 def test_a_stream_of_samples_is_fetched_ahead_too(served, large_shards, alone):

@@ -48,7 +48,7 @@ def maps(units, image):
         "disparity of units": disparity_from_units(units, **PAIR, unit_m=0.1),
         "disparity": disparity_from_depth(depth_m, **PAIR),
         "depth": depth_from_disparity(depth_m, **PAIR),
-        "error": disparity_error_px(depth_m, **PAIR, quantum_m=0.1),
+        "error": disparity_error_px(depth_m, shift_px_m=2.7, half_step_m=0.05),
         "planar": planar_from_ray(depth_m, CAMERA),
     }
     for name, projection in lands.items():

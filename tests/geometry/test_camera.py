@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -85,34 +87,20 @@ def test_a_ray_lands_on_the_same_fraction_of_the_image_at_every_size(width_px, h
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes",
     [
-        ({"width_px": 0}, r"width_px must be at least 1, got 0"),
-        ({"height_px": -3}, r"height_px must be at least 1, got -3"),
-        ({"fx_px": 0.0}, r"fx_px must be a positive finite number, got 0\.0"),
-        ({"fy_px": float("nan")}, r"fy_px must be a positive finite number, got nan"),
-        ({"cx_px": float("inf")}, r"cx_px must be finite, got inf"),
+        {"width_px": 0}, {"height_px": -3}, {"fx_px": 0.0}, {"fy_px": float("nan")},
+        {"cx_px": float("inf")},
     ],
-)
-def test_intrinsics_out_of_range_are_refused(changes, message):
-    numbers = {
-        "fx_px": 70.0,
-        "fy_px": 66.0,
-        "cx_px": 21.5,
-        "cy_px": 14.0,
-        "width_px": 40,
-        "height_px": 30,
-    }
+    ids=str,
+)  # fmt: skip
+def test_intrinsics_out_of_range_are_refused(intrinsics, changes):
+    ((name, value),) = changes.items()
 
-    with pytest.raises(GeometryError, match=message):
-        Intrinsics(**(numbers | changes))
-
-
-def test_a_resize_to_nothing_is_refused(intrinsics):
-    with pytest.raises(GeometryError, match="width_px must be at least 1, got 0"):
-        intrinsics.resized(width_px=0, height_px=10)
+    with pytest.raises(GeometryError, match=f"{name}={value}"):
+        replace(intrinsics, **changes)
 
 
 def test_a_sensor_without_width_is_refused():
-    with pytest.raises(GeometryError, match=r"sensor width in mm must be .* got 0\.0"):
+    with pytest.raises(GeometryError, match=r"sensor.* got \(0\.0, 24\.0\) mm"):
         Intrinsics.from_mm(focal_mm=50.0, sensor_mm=(0.0, 24.0), size_px=(720, 720))

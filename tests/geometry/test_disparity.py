@@ -151,9 +151,7 @@ def test_a_disparity_that_no_depth_explains_has_none(library, disparity_px, base
 def test_the_error_of_one_pixel_at_a_tenth_of_a_metre(library, depth_m, expected_px):
     depth = library.array(np.array([[depth_m]], dtype=np.float32))
 
-    error_px = library.numpy(
-        disparity_error_px(depth, focal_px=1115.0, baseline_m=-0.1, quantum_m=0.1)
-    )
+    error_px = library.numpy(disparity_error_px(depth, shift_px_m=111.5, half_step_m=0.05))
 
     assert error_px.dtype == np.float32
     np.testing.assert_allclose(error_px, [[expected_px]], rtol=1e-4)
@@ -180,7 +178,10 @@ def test_rounded_depth_never_moves_disparity_beyond_the_bound(
     pair = {"focal_px": focal_px, "baseline_m": baseline_m}
 
     disparity_px = library.numpy(disparity_from_depth(stored, **pair)).astype(np.float64)
-    bound_px = library.numpy(disparity_error_px(stored, quantum_m=quantum_m, **pair))
+    shift_px_m = focal_px * abs(baseline_m)
+    bound_px = library.numpy(
+        disparity_error_px(stored, shift_px_m=shift_px_m, half_step_m=quantum_m / 2)
+    )
 
     error_px = np.abs(disparity_px - focal_px * baseline_m / true_m)
     assert (error_px <= bound_px).all()
@@ -189,9 +190,8 @@ def test_rounded_depth_never_moves_disparity_beyond_the_bound(
 def test_the_bound_is_no_looser_than_the_worst_case():
     """At the near end of the step the error reaches the bound but for float32's rounding."""
     depth_m = np.array([[0.1, 3.0, 100.0]], dtype=np.float32)
-    pair = {"focal_px": 1756.0, "baseline_m": 0.06}
 
-    bound_px = disparity_error_px(depth_m, quantum_m=0.1, **pair)
+    bound_px = disparity_error_px(depth_m, shift_px_m=1756 * 0.06, half_step_m=0.05)
 
     worst_px = 1756 * 0.06 / (depth_m - 0.05) - 1756 * 0.06 / depth_m
     np.testing.assert_allclose(bound_px, worst_px, rtol=1e-3)

@@ -35,6 +35,7 @@ def test_a_picture_field_needs_its_own_video_alone():
 
 
 def test_views_cannot_be_flipped():
-    options = {"fields": ("image",), "size": None, "depth": None}
     with pytest.raises(FieldError, match=r"SceneViews .*got HorizontalFlip"):
-        parse_request("views", "stacked", transform=HorizontalFlip(), **options)
+        parse_request(
+            "views", "stacked", fields=("image",), options={"transform": HorizontalFlip()}
+        )
