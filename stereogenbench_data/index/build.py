@@ -18,7 +18,7 @@ from stereogenbench_data.errors import (
     StorageError,
 )
 from stereogenbench_data.index.evidence import agreed_forms
-from stereogenbench_data.index.folders import folder_of, stamp_of
+from stereogenbench_data.index.folders import SceneFolder, folder_of, stamp_of
 from stereogenbench_data.index.journal import Journal
 from stereogenbench_data.index.parquet import IndexHead
 from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, json_of, scene_of_json
@@ -223,8 +223,11 @@ class DescribeTask:
     def __call__(self, key: str, advance: Advance = no_advance) -> Outcome:
         """Return what the scene is."""
         advance(0)
+        return self.outcome(folder_of(self.root, key), key)
+
+    def outcome(self, folder: SceneFolder, key: str) -> Outcome:
+        """Return what the scene of a folder is, whose files are all read."""
         files: dict[str, tuple[int, int]] = {}
-        folder = folder_of(self.root, key)
         try:
             files = folder.stamps()
             scene = describe_scene(

@@ -18,7 +18,7 @@ from stereogenbench_data.errors import MediaError, SchemaError, StereoGenBenchEr
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.index.evidence import understood_poses
 from stereogenbench_data.index.folders import SceneFolder, folder_of
-from stereogenbench_data.index.scene_folder import IncompleteScene, describe_scene
+from stereogenbench_data.index.scene_folder import IncompleteScene, describe_scene, keys_in
 from stereogenbench_data.index.tree import find_remote_scenes, find_scene_folders
 from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.media.video import probe
@@ -28,9 +28,7 @@ from stereogenbench_data.schema.conventions import (
     DepthAs,
     PosesAs,
     Shape,
-    keys_of,
 )
-from stereogenbench_data.schema.document import parse_object
 from stereogenbench_data.schema.parse import parse_scene_key, see_rig
 from stereogenbench_data.schema.records import (
     DepthEncoding,
@@ -121,26 +119,14 @@ def chosen_scenes(
     spread = [key for each in rounds for key in each if key is not None]
     chosen, others = spread[:count], spread[count:]
     if not is_remote(root) and others:
-        known = {_keys(folder_of(root, key), (BASELINE_JSON,)) for key in chosen}
+        known = {keys_in(folder_of(root, key), (BASELINE_JSON,)) for key in chosen}
         step = max(1, len(others) // _KEYS_READ)
         for key in others[::step][:_KEYS_READ]:
-            keys_there = _keys(folder_of(root, key), (BASELINE_JSON,))
+            keys_there = keys_in(folder_of(root, key), (BASELINE_JSON,))
             if keys_there not in known and len(chosen) < count + _MORE_SHAPES:
                 known.add(keys_there)
                 chosen.append(key)
     return chosen
-
-
-def _keys(folder: SceneFolder, names: Iterable[str]) -> frozenset[str]:
-    """Return the keys of a scene's files; those of a file that cannot be read are missing."""
-    found: set[str] = set()
-    for name in names:
-        try:
-            document = parse_object(folder.read(name), where=name)
-        except (StereoGenBenchError, KeyError):
-            continue
-        found |= {f"{name}: {place}" for place in keys_of(document)}
-    return frozenset(found)
 
 
 def examine(root: str | Path, key: str, *, conventions: Conventions | None = None) -> Examined:
@@ -172,7 +158,7 @@ def examine(root: str | Path, key: str, *, conventions: Conventions | None = Non
     notes["depth"] = [] if depth is None else _depth_notes(depth, scene)
     names = [name for name in (BASELINE_JSON, TRAJECTORY_JSON) if name in files]
     return Examined(
-        key, _keys(folder, names), shape, notes, unknown, depth, scene, problem,
+        key, keys_in(folder, names), shape, notes, unknown, depth, scene, problem,
         lacks_mark=COMPLETE_JSON not in files,
     )  # fmt: skip
 

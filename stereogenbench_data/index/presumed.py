@@ -28,6 +28,7 @@ from stereogenbench_data.geometry.rig import RECTIFIED_PX
 from stereogenbench_data.index.build import (
     ALIKE,
     POOL_FROM,
+    DescribeTask,
     Outcome,
     TreeReport,
     find_scenes,
@@ -78,7 +79,6 @@ from stereogenbench_data.schema.release import (
     CAMERA_PAIRS,
     COMPLETE_JSON,
     TRAINING_JSON,
-    TRAJECTORY_JSON,
     VIDEO_FILES,
     depth_name,
 )
@@ -165,15 +165,8 @@ class ListedTree:
         """Return what a scene is, whose files are all read."""
         if key in self.described:
             return self.described[key]
-        files: dict[str, tuple[int, int]] = {}
-        try:
-            folder = self.folder(key)
-            files = folder.stamps()
-            folder.fetch([BASELINE_JSON, COMPLETE_JSON, TRAJECTORY_JSON, *VIDEO_FILES])
-            scene = describe_scene(self.root, key, conventions=self.conventions, folder=folder)
-        except StereoGenBenchError as error:
-            return Outcome.of_error(key, error, files=files)
-        outcome = Outcome.of_scene(scene, stamp_of(files))
+        task = DescribeTask(str(self.root), conventions=self.conventions)
+        outcome = task.outcome(self.folder(key), key)
         if self.is_remote:
             self.described[key] = outcome
         return outcome
@@ -518,8 +511,6 @@ class Presumption:
             with suppress(ValueError, KeyError, TypeError, IndexError, AttributeError):
                 scene = None if kept is None else scene_of_json(json.loads(kept))
             if scene is None:
-                texts = BASELINE_JSON, COMPLETE_JSON, TRAJECTORY_JSON, *DESCRIPTIONS
-                folder.fetch([*texts, *(videos or ())])
                 scene = describe_scene(
                     tree.root, key, conventions=tree.conventions, folder=folder, videos=videos
                 )

@@ -5,9 +5,10 @@ picture is decoded unless the share of measured depth is asked for. `metadata_di
 the same files with an existing row.
 """
 
+import functools
 import math
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -188,6 +189,8 @@ class _Description:
         """Return the row; `describe_scene` says more."""
         problems: list[StereoGenBenchError] = []
         rig, labels = None, SceneLabels()
+        small = BASELINE_JSON, COMPLETE_JSON, TRAJECTORY_JSON, *DESCRIPTIONS
+        self.folder.fetch([*small, *(self.names if videos is None else videos)])
         self.probe(videos)
         try:
             rig, labels = self.rig(conventions)
@@ -294,14 +297,10 @@ class _Description:
         """Return what ``baseline.json`` says, by the conventions for its keys."""
         text, where = self.folder.read(BASELINE_JSON), self.where(BASELINE_JSON)
 
-        def keys() -> set[str]:
-            return {
-                f"{name}: {place}"
-                for name in (BASELINE_JSON, TRAJECTORY_JSON) if name in self.files
-                for place in keys_of(parse_object(self.folder.read(name), where=self.where(name)))
-            }  # fmt: skip
-
         if conventions is not None:
+            parse_object(text, where=where)  # What is not JSON has no keys, and its own error.
+            names = BASELINE_JSON, TRAJECTORY_JSON
+            keys = functools.partial(keys_in, self.folder, names)
             self.shape = conventions.shape_of(keys, where=self.key)
         size_px = next(((each.width_px, each.height_px) for each in self.facts.values()), None)
         if self.document is not None:
@@ -510,6 +509,18 @@ def _source_of(encoding: DepthEncoding | None) -> DepthUnitSource:
     if encoding is None or encoding.source == "user":
         return "unreadable"
     return encoding.source
+
+
+def keys_in(folder: SceneFolder, names: Iterable[str]) -> frozenset[str]:
+    """Return the keys of a scene's files, as `Shape.has` names them, without unreadable ones."""
+    found: set[str] = set()
+    for name in names:
+        try:
+            document = parse_object(folder.read(name), where=name)
+        except (StereoGenBenchError, KeyError):
+            continue
+        found |= {f"{name}: {place}" for place in keys_of(document)}
+    return frozenset(found)
 
 
 def as_kept(remarks: list[Remark]) -> tuple[Remark, ...]:
