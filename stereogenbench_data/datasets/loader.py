@@ -15,19 +15,18 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property, partial
-from typing import Any, Final, NamedTuple, Protocol, SupportsIndex, cast
+from typing import Any, Final, NamedTuple, SupportsIndex
 from weakref import WeakSet
 
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset, DistributedSampler, Sampler, SequentialSampler
+from torch.utils.data import DataLoader, DistributedSampler, Sampler, SequentialSampler
 
-from stereogenbench_data.datasets.batch_buffers import BatchBuffers, forget_slots, held_batches
+from stereogenbench_data.datasets.batch_buffers import forget_slots, held_batches
 from stereogenbench_data.datasets.batches import (
     EpochBatch,
     EpochBatches,
     EpochOptions,
-    Numbered,
     Pass,
     State,
 )
@@ -38,7 +37,6 @@ from stereogenbench_data.errors import (
     StereoGenBenchError,
     WorkerError,
 )
-from stereogenbench_data.samples.streams import StreamStats
 from stereogenbench_data.selection.order import EpochOrder, Numbers
 from stereogenbench_data.selection.plan import Plan
 
@@ -58,24 +56,6 @@ class LoaderOptions(EpochOptions, total=False):
     prefetch_factor: int | None
     persistent_workers: bool
     collate_fn: Any
-
-
-class Loadable(Numbered, Protocol):
-    """A numbered dataset that a loader loads."""
-
-    buffers: BatchBuffers
-
-    def keep_open(self, batches: EpochBatches, *, processes: int) -> None:
-        """Keep videos open for the scenes that one of so many processes reads at a time."""
-
-    def stop_fetching(self) -> None:
-        """End the requests of this process for coming samples."""
-
-    def stats(self) -> StreamStats:
-        """Return how many videos this process has open."""
-
-    def close(self) -> None:
-        """Close the videos that are open in this process."""
 
 
 class LoaderStats(NamedTuple):
@@ -173,7 +153,7 @@ class PairsLoader(DataLoader[Any]):
 
     def __init__(
         self,
-        dataset: Loadable,
+        dataset: Any,
         batches: EpochBatches,
         *,
         num_workers: int = 0,
@@ -183,7 +163,7 @@ class PairsLoader(DataLoader[Any]):
         """Load batches of a dataset.
 
         Args:
-            dataset: The samples.
+            dataset: The samples: `StereoPairs` or `SceneViews`, whose module imports this one.
             batches: Their batches.
             num_workers: How many processes load; 0 loads in this one.
             batch_sampler: What gives the batches on their way to the workers, such as what
@@ -193,8 +173,7 @@ class PairsLoader(DataLoader[Any]):
         if options.get("collate_fn") is None:
             options["collate_fn"] = dataset.buffers.collate
         super().__init__(
-            # A protocol: torch asks for len and [] alone.
-            cast("Dataset[Any]", dataset),
+            dataset,
             batch_sampler=batch_sampler or batches,
             num_workers=num_workers,
             **options,
