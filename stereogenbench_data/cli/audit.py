@@ -91,7 +91,7 @@ def audit(  # noqa: PLR0913 - one parameter an option
             source.data,
             root=source.data_root,
             progress=progress,
-            conventions=source.conventions,
+            conventions=source.stated(),
             **options,
         )
     notes = _journal(out, source.data, request)

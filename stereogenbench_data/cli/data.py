@@ -1,7 +1,6 @@
 """Opening DATA: what is odd about them is told in lines on stderr."""
 
 import warnings
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
@@ -11,17 +10,18 @@ from stereogenbench_data.schema.text import plain_line
 
 if TYPE_CHECKING:
     from stereogenbench_data.index.table import SceneIndex
+    from stereogenbench_data.schema.conventions import Conventions
 
 
 def open_data(
-    data: str, *, root: str | None = None, conventions: Path | None = None
+    data: str, *, root: str | None = None, conventions: "Conventions | None" = None
 ) -> "SceneIndex":
     """Return the index of some data, with its warnings printed on stderr.
 
     Args:
         data: What the command was given.
         root: Where an index file's data are, if the user says so.
-        conventions: The file that says how the data are read.
+        conventions: How the data are read.
 
     Raises:
         StorageError: If the data do not exist, hold no complete scene or too many broken ones, or

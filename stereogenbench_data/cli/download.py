@@ -50,7 +50,7 @@ def download(  # noqa: PLR0913 - one parameter an option
 
     numbers = list(cameras or range(CAMERA_COUNT))
     filters: Any = chosen.filters()
-    index = SceneIndex.open(source.data, root=source.data_root, conventions=source.conventions)
+    index = SceneIndex.open(source.data, root=source.data_root, conventions=source.stated())
     rows = filter_scenes(index, filters).tolist()
     kinds = ("rgb", "depth") if streams == "both" else (streams,)
     if share.is_given:

@@ -6,7 +6,7 @@ shows typer the fields in its place.
 
 import inspect
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -18,6 +18,7 @@ from stereogenbench_data.schema.release import CAMERA_COUNT, CAMERA_PAIRS
 
 if TYPE_CHECKING:
     from stereogenbench_data.index.table import SceneIndex
+    from stereogenbench_data.schema.conventions import Conventions
     from stereogenbench_data.schema.records import SceneId
 
 SCENES: Final = "Which scenes"
@@ -246,10 +247,35 @@ class DataOptions:
         typer.Option("--root", help="Where the data of an index file are, if not beside."),
     ] = None
     conventions: ConventionsOption = None
+    accept: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="LOSS",
+            help="Accept depth that is 8-bit ... 14-bit, lossy, chroma.",
+            autocompletion=complete_from(("8-bit", "10-bit", "12-bit", "lossy", "chroma")),
+        ),
+    ] = None
+
+    def stated(self) -> "Conventions | None":
+        """Return the conventions, with the losses of depth that are accepted."""
+        from stereogenbench_data.schema.conventions import Conventions, DepthAs, Shape
+        from stereogenbench_data.schema.records import DepthEncoding
+
+        accepted: Any = {*(self.accept or ())}
+        stated = None if self.conventions is None else Conventions.read(self.conventions)
+        if not accepted:
+            return stated
+        shapes = []
+        for shape in (Shape(),) if stated is None else stated.shapes:
+            depth = shape.depth or DepthAs(encoding=DepthEncoding())
+            accept = depth.encoding.accept | accepted
+            depth = replace(depth, encoding=replace(depth.encoding, accept=accept))
+            shapes.append(replace(shape, depth=depth))
+        return Conventions(tuple(shapes), "--accept" if stated is None else stated.where)
 
     def open(self) -> "SceneIndex":
         """Return the index of the data as `open_data` does."""
-        return open_data(self.data, root=self.data_root, conventions=self.conventions)
+        return open_data(self.data, root=self.data_root, conventions=self.stated())
 
 
 @dataclass(frozen=True, kw_only=True)

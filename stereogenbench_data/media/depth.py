@@ -165,8 +165,9 @@ def require_depth_stream(
         raise MediaError(
             f"{stored} ({', '.join(refused)}), which does not keep depth whole. Store it as "
             f"gray16le with FFV1; if this is intended, pass "
-            f"DepthEncoding(accept=frozenset({{{accept}}})), with unit_m=... if the file does not "
-            f"tell its unit; or write both below [depth] in a file for --conventions.{rescaled}"
+            f"DepthEncoding(accept=frozenset({{{accept}}})), by command --accept, with "
+            f"unit_m=... if the file does not tell its unit; or write both below [depth] in a file "
+            f"for --conventions.{rescaled}"
         )
     return layout
 

@@ -1,13 +1,16 @@
 """Options declared once: groups of them as parameters, and errors that name the option."""
 
+import shutil
+import subprocess
 from dataclasses import dataclass
 from typing import Annotated
 
+import imageio_ffmpeg
 import pytest
 import typer
 from typer.testing import CliRunner
 
-from stereogenbench_data.cli.options import SceneOptions, filter_of, grouped
+from stereogenbench_data.cli.options import DataOptions, SceneOptions, filter_of, grouped
 from stereogenbench_data.samples.size import SwappedSizeWarning
 from tests.cli.command import invoke, one_line
 
@@ -124,3 +127,31 @@ def test_a_size_that_looks_swapped_gives_a_warning_that_names_the_option(small_s
         shown = invoke(*words, "--size", "30x52", "--workers", "1")
 
     assert shown.exit_code == 0, shown.output
+
+
+def test_losses_of_depth_are_accepted_beside_what_conventions_state(tmp_path):
+    stated = tmp_path / "c.toml"
+    stated.write_text('[depth]\nunit_m = 0.01\naccept = ["lossy"]\n')
+
+    (alone,) = DataOptions(data="x", accept=["10-bit"]).stated().shapes
+    (both,) = DataOptions(data="x", conventions=stated, accept=["10-bit"]).stated().shapes
+
+    assert (alone.depth.encoding.accept, alone.depth.encoding.unit_m) == ({"10-bit"}, None)
+    assert (both.depth.encoding.accept, both.depth.encoding.unit_m) == ({"10-bit", "lossy"}, 0.01)
+    assert DataOptions(data="x").stated() is None
+
+
+def test_commands_read_depth_of_few_bits_where_the_loss_is_accepted(small_release, tmp_path):
+    root, out = tmp_path / "release", tmp_path / "sheet.png"
+    shutil.copytree(small_release / "eval", root / "eval")
+    for path in root.rglob("*_depth.mkv"):
+        encode = (imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-i", path)
+        narrow = path.with_suffix(".new.mkv")
+        subprocess.run([*encode, "-vf", "format=gray10le", "-c:v", "ffv1", narrow], check=True)
+        narrow.replace(path)
+
+    refused = invoke("show", root, "-o", out)
+    shown = invoke("show", root, "-o", out, "--accept", "10-bit")
+
+    assert "--accept" in one_line(refused.stderr)
+    assert (refused.exit_code, shown.exit_code, out.exists()) == (2, 0, True)
