@@ -318,9 +318,10 @@ def _checked(reading: Reading, rig: Rig) -> _Passed | str:
         )
     axes = poses.world_from_cam_rotations[..., 0][:, _LEFT]
     along = np.sum((steps @ OPENCV_FROM_UNREAL.T) * axes, axis=-1) / distances
-    off = float(np.sqrt(np.maximum(0.0, 1 - np.square(along))).max())
-    turns = poses.world_from_cam_rotations
-    if off > _OFF_AXIS and np.abs(turns - turns[:, :1]).max() <= _EXACT:
+    sines = np.sqrt(np.maximum(0.0, 1 - np.square(along)))
+    off, turns = float(sines.max()), poses.world_from_cam_rotations
+    is_off = (sines * baselines_cm > _OFF_AXIS * baselines_cm + _DEVIATION_CM).any()
+    if is_off and np.abs(turns - turns[:, :1]).max() <= _EXACT:
         return (
             f"the cameras look one way, and stand {np.degrees(np.arcsin(off)):.3g} degrees off "
             f"the axis to their right"
