@@ -143,7 +143,7 @@ def posed_images(sample: Sample) -> list[PosedImage]:
         raise FieldError(
             f"the sample has no {', '.join(missing)}: load {kind} with fields={needed}."
         )
-    arrays = {
+    arrays: dict[str, Any] = {
         name: sample[name] if name == "scene" else np.asarray(sample[name]) for name in needed
     }
     if kind == "pair":

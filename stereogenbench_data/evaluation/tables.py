@@ -1,6 +1,8 @@
 """The tables of an evaluation: groups of pairs, a row for each method, the paper's rows below.
 
-A table holds methods of one tier only: rows of different tiers answer different questions.
+A table holds methods of one tier only: rows of different tiers answer different questions. The
+paper's tables are CSV files in ``reference_tables``: numbers as printed, since the last digit of a
+reference is part of it, and an empty cell for a dash.
 """
 
 import csv
