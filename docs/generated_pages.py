@@ -1,6 +1,6 @@
 """What the documentation says of the code by the code itself: the commands, the tables of fields.
 
-The page of commands is made when the site is built. The tables of fields stand in ``fields.md``,
+The page of commands is made when the site is built. The tables of fields stand in ``samples.md``,
 for those who read the file; ``python docs/generated_pages.py`` writes them anew.
 """
 
@@ -90,5 +90,5 @@ def _cell(text: str) -> str:
 
 
 if __name__ == "__main__":
-    page = Path(__file__).with_name("fields.md")
+    page = Path(__file__).with_name("samples.md")
     page.write_text(with_fields_tables(page.read_text()))

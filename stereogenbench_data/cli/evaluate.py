@@ -33,22 +33,18 @@ if TYPE_CHECKING:
     from stereogenbench_data.evaluation.tables import Table
 
 
-def parse_strata(texts: list[str] | None) -> dict[str, tuple[float, ...]]:
-    """Return the columns of ``--by``, each with its edges."""
-    strata: dict[str, tuple[float, ...]] = {}
-    for text in texts or []:
-        column, _, edges = text.partition(":")
-        try:
-            strata[column] = tuple(float(edge) for edge in edges.split(",")) if edges else ()
-        except ValueError:
-            raise typer.BadParameter(
-                f"{text!r}: the edges {edges!r} are not numbers such as 18,35.", param_hint="--by"
-            ) from None
-    return strata
+def _stratum_of(text: str) -> tuple[str, tuple[float, ...]]:
+    """Return the column of ``--by`` with its edges."""
+    column, _, edges = text.partition(":")
+    try:
+        return column, tuple(float(edge) for edge in edges.split(",")) if edges else ()
+    except ValueError:
+        raise typer.BadParameter(
+            f"{text!r}: the edges {edges!r} are not numbers such as 18,35."
+        ) from None
 
 
 _DIFFERENCES_SHOWN = 20
-_WHAT_IS_SAME = "the same data, protocol, weights, right views and numbers"
 _METRICS = "How metrics are computed"
 """Panel of the help for the options of metrics."""
 TierOption = Annotated[
@@ -200,7 +196,8 @@ class ReportOptions:
         if differing:
             typer.echo(f"{self.compare}: {counted(len(differing), 'difference')}", err=True)
             raise typer.Exit(FINDINGS)
-        typer.echo(f"{self.compare}: reproduced, {_WHAT_IS_SAME}", err=True)
+        same = "the same data, protocol, weights, right views and numbers"
+        typer.echo(f"{self.compare}: reproduced, {same}", err=True)
 
 
 @grouped
@@ -252,8 +249,9 @@ def score(  # noqa: PLR0913 - one parameter an option
     chosen: ScoredOptions,
     scoring: ProtocolOptions,
     by: Annotated[
-        list[str] | None,
+        list[Any] | None,
         typer.Option(
+            parser=_stratum_of,
             metavar="COLUMN[:EDGES]",
             help="Also score by map_name or focal_mm:18,35,85. May be repeated.",
         ),
@@ -278,7 +276,7 @@ def score(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.evaluation.tables import tables_of
 
     protocol, selection = scoring.protocol(), chosen.selection()
-    strata = parse_strata(by)
+    strata: dict[str, tuple[float, ...]] = dict(by or ())
     called = name or predictions.resolve().name
     folder = report.out or Path("evaluation") / f"{called}-{tier}"
     index = source.open()

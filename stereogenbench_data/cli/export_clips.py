@@ -114,8 +114,5 @@ def clips(  # noqa: PLR0913 - one parameter an option
         clips_of = {"written": list(report.written), "kept": list(report.kept)}
         typer.echo(json.dumps({"out": str(out), "manifests": names} | clips_of, indent=2))
         return
-    were = "was" if len(report.kept) == 1 else "were"
-    typer.echo(
-        f"{out}: {counted(len(report.written), 'clip')} written, {len(report.kept)} {were} there "
-        f"before; {', '.join(names)}"
-    )
+    clips_now = counted(len(report.written), "clip")
+    typer.echo(f"{out}: {clips_now} written, {len(report.kept)} kept; {', '.join(names)}")

@@ -67,24 +67,13 @@ def index(  # noqa: PLR0913 - one parameter an option
             "the index of a part needs its own file: name it with --out FILE.",
             param_hint="--out",
         )
-    if target.is_dir():
-        raise typer.BadParameter(
-            f"{target} is a folder: name a file, such as {target / _INDEX_NAME}.",
-            param_hint="--out",
-        )
     if target.exists() and not target.is_file():
         raise typer.BadParameter(
-            f"{target} is not a regular file, and an index would replace it.", param_hint="--out"
+            f"{target} is not a regular file: name one, such as {target / _INDEX_NAME}.",
+            param_hint="--out",
         )
     if out is None and target.parent.is_dir():
-        try:
-            require_writable(target, "file")
-        except OSError as error:
-            raise typer.BadParameter(
-                f"{target} cannot be written ({error.strerror}): name a file elsewhere with --out "
-                "FILE or -o FILE.",
-                param_hint="--out",
-            ) from error
+        require_writable(target, "file")
     recorded_root(root, beside=target.parent)  # Refuses a root before hours of work.
     stated = None if conventions is None else Conventions.read(conventions)
     how = f"valid_depth={mode} {'' if stated is None else [each.text() for each in stated.shapes]}"

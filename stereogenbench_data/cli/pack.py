@@ -122,10 +122,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
         typer.echo(json.dumps(document, indent=2))
         return
     kept = len(report.part) - len(report.packed)
-    were = "was" if kept == 1 else "were"
-    typer.echo(
-        f"{out}: {counted(len(report.packed), 'shard')} packed, {kept} {were} finished before"
-    )
+    typer.echo(f"{out}: {counted(len(report.packed), 'shard')} packed, {kept} kept")
     if report.index is None:
         typer.echo(
             f"{counted(len(report.missing), 'shard')} of the plan to be packed yet, from "
@@ -246,8 +243,5 @@ def unpack(
     if as_json:
         typer.echo(json.dumps(asdict(report) | {"out": str(out)}, indent=2))
         return
-    were = "was" if len(report.kept) == 1 else "were"
-    typer.echo(
-        f"{out}: {counted(len(report.unpacked), 'scene')} unpacked, {len(report.kept)} {were} "
-        f"there before"
-    )
+    unpacked_now = counted(len(report.unpacked), "scene")
+    typer.echo(f"{out}: {unpacked_now} unpacked, {len(report.kept)} kept")

@@ -89,7 +89,6 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     template: Annotated[
         bool, flag("--template", "Write the questions that --about answers.")
     ] = False,
-    as_json: JsonOption = False,
 ) -> None:
     """Write a Croissant 1.1 descriptor, or check one.
 
@@ -98,7 +97,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     Example: `stereogenbench publish croissant shards/ -o croissant/sample.json`
     """
     if check:
-        _check(data, as_json=as_json)
+        _check(data)
         return
     if out is None:
         raise typer.BadParameter(
@@ -126,25 +125,18 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     )
     descriptor = write_descriptor(index, out, publication=publication)
     files, records = len(descriptor["distribution"]), len(descriptor["recordSet"])
-    if as_json:
-        summary = {"descriptor": str(out), "distribution": files, "record_sets": records}
-        typer.echo(json.dumps(summary, indent=2))
-    else:
-        typer.echo(f"{out}: {files} files and sets of files, {counted(records, 'record set')}")
+    typer.echo(f"{out}: {files} files and sets of files, {counted(records, 'record set')}")
 
 
-def _check(data: str | None, *, as_json: bool) -> None:
+def _check(data: str | None) -> None:
     if data is None:
         raise typer.BadParameter("no descriptor to check: name its file.", param_hint="DATA")
     from stereogenbench_data.bridges.croissant.check import check_descriptor
 
     problems = check_descriptor(Path(data))
-    if as_json:
-        typer.echo(json.dumps({"descriptor": data, "problems": problems}, indent=2))
-    else:
-        for problem in problems:
-            typer.echo(problem)
-        typer.echo(f"{data}: {counted(len(problems), 'problem')}")
+    for problem in problems:
+        typer.echo(problem)
+    typer.echo(f"{data}: {counted(len(problems), 'problem')}")
     if problems:
         raise typer.Exit(FINDINGS)
 

@@ -25,7 +25,7 @@ from stereogenbench_data.schema.release import (
     Subset,
 )
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.synthesis.request import Check, ExportContract, RotationForm, SynthRequest
+from stereogenbench_data.synthesis.request import Check, ExportContract, SynthRequest
 
 if TYPE_CHECKING:
     from stereogenbench_data.synthesis.renderer import Renderer
@@ -62,12 +62,6 @@ def synth(  # noqa: PLR0913 - one parameter an option
         float | None, typer.Option(help="Focal length, mm [random, 18 to 85, for each scene].")
     ] = None,
     depth_unit_m: Annotated[float, typer.Option(help="Metres in a stored unit.")] = 0.001,
-    depth_tag: Annotated[
-        str, typer.Option(help="Name of the tag that states the unit; '' writes none.")
-    ] = "DEPTH_SCALE",
-    rotation: Annotated[
-        RotationForm, typer.Option(help="How trajectory.json records rotations.")
-    ] = "rotator",
     assets: Annotated[
         Path | None,
         typer.Option(
@@ -82,15 +76,12 @@ def synth(  # noqa: PLR0913 - one parameter an option
     plan_only: Annotated[bool, flag("--plan-only", "Propose and filter, render nothing.")] = False,
     report: Annotated[
         Path | None,
-        typer.Option(help="File for a report on all proposals of OUT so far: .md or .json."),
-    ] = None,
-    contact_sheets: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Folder for a picture of each scene, to look through."),
-    ] = None,
-    holdout: Annotated[
-        Path | None,
-        typer.Option(help="File of scene paths, one a line: move them to OUT/.holdout, and end."),
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="DIR",
+            help="Folder for a report on all proposals so far, and a picture of each scene.",
+        ),
     ] = None,
     work: WorkOptions,
     as_json: JsonOption = False,
@@ -110,19 +101,10 @@ def synth(  # noqa: PLR0913 - one parameter an option
     )
     from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
     from stereogenbench_data.synthesis.render import RAY_CASTING
-    from stereogenbench_data.synthesis.review import hold_out, write_sheets
+    from stereogenbench_data.synthesis.review import write_sheets
 
-    _require_options_agree(
-        plan_only=plan_only, report=report, contact_sheets=contact_sheets, holdout=holdout
-    )
-    if holdout is not None:
-        moved = hold_out(out, _listed(holdout))
-        _print(
-            {"root": str(out), "held_out": moved},
-            f"{out}: {counted(len(moved), 'scene')} moved to {out / '.holdout'}",
-            as_json=as_json,
-        )
-        return
+    if report is not None:
+        require_writable(report, "folder")
     if map_name is not None and _ALL in map_name and len(map_name) > 1:
         raise typer.BadParameter(
             f"'{_ALL}' is all maps: give it alone, or name maps without it.", param_hint="--map"
@@ -143,9 +125,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
         subset=subset,
         map_name=chosen.maps if everywhere else tuple(map_name or ["SynthStage"]),
         focal_mm=focal_mm,
-        contract=ExportContract(
-            rotation=rotation, depth_unit_m=depth_unit_m, depth_tag=depth_tag or None
-        ),
+        contract=ExportContract(depth_unit_m=depth_unit_m),
         check=check,
     )
     how: Any = {"renderer": chosen, "part": part, **work.options()}
@@ -155,20 +135,20 @@ def synth(  # noqa: PLR0913 - one parameter an option
     if not plan_only:
         with progress_bar("drawing", unit="frames") as progress:
             keys = synthesise(out, request, progress=progress, **how)
-    if contact_sheets is not None and keys:
-        with progress_bar("contact sheets", unit="scenes") as progress:
+    if report is not None:
+        found = report_of(all_decisions(out))
+        write_report(report / "report.json", json.dumps(found, indent=2))
+        write_report(report / "report.md", report_markdown(found))
+    if report is not None and keys:
+        with progress_bar("pictures", unit="scenes") as progress:
             write_sheets(
                 out,
                 keys,
-                folder=contact_sheets,
+                folder=report,
                 unit_m=depth_unit_m,
                 progress=progress,
                 **work.options(),
             )
-    if report is not None:
-        found = report_of(all_decisions(out))
-        is_json = report.suffix == ".json"
-        write_report(report, json.dumps(found, indent=2) if is_json else report_markdown(found))
     if plan_only:
         shown = report_of([(request.family, decisions)])
         _print(shown, report_markdown(shown).rstrip(), as_json=as_json)
@@ -184,37 +164,6 @@ def synth(  # noqa: PLR0913 - one parameter an option
         f"{out}: {counted(len(keys), 'scene')}{where}",
         as_json=as_json,
     )
-
-
-def _require_options_agree(
-    *, plan_only: bool, report: Path | None, contact_sheets: Path | None, holdout: Path | None
-) -> None:
-    """Refuse options of which one would silently do nothing, and files that cannot be written."""
-    if report is not None and report.suffix not in (".md", ".json"):
-        raise typer.BadParameter(f"{report} must end in .md or .json.", param_hint="--report")
-    if holdout is not None and (plan_only or report or contact_sheets):
-        raise typer.BadParameter(
-            "it only moves scenes: leave out --plan-only, --report and --contact-sheets.",
-            param_hint="--holdout",
-        )
-    if plan_only and contact_sheets is not None:
-        raise typer.BadParameter(
-            "--plan-only renders no scenes to show: leave one of the two out.",
-            param_hint="--contact-sheets",
-        )
-    if report is not None:
-        require_writable(report, "file")
-    if contact_sheets is not None:
-        require_writable(contact_sheets, "folder")
-
-
-def _listed(path: Path) -> list[str]:
-    try:
-        return [word.rstrip("/") for word in path.read_text(encoding="utf-8-sig").split()]
-    except UnicodeDecodeError as error:
-        raise typer.BadParameter(
-            f"{path} is not text. List paths of scenes, one a line.", param_hint="--holdout"
-        ) from error
 
 
 def _print(document: Any, text: str, *, as_json: bool) -> None:

@@ -9,7 +9,7 @@ A worker decodes while it fetches ahead, so the slower of the two decides:
     rate_s     = min(machines * machine_s, total_bytes_s / bytes, requests_s / requests, demand_s)
 
 Times are seconds of one sample; `machine_s`, `rate_s` and `demand_s` are samples a second.
-``docs/scale.md`` says where the numbers come from, and what is left out.
+``docs/shards.md`` says where the numbers come from, and what is left out.
 """
 
 import contextlib

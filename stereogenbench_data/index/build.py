@@ -43,7 +43,7 @@ _NAMED: Final = 6
 ALIKE: Final = 20
 """How many scenes that are broken for one reason show that it is the format."""
 FORMAT_CURE: Final = (
-    "Names that are understood stand in docs/formats.md. For others, write where a quantity stands "
+    "Names that are understood stand in docs/release.md. For others, write where a quantity stands "
     "into a file of conventions: `stereogenbench conventions {root} -o c.toml` lists the keys that "
     'nobody reads; add a table, such as [field_of_view] with place = "$.camera_intrinsics.angle", '
     "and give the file as conventions= or --conventions."

@@ -23,7 +23,7 @@ def test_it_says_what_was_written_and_what_was_there(indexed_release, tmp_path):
     first, again = run(*words), run(*words, "--json")
 
     assert first.exit_code == again.exit_code == 0, first.output
-    assert "3 clips written, 0 were there before; clips.jsonl, dataset.toml" in first.stdout
+    assert "3 clips written, 0 kept; clips.jsonl, dataset.toml" in first.stdout
     told = json.loads(again.stdout)
     assert (told["written"], len(told["kept"])) == ([], 3)
     assert told["manifests"] == ["clips.jsonl", "dataset.toml"]

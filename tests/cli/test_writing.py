@@ -1,7 +1,6 @@
 """What commands write: reports whole or not at all, and the place where it failed is named."""
 
 import errno
-import json
 import os
 import resource
 import signal
@@ -143,17 +142,6 @@ def test_a_command_whose_stdout_was_closed_does_its_work(small_shards):
     ended = subprocess.run(words, stderr=subprocess.PIPE, text=True, check=False)
 
     assert (ended.returncode, ended.stderr) == (0, "")
-
-
-def test_a_descriptor_is_reported_as_json(small_shards, tmp_path):
-    shown = invoke("publish", "croissant", small_shards, "-o", tmp_path / "c.json", "--json")
-
-    assert shown.exit_code == 0
-    assert json.loads(shown.stdout) == {
-        "descriptor": str(tmp_path / "c.json"),
-        "distribution": len(json.loads((tmp_path / "c.json").read_text())["distribution"]),
-        "record_sets": len(json.loads((tmp_path / "c.json").read_text())["recordSet"]),
-    }
 
 
 @pytest.fixture

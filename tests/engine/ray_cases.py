@@ -300,7 +300,7 @@ def test_the_command_works_on_a_cluster_by_its_address_with_relative_paths(
     )  # fmt: skip
 
     assert ended.returncode == 0, ended.stderr
-    assert "4 shards packed, 0 were finished before" in ended.stdout
+    assert "4 shards packed, 0 kept" in ended.stdout
     assert bytes_of(tmp_path / "out") == bytes_of(shards)
 
 

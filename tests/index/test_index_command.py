@@ -134,8 +134,8 @@ def test_a_tree_that_cannot_be_written_asks_for_a_file_elsewhere(
 
     assert refused.exit_code == 2
     said = " ".join(refused.stderr.replace("│", " ").split())
-    assert "cannot be written (Read-only file system): name a file elsewhere" in said
-    assert "-o FILE" in said
+    assert "(Read-only file system)" in said
+    assert "place that can be written" in said
     assert elsewhere.exit_code == 0
     assert len(SceneIndex.open(tmp_path / "elsewhere.parquet", root=root)) == 1
 

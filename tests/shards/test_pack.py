@@ -637,8 +637,7 @@ def test_the_command_packs_and_reports_what_there_is(small_release, tmp_path, pa
     assert NAMES[1] in remaining_line
     assert "index" in remaining_line
     assert second.stdout == (
-        f"{tmp_path}: 2 shards packed, 2 were finished before\n"
-        f"{tmp_path / 'index.parquet'}: 4 scenes\n"
+        f"{tmp_path}: 2 shards packed, 2 kept\n{tmp_path / 'index.parquet'}: 4 scenes\n"
     )
     assert bytes_of(tmp_path) == bytes_of(packed)
 

@@ -362,7 +362,7 @@ def test_the_commands_pack_and_unpack(small_release, packed, tmp_path):
 
     assert (first.exit_code, second.exit_code, third.exit_code) == (0, 0, 0)
     assert bytes_of(tmp_path / "shards") == bytes_of(packed)
-    assert second.stdout == f"{tmp_path / 'tree'}: 4 scenes unpacked, 0 were there before\n"
+    assert second.stdout == f"{tmp_path / 'tree'}: 4 scenes unpacked, 0 kept\n"
     assert json.loads(third.stdout)["unpacked"] == []
 
 
