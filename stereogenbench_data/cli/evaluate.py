@@ -44,7 +44,6 @@ def _stratum_of(text: str) -> tuple[str, tuple[float, ...]]:
         ) from None
 
 
-_DIFFERENCES_SHOWN = 20
 _METRICS = "How metrics are computed"
 """Panel of the help for the options of metrics."""
 TierOption = Annotated[
@@ -191,7 +190,7 @@ class ReportOptions:
         if there is None:
             return
         differing = differences(json.loads(json.dumps(content)), there)
-        for text in differing[:_DIFFERENCES_SHOWN]:
+        for text in differing[:20]:
             typer.echo(f"differs: {text}", err=True)
         if differing:
             typer.echo(f"{self.compare}: {counted(len(differing), 'difference')}", err=True)

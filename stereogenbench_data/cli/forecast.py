@@ -29,6 +29,13 @@ def _trained_frames(text: str) -> Any:
     return (kind, int(number)) if is_drawn else frames_of(text)
 
 
+def _numbers_of(text: str) -> tuple[int, ...]:
+    """Return numbers of accelerators."""
+    if not all(part.isdecimal() and int(part) > 0 for part in text.split(",")):
+        raise typer.BadParameter(f"{text!r}: write numbers from 1, such as 1,8,64.")
+    return tuple(map(int, text.split(",")))
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrainedOptions(SampleOptions):
     """Which samples of which scenes are trained on."""
@@ -49,7 +56,9 @@ class MachineOptions:
     """What trains, and where the data will be."""
 
     samples_s: Annotated[float, _of("Samples a second that an accelerator takes.", min=0.001)]
-    accelerators: Annotated[str, _of("How many, in all.", metavar="N,N")] = "1,8,64,512,1000,10000"
+    accelerators: Annotated[Any, _of("How many, in all.", parser=_numbers_of, metavar="N,N")] = (
+        "1,8,64,512,1000,10000"
+    )
     per_machine: Annotated[int, _of("Accelerators of a machine.", min=1)] = 8
     cores: Annotated[int | None, _of("Cores of a machine [as here].", min=1)] = None
     delay_ms: Annotated[float | None, _of("Until the first byte [of a URL: measured].", min=0)] = (
@@ -57,20 +66,6 @@ class MachineOptions:
     )
     machine_mb_s: Annotated[float, _of("Of a machine.", min=0.001)] = math.inf
     total_mb_s: Annotated[float, _of("Of the server, for all.", min=0.001)] = math.inf
-
-    def options(self) -> dict[str, Any]:
-        """Return the options of `forecast`.
-
-        Raises:
-            typer.BadParameter: If the numbers of accelerators are not numbers from 1.
-        """
-        parts = [part.strip() for part in self.accelerators.split(",")]
-        if not all(part.isdecimal() and int(part) > 0 for part in parts):
-            raise typer.BadParameter(
-                f"{self.accelerators!r}: write numbers from 1, such as 1,8,64.",
-                param_hint="--accelerators",
-            )
-        return vars(self) | {"accelerators": tuple(map(int, parts))}
 
 
 @grouped
@@ -95,7 +90,7 @@ def forecast(  # noqa: PLR0913 - one parameter an option
     """
     from stereogenbench_data.datasets.forecast import forecast as forecast_by
 
-    options = trains.options() | chosen.selection()
+    options = vars(trains) | chosen.selection()
     if fields is not None:
         options["fields"] = [each.strip() for each in fields.split(",")]
     if size is not None:

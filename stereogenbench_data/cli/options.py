@@ -224,9 +224,7 @@ ShardsArgument = Annotated[str, typer.Argument(help="Folder of shards, or its in
 JsonOption = Annotated[bool, flag("--json", "Report as JSON on stdout.")]
 OutOption = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")]
 OutArgument = Annotated[Path, typer.Argument(parser=out_folder, help="Folder to write into.")]
-RootArgument = Annotated[
-    str, typer.Argument(help="Folder that holds train/ or eval/, or its URL.", show_default=False)
-]
+RootArgument = Annotated[str, typer.Argument(help="Folder that holds train/ or eval/, or its URL.")]
 ConventionsOption = Annotated[
     Path | None,
     typer.Option(

@@ -97,8 +97,15 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     Example: `stereogenbench publish croissant shards/ -o croissant/sample.json`
     """
     if check:
-        _check(data)
-        return
+        from stereogenbench_data.bridges.croissant.check import check_descriptor
+
+        if data is None:
+            raise typer.BadParameter("no descriptor to check: name its file.", param_hint="DATA")
+        problems = check_descriptor(Path(data))
+        for problem in problems:
+            typer.echo(problem)
+        typer.echo(f"{data}: {counted(len(problems), 'problem')}")
+        raise typer.Exit(FINDINGS if problems else 0)
     if out is None:
         raise typer.BadParameter(
             "no file for the descriptor: name it with -o FILE.", param_hint="--out"
@@ -126,19 +133,6 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     descriptor = write_descriptor(index, out, publication=publication)
     files, records = len(descriptor["distribution"]), len(descriptor["recordSet"])
     typer.echo(f"{out}: {files} files and sets of files, {counted(records, 'record set')}")
-
-
-def _check(data: str | None) -> None:
-    if data is None:
-        raise typer.BadParameter("no descriptor to check: name its file.", param_hint="DATA")
-    from stereogenbench_data.bridges.croissant.check import check_descriptor
-
-    problems = check_descriptor(Path(data))
-    for problem in problems:
-        typer.echo(problem)
-    typer.echo(f"{data}: {counted(len(problems), 'problem')}")
-    if problems:
-        raise typer.Exit(FINDINGS)
 
 
 @grouped

@@ -9,8 +9,6 @@ from stereogenbench_data.cli.options import DataOptions, complete_scene, grouped
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
 
-_ENDINGS = (".png", ".mp4", ".gif", ".rrd")
-
 
 @grouped
 def show(
@@ -57,7 +55,7 @@ def show(
     from stereogenbench_data.selection.filters import find_scene
 
     ending = ".png" if out is None else out.suffix.lower()
-    if ending not in _ENDINGS:
+    if ending not in (".png", ".mp4", ".gif", ".rrd"):
         raise typer.BadParameter(
             f"{out}: a sheet is .png, a clip .mp4 or .gif, a recording .rrd.", param_hint="--out"
         )
