@@ -45,10 +45,6 @@ class Journal:
                 entry: Any = json.loads(line)
                 self._known[str(entry["key"])] = (entry["stamp"], entry["value"])
 
-    def __repr__(self) -> str:
-        """Return a summary."""
-        return f"Journal({str(self._path)!r}, {len(self)} scenes done before)"
-
     def __len__(self) -> int:
         """The number of scenes that earlier runs have done."""
         return len(self._known)
