@@ -556,7 +556,7 @@ def test_pictures_of_one_camera_that_are_wrong_are_named(verdict_on, camera, cha
 
 
 def test_late_pictures_of_one_camera_are_named(verdict_on):
-    verdict = verdict_on(lambda folder: rewrite_rgb(folder, 5, late(3)), frames=3)
+    verdict = verdict_on(lambda folder: rewrite_rgb(folder, 5, late(3)), frames=2)
 
     (problem,) = verdict.problems
     assert "camera 5" in problem
@@ -676,7 +676,7 @@ def test_a_shift_where_little_is_seen_does_not_make_the_unit_wrong_too(small_par
     root, folder = small_parallax(size_px=130, height_px=98)
     rewrite_rgb(folder, 1, lambda pictures: np.roll(pictures, 2, axis=2))
 
-    (verdict,) = diagnose(root, workers=1).verdicts
+    (verdict,) = diagnose(root, frames=2, workers=1).verdicts
 
     assert wrong_topics(verdict) == {"disparity offset"}
     assert answer(verdict, "disparity offset").found.startswith("camera 1's picture is +2.0")
@@ -686,7 +686,7 @@ def test_a_unit_where_little_is_seen_is_not_taken_for_a_lag(small_parallax):
     root, folder = small_parallax(size_px=128, height_px=84, renderer=FULL_FRAME)
     rewrite_depth(folder, lambda units: units, unit_factor=0.976)
 
-    (verdict,) = diagnose(root, workers=1).verdicts
+    (verdict,) = diagnose(root, frames=2, workers=1).verdicts
 
     assert answer(verdict, "frame lag").status == "cannot tell"
     assert verdict.encoding is None
