@@ -26,17 +26,17 @@ from stereogenbench_data import (
 )
 
 FIELDS = ("left", "right", "disparity", "valid", "visible")
-BASELINES_CM, CROP, BATCH = (1, 100), (160, 224), 4
+BASELINES_CM, BATCH = (1, 100), 4
 STEPS_BETWEEN_LINES, STEPS_BETWEEN_SAVES = 100, 200
 
 
-def training_pairs(shards: str, *, pairs: str, seed: int) -> StereoPairs:
+def training_pairs(shards: str, *, pairs: str, crop: tuple[int, int], seed: int) -> StereoPairs:
     """Return the training set: as many pairs of each bin of baselines, if all are taken."""
     balanced = {"balance": "bins"} if pairs == "all" else {}
     return StereoPairs(
         shards, split="train", pairs=pairs, baseline_cm=BASELINES_CM, **balanced,
         fields=FIELDS, seed=seed,
-        transform=Compose([HorizontalFlip(), RandomCrop(*CROP), ColorJitter(), Eraser()]),
+        transform=Compose([HorizontalFlip(), RandomCrop(*crop), ColorJitter(), Eraser()]),
     )  # fmt: skip
 
 
@@ -61,12 +61,13 @@ def main() -> None:
     options.add_argument("--pairs", choices=("all", "primary"), default="all")
     options.add_argument("--seed", type=int, default=0)
     options.add_argument("--steps", type=int, default=3000)
+    options.add_argument("--crop", type=int, nargs=2, default=(160, 224), help="height, width")
     options.add_argument("--workers", type=int, default=1)
     given = options.parse_args()
     torch.manual_seed(given.seed)
     given.run.mkdir(parents=True, exist_ok=True)
 
-    training = training_pairs(given.shards, pairs=given.pairs, seed=given.seed)
+    training = training_pairs(given.shards, pairs=given.pairs, crop=given.crop, seed=given.seed)
     loader = training.loader(BATCH, num_workers=given.workers, seed=given.seed)
     held_out = StereoPairs(
         given.shards,

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from PIL import Image
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -71,6 +72,35 @@ def test_the_demo_learns_what_it_never_saw_and_draws_it(tmp_path):
     assert float(after) < float(before) / 3
     with Image.open(tmp_path / "demo" / "training.png") as picture:
         assert min(picture.size) > 1000
+
+
+def test_a_real_training_goes_on_where_it_was_stopped_and_is_scored(tmp_path, ground_truth):
+    train = ("train.py", EXAMPLES.parent / "shards", tmp_path / "run", "--crop", 64, 64)
+    train = (EXAMPLES / "stereo" / train[0], *train[1:], "--steps", 4, "--workers", 0)
+    saved = tmp_path / "run" / "checkpoint.pt"
+
+    assert "from step 0 on" in run(tmp_path, *train)
+    assert "from step 4 on" in run(tmp_path, *train)
+    assert torch.load(saved, weights_only=True)["loader"]["taken"] == 4
+    said = run(
+        tmp_path, EXAMPLES / "stereo" / "score.py", "--middlebury", ground_truth, saved.parent
+    )
+    opencv, network = (line.split(" | ") for line in said.splitlines()[2:])
+    assert len(opencv) == len(network) == 5
+    assert float(opencv[-1].split(" px")[0]) < 1 < float(network[-1].split(" px")[0])
+
+
+def test_a_learned_right_view_is_better_than_warping(tmp_path):
+    said = run(tmp_path, EXAMPLES / "learned_fill.py", "--steps", 60)
+
+    means = {}
+    for line in said.splitlines():
+        cells = line.strip("| ").split(" | ")
+        if cells[0] in ("warp and fill", "learned"):
+            means.setdefault(cells[0], []).append(float(cells[-2]))
+    assert len(means["learned"]) > 5
+    assert sum(means["learned"]) > sum(means["warp and fill"])
+    assert (tmp_path / "demo" / "learned_fill.png").exists()
 
 
 def test_pairs_are_made_on_the_device(tmp_path):
