@@ -106,7 +106,10 @@ def main() -> None:
     draw(curve, network, held_out).savefig(picture, dpi=110)
     off = [f"{errors.gt(1).float().mean():.1%}" for errors in (before, after)]
     print(f"curve and predictions: {picture}. Next: README.md, then docs/training.md")
-    print(f"{given.steps * BATCH / seconds:.0f} samples a second, validation included")
+    print(
+        f"{given.steps * BATCH / seconds:.0f} samples a second, validation included; "
+        f"{loader.stats().waiting:.0%} of the last epoch waiting for data"
+    )
     print(f"pixels off by more than 1 px: {off[0]} before, {off[1]} after")
     print(f"held-out error {curve[0]:.2f} px before, {curve[step]:.2f} px after")
 

@@ -3,7 +3,7 @@
     python examples/stereo/train.py SHARDS RUN [--pairs all|primary] [--seed N] [--steps N]
 
 RUN receives checkpoint.pt, saved every few minutes, and log.jsonl. How the shards are made, and how
-the trained network is scored on real pictures, is in docs/real_training.md.
+the trained network is scored on real pictures, is in docs/training.md.
 """
 
 import argparse
@@ -107,6 +107,7 @@ def main() -> None:
                 "loss": sum(losses) / len(losses),
                 "held_out_px": held_out_error(network, validation),
                 "samples_per_s": len(losses) * BATCH / (time.perf_counter() - began),
+                "waiting_for_data": loader.stats().waiting,
             }
             with (given.run / "log.jsonl").open("a") as log:
                 log.write(json.dumps(line) + "\n")

@@ -15,6 +15,7 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property, partial
+from time import perf_counter
 from typing import Any, Final, NamedTuple, SupportsIndex
 from weakref import WeakSet
 
@@ -71,6 +72,8 @@ class LoaderStats(NamedTuple):
             part of them, or they arrived early.
         mixing: How many scenes and moments a batch shows, beside one of a fully shuffled sampler,
             in one line (of the first batches of epoch 0); empty of more than 100,000 samples.
+        waiting: The share of the time that the loop has waited for batches, from the beginning of
+            the latest pass to its latest batch; starting the workers counts.
     """
 
     epoch: int
@@ -80,6 +83,7 @@ class LoaderStats(NamedTuple):
     videos_limit: int
     batches_held: int
     mixing: str
+    waiting: float
 
 
 class ShareSampler(DistributedSampler[Any]):
@@ -182,6 +186,7 @@ class PairsLoader(DataLoader[Any]):
         self._loadable = dataset
         self._workers: WeakSet[_Workers] = WeakSet()
         self._begun_passes = 0
+        self._pass_began_s = self._passed_s = self._waited_s = 0.0
         self._persistent: _Workers | None = None
         self._set_sampler()
         dataset.keep_open(batches, processes=batches.world_size * max(1, num_workers))
@@ -257,6 +262,7 @@ class PairsLoader(DataLoader[Any]):
             videos_limit=videos.videos_limit,
             batches_held=held_batches(pids),
             mixing=self._mixing,
+            waiting=self._waited_s / self._passed_s if self._passed_s else 0.0,
         )
 
     @cached_property
@@ -359,6 +365,7 @@ class PairsLoader(DataLoader[Any]):
         """Record that a pass begins."""
         self.batches.passes.begin(begun)
         self.end_of_dataloader = False
+        self._pass_began_s, self._waited_s = perf_counter(), 0.0
         self._begun_passes += 1
         if self._begun_passes == 1 and self._gradient_state is not None:
             self.remainder = 0
@@ -455,13 +462,16 @@ class LoaderPass(Iterator[Any]):
                 "batches, as another one was begun: workers that persist serve one pass at a time. "
                 "Use a loader for each, or persistent_workers=False."
             )
+        loader, asked_s = self._loader, perf_counter()
         with self._ended_by_errors():
             batch = self._load(workers)
+        loader._waited_s += perf_counter() - asked_s
+        loader._passed_s = perf_counter() - loader._pass_began_s
         begun.taken += 1
         if begun.is_complete:
-            self._loader.batches.passes.end(begun)
-        self._loader.end_of_dataloader = begun.is_complete
-        return self._loader.on_device(batch)
+            loader.batches.passes.end(begun)
+        loader.end_of_dataloader = begun.is_complete
+        return loader.on_device(batch)
 
     def _begin(self) -> None:
         """Begin at the position that the loader is at now."""

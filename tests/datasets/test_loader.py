@@ -4,6 +4,7 @@ import itertools
 import json
 import os
 import signal
+import time
 from collections import Counter
 from dataclasses import replace
 
@@ -450,6 +451,19 @@ def test_a_loader_says_what_it_holds(small_index):
     assert while_held.batches_held >= 1
     assert after.batches_held < while_held.batches_held
     assert loader.stats().workers == 0
+
+
+def test_a_loader_says_which_share_of_the_time_the_loop_waited(keyed):
+    loader = keyed.loader(9)
+    before = loader.stats().waiting
+    for _ in loader:
+        time.sleep(0.05)
+    slow_loop = loader.stats().waiting
+    for _ in loader:
+        pass
+    idle_loop = loader.stats().waiting
+
+    assert 0 == before < slow_loop < idle_loop <= 1
 
 
 def test_public_objects_say_what_they_are(keyed):
