@@ -10,6 +10,7 @@ without dividing, and one buffer of inverse depths keeps the nearest.
 """
 
 from collections.abc import Iterator, Sequence
+from itertools import product
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -26,8 +27,8 @@ _FIRST_FACE: Final = 2
 _FACES: Final = 6
 
 _NEAREST_M: Final = 0.05
-_BLOCK_PX: Final = 1 << 16
-"""Pixels that are drawn at a time, so that they stay in the processor's cache."""
+_TILE_PX: Final = 256
+"""Side of the squares that are drawn at a time: they stay in the processor's cache."""
 _EVERYWHERE: Final = (-np.inf, np.inf, -np.inf, np.inf)
 
 
@@ -143,13 +144,16 @@ def first_hits(
     def draw(part: Plane | Ball, bounds: tuple[float, float, float, float]) -> None:
         first, last = np.searchsorted(right, bounds[:2]).tolist()
         top, bottom = np.searchsorted(below, bounds[2:]).tolist()
-        step = max(1, _BLOCK_PX // max(1, last - first))
-        for start in range(top, bottom, step):
-            block = np.s_[start : min(start + step, bottom), first:last]
-            inverse = inverse_depth(part, right=right[block[1]], below=below[block[0], None])
-            nearer = inverse > nearest[block]
-            np.copyto(nearest[block], inverse, where=nearer)
-            np.copyto(faces[block], part.face, where=nearer)
+        for row, column in product(range(top, bottom, _TILE_PX), range(first, last, _TILE_PX)):
+            rows = slice(row, min(row + _TILE_PX, bottom))
+            columns = slice(column, min(column + _TILE_PX, last))
+            across, down = right[columns], below[rows]
+            if isinstance(part, Plane) and _misses(part, right=across, below=down):
+                continue
+            inverse = inverse_depth(part, right=across, below=down[:, None])
+            nearer = inverse > nearest[rows, columns]
+            np.copyto(nearest[rows, columns], inverse, where=nearer)
+            np.copyto(faces[rows, columns], part.face, where=nearer)
 
     draw(ground_plane(view, slope=slope), _EVERYWHERE)
     for number, shape in enumerate(shapes):
@@ -158,6 +162,16 @@ def first_hits(
             for part in visible_parts(view, number=number, shape=shape):
                 draw(part, bounds)
     return nearest, faces
+
+
+def _misses(plane: Plane, *, right: Array, below: Array) -> bool:
+    """Return whether a rectangle of rays lies beyond one of the edges of a plane's part."""
+    for side in plane.sides:
+        for c_0, c_r, c_b in (plane.inverse - side, plane.inverse + side):
+            corners = c_0 + c_r * right[[0, -1]] + c_b * below[[0, -1], None]
+            if corners.max() < 0:
+                return True
+    return False
 
 
 def _bounds(shape: Shape, *, view: View) -> tuple[float, float, float, float] | None:

@@ -60,13 +60,16 @@ def luma(frame):
 
 @pytest.fixture(scope="session")
 def draw(tmp_path_factory):
-    """Draw one scene: by default 96 px wide, 3 frames."""
+    """Draw one scene, once for all tests: by default 96 px wide, 3 frames."""
+    drawn = {}
 
     def draw_scene(*, renderer=RAY_CASTING, **request):
-        asked = {"size_px": 96, "frames": 3, "seed": 2} | request
-        out = tmp_path_factory.mktemp("synth")
-        (key,) = synthesise(out, SynthRequest(**asked), renderer=renderer)
-        return Drawn(out / key)
+        asked = SynthRequest(**{"size_px": 96, "frames": 3, "seed": 2} | request)
+        if (renderer, asked) not in drawn:
+            out = tmp_path_factory.mktemp("synth")
+            (key,) = synthesise(out, asked, renderer=renderer)
+            drawn[renderer, asked] = Drawn(out / key)
+        return drawn[renderer, asked]
 
     return draw_scene
 

@@ -507,7 +507,7 @@ def test_the_subject_is_seen_and_moves(scenes):
 
 
 def test_the_doctor_confirms_the_contract_and_the_audit_finds_nothing(rendered):
-    few = ("--frames", "2", "--workers", "1")
+    few = ("--per-scene", "2", "--workers", "1")
 
     doctor = CliRunner().invoke(app, ["doctor", str(rendered), *few, "--scenes", "2", "--json"])
     audit = CliRunner().invoke(app, ["audit", str(rendered), *few])
