@@ -40,9 +40,12 @@ _OPEN_SKY_M: Final = 20.0
 """How far above its highest point cameras may be in a map without a ceiling."""
 _OPEN_SHARE: Final = 0.3
 _GRID: Final = 12
-_MAP_SIZE_M: Final = (2.0, 500.0)
-_ROOM_HEIGHT_M: Final = (1.8, 40.0)
-_HEIGHT_M: Final = (0.5, 3.0)
+_SIZES_M: Final = {
+    "width": (2.0, 500.0, 4.0, 200.0),
+    "height inside": (1.8, 40.0, 2.0, 12.0),
+    "height": (0.5, 3.0, 0.5, 3.0),
+}
+"""From where to where sizes of maps, rooms and subjects are taken for right, and are usual."""
 _UNITS_M: Final = (0.01, 100.0, 0.001, 1000.0, 0.0254, 39.37, 0.3048, 3.281, 0.1, 10.0)
 _POINTS: Final = 24
 _MOST_STEPS: Final = 300
@@ -350,8 +353,6 @@ def _add(path: str, where: str) -> tuple[list[Any], list[Any], float]:
             with bpy.data.libraries.load(path, link=False) as (there, wanted):
                 wanted.scenes = there.scenes[:1]
                 wanted.actions = there.actions
-                if not there.scenes:
-                    wanted.objects = there.objects
         except (OSError, RuntimeError) as error:
             raise AssetError(
                 f"{where}: Blender cannot open it ({error}). Save it again with Blender 5.2."
@@ -365,8 +366,6 @@ def _add(path: str, where: str) -> tuple[list[Any], list[Any], float]:
                 item.hide_render |= item not in shown
                 here.objects.link(item)
             bpy.data.scenes.remove(scene)
-        for item in wanted.objects or ():
-            here.objects.link(item)
     else:
         rate_hz = _rate_hz(bpy.context.scene)
         _import(path, where)
@@ -504,17 +503,16 @@ class Subject:
 
     def _measure(self, character: CharacterAsset, *, repeat: str) -> None:
         """Find the soles, the height, and how the take repeats."""
-        where, scale = character.where, character.scale
+        scale = character.scale
         self.place(None, time_frames=self.start)
         points = self._vertices()
         if not len(points):
             raise AssetError(
-                f"{where}: it has no mesh that is rendered. Export the mesh with "
+                f"{character.where}: it has no mesh that is rendered. Export the mesh with "
                 f"the armature, or show it in renders."
             )
         low, high = points.min(axis=0), points.max(axis=0)
-        height_m = float(high[2] - low[2]) * scale
-        _require_size("height", height_m, scale, where=where, within=_HEIGHT_M, usual=_HEIGHT_M)
+        _require_size("height", float(high[2] - low[2]) * scale, character)
         self.chosen = _spread(points)
         first = self._bones()
         # No frame puts a sole below the floor on which the subject stands.
@@ -660,22 +658,15 @@ def _few(names: Any, most: int = 4) -> str:
     )
 
 
-def _require_size(
-    what: str,
-    size_m: float,
-    scale: float,
-    *,
-    where: str,
-    within: tuple[float, float],
-    usual: tuple[float, float],
-) -> None:
+def _require_size(noun: str, size_m: float, asset: MapAsset | CharacterAsset) -> None:
     """Refuse a size that tells of a wrong scale, and name the scale that makes it a usual one."""
-    if within[0] <= size_m <= within[1]:
+    least, most, usual_least, usual_most = _SIZES_M[noun]
+    if least <= size_m <= most:
         return
-    likely = [factor for factor in _UNITS_M if usual[0] <= size_m * factor <= usual[1]]
-    cure = f"Set scale = {scale * likely[0]:g}" if likely else "Set scale to metres in a unit"
+    likely = [factor for factor in _UNITS_M if usual_least <= size_m * factor <= usual_most]
+    cure = f"Set scale = {asset.scale * likely[0]:g}" if likely else "Set scale to metres in a unit"
     raise AssetError(
-        f"{where}: its {what} is {size_m:.3g} m, and should be {within[0]:g} to {within[1]:g} m. "
+        f"{asset.where}: its {noun} is {size_m:.3g} m, and should be {least:g} to {most:g} m. "
         f"{cure} there. If a map is right, set bounds_m to the part where cameras may be."
     )
 
@@ -797,16 +788,9 @@ class Stage:
         low, high = bounds_m
         floor_m, ceiling_m = self._floor_and_ceiling_m(low, high)
         if asset.bounds_m is None:
-            width_m = float((high - low).max())
-            _require_size(
-                "width", width_m, asset.scale,
-                where=asset.where, within=_MAP_SIZE_M, usual=(4.0, 200.0),
-            )  # fmt: skip
+            _require_size("width", float((high - low).max()), asset)
             if np.isfinite(ceiling_m):
-                _require_size(
-                    "height inside", ceiling_m - floor_m, asset.scale,
-                    where=asset.where, within=_ROOM_HEIGHT_M, usual=(2.0, 12.0),
-                )  # fmt: skip
+                _require_size("height inside", ceiling_m - floor_m, asset)
         if np.isfinite(ceiling_m):
             return bounds_m, np.stack([low, [*high[:2], ceiling_m - 0.01]])
         bounds_m[1, 2] += _OPEN_SKY_M
