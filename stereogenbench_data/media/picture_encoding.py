@@ -22,7 +22,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from stereogenbench_data.errors import MediaError
-from stereogenbench_data.media.container import VideoFile, open_container, stream_facts
+from stereogenbench_data.media.container import VideoFile
 from stereogenbench_data.media.packet_checksums import (
     TAG,
     reserved_checksums,
@@ -262,9 +262,3 @@ def _squared_error(one: np.ndarray, other: np.ndarray) -> float:
 
 def _decibels(error: float) -> float:
     return min(MOST_PSNR_DB, 10 * math.log10(255**2 / error)) if error else MOST_PSNR_DB
-
-
-def key_frames_of(video: VideoFile, *, name: str) -> tuple[int, ...]:
-    """Return the frames of an MP4 video at which decoding can begin."""
-    with open_container(video, name=name, pixel_format="later") as container:
-        return stream_facts(container, name=name, frames=1, pixel_format="later").key_frames

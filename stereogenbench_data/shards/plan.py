@@ -8,9 +8,8 @@ import hashlib
 import json
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from itertools import groupby
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -52,8 +51,11 @@ MEMBER_ORDER: Final = (
 )
 """The order of a scene's files in a shard: metadata first, then camera by camera."""
 
-_UNITS: Final = {"": 1, "k": 1000, "m": 1000**2, "g": 1000**3, "t": 1000**4}
-_BINARY_UNITS: Final = {"ki": 1024, "mi": 1024**2, "gi": 1024**3, "ti": 1024**4}
+_UNITS: Final = {"": 1} | {
+    unit + binary: (1024 if binary else 1000) ** power
+    for power, unit in enumerate("kmgt", 1)
+    for binary in ("", "i")
+}
 _SIZE: Final = re.compile(r"(\d+(?:\.\d+)?) ?([kmgt]?i?)b?", re.IGNORECASE)
 
 
@@ -148,17 +150,23 @@ def plan_shards(
         map(index.scene, _whole_rows(index, rows)),
         key=lambda scene: (_group_of(scene), scene.id.key),
     )
-
-    def planned(scene: Scene) -> list[PlannedMember]:
-        return _planned_members(scene, depth_codec=depth_codec, training=training)
-
-    shards = tuple(
-        shard
-        for group, members in groupby(scenes, key=_group_of)
-        for shard in _filled(
-            group, members, target_bytes=target_bytes, planned=planned, training=training
-        )
-    )
+    shards: list[PlannedShard] = []
+    for scene in scenes:
+        members = tuple(_planned_members(scene, depth_codec=depth_codec, training=training))
+        group, size, number = _group_of(scene), _tar_bytes(members), 0
+        last = shards[-1] if shards else None
+        if last is not None and last.name[: -len("-000000.tar")] == group:
+            if last.size + size <= target_bytes:
+                shards[-1] = replace(
+                    last,
+                    size=last.size + size,
+                    scenes=(*last.scenes, scene),
+                    members=last.members + members,
+                )
+                continue
+            number = int(last.name[-len("000000.tar") : -len(".tar")]) + 1
+        name = f"{group}-{number:06d}.tar"
+        shards.append(PlannedShard(name, len(END_OF_ARCHIVE) + size, (scene,), members, training))
     content = [
         [
             shard.name,
@@ -173,7 +181,7 @@ def plan_shards(
         whole += [training.describe(), index.digest]
     content_text = json.dumps(whole, separators=(",", ":"))
     digest = hashlib.sha256(content_text.encode()).hexdigest()
-    return ShardPlan(index.root, target_bytes, shards, digest, depth_codec, training)
+    return ShardPlan(index.root, target_bytes, tuple(shards), digest, depth_codec, training)
 
 
 def _facts_of(scene: Scene) -> dict[str, Any]:
@@ -217,7 +225,7 @@ def parse_bytes(text: str) -> int:
     (2000000000, 1610612736, 4096)
     """
     match = _SIZE.fullmatch(text.strip())
-    unit = (_UNITS | _BINARY_UNITS).get(match[2].lower()) if match else None
+    unit = _UNITS.get(match[2].lower()) if match else None
     size = int(float(match[1]) * unit) if match and unit else 0
     if size < 1:
         raise ShardError(f"{text!r} is not a size: write one such as 500MB, 2GB or 2GiB.")
@@ -276,35 +284,6 @@ def _group_of(scene: Scene) -> str:
     place = scene.id
     subset = [place.subset or "unnamed"] if place.split == "eval" else []
     return "-".join([place.split, *subset, place.family])
-
-
-def _filled(
-    group: str,
-    scenes: Iterable[Scene],
-    *,
-    target_bytes: int,
-    planned: Callable[[Scene], list[PlannedMember]],
-    training: TrainingSettings | None,
-) -> Iterator[PlannedShard]:
-    """Yield the shards of one group, each as full as the order of scenes allows."""
-    number, size = 0, len(END_OF_ARCHIVE)
-    held: list[Scene] = []
-    members: list[PlannedMember] = []
-
-    def finished() -> PlannedShard:
-        name = f"{group}-{number:06d}.tar"
-        return PlannedShard(name, size, tuple(held), tuple(members), training)
-
-    for scene in scenes:
-        added = planned(scene)
-        added_bytes = _tar_bytes(added)
-        if held and size + added_bytes > target_bytes:
-            yield finished()
-            held, members, size, number = [], [], len(END_OF_ARCHIVE), number + 1
-        held.append(scene)
-        members += added
-        size += added_bytes
-    yield finished()
 
 
 def _derived(scene: Scene, training: TrainingSettings) -> list[PlannedMember]:

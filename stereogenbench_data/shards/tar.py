@@ -25,12 +25,6 @@ END_OF_ARCHIVE: Final = bytes(2 * BLOCK_BYTES)
 LARGEST_MEMBER_BYTES: Final = 8**11 - 1
 """Eleven octal digits: 8 GiB less one byte."""
 
-CODE_SUFFIXES: Final = frozenset(
-    {"pickle", "pkl", "pk", "pyd", "pyc", "py", "so", "dill", "joblib"}
-    | {"pt", "pth", "ckpt", "npy", "npz"}
-)
-"""Suffixes of files that loaders may unpickle or run. No shard holds such a member."""
-
 CHUNK_BYTES: Final = 4 * 1024 * 1024
 """How much of a file is read at a time."""
 
@@ -50,14 +44,11 @@ def member_header(name: str, size: int) -> bytes:
     Raises:
         ShardError: If ustar cannot hold such a member.
     """
-    unfit = ""
     if _UNSAFE_NAME.search(name):
-        unfit = "its name is not a relative path in ASCII that stays inside its folder"
-    code = sorted(CODE_SUFFIXES & set(name.rpartition("/")[2].lower().split(".")[1:]))
-    if code:
-        unfit = f"may hold code that runs when it is loaded (.{code[0]})"
-    if unfit:
-        raise ShardError(f"member {name!r}: {unfit}. Rename it.")
+        raise ShardError(
+            f"member {name!r}: its name is not a relative path in ASCII that stays inside its "
+            f"folder. Rename it."
+        )
     if not 0 <= size <= LARGEST_MEMBER_BYTES:
         raise ShardError(
             f"member {name!r}: has {size} bytes, and ustar holds 0 to {LARGEST_MEMBER_BYTES}. "

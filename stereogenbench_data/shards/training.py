@@ -29,12 +29,11 @@ from stereogenbench_data.media.depth_packing import packed_depth
 from stereogenbench_data.media.picture_encoding import (
     QUALITIES,
     Quality,
-    key_frames_of,
     measured_error,
     require_encodable,
     write_pictures,
 )
-from stereogenbench_data.media.video import VideoReader, read_rgb, require_pixel_aspect
+from stereogenbench_data.media.video import VideoReader, probe, read_rgb, require_pixel_aspect
 from stereogenbench_data.schema.records import DepthEncoding, Scene, ShardFacts
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
@@ -247,7 +246,7 @@ def derive_scene(
                     after_frame=step,
                 )
                 error = measured_error(pictures, target, name=str(target), after_frame=step)
-                found_keys = key_frames_of(target, name=str(target))
+                found_keys = probe(target, name=str(target), pixel_format="later").key_frames
                 key_frames = set(found_keys) & (key_frames or set(found_keys))
             else:
                 target.write_bytes(

@@ -5,7 +5,6 @@ FFV1 video again, whose pictures, times and tags are compared with what was pack
 """
 
 import io
-import shutil
 import zlib
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,13 +14,14 @@ from typing import Final, Literal
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
 from stereogenbench_data.errors import MediaError, ShardError, describe_os_error
 from stereogenbench_data.index.open import warn_if_stale
+from stereogenbench_data.jobs import atomic_folder
 from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.depth_packing import write_depth_video
 from stereogenbench_data.media.video import probe
-from stereogenbench_data.schema.records import Scene, ShardFacts
+from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
-from stereogenbench_data.shards.open import open_shards
 from stereogenbench_data.shards.tar import read_chunks
+from stereogenbench_data.shards.writer import open_shards
 from stereogenbench_data.sources.files import copy_with_crc32, try_locked
 from stereogenbench_data.sources.members import open_local
 from stereogenbench_data.sources.ranged_file import require_crc32
@@ -52,11 +52,6 @@ class _UnpackTask:
     def folder(self) -> Path:
         """The scene's folder."""
         return Path(self.out, self.scene.id.key)
-
-    @property
-    def temporary(self) -> Path:
-        """Its name until it is whole; walks of a tree ignore such names."""
-        return self.folder.with_name(f".{self.folder.name}.unpacking")
 
 
 def unpack(
@@ -148,31 +143,34 @@ def unpack_scene(
         _require_unpacked(task)
         after_bytes(sum(member.size for member in scene.members.values()))
         return scene.id.key, "kept"
-    shutil.rmtree(task.temporary, ignore_errors=True)
-    task.temporary.mkdir(parents=True)
     try:
-        for name, member in sorted(scene.members.items(), key=lambda item: item[1].offset):
-            where = f"{Path(task.root, member.path)}: {scene.id.key}.{name}"
-            target = task.temporary / _RELEASED_NAMES.get(name, name)
-            opened = open_local(task.root, member, shard=task.shards[member.path])
-            with opened.open("rb") if isinstance(opened, Path) else opened as file:
-                if name in _RELEASED_NAMES:
-                    content = file.read()
-                    require_crc32(zlib.crc32(content), expected=member.crc32, name=where)
-                    with DepthFrames(io.BytesIO(content), name=where, frames=scene.frames) as depth:
-                        write_depth_video(depth, target)
-                    after_bytes(member.size)
-                    continue
-                chunks = read_chunks(file, member.size, after_bytes=after_bytes)
-                with target.open("xb") as output:
-                    crc32 = copy_with_crc32(chunks, output.write)
-                require_crc32(crc32, expected=member.crc32, name=where)
-        task.temporary.rename(task.folder)
+        with atomic_folder(task.folder) as folder:
+            for name, member in sorted(scene.members.items(), key=lambda item: item[1].offset):
+                _unpack_file(task, name, member, folder, after_bytes)
     except MediaError as error:
         raise ShardError(str(error)) from error
-    finally:
-        shutil.rmtree(task.temporary, ignore_errors=True)
     return scene.id.key, "unpacked"
+
+
+def _unpack_file(
+    task: _UnpackTask, name: str, member: Member, folder: Path, after_bytes: Advance
+) -> None:
+    where = f"{Path(task.root, member.path)}: {task.scene.id.key}.{name}"
+    target = folder / _RELEASED_NAMES.get(name, name)
+    opened = open_local(task.root, member, shard=task.shards[member.path])
+    with opened.open("rb") if isinstance(opened, Path) else opened as file:
+        if name in _RELEASED_NAMES:
+            content = file.read()
+            require_crc32(zlib.crc32(content), expected=member.crc32, name=where)
+            frames = task.scene.frames
+            with DepthFrames(io.BytesIO(content), name=where, frames=frames) as depth:
+                write_depth_video(depth, target)
+            after_bytes(member.size)
+            return
+        chunks = read_chunks(file, member.size, after_bytes=after_bytes)
+        with target.open("xb") as output:
+            crc32 = copy_with_crc32(chunks, output.write)
+        require_crc32(crc32, expected=member.crc32, name=where)
 
 
 def _require_unpacked(task: _UnpackTask) -> None:

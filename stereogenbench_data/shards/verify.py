@@ -42,7 +42,6 @@ from stereogenbench_data.schema.release import (
     depth_name,
 )
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.shards.open import open_shards
 from stereogenbench_data.shards.plan import SCENE_TEXTS
 from stereogenbench_data.shards.tar import (
     BLOCK_BYTES,
@@ -57,7 +56,7 @@ from stereogenbench_data.shards.training import (
     released_name,
     source_pictures,
 )
-from stereogenbench_data.shards.writer import TEMPORARY_SUFFIX
+from stereogenbench_data.shards.writer import TEMPORARY_SUFFIX, open_shards
 from stereogenbench_data.sources.files import copy_with_crc32
 
 _FETCH_AGAIN: Final = "Fetch the shard again, or pack it again."

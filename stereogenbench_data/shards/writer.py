@@ -23,7 +23,9 @@ from typing import Final, Literal
 
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, ShardError, explain_os_errors
+from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.scene_folder import derived_scene, metadata_differences
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth_packing import packed_depth
 from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
 from stereogenbench_data.schema.records import Member, Scene
@@ -38,6 +40,7 @@ from stereogenbench_data.shards.tar import (
 )
 from stereogenbench_data.shards.training import Derivation, derive_scene, derived_names
 from stereogenbench_data.sources.files import copy_with_crc32, try_locked, write_atomic
+from stereogenbench_data.sources.location import is_remote, shown
 from stereogenbench_data.sources.ranged_file import FileSlice
 
 TEMPORARY_SUFFIX: Final = ".tmp"
@@ -104,6 +107,33 @@ class ShardManifest:
         """Where each member lies in the shard, by its whole name."""
         found = zip(self.members, self.offsets, self.sizes, self.crc32s, strict=True)
         return {name: Member(self.name, *place) for name, *place in found}
+
+
+def open_shards(data: str | Path, root: str | Path | None) -> SceneIndex:
+    """Return the index of shards on this machine.
+
+    Args:
+        data: The folder of the shards, or its index file.
+        root: The folder of the shards, if the index file is elsewhere.
+
+    Raises:
+        StorageError: If there is no index of shards, or it cannot be opened.
+    """
+    if is_remote(data):
+        raise ShardError(f"{shown(data)}: is remote. Download the shards, and pass their folder.")
+    path = Path(data)
+    if path.is_dir() and not (path / INDEX_NAME).is_file():
+        cure = "Pass a folder that `stereogenbench pack` made."
+        if (path / PARTS).is_dir():
+            cure = "Packing was not finished: run `stereogenbench pack` again."
+        raise ShardError(f"{path}: holds no {INDEX_NAME}. {cure}")
+    index = SceneIndex.open(path, root=root)
+    if not index.shards:
+        raise ShardError(
+            f"{path}: is the index of a released folder, not of shards. Pack it with "
+            f"`stereogenbench pack`, or pass a folder of shards."
+        )
+    return index
 
 
 def find_packed(task: ShardTask) -> ShardManifest | None:

@@ -16,17 +16,11 @@ import os
 import re
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.errors import (
-    DISK_FULL,
-    NOT_WRITABLE,
-    ShardError,
-    StorageError,
-    describe_os_error,
-)
+from stereogenbench_data.errors import NOT_WRITABLE, ShardError, StorageError, explain_os_errors
 from stereogenbench_data.schema.records import Member
 from stereogenbench_data.sources.files import copy_with_crc32, locked, try_locked, write_atomic
 from stereogenbench_data.sources.ranged_file import FileSlice
@@ -283,16 +277,7 @@ def _fetch(part: Path, member: Member, *, remote: RemoteObject) -> int:
     return crc32
 
 
-@contextmanager
-def _named_errors(folder: Path) -> Iterator[None]:
+def _named_errors(folder: Path) -> AbstractContextManager[None]:
     """Raise errors of the disk as errors that name the cache."""
-    try:
-        yield
-    except StorageError:
-        raise
-    except OSError as error:
-        what = f"{folder}: the cache cannot be read or written"
-        smaller = " Or give the cache a smaller limit." if error.errno in DISK_FULL else ""
-        raise StorageError(
-            describe_os_error(what, error, "Choose another folder for the cache.") + smaller
-        ) from error
+    cure = "Choose another folder for the cache."
+    return explain_os_errors(f"{folder}: the cache cannot be read or written", cure)

@@ -26,7 +26,7 @@ from stereogenbench_data.sources.retry import (
     ProcessLock,
     require_expected_size,
 )
-from stereogenbench_data.sources.web import WebTransport
+from stereogenbench_data.sources.web import Limit, WebTransport
 
 _ADDRESS: Final = re.compile(
     r"hf://(datasets/|spaces/|models/)?(?!(?:datasets|spaces|models|buckets)/)([\w.-]+/[\w.-]+)"
@@ -172,11 +172,9 @@ class HubTransport:
 
     def _open(self, timeout_s: float) -> WebTransport | Path:
         """Return the file in the Hub's cache, or else where it is on the Hub."""
-        if self._opened is not None:
-            return self._opened
-        with self._opening.held(timeout_s):
-            if self._opened is None:
-                self._opened = self._find(timeout_s)
+        if self._opened is None:
+            with self._opening.held(timeout_s):
+                self._opened = self._opened or self._find(timeout_s)
         return self._opened
 
     def _find(self, timeout_s: float) -> WebTransport | Path:
@@ -237,7 +235,8 @@ class _HubWeb(WebTransport):
 
     def commit(self, timeout_s: float) -> str:
         """Return the commit that a branch is at; the branch itself where the Hub does not say."""
-        response = self.head(timeout_s)
+        response = self._ask(self._url, {"Range": "bytes=0-0"}, Limit(timeout_s), follow=False)
+        response.close()
         found = response.headers.get("X-Repo-Commit", "")
         if response.status >= 400 and not _COMMIT.fullmatch(found):
             raise self.refusal(response)

@@ -6,7 +6,8 @@ import os
 import stat
 import zlib
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -158,20 +159,25 @@ class RangedFile(MemberFile):
         length = min(2 * max(before, default=FIRST_BLOCK // 2), LARGEST_BLOCK)
         behind = [first for first, _ in self._blocks if first > start]
         end = min(max(start + length, stop), self.size, *behind)
-        if self.failure is not None:
-            raise self.failure
-        try:
+        with self._kept_failure():
             block = (start, self._fetch(start, end))
             if self._checksum is not None:
                 self._checksum.add(*block)
-        except StorageError as error:
-            # FFmpeg may take an error for the end of the file and try again: it is raised again.
-            self.failure = error
-            raise
         self._blocks.append(block)
         while sum(len(data) for _, data in self._blocks) > KEPT_BYTES and len(self._blocks) > 1:
             self._blocks.pop(0)
         return block
+
+    @contextmanager
+    def _kept_failure(self) -> Iterator[None]:
+        """Raise the first error again: FFmpeg may take one for the file's end, and try again."""
+        if self.failure is not None:
+            raise self.failure
+        try:
+            yield
+        except StorageError as error:
+            self.failure = error
+            raise
 
 
 class PacketFile(RangedFile):
@@ -227,24 +233,16 @@ class PacketFile(RangedFile):
         return data
 
     def _packet_bytes(self, at: int, size: int) -> bytes:
-        if self.failure is not None:
-            raise self.failure
-        try:
+        with self._kept_failure():
             if self._checksum is not None and not self._has_fed_header:
                 self._has_fed_header = True
                 self._checksum.add(0, self._table.head)
                 self._checksum.add(self._table.bounds[-1], self._table.tail)
             found = self._ahead(at)
-            if found is None:
-                start, block = self._block(at, min(self._table.packet_end(at), self.size))
-                return block[at - start : at - start + size]
-            start, block = found
-            if self._checksum is not None and start != self._fed_from:
-                self._fed_from, own = start, max(0, start)
-                self._checksum.add(own, block[own - start : max(0, self.size - start)])
-        except StorageError as error:
-            self.failure = error
-            raise
+            if found is not None and self._checksum is not None and found[0] != self._fed_from:
+                self._fed_from, own = found[0], max(0, found[0])
+                self._checksum.add(own, found[1][own - found[0] : max(0, self.size - found[0])])
+        start, block = found or self._block(at, min(self._table.packet_end(at), self.size))
         return block[at - start : at - start + size]
 
 

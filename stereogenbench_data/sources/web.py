@@ -69,7 +69,7 @@ _pools: Final[dict[tuple[int, str], urllib3.PoolManager]] = {}
 """Connections by process and proxy: those of the process that forked this one stay its own."""
 
 
-class _Limit:
+class Limit:
     """Until when a server may keep a request waiting."""
 
     def __init__(self, timeout_s: float) -> None:
@@ -77,16 +77,22 @@ class _Limit:
         self.renew()
 
     def renew(self) -> None:
+        """Begin to count anew."""
         self._until_s = time.monotonic() + self.timeout_s
 
     def left_s(self) -> float:
+        """Return the seconds that are left.
+
+        Raises:
+            TimeoutError: If none are.
+        """
         left_s = self._until_s - time.monotonic()
         if left_s <= 0:
             raise TimeoutError(f"no answer within {self.timeout_s:g} s")
         return left_s
 
 
-_limit: Final[ContextVar[_Limit | None]] = ContextVar("_limit", default=None)
+_limit: Final[ContextVar[Limit | None]] = ContextVar("_limit", default=None)
 """The limit of the request that this thread makes."""
 
 
@@ -96,7 +102,7 @@ class _LimitedStream(io.RawIOBase):
     urllib3 limits each wait alone.
     """
 
-    def __init__(self, stream: io.RawIOBase, connection: socket.socket, limit: _Limit) -> None:
+    def __init__(self, stream: io.RawIOBase, connection: socket.socket, limit: Limit) -> None:
         super().__init__()
         self._stream, self._connection, self._limit = stream, connection, limit
 
@@ -181,17 +187,10 @@ class WebTransport:
 
     def size(self, timeout_s: float) -> int:
         """Return how many bytes the object has, as the response for its first byte states."""
-        response, stated = self._get(0, 1, _Limit(timeout_s))
+        response, stated = self._get(0, 1, Limit(timeout_s))
         response.close()
         self._require_size_stated(response, stated)
         return stated.size
-
-    def head(self, timeout_s: float) -> urllib3.BaseHTTPResponse:
-        """Return the response of the URL itself for the first byte, which may be a redirect."""
-        part = {"Range": "bytes=0-0"}
-        response = self._ask(self._url, part, _Limit(timeout_s), follow=False)
-        response.close()
-        return response
 
     def entries(self, timeout_s: float) -> dict[str, int | None]:
         """Refuse to list a folder: plain web servers have no listings."""
@@ -207,7 +206,7 @@ class WebTransport:
 
     def part(self, start: int, stop: int, timeout_s: float) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop, or the first of them."""
-        limit = _Limit(timeout_s)
+        limit = Limit(timeout_s)
         response, stated = self._get(start, stop, limit)
         try:
             self._require_part(response, stated, start, stop)
@@ -228,9 +227,7 @@ class WebTransport:
             # A response that was read to its end is back in the pool, and is not closed.
             response.close()
 
-    def _get(
-        self, start: int, stop: int, limit: _Limit
-    ) -> tuple[urllib3.BaseHTTPResponse, _Stated]:
+    def _get(self, start: int, stop: int, limit: Limit) -> tuple[urllib3.BaseHTTPResponse, _Stated]:
         """Return a response that has content of the object that was read before."""
         part = {"Range": f"bytes={start}-{stop - 1}"}
         response = self._ask_address(part, limit)
@@ -255,7 +252,7 @@ class WebTransport:
         return response, stated
 
     def _ask_address(
-        self, part: Mapping[str, str], limit: _Limit
+        self, part: Mapping[str, str], limit: Limit
     ) -> urllib3.BaseHTTPResponse | None:
         """Return a response from where the URL led to; None if that is not known or refuses."""
         address = self._addresses.get(self._url)
@@ -274,7 +271,7 @@ class WebTransport:
         return None
 
     def _ask(
-        self, url: str, headers: Mapping[str, str], limit: _Limit, *, follow: bool = True
+        self, url: str, headers: Mapping[str, str], limit: Limit, *, follow: bool = True
     ) -> urllib3.BaseHTTPResponse:
         """Return a server's response, of which nothing but the head is read yet."""
         sent = {**self._headers, **headers}

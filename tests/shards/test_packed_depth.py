@@ -293,7 +293,7 @@ def test_unpacking_goes_on_where_it_was(small_shards, small_release, tmp_path):
     tree = tmp_path / "tree"
     unpack(small_shards, tree, workers=1)
     shutil.rmtree(tree / KEY)
-    (tree / KEY).with_name(".scene_000001.unpacking").mkdir()
+    (tree / KEY).with_name(".scene_000001.unfinished").mkdir()
     seen = []
 
     report = unpack(small_shards, tree, workers=1, progress=lambda *now: seen.append(now))
@@ -335,7 +335,7 @@ def test_a_damaged_member_is_not_unpacked(shards, tmp_path, name):
         unpack(shards, tmp_path / "tree", workers=1)
 
     assert not (tmp_path / "tree" / KEY).exists()
-    assert not list((tmp_path / "tree").rglob("*.unpacking"))
+    assert not list((tmp_path / "tree").rglob("*.unfinished"))
 
 
 def test_where_there_are_no_shards_nothing_is_unpacked(packed, small_release, tmp_path):

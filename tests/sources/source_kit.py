@@ -20,12 +20,13 @@ from stereogenbench_data.sources.location import is_remote, joined, local_path, 
 from stereogenbench_data.sources.members import MemberSource
 from stereogenbench_data.sources.ranged_file import FileSlice
 from stereogenbench_data.sources.remote import RemoteObject
+from tests.sources.policies import waits_noted
 
 VIDEO = "cam_00_rgb.mp4"
 
 
 def read_range(place, start, stop):
-    """Return the bytes from start to stop of a file, local or by URL; retries do not wait."""
+    """Return the bytes from start to stop of a file, local or by URL."""
     if is_remote(place):
         return RemoteObject(str(place)).read(start, stop)
     with FileSlice(local_path(place), Member("", start, stop - start)) as file:
@@ -143,7 +144,8 @@ class SourceTests:
         ):
             make_source(shards=facts).read(altered, BASELINE_JSON)
 
-    def test_a_range_beyond_the_end_is_an_error(self, root, scene):
+    def test_a_range_beyond_the_end_is_an_error(self, root, scene, monkeypatch):
+        waits_noted(monkeypatch)
         place = joined(str(root), scene.members[VIDEO].path)
         size = size_of(place)
 

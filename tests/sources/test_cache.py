@@ -248,7 +248,7 @@ def test_a_full_disk_is_reported_and_leaves_nothing(cache, shard, tmp_path, monk
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(cache_module.os, "fsync", full)
-    with pytest.raises(StorageError, match=r"\(No space left on device\)\. .*smaller limit"):
+    with pytest.raises(StorageError, match=r"\(No space left on device\)\. Make room"):
         cache.open(member(0, 2000), remote=shard, revision="1")
     assert items(tmp_path) == []
 
