@@ -32,8 +32,6 @@ from stereogenbench_data.sources.files import try_locked, write_atomic
 Work = TypeVar("Work")
 Result = TypeVar("Result")
 
-_CURE: Final = "Choose another folder, or remove it."
-
 
 @dataclass(frozen=True, slots=True)
 class JobKind:
@@ -85,7 +83,12 @@ def job_folder(
                 )
             _require_stated(root, kind)
             if stated.exists() and _has_items(root, kind):
-                _require_same(read_json(stated), settings, root=root, kind=kind)
+                asked = json.loads(json_bytes(settings))
+                for name, theirs, ours in _differences(read_json(stated), asked):
+                    raise kind.error(
+                        f"{root}: holds {kind.noun} of other {name}: {theirs!r}, where {ours!r} is "
+                        f"asked for. Choose another folder, or remove it."
+                    )
             else:
                 write_atomic(stated, json_bytes(settings))
         yield
@@ -94,17 +97,6 @@ def job_folder(
 def _require_stated(root: Path, kind: JobKind) -> None:
     if not (root / kind.settings).exists() and _has_items(root, kind):
         raise kind.error(f"{root}: is not empty and holds no {kind.settings}: choose a new folder.")
-
-
-def _require_same(
-    there: Mapping[str, Any], settings: Mapping[str, Any], *, root: Path, kind: JobKind
-) -> None:
-    here = json.loads(json_bytes(settings))
-    for name, theirs, ours in _differences(there, here):
-        raise kind.error(
-            f"{root}: holds {kind.noun} of other {name}: {_shown(theirs)}, where {_shown(ours)} is "
-            f"asked for. {_CURE}"
-        )
 
 
 def _has_items(root: Path, kind: JobKind) -> bool:
@@ -121,10 +113,6 @@ def _differences(theirs: Any, ours: Any, name: str = "") -> Iterator[tuple[str, 
             yield from _differences(theirs.get(key), ours.get(key), inner)
     elif theirs != ours:
         yield name, theirs, ours
-
-
-def _shown(value: Any) -> str:
-    return "set" if isinstance(value, dict) else repr(value)
 
 
 @contextmanager

@@ -70,11 +70,6 @@ class DepthLayout:
     channels: tuple[tuple[int, int], ...] = ()
     per_pixel: int = 1
 
-    @property
-    def is_bytes(self) -> bool:
-        """Whether a 16-bit number may stand in two channels of 8 bits."""
-        return bool(self.channels) and self.dtype == "u1"
-
 
 @cache
 def _layout(pixel_format: str) -> DepthLayout | None:
@@ -227,7 +222,7 @@ def _units_of_channels(
     Which byte is high is decided by the video's first frame, so that all frames are read alike.
     """
     red, green, blue = channels = _channels(reader, index, layout)
-    if layout.is_bytes:
+    if layout.dtype == "u1":  # a 16-bit number may stand in two channels of 8 bits
         order = _byte_order(_channels(reader, 0, layout), name=reader.name)
         (other,) = {0, 1, 2}.difference(order)
         if not _is_flat(channels[other]):

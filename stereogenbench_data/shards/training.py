@@ -10,6 +10,7 @@ import importlib.metadata
 import io
 import time
 import zlib
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from fractions import Fraction
@@ -430,7 +431,7 @@ def estimate(
     scenes = [index.scene(int(row)) for row in rows]
     names = [derived_names(scene, settings) for scene in scenes]
     places = sorted({round(each) for each in np.linspace(0, len(scenes) - 1, SAMPLED_SCENES)})
-    spent_s, made, frames = 0.0, {"rgb": 0, "depth": 0}, {"rgb": 0, "depth": 0}
+    spent_s, made, frames = 0.0, Counter[str](), Counter[str]()
     for place in places:
         scene = scenes[place]
         camera = next(int(name[4:6]) for name in names[place] if name.endswith("_rgb.mp4"))
@@ -440,24 +441,23 @@ def estimate(
         document = derive_scene(derivation, scene, folder / str(place))
         spent_s += time.process_time() - began_s
         for name, file in document.files.items():
-            kind = "rgb" if name.endswith("_rgb.mp4") else "depth"
-            made[kind] += file.size
-            frames[kind] += scene.frames
-    wanted = {"rgb": 0, "depth": 0}
+            made[name[7:]] += file.size
+            frames[name[7:]] += scene.frames
+    wanted = Counter[str]()  # frames by what follows the camera in a file's name
     videos = texts = 0
     for scene, each in zip(scenes, names, strict=True):
         for name in each:
             if name.startswith("cam_"):
-                wanted["rgb" if name.endswith("_rgb.mp4") else "depth"] += scene.frames
+                wanted[name[7:]] += scene.frames
                 videos += 1
             elif name in scene.members:
                 texts += scene.members[name].size
-    size = texts + sum(made[kind] * wanted[kind] / max(frames[kind], 1) for kind in made)
+    size = texts + sum(made[kind] * wanted[kind] / frames[kind] for kind in made)
     return PackingEstimate(
         scenes=len(scenes),
         videos=videos,
         bytes=round(size),
         source_bytes=sum(map(source_bytes, scenes, names)),
-        core_hours=spent_s / sum(frames.values()) * sum(wanted.values()) / 3600,
+        core_hours=spent_s / frames.total() * wanted.total() / 3600,
         sampled=tuple(scenes[place].id.key for place in places),
     )

@@ -26,7 +26,6 @@ from stereogenbench_data.media.depth import (
     ANY_DEPTH,
     open_depth,
     read_depth_units,
-    require_depth_stream,
     resized_nearest,
     resolve_encoding,
 )
@@ -38,7 +37,6 @@ from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
     METADATA_FILES,
-    PACKED_DEPTH_NAMES,
     depth_name,
 )
 from stereogenbench_data.schema.text import counted
@@ -387,16 +385,15 @@ def _decode(task: _SceneTask, name: str) -> None:
     """Decode all frames of a video in a shard, and compare its header with the index."""
     scene, member = task.scene, task.scene.members[name]
     file = io.BytesIO(_content(task.root, member))
-    if name in PACKED_DEPTH_NAMES.values():
-        with DepthFrames(file, name=name, frames=scene.frames) as depth:
-            _require_indexed(scene, name, depth.facts)
-            for index in range(scene.frames):
-                depth.units(index)
-        return
     _require_indexed(scene, name, probe(file, name=name))
-    with VideoReader(file, name=name, frames=scene.frames) as reader:
+    if name.endswith("_rgb.mp4"):
+        with VideoReader(file, name=name, frames=scene.frames) as pictures:
+            for index in range(scene.frames):
+                pictures.colour_frame(index)
+        return
+    with open_depth(file, name=name, frames=scene.frames) as depth:
         for index in range(scene.frames):
-            _ = reader.colour_frame(index) if name.endswith("_rgb.mp4") else reader.frame(index)
+            read_depth_units(depth, index, encoding=ANY_DEPTH)
 
 
 def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
@@ -421,12 +418,6 @@ def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
         indexed = (*indexed, scene.depth_unit_m[camera], scene.depth_offset_m[camera])
     if found != indexed:
         raise MediaError(f"{name}: is stored as {found}, and the index says {indexed}.")
-    require_depth_stream(
-        codec=depth_coding(facts),
-        pixel_format=facts.pixel_format,
-        encoding=ANY_DEPTH,
-        name=name,
-    )
 
 
 def _difference(derivation: Derivation, task: _SceneTask, released: Scene, name: str) -> str:

@@ -6,13 +6,12 @@ begun. Threads fetch the ranges in the order in which they are needed; a thread 
 nothing left to fetch. What could not be fetched raises its error where it is read.
 """
 
-import heapq
 import os
 import sys
 import threading
 import weakref
 from bisect import bisect_right, insort
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
 from itertools import islice, takewhile
@@ -81,13 +80,12 @@ class _State:
 
     pid: int = field(default_factory=os.getpid)
     changed: threading.Condition = field(default_factory=threading.Condition)
-    queue: list[tuple[int, int, _Part]] = field(default_factory=list)
+    queue: deque[_Part] = field(default_factory=deque)
     threads: set[threading.Thread] = field(default_factory=set)
     parts: dict[Hashable, list[_Part]] = field(default_factory=lambda: defaultdict(list))
     due: dict[int, list[_Part]] = field(default_factory=lambda: defaultdict(list))
     planned_bytes: int = 0
     up_to: int = -1
-    count: int = 0
 
 
 class FetchAhead:
@@ -141,7 +139,7 @@ class FetchAhead:
         state = self._state
         with state.changed:
             state.up_to = sample
-            waiting = sum(first <= sample for first, _, _ in state.queue)
+            waiting = sum(part.first <= sample for part in state.queue)
             for _ in range(min(waiting, CONNECTIONS - len(state.threads))):
                 thread = threading.Thread(
                     target=_work, args=(state,), name="fetch-ahead", daemon=True
@@ -200,8 +198,8 @@ class PlannedFetches(FetchAhead):
         """Take what is planned for the samples up to one as fetched."""
         state = self._state
         state.up_to = sample
-        while state.queue and state.queue[0][0] <= sample:
-            part = heapq.heappop(state.queue)[2]
+        while state.queue and state.queue[0].first <= sample:
+            part = state.queue.popleft()
             if part.state == "queued":
                 part.state = "here"
 
@@ -252,8 +250,7 @@ def _add(state: _State, wanted: Wanted, start: int, stop: int, sample: int) -> N
         insort(parts, part, key=_START)
         state.due[sample].append(part)
         state.planned_bytes += held_bytes
-        state.count += 1
-        heapq.heappush(state.queue, (sample, state.count, part))
+        state.queue.append(part)
 
 
 def _drop(state: _State, part: _Part) -> None:
@@ -272,14 +269,11 @@ def _work(state: _State) -> None:
     """Fetch what is queued, in a thread of its own."""
     while True:
         with state.changed:
-            part = None
-            while (
-                state.queue
-                and state.queue[0][0] <= state.up_to
-                and (part is None or part.state == "dropped")
-            ):
-                part = heapq.heappop(state.queue)[2]
-            if part is None or part.state == "dropped":
+            while state.queue and state.queue[0].first <= state.up_to:
+                part = state.queue.popleft()
+                if part.state == "queued":
+                    break
+            else:
                 state.threads.discard(threading.current_thread())
                 return
             part.state = "under way"

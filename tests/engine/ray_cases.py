@@ -1,7 +1,6 @@
 """Batch commands on Ray: a cluster of two nodes on this machine, the same results."""
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -20,7 +19,7 @@ from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.training import TrainingSettings
-from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.evaluation.conftest import write_pngs
 from tests.servers.tools import require_module
@@ -156,17 +155,6 @@ def test_a_cluster_that_loses_a_worker_gives_what_this_process_gives(command, ma
     assert there == here
 
 
-@pytest.mark.usefixtures("ray")
-def test_a_cluster_finds_the_same_plans_of_eval_scenes(tmp_path):
-    request = SynthRequest(scenes=5, size_px=32, frames=2, split="eval", subset="unseen_map")
-
-    here = plan_scenes(tmp_path / "here", request)
-    there = plan_scenes(tmp_path / "there", request, engine=RayCluster(), workers=2)
-
-    assert there == here
-    assert bytes_of(tmp_path / "there") == bytes_of(tmp_path / "here")
-
-
 # What else Ray does.
 
 
@@ -262,29 +250,6 @@ def test_closing_the_results_interrupts_tasks_that_run(tmp_path):
 def test_a_task_that_needs_a_gpu_is_refused_where_there_is_none():
     with pytest.raises(StorageError, match=r"has 0 GPUs, and each task needs 1.* device cpu"):
         list(RayCluster(gpus=1).map(pid, [1], name=called))
-
-
-@pytest.mark.usefixtures("ray")
-def test_an_error_on_ray_is_the_one_of_packing(small_release, tmp_path):
-    tree = shutil.copytree(small_release, tmp_path / "tree")
-    index = SceneIndex.open(tree)
-    next(tree.glob("train/Uniform/*/scene_000001/cam_03_depth.mkv")).unlink()
-
-    with pytest.raises(ShardError, match=r"cam_03_depth\.mkv: cannot be read \(No such file"):
-        pack(index, tmp_path / "out", target_bytes=ONE_EACH, engine=RayCluster())
-
-    assert list((tmp_path / "out").glob("*.tmp")) == []
-
-
-def test_ray_and_processes_share_one_plan_and_ray_stays_connected(ray, material, tmp_path):
-    release, shards, _ = material
-    pack(release, tmp_path, target_bytes=ONE_EACH, part=(1, 2), workers=1)
-
-    report = pack(release, tmp_path, target_bytes=ONE_EACH, engine=RayCluster())
-
-    assert len(report.packed) == 2
-    assert bytes_of(tmp_path) == bytes_of(shards)
-    assert ray.is_initialized()
 
 
 def test_the_command_works_on_a_cluster_by_its_address_with_relative_paths(
