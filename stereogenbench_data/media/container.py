@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, Literal, NoReturn, Protocol, Self, runtime_checkable
+from typing import Any, Final, Literal, NoReturn, Protocol, TypeVar, runtime_checkable
 
 import av
 from av.container import InputContainer
@@ -81,6 +81,9 @@ class HeaderFirstFile(BinaryFile, Protocol):
 VideoFile = str | Path | BinaryFile
 
 
+Reader = TypeVar("Reader", bound="FrameReader")
+
+
 class FrameReader:
     """What readers of frames have in common.
 
@@ -108,7 +111,7 @@ class FrameReader:
                 f"{self.name}: has no frame {index}: ask for one of 0 to {self.frames - 1}."
             )
 
-    def __enter__(self) -> Self:
+    def __enter__(self: Reader) -> Reader:
         """Return the reader itself."""
         return self
 

@@ -282,7 +282,7 @@ for opens in (lambda: pairs[len(pairs) - 1], lambda: StereoPairs(sys.argv[1])):
 """
 
 
-@pytest.mark.parametrize("kind", ["tree", "shards", "packed depth"])
+@pytest.mark.parametrize("kind", ["tree", "packed depth"])
 def test_too_many_open_files_are_reported_as_such(kind, indexed_release, small_shards, tmp_path):
     data = indexed_release if kind == "tree" else small_shards
     if kind == "packed depth":
