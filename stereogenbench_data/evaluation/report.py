@@ -23,6 +23,12 @@ FORMAT: Final = 4
 _GAPS_SHOWN: Final = 20
 ABSENT: Final = "-"
 _ARROWS: Final = {"higher": "↑", "lower": "↓", "neither": ""}
+_LATEX: Final = {
+    "\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$",
+    "{": r"\{", "}": r"\}", "±": r"$\pm$", "↑": r"$\uparrow$", "↓": r"$\downarrow$",
+    "∞": r"$\infty$", "†": r"$^\dagger$", "≤": r"$\le$", "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$", "|": "$|$", "[": "{[}", "*": "{*}",
+}  # fmt: skip
 
 
 def document(results: Sequence[Scores], tables: Sequence[Table]) -> dict[str, Any]:
@@ -84,7 +90,7 @@ def write_report(
     *,
     plots: Literal["write", "skip"] = "write",
 ) -> list[Path]:
-    """Write results.json, report.md, pairs.csv and plots; return the files.
+    """Write results.json, report.md, tables.tex, pairs.csv and plots; return the files.
 
     Raises:
         StorageError: If a file cannot be written.
@@ -95,6 +101,7 @@ def write_report(
             document(results, tables), indent=1, allow_nan=False, ensure_ascii=False
         ),
         "report.md": page(results, tables),
+        "tables.tex": "\n".join(map(latex, tables)),
         "pairs.csv": pairs_csv(results),
     }
     cannot = f"{folder}: the report cannot be written"
@@ -144,20 +151,43 @@ def _coverage(one: Scores) -> dict[str, Any]:
 
 def markdown(table: Table) -> str:
     """Return a table in Markdown, with its title and notes."""
+    head, *rows = _texts(table)
+    rule = ["---"] * (1 + len(table.keys)) + ["---:"] * (len(head) - 1 - len(table.keys))
+    lines = [head, rule, *(list(map(markdown_text, row)) for row in rows)]
+    pipes = ["| " + " | ".join(texts) + " |" for texts in lines]
+    notes = ["", *(f"- {note}" for note in table.notes)] if table.notes else []
+    return "\n".join([f"### {table.title}", "", *pipes, *notes]) + "\n"
+
+
+def latex(table: Table) -> str:
+    """Return a table in LaTeX, for the package booktabs; its caption has the notes."""
+    escapes = str.maketrans(_LATEX)
+    caption = " ".join([f"{table.title}.", *table.notes]).translate(escapes)
+    head, *rows = (" & ".join(each.translate(escapes) for each in row) for row in _texts(table))
+    left = "l" * (1 + len(table.keys))
+    lines = [
+        rf"\begin{{table}} \centering \caption{{{caption}}}",
+        rf"\begin{{tabular}}{{{left}{'r' * (len(_texts(table)[0]) - len(left))}}} \toprule",
+        rf"{head} \\ \midrule",
+        *(rf"{row} \\" for row in rows),
+        r"\bottomrule \end{tabular} \end{table}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _texts(table: Table) -> list[list[str]]:
+    """Return the cells of the head and of each row."""
     has_gaps = any(row.missing for row in table.rows)
     head = ["Method", *table.keys, "N_s", "N_f", *(["missing"] if has_gaps else [])]
-    head += [heading(table, name) for name in table.columns]
-    rule = ["---"] * (1 + len(table.keys)) + ["---:"] * (len(head) - 1 - len(table.keys))
-    lines = [head, rule]
+    lines = [head + [heading(table, name) for name in table.columns]]
     for row in table.rows:
         counts = [row.scenes, row.frames, *([row.missing] if has_gaps else [])]
         texts = [row.method, *(label or ABSENT for label in row.labels)]
         texts += [ABSENT if count is None else str(count) for count in counts]
-        texts += [_cell_text(table, row.values.get(name), name) for name in table.columns]
-        lines.append(list(map(markdown_text, texts)))
-    pipes = ["| " + " | ".join(texts) + " |" for texts in lines]
-    notes = ["", *(f"- {note}" for note in table.notes)] if table.notes else []
-    return "\n".join([f"### {table.title}", "", *pipes, *notes]) + "\n"
+        lines.append(
+            texts + [_cell_text(table, row.values.get(name), name) for name in table.columns]
+        )
+    return lines
 
 
 def heading(table: Table, column: str) -> str:

@@ -31,7 +31,7 @@ def test_predictions_are_scored_and_reported(scenes, other_views, tmp_path):
     assert "StereoSpace (paper, other scenes) | seen_map | Uniform" in shown.stdout
     assert "By map_name" in shown.stdout
     assert {path.name for path in out.iterdir()} == {
-        "results.json", "report.md", "pairs.csv", "plots", "partial",
+        "results.json", "report.md", "tables.tex", "pairs.csv", "plots", "partial",
     }  # fmt: skip
     assert {path.name for path in (out / "plots").iterdir()} == {
         "psnr_by_baseline.png", "ssim_by_baseline.png",

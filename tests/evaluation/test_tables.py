@@ -11,7 +11,7 @@ import pytest
 from stereogenbench_data import EvaluationError, EvaluationProtocol, tables_of, write_report
 from stereogenbench_data.evaluation.aggregate import PairMeans, Scores, tally
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
-from stereogenbench_data.evaluation.report import document, markdown
+from stereogenbench_data.evaluation.report import document, latex, markdown
 from stereogenbench_data.evaluation.tables import release_difference, stratum_table, table_of
 
 PAPERS = EvaluationProtocol()
@@ -249,7 +249,7 @@ def test_no_output_holds_nan_and_json_reads_back(scores, tmp_path):
         (tmp_path / "results.json").read_text(), parse_constant=lambda text: pytest.fail(text)
     )
 
-    assert [path.name for path in files] == ["results.json", "report.md", "pairs.csv"]
+    assert [path.name for path in files] == ["results.json", "report.md", "tables.tex", "pairs.csv"]
     assert told == document(results, tables)
     for path in files:
         assert "nan" not in path.read_text().replace("nan (", "").lower().split(), path
@@ -267,3 +267,13 @@ def test_the_csv_has_a_line_for_each_pair(scores, tmp_path):
 def test_a_table_needs_a_method():
     with pytest.raises(EvaluationError, match="at least one method, got none"):
         tables_of([])
+
+
+def test_latex_has_its_signs_escaped_and_its_columns_counted(scores):
+    text = latex(table_of([scores("[50 % & more_{x} < y|")], "branches"))
+    rows_of_text = [line for line in text.splitlines() if r"\\" in line]
+
+    assert r"{[}50 \% \& more\_\{x\} $<$ y$|$" in text
+    assert r"$\pm$" in text
+    assert len({line.replace(r"\&", "").count("&") for line in rows_of_text}) == 1
+    assert text.count(r"\begin{") == text.count(r"\end{") == 2
