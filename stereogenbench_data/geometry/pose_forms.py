@@ -34,7 +34,7 @@ _LOCATION: Final = {
 }  # fmt: skip
 _ROTATION: Final = {
     "rotation", "rotator", "orientation", "euler", "quaternion", "quat", "rot", "q", "r",
-    "angles", "rotmat", "matrix", "rotvec", "rvec", "qvec",
+    "angles", "rotmat", "matrix", "rotvec", "rvec", "qvec", "pyr", "rpy",
 }  # fmt: skip
 _NO_POSE: Final = {
     "scale", "scale3d", "velocity", "forward", "up", "right", "target", "lookat", "color",
@@ -300,9 +300,9 @@ def _tier(block: Block, kind: list[str], axes: str, hints: frozenset[str]) -> in
     in forms that fit, and all else is of one rank: what is not named must be the only one to pass.
     """
     said = hints | block.words
-    text = "_".join((*(key for key in block.name if key != "*"), *sorted(said)))
-    is_from_world = any(word in text for word in _FROM_WORLD) and not any(
-        word in text for word in _FROM_CAMERA
+    text = "_".join(("", *(key for key in block.name if key != "*"), *sorted(said)))
+    is_from_world = any(f"_{word}" in text for word in _FROM_WORLD) and not any(
+        f"_{word}" in text for word in _FROM_CAMERA
     )
     is_vector = kind[0] == "vector" and not block.unit.startswith("deg")
     is_rad = is_vector or block.unit.startswith("rad") or any(w.startswith("rad") for w in said)

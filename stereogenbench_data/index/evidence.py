@@ -24,7 +24,7 @@ from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_re
 from stereogenbench_data.schema.conventions import PosesAs
 from stereogenbench_data.schema.quantities import UNITS_M
 from stereogenbench_data.schema.records import Rig
-from stereogenbench_data.schema.release import CAMERA_PAIRS
+from stereogenbench_data.schema.release import BASELINE_JSON, CAMERA_PAIRS
 from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.schema.trajectory import RecordedPoses, record_poses
 
@@ -47,7 +47,7 @@ _SHOWN: Final = 4
 
 
 class SidesError(SchemaError):
-    """Poses fit a rig but for what baselines are, or which camera is left: that is stated twice."""
+    """What a trajectory says of baselines, lens or the left camera contradicts the rig."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,9 +99,15 @@ def understood_poses(
     Raises:
         SchemaError: If no reading of its numbers passes, or several pass and disagree about where
             the cameras stand to each other, or not as conventions say; it says what was tried.
-        SidesError: If its own form fits but for the side of the primary pair's left camera.
+        SidesError: If its own form fits but for the side of the primary pair's left camera or one
+            factor of all baselines, or if its focal length changes.
     """
     recorded = record_poses(text, where=where)
+    if recorded.lens:
+        raise SidesError(
+            f"{where}: {recorded.lens}, and a scene of {BASELINE_JSON} has one lens. Leave this "
+            f"scene out, or remove the key."
+        )
     other = "; ".join(
         f"{where}: {path} states cameras {pair[0]} and {pair[1]}"
         for path, pair in recorded.primary_pairs
@@ -298,7 +304,9 @@ def _checked(reading: Reading, rig: Rig) -> _Passed | str:
         frame, pair = divmod(worst, len(CAMERA_PAIRS))
         a, b = CAMERA_PAIRS[pair]
         is_scaled = bool((np.abs(scaled_cm - baselines_cm) <= allowed_cm).all())
-        is_told = is_scaled and np.isfinite(stated_m) and not 0.5 < ratio / unit_m < 2
+        # One ratio in all pairs and frames is no rounding: it is a unit, or a scale.
+        is_one = bool((np.abs(scaled_cm - baselines_cm) <= _DEVIATION_SHARE * baselines_cm).all())
+        is_told = np.isfinite(stated_m) and (is_one or (is_scaled and not 0.5 < ratio / unit_m < 2))
         return (
             f"baseline.json says that cameras {a} and {b} are {baselines_cm[pair]:.6g} cm apart, "
             f"and by the poses they are {distances[frame, pair] * unit_m * 100:.6g} cm apart in "
@@ -338,7 +346,7 @@ def _unit_of(ratio: float, stated_m: float) -> float | None:
     return None
 
 
-_IN_ANOTHER_UNIT: Final = ", as if one of the two were in another unit"
+_IN_ANOTHER_UNIT: Final = ", as if one of the two were in another unit or scaled"
 _ROUGH: Final = 0.1
 """How far the median of distances may be from a unit before they are compared one by one."""
 

@@ -81,6 +81,8 @@ _PLANAR: Final = re.compile(
     r"planar|plane|axi|ortho|perpendicular|linear|metric|depth|\bz\b|\d|float|int|half|video|none"
 )
 """Texts under such a key that are of depth along the optical axis, or of how it is stored."""
+_SUM: Final = re.compile(r"[\w)\]] \+ [\w.(\[]|[*/][^,;\n]*[\w)\]] - \d")
+"""A sum in a formula, which has an offset that nothing here reads."""
 _NORMALISED: Final = re.compile(r"normali[sz]")
 _STATISTICS: Final = frozenset(
     {"stat", "stats", "statistics", "valid", "observed", "mean", "median", "std", "percentile",
@@ -320,7 +322,11 @@ def _of_range(
     ends = [*about["far"], *about["near"]]
     weak = [each for each in ends if each.is_weak and not is_normalised]
     doubtful = [each for each in weak if each.origin == "metadata" or lengths - {1.0}]
-    if doubtful and not about["unit"]:
+    # Statistics have two ends; what has the nearest alone may be the depth of stored zeros.
+    is_start = any(each.values[0] for each in doubtful) and {each.about for each in doubtful} == {
+        "near"
+    }
+    if doubtful and (is_start or not about["unit"]):
         _refuse("may be the range that stored numbers fill, or the scene's", doubtful)
     ends = [each for each in ends if each not in doubtful]
     if not ends:
@@ -466,7 +472,10 @@ class _Source:
         if _METRES.fullmatch(plain):
             yield self._make("length unit", (UNITS_M[words(plain)],), text)
             return
-        if _OTHER_MEANING.search(plain):
+        formula = "=" in plain or "*" in plain
+        if _OTHER_MEANING.search(plain) or (
+            formula and _SUM.search(_RANGE_FORMULA.sub(" ", plain))
+        ):
             yield self._make("other meaning", (), text)
             return
         if _NORMALISED.search(plain) or _RANGE_FORMULA.search(plain):

@@ -49,7 +49,11 @@ _FOLDER: Final = re.compile(r"[!-\-0-\[\]-~](?:[ -\-0-\[\]-~]*[!-\-0-\[\]-~])?\Z
 
 _KEY_SHOWN: Final = 300
 _SHOWN: Final = 20
-_PRINCIPAL: Final = re.compile(r"principal|optical_cent|(?:lens_|\A)shift_[xy]")
+_PRINCIPAL: Final = re.compile(
+    r"principal|optical_cent|(?:lens|sensor|film|filmback)_(?:shift|offset)|(?:\A|_)shift_[xy]|"
+    r"(?:\A|_)(?:c|center|centre)_?[xy](?:_|\Z)"
+)
+"""Names of principal points, with the key above, whatever follows them."""
 _CENTRE_PX: Final = 1.0
 """How far a principal point may be from the image's centre to be that centre: conventions of pixels
 differ by a half, and centres are written as whole pixels."""
@@ -454,7 +458,9 @@ class _RigFile(MetadataFile):
                   for quantity in ("principal_x", "principal_y")]  # fmt: skip
         read = [each.path for found in points for each in found]
         odd = [f"{node.path} {brief(node.value)}" for node in self.values.nodes
-               if _PRINCIPAL.search(node.name) and not isinstance(node.value, dict)
+               if _PRINCIPAL.search(f"{node.parent}_{node.name}"
+                                    if is_number(node.value) else node.name)
+               and not isinstance(node.value, dict)
                and node.path not in read and not any(path.startswith(node.path) for path in read)
                and node.value not in (0, [0, 0], [0.5, 0.5])
                and "cent" not in str(node.value)]  # fmt: skip
@@ -503,7 +509,8 @@ class _RigFile(MetadataFile):
                     f"found {brief(each.value)}"
                 )
                 continue
-            first = 0 if isinstance(each.value, dict) and self._names_camera_0 else first_number
+            is_named = isinstance(each.value, dict) and first_number and self._names_camera_0
+            first = 0 if is_named else first_number
             left, right = named[0] - first, named[1] - first
             if left == right or not {left, right} <= set(range(CAMERA_COUNT)):
                 odd.append(
@@ -620,33 +627,48 @@ class _RigFile(MetadataFile):
             path: Its JSON path.
             unit_m: Metres in the unit of lengths whose keys name none.
         """
-        waiting: list[tuple[Any, str, str, int | None]] = [(value, name, path, None)]
-        for node, words_, place, row in waiting:
+        waiting: list[tuple[Any, str, str, int | None, float]] = [(value, name, path, None, unit_m)]
+        for node, words_, place, row, above_m in waiting:
             if "primary" in words_ or not isinstance(node, dict | list):
                 continue
             is_of_pairs = _SPEAKS_OF_PAIRS.search(words_) is not None
-            own_m = UNITS_M.get(without_unit(words_)[1], unit_m)
+            inner_m = _unit_below(node, above_m)
+            own_m = UNITS_M.get(without_unit(words_)[1], inner_m)
             if is_of_pairs and isinstance(node, dict) and _are_columns(node):
-                rows = zip(*node.values(), strict=True)
-                node = [dict(zip(node, row, strict=True)) for row in rows]
+                node = _rows_of(node)
             cameras = _cameras_of(node) if is_of_pairs else None
             if cameras is not None:
                 length = node if isinstance(node, dict) else node[2]
                 self._add_pair(cameras, length, own_m, place)
-            elif isinstance(node, list) and "adjacent" in words_ and _are_numbers(node):
+            elif self._are_neighbours(node, words_):
                 self._add_neighbours(node, own_m, place)
             elif is_of_pairs or isinstance(node, dict):
                 for key, inner in node.items() if isinstance(node, dict) else enumerate(node):
+                    if is_of_pairs and self._add_row(inner, own_m, place, key):
+                        continue
                     own, at = words(str(key)), child_path(place, key)
-                    pair = _pair_of(own) if isinstance(key, str) else None
-                    if row is not None and own.isdigit():
-                        pair = row, int(own)  # of a table
+                    named = _pair_of(own) if isinstance(key, str) else None
+                    pair = named if row is None or not own.isdigit() else (row, int(own))
                     if is_of_pairs and pair is not None:
                         self._add_pair(pair, inner, own_m, at)
                         continue
                     is_row = own.isdigit() and _is_row(inner, of=node)
                     longer = words_ if isinstance(key, int) or is_row else f"{words_}_{own}"
-                    waiting.append((inner, longer, at, int(own) if is_row else None))
+                    waiting.append((inner, longer, at, int(own) if is_row else None, inner_m))
+
+    def _add_row(self, row: Any, unit_m: float, place: str, key: str | int) -> bool:
+        """Add the baseline of an entry of a list, as nearly all files have, or return False."""
+        cameras = _cameras_of(row) if isinstance(key, int) and isinstance(row, dict) else None
+        if cameras is not None:
+            self._add_pair(cameras, row, unit_m, f"{place}[{key}]")
+        return cameras is not None
+
+    def _are_neighbours(self, value: Any, name: str) -> bool:
+        """Return whether a value lists the baselines of neighbours, which may be all that is."""
+        is_spacing = "spacing" in name and not self._found and not _FIGURES.search(name)
+        return (
+            isinstance(value, list) and ("adjacent" in name or is_spacing) and _are_numbers(value)
+        )
 
     def _add_neighbours(self, lengths: list[Any], unit_m: float, path: str) -> None:
         if len(lengths) != len(ADJACENT_PAIRS):
@@ -663,7 +685,7 @@ class _RigFile(MetadataFile):
         if not isinstance(value, dict):
             self._add(cameras, value, unit_m, path)
             return
-        at, keys = self._baselines_at, _entry_form(tuple(value))[1]
+        at, (_, keys, unit_key) = self._baselines_at, _entry_form(tuple(value))
         if not keys and at is not None and path.startswith((f"{at.place}.", f"{at.place}[")):
             # Where conventions say that baselines stand, the only number beside cameras is one.
             others = [key for key in value if is_number(value[key]) and not _roles(words(key))]
@@ -671,7 +693,7 @@ class _RigFile(MetadataFile):
         if not keys and not any(_NO_LENGTH in problem for problem in self.problems):
             listed = ", ".join(sorted(value))
             self.problems.append(f"{path}: {_NO_LENGTH}; the keys here are: {listed}")
-        named = next((value[key] for key in value if words(key) in ("unit", "units")), None)
+        named = value.get(unit_key)
         if isinstance(named, str):
             unit_m = UNITS_M.get(words(named), math.nan)
             if math.isnan(unit_m):
@@ -693,6 +715,10 @@ class _RigFile(MetadataFile):
         if is_number(found.value) and found.value > 0:
             cm = float(found.value) * (UNITS_M.get(found.unit, unit_m) / 0.01)
             self._found.append(_Length(cameras, cm, found, is_by_place))
+            if math.isnan(cm):
+                self.problems.append(
+                    f"{found.path}: is in a unit of length that is not known: correct it"
+                )
         else:
             told = f"{found.path}: must be a number above zero, found {brief(value)}"
             self.problems.append(told)
@@ -714,8 +740,10 @@ def _roles(name: str) -> frozenset[str]:
     >>> [*_roles("baseline_cm"), *_roles("target_baseline"), *_roles("camera_index_a")]
     ['length', 'figure', 'camera']
     """
-    if re.search(r"baseline|distance|length|count|separation", name):
-        is_length = re.search(r"(?:baseline|distance|separation|length)\Z", without_unit(name)[0])
+    if name in UNITS_M or re.search(r"baseline|distance|length|count|separation|\Avalue\Z", name):
+        is_length = name in UNITS_M or re.search(
+            r"(?:baseline|distance|separation|length|value)\Z", without_unit(name)[0]
+        )
         return frozenset({"length" if is_length and not _FIGURES.search(name) else "figure"})
     found = {"pair"} if re.search(r"pair|key|id|name", name) else set()
     if "pair" not in name and _NAMES_A_CAMERA.search(name):
@@ -726,11 +754,13 @@ def _roles(name: str) -> frozenset[str]:
 @functools.lru_cache(maxsize=256)
 def _entry_form(
     keys: tuple[str, ...],
-) -> tuple[list[tuple[str, frozenset[str]]], list[tuple[str, str]]]:
-    """Return which keys of an entry may name cameras, and its baselines with their units."""
+) -> tuple[list[tuple[str, frozenset[str]]], list[tuple[str, str]], str | None]:
+    """Return which keys may name cameras, the baselines with their units, and the unit's key."""
     roles = {key: _roles(words(key)) for key in keys}
     naming = [(key, each) for key, each in roles.items() if not each & {"length", "figure"}]
-    return naming, [(key, without_unit(words(key))[1]) for key in keys if "length" in roles[key]]
+    lengths = [(key, words(key) if words(key) in UNITS_M else without_unit(words(key))[1])
+               for key in keys if "length" in roles[key]]  # fmt: skip
+    return naming, lengths, next((key for key in keys if words(key) in ("unit", "units")), None)
 
 
 def _cameras_of(entry: dict[str, Any] | list[Any]) -> Pair | None:
@@ -744,12 +774,12 @@ def _cameras_of(entry: dict[str, Any] | list[Any]) -> Pair | None:
     for key, roles in _entry_form(tuple(entry))[0]:
         value = entry[key]
         pair = _pair_of(value) if isinstance(value, str) and "pair" in roles else None
-        if isinstance(value, list) and len(value) == 2:
+        if type(value) is int:
+            by_number += [value] if "camera" in roles and 0 <= value < 100 else []
+        elif isinstance(value, list) and len(value) == 2:
             by_number += [each for each in map(camera_of, value) if each is not None]
         elif pair is not None:
             by_name += pair
-        elif type(value) is int:
-            by_number += [value] if "camera" in roles and 0 <= value < 100 else []
         elif "camera" in roles and not (isinstance(value, str) and len(by_number) == 2):
             camera = _camera(value)
             own = by_name if isinstance(value, str) else by_number
@@ -803,11 +833,23 @@ def _camera(value: object) -> int | None:
     return camera_of(value)
 
 
+def _unit_below(node: Any, above_m: float) -> float:
+    """Return the metres in the unit that an object names, nan if not known, or in that above."""
+    named = node.get("unit", node.get("units")) if isinstance(node, dict) else None
+    if not isinstance(named, str):
+        return above_m
+    return UNITS_M.get(words(named), UNITS_M.get(words(named).partition("_")[0], math.nan))
+
+
 def _are_columns(table: dict[str, Any]) -> bool:
     """Return whether an object has the cameras and the lengths of all pairs as lists."""
-    roles = {role for key in table for role in _roles(words(key))}
     lengths = {len(each) if isinstance(each, list) else -1 for each in table.values()}
-    return len(lengths) == 1 and max(lengths) > 2 and {"camera", "length"} <= roles
+    roles = (role for key in table for role in _roles(words(key)))
+    return len(lengths) == 1 and max(lengths) > 2 and {"camera", "length"} <= {*roles}
+
+
+def _rows_of(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def _are_numbers(values: list[Any]) -> bool:

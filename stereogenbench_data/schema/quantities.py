@@ -326,11 +326,13 @@ def value_at(document: Any, path: str) -> Any:
 
 
 def as_stated(value: Any, unit: str, at: Node | str | tuple[str, str | int]) -> Stated:
-    """Return a value with its unit, which may stand in it: "32.5 mm", or {"value", "unit"}."""
+    """Return a value with its unit, which may be in it: "32 mm", [32, "mm"], {"value", "unit"}."""
     if type(value) is float or type(value) is int:
         return Stated(value, unit, at)
     if isinstance(value, dict) and isinstance(value.get("unit"), str) and "value" in value:
         value, unit = value["value"], words(value["unit"])
+    if isinstance(value, list) and [*map(type, value)] in ([float, str], [int, str]):
+        value, unit = value[0], words(value[1])
     if isinstance(value, list) and len(value) == CAMERA_COUNT and is_number(value[0]):
         value = value[0] if value.count(value[0]) == CAMERA_COUNT else value
     text = _TEXT_NUMBER.match(value) if isinstance(value, str) else None

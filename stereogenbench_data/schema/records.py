@@ -88,7 +88,7 @@ REMARKS: Final = {
     "poses": "fields and rigs that need poses; without them the rig is assumed rectified",
     "world": "poses in the world: several readings fit",
     "principal point": "the intrinsics; the image's centre is assumed",
-    "left": "disparity, and all that needs poses: which camera is left is stated in two ways",
+    "left": "disparity, and all that needs poses: the rig is stated in two ways",
     "primary pair": "nothing: cameras are taken to be numbered from left to right",
     "pair": "nothing: the primary pair of baseline.json counts",
     "sensor": "the focal length in mm: the release's sensor is assumed",

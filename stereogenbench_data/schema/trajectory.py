@@ -17,7 +17,7 @@ import numpy as np
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.schema.document import brief, camera_of, is_number, parse_document
 from stereogenbench_data.schema.parse import named_pair
-from stereogenbench_data.schema.quantities import Values, without_unit, words
+from stereogenbench_data.schema.quantities import NAMES, Values, without_unit, words
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
 _COUNTING: Final = re.compile(r"(.*?)(\d+)\Z")
@@ -27,11 +27,13 @@ _SPEAKS_OF_FORM: Final = re.compile(
 )
 _COMPONENTS: Final = (
     ("pitch", "yaw", "roll"),
+    ("p", "y", "r"),
     ("qx", "qy", "qz", "qw"),
     ("x", "y", "z", "w"),
     ("x", "y", "z"),
     ("tx", "ty", "tz"),
     ("rx", "ry", "rz"),
+    tuple(f"m{row}{column}" for row in range(4) for column in range(4)),
 )
 """Names of components, in the order in which they are kept; the first that are all there win."""
 _TRAILING: Final = ((4, 4), (3, 4), (3, 3), (16,), (12,), (9,), (4,), (3,))
@@ -81,12 +83,15 @@ class RecordedPoses:
         hints: The words of the texts in which a file says how they are to be read.
         unit_m: Metres in the unit that the file names for lengths, None without one.
         primary_pairs: The places where it names the primary pair, and the cameras there.
+        lens: The key of a focal length or a field of view that is not the same everywhere, and its
+            least and greatest number; "" where there is none.
     """
 
     blocks: tuple[Block, ...]
     hints: frozenset[str]
     unit_m: float | None
     primary_pairs: tuple[tuple[str, tuple[int, int]], ...] = ()
+    lens: str = ""
 
 
 def record_poses(text: bytes, *, where: str) -> RecordedPoses:
@@ -126,7 +131,24 @@ def record_poses(text: bytes, *, where: str) -> RecordedPoses:
     head = {key: value for key, value in document.items() if "pair" in words(key)}
     pairs = [(each.path, named_pair(each.value)) for each in Values(head).stated("primary_pair")]
     known = tuple((path, pair) for path, pair in pairs if pair is not None)
-    return RecordedPoses(tuple(blocks), _hints(document), _unit_m(document, where), known)
+    unit_m = _unit_m(document, where)
+    return RecordedPoses(tuple(blocks), _hints(document), unit_m, known, _changing_lens(columns))
+
+
+def _changing_lens(columns: Columns) -> str:
+    for place, (_, values) in columns.items():
+        name = without_unit(place[-1])[0] if place else ""
+        if name in _LENS_KEYS and all(map(is_number, values)):
+            least, most = min(values), max(values)
+            if most - least > _SAME_LENS * most:
+                return f"{'.'.join(place)} is {least:.6g} to {most:.6g}".replace(".*", "[]")
+    return ""
+
+
+_LENS_KEYS: Final = {
+    key for quantity in ("focal", "focal_px", "fov", "fov_y") for key in NAMES[quantity].split()
+}
+_SAME_LENS: Final = 1e-3
 
 
 def _first_of_lists(node: Any) -> Any:
@@ -299,6 +321,7 @@ def _of_components(columns: Columns) -> list[tuple[Place, tuple[str, ...], str, 
             numbers = [part for part in parts if part is not None]
             if len(numbers) == len(names):
                 unit = components[names[0]][0] or own_unit
+                names = _COMPONENTS[0] if names == ("p", "y", "r") else names
                 found.append((place, names, unit, np.stack(numbers, axis=-1)))
     return found
 
@@ -399,6 +422,10 @@ def _numbers_of(
         found = [camera_of(value) if is_camera else _frame_of(value) for value in column[1]]
         if None not in found:
             known[name] = np.array(found, dtype=np.int64).reshape(column[0])
+    listed = columns.get(("camera_order", "*")) if is_camera and not known else None
+    if listed is not None and listed[0] == (CAMERA_COUNT,):
+        order = [camera_of(name) for name in listed[1]]
+        return None if None in order else np.array(order, dtype=np.int64)
     if not known:
         return None
     first, numbers = next(iter(known.items()))

@@ -284,7 +284,25 @@ def test_the_poses_of_another_rig_are_refused():
     rotators, places_cm = TURNED
 
     with pytest.raises(SchemaError, match=r"trajectory\.json: no reading of its poses fits"):
-        understood(written("rotator", rotators, places_cm * 1.01))
+        understood(written("rotator", rotators, places_cm * np.linspace(1, 1.1, 6)[:, None]))
+
+
+@pytest.mark.parametrize("share", [0.5, 1.01])
+def test_distances_in_one_ratio_to_the_baselines_are_stated_in_two_ways(share):
+    rotators, places_cm = TURNED
+
+    with pytest.raises(SidesError, match="in another unit or scaled"):
+        understood(written("rotator", rotators, places_cm * share))
+
+
+def test_a_focal_length_that_changes_over_frames_is_refused():
+    document = json.loads(written("rotator", *TURNED))
+    for number, frame in enumerate(document["frames"]):
+        for camera in frame["cameras"]:
+            camera["focal_length_mm"] = 45 + number
+
+    with pytest.raises(SidesError, match=r"focal_length_mm is 45 to "):
+        understood(json.dumps(document).encode())
 
 
 def test_a_left_camera_that_stands_on_the_right_is_a_contradiction():

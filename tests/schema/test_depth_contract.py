@@ -148,6 +148,7 @@ def test_a_range_gives_unit_and_offset(statements):
         {"comment": "uint16 mm, distance to camera"}, {"comment": "range image, mm"},
         {"comment": "1/z", "scale": "0.001"}, {"DEPTH_TYPE": "distance", "scale": "0.001"},
         {"projection": "distance_to_camera", "scale": "0.001"},
+        {"comment": "depth = 1.0 m + 0.001 m * value", "scale": "0.001"},
     ],
     ids=str,
 )  # fmt: skip
@@ -167,6 +168,7 @@ def test_tags_that_do_not_tell_the_unit_are_refused_by_name(tags):
         {"depth_kind": "spherical", "depth_scale": 0.001},
         {"depth_is_planar": False, "depth_scale": 0.001},
         {"depth_definition": "L2 norm of the point", "depth_scale": 0.001},
+        {"depth": {"scale_m": 0.001, "min_m": 1.0}},
     ],
     ids=json.dumps,
 )

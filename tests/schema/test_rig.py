@@ -202,6 +202,16 @@ def test_without_a_primary_pair_cameras_are_taken_to_ascend_to_the_right(rig_doc
     assert remark.about == "primary pair"
 
 
+def test_baselines_below_a_unit_that_is_not_known_are_refused(rig_document, dumped):
+    pairs = rig_document.pop("pairwise_pairs")
+    rows = [
+        {"a": each["camera_index_a"], "b": each["camera_index_b"], "value": 1} for each in pairs
+    ]
+
+    with pytest.raises(SchemaError, match=r"value: is in a unit of length that is not known"):
+        parse_rig(dumped(rig_document | {"baseline": {"unit": "ell", "pairs": rows}}), where="rig")
+
+
 def test_a_principal_point_is_read(rig_document, dumped):
     rig_document["camera_intrinsics"]["principal_point_px"] = {"x": 300.5, "y": 250}
 
@@ -255,6 +265,7 @@ def test_a_principal_point_at_the_centre_is_none(rig_document, dumped, written):
     [
         {"cx": 300.5}, {"principal_point": "left"}, {"cx": 1e9, "cy": 1}, {"shift_x": 0.05},
         {"principal_point_normalized": [0.53, 0.5]}, {"principal_point_offset_px": [4, 0]},
+        {"principal_point_shift_px": {"x": 5, "y": 0}}, {"cx_norm": 0.55, "cy_norm": 0.5},
     ],
 )  # fmt: skip
 def test_a_principal_point_that_is_not_understood_stops_no_disparity(rig_document, dumped, written):
@@ -413,6 +424,15 @@ def pairs_as(document, write):
         pytest.param(
             lambda pairs: {"adjacent_baselines_cm": [cm for a, b, cm in pairs if b == a + 1]},
             id="neighbours alone"),
+        pytest.param(
+            lambda pairs: {"rig": {"spacings": [cm for a, b, cm in pairs if b == a + 1],
+                                   "unit": "cm"}}, id="spacings alone"),
+        pytest.param(
+            lambda pairs: {"baseline": {"unit": "mm", "pairs": [
+                {"a": a, "b": b, "value": 10 * cm} for a, b, cm in pairs]}}, id="values"),
+        pytest.param(
+            lambda pairs: {"pairwise_baselines": {f"{a}_{b}": {"m": cm / 100}
+                                                  for a, b, cm in pairs}}, id="units as keys"),
         pytest.param(
             lambda pairs: {"camera_offsets_m": [0.0, *(cm / 100 for a, _, cm in pairs if a == 0)]},
             id="places along the rig"),
