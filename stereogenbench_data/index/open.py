@@ -231,7 +231,8 @@ def _open_tree(
     from stereogenbench_data.index.build import walk
     from stereogenbench_data.index.presumed import list_tree
 
-    tree = list_tree(root if is_remote(root) else Path(root), wanted, conventions)
+    with _no_collection():
+        tree = list_tree(root if is_remote(root) else Path(root), wanted, conventions)
     if tree is not None and rows == "presumed" and tree.has_one_shape:
         opened = _open_presumed(tree, "when needed" if tree.is_remote else "read")
         if opened is not None:

@@ -64,6 +64,7 @@ FORMS = {
     "rotator upside": lambda p: {"Rotation": p.rotator("Roll", "Yaw", "Pitch"), "loc": p.place},
     "rotator flat": lambda p: p.at("xyz") | p.rotator("pitch_deg", "yaw_deg", "roll_deg"),
     "rotator list": lambda p: {"position": p.place, "rotation_pyr": p.angles("pitch yaw roll")},
+    "rotator initials": lambda p: {"Loc": p.at("XYZ"), "Rot": p.initials()},
     "roll first": lambda p: {"position": p.place, "rotation_rpy": p.angles("roll pitch yaw")},
     "quaternion": lambda p: {"location": p.at("XYZ"), "rotation": p.quaternion("xyzw")},
     "quaternion wxyz": lambda p: {"t": p.place, "rotation_wxyz": [*p.quaternion("wxyz").values()]},
@@ -71,6 +72,8 @@ FORMS = {
     "3x3": lambda p: {"position": p.place, "rotation": p.turn.tolist()},
     "9": lambda p: {"position": p.place, "rotation_matrix": p.turn.ravel().tolist()},
     "4x4": lambda p: {"camera_to_world": p.matrix.tolist()},
+    "m00": lambda p: {"matrix": {f"m{at // 4}{at % 4}": each
+                                 for at, each in enumerate(p.matrix.ravel().tolist())}},
     "rows": lambda p: {"camera_to_world": p.matrix.T.tolist()},
     "3x4": lambda p: {"c2w": p.matrix[:3].tolist()},
     "inverse": lambda p: {"world_to_camera": np.linalg.inv(p.matrix).tolist()},
@@ -78,7 +81,7 @@ FORMS = {
     "R and t": lambda p: {"world_to_camera": p.inverse_parts()},
     "rvec": lambda p: p.vectors("rvec"),
     "colmap": lambda p: p.vectors("qvec"),
-}
+}  # fmt: skip
 ROTATORS_ONLY = {name for name in FORMS if name.startswith("ro") and name != "rows"}
 
 
@@ -97,6 +100,9 @@ class Written:
 
     def rotator(self, *names):
         return {name: self._angles[name.lower().removesuffix("_deg")] for name in names}
+
+    def initials(self):
+        return {name[0].upper(): angle for name, angle in self._angles.items()}
 
     def angles(self, order):
         return [self._angles[name] for name in order.split()]

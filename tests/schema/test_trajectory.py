@@ -118,6 +118,13 @@ def named(place):
                                   for f in range(3)]},
             id="a plural",
         ),
+        pytest.param(
+            lambda d: {"camera_order": [f"Cam_{c:02d}" for c in reversed(range(6))],
+                       "frames": [{"cameras": [{"loc": p} for k, _, p in poses_of(d)
+                                               if k == f][::-1]}
+                                  for f in range(3)]},
+            id="an order of its own",
+        ),
     ],
 )  # fmt: skip
 def test_locations_are_found_at_any_depth_and_in_any_order(trajectory_document, write):
