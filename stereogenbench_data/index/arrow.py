@@ -68,6 +68,8 @@ def one_array(values: Any) -> Any:
         return values
     if values.num_chunks == 1:
         return values.chunk(0)  # Arrow would copy it
+    if values.num_chunks == 0:
+        return pa.nulls(0, values.type)  # Arrow would import pandas
     values = values.combine_chunks()
     return values.chunk(0) if isinstance(values, pa.ChunkedArray) else values
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from stereogenbench_data.errors import SchemaError, StereoGenBenchError, StorageError
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
+from stereogenbench_data.index.alike_rigs import Parsed, RigReader
 from stereogenbench_data.index.build import (
     ALIKE,
     POOL_FROM,
@@ -62,14 +63,12 @@ from stereogenbench_data.index.tree_cache import TreeCache
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import (
     parse_complete,
-    parse_rig,
     parse_scene_key,
     require_unit,
 )
 from stereogenbench_data.schema.records import (
     Member,
     Remark,
-    Rig,
     Scene,
     SceneId,
     SceneLabels,
@@ -233,7 +232,7 @@ class _Metadata:
 
     id: SceneId
     files: Files
-    parsed: tuple[Rig, SceneLabels, tuple[Remark, ...]] | None
+    parsed: Parsed | None
     marked: SceneLabels
 
 
@@ -301,7 +300,7 @@ def _listed(tree: ListedTree) -> Iterator[tuple[str, _Metadata | StereoGenBenchE
 
 def _metadata(tree: ListedTree) -> Iterator[tuple[str, _Metadata | StereoGenBenchError]]:
     """Yield what the small JSON files of each scene say, or why the scene cannot be used."""
-    shape = None if tree.conventions is None else tree.conventions.shapes[0]
+    rigs = RigReader(None if tree.conventions is None else tree.conventions.shapes[0])
 
     def baseline_text(key: str) -> tuple[Files, bytes] | StereoGenBenchError:
         try:
@@ -324,7 +323,7 @@ def _metadata(tree: ListedTree) -> Iterator[tuple[str, _Metadata | StereoGenBenc
             continue
         try:
             scene_id, where = parse_scene_key(key), f"{key}/{BASELINE_JSON}"
-            rig, labels, odd = parse_rig(read[1], where=where, shape=shape)
+            rig, labels, odd = rigs.read(read[1], where=where)
             parsed = rig, labels, (*odd, *require_unit(rig, family=scene_id.family, where=where))
             marked = SceneLabels()
             is_lacking = labels.character is None or labels.animation is None

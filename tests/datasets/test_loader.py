@@ -1,5 +1,6 @@
 """The loader: the same order whatever ranks and workers, saved and loaded at any batch."""
 
+import gc
 import itertools
 import json
 import os
@@ -526,6 +527,8 @@ def test_a_death_is_named_though_the_thread_that_pins_memory_met_it_first():
     # Where torch notices it depends on what the worker was doing.
     with pytest.raises((RuntimeError, OSError, EOFError)):
         list(batches)
+    del batches, loader  # torch joins the workers, and its handler would raise then
+    gc.collect()
     signal.signal(signal.SIGCHLD, torchs_own)
 
     of_a_worker = ConnectionResetError(

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from stereogenbench_data import IncompleteSceneWarning, OddSceneWarning, StereoPairs
-from stereogenbench_data.errors import StorageError
+from stereogenbench_data.errors import SchemaError, StorageError
+from stereogenbench_data.index.alike_rigs import RigReader
 from stereogenbench_data.index.assumptions import AssumptionWarning
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.index.tree_cache import VARIABLE
+from stereogenbench_data.schema.parse import parse_rig
 from tests.servers.scene_fixtures import documents
 
 KEYS = [f"train/Uniform/Map_{number % 4}/scene_{number:06d}" for number in range(68)] + [
@@ -318,3 +320,60 @@ def test_captions_are_read_where_scenes_are_chosen_by_them(tree):
     pairs = StereoPairs(tree, caption="horse", fields=["left"])
 
     assert pairs.index.column("key")[pairs.plan.scene_rows].tolist() == [ODD]
+
+
+def unchanged(document):
+    return document
+
+
+def in_metres(document):
+    return document | {"unit": "m"}
+
+
+def negative(document):
+    document["camera_intrinsics"]["focal_length_mm"] = -3.5
+    return document
+
+
+def other_camera(document):
+    document["primary_stereo_pair"]["right_camera"] = "Town_scene_90_Cam_03"
+    return document
+
+
+def stated_twice(document):
+    document["pairwise_pairs"].append(document["pairwise_pairs"][0] | {"baseline_cm": 99.5})
+    return document
+
+
+def as_text(document):
+    document["pairwise_pairs"][2]["baseline_cm"] = "many"
+    return document
+
+
+def other_map(document):
+    return document | {"map_name": "Another_Map"}
+
+
+def odd_label(document):
+    return document | {"scene_label": ["a", "list"]}
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [unchanged, in_metres, negative, other_camera, stated_twice, as_text, other_map, odd_label],
+)
+def test_many_alike_files_are_read_as_one_by_one(edit):
+    reader = RigReader()
+    for number in range(40):
+        text = json.dumps(baseline_of(number)).encode()
+        assert reader.read(text, where="w") == parse_rig(text, where="w")
+    text = json.dumps(edit(baseline_of(90))).encode()
+
+    assert outcome(reader.read, text) == outcome(parse_rig, text)
+
+
+def outcome(read, text):
+    try:
+        return read(text, where="w")
+    except SchemaError as error:
+        return str(error)
