@@ -26,7 +26,6 @@ from stereogenbench_data.audit.paper_numbers import (
     TRAIN_MAPS_TABLE,
     map_counts,
 )
-from stereogenbench_data.audit.pictures.figure import figure_class
 from stereogenbench_data.audit.statistics import (
     ADJACENT_COLUMNS,
     FOCAL_EDGES_MM,
@@ -34,6 +33,7 @@ from stereogenbench_data.audit.statistics import (
     Statistics,
     branch_rows,
 )
+from stereogenbench_data.errors import missing_extra
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import SCENE_COUNTS
 from stereogenbench_data.schema.text import markdown_table, markdown_text
@@ -309,10 +309,18 @@ def _histogram(axes: Any, values: Float64[np.ndarray, " n"], *, bins: Any, colou
 
 
 def _figure(panels: int) -> Any:
-    """Return a figure with that many panels; the rest of its grid is blank."""
+    """Return a figure with that many panels; the rest of its grid is blank.
+
+    Raises:
+        ExtraError: If matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise missing_extra("plots", "plots", error) from error
     columns = min(_COLUMNS, panels)
     rows = -(-panels // columns)
-    figure = figure_class()(figsize=(_INCHES[0] * columns, _INCHES[1] * rows), layout="constrained")
+    figure = Figure(figsize=(_INCHES[0] * columns, _INCHES[1] * rows), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.flat[panels:]:
         axes.set_axis_off()
