@@ -184,34 +184,33 @@ class Shape:
         for name, quantity in NUMBERS.items():
             at = self.at.get(name, At())
             if at.place is not None:
-                value = self.value_at(document, at.place, name, where=where)
+                value = value_stated(document, at.place, name, where=where)
                 known[quantity] = as_stated(value, at.unit or "", at.place)
             elif at.value is not None:
                 known[quantity] = Stated(at.value, at.unit or "", f"[{name}] of the conventions")
         return known
 
-    def value_at(
-        self, document: dict[str, Any], path: str | None, table: str, *, where: str
-    ) -> Any:
-        """Return the value at a place that is stated.
-
-        Raises:
-            SchemaError: If it is not in the document.
-        """
-        try:
-            return value_at(document, str(path))
-        except LookupError as error:
-            keys = plain_line(shortened(", ".join(sorted(document)), 400))
-            raise SchemaError(
-                f"{where}: {plain_line(str(path))} is not in the file, and the conventions say "
-                f"that [{table}] stands there; its keys are: {keys}. Correct the place, or state "
-                f"another [[shape]] for such files."
-            ) from error
-
     def ignores(self, path: str) -> bool:
         """Return whether what stands at a JSON path, or the object around it, does not count."""
         listed = {each for at in self.at.values() for each in at.ignored}
         return any(path == each or path.startswith((f"{each}.", f"{each}[")) for each in listed)
+
+
+def value_stated(document: dict[str, Any], path: str | None, table: str, *, where: str) -> Any:
+    """Return the value at a place that conventions state.
+
+    Raises:
+        SchemaError: If it is not in the document.
+    """
+    try:
+        return value_at(document, str(path))
+    except LookupError as error:
+        keys = plain_line(shortened(", ".join(sorted(document)), 400))
+        raise SchemaError(
+            f"{where}: {plain_line(str(path))} is not in the file, and the conventions say that "
+            f"[{table}] stands there; its keys are: {keys}. Correct the place, or state another "
+            f"[[shape]] for such files."
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)

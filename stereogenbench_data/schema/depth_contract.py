@@ -13,6 +13,7 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -67,6 +68,7 @@ _ROLES: Final = {
 """What a number means by a word of its key. A "step" counts only with a unit beside it: it may be
 one of pictures or bits."""
 _RANGES: Final = frozenset({"range", "limits", "bounds"})
+_ENDS: Final[tuple[About, About]] = ("near", "far")
 _NAMED_RANGE: Final = frozenset({"near", "far", "znear", "zfar"})
 _OTHER_MEANING: Final = re.compile(
     r"(?<![a-z])(?:inv(?:erse[d]?)?|disparit\w+|log(?:arithm\w*)?|non-?linear|gamma|sqrt|radial|"
@@ -220,8 +222,8 @@ def stated_in_json(document: dict[str, Any], *, name: str) -> list[Statement]:
         if isinstance(value, list) and value[:1] * CAMERA_COUNT == value:
             value = value[0]
         if isinstance(value, list) and len(value) != 2:
-            is_scale = not _SCALES.isdisjoint(re.split("_|(?<=[a-z])s_", node.name))
-            found += [source.unclear(value)] if is_scale else []
+            if not _SCALES.isdisjoint(node.name.split("_")):
+                found.append(source.make("unclear", (), json.dumps(value)))
         elif not isinstance(value, dict):
             found += source.read(node.name, value)
     return found
@@ -257,8 +259,9 @@ def agreed(statements: Sequence[Statement], *, largest: int) -> StatedDepth:
         if near_m and units and not about["normalised"] and not is_same:
             _refuse(_CONTRADICTION, [*units, ranged])  # ends of a range, or planes that clip
         units = [*units, ranged]
-        if _is_only_of_range(about):
-            names = []
+        # A word for a unit is that of the range's ends, where these have none themselves.
+        is_of_range = any(each.is_bare for each in [*about["near"], *about["far"]])
+        names = [] if is_of_range else names
     found = _of_units(units, names)
     if found.unit_m is None:
         _refuse("says nothing of the nearest and the farthest depth", about["normalised"])
@@ -302,11 +305,6 @@ def _of_units(units: Sequence[Statement], names: Sequence[Statement]) -> StatedD
             return StatedDepth(unit_m, origin="tag" if is_tagged else "metadata")
     _refuse(_CONTRADICTION, everything)
     return StatedDepth()
-
-
-def _is_only_of_range(about: Mapping[About, list[Statement]]) -> bool:
-    """Tell whether a word for a unit is that of the range's ends, which have none themselves."""
-    return any(each.is_bare for each in [*about["near"], *about["far"]])
 
 
 def _of_range(
@@ -367,25 +365,19 @@ class _Source:
     origin: Origin
     path: str = ""
 
-    def unclear(self, value: object) -> Statement:
-        """Return that a value of a scale is not understood."""
-        return self._make("unclear", (), json.dumps(value))
-
     def read(self, name: str, value: object) -> list[Statement]:
         """Return what a value under a key, in snake_case, says."""
         text = value.strip() if isinstance(value, str) else json.dumps(value)
         if value is False and "planar" in name:
-            return [self._make("other meaning", (), text)]
+            return [self.make("other meaning", (), text)]
         if value is None or value is False or text.lower() in ("", "false", "no", "none"):
             is_scale = text == "" and not _SCALES.isdisjoint(name.split("_"))
-            return [self._make("unclear", (), text)] if is_scale else []
-        inner = _object_of(text) if isinstance(value, str) else None
-        if inner is not None:
-            found = []
-            for node in nodes_of(inner):
-                if not isinstance(node.value, dict):
-                    found += self.read(node.name, node.value)
-            return found
+            return [self.make("unclear", (), text)] if is_scale else []
+        if text.startswith("{") and isinstance(value, str):
+            with suppress(ValueError, RecursionError):
+                inner = nodes_of(json.loads(text if '"' in text else text.replace("'", '"')))
+                listed = [each for each in inner if not isinstance(each.value, dict)]
+                return [each for node in listed for each in self.read(node.name, node.value)]
         return list(self._read(name, value, text))
 
     def _read(self, name: str, value: object, text: str) -> Iterator[Statement]:
@@ -396,10 +388,10 @@ class _Source:
         is_kind = not _KINDS.isdisjoint(parts) and isinstance(value, str)
         is_other_kind = is_kind and not _PLANAR.search(text.lower())
         if is_other_kind or _OTHER_MEANING.search(name.replace("_", " ")):
-            yield self._make("other meaning", (), text)
+            yield self.make("other meaning", (), text)
             return
         if _NORMALISED.search(self.path or name):
-            yield self._make("normalised", (), text)
+            yield self.make("normalised", (), text)
         if not where.isdisjoint(_STATISTICS):
             return
         number, rest = _number_of(value)
@@ -409,12 +401,11 @@ class _Source:
             unit_m = UNITS_M[words(rest)] if rest else None
             yield from self._number(parts, number, unit_m=unit_m, where=where, text=text)
         elif number is not None and re.fullmatch("[a-z]+", rest):
-            yield self._make("unclear" if _SCALES.isdisjoint(parts) else "unit", (), text)
-        elif number is not None:
-            sentence = f"{name.replace('_', ' ')} {text.lower()}"
-            yield from self._sentence(sentence, is_about_unit=True)
+            yield self.make("unclear" if _SCALES.isdisjoint(parts) else "unit", (), text)
         elif isinstance(value, str):
-            yield from self._sentence(text.lower(), is_about_unit=not _SCALES.isdisjoint(parts))
+            key = "" if number is None else f"{name.replace('_', ' ')} "
+            is_about_unit = number is not None or not _SCALES.isdisjoint(parts)
+            yield from self._sentence(key + text.lower(), is_about_unit=is_about_unit)
 
     def _number(
         self,
@@ -440,52 +431,45 @@ class _Source:
             yield self._unit(number, role, metre or 1.0, text)
         elif role == "scale" or (role == "step" and metre):
             yield self._unit(number, "metres" if metre else "either", metre or 1.0, text)
-        elif where.isdisjoint(_HARMLESS) and self._is_odd(number):
-            yield self._make("unclear", (), text)
-
-    def _is_odd(self, number: float) -> bool:
-        """Tell whether a number that nobody understands may be a scale.
-
-        Of JSON, only fractions and powers of ten may.
-        """
-        if self.origin == "tag":
-            return True
-        is_power = number >= 10 and math.log10(number).is_integer()
-        return number > 0 and (number % 1 != 0 or is_power)
+        elif where.isdisjoint(_HARMLESS):
+            # What nobody understands may be a scale; of JSON, only fractions and powers of ten.
+            is_power = number >= 10 and math.log10(number).is_integer()
+            if self.origin == "tag" or (number > 0 and (number % 1 != 0 or is_power)):
+                yield self.make("unclear", (), text)
 
     def _range(
         self, numbers: Sequence[str], parts: Sequence[str], text: str
     ) -> Iterator[Statement]:
         ends = sorted(number for each in numbers if (number := _parsed(each)) is not None)
-        if len(ends) != len(("near", "far")):
-            yield self._make("unclear", (), text)
-            return
         unit = _METRES.search(text.lower())
         metre = UNITS_M.get(parts[-1]) if unit is None else UNITS_M[words(unit[0])]
-        yield self._length("near", ends[0], metre, text, parts)
-        yield self._length("far", ends[1], metre, text, parts)
+        if len(ends) != len(_ENDS):
+            yield self.make("unclear", (), text)
+        else:
+            for about, number in zip(_ENDS, ends, strict=True):
+                yield self._length(about, number, metre, text, parts)
 
     def _sentence(self, text: str, *, is_about_unit: bool) -> Iterator[Statement]:
         """Return what a text says of the unit, the range and the meaning of depth."""
         plain = text.replace("\u00d7", "*").replace("\u00f7", "/").replace("_", " ").strip()
         plain = re.sub(r" x (?=[\d.])|(?<=\d) x ", " * ", plain)
         if _METRES.fullmatch(plain):
-            yield self._make("length unit", (UNITS_M[words(plain)],), text)
+            yield self.make("length unit", (UNITS_M[words(plain)],), text)
             return
         formula = "=" in plain or "*" in plain
         if _OTHER_MEANING.search(plain) or (
             formula and _SUM.search(_RANGE_FORMULA.sub(" ", plain))
         ):
-            yield self._make("other meaning", (), text)
+            yield self.make("other meaning", (), text)
             return
         if _NORMALISED.search(plain) or _RANGE_FORMULA.search(plain):
-            yield self._make("normalised", (), text)
+            yield self.make("normalised", (), text)
         for clause in _CLAUSES.split(_RANGE_FORMULA.sub(" ", plain)):
             is_of_depth = _DEPTH_WORDS.search(plain) and not _EVERYDAY.search(clause)
             found = list(self._clause(clause, text, has_units=is_about_unit or bool(is_of_depth)))
             is_number = re.search(r"\d", _TYPES.sub(" ", clause)) and _SCALE_WORDS.search(clause)
             if not found and (is_about_unit or (is_number and not _EVERYDAY.search(clause))):
-                found.append(self._make("unclear", (), text))
+                found.append(self.make("unclear", (), text))
             yield from found
 
     def _clause(self, clause: str, text: str, *, has_units: bool) -> Iterator[Statement]:
@@ -499,7 +483,7 @@ class _Source:
             rest = pattern.sub(" ", rest)
         for match in _METRES.finditer(rest) if has_units else ():
             if not re.search(r"[\d.] ?$", rest[: match.start()]):
-                yield self._make("length unit", (UNITS_M[words(match[0])],), text)
+                yield self.make("length unit", (UNITS_M[words(match[0])],), text)
 
     def _expression(self, match: re.Match[str], text: str) -> Iterator[Statement]:
         """Return what an equation says, such as "stored = metres * 1000", or half of one."""
@@ -512,9 +496,9 @@ class _Source:
                  for each in (_METRES.search(left), _METRES.search(right))]  # fmt: skip
         is_depth = [bool(_DEPTH_VARIABLE.search(each)) for each in (left, right)]
         if match["more"]:
-            yield self._make("other meaning", (), text)
+            yield self.make("other meaning", (), text)
         elif not (math.isfinite(factor) and factor > 0):
-            yield self._make("unclear", (), text)
+            yield self.make("unclear", (), text)
         elif units[0] is not None and units[1] is None:
             yield self._unit(factor, "metres", units[0], text)
         elif units[1] is not None and units[0] is None:
@@ -524,26 +508,18 @@ class _Source:
         elif not left and (is_depth[1] or _DEPTH_WORDS.search(right)):
             yield self._unit(factor, "either", 1.0, text)
         elif left or is_depth[1]:
-            yield self._make("unclear", (), text)
+            yield self.make("unclear", (), text)
 
     def _phrase(self, kind: str, match: re.Match[str], text: str) -> Iterator[Statement]:
-        unit = match["unit"]
-        metre = None if unit is None else UNITS_M[words(unit)]
-        if kind == "range":
-            for about in ("near", "far"):
-                number = _parsed(match[about])
-                if number is not None:
-                    yield self._length("near" if about == "near" else "far", number, metre, text,
-                                       [])  # fmt: skip
-            return
-        number = _parsed(match["number"])
-        if number is None:
-            return
-        if kind in ("near", "far"):
-            yield self._length("near" if kind == "near" else "far", number, metre, text, [kind])
-        elif kind == "scale":
-            yield self._unit(number, "metres" if metre else "either", metre or 1.0, text)
-        else:
+        metre = None if match["unit"] is None else UNITS_M[words(match["unit"])]
+        parts = [] if kind == "range" else [kind]
+        for about in _ENDS:
+            number = _parsed(match[about] if kind == "range" else match["number"])
+            if number is not None and kind in ("range", about):
+                yield self._length(about, number, metre, text, parts)
+        if kind not in ("range", *_ENDS) and (number := _parsed(match["number"])) is not None:
+            if kind == "scale":
+                kind = "metres" if metre else "either"
             yield self._unit(number, kind, metre or 1.0, text)
 
     def _unit(self, number: float, kind: str, metre: float, text: str) -> Statement:
@@ -551,51 +527,39 @@ class _Source:
         if number > 0:
             if kind != "inverse":
                 readings.append(number * metre)
-            if kind == "inverse" or (kind == "either" and _may_be_divisor(number)):
+            # Stored units a metre are a round number, such as 1000 or 256.
+            is_round = float(f"{number:.1e}") == number or math.log2(number).is_integer()
+            may_divide = number > 1 and number.is_integer() and is_round
+            if kind == "inverse" or (kind == "either" and may_divide):
                 readings.append(metre / number)
         possible = (each for each in readings if LEAST_UNIT_M <= each <= LARGEST_UNIT_M)
         values = tuple(dict.fromkeys(possible))
-        return self._make("unit", values, text, is_bare=kind == "either", number=number)
+        return self.make("unit", values, text, is_bare=kind == "either", number=number)
 
     def _length(
         self, about: About, number: float, metre: float | None, text: str, parts: Sequence[str]
     ) -> Statement:
         is_weak = about != "offset" and _NAMED_RANGE.isdisjoint(parts)
-        return self._make(
+        return self.make(
             about, (number * (metre or 1.0),), text,
             is_bare=metre is None, is_weak=is_weak, number=number,
         )  # fmt: skip
 
-    def _make(
+    def make(
         self, about: About, values: tuple[float, ...], text: str, *, number: float = 0.0,
         **facts: bool,
     ) -> Statement:  # fmt: skip
+        """Return a statement; the digits of its number tell how it is rounded."""
         digits = len(f"{number:.12g}".replace(".", "").lstrip("0").partition("e")[0].rstrip("0"))
         rounding = 0.5 * 10.0 ** (1 - digits) if number else 0.0
         shown = shortened(repr(text))
         return Statement(about, values, self.place, shown, self.origin, rounding=rounding, **facts)
 
 
-def _may_be_divisor(number: float) -> bool:
-    """Return whether a number may be stored units a metre: a round one, such as 1000 or 256."""
-    is_round = float(f"{number:.1e}") == number or math.log2(number).is_integer()
-    return number > 1 and number.is_integer() and is_round
-
-
 _TECHNICAL: Final = frozenset(
     {"encoder", "duration", "creation", "handler", "vendor", "language", "brand", "brands",
      "statistics", "bps", "timecode", "software", "mimetype"}
 )  # fmt: skip
-
-
-def _object_of(text: str) -> dict[str, Any] | None:
-    if not text.startswith("{"):
-        return None
-    try:
-        found = json.loads(text if '"' in text else text.replace("'", '"'))
-    except (ValueError, RecursionError):
-        return None
-    return found if isinstance(found, dict) else None
 
 
 def _ratio(plain: str) -> tuple[str, float] | None:

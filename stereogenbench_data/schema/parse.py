@@ -7,14 +7,22 @@ What only some fields need, or none (principal point, labels, captions), becomes
 
 import functools
 import itertools
+import json
 import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.conventions import NUMBERS, At, Shape, keys_of, place_of
+from stereogenbench_data.schema.conventions import (
+    NUMBERS,
+    At,
+    Shape,
+    keys_of,
+    place_of,
+    value_stated,
+)
 from stereogenbench_data.schema.document import (
     MOST_LETTERS,
     brief,
@@ -25,6 +33,7 @@ from stereogenbench_data.schema.document import (
 )
 from stereogenbench_data.schema.quantities import (
     NAMES,
+    SPEAKS_OF_PAIRS,
     UNITS_M,
     Stated,
     Values,
@@ -65,7 +74,6 @@ _NAMES_A_CAMERA: Final = re.compile(
 _FLOAT32: Final = 1e-6
 
 Pair = tuple[int, int]
-_SPEAKS_OF_PAIRS: Final = re.compile(r"pair|baseline")
 _NO_LENGTH: Final = "baseline_cm is missing"
 
 
@@ -88,17 +96,13 @@ def parse_scene_key(key: str) -> SceneId:
     'seen_map'
     """
     folders, shown = key.split("/"), shortened(key, _KEY_SHOWN)
-    if "." in key:
-        raise SchemaError(
-            f"scene {shown!r}: a folder name contains a dot, which would end the scene's key "
-            f"in a tar shard. Rename the folder."
-        )
-    bad = next((folder for folder in folders if not _FOLDER.match(folder)), None)
-    if bad is not None:
-        raise SchemaError(
-            f"scene {shown!r}: {shortened(bad)!r} is not a valid folder name: use printable ASCII "
-            f"without a backslash, and without a space at either end. Rename the folder."
-        )
+    for folder in folders:
+        if not _FOLDER.match(folder):
+            raise SchemaError(
+                f"scene {shown!r}: {shortened(folder)!r} is not a valid folder name: use printable "
+                f"ASCII without a dot, which would end the scene's key in a tar shard, without a "
+                f"backslash, and without a space at either end. Rename the folder."
+            )
     if folders[0] == "train" and len(folders) == 4:
         return SceneId(key, "train", None, folders[1], folders[2])
     if folders[0] == "eval" and len(folders) == 5:
@@ -122,9 +126,6 @@ class MetadataFile:
         remarks: What only concerns some fields, or none.
     """
 
-    CLOSED: ClassVar[re.Pattern[str] | None] = None
-    """What the keys of lists have that are not searched for quantities."""
-
     def __init__(self, text: bytes, *, where: str, shape: Shape | None = None) -> None:
         """Parse a file.
 
@@ -135,8 +136,7 @@ class MetadataFile:
         self.document = parse_object(text, where=where)
         self.shape = shape
         known = {} if shape is None else shape.known(self.document, where=where)
-        ignores = None if shape is None else shape.ignores
-        self.values = Values(self.document, known=known, ignores=ignores, closed=self.CLOSED)
+        self.values = Values(self.document, known=known, ignores=shape.ignores if shape else None)
         self.problems: list[str] = []
         self.remarks: list[Remark] = []
 
@@ -310,13 +310,6 @@ class _Length:
 class _RigFile(MetadataFile):
     """A ``baseline.json``, of which each quantity is looked for."""
 
-    CLOSED = _SPEAKS_OF_PAIRS
-
-    def __init__(self, text: bytes, *, where: str, shape: Shape | None = None) -> None:
-        """Parse a file."""
-        super().__init__(text, where=where, shape=shape)
-        self._found: list[_Length] = []
-
     def rig(self, size_px: Pair | None = None) -> Rig:
         """Return the rig; what it lacks is a problem."""
         baselines_cm = self._baselines_cm()
@@ -336,9 +329,8 @@ class _RigFile(MetadataFile):
                if _LENS_MODELS.search(node.name) and _is_lens_model(node.value)]  # fmt: skip
         if odd:
             self.remark("lens", f"{', '.join(odd[:3])}: a pinhole lens is assumed all the same")
-        for each in self.values.numbers("focal_y_px"):
-            if each.value > 0:
-                sensor_height_mm = sensor_height_mm or focal_mm * height_px / each.value
+        for each in self.values.positive("focal_y_px"):
+            sensor_height_mm = sensor_height_mm or focal_mm * height_px / each.value
         return Rig(
             focal_mm=focal_mm,
             sensor_width_mm=sensor_width_mm,
@@ -365,30 +357,29 @@ class _RigFile(MetadataFile):
         return shortened(", ".join(plain) or "none", 400)
 
     def _conflict(self, what: str, first: Stated, other: Stated) -> None:
+        again, known = (f"{brief(each.value)} {each.unit}".rstrip() for each in (other, first))
         self.problems.append(
-            f"{other.path}: states another {what} ({brief(other.value)} {other.unit}) than "
-            f"{first.path} ({brief(first.value)} {first.unit}). {self._cure}"
+            f"{other.path}: states another {what} ({again}) than {first.path} ({known}). "
+            f"{self._cure}"
         )
 
     def _side(self, quantity: str) -> int | None:
         """Return a side of the recorded image in pixels, None where it has none."""
-        values = (float(each.value) for each in self.values.numbers(quantity))
-        return next((int(each) for each in values if each > 0 and each.is_integer()), None)
+        values = (float(each.value) for each in self.values.positive(quantity))
+        return next((int(each) for each in values if each.is_integer()), None)
 
     def _length_mm(self, quantity: str) -> float:
         """Return a length of the camera in mm, the unit of cameras; 0 where there is none."""
         found: Stated | None = None
         length_mm, odd = 0.0, ""
         for each in self.values.stated(quantity):
-            if each.unit and each.unit not in UNITS_M:
+            scale_mm = UNITS_M.get(each.unit or "mm", math.nan) * 1000
+            if math.isnan(scale_mm) or isinstance(each.value, dict | list):
                 continue
-            scale_mm = UNITS_M.get(each.unit, 1e-3) * 1000
-            if not is_number(each.value) or each.value <= 0:
-                if not isinstance(each.value, dict | list):
-                    odd = f"{each.path}: must be a number above zero, found {brief(each.value)}"
-                continue
-            again_mm = each.value * scale_mm
-            if not each.unit and not _LEAST_MM <= again_mm <= _MOST_MM:
+            again_mm = each.value * scale_mm if is_number(each.value) else 0.0
+            if again_mm <= 0:
+                odd = f"{each.path}: must be a number above zero, found {brief(each.value)}"
+            elif not each.unit and not _LEAST_MM <= again_mm <= _MOST_MM:
                 shown = brief(each.value)
                 odd = f"{each.path}: {shown} is no length in mm of a camera: name its unit"
             elif found is None:
@@ -428,11 +419,10 @@ class _RigFile(MetadataFile):
                 self.problems.append(missing)
         low, high = _LENSES if self.shape is None else _FOCAL_LENGTHS
         if focal_mm and sensor_mm and not low <= focal_mm / sensor_mm <= high:
-            angle = math.degrees(2 * math.atan(0.5 * sensor_mm / focal_mm))
             self.problems.append(
-                f"a focal length of {focal_mm:.6g} mm on a sensor {sensor_mm:.6g} mm wide, "
-                f"{focal_mm / sensor_mm:.3g} widths, would see {angle:.3g} degrees, and lenses "
-                f"have {low:g} to {high:g} widths. Correct its unit or its place"
+                f"a focal length of {focal_mm:.6g} mm on a sensor {sensor_mm:.6g} mm wide is "
+                f"{focal_mm / sensor_mm:.3g} widths of the sensor, and lenses have {low:g} to "
+                f"{high:g}. Correct its unit or its place"
             )
         return focal_mm or 1.0, sensor_mm or 1.0
 
@@ -447,9 +437,8 @@ class _RigFile(MetadataFile):
                 angle = each.value if is_rad else math.radians(each.value)
                 if 0 < angle < math.pi:
                     yield each, 0.5 / math.tan(angle / 2) / scale
-        for each in self.values.numbers("focal_px") if width_px else ():
-            is_px = each.unit.startswith("p") or each.path.lower().endswith("x")
-            if is_px and each.value > 0:
+        for each in self.values.positive("focal_px") if width_px else ():
+            if each.unit.startswith("p") or each.path.lower().endswith("x"):
                 yield each, each.value / (width_px or 1)
 
     def _principal_point(self, *size_px: int) -> tuple[float, float] | None:
@@ -493,29 +482,22 @@ class _RigFile(MetadataFile):
     def _primary_pair(self) -> Pair:
         pairs: list[tuple[Stated, Pair]] = []
         odd: list[str] = []
+        stated = self.values.stated("primary_pair")
         at = None if self.shape is None else self.shape.at.get("primary_pair")
-        stated = [*self.values.stated("primary_pair")]
-        if self.shape is not None and at is not None:
-            paths = at.left, at.right
-            ends = [self.shape.value_at(self.document, path, "primary_pair", where=self.where)
-                    for path in paths]  # fmt: skip
-            stated.insert(0, Stated(ends, "", " and ".join(map(str, paths))))
+        if at is not None:
+            ends = [value_stated(self.document, path, "primary_pair", where=self.where)
+                    for path in (at.left, at.right)]  # fmt: skip
+            stated = [Stated(ends, "", f"{at.left} and {at.right}"), *stated]
         first_number = _first_number(self.lengths)
         for each in stated:
-            named = named_pair(each.value)
-            if named is None:
-                odd.append(
-                    f"{each.path}: must be {{left_camera, right_camera}} or a list of two cameras, "
-                    f"found {brief(each.value)}"
-                )
-                continue
-            is_named = isinstance(each.value, dict) and first_number and self._names_camera_0
-            first = 0 if is_named else first_number
-            left, right = named[0] - first, named[1] - first
+            left, right = named_pair(each.value) or (0, 0)
+            if first_number and not (isinstance(each.value, dict) and self._names_camera_0):
+                left, right = left - 1, right - 1
             if left == right or not {left, right} <= set(range(CAMERA_COUNT)):
+                shown = shortened(json.dumps(each.value), 100)
                 odd.append(
-                    f"{each.path}: names cameras {left} and {right}, and a pair is two of the "
-                    f"cameras 0 to {CAMERA_COUNT - 1}"
+                    f"{each.path}: must be {{left_camera, right_camera}} or a list of two of the "
+                    f"cameras 0 to {CAMERA_COUNT - 1}, found {shown}"
                 )
                 continue
             if pairs and pairs[0][1] != (left, right):
@@ -533,10 +515,6 @@ class _RigFile(MetadataFile):
         return 0, 1
 
     @property
-    def _baselines_at(self) -> At | None:
-        return None if self.shape is None else self.shape.at.get("baselines")
-
-    @property
     def _names_camera_0(self) -> bool:
         """Whether a text names camera 0: names may count from 0 beside numbers from 1."""
         names = re.findall(rb'(?i)"([^"]*cam[^"]*)"', self.content)
@@ -550,17 +528,14 @@ class _RigFile(MetadataFile):
         first_number = _first_number(self.lengths)
         best: dict[Pair, _Length] = {}
         for each in self.lengths:
-            a, b = each.cameras
             first = 0 if each.is_by_place else first_number
-            pair = min(a, b) - first, max(a, b) - first
-            known = best.get(pair)
+            pair = min(each.cameras) - first, max(each.cameras) - first
+            known = best.setdefault(pair, each)
             if pair not in CAMERA_PAIRS:
                 self.problems.append(
-                    f"{each.stated.path}: is of cameras {a} and {b}, and the rig has cameras 0 to "
-                    f"{CAMERA_COUNT - 1}"
+                    f"{each.stated.path}: is of cameras {each.cameras[0]} and {each.cameras[1]}, "
+                    f"and the rig has cameras 0 to {CAMERA_COUNT - 1}"
                 )
-            elif known is None:
-                best[pair] = each
             elif abs(each.cm - known.cm) <= _FLOAT32 * known.cm:
                 continue
             elif abs(each.cm - known.cm) > each.rounding_cm + known.rounding_cm:
@@ -571,28 +546,29 @@ class _RigFile(MetadataFile):
                 )
             elif each.rounding_cm < known.rounding_cm:
                 best[pair] = each
-        missing = [f"{a}-{b}" for a, b in CAMERA_PAIRS if (a, b) not in best]
-        lengths_cm = {pair: each.cm for pair, each in best.items()}
-        if missing:
-            lengths_cm = _completed(best) | lengths_cm
-        if len(lengths_cm) < len(CAMERA_PAIRS):
+        best = {pair: each for pair, each in best.items() if pair in CAMERA_PAIRS}
+        listed = ", ".join(f"{a}-{b}" for a, b in CAMERA_PAIRS if (a, b) not in best)
+        added_cm = _completed(best) if listed else {}
+        if listed and not added_cm:
             self.problems.append(
                 f"$.pairwise_pairs must have the baseline of each of the {len(CAMERA_PAIRS)} "
-                f"camera pairs, and lacks {', '.join(missing)}; the keys are: {self._keys}"
+                f"camera pairs, and lacks {listed}; the keys are: {self._keys}"
             )
-        elif missing:
-            listed = ", ".join(missing)
+        elif listed:
             told = f"the baselines of {listed} are not recorded and were added up from the others"
             self.remark("baselines", told)
-        return lengths_cm
+        return added_cm | {pair: each.cm for pair, each in best.items()}
 
     @functools.cached_property
     def lengths(self) -> list[_Length]:
         """The baselines of pairs that the file records, those of the paper's key first."""
-        shape, at, unit_m = self.shape, self._baselines_at, self.values.length_unit_m or 0.01
-        if shape is not None and at is not None and at.place is not None:
+        self._found: list[_Length] = []
+        unit_m = self.values.length_unit_m or 0.01
+        at = None if self.shape is None else self.shape.at.get("baselines")
+        self._baselines_at = None if at is None else at.place
+        if at is not None and at.place is not None:
             unit_m = UNITS_M.get(at.unit or "", unit_m)
-            value = shape.value_at(self.document, at.place, "baselines", where=self.where)
+            value = value_stated(self.document, at.place, "baselines", where=self.where)
             name = f"baselines_{words(at.place.rpartition('.')[2])}"
             self._look_below(value, name, at.place, unit_m)
             quotients = [each.cm / each.stated.value for each in self._found]
@@ -606,8 +582,7 @@ class _RigFile(MetadataFile):
             self._look_below(self.document[key], words(key), child_path("$", key), unit_m)
         for node in () if self._found else self.values.nodes:
             places = node.value  # of the cameras along the rig
-            is_listed = isinstance(places, list) and len(places) == CAMERA_COUNT
-            if _PLACES.search(node.plain) and is_listed and all(map(is_number, places)):
+            if _PLACES.search(node.plain) and _are_numbers(places, CAMERA_COUNT):
                 own_m = UNITS_M.get(node.unit, unit_m)
                 for a, b in CAMERA_PAIRS:
                     length = abs(places[b] - places[a])
@@ -631,21 +606,21 @@ class _RigFile(MetadataFile):
         for node, words_, place, row, above_m in waiting:
             if "primary" in words_ or not isinstance(node, dict | list):
                 continue
-            is_of_pairs = _SPEAKS_OF_PAIRS.search(words_) is not None
+            is_of_pairs = SPEAKS_OF_PAIRS.search(words_) is not None
             inner_m = _unit_below(node, above_m)
             own_m = UNITS_M.get(without_unit(words_)[1], inner_m)
             if is_of_pairs and isinstance(node, dict) and _are_columns(node):
-                node = _rows_of(node)
+                rows = zip(*node.values(), strict=True)
+                node = [dict(zip(node, row, strict=True)) for row in rows]
             cameras = _cameras_of(node) if is_of_pairs else None
             if cameras is not None:
                 length = node if isinstance(node, dict) else node[2]
                 self._add_pair(cameras, length, own_m, place)
             elif self._are_neighbours(node, words_):
-                self._add_neighbours(node, own_m, place)
+                for number, (ends, each) in enumerate(zip(ADJACENT_PAIRS, node, strict=True)):
+                    self._add(ends, each, own_m, (place, number), is_by_place=True)
             elif is_of_pairs or isinstance(node, dict):
                 for key, inner in node.items() if isinstance(node, dict) else enumerate(node):
-                    if is_of_pairs and self._add_row(inner, own_m, place, key):
-                        continue
                     own, at = words(str(key)), child_path(place, key)
                     named = _pair_of(own) if isinstance(key, str) else None
                     pair = named if row is None or not own.isdigit() else (row, int(own))
@@ -656,27 +631,10 @@ class _RigFile(MetadataFile):
                     longer = words_ if isinstance(key, int) or is_row else f"{words_}_{own}"
                     waiting.append((inner, longer, at, int(own) if is_row else None, inner_m))
 
-    def _add_row(self, row: Any, unit_m: float, place: str, key: str | int) -> bool:
-        """Add the baseline of an entry of a list, as nearly all files have, or return False."""
-        cameras = _cameras_of(row) if isinstance(key, int) and isinstance(row, dict) else None
-        if cameras is not None:
-            self._add_pair(cameras, row, unit_m, f"{place}[{key}]")
-        return cameras is not None
-
     def _are_neighbours(self, value: Any, name: str) -> bool:
         """Return whether a value lists the baselines of neighbours, which may be all that is."""
         is_spacing = "spacing" in name and not self._found and not _FIGURES.search(name)
-        return (
-            isinstance(value, list) and ("adjacent" in name or is_spacing) and _are_numbers(value)
-        )
-
-    def _add_neighbours(self, lengths: list[Any], unit_m: float, path: str) -> None:
-        if len(lengths) != len(ADJACENT_PAIRS):
-            told = f"must be a list of {len(ADJACENT_PAIRS)} baselines, found {brief(lengths)}"
-            self.problems.append(f"{path}: {told}")
-            return
-        for number, (pair, each) in enumerate(zip(ADJACENT_PAIRS, lengths, strict=True)):
-            self._add(pair, each, unit_m, (path, number), is_by_place=True)
+        return ("adjacent" in name or is_spacing) and _are_numbers(value, len(ADJACENT_PAIRS))
 
     def _add_pair(self, cameras: Pair, value: Any, unit_m: float, path: str) -> None:
         """Add the baseline that a value is, or those of an entry, in one unit or in several."""
@@ -686,20 +644,15 @@ class _RigFile(MetadataFile):
             self._add(cameras, value, unit_m, path)
             return
         at, (_, keys, unit_key) = self._baselines_at, _entry_form(tuple(value))
-        if not keys and at is not None and path.startswith((f"{at.place}.", f"{at.place}[")):
+        if not keys and at is not None and path.startswith((f"{at}.", f"{at}[")):
             # Where conventions say that baselines stand, the only number beside cameras is one.
             others = [key for key in value if is_number(value[key]) and not _roles(words(key))]
             keys = [(key, "") for key in others] if len(others) == 1 else []
         if not keys and not any(_NO_LENGTH in problem for problem in self.problems):
             listed = ", ".join(sorted(value))
             self.problems.append(f"{path}: {_NO_LENGTH}; the keys here are: {listed}")
-        named = value.get(unit_key)
-        if isinstance(named, str):
-            unit_m = UNITS_M.get(words(named), math.nan)
-            if math.isnan(unit_m):
-                self.problems.append(
-                    f"{path}: {brief(named)} is not a unit of length that is known"
-                )
+        if isinstance(value.get(unit_key), str):
+            unit_m = UNITS_M.get(words(value[unit_key]), math.nan)
         for key, unit in keys:
             is_inner = isinstance(value[key], dict) and "value" not in value[key]
             if not is_inner and not isinstance(value[key], list) and unit in ("", *UNITS_M):
@@ -725,8 +678,6 @@ class _RigFile(MetadataFile):
 
 
 _PLACES: Final = re.compile(r"offset|lateral|along|(?:camera|rig)_(?:position|place)")
-
-
 _FIGURES: Final = re.compile(
     r"target|request|nominal|desired|min|max|mean|std|range|count|error|focal|times"
 )
@@ -848,12 +799,8 @@ def _are_columns(table: dict[str, Any]) -> bool:
     return len(lengths) == 1 and max(lengths) > 2 and {"camera", "length"} <= {*roles}
 
 
-def _rows_of(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
-    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-
-
-def _are_numbers(values: list[Any]) -> bool:
-    return bool(values) and all(map(is_number, values))
+def _are_numbers(value: Any, count: int) -> bool:
+    return isinstance(value, list) and len(value) == count and all(map(is_number, value))
 
 
 def _is_row(value: Any, *, of: dict[str, Any] | list[Any]) -> bool:
@@ -916,26 +863,25 @@ def see_rig(text: bytes, *, where: str) -> Seen:
     at: dict[str, At] = {}
     found: dict[str, list[str]] = {}
     for name, quantity in NUMBERS.items():
-        usable = [each for each in file.values.numbers(quantity) if _is_usable(name, each)]
+        usable = [each for each in file.values.positive(quantity) if _is_usable(name, each)]
         if usable:
-            at[name] = At(place=usable[0].path, unit=usable[0].unit or _USUAL_UNITS.get(name))
-            found[name] = [f"{each.path} is {each.value:g} {each.unit}".rstrip() for each in usable]
-            found[name][0] = (
-                f"{usable[0].path} is {usable[0].value:g} {at[name].unit or ''}".rstrip()
-            )
+            unit = usable[0].unit or _USUAL_UNITS.get(name)
+            at[name] = At(place=usable[0].path, unit=unit)
+            units = [unit or "", *(each.unit for each in usable[1:])]
+            found[name] = [f"{each.path} is {each.value:g} {unit}".rstrip()
+                           for each, unit in zip(usable, units, strict=True)]  # fmt: skip
     read = {place_of(each.path) for name in NAMES for each in file.values.stated(name)}
     read |= {place_of(each.stated.path) for each in file.lengths}
     if file.lengths:
         first = file.lengths[0]
         steps = [re.findall(r"\.[^.\[]+|\[[^\]]*\]", each.stated.path) for each in file.lengths]
         same = [each for each in steps if each[:1] == steps[0][:1]]
-        common = [each[0] for each in itertools.takewhile(_are_one, zip(*same, strict=False))]
-        place = "$" + "".join(common if len(common) < len(steps[0]) else common[:-1])
+        by_step = zip(*(each[:-1] for each in same), strict=False)
+        common = itertools.takewhile(lambda each: len({*each}) == 1, by_step)
+        place = "$" + "".join(each[0] for each in common)
         unit_m = first.cm / 100 / first.stated.value
-        unit = next(
-            (name for name in ("mm", "cm", "m") if math.isclose(UNITS_M[name], unit_m)), None
-        )
-        at["baselines"] = At(place=place, unit=unit)
+        known = [name for name in ("mm", "cm", "m") if math.isclose(UNITS_M[name], unit_m)]
+        at["baselines"] = At(place=place, unit=next(iter(known), None))
         found["baselines"] = [
             f"{first.stated.path} is {first.stated.value:g}, {first.cm:g} cm of cameras "
             f"{first.cameras[0]} and {first.cameras[1]}",
@@ -958,10 +904,6 @@ def see_rig(text: bytes, *, where: str) -> Seen:
     return Seen(Shape(at=at), found, unknown)
 
 
-def _are_one(steps: tuple[str, ...]) -> bool:
-    return len({*steps}) == 1
-
-
 _USUAL_UNITS: Final = {
     **dict.fromkeys(("focal_length", "sensor_width", "sensor_height"), "mm"),
     "field_of_view": "deg",
@@ -969,9 +911,7 @@ _USUAL_UNITS: Final = {
 
 
 def _is_usable(name: str, each: Stated) -> bool:
-    """Return whether a number is what a table of conventions may mean."""
+    """Return whether a number above zero is what a table of conventions may mean."""
     if name in ("focal_length", "sensor_width", "sensor_height"):
-        return each.value > 0 and each.unit in ("", *UNITS_M)
-    if name == "focal_length_px":
-        return bool(each.value > 0 and (each.unit.startswith("p") or each.path[-1:] in "xX"))
-    return bool(each.value > 0)
+        return each.unit in ("", *UNITS_M)
+    return name != "focal_length_px" or each.unit.startswith("p") or each.path[-1:] in "xX"

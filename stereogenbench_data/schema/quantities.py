@@ -89,6 +89,8 @@ OTHER_UNITS: Final = frozenset({"px", "pixel", "pixels", "deg", "degree", "degre
 _TEXT_NUMBER: Final = re.compile(r"\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([A-Za-z]*)\s*\Z")
 _DEEPEST: Final = 8
 _LONGEST: Final = 256
+SPEAKS_OF_PAIRS: Final = re.compile(r"pair|baseline")
+"""Keys of the baselines of pairs of cameras."""
 _MOST_NODES: Final = 20_000
 """How many values of a document are searched: a released one has some hundreds."""
 
@@ -179,12 +181,10 @@ def without_unit(name: str) -> tuple[str, str]:
     return name, ""
 
 
-def nodes_of(document: Any, *, closed: re.Pattern[str] | None = None) -> list[Node]:
-    """Return the values below a document, the outermost first; long lists are not searched.
+def nodes_of(document: Any) -> list[Node]:
+    """Return the values below a document, the outermost first.
 
-    Args:
-        document: The document.
-        closed: What the keys of other lists that are not searched have.
+    Lists that are long, or whose keys speak of pairs, are not searched.
     """
     waiting = [Node("", None, document)]
     depths = [0]
@@ -192,9 +192,7 @@ def nodes_of(document: Any, *, closed: re.Pattern[str] | None = None) -> list[No
         value = node.value
         if not isinstance(value, dict | list) or depth > _DEEPEST:
             continue
-        if isinstance(value, list) and (
-            len(value) > _LONGEST or (closed is not None and closed.search(node.name))
-        ):
+        if isinstance(value, list) and (len(value) > _LONGEST or SPEAKS_OF_PAIRS.search(node.name)):
             continue
         above = node.plain or node.parent
         for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
@@ -220,7 +218,6 @@ class Values:
         *,
         known: Mapping[str, Stated] = MappingProxyType({}),
         ignores: Callable[[str], bool] | None = None,
-        closed: re.Pattern[str] | None = None,
     ) -> None:
         """Find them.
 
@@ -229,9 +226,8 @@ class Values:
             known: Values that conventions state. They come first, and know the unit of a key that
                 names none.
             ignores: Whether what stands at a JSON path does not count.
-            closed: As for `nodes_of`.
         """
-        nodes = nodes_of(document, closed=closed)
+        nodes = nodes_of(document)
         self.nodes = [node for node in nodes if not ignores(node.path)] if ignores else nodes
         found: dict[str, list[tuple[int, Stated]]] = {}
         for node in self.nodes:
@@ -258,6 +254,10 @@ class Values:
     def numbers(self, quantity: str) -> list[Stated]:
         """Return the finite numbers that are stated for a quantity."""
         return [each for each in self.stated(quantity) if is_number(each.value)]
+
+    def positive(self, quantity: str) -> list[Stated]:
+        """Return the numbers above zero that are stated for a quantity."""
+        return [each for each in self.numbers(quantity) if each.value > 0]
 
     @property
     def length_unit_m(self) -> float | None:

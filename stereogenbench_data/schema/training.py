@@ -75,16 +75,18 @@ class TrainingDocument:
     @property
     def facts(self) -> TrainingFacts:
         """What the index keeps of it."""
-        pictures = [self.files.get(rgb_name(camera)) for camera in range(CAMERA_COUNT)]
+
+        def of_pictures(name: str) -> tuple[float, ...]:
+            pictures = (self.files.get(rgb_name(camera)) for camera in range(CAMERA_COUNT))
+            return tuple(getattr(each, name, math.nan) for each in pictures)
+
         return TrainingFacts(
             source_digest=self.source_digest,
             quality=self.quality,
             codec=str(self.pictures["codec"]),
             settings=json.dumps(self.pictures, sort_keys=True),
-            psnr_db=tuple(math.nan if each is None else each.psnr_db for each in pictures),
-            worst_psnr_db=tuple(
-                math.nan if each is None else each.worst_psnr_db for each in pictures
-            ),
+            psnr_db=of_pictures("psnr_db"),
+            worst_psnr_db=of_pictures("worst_psnr_db"),
         )
 
     def text(self) -> bytes:
@@ -93,27 +95,18 @@ class TrainingDocument:
         for name, file in sorted(self.files.items()):
             files[name] = {"bytes": file.size, "crc32": f"{file.crc32:08x}"}
             if file.worst_frame >= 0:
-                files[name] |= {
-                    "psnr_db": file.psnr_db,
-                    "worst_psnr_db": file.worst_psnr_db,
-                    "worst_frame": file.worst_frame,
-                }
+                measured = ("psnr_db", "worst_psnr_db", "worst_frame")
+                files[name] |= {each: getattr(file, each) for each in measured}
+        size = {"quality": self.quality, "key_frames": list(self.key_frames)}
         document = {
             "format": _FORMAT,
-            "source": {
-                "key": self.key,
-                "index_digest": self.source_digest,
-                **_size(self.source_size_px),
-            },
-            "derived": {
-                **_size(self.size_px),
-                "quality": self.quality,
-                "key_frames": list(self.key_frames),
-            },
+            "source": {"key": self.key, "index_digest": self.source_digest,
+                       **_size(self.source_size_px)},
+            "derived": {**_size(self.size_px), **size},
             "pictures": dict(self.pictures),
             "versions": dict(self.versions),
             "files": files,
-        }
+        }  # fmt: skip
         return json.dumps(document, allow_nan=False).encode() + b"\n"
 
 

@@ -114,7 +114,9 @@ def record_poses(text: bytes, *, where: str) -> RecordedPoses:
         raise SchemaError(f"{where}: has over {_MOST_VALUES:,} values. Replace it with the file of "
                           "the release.")  # fmt: skip
     blocks, odd = [], []
-    for name, components, unit, values in _vectors(columns):
+    lists = [_of_list(place, *column) for place, column in columns.items()]
+    vectors = [each for each in lists if each is not None] + _of_components(columns)
+    for name, components, unit, values in vectors:
         try:
             ordered = _ordered(name, values, columns)
         except _Odd as error:
@@ -128,8 +130,8 @@ def record_poses(text: bytes, *, where: str) -> RecordedPoses:
             f"{', '.join(sorted(document)[:20])}"
         )
         raise SchemaError(f"{where}: {reason}.")
-    head = {key: value for key, value in document.items() if "pair" in words(key)}
-    pairs = [(each.path, named_pair(each.value)) for each in Values(head).stated("primary_pair")]
+    head = Values({key: value for key, value in document.items() if "pair" in words(key)})
+    pairs = [(each.path, named_pair(each.value)) for each in head.stated("primary_pair")]
     known = tuple((path, pair) for path, pair in pairs if pair is not None)
     unit_m = _unit_m(document, where)
     return RecordedPoses(tuple(blocks), _hints(document), unit_m, known, _changing_lens(columns))
@@ -210,7 +212,8 @@ def _columns(node: Any, depth: int = 0) -> Columns:
                 found[(*owner, *place)] = column
             numbers = [number for number, _ in counted]
             found[(*owner, "*", "#")] = ((len(numbers),), numbers)
-            node = {key: value for key, value in node.items() if not _is_among(value, counted)}
+            among = {id(value) for _, value in counted}
+            node = {key: value for key, value in node.items() if id(value) not in among}
         for key, value in node.items():
             for place, column in _columns(value, depth + 1).items():
                 found[(words(key), *place)] = column
@@ -218,10 +221,6 @@ def _columns(node: Any, depth: int = 0) -> Columns:
     if isinstance(node, list):
         return _stacked(_by_frame(node), depth)
     return {(): ((), [node])}
-
-
-def _is_among(value: Any, counted: list[tuple[int, Any]]) -> bool:
-    return any(value is each for _, each in counted)
 
 
 def _counted(node: dict[str, Any]) -> dict[str, list[tuple[int, Any]]]:
@@ -273,12 +272,6 @@ def _stacked(nodes: list[Any], depth: int) -> Columns:
             values = [value for other in others for value in other[1]]
             found[("*", *place)] = ((len(nodes), *lengths), values)
     return found
-
-
-def _vectors(columns: Columns) -> list[tuple[Place, tuple[str, ...], str, np.ndarray]]:
-    """Return what may be a location, a rotation or a matrix: place, components, unit and values."""
-    lists = [_of_list(place, *column) for place, column in columns.items()]
-    return [each for each in lists if each is not None] + _of_components(columns)
 
 
 def _of_list(
@@ -336,11 +329,7 @@ def _as_numbers(values: list[Any], lengths: tuple[int, ...]) -> np.ndarray | Non
     return np.array(values, dtype=np.float64).reshape(lengths)
 
 
-def _ordered(
-    place: Place,
-    values: np.ndarray,
-    columns: Columns,
-) -> np.ndarray | None:
+def _ordered(place: Place, values: np.ndarray, columns: Columns) -> np.ndarray | None:
     """Return values as (frames, 6, ...), in the order of the numbers; None where no axis has six.
 
     Raises:
@@ -350,32 +339,27 @@ def _ordered(
     if len(axes) < 2 or CAMERA_COUNT not in values.shape[:2]:
         return None
     owners = [next((key for key in reversed(place[:at]) if key != "*"), "") for at in axes]
-    is_of_cameras = ["cam" in owner or "view" in owner for owner in owners]
-    if values.shape[0] != values.shape[1] or is_of_cameras[0] == is_of_cameras[1]:
-        camera_axis = 0 if values.shape[0] == CAMERA_COUNT and (
-            values.shape[1] != CAMERA_COUNT or is_of_cameras[0]
-        ) else 1  # fmt: skip
-    else:
-        camera_axis = 0 if is_of_cameras[0] else 1
-    before = place[: axes[camera_axis]][-1:]
-    is_of_frames = "frame" in "".join(before) and not is_of_cameras[camera_axis]
+    named = ["cam" in owner or "view" in owner for owner in owners]
+    is_outer = values.shape[0] == CAMERA_COUNT and (values.shape[1] != CAMERA_COUNT or named[0])
+    if values.shape[0] == values.shape[1] and named[0] != named[1]:
+        is_outer = named[0]
+    camera_axis = 0 if is_outer else 1
+    is_of_frames = "frame" in place[: axes[camera_axis]][-1] and not named[camera_axis]
     if values.shape[camera_axis] != CAMERA_COUNT or is_of_frames:
         return None
+    values = np.swapaxes(values, 0, 1) if is_outer else values
     # Cameras first: each frame may list them in an order of its own.
-    for axis in (camera_axis, 1 - camera_axis):
-        is_camera, at = axis == camera_axis, axes[axis]
-        numbers = _numbers_of(place, axes, axis, at, columns, is_camera=is_camera)
-        if numbers is None:
-            continue
-        what = "cameras" if is_camera else "frames"
-        if numbers.ndim == 1:
-            values = np.take(values, _order(numbers, what), axis=axis)
-            continue
-        rows = numbers if axis == 1 else numbers.T
-        taken = values if axis == 1 else np.swapaxes(values, 0, 1)
-        taken = np.stack([taken[row][_order(rows[row], what)] for row in range(len(rows))])
-        values = taken if axis == 1 else np.swapaxes(taken, 0, 1)
-    return np.ascontiguousarray(values if camera_axis == 1 else np.swapaxes(values, 0, 1))
+    for what, axis, at in (("cameras", 1, axes[camera_axis]), ("frames", 0, axes[1 - camera_axis])):
+        numbers = _numbers_of(place[: at + 1], columns, what)
+        if numbers is not None:
+            if numbers.ndim == 1:
+                numbers = np.expand_dims(numbers, 1 - axis)
+            elif is_outer:
+                numbers = numbers.T
+            order = np.apply_along_axis(_order, axis, numbers, what)
+            order = np.expand_dims(order, tuple(range(2, values.ndim)))
+            values = np.take_along_axis(values, order, axis=axis)
+    return np.ascontiguousarray(values)
 
 
 def _order(numbers: np.ndarray, what: str) -> np.ndarray:
@@ -396,43 +380,34 @@ def _order(numbers: np.ndarray, what: str) -> np.ndarray:
     return order
 
 
-def _numbers_of(
-    place: Place,
-    axes: list[int],
-    axis: int,
-    at: int,
-    columns: Columns,
-    *,
-    is_camera: bool,
-) -> np.ndarray | None:
-    """Return the numbers of the elements of an axis, (n,) or (frames, 6); None if they have none.
+def _numbers_of(place: Place, columns: Columns, what: str) -> np.ndarray | None:
+    """Return the numbers of the elements of an axis, (n,) or (outer, inner), None without any.
 
     They are the keys of an object, or stand in the elements under a key that speaks of them.
     """
-    keyed = columns.get((*place[: at + 1], "#"))
+    keyed = columns.get((*place, "#"))
     if keyed is not None:
         lengths, values = keyed
-        numbers = np.array(values).reshape(lengths)
-        return numbers if numbers.ndim == 1 or len(lengths) == 2 else None
+        return np.array(values).reshape(lengths) if len(lengths) <= 2 else None
+    names, number_of = (_CAMERA_KEYS, camera_of) if what == "cameras" else (_FRAME_KEYS, _frame_of)
     known: dict[str, np.ndarray] = {}
-    for name in _CAMERA_KEYS if is_camera else _FRAME_KEYS:
-        column = columns.get((*place[: at + 1], name))
-        if column is None or len(column[0]) > 2:
-            continue
-        found = [camera_of(value) if is_camera else _frame_of(value) for value in column[1]]
-        if None not in found:
-            known[name] = np.array(found, dtype=np.int64).reshape(column[0])
-    listed = columns.get(("camera_order", "*")) if is_camera and not known else None
-    if listed is not None and listed[0] == (CAMERA_COUNT,):
-        order = [camera_of(name) for name in listed[1]]
-        return None if None in order else np.array(order, dtype=np.int64)
+    for name in names:
+        lengths, values = columns.get((*place, name), ((), []))
+        found = list(map(number_of, values))
+        if found and len(lengths) <= 2 and None not in found:
+            known[name] = np.array(found, dtype=np.int64).reshape(lengths)
+    if what == "cameras" and not known:
+        lengths, values = columns.get(("camera_order", "*"), ((), []))
+        order = list(map(camera_of, values))
+        is_order = lengths == (CAMERA_COUNT,) and None not in order
+        return np.array(order, dtype=np.int64) if is_order else None
     if not known:
         return None
     first, numbers = next(iter(known.items()))
     for name, others in known.items():
         is_number_too = {*np.unique(others)} == {*np.unique(numbers)}
         if is_number_too and not np.array_equal(others, numbers):
-            raise _Odd(f"{first} and {name} number {'cameras' if is_camera else 'frames'} apart")
+            raise _Odd(f"{first} and {name} number {what} apart")
     is_same = numbers.ndim == 2 and bool((numbers == numbers[:1]).all())
     return np.asarray(numbers[0]) if is_same else numbers
 

@@ -74,7 +74,7 @@ def test_a_dot_in_a_folders_name_is_listed(tree):
 
     refused = find_scene_folders(tree).refused
 
-    assert "contains a dot" in refused["train/Uniform/Car_Dealer/scene_1.5"]
+    assert "not a valid folder" in refused["train/Uniform/Car_Dealer/scene_1.5"]
 
 
 @pytest.mark.parametrize(

@@ -29,8 +29,8 @@ def test_a_key_tells_split_subset_family_and_map(key, split, subset):
 @pytest.mark.parametrize(
     ("key", "match"),
     [
-        ("train/Uniform/Map/scene_1.5", "contains a dot.*Rename the folder"),
-        ("train/Uniform/../scene_1", "contains a dot"),
+        ("train/Uniform/Map/scene_1.5", "is not a valid folder.*Rename the folder"),
+        ("train/Uniform/../scene_1", "is not a valid folder"),
         ("train/Uniform/Mäp/scene_1", "'Mäp' is not a valid folder"),
         ("train/Uniform//scene_1", "'' is not a valid folder"),
         ("train/Uniform/a\\b/scene_1", "is not a valid folder"),
