@@ -21,7 +21,7 @@ from benchmarks.server import REPOSITORY, Network, serving
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.index.tree_cache import VARIABLE
+from stereogenbench_data.index.tree import CACHE_VARIABLE
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
@@ -63,7 +63,7 @@ def measured(root: Path, *, scenes: int, workers: int, delay_ms: float) -> dict[
         serving(root, network=Network(delay_ms / 1e3), kind="hub") as server,
     ):
         fsspec.config.conf["hf"] = {"endpoint": server.url, "token": False}
-        os.environ[VARIABLE] = cache
+        os.environ[CACHE_VARIABLE] = cache
 
         def run(name: str, pairs: StereoPairs, began_s: float) -> None:
             loader = pairs.loader(8, num_workers=workers, seed=0)

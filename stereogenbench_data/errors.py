@@ -19,9 +19,9 @@ StereoGenBenchError
 
 Warnings, each a `UserWarning`, stand beside the code that gives them:
 
-StaleIndexWarning        index.stale          a folder differs from its index
+StaleIndexWarning        index.open           a folder differs from its index
 IncompleteSceneWarning   index.open           some scenes of the data cannot be used
-AssumptionWarning        index.assumptions    files are not as the paper prints them
+AssumptionWarning        index.open           files are not as the paper prints them
 OddSceneWarning          samples.checks       selected scenes differ from what the release promises
 SwappedSizeWarning       samples.size         a size looks like (width, height)
 OpenVideosWarning        datasets.batches more videos are needed than may be open

@@ -16,13 +16,13 @@ import pytest
 
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.index.tree_cache import VARIABLE
+from stereogenbench_data.index.tree import CACHE_VARIABLE
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
 pytest_plugins = ("tests.servers.fixtures", "tests.servers.scene_fixtures")
 
-os.environ[VARIABLE] = "off"  # no test leaves anything in the user's cache
+os.environ[CACHE_VARIABLE] = "off"  # no test leaves anything in the user's cache
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 

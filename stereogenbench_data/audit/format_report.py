@@ -14,8 +14,8 @@ from typing import Any, Final
 
 from stereogenbench_data.audit.conventions import Survey
 from stereogenbench_data.errors import StereoGenBenchError
-from stereogenbench_data.index.folders import SceneFolder, folder_of
 from stereogenbench_data.index.learning import Examined
+from stereogenbench_data.index.tree import SceneFolder, folder_of
 from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.schema.document import parse_object
 from stereogenbench_data.schema.parse import parse_scene_key

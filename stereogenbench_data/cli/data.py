@@ -27,9 +27,11 @@ def open_data(
         StorageError: If the data do not exist, hold no complete scene or too many broken ones, or
             contradict conventions.
     """
-    from stereogenbench_data.index.assumptions import AssumptionWarning
-    from stereogenbench_data.index.open import IncompleteSceneWarning
-    from stereogenbench_data.index.stale import StaleIndexWarning
+    from stereogenbench_data.index.open import (
+        AssumptionWarning,
+        IncompleteSceneWarning,
+        StaleIndexWarning,
+    )
     from stereogenbench_data.index.table import SceneIndex
 
     with (

@@ -1,6 +1,7 @@
 """``stereogenbench index``: walk a released tree once, so that it opens at once afterwards."""
 
 import json
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
@@ -52,7 +53,7 @@ def index(  # noqa: PLR0913 - one parameter an option
 
     Example: `stereogenbench index scenes/`
     """
-    from stereogenbench_data.index.build import scene_journal, walk
+    from stereogenbench_data.index.build import ManyRequestsWarning, scene_journal, walk
     from stereogenbench_data.index.parquet import recorded_root
     from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.schema.conventions import Conventions
@@ -79,10 +80,13 @@ def index(  # noqa: PLR0913 - one parameter an option
     how = f"valid_depth={mode} {'' if stated is None else [each.text() for each in stated.shapes]}"
     done_before = target.with_name(f"{target.name}.journal")
     with (
+        warnings.catch_warnings(),
         writing(done_before),
         scene_journal(done_before, walk=f"{full_place(root)} {how.strip()}") as journal,
         progress_bar("indexing", unit="scenes") as progress,
     ):
+        warnings.simplefilter("always", ManyRequestsWarning)
+        warnings.showwarning = lambda told, *_: console.print(plain_line(str(told)), markup=False)
         report = walk(
             root,
             **work.options(),

@@ -3,23 +3,24 @@
 A `Journal` keeps the described scenes, so a killed run continues where it stopped.
 """
 
+import json
 import re
+import warnings
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal, TextIO
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, no_advance, require_workers
 from stereogenbench_data.errors import (
     MediaError,
     StereoGenBenchError,
     StorageError,
+    explain_os_errors,
 )
 from stereogenbench_data.index.evidence import agreed_forms
-from stereogenbench_data.index.folders import SceneFolder, folder_of, stamp_of
-from stereogenbench_data.index.journal import Journal
 from stereogenbench_data.index.parquet import IndexHead
 from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, json_of, scene_of_json
 from stereogenbench_data.index.scene_folder import (
@@ -29,15 +30,102 @@ from stereogenbench_data.index.scene_folder import (
     describe_scene,
     unfinished,
 )
-from stereogenbench_data.index.tree import FoundScenes, find_remote_scenes, find_scene_folders
+from stereogenbench_data.index.tree import (
+    FoundScenes,
+    SceneFolder,
+    find_remote_scenes,
+    find_scene_folders,
+    folder_of,
+    stamp_of,
+)
 from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.schema.conventions import Conventions, depth_of
 from stereogenbench_data.schema.document import brief
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import REMARKS, Scene, SceneId
-from stereogenbench_data.schema.release import COMPLETE_JSON, TRAIN_MAPS, Subset, depth_name
+from stereogenbench_data.schema.release import (
+    COMPLETE_JSON,
+    METADATA_FILES,
+    TRAIN_MAPS,
+    VIDEO_FILES,
+    Subset,
+    depth_name,
+)
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.location import is_remote, shown
+
+_JOURNAL_FORMAT: Final = 2
+
+
+class Journal:
+    """JSON values by scene, on disk; leaving its block keeps the file, `delete` removes it."""
+
+    def __init__(self, path: Path, *, work: Mapping[str, Any]) -> None:
+        """Read a journal; that of other work is ignored, and replaced by the first new value.
+
+        Args:
+            path: The journal's file.
+            work: What the work is, as JSON: runs of the same work share their values.
+
+        Raises:
+            StorageError: If the file exists and cannot be read.
+        """
+        self._path = path
+        self._file: TextIO | None = None
+        self._head = json.dumps({"journal": _JOURNAL_FORMAT, **work})
+        what = f"{path}: the journal of an earlier run cannot be read"
+        lines: list[str] = []
+        with (
+            explain_os_errors(what, "Remove it, or write the result to another folder."),
+            suppress(FileNotFoundError, NotADirectoryError),
+        ):
+            lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        self._is_same = bool(lines) and lines[0] == self._head
+        self._known: dict[str, tuple[str, Any]] = {}
+        for line in lines[1:] if self._is_same else ():
+            with suppress(ValueError, KeyError, TypeError):
+                entry: Any = json.loads(line)
+                self._known[str(entry["key"])] = (entry["stamp"], entry["value"])
+
+    def __len__(self) -> int:
+        """The number of scenes that earlier runs have done."""
+        return len(self._known)
+
+    def value(self, key: str, *, stamp: str) -> Any:
+        """Return a scene's value; None if there is none, or its files have changed."""
+        known = self._known.get(key)
+        return known[1] if known is not None and known[0] == stamp else None
+
+    def record(self, key: str, value: Any, *, stamp: str) -> None:
+        """Write a scene's value, any JSON but null.
+
+        Raises:
+            StorageError: If the file cannot be written.
+        """
+        line = json.dumps({"key": key, "stamp": stamp, "value": value})
+        what = f"{self._path}: the journal cannot be written"
+        with explain_os_errors(what, "Write the result to another folder."):
+            if self._file is None:
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                self._file = self._path.open("a" if self._is_same else "w", encoding="utf-8")
+                self._file.write("\n" if self._is_same else f"{self._head}\n")
+            self._file.write(f"{line}\n")
+            self._file.flush()
+
+    def delete(self) -> None:
+        """Remove the file, whose values were written elsewhere."""
+        self.__exit__()
+        self._path.unlink(missing_ok=True)
+
+    def __enter__(self) -> "Journal":
+        """Return the journal itself."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Close the file, and keep it."""
+        if self._file is not None:
+            self._file.close()
+
 
 _NAMED: Final = 6
 ALIKE: Final = 20
@@ -48,6 +136,10 @@ FORMAT_CURE: Final = (
     'nobody reads; add a table, such as [field_of_view] with place = "$.camera_intrinsics.angle", '
     "and give the file as conventions= or --conventions."
 )
+_MOST_UNTOLD: Final = 2500
+"""More requests are told: the Hub answers 3,000 in five minutes."""
+_REQUESTS: Final = 2 * len(VIDEO_FILES) + len(METADATA_FILES)
+"""The requests that describe a scene behind a URL: both ends of each video, and the small files."""
 POOL_FROM: Final = 64
 """How many scenes there must be for worker processes to be worth their start."""
 
@@ -82,30 +174,19 @@ class TreeReport:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """The outcome of one scene's folder: a scene and the digest of its files, or why not."""
+    """What became of one scene's folder.
+
+    Attributes:
+        key: The scene.
+        found: Its row, or why it has none: `IncompleteScene` where it was never finished.
+        stamp: A digest of its files.
+        has_mark: Whether it has its completion mark.
+    """
 
     key: str
-    kind: Literal["whole", "incomplete", "broken"]
-    scene: Scene | None = None
+    found: Scene | StereoGenBenchError
     stamp: str = ""
-    reason: str = ""
     has_mark: bool = True
-
-    @classmethod
-    def of_error(
-        cls, key: str, error: StereoGenBenchError, *, files: Collection[str] = ()
-    ) -> "Outcome":
-        """Return the outcome of a scene that cannot be described; () if its files are not known."""
-        kind: Literal["incomplete", "broken"] = (
-            "incomplete" if isinstance(error, IncompleteScene) else "broken"
-        )
-        return cls(key, kind, reason=str(error), has_mark=not files or COMPLETE_JSON in files)
-
-    @classmethod
-    def of_scene(cls, scene: Scene, stamp: str = "") -> "Outcome":
-        """Return the outcome of a scene that was described."""
-        key, has_mark = scene.id.key, COMPLETE_JSON in scene.members
-        return cls(key, "whole", scene, stamp, has_mark=has_mark)
 
 
 def scene_journal(path: Path, *, walk: str) -> Journal:
@@ -154,17 +235,35 @@ def walk(  # noqa: PLR0913 - each is an option of the command
     pending = [key for key in folders.keys if key not in outcomes]
     if engine is LOCAL and len(pending) < POOL_FROM:
         workers = 1
+    if is_remote(root):
+        tell_requests(root, len(pending), each=_REQUESTS, what="all files")
     task = DescribeTask(str(root), valid_depth, conventions)
     for outcome in engine.map(task, pending, name=str, workers=workers):
         outcomes[outcome.key] = outcome
         if len(outcomes) == ALIKE:
             require_not_all_alike(root, outcomes.values())
-        if journal is not None and outcome.scene is not None:
-            journal.record(outcome.key, json_of(outcome.scene), stamp=outcome.stamp)
+        if journal is not None and isinstance(outcome.found, Scene):
+            journal.record(outcome.key, json_of(outcome.found), stamp=outcome.stamp)
         if progress is not None:
             progress(len(outcomes), total)
     in_order = [outcomes[key] for key in folders.keys]
     return report_of(root, folders, in_order, is_part=is_part)
+
+
+class ManyRequestsWarning(UserWarning):
+    """So many requests are made that a server may let them wait."""
+
+
+def tell_requests(root: str | Path, scenes: int, *, each: int, what: str) -> None:
+    """Warn of the requests that scenes behind a URL take, if a server may let them wait."""
+    requests, where = scenes * each, shown(root)
+    if requests > _MOST_UNTOLD:
+        message = (
+            f"{where}: reads {what} of {scenes} scenes, in {requests:,} requests: on the Hub "
+            f"without a login some {requests // 600} minutes. An interrupted run goes on where it "
+            f"stopped; an index holds them: `stereogenbench index {where}`."
+        )
+        warnings.warn(message, ManyRequestsWarning, stacklevel=2)
 
 
 def find_scenes(
@@ -177,39 +276,35 @@ def find_scenes(
     """Return the wanted scenes of a tree, and whether they are a part of it; see `walk`."""
     if folders is None:
         folders = find_remote_scenes(str(root)) if is_remote(root) else find_scene_folders(root)
-    if wanted is not None and if_none == "all":
-        wanted = wanted if any(wanted(parse_scene_key(key)) for key in folders.keys) else None
-    if wanted is not None:
-        folders = _chosen(root, folders, wanted)
-    return folders, wanted is not None
+    if wanted is None:
+        return folders, False
+    keys = tuple(key for key in folders.keys if wanted(parse_scene_key(key)))
+    if keys:
+        return replace(folders, keys=keys), True
+    if if_none == "all":
+        return folders, False
+    there = sorted({key.rpartition("/")[0] for key in folders.keys})
+    more = f" and {len(there) - _NAMED} folders more" if len(there) > _NAMED else ""
+    raise StorageError(
+        f"{shown(root)}: none of its {counted(len(folders.keys), 'scene')} is asked for; there are "
+        f"scenes in {', '.join(there[:_NAMED])}{more}. Check the filters' spelling."
+    )
 
 
-def require_not_all_alike(root: str | Path, outcomes: Iterable[Outcome]) -> None:
+def require_not_all_alike(root: str | Path, outcomes: Collection[Outcome]) -> None:
     """Refuse a tree whose first scenes are broken for one reason: so are the others."""
-    kinds = {
-        out.kind + re.sub(r"[0-9.]+", "#", out.reason.replace(out.key, "")) for out in outcomes
-    }
-    first = min(outcomes, key=lambda out: out.key)
-    if len(kinds) == 1 and first.kind == "broken":
+    reasons = {
+        "" if isinstance(out.found, Scene)
+        else re.sub(r"[0-9.]+", "#", str(out.found).replace(out.key, ""))
+        for out in outcomes
+    }  # fmt: skip
+    first = min(outcomes, key=lambda out: out.key).found
+    if len(reasons) == 1 and not isinstance(first, Scene | IncompleteScene):
         raise StorageError(
             f"{shown(root)}: the first {ALIKE} scenes cannot be used, all for one reason, so it is "
-            f"the format of the files and no single scene. The first: {first.reason}\n"
+            f"the format of the files and no single scene. The first: {first}\n"
             f"{FORMAT_CURE.format(root=shown(root))}"
         )
-
-
-def _chosen(
-    root: str | Path, folders: FoundScenes, wanted: Callable[[SceneId], bool]
-) -> FoundScenes:
-    keys = tuple(key for key in folders.keys if wanted(parse_scene_key(key)))
-    if not keys:
-        there = sorted({key.rpartition("/")[0] for key in folders.keys})
-        more = f" and {len(there) - _NAMED} folders more" if len(there) > _NAMED else ""
-        raise StorageError(
-            f"{shown(root)}: none of its {counted(len(folders.keys), 'scene')} is asked for; "
-            f"there are scenes in {', '.join(there[:_NAMED])}{more}. Check the filters' spelling."
-        )
-    return replace(folders, keys=keys)
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,8 +330,8 @@ class DescribeTask:
                 folder=folder,
             )  # fmt: skip
         except StereoGenBenchError as error:
-            return Outcome.of_error(key, error, files=files)
-        return Outcome.of_scene(scene, stamp_of(files))
+            return Outcome(key, error, has_mark=not files or COMPLETE_JSON in files)
+        return Outcome(key, scene, stamp_of(files), has_mark=COMPLETE_JSON in files)
 
 
 def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> dict[str, Outcome]:
@@ -249,7 +344,8 @@ def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> d
             stamp = stamp_of(folder_of(root, key).stamps())
             row = None if journal is None else journal.value(key, stamp=stamp)
             if row is not None:
-                outcomes[key] = Outcome.of_scene(scene_of_json(row), stamp)
+                scene = scene_of_json(row)
+                outcomes[key] = Outcome(key, scene, stamp, COMPLETE_JSON in scene.members)
     return outcomes
 
 
@@ -260,14 +356,18 @@ def report_of(
 
     Scenes without their completion mark are not finished, unless no scene of the tree has one.
     """
-    if folders.is_marked or any(out.has_mark and out.kind != "incomplete" for out in outcomes):
-        outcomes = [
-            out if out.has_mark else Outcome.of_error(out.key, unfinished(out.key))
-            for out in outcomes
-        ]
+    is_incomplete = [isinstance(out.found, IncompleteScene) for out in outcomes]
+    marked = (out.has_mark for out, lacks in zip(outcomes, is_incomplete, strict=True) if not lacks)
+    if folders.is_marked or any(marked):
+        outcomes = [out if out.has_mark else Outcome(out.key, unfinished(out.key))
+                    for out in outcomes]  # fmt: skip
+    left_out = {out.key: out.found for out in outcomes if not isinstance(out.found, Scene)}
+    incomplete = {key: str(error) for key, error in left_out.items()
+                  if isinstance(error, IncompleteScene)}  # fmt: skip
+    broken = {key: str(error) for key, error in left_out.items() if key not in incomplete}
     ids = [parse_scene_key(key) for key in folders.keys]
     maps = {scene.map_name for scene in ids if scene.split == "train"} | TRAIN_MAPS
-    found = [outcome.scene for outcome in outcomes if outcome.scene is not None]
+    found = [out.found for out in outcomes if isinstance(out.found, Scene)]
     agreed = agreed_forms(scene.pose_form for scene in found if scene.pose_form)
     found = [as_agreed(scene, agreed) for scene in found]
     scenes, unnamed, labels = [], set(), []
@@ -289,11 +389,10 @@ def report_of(
         f"files of {counted(len(labels), 'scene')} call the map otherwise than its folder, whose "
         f"name is used, such as {labels[0]}"
     ] if labels else []  # fmt: skip
-    broken = {out.key: out.reason for out in outcomes if out.kind == "broken"}
     return TreeReport(
         root=str(root),
         scenes=tuple(scenes),
-        incomplete={out.key: out.reason for out in outcomes if out.kind == "incomplete"},
+        incomplete=incomplete,
         broken=dict(sorted((folders.refused | broken).items())),
         notes=(*subsets, *named, *_remarks(found), *_depth_notes(found)),
         is_part=is_part,
@@ -316,28 +415,21 @@ def _remarks(scenes: list[Scene]) -> list[str]:
 
 def _depth_notes(scenes: list[Scene]) -> list[str]:
     """Describe depth that loading refuses unless the user's `DepthEncoding` accepts it."""
-    notes: dict[tuple[str, str], str] = {}
+    first: dict[tuple[str, str], tuple[Scene, int]] = {}
     videos: Counter[tuple[str, str]] = Counter()
     for scene in scenes:
         stored = zip(scene.depth_codec, scene.depth_pixel_format, strict=True)
         for camera, kind in enumerate(stored):
             videos[kind] += 1
-            if kind in notes:
-                continue
-            notes[kind] = ""
-            try:
-                require_depth_stream(
-                    codec=kind[0],
-                    pixel_format=kind[1],
-                    encoding=depth_of(scene),
-                    name=f"{scene.id.key}/{depth_name(camera)}",
-                )
-            except MediaError as error:
-                notes[kind] = str(error)
-    return [
-        f"{note} ({counted(videos[kind] - 1, 'other video')} likewise.)"
-        if videos[kind] > 1
-        else note
-        for kind, note in notes.items()
-        if note
-    ]
+            first.setdefault(kind, (scene, camera))
+    notes = []
+    for (codec, pixel_format), (scene, camera) in first.items():
+        name, others = f"{scene.id.key}/{depth_name(camera)}", videos[codec, pixel_format] - 1
+        try:
+            require_depth_stream(
+                codec=codec, pixel_format=pixel_format, encoding=depth_of(scene), name=name
+            )
+        except MediaError as error:
+            more = f" ({counted(others, 'other video')} likewise.)" if others else ""
+            notes.append(f"{error}{more}")
+    return notes

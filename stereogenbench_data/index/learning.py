@@ -17,9 +17,13 @@ import numpy as np
 from stereogenbench_data.errors import MediaError, SchemaError, StereoGenBenchError
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.index.evidence import understood_poses
-from stereogenbench_data.index.folders import SceneFolder, folder_of
 from stereogenbench_data.index.scene_folder import IncompleteScene, describe_scene, keys_in
-from stereogenbench_data.index.tree import find_remote_scenes, find_scene_folders
+from stereogenbench_data.index.tree import (
+    SceneFolder,
+    find_remote_scenes,
+    find_scene_folders,
+    folder_of,
+)
 from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.schema.conventions import (

@@ -12,7 +12,6 @@ of a scene only the videos that its samples need are opened, ahead of them where
 
 import hashlib
 import json
-import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,7 +24,7 @@ import numpy as np
 
 from stereogenbench_data.errors import SchemaError, StereoGenBenchError, StorageError
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
-from stereogenbench_data.index.alike_rigs import Parsed, RigReader
+from stereogenbench_data.index.alike_rigs import RigReader
 from stereogenbench_data.index.build import (
     ALIKE,
     POOL_FROM,
@@ -34,15 +33,9 @@ from stereogenbench_data.index.build import (
     TreeReport,
     find_scenes,
     report_of,
+    tell_requests,
 )
 from stereogenbench_data.index.evidence import agreed_forms
-from stereogenbench_data.index.folders import (
-    Files,
-    RemoteFolder,
-    SceneFolder,
-    in_parallel,
-    stamp_of,
-)
 from stereogenbench_data.index.rows import json_of, scene_of_json
 from stereogenbench_data.index.scene_folder import (
     DESCRIPTIONS,
@@ -58,8 +51,16 @@ from stereogenbench_data.index.scene_folder import (
     sized_as_videos,
     unfinished,
 )
-from stereogenbench_data.index.tree import FoundScenes, RemoteTree
-from stereogenbench_data.index.tree_cache import TreeCache
+from stereogenbench_data.index.tree import (
+    Files,
+    FoundScenes,
+    RemoteFolder,
+    RemoteTree,
+    SceneFolder,
+    TreeCache,
+    in_parallel,
+    stamp_of,
+)
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import (
     parse_complete,
@@ -69,6 +70,7 @@ from stereogenbench_data.schema.parse import (
 from stereogenbench_data.schema.records import (
     Member,
     Remark,
+    Rig,
     Scene,
     SceneId,
     SceneLabels,
@@ -90,8 +92,6 @@ _LOOKED_AT: Final = 20
 _LEAST_OF_A_GROUP: Final = 3
 FEW_REMOTE: Final = 8
 """Fewer scenes behind a URL are all described."""
-_MOST_UNTOLD: Final = 2500
-"""More requests for ``baseline.json`` are told: the Hub answers 3,000 in five minutes."""
 _KEPT_SCENES: Final = 512
 """Of how many scenes behind a URL what was described is kept in memory."""
 _READERS: Final = 8
@@ -222,18 +222,15 @@ def _of_each(read: Callable[[str], Any], keys: Sequence[str]) -> Iterator[Any]:
             yield from part
 
 
-class ManyRequestsWarning(UserWarning):
-    """So many requests are made that a server may let them wait."""
-
-
 @dataclass(frozen=True, slots=True)
 class _Metadata:
-    """What the small JSON files of a scene say."""
+    """What a scene's listing and its small JSON files say; without a rig these were not read."""
 
     id: SceneId
     files: Files
-    parsed: Parsed | None
-    marked: SceneLabels
+    rig: Rig | None = None
+    labels: SceneLabels = field(default_factory=SceneLabels)
+    remarks: tuple[Remark, ...] = ()
 
 
 Baselines = Literal["read", "when needed"]
@@ -252,11 +249,11 @@ def presumed_report(tree: ListedTree, baselines: Baselines) -> TreeReport | None
     """
     outcomes: dict[str, Outcome] = {}
     groups: dict[tuple[object, ...], list[_Metadata]] = {}
-    for key, found in _metadata(tree) if baselines == "read" else _listed(tree):
+    for key, found in _metadata(tree, baselines):
         if isinstance(found, StereoGenBenchError):
             # A focal length in pixels may need the size of the videos.
             is_of_rig = isinstance(found, SchemaError)
-            outcomes[key] = tree.describe(key) if is_of_rig else Outcome.of_error(key, found)
+            outcomes[key] = tree.describe(key) if is_of_rig else Outcome(key, found)
             if len(outcomes) == ALIKE and not groups:
                 return None
             continue
@@ -274,7 +271,7 @@ def presumed_report(tree: ListedTree, baselines: Baselines) -> TreeReport | None
             tree.describe(key) for key in keys
         ]  # fmt: skip
         outcomes |= {outcome.key: outcome for outcome in looked_at}
-        models = [outcome.scene for outcome in looked_at if outcome.scene is not None]
+        models = [outcome.found for outcome in looked_at if isinstance(outcome.found, Scene)]
         others = [each for each in group if each.id.key not in outcomes]
         if others and not _are_alike(models):
             return None
@@ -283,57 +280,52 @@ def presumed_report(tree: ListedTree, baselines: Baselines) -> TreeReport | None
         for each in others:
             scene = _presumed(each, models, tree.conventions)
             key = each.id.key
-            outcomes[key] = tree.describe(key) if scene is None else Outcome.of_scene(scene)
+            has_mark = COMPLETE_JSON in each.files
+            outcomes[key] = (
+                tree.describe(key) if scene is None else Outcome(key, scene, has_mark=has_mark)
+            )
     in_order = [outcomes[key] for key in tree.folders.keys]
     return report_of(tree.root, tree.folders, in_order, is_part=tree.is_part)
 
 
-def _listed(tree: ListedTree) -> Iterator[tuple[str, _Metadata | StereoGenBenchError]]:
-    """Yield the scenes whose files the listing shows, or why one cannot be used."""
-    for key in tree.folders.keys:
-        try:
-            files = tree.finished(key)
-            yield key, _Metadata(parse_scene_key(key), files, None, SceneLabels())
-        except StereoGenBenchError as error:
-            yield key, error
-
-
-def _metadata(tree: ListedTree) -> Iterator[tuple[str, _Metadata | StereoGenBenchError]]:
-    """Yield what the small JSON files of each scene say, or why the scene cannot be used."""
+def _metadata(
+    tree: ListedTree, baselines: Baselines
+) -> Iterator[tuple[str, _Metadata | StereoGenBenchError]]:
+    """Yield what is known of each scene before it is described, or why it cannot be used."""
     rigs = RigReader(None if tree.conventions is None else tree.conventions.shapes[0])
 
-    def baseline_text(key: str) -> tuple[Files, bytes] | StereoGenBenchError:
+    def read(key: str) -> tuple[Files, bytes] | StereoGenBenchError:
         try:
             files = tree.finished(key)
-            return files, tree.folder(key).read(BASELINE_JSON)
+            return files, tree.folder(key).read(BASELINE_JSON) if baselines == "read" else b""
         except StereoGenBenchError as error:
             return error
 
     keys = tree.folders.keys
-    if tree.is_remote and len(keys) > _MOST_UNTOLD:
-        message = (
-            f"{shown(tree.root)}: reads {BASELINE_JSON} of {len(keys)} scenes, a request each: on "
-            f"the Hub without a login some {len(keys) // 600} minutes. They are kept; an index "
-            f"holds them: `stereogenbench index {shown(tree.root)}`."
-        )
-        warnings.warn(message, ManyRequestsWarning, stacklevel=2)
-    for key, read in zip(keys, tree.of_each(baseline_text, keys), strict=True):
-        if isinstance(read, StereoGenBenchError):
-            yield key, read
+    if baselines == "read" and tree.is_remote:
+        tell_requests(tree.root, len(keys), each=1, what=BASELINE_JSON)
+    for key, found in zip(keys, tree.of_each(read, keys), strict=True):
+        if isinstance(found, StereoGenBenchError):
+            yield key, found
             continue
+        files, text = found
         try:
-            scene_id, where = parse_scene_key(key), f"{key}/{BASELINE_JSON}"
-            rig, labels, odd = rigs.read(read[1], where=where)
-            parsed = rig, labels, (*odd, *require_unit(rig, family=scene_id.family, where=where))
-            marked = SceneLabels()
+            scene_id = parse_scene_key(key)
+            if baselines != "read":
+                yield key, _Metadata(scene_id, files)
+                continue
+            where = f"{key}/{BASELINE_JSON}"
+            rig, labels, odd = rigs.read(text, where=where)
+            odd = (*odd, *require_unit(rig, family=scene_id.family, where=where))
             is_lacking = labels.character is None or labels.animation is None
-            if is_lacking and COMPLETE_JSON in read[0]:  # scenes are chosen by these
-                text = tree.folder(key).read(COMPLETE_JSON)
-                marked, _ = parse_complete(text, where=f"{key}/{COMPLETE_JSON}")
+            if is_lacking and COMPLETE_JSON in files:  # scenes are chosen by these
+                where = f"{key}/{COMPLETE_JSON}"
+                marked, _ = parse_complete(tree.folder(key).read(COMPLETE_JSON), where=where)
+                labels = merged_labels(labels, marked)
         except StereoGenBenchError as error:
             yield key, error
-            continue
-        yield key, _Metadata(scene_id, read[0], parsed, marked)
+        else:
+            yield key, _Metadata(scene_id, files, rig, labels, odd)
 
 
 def _are_alike(models: Sequence[Scene]) -> bool:
@@ -361,11 +353,12 @@ def _presumed(
 ) -> Scene | None:
     """Return a scene that is like others; None where its baselines are not those of a line."""
     key, like = each.id.key, models[0]
-    rig, labels, odd = each.parsed or (like.rig, SceneLabels(), ())
-    remarks = [*odd]
+    remarks = [*each.remarks]
     size_px = like.rig.image_width_px, like.rig.image_height_px
     shape = None if conventions is None else conventions.shapes[0]
-    rig = sized_as_videos(key, rig, size_px, document=None, remarks=remarks, shape=shape)
+    rig = sized_as_videos(
+        key, each.rig or like.rig, size_px, document=None, remarks=remarks, shape=shape
+    )
     places_m = assumed_places_m(rig)
     if not places_m:
         return None
@@ -387,7 +380,7 @@ def _presumed(
     return replace(
         like,
         id=each.id,
-        labels=merged_labels(labels, each.marked),
+        labels=each.labels,
         caption="",
         rig=rig,
         lateral_m=places_m,
@@ -599,15 +592,8 @@ def _differences(presumed: Scene, found: Scene, *, baselines: Baselines) -> Iter
         value, there = getattr(presumed.rig, name), getattr(found.rig, name)
         if there != value:
             yield f"{name} of {BASELINE_JSON} read as {value}, and it is {there}"
-    if any((before > 0) != (now > 0) for before, now in _steps_m(presumed, found)):
+    before_m, now_m = presumed.lateral_m, found.lateral_m
+    if any((before_m[b] > before_m[a]) != (now_m[b] > now_m[a]) for a, b in CAMERA_PAIRS):
         yield f"places of cameras in m presumed {presumed.lateral_m}, found {found.lateral_m}"
     if presumed.rig_residual_px <= RECTIFIED_PX < found.rig_residual_px:
         yield f"a rectified rig presumed, found one that is off by {found.rig_residual_px:.3g} px"
-
-
-def _steps_m(presumed: Scene, found: Scene) -> Iterator[tuple[float, float]]:
-    for a, b in CAMERA_PAIRS:
-        yield (
-            presumed.lateral_m[b] - presumed.lateral_m[a],
-            found.lateral_m[b] - found.lateral_m[a],
-        )

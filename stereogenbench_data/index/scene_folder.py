@@ -8,7 +8,7 @@ the same files with an existing row.
 import functools
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -33,7 +33,7 @@ from stereogenbench_data.index.evidence import (
     shape_of,
     understood_poses,
 )
-from stereogenbench_data.index.folders import SceneFolder, folder_of
+from stereogenbench_data.index.tree import SceneFolder, folder_of
 from stereogenbench_data.media.clock import MOST_EXTRA_FRAMES
 from stereogenbench_data.media.container import StreamFacts, depth_coding
 from stereogenbench_data.media.depth import (
@@ -71,7 +71,6 @@ from stereogenbench_data.schema.parse import (
 )
 from stereogenbench_data.schema.records import (
     DepthEncoding,
-    DepthUnitSource,
     Member,
     Remark,
     Rig,
@@ -248,7 +247,10 @@ class _Description:
                 math.nan if each is None else each.known_unit_m for each in encodings
             ),
             depth_offset_m=tuple(0.0 if each is None else each.offset_m for each in encodings),
-            depth_unit_source=tuple(map(_source_of, encodings)),
+            depth_unit_source=tuple(
+                "unreadable" if each is None or each.source == "user" else each.source
+                for each in encodings
+            ),
             depth_codec=tuple(depth_coding(facts) for _, facts in depths),
             depth_pixel_format=tuple(facts.pixel_format for _, facts in depths),
             valid_depth_ratio=None,
@@ -278,11 +280,11 @@ class _Description:
                 video, where = self.folder.video(held), self.where(held)
                 reads: Literal["all", "little"] = "all" if isinstance(video, Path) else "little"
                 try:
-                    is_later: Literal["later", "needed"] = "needed"
-                    if name.endswith(".mp4"):
-                        is_later = "later"
-                    facts = probe(video, name=where, pixel_format=is_later)
-                    if is_later == "later" and facts.is_colour is None:
+                    is_picture = name.endswith(".mp4")
+                    facts = probe(
+                        video, name=where, pixel_format="later" if is_picture else "needed"
+                    )
+                    if is_picture and facts.is_colour is None:
                         facts = probe(video, name=where)
                     self.facts[name] = facts
                     if (table := read_seek_table(video, name=where, reads=reads)) is not None:
@@ -316,18 +318,23 @@ class _Description:
             told = f"{self.key}: none of its videos can be opened. Fetch the scene again."
             raise MediaError(told)
         counts = {name: fact.frames for name, fact in self.facts.items()}
-        common = Counter(counts.values()).most_common(1)[0][0]
-        odd = [f"{name} has {count}" for name, count in counts.items() if count != common]
-        told = (
-            f"{self.key}: its videos must have one number of frames: {len(counts) - len(odd)} have "
-            f"{common}, but {', '.join(odd)}"
-        )
-        if any(abs(count - common) > MOST_EXTRA_FRAMES for count in counts.values()):
+        told, odd = self.odd_ones(counts, "one number of frames")
+        if odd and max(counts.values()) - min(counts.values()) > MOST_EXTRA_FRAMES:
             raise StorageError(f"{told}. Fetch those again.")
         frames = min(counts.values())
         if odd:
             self.remark("frames", f"{told}. The first {frames} of all are used")
         return frames
+
+    def odd_ones(self, found: Mapping[str, object], what: str) -> tuple[str, list[str]]:
+        """Return that files do not have alike what most of them have, and the names of these."""
+        common = Counter(found.values()).most_common(1)[0][0]
+        odd = [name for name, value in found.items() if value != common]
+        listed = ", ".join(f"{name} has {found[name]}" for name in odd)
+        return (
+            f"{self.key}: its videos must have {what}: {len(found) - len(odd)} have {common}, but "
+            f"{listed}"
+        ), odd
 
     def common_key_frames(self, frames: int) -> tuple[int, ...]:
         """Return the frames at which all videos of pictures have a key frame."""
@@ -338,13 +345,9 @@ class _Description:
     def require_one_size(self) -> None:
         """Refuse videos of different picture sizes."""
         sizes = {name: f"{fact.width_px}x{fact.height_px}" for name, fact in self.facts.items()}
-        common = Counter(sizes.values()).most_common(1)[0][0]
-        odd = [f"{name} has {size}" for name, size in sizes.items() if size != common]
+        told, odd = self.odd_ones(sizes, "one picture size in pixels")
         if odd:
-            raise StorageError(
-                f"{self.key}: its files must have one picture size: {len(sizes) - len(odd)} have "
-                f"{common} pixels, but {', '.join(odd)}. Fetch those again."
-            )
+            raise StorageError(f"{told}. Fetch those again.")
 
     def require_kinds(self, rig: Rig) -> None:
         """Refuse views without colours, and depth videos that hold colours.
@@ -367,10 +370,9 @@ class _Description:
         for name, fact in depths.items():
             if fact.is_colour and (grey or "matroska" not in fact.container):
                 raise MediaError(
-                    f"{self.where(name)}: holds colours (codec {fact.codec}, {fact.pixel_format}, "
-                    f"container {fact.container}), and depth is one number a pixel, as in {grey} "
-                    f"other depth videos of the scene. Another video stands under this name: fetch "
-                    f"it again."
+                    f"{self.where(name)}: holds colours (codec {fact.codec}, {fact.pixel_format}), "
+                    f"and depth is one number a pixel, as in {grey} other depth videos of the "
+                    f"scene. Another video stands under this name: fetch it again."
                 )
 
     def poses(self, rig: Rig, frames: int) -> tuple[CameraPoses | None, str | None]:
@@ -503,12 +505,6 @@ class _Description:
                     f"{brief(found)}. A file is of another scene: fetch the scene again."
                 )
         return replace(derived_scene(scene, self.document), depth_codec=scene.depth_codec)
-
-
-def _source_of(encoding: DepthEncoding | None) -> DepthUnitSource:
-    if encoding is None or encoding.source == "user":
-        return "unreadable"
-    return encoding.source
 
 
 def keys_in(folder: SceneFolder, names: Iterable[str]) -> frozenset[str]:
@@ -747,17 +743,21 @@ def metadata_differences(scene: Scene, texts: Mapping[str, bytes]) -> list[Diffe
         texts: File name to bytes; missing files are not compared.
     """
     found: list[Difference] = []
-    for name, described_again in (
-        ("", _placed),
-        (BASELINE_JSON, _with_rig),
-        (TRAINING_JSON, _derived),
-        (TRAJECTORY_JSON, _posed),
-        (next((name for name in DESCRIPTIONS if name in texts), DESCRIPTION_JSON), _captioned),
-    ):
+    described = next((name for name in DESCRIPTIONS if name in texts), DESCRIPTION_JSON)
+    place = parse_scene_key(scene.id.key)
+    subset = scene.id.subset if place.split == "eval" else None
+    again: tuple[tuple[str, Callable[[], Scene]], ...] = (
+        ("", lambda: replace(scene, id=replace(place, subset=place.subset or subset))),
+        (BASELINE_JSON, lambda: _with_rig(scene, texts)),
+        (TRAINING_JSON, lambda: _derived(scene, texts[TRAINING_JSON])),
+        (TRAJECTORY_JSON, lambda: _posed(scene, texts[TRAJECTORY_JSON])),
+        (described, lambda: replace(scene, caption=caption_of(texts, key=scene.id.key)[0])),
+    )
+    for name, described_again in again:
         if name and name not in texts:
             continue
         try:
-            differences = _changed(scene, described_again(scene, texts))
+            differences = _changed(scene, described_again())
             where = "" if name else "its path "
             found += [(name, f"{where}{difference}") for difference in differences]
         except SchemaError as error:
@@ -774,12 +774,6 @@ def _changed(indexed: Any, now: Any) -> Iterator[str]:
             yield from _changed(before, after)
         elif not _same(after, before, within=_ROUNDING.get(each.name, 0.0)):
             yield f"tells {each.name} {brief(after)}, and by the index it is {brief(before)}"
-
-
-def _placed(scene: Scene, texts: Mapping[str, bytes]) -> Scene:
-    place = parse_scene_key(scene.id.key)
-    subset = scene.id.subset if place.split == "eval" else None
-    return replace(scene, id=replace(place, subset=place.subset or subset))
 
 
 def _with_rig(scene: Scene, texts: Mapping[str, bytes]) -> Scene:
@@ -806,9 +800,9 @@ def _stated_of(scene: Scene) -> Shape | None:
     return None if scene.conventions is None else shape_of_text(scene.conventions)
 
 
-def _derived(scene: Scene, texts: Mapping[str, bytes]) -> Scene:
+def _derived(scene: Scene, text: bytes) -> Scene:
     """Return a scene as its ``training.json`` says."""
-    document = parse_training(texts[TRAINING_JSON], where=f"{scene.id.key}/{TRAINING_JSON}")
+    document = parse_training(text, where=f"{scene.id.key}/{TRAINING_JSON}")
     members = {
         name: replace(
             member, size=file.size, crc32=None if member.crc32 is None else file.crc32
@@ -819,13 +813,9 @@ def _derived(scene: Scene, texts: Mapping[str, bytes]) -> Scene:
     return replace(again, id=replace(scene.id, key=document.key))
 
 
-def _posed(scene: Scene, texts: Mapping[str, bytes]) -> Scene:
+def _posed(scene: Scene, text: bytes) -> Scene:
     """Return a scene with the cameras' places and the residual that its ``trajectory.json`` has."""
-    text, where, shape = (
-        texts[TRAJECTORY_JSON],
-        f"{scene.id.key}/{TRAJECTORY_JSON}",
-        _stated_of(scene),
-    )
+    where, shape = f"{scene.id.key}/{TRAJECTORY_JSON}", _stated_of(scene)
     if scene.remark("poses"):
         return scene
     poses = poses_as(text, scene.pose_form, where=where)
@@ -838,10 +828,6 @@ def _posed(scene: Scene, texts: Mapping[str, bytes]) -> Scene:
         lateral_m=_places_m(poses),
         rig_residual_px=rectification_residual_px(poses, recorded_intrinsics(scene.rig)),
     )
-
-
-def _captioned(scene: Scene, texts: Mapping[str, bytes]) -> Scene:
-    return replace(scene, caption=caption_of(texts, key=scene.id.key)[0])
 
 
 def _same(found: Any, indexed: Any, *, within: float = 0.0) -> bool:

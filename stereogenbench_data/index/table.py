@@ -5,6 +5,7 @@ data's root and never lead out of it.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -14,7 +15,13 @@ import pyarrow as pa
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import compute as pc
 from stereogenbench_data.index.arrow import as_categories, as_numpy, one_array, table_digest
-from stereogenbench_data.index.open import Opened, Rows, open_table, with_baselines
+from stereogenbench_data.index.open import (
+    Opened,
+    Rows,
+    open_table,
+    opened_report,
+    with_baselines,
+)
 from stereogenbench_data.index.parquet import (
     IndexHead,
     read_seek_tables,
@@ -65,7 +72,7 @@ class SceneIndex:
 
     def __init__(self, opened: Opened, *, retry: RetryPolicy | None = None) -> None:
         """Take a checked table; use `open` or `from_scenes` to make an index."""
-        head = opened.head
+        self._head = head = opened.head
         self.root = head.root
         self.retry = retry
         self.incomplete = head.incomplete
@@ -165,8 +172,7 @@ class SceneIndex:
     @classmethod
     def from_report(cls, report: "TreeReport") -> "SceneIndex":
         """Return the index of the scenes that a walk found, and of those that it left out."""
-        table = table_of_scenes(report.scenes, where=shown(report.root))
-        return cls(Opened(table, report.head, seek_tables=seek_tables_of(report.scenes)))
+        return cls(opened_report(report))
 
     def __repr__(self) -> str:
         """Return the root without secrets, and the number of scenes and shards."""
@@ -187,17 +193,9 @@ class SceneIndex:
                 f"{self.where}: most of its rows are presumed, and an index must not be. Run "
                 f"`stereogenbench index {self.where}`, or open it with rows='read'."
             )
-        head = IndexHead(
-            root=self.root,
-            digest=self.digest,
-            incomplete=self.incomplete,
-            broken=self.broken,
-            shards=self.shards,
-            is_part=self.is_part,
-            passed_over=self.passed_over,
-        )
         self.load_seek_tables()
         tables = None if isinstance(self._seek_tables, Path) else self._seek_tables
+        head = replace(self._head, digest=self.digest, passed_over=self.passed_over)
         write_index_file(Path(path), self._table, head, seek_tables=tables)
 
     @property

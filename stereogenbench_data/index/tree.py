@@ -1,37 +1,322 @@
-"""The scenes of a tree in the released layout, found by the names of its folders.
+"""The scenes of a tree in the released layout: their folders and files, and what is kept of them.
 
     ROOT/train/<family>/<map>/<scene>/
     ROOT/eval/<subset>/<family>/<map>/<scene>/
 
 `find_scene_folders` searches a folder of this machine and says where misplaced scenes belong;
 `find_remote_scenes` and `PlacedFolders` list only folders where scenes belong. The Hub lists a
-thousand files a request, so `RemoteTree` lists a whole release in some hundred, and keeps the
-listing of a commit in the user's cache.
+thousand files a request, so `RemoteTree` lists a whole release in some hundred. A `SceneFolder`
+reads the files of one scene; behind a URL several at a time, and of large videos both ends alone.
+
+What was found out about trees without an index is kept in the user's cache:
+
+    <cache>/stereogenbench/trees/<digest of the root>/
+        presumed-<digest of the listing>.parquet   the rows, as an index file
+        scenes/ab/<digest of the scene's files>    the row of a scene that was described
+        listing/ab/<digest of the folder>          what a commit of the Hub holds
+        files/ab/<digest of path and ETag>         a small file of a scene behind a URL
+
+The listing is the path, size and modification time of every file, so what is kept is used only for
+unchanged files. Any number of processes, of several machines too, may read and write: files are
+renamed into place, whole or not at all, and one that is damaged or cannot be written is as good as
+none.
 """
 
+import hashlib
 import json
 import os
 import re
 import sys
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
-from stereogenbench_data.errors import SchemaError, StorageError, describe_os_error
-from stereogenbench_data.index.folders import FILES, Files, in_parallel
-from stereogenbench_data.index.tree_cache import TreeCache
+import pyarrow as pa
+
+from stereogenbench_data.errors import (
+    SchemaError,
+    StorageError,
+    describe_os_error,
+    explain_os_errors,
+)
+from stereogenbench_data.index.arrow import table_digest
+from stereogenbench_data.index.parquet import (
+    IndexHead,
+    read_index_file,
+    read_seek_tables,
+    write_index_file,
+)
+from stereogenbench_data.index.rows import SCHEMA
+from stereogenbench_data.schema.document import MAX_TEXT_BYTES, require_text_size
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
     COMPLETE_JSON,
+    METADATA_FILES,
+    PACKED_DEPTH_NAMES,
+    TRAINING_JSON,
     TRAJECTORY_JSON,
     VIDEO_FILES,
 )
-from stereogenbench_data.sources.location import joined, shown
+from stereogenbench_data.sources.files import write_atomic
+from stereogenbench_data.sources.location import is_remote, joined, shown
+from stereogenbench_data.sources.members import read_text_file
+from stereogenbench_data.sources.ranged_file import FIRST_BLOCK, MemberFile, RangedFile
 from stereogenbench_data.sources.remote import RemoteObject
+
+CACHE_VARIABLE: Final = "STEREOGENBENCH_CACHE"
+"""The environment variable that names another folder for the cache, or is "off"."""
+
+_FORMAT: Final = 2
+_MOST_TABLES: Final = 8
+"""So many selections of a tree are kept: each has a table of its own."""
+
+
+def cache_folder() -> Path | None:
+    """Return the user's cache folder for this package, None where there is none or it is off."""
+    named = os.environ.get(CACHE_VARIABLE)
+    if named is not None:
+        return None if named.strip().lower() in ("", "off") else Path(named)
+    places = {"darwin": "~/Library/Caches", "win32": os.environ.get("LOCALAPPDATA", "~")}
+    usual = os.environ.get("XDG_CACHE_HOME") or places.get(sys.platform, "~/.cache")
+    folder = Path(usual).expanduser()
+    return folder / "stereogenbench" if folder.is_absolute() else None
+
+
+class TreeCache:
+    """What is kept of one tree; nothing where there is no cache folder."""
+
+    def __init__(self, root: str | Path, read_as: str = "") -> None:
+        """Name the tree, and the conventions it is read by; nothing is read or written yet."""
+        base = cache_folder()
+        # What another version understood of the same files may differ.
+        made_by = ""
+        with suppress(PackageNotFoundError):  # of a checkout that is not installed
+            made_by = version("stereogenbench-data")
+        place = str(root) if is_remote(root) else os.path.realpath(root)
+        what = [_FORMAT, made_by, SCHEMA.names, place, read_as]
+        self._folder = None if base is None else base / "trees" / _digest(json.dumps(what))
+
+    def table(self, name: str) -> tuple[pa.Table, IndexHead, pa.BinaryArray | None] | None:
+        """Return the rows that were kept under a name, and what an index knows besides."""
+        if self._folder is None:
+            return None
+        path = self._folder / f"{name}.parquet"
+        try:
+            table, head = read_index_file(path, where=str(path))
+        except (StorageError, OSError):
+            return None
+        if head.digest != table_digest(table):
+            return None
+        with suppress(OSError):
+            os.utime(path)
+        return table, head, read_seek_tables(path)
+
+    def keep_table(
+        self, name: str, table: pa.Table, head: IndexHead, seek_tables: pa.BinaryArray | None
+    ) -> None:
+        """Keep rows under a name, in place of those that were used longest ago."""
+        if self._folder is None:
+            return
+        with suppress(StorageError, OSError):
+            write_index_file(self._folder / f"{name}.parquet", table, head, seek_tables=seek_tables)
+            tables = sorted(self._folder.glob("*.parquet"), key=lambda path: path.stat().st_mtime)
+            for old in tables[:-_MOST_TABLES]:
+                old.unlink(missing_ok=True)
+
+    def read(self, kind: str, name: str) -> bytes | None:
+        """Return what was kept under a kind and a name; None if there is none, or it is damaged."""
+        if self._folder is not None:
+            with suppress(OSError, zlib.error):
+                return zlib.decompress(self._place(kind, name).read_bytes())
+        return None
+
+    def keep(self, kind: str, name: str, content: bytes) -> None:
+        """Keep bytes under a kind and a name, which changes with what they were made of."""
+        if self._folder is not None:
+            place = self._place(kind, name)
+            with suppress(OSError):
+                place.parent.mkdir(parents=True, exist_ok=True)
+                write_atomic(place, zlib.compress(content, 1))
+
+    def _place(self, kind: str, name: str) -> Path:
+        digest = _digest(name)
+        return Path(self._folder or "", kind, digest[:2], digest)
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
+
+
+_T = TypeVar("_T")
+_Item = TypeVar("_Item")
+
+Files = Mapping[str, tuple[int, int]]
+"""Name of each file of a scene to its size in bytes, and a number that changes with the file."""
+
+FILES: Final = frozenset(
+    {*METADATA_FILES, TRAINING_JSON, *VIDEO_FILES, *PACKED_DEPTH_NAMES.values()}
+)
+"""Files of a release; others in a scene's folder are ignored."""
+
+_AT_A_TIME: Final = 12
+_READ_WHOLE: Final = 4 * FIRST_BLOCK
+"""Videos of so many bytes are fetched whole when a scene is described, of larger ones both ends."""
+
+
+def in_parallel(read: Callable[[_Item], _T], items: Iterable[_Item]) -> Iterator[_T]:
+    """Yield what is read of each item, in order; several wait for the server at a time."""
+    with ThreadPoolExecutor(_AT_A_TIME) as pool:
+        yield from pool.map(read, items)
+
+
+def folder_of(root: str | Path, key: str) -> "SceneFolder":
+    """Return a scene's folder on this machine or behind a URL; nothing is read yet."""
+    return RemoteFolder(str(root), key) if is_remote(root) else SceneFolder(root, key)
+
+
+def stamp_of(files: Files) -> str:
+    """Return a digest of a scene's files that changes when one of them does."""
+    return hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest()[:32]
+
+
+class SceneFolder:
+    """A scene's folder on this machine."""
+
+    def __init__(self, root: str | Path, key: str) -> None:
+        """Name the folder by the data's root and the scene's key; nothing is read yet."""
+        self._root = root
+        self._key = key
+
+    def stamps(self) -> dict[str, tuple[int, int]]:
+        """Return the size in bytes and the modification time in ns of each file.
+
+        Raises:
+            StorageError: If the folder cannot be read.
+        """
+        folder = Path(self._root, self._key)
+        with (
+            explain_os_errors(f"{folder}: cannot be read", "Fetch the scene again."),
+            os.scandir(folder) as entries,
+        ):
+            found = {entry.name: entry.stat() for entry in entries if entry.name in FILES}
+        return {name: (found[name].st_size, found[name].st_mtime_ns) for name in sorted(found)}
+
+    def fetch(self, names: Iterable[str]) -> None:
+        """Fetch files at a time, if they are behind a URL."""
+
+    def read(self, name: str) -> bytes:
+        """Return a metadata file, whole.
+
+        Raises:
+            StorageError: If it cannot be read.
+            SchemaError: If it is too large for a metadata file.
+        """
+        where = f"{self._key}/{name}"
+        return read_text_file(Path(self._root, where), where=where)
+
+    def video(self, name: str) -> Path | MemberFile:
+        """Return a video: its path, or an open file that the caller closes.
+
+        Raises:
+            StorageError: If it cannot be read.
+        """
+        return Path(self._root, self._key, name)
+
+
+class RemoteFolder(SceneFolder):
+    """A scene's folder behind a URL."""
+
+    def __init__(
+        self, root: str, key: str, files: Files | None = None, kept: TreeCache | None = None
+    ) -> None:
+        """Name the folder, its files if they are listed already, and where small ones are kept."""
+        super().__init__(root, key)
+        self._listed = files
+        self._kept = kept
+        self._objects: dict[str, RemoteObject] = {}
+        self._parts: dict[str, list[tuple[int, bytes]]] = {}
+
+    @property
+    def _files(self) -> Files:
+        if self._listed is None:
+            found = RemoteObject(joined(str(self._root), self._key)).entries()
+            sizes = {name: found[name] for name in sorted(found) if name in FILES}
+            self._listed = {name: (size, 0) for name, size in sizes.items() if size is not None}
+        return self._listed
+
+    def stamps(self) -> dict[str, tuple[int, int]]:
+        """Return the size in bytes of each file, and a number that changes with it."""
+        return dict(self._files)
+
+    def fetch(self, names: Iterable[str]) -> None:
+        """Fetch small files, and both ends of videos, at a time.
+
+        Raises:
+            StorageError: If one cannot be read.
+        """
+        parts: list[tuple[str, int, int]] = []
+        for name in names:
+            is_video = name.startswith("cam_")
+            is_read = is_video or self._files.get(name, (0, 0))[0] <= MAX_TEXT_BYTES
+            if name in self._files and name not in self._objects and is_read:
+                size, _ = self._files[name]
+                url = joined(str(self._root), f"{self._key}/{name}")
+                self._objects[name] = RemoteObject(url, expected_size=size)
+                if is_video and size > _READ_WHOLE:
+                    parts += (name, 0, FIRST_BLOCK), (name, size - FIRST_BLOCK, size)
+                else:
+                    parts.append((name, 0, size))
+        for part, data in zip(parts, in_parallel(self._part, parts), strict=True):
+            self._parts.setdefault(part[0], []).append((part[1], data))
+
+    def read(self, name: str) -> bytes:
+        """Return a metadata file, whole.
+
+        Raises:
+            StorageError: If it cannot be read.
+            SchemaError: If it is too large for a metadata file.
+        """
+        if name not in self._files:
+            raise StorageError(f"{self._key}/{name}: is missing.")
+        require_text_size(self._files[name][0], where=f"{self._key}/{name}")
+        self.fetch([name])
+        return self._parts[name][0][1]
+
+    def video(self, name: str) -> RangedFile:
+        """Return a video, an open file that the caller closes.
+
+        Raises:
+            StorageError: If it cannot be read.
+        """
+        self.fetch([name])
+        remote, parts = self._objects[name], self._parts[name]
+
+        def fetch(start: int, stop: int) -> bytes:
+            for first, data in parts:
+                if first <= start and stop <= first + len(data):
+                    return data[start - first : stop - first]
+            return remote.read(start, stop)
+
+        return RangedFile(fetch, size=self._files[name][0])
+
+    def _part(self, part: tuple[str, int, int]) -> bytes:
+        name, start, stop = part
+        if name.startswith("cam_"):
+            return self._objects[name].read(start, stop)
+        version = f"{self._key}/{name} {self._files[name]}"
+        kept = None if self._kept is None else self._kept.read("files", version)
+        if kept is None:
+            kept = self._objects[name].read(start, stop)
+            if self._kept is not None:
+                self._kept.keep("files", version, kept)
+        return kept
+
 
 _LAYOUT: Final = "train/<family>/<map>/<scene> or eval/<subset>/<family>/<map>/<scene>"
 _SCENE_FILES: Final = frozenset({BASELINE_JSON, TRAJECTORY_JSON, COMPLETE_JSON, *VIDEO_FILES})
@@ -264,10 +549,10 @@ class RemoteTree:
             folders += [folder] if len(own) >= _FEW else own
         found: dict[str, dict[str, tuple[int, int]]] = {key: {} for key in keys}
         for folder, listed in zip(folders, in_parallel(self._listed, folders), strict=True):
-            for path, (size, version) in listed.items():
+            for path, (size, stamp) in listed.items():
                 key, _, name = f"{folder}/{path}".rpartition("/")
                 if key in found and name in FILES:
-                    found[key][sys.intern(name)] = size, version
+                    found[key][sys.intern(name)] = size, stamp
         return {key: dict(sorted(files.items())) for key, files in found.items()}
 
     def _listed(self, folder: str) -> dict[str, tuple[int, int]]:

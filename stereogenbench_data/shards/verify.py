@@ -17,8 +17,8 @@ import numpy as np
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
 from stereogenbench_data.errors import MediaError, ShardError, cure_of
+from stereogenbench_data.index.open import StaleIndexWarning
 from stereogenbench_data.index.scene_folder import metadata_differences
-from stereogenbench_data.index.stale import StaleIndexWarning
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.clock import MOST_EXTRA_FRAMES
 from stereogenbench_data.media.container import StreamFacts, depth_coding

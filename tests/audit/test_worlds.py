@@ -14,7 +14,7 @@ from stereogenbench_data.audit.scene_access import source_of
 from stereogenbench_data.datasets.mapped import SceneViews
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.pose_forms import readings
-from stereogenbench_data.index.assumptions import AssumptionWarning
+from stereogenbench_data.index.open import AssumptionWarning
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.conventions import Conventions

@@ -20,8 +20,7 @@ from stereogenbench_data import (
     StereoPairs,
     StorageError,
 )
-from stereogenbench_data.index.assumptions import AssumptionWarning
-from stereogenbench_data.index.open import IncompleteSceneWarning
+from stereogenbench_data.index.open import AssumptionWarning, IncompleteSceneWarning
 from stereogenbench_data.samples.checks import OddSceneWarning
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest

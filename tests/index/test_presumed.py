@@ -10,9 +10,9 @@ import pytest
 from stereogenbench_data import IncompleteSceneWarning, OddSceneWarning, StereoPairs
 from stereogenbench_data.errors import SchemaError, StorageError
 from stereogenbench_data.index.alike_rigs import RigReader
-from stereogenbench_data.index.assumptions import AssumptionWarning
+from stereogenbench_data.index.open import AssumptionWarning
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.index.tree_cache import VARIABLE
+from stereogenbench_data.index.tree import CACHE_VARIABLE
 from stereogenbench_data.schema.parse import parse_rig
 from tests.servers.scene_fixtures import documents
 
@@ -75,7 +75,7 @@ def tree(whole_tree, tmp_path):
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
-    monkeypatch.setenv(VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     return tmp_path / "cache"
 
 
@@ -238,7 +238,7 @@ def test_a_second_opening_has_the_same_rows_with_and_without_a_cache(
     whole_tree, cache, monkeypatch
 ):
     first, second = SceneIndex.open(whole_tree), SceneIndex.open(whole_tree)
-    monkeypatch.setenv(VARIABLE, "off")
+    monkeypatch.setenv(CACHE_VARIABLE, "off")
     without = SceneIndex.open(whole_tree)
 
     assert list(cache.rglob("presumed-*.parquet"))
@@ -258,7 +258,7 @@ def test_a_damaged_cache_is_ignored_and_written_anew(whole_tree, cache):
 
 def test_a_cache_that_cannot_be_written_is_none(whole_tree, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    monkeypatch.setenv(VARIABLE, str(tmp_path / "file" / "cache"))
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file" / "cache"))
 
     assert len(SceneIndex.open(whole_tree)) == len(KEYS)
 
@@ -293,7 +293,7 @@ def test_a_state_is_loaded_by_a_second_opening(whole_tree, cache, monkeypatch):
     batches = iter(first)
     next(batches)
     state, due = first.state_dict(), next(batches)["scene"]
-    monkeypatch.setenv(VARIABLE, "off")
+    monkeypatch.setenv(CACHE_VARIABLE, "off")
     second = loader()
     second.load_state_dict(state)
 

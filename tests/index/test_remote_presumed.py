@@ -11,7 +11,7 @@ from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import open as open_module
 from stereogenbench_data.index.presumed import Presumption
-from stereogenbench_data.index.tree_cache import VARIABLE
+from stereogenbench_data.index.tree import CACHE_VARIABLE
 from tests.servers.hub import REPOSITORY, hub_serving
 
 HUB = f"hf://datasets/{REPOSITORY}@main"
@@ -46,7 +46,7 @@ def release(whole_release, tmp_path):
 
 @pytest.fixture
 def hub(release, tmp_path, monkeypatch):
-    monkeypatch.setenv(VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     with hub_serving(release, monkeypatch) as server:
         server.facts["page"] = 100
         yield server

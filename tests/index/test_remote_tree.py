@@ -7,6 +7,7 @@ from typer.testing import CliRunner
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import StorageError
+from stereogenbench_data.index import build
 from stereogenbench_data.index.tree import find_remote_scenes
 from tests.servers.hub import REPOSITORY, hub_serving
 
@@ -57,6 +58,17 @@ def test_the_command_indexes_a_part_of_a_repository(tmp_path, small_release):
     pairs = StereoPairs(index, fields=("left",))
     np.testing.assert_array_equal(pairs[0]["left"], folder[0]["left"])
     assert key == folder.index.column("key")[folder.plan.scene_rows[0]]
+
+
+@pytest.mark.usefixtures("hub_tree")
+def test_the_command_tells_requests_and_time_before_it_reads_many_scenes(tmp_path, monkeypatch):
+    monkeypatch.setattr(build, "_MOST_UNTOLD", 40)
+
+    done = CliRunner().invoke(app, ["index", HUB, "-o", str(tmp_path / "all.parquet")])
+
+    assert done.exit_code == 0, done.output
+    told = " ".join(done.output.split())
+    assert "reads all files of 4 scenes, in 116 requests: on the Hub without a login" in told
 
 
 def test_a_part_is_indexed_under_a_name_of_its_own(small_release):

@@ -7,13 +7,13 @@ import shutil
 import pytest
 
 from stereogenbench_data.errors import SchemaError, StorageError
-from stereogenbench_data.index.assumptions import assumptions
-from stereogenbench_data.index.folders import SceneFolder, stamp_of
+from stereogenbench_data.index.open import assumptions
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
     describe_scene,
     metadata_differences,
 )
+from stereogenbench_data.index.tree import SceneFolder, stamp_of
 from stereogenbench_data.schema.records import Member
 
 KEY = "train/Uniform/Car_Dealer/scene_000001"

@@ -20,8 +20,7 @@ from hypothesis import strategies as st
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import open as index_module
 from stereogenbench_data.index.arrow import table_digest
-from stereogenbench_data.index.assumptions import AssumptionWarning
-from stereogenbench_data.index.open import IncompleteSceneWarning
+from stereogenbench_data.index.open import AssumptionWarning, IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Member, Rig, Scene, SceneId, SceneLabels
 from stereogenbench_data.sources.members import MemberSource
@@ -401,7 +400,7 @@ def recording(scenes, path, root):
     return path
 
 
-@pytest.mark.filterwarnings("ignore::stereogenbench_data.index.stale.StaleIndexWarning")
+@pytest.mark.filterwarnings("ignore::stereogenbench_data.index.open.StaleIndexWarning")
 @pytest.mark.parametrize(
     "root",
     [
@@ -441,7 +440,7 @@ def test_a_root_elsewhere_than_beside_the_index_is_the_users_own_word(
     assert SceneIndex.open(path).root == str(tmp_path / "a")
 
 
-@pytest.mark.filterwarnings("ignore::stereogenbench_data.index.stale.StaleIndexWarning")
+@pytest.mark.filterwarnings("ignore::stereogenbench_data.index.open.StaleIndexWarning")
 def test_a_chain_that_runs_commands_is_not_opened(scenes, tmp_path, monkeypatch):
     template = "{{ cycler.__init__.__globals__.os.system('touch RAN') }}"
     members = [member.path for member in scenes[0].members.values()]

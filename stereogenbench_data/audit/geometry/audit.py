@@ -25,13 +25,12 @@ from stereogenbench_data.audit.geometry.table import table_rows
 from stereogenbench_data.audit.scene_access import source_of
 from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
-from stereogenbench_data.index.build import walk
-from stereogenbench_data.index.folders import SceneFolder
-from stereogenbench_data.index.journal import Journal
+from stereogenbench_data.index.build import Journal, walk
 from stereogenbench_data.index.open import IncompleteSceneWarning
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.rows import row_of
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.index.tree import SceneFolder
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import DepthEncoding, Scene
