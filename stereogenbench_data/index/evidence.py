@@ -78,6 +78,7 @@ class _Passed:
     reading: Reading
     poses: CameraPoses
     off: float
+    lateral_m: np.ndarray
 
     @property
     def name(self) -> str:
@@ -152,6 +153,7 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
     exact: list[_Passed] = []
     reversed_: list[_Passed] = []
     first = None
+    left, right = rig.primary_pair
     for _, tier in groupby(found, key=lambda each: each.tier):
         for reading in tier:
             first = first or reading
@@ -159,7 +161,7 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
             if isinstance(checked, str):
                 failures.setdefault(checked, reading.name)
                 scaled += [checked] if reading.tier == 0 and _IN_ANOTHER_UNIT in checked else []
-            elif _is_reversed(checked.poses, rig):
+            elif checked.lateral_m[left] > checked.lateral_m[right]:
                 reversed_.append(checked)
             else:
                 (exact if checked.off <= _EXACT else loose).append(checked)
@@ -167,7 +169,6 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
             break
     passed = exact or [each for each in loose if each.reading.tier == 0][:1]
     if reversed_ and not passed:
-        left, right = rig.primary_pair
         raise SidesError(
             f"{where}: by its poses ({reversed_[0].reading.name}), camera {left} is to the right "
             f"of camera {right}, and by baseline.json it is the left one. Correct one of them."
@@ -232,13 +233,6 @@ def shape_of(form: str) -> str:
     return form.split(": ")[0]
 
 
-def _is_reversed(poses: CameraPoses, rig: Rig) -> bool:
-    """Return whether the left camera of the primary pair stands to the right of the other."""
-    lateral_m = lateral_offsets_m(poses)
-    left, right = rig.primary_pair
-    return bool(lateral_m[left] > lateral_m[right])
-
-
 def _is_upright(poses: CameraPoses) -> bool:
     """Return whether no camera is upside down, in a world whose z axis must be the vertical one.
 
@@ -296,7 +290,10 @@ def _checked(reading: Reading, rig: Rig) -> _Passed | str:
         ratio = float(np.median(baselines_cm / 100 / distances))
         scaled_cm = distances * ratio * 100
     stated_m = reading.trajectory.unit_m
-    unit_m = _unit_of(ratio, stated_m) or (stated_m if np.isfinite(stated_m) else _UNREAL_M)
+    # A stated unit must be that of the distances.
+    units_m = [stated_m] if np.isfinite(stated_m) else sorted(set(UNITS_M.values()))
+    other_m = stated_m if np.isfinite(stated_m) else _UNREAL_M
+    unit_m = next((each for each in units_m if abs(ratio / each - 1) <= _ROUGH), other_m)
     allowed_cm = _DEVIATION_CM + _DEVIATION_SHARE * baselines_cm
     away_cm = np.abs(distances * unit_m * 100 - baselines_cm)
     if not (away_cm <= allowed_cm).all():
@@ -334,16 +331,7 @@ def _checked(reading: Reading, rig: Rig) -> _Passed | str:
             f"the cameras look one way, and stand {np.degrees(np.arcsin(off)):.3g} degrees off "
             f"the axis to their right"
         )
-    return _Passed(reading, poses, off)
-
-
-def _unit_of(ratio: float, stated_m: float) -> float | None:
-    """Return the metres in the unit of poses; a stated one must be that of the distances."""
-    known = [stated_m] if np.isfinite(stated_m) else sorted(set(UNITS_M.values()))
-    for unit_m in known:
-        if abs(ratio / unit_m - 1) <= _ROUGH:
-            return unit_m
-    return None
+    return _Passed(reading, poses, off, lateral_m)
 
 
 _IN_ANOTHER_UNIT: Final = ", as if one of the two were in another unit or scaled"
@@ -358,34 +346,29 @@ def same_poses(first: CameraPoses, other: CameraPoses) -> bool:
 
 def _same_rig(first: CameraPoses, other: CameraPoses) -> bool:
     """Return whether two readings agree about how cameras stand to each other, in some frames."""
-    frames = sorted({0, first.frame_count // 2, first.frame_count - 1})
     return all(
         np.allclose(
             first.cam_from_cam(frame, target=target, source=source),
             other.cam_from_cam(frame, target=target, source=source),
             atol=_SAME,
         )
-        for frame in frames
+        for frame in _frames(first)
         for source, target in ((0, 5), (2, 3))
     )
 
 
 def _same_world(first: CameraPoses, other: CameraPoses) -> bool:
     """Return whether two readings move the cameras alike, seen from their first place."""
-    return all(
+    turns = (poses.world_from_cam_rotations[0, 0] for poses in (first, other))
+    return np.allclose(*turns, atol=_SAME) and all(
         np.allclose(_moved(first, frame), _moved(other, frame), atol=_SAME)
         for frame in _frames(first)
-    ) and np.allclose(_forward(first), _forward(other), atol=_SAME)
+    )
 
 
-def _frames(poses: CameraPoses) -> Iterable[int]:
+def _frames(poses: CameraPoses) -> list[int]:
     return sorted({0, poses.frame_count // 2, poses.frame_count - 1})
 
 
 def _moved(poses: CameraPoses, frame: int) -> np.ndarray:
-    first, later = poses.world_from_cam(0, 0), poses.world_from_cam(frame, 0)
-    return np.asarray(np.linalg.inv(first) @ later)
-
-
-def _forward(poses: CameraPoses) -> np.ndarray:
-    return np.asarray(poses.world_from_cam_rotations[0, 0])
+    return np.asarray(np.linalg.inv(poses.world_from_cam(0, 0)) @ poses.world_from_cam(frame, 0))

@@ -154,10 +154,12 @@ def examine(root: str | Path, key: str, *, conventions: Conventions | None = Non
         seen = see_rig(folder.read(BASELINE_JSON), where=f"{key}/{BASELINE_JSON}")
         shape, notes, unknown = seen.shape, seen.found, seen.unknown
     if scene is not None:
-        shape = _sized(shape, scene)
         _note_camera(scene, notes)
         named, notes["poses"] = _learned_poses(folder, scene)
-        shape = replace(shape, poses=named)
+        # An image size that the videos contradict is not stated, as theirs counts.
+        at = {name: each for name, each in shape.at.items()
+              if not (scene.remark("size") and name.startswith("image_"))}  # fmt: skip
+        shape = replace(shape, at=at, poses=named)
     depth = _depth_facts(folder, key, files)
     notes["depth"] = [] if depth is None else _depth_notes(depth, scene)
     names = [name for name in (BASELINE_JSON, TRAJECTORY_JSON) if name in files]
@@ -165,14 +167,6 @@ def examine(root: str | Path, key: str, *, conventions: Conventions | None = Non
         key, keys_in(folder, names), shape, notes, unknown, depth, scene, problem,
         lacks_mark=COMPLETE_JSON not in files,
     )  # fmt: skip
-
-
-def _sized(shape: Shape, scene: Scene) -> Shape:
-    """Return a shape without an image size that the videos contradict, as theirs counts."""
-    if not scene.remark("size"):
-        return shape
-    at = {name: each for name, each in shape.at.items() if not name.startswith("image_")}
-    return replace(shape, at=at)
 
 
 def _note_camera(scene: Scene, notes: Notes) -> None:
@@ -254,15 +248,18 @@ def _depth_notes(facts: StreamFacts, scene: Scene | None) -> list[str]:
     ]
     if scene is None:
         return notes
-    unit_m, source = scene.depth_unit_m[0], scene.depth_unit_source[0]
-    where = {"tag": "a tag states it", "conventions": "the conventions state it"}.get(
-        source, "the scene's files state it"
-    )
-    if source == "default":
-        where = "nothing states it, so this is the release's default"
-    if source == "unreadable":
+    if scene.depth_unit_source[0] == "unreadable":
         return [*notes, f"the unit is not understood: {scene.remark('depth')}"]
-    return [*notes, f"{unit_m:g} m in a stored unit: {where}"]
+    where = _UNIT_SOURCES[scene.depth_unit_source[0]]
+    return [*notes, f"{scene.depth_unit_m[0]:g} m in a stored unit: {where}"]
+
+
+_UNIT_SOURCES: Final = {
+    "tag": "a tag states it",
+    "metadata": "the scene's files state it",
+    "conventions": "the conventions state it",
+    "default": "nothing states it, so this is the release's default",
+}
 
 
 def learn(root: str | Path, examined: Sequence[Examined]) -> Learned:

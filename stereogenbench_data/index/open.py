@@ -17,7 +17,7 @@ import gc
 import warnings
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
@@ -28,7 +28,7 @@ import pyarrow as pa
 from stereogenbench_data.errors import (
     SchemaError,
     StorageError,
-    describe_os_error,
+    explain_os_errors,
     text_without_secrets,
 )
 from stereogenbench_data.index import compute as pc
@@ -140,11 +140,9 @@ def open_table(
     else:
         path = local_path(data)
         where = str(path)
-        try:
+        with explain_os_errors(f"{path}: cannot be looked at"):
             is_folder, is_file = path.is_dir(), path.is_file()
             is_tree = is_folder and not (path / INDEX_NAME).is_file()
-        except OSError as error:
-            raise StorageError(describe_os_error(f"{path}: cannot be looked at", error)) from error
         if is_tree:
             _require_no_root(path, named_root)
             opened = open_tree(path)
@@ -180,7 +178,6 @@ def _open_file(path: Path, *, root: str | None) -> Opened:
     """
     table, head = read_index_file(path, where=str(path))
     head = replace(head, root=_recorded_root(path, head, table) if root is None else root)
-    _require_digest(table, head, where=str(path))
     stale = "" if is_remote(head.root) else stale_message(table, head, index_file=path)
     return Opened(table, head, stale, path)
 
@@ -226,7 +223,6 @@ def _open_url(
     content = pa.BufferReader(remote.read(0, size))
     table, head = read_index_file(content, where=remote.where)
     head = replace(head, root=root or beside)
-    _require_digest(table, head, where=remote.where)
     content.seek(0)
     return Opened(table, head, seek_tables=read_seek_tables(content))
 
@@ -277,7 +273,8 @@ def _open_presumed(tree: "ListedTree", baselines: "Baselines") -> Opened | None:
             opened = None if report is None else _keep(tree, name, _of_report(report))
     if opened is None:
         return None
-    presumption = Presumption(tree, forms=_forms_in(opened.table), baselines=baselines)
+    forms = opened.table.column("pose_form").drop_null().to_pylist()
+    presumption = Presumption(tree, forms=forms, baselines=baselines)
     return opened._replace(presumption=presumption)
 
 
@@ -287,6 +284,8 @@ def with_baselines(presumption: "Presumption", table: pa.Table) -> "tuple[pa.Tab
     Raises:
         StorageError: If one of them cannot be used, or read.
     """
+    if presumption.baselines == "read":
+        return table, presumption
     opened = _open_presumed(presumption.tree, "read")
     if opened is None or opened.presumption is None or opened.table["key"] != table["key"]:
         why = "" if opened is None else _listed(opened.head.incomplete | opened.head.broken)
@@ -382,19 +381,6 @@ def _assumed_of(table: pa.Table, *, where: str) -> str:
     return assumptions(map(scene_of, scenes), where=where)
 
 
-def _forms_in(table: pa.Table) -> list[str]:
-    """Return how the poses are read of the scenes whose trajectories were read."""
-    forms: list[str] = table.column("pose_form").drop_null().to_pylist()
-    return forms
-
-
-def _require_digest(table: pa.Table, head: IndexHead, *, where: str) -> None:
-    if table_digest(table) != head.digest:
-        raise StorageError(
-            f"{where}: its rows were changed after they were written. {made_again(where)}"
-        )
-
-
 def _require_root(root: str | Path) -> str:
     """Return the root that the user named: any URL, or a folder."""
     if is_remote(root):
@@ -427,7 +413,11 @@ def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:
         return str(beside)
     if any((beside / file["path"]).exists() for file in table.column("members")[0].as_py()):
         return str(beside)
-    folder = None if is_remote(recorded) else _recorded_folder(recorded, beside)
+    folder = None
+    with suppress(OSError, ValueError, RuntimeError):  # of a path that is none
+        is_url = recorded[:5].lower() == "file:"
+        place = local_path(recorded) if is_url else Path(recorded)
+        folder = None if is_remote(recorded) else (beside / place).resolve()
     if folder is None or not folder.is_relative_to(beside.resolve()):
         raise _must_be_named(path, recorded)
     if not folder.is_dir():
@@ -436,15 +426,6 @@ def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:
             f"the data's root, or run `stereogenbench index` again."
         )
     return str(folder)
-
-
-def _recorded_folder(recorded: str, beside: Path) -> Path | None:
-    """Return the folder of a recorded path, with links resolved; None if the path is invalid."""
-    try:
-        folder = local_path(recorded) if recorded[:5].lower() == "file:" else Path(recorded)
-        return (beside / folder).resolve()
-    except (OSError, ValueError, RuntimeError):
-        return None
 
 
 def _must_be_named(path: Path, recorded: str) -> StorageError:

@@ -25,7 +25,7 @@ from stereogenbench_data.errors import (
     explain_os_errors,
 )
 from stereogenbench_data.index import compute as pc
-from stereogenbench_data.index.arrow import as_numpy, one_array
+from stereogenbench_data.index.arrow import as_numpy, one_array, table_digest
 from stereogenbench_data.index.rows import (
     ADDED,
     COLUMNS,
@@ -103,6 +103,9 @@ def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Tab
         table = _with_added(_read_bounded(file, footer, schema, names, where=where))
         table = table.combine_chunks()
         table.validate(full=True)
+        require_sound(table, where=where)
+        if table_digest(table) != head.digest:
+            raise _altered(where, "its rows were changed after they were written")
     except StorageError:
         raise
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
@@ -113,7 +116,6 @@ def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Tab
             f"{where}: not a readable Parquet file ({error}). It was cut short or is something "
             f"else. {made_again(where)}"
         ) from error
-    require_sound(table, where=where)
     return table, head
 
 
@@ -146,10 +148,8 @@ def _require_columns(schema: pa.Schema, names: list[str], *, where: str) -> None
     ]
     odd += [name for name in SCHEMA.names if name not in (*names, *ADDED)]
     if odd:
-        raise StorageError(
-            f"{where}: its columns are not those of an index (see "
-            f"{shortened(', '.join(odd), 300)}). {made_again(where)}"
-        )
+        shown_odd = shortened(", ".join(odd), 300)
+        raise _altered(where, f"its columns are not those of an index (see {shown_odd})")
 
 
 def _read_bounded(
@@ -198,9 +198,10 @@ def _read_bounded(
                 groups.append(group.cast(plain))
     if need <= most:
         return pa.concat_tables(groups)
-    raise StorageError(
-        f"{where}: its {footer.num_rows:,} rows take {need:,} bytes of memory or more, and an "
-        f"index of {size:,} bytes may take {most:,}. It was altered. {made_again(where)}"
+    raise _altered(
+        where,
+        f"its {footer.num_rows:,} rows take {need:,} bytes of memory or more, and an index of "
+        f"{size:,} bytes may take {most:,}",
     )
 
 
@@ -309,40 +310,37 @@ def _parse_head(metadata: bytes | None, *, where: str) -> IndexHead:
             f"{where}: is an index of format {shortened(repr(head.get('format')))}, and this "
             f"version of the package reads format {_FORMAT}. {made_again(where)}"
         )
-    reasons = [head.get("incomplete"), head.get("broken")]
-    if (
-        not all(map(_are_texts, reasons))
-        or not isinstance(head.get("shards"), dict)
-        or not isinstance(head.get("root"), str)
-        or not all(map(_are_shard_facts, head["shards"].values()))
-        or any(re.search(UNSAFE_PATH, path) for path in head["shards"])
-        or not isinstance(head.get("passed_over", []), list)
-    ):
-        raise StorageError(f"{where}: its description of itself was altered. {made_again(where)}")
+    reasons, shards = [head.get("incomplete"), head.get("broken")], head.get("shards")
+    kinds = {"size": int, "sha256": str, "members": int}
+    is_right = (
+        all(isinstance(each, dict) and all(type(text) is str for text in each.values())
+            for each in reasons)
+        and isinstance(head.get("root"), str)
+        and isinstance(head.get("passed_over", []), list)
+        and isinstance(shards, dict)
+        and not any(re.search(UNSAFE_PATH, path) for path in shards)
+        and all(isinstance(facts, dict)
+                and {name: type(each) for name, each in facts.items()} == kinds
+                and min(facts["size"], facts["members"]) >= 0
+                and max(facts["size"], facts["members"]) < _LARGEST
+                for facts in shards.values())
+    )  # fmt: skip
+    if not is_right:
+        raise _altered(where, "its description of itself was altered")
     return IndexHead(
         root=head["root"],
         digest=str(head.get("digest")),
         incomplete=head["incomplete"],
         broken=head["broken"],
-        shards={path: ShardFacts(**facts) for path, facts in head["shards"].items()},
+        shards={path: ShardFacts(**facts) for path, facts in shards.items()},
         # An index of an earlier version that lies elsewhere may have been made of a part.
         is_part=head.get("part", head["root"] != ".") is True,
         passed_over=tuple(map(str, head.get("passed_over", ()))),
     )
 
 
-def _are_texts(value: Any) -> bool:
-    return isinstance(value, dict) and all(isinstance(text, str) for text in value.values())
-
-
-def _are_shard_facts(value: Any) -> bool:
-    kinds = {"size": int, "sha256": str, "members": int}
-    return (
-        isinstance(value, dict)
-        and {name: type(each) for name, each in value.items()} == kinds
-        and 0 <= value["size"] < _LARGEST
-        and 0 <= value["members"] < _LARGEST
-    )
+def _altered(where: str, what: str) -> StorageError:
+    return StorageError(f"{where}: {what}. The index was altered. {made_again(where)}")
 
 
 def require_sound(table: pa.Table, *, where: str) -> None:
@@ -351,10 +349,7 @@ def require_sound(table: pa.Table, *, where: str) -> None:
     keys = table.column("key").to_pylist()
     for key, following in itertools.pairwise(keys):
         if key >= following:
-            raise StorageError(
-                f"{where}: scene {shortened(following)!r} is listed twice or out of order. "
-                f"{made_again(where)}"
-            )
+            raise _altered(where, f"scene {shortened(following)!r} is listed twice or out of order")
     for paths, unfit in (
         (table.column("key"), UNSAFE_PATH),
         (pc.struct_field(members, "path"), UNSAFE_PATH),
@@ -362,21 +357,16 @@ def require_sound(table: pa.Table, *, where: str) -> None:
     ):
         unsafe = paths.filter(pc.match_substring_regex(paths, unfit))
         if len(unsafe):
-            raise StorageError(
-                f"{where}: {shortened(unsafe[0].as_py())!r} is not a path inside the data's root. "
-                f"The index was altered. {made_again(where)}"
-            )
-    remarks = pc.list_flatten(table.column("remarks"))
-    checks: list[tuple[str, Any, tuple[float, float] | str | None]] = [
-        (name, table.column(name), column.allowed) for name, column in COLUMNS.items()
-    ]
-    checks += [(name, pc.struct_field(members, name), None) for name in ("name", "path")]
-    checks += [(name, pc.struct_field(members, name), _OF_BYTES) for name in ("offset", "size")]
-    about = f"^({'|'.join(REMARKS)})$"
-    for name, known in (("text", None), ("about", about)):
-        checks.append((name, pc.struct_field(remarks, name), known))
-    for name, values, allowed in checks:
-        _require_allowed(name, values, allowed, where=where)
+            shown_path = shortened(unsafe[0].as_py())
+            raise _altered(where, f"{shown_path!r} is not a path inside the data's root")
+    for name, column in COLUMNS.items():
+        _require_allowed(name, table.column(name), column.allowed, where=where)
+    for values, allowed_of in (
+        (members, {"name": None, "path": None, "offset": _OF_BYTES, "size": _OF_BYTES}),
+        (pc.list_flatten(table.column("remarks")), {"text": None, "about": _ABOUT}),
+    ):
+        for name, allowed in allowed_of.items():
+            _require_allowed(name, pc.struct_field(values, name), allowed, where=where)
     _require_whole(table, where=where)
 
 
@@ -394,10 +384,8 @@ def _require_allowed(
     if pa.types.is_string(values.type):
         length = pc.max(pc.utf8_length(values)).as_py() or 0
         if length > MOST_LETTERS:
-            raise StorageError(
-                f"{where}: {name} of a scene has {length:,} letters, and it may have "
-                f"{MOST_LETTERS:,}. The index was altered. {made_again(where)}"
-            )
+            told = f"{name} of a scene has {length:,} letters, and it may have {MOST_LETTERS:,}"
+            raise _altered(where, told)
     if isinstance(allowed, str):
         odd = values.filter(pc.invert(pc.match_substring_regex(values, allowed))).to_pylist()
         if odd:
@@ -412,6 +400,7 @@ def _require_allowed(
 
 
 _OF_BYTES: Final = (0, 2**61)
+_ABOUT: Final = f"^({'|'.join(REMARKS)})$"
 _MAY_BE_NAN: Final = ("depth_unit_m", "psnr_db", "worst_psnr_db")
 
 
@@ -424,7 +413,7 @@ def _require_whole(table: pa.Table, *, where: str) -> None:
             except (SchemaError, ValueError, RecursionError) as error:
                 raise _odd(where, name, text, f"not understood ({error})") from error
     if pc.any(pc.equal(table.column("primary_left"), table.column("primary_right"))).as_py():
-        raise StorageError(f"{where}: a primary pair has a camera twice. {made_again(where)}")
+        raise _altered(where, "a primary pair has a camera twice")
     unknown = np.isnan(as_numpy(table.column("depth_unit_m")))
     if (unknown & (as_numpy(table.column("depth_unit_source")) != "unreadable")).any():
         raise _odd(where, "depth_unit_m", math.nan, "not a unit, though files state one")
@@ -434,7 +423,7 @@ def _require_whole(table: pa.Table, *, where: str) -> None:
         ("what training shards say of a scene is there in part only", TRAINING_COLUMNS),
     ):
         if len({tuple(pc.is_null(table.column(name)).to_pylist()) for name in names}) > 1:
-            raise StorageError(f"{where}: {what}. {made_again(where)}")
+            raise _altered(where, what)
     lists = one_array(table.column("key_frames"))
     flat = as_numpy(lists.flatten()).astype(np.int64)
     scenes = as_numpy(pc.list_parent_indices(lists))
@@ -448,7 +437,4 @@ def _require_whole(table: pa.Table, *, where: str) -> None:
 
 
 def _odd(where: str, name: str, found: Any, why: str) -> StorageError:
-    return StorageError(
-        f"{where}: {name} is {shortened(repr(found))}, {why}. The index was altered. "
-        f"{made_again(where)}"
-    )
+    return _altered(where, f"{name} is {shortened(repr(found))}, {why}")

@@ -267,8 +267,8 @@ class SceneIndex:
             captions = self.presumption.captions(self.column("key"))
             self._columns[name] = np.array(captions, dtype=object)
             self._columns[name].setflags(write=False)
-        if name in _OF_BASELINES:
-            self._read_baselines()
+        if name in _OF_BASELINES and self.presumption is not None:
+            self._table, self.presumption = with_baselines(self.presumption, self._table)
         if name not in self._columns:
             columns = [each for each in SCHEMA.names if each not in _LISTS]
             if name not in columns:
@@ -277,11 +277,6 @@ class SceneIndex:
             self._columns[name] = as_numpy(self._table.column(name))
             self._columns[name].setflags(write=False)
         return self._columns[name]
-
-    def _read_baselines(self) -> None:
-        """Read what each ``baseline.json`` says, if it is presumed."""
-        if self.presumption is not None and self.presumption.baselines != "read":
-            self._table, self.presumption = with_baselines(self.presumption, self._table)
 
     @property
     def shapes(self) -> tuple[Shape, ...]:

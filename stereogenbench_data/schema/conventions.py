@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, Final, get_args
 
 from stereogenbench_data.errors import SchemaError, explain_os_errors
-from stereogenbench_data.schema.document import is_number
+from stereogenbench_data.schema.document import is_number, listed_keys
 from stereogenbench_data.schema.quantities import (
     OTHER_UNITS,
     UNITS_M,
@@ -205,7 +205,7 @@ def value_stated(document: dict[str, Any], path: str | None, table: str, *, wher
     try:
         return value_at(document, str(path))
     except LookupError as error:
-        keys = plain_line(shortened(", ".join(sorted(document)), 400))
+        keys = plain_line(listed_keys(document))
         raise SchemaError(
             f"{where}: {plain_line(str(path))} is not in the file, and the conventions say that "
             f"[{table}] stands there; its keys are: {keys}. Correct the place, or state another "

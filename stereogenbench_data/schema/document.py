@@ -7,6 +7,7 @@ import json
 import math
 import re
 from collections import Counter
+from collections.abc import Iterable
 from typing import Any, Final, TypeGuard
 
 from stereogenbench_data.errors import SchemaError
@@ -129,18 +130,19 @@ def child_path(path: str, key: str | int) -> str:
 def brief(value: object) -> str:
     """Return a JSON value as messages show it: the size of containers, the start of long texts."""
     if isinstance(value, dict):
-        return f"an object with {len(value)} keys ({_keys(value)})" if value else "an empty object"
+        keys = listed_keys(value)
+        return f"an object with {len(value)} keys ({keys})" if value else "an empty object"
     if isinstance(value, list):
         return f"a list of {len(value)}"
     return "null" if value is None else shortened(repr(value))
 
 
-def _keys(document: dict[str, object]) -> str:
+def listed_keys(keys: Iterable[str]) -> str:
     """Return the keys of an object, sorted, as messages show them."""
-    keys = sorted(document)
-    more = f", and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
-    plain = (key if key.isascii() and key.isprintable() else ascii(key) for key in keys[:_SHOWN])
-    return ", ".join(map(shortened, plain)) + more or "none"
+    first = sorted(keys)[:_SHOWN]
+    plain = (key if key.isascii() and key.isprintable() else ascii(key) for key in first)
+    more = len(list(keys)) - len(first)
+    return ", ".join(map(shortened, plain)) + (f", and {more} more" if more else "") or "none"
 
 
 def is_number(value: object) -> TypeGuard[int | float]:
@@ -148,13 +150,6 @@ def is_number(value: object) -> TypeGuard[int | float]:
     if type(value) is int:
         return abs(value) < _LARGEST_INT
     return type(value) is float and math.isfinite(value)
-
-
-def _as_integer(value: object) -> int | None:
-    if not is_number(value):
-        return None
-    number = float(value)
-    return int(number) if number.is_integer() else None
 
 
 def camera_of(value: object) -> int | None:
@@ -166,4 +161,4 @@ def camera_of(value: object) -> int | None:
     if isinstance(value, str):
         named = _CAMERA_NAME.search(value)
         return int(named[1]) if named else None
-    return _as_integer(value)
+    return int(value) if is_number(value) and float(value).is_integer() else None

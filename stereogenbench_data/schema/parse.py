@@ -29,6 +29,7 @@ from stereogenbench_data.schema.document import (
     camera_of,
     child_path,
     is_number,
+    listed_keys,
     parse_object,
 )
 from stereogenbench_data.schema.quantities import (
@@ -352,9 +353,7 @@ class _RigFile(MetadataFile):
     def _keys(self) -> str:
         inner = self.document.get("camera_intrinsics")
         inner = inner if isinstance(inner, dict) else {}
-        keys = sorted([*self.document, *(f"camera_intrinsics.{key}" for key in inner)])
-        plain = (key if key.isascii() and key.isprintable() else ascii(key) for key in keys)
-        return shortened(", ".join(plain) or "none", 400)
+        return listed_keys([*self.document, *(f"camera_intrinsics.{key}" for key in inner)])
 
     def _conflict(self, what: str, first: Stated, other: Stated) -> None:
         again, known = (f"{brief(each.value)} {each.unit}".rstrip() for each in (other, first))
@@ -489,9 +488,12 @@ class _RigFile(MetadataFile):
                     for path in (at.left, at.right)]  # fmt: skip
             stated = [Stated(ends, "", f"{at.left} and {at.right}"), *stated]
         first_number = _first_number(self.lengths)
+        # Names may count from 0 beside numbers from 1.
+        names = re.findall(rb'(?i)"([^"]*cam[^"]*)"', self.content if first_number else b"")
+        names_camera_0 = any(camera_of(name.decode(errors="replace")) == 0 for name in names)
         for each in stated:
             left, right = named_pair(each.value) or (0, 0)
-            if first_number and not (isinstance(each.value, dict) and self._names_camera_0):
+            if first_number and not (isinstance(each.value, dict) and names_camera_0):
                 left, right = left - 1, right - 1
             if left == right or not {left, right} <= set(range(CAMERA_COUNT)):
                 shown = shortened(json.dumps(each.value), 100)
@@ -513,12 +515,6 @@ class _RigFile(MetadataFile):
                 f"right, as in the release; the keys are: {self._keys}",
             )
         return 0, 1
-
-    @property
-    def _names_camera_0(self) -> bool:
-        """Whether a text names camera 0: names may count from 0 beside numbers from 1."""
-        names = re.findall(rb'(?i)"([^"]*cam[^"]*)"', self.content)
-        return any(camera_of(name.decode(errors="replace")) == 0 for name in names)
 
     def _baselines_cm(self) -> dict[Pair, float]:
         """Return each pair's baseline in cm.

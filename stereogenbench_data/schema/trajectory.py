@@ -15,7 +15,13 @@ from typing import Any, Final
 import numpy as np
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.document import brief, camera_of, is_number, parse_document
+from stereogenbench_data.schema.document import (
+    brief,
+    camera_of,
+    is_number,
+    listed_keys,
+    parse_document,
+)
 from stereogenbench_data.schema.parse import named_pair
 from stereogenbench_data.schema.quantities import NAMES, Values, without_unit, words
 from stereogenbench_data.schema.release import CAMERA_COUNT
@@ -127,7 +133,7 @@ def record_poses(text: bytes, *, where: str) -> RecordedPoses:
     if not blocks or odd:
         reason = "; ".join(dict.fromkeys(odd)) or (
             f"no numbers of {CAMERA_COUNT} cameras in each frame are in it; the keys are: "
-            f"{', '.join(sorted(document)[:20])}"
+            f"{listed_keys(document)}"
         )
         raise SchemaError(f"{where}: {reason}.")
     head = Values({key: value for key, value in document.items() if "pair" in words(key)})
@@ -413,10 +419,8 @@ def _numbers_of(place: Place, columns: Columns, what: str) -> np.ndarray | None:
 
 
 def _frame_of(value: object) -> int | None:
-    if isinstance(value, str):
-        match = _COUNTING.match(value)
-        return int(match[2]) if match else None
-    return int(value) if is_number(value) and float(value).is_integer() else None
+    match = _COUNTING.match(value) if isinstance(value, str) else None
+    return int(match[2]) if match else None if isinstance(value, str) else camera_of(value)
 
 
 _CAMERA_KEYS: Final = ("camera_index", "camera_id", "cam_index", "cam_id", "camera_number", "index",
