@@ -43,9 +43,9 @@ from stereogenbench_data.evaluation.models.registry import ModelOptions as Model
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol as EvaluationProtocol
 from stereogenbench_data.evaluation.report import write_report as write_report
 from stereogenbench_data.evaluation.tables import tables_of as tables_of
-from stereogenbench_data.index.assumptions import AssumptionWarning as AssumptionWarning
+from stereogenbench_data.index.open import AssumptionWarning as AssumptionWarning
 from stereogenbench_data.index.open import IncompleteSceneWarning as IncompleteSceneWarning
-from stereogenbench_data.index.stale import StaleIndexWarning as StaleIndexWarning
+from stereogenbench_data.index.open import StaleIndexWarning as StaleIndexWarning
 from stereogenbench_data.index.table import SceneIndex as SceneIndex
 from stereogenbench_data.samples.checks import OddSceneWarning as OddSceneWarning
 from stereogenbench_data.samples.fields import PAIR_FIELDS as PAIR_FIELDS

@@ -26,9 +26,10 @@ _MOST_VALUES: Final = 2000
 """A file with more values is read by itself: a released one has some hundreds."""
 _SCALES: Final = (1.0, 100.0, 0.1, 10.0, 1000.0)
 """From a unit in which lengths may be written to cm or mm."""
-_NUMBERS: Final = (
-    "focal_mm", "sensor_width_mm", "sensor_height_mm", "image_width_px", "image_height_px",
-)  # fmt: skip
+_NUMBERS: Final = {
+    **dict.fromkeys(("focal_mm", "sensor_width_mm", "sensor_height_mm"), float),
+    **dict.fromkeys(("image_width_px", "image_height_px"), int),
+}
 _LABELS: Final = tuple(each.name for each in fields(SceneLabels))
 
 
@@ -191,14 +192,13 @@ def _values(parsed: Parsed) -> list[Any]:
 
 def _parsed(values: Sequence[Any], *, like: Rig) -> Parsed:
     """Return the records of such values."""
-    lengths, baselines = len(_NUMBERS), len(like.baselines_cm)
-    focal_mm, width_mm, height_mm, width_px, height_px = values[:lengths]
-    rig = Rig(
-        float(focal_mm), float(width_mm), float(height_mm), int(width_px), int(height_px),
-        like.principal_point_px, tuple(map(float, values[lengths : lengths + baselines])),
-        like.primary_pair, like.image_size_source,
-    )  # fmt: skip
-    return rig, SceneLabels(*values[lengths + baselines :]), ()
+    count = len(_NUMBERS)
+    labels_at = count + len(like.baselines_cm)
+    numbers: dict[str, Any] = {
+        name: kind(value) for (name, kind), value in zip(_NUMBERS.items(), values, strict=False)
+    }
+    rig = replace(like, baselines_cm=tuple(map(float, values[count:labels_at])), **numbers)
+    return rig, SceneLabels(*values[labels_at:]), ()
 
 
 def _unlearned(rig: Rig) -> Rig:

@@ -612,24 +612,24 @@ def require_finished(
 
 def caption_of(texts: Mapping[str, bytes], *, key: str) -> tuple[str, tuple[Remark, ...]]:
     """Return a scene's caption from its files: the detailed one, else the short one, else ""."""
-    remarks: tuple[Remark, ...] = ()
-    if DESCRIPTION_JSON in texts:
-        where = f"{key}/{DESCRIPTION_JSON}"
-        description, remarks = parse_description(texts[DESCRIPTION_JSON], where=where)
-        written = description.detailed_caption or description.short_caption
-        if written:
-            return written, remarks
-    if DESCRIPTION_TXT in texts:
-        where = f"{key}/{DESCRIPTION_TXT}"
+    written, remarks = "", list[Remark]()
+    for name in DESCRIPTIONS:
+        where = f"{key}/{name}"
+        if name not in texts or written:
+            continue
+        if name == DESCRIPTION_JSON:
+            description, odd = parse_description(texts[name], where=where)
+            written = description.detailed_caption or description.short_caption
+            remarks += odd
+            continue
         try:
-            written = parse_text(texts[DESCRIPTION_TXT], where=where).strip()
+            written = parse_text(texts[name], where=where).strip()
         except SchemaError as error:
-            return "", (*remarks, Remark("caption", str(error)))
+            remarks.append(Remark("caption", str(error)))
         if len(written) > MOST_LETTERS:
-            odd = f"{where}: may have {MOST_LETTERS:,} letters, this one has {len(written):,}"
-            return "", (*remarks, Remark("caption", odd))
-        return written, remarks
-    return "", remarks
+            told = f"{where}: may have {MOST_LETTERS:,} letters, this one has {len(written):,}"
+            written, remarks = "", [*remarks, Remark("caption", told)]
+    return written, tuple(remarks)
 
 
 def merged_labels(labels: SceneLabels, marked: SceneLabels) -> SceneLabels:
@@ -652,35 +652,29 @@ def sized_as_videos(
 
     A principal point, in pixels of the recorded image, moves with the size.
     """
-    width_px, height_px = size_px
-    if document is not None and (width_px, height_px) != document.size_px:
+    recorded_px = size_px if document is None else document.source_size_px
+    known_px = rig.image_width_px, rig.image_height_px
+    known, recorded, now = (f"{w}x{h} pixels" for w, h in (known_px, recorded_px, size_px))
+    if document is not None and size_px != document.size_px:
         raise StorageError(
             f"{key}: {TRAINING_JSON} is for pictures of {document.size_px[0]}x"
-            f"{document.size_px[1]} pixels, and all videos have {width_px}x{height_px} pixels. "
-            f"Fetch the scene again."
+            f"{document.size_px[1]} pixels, and all videos have {now}. Fetch the scene again."
         )
-    recorded_px = (width_px, height_px) if document is None else document.source_size_px
-    known_px = rig.image_width_px, rig.image_height_px
-    if rig.image_size_source == "recorded" and known_px != recorded_px:
+    is_recorded = rig.image_size_source == "recorded"
+    if is_recorded and known_px != recorded_px:
         if shape is not None and not {"image_width", "image_height"}.isdisjoint(shape.at):
             raise StorageError(
-                f"{key}: by the conventions pictures have {known_px[0]}x{known_px[1]} pixels, and "
-                f"all videos have {recorded_px[0]}x{recorded_px[1]}. Correct [image_width] and "
-                f"[image_height], or leave them out: the videos' size counts."
+                f"{key}: by the conventions pictures have {known}, and all videos have {recorded}. "
+                f"Correct [image_width] and [image_height], or leave them out: the videos' size "
+                f"counts."
             )
-        remarks.append(
-            Remark(
-                "size",
-                f"{key}: {BASELINE_JSON} is for pictures of {known_px[0]}x{known_px[1]} pixels, "
-                f"and all videos have {recorded_px[0]}x{recorded_px[1]}, which counts",
-            )
-        )
+        told = f"is for pictures of {known}, and all videos have {recorded}, which counts"
+        remarks.append(Remark("size", f"{key}: {BASELINE_JSON} {told}"))
     point_px = rig.principal_point_px
     if point_px is not None and known_px != recorded_px:
-        scales = [recorded / known for recorded, known in zip(recorded_px, known_px, strict=True)]
-        if rig.image_size_source == "default":  # in pixels of the videos, then
-            scales = [1.0, 1.0]
-        point_px = (point_px[0] * scales[0], point_px[1] * scales[1])
+        if is_recorded:  # else it is in pixels of the videos
+            x, y = (own / known for own, known in zip(recorded_px, known_px, strict=True))
+            point_px = (point_px[0] * x, point_px[1] * y)
         if all(abs(at - side / 2) <= 1 for at, side in zip(point_px, recorded_px, strict=True)):
             point_px = None
     height_mm = rig.sensor_height_mm
@@ -689,20 +683,17 @@ def sized_as_videos(
         height_mm = rig.sensor_width_mm * recorded_px[1] / recorded_px[0]
     aspect = rig.sensor_width_mm / height_mm * recorded_px[1] / recorded_px[0]
     if abs(aspect - 1) > _SQUARE:
-        remarks.append(
-            Remark(
-                "pixels",
-                f"{key}: a sensor of {rig.sensor_width_mm:.6g} x {height_mm:.6g} mm and pictures "
-                f"of {recorded_px[0]}x{recorded_px[1]} pixels have pixels that are not square "
-                f"({aspect:.4g} times as wide as high)",
-            )
+        told = (
+            f"{key}: a sensor of {rig.sensor_width_mm:.6g} x {height_mm:.6g} mm and pictures of "
+            f"{recorded} have pixels that are not square ({aspect:.4g} times as wide as high)"
         )
+        remarks.append(Remark("pixels", told))
     return replace(
         rig,
         principal_point_px=point_px,
         sensor_height_mm=height_mm,
-        image_width_px=width_px,
-        image_height_px=height_px,
+        image_width_px=size_px[0],
+        image_height_px=size_px[1],
         recorded_size_px=None if document is None else document.source_size_px,
     )
 

@@ -195,7 +195,8 @@ class SceneIndex:
             )
         self.load_seek_tables()
         tables = None if isinstance(self._seek_tables, Path) else self._seek_tables
-        head = replace(self._head, digest=self.digest, passed_over=self.passed_over)
+        left_out = {name: getattr(self, name) for name in ("incomplete", "broken", "passed_over")}
+        head = replace(self._head, digest=self.digest, **left_out)
         write_index_file(Path(path), self._table, head, seek_tables=tables)
 
     @property

@@ -80,7 +80,7 @@ def test_a_scene_is_the_same_by_the_file_it_taught(elsewhere, shared_scenes):
         ("$.image_width", "$.camera_count", r"6x320.*320x320"),
         ('"$.pairwise_pairs"\nunit = "cm"', '"$.pairwise_pairs"\nunit = "m"', r"pairwise_pairs"),
         ("$.pairwise_pairs", "$.camera_order", r"camera_order"),
-        ("pair.left_camera", "pair.right_camera", r"1 and 1"),
+        ("pair.left_camera", "pair.right_camera", r"Cam_01.*Cam_01"),
         ('left = "$.primary_stereo_pair.left_camera"\nright = "$.primary_stereo_pair.right_camera"',
          'left = "$.primary_stereo_pair.right_camera"\nright = "$.primary_stereo_pair.left_camera"',
          r"primary pair"),

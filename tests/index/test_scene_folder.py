@@ -224,7 +224,7 @@ def test_units_of_depth_that_differ_by_a_scale_within_a_rig_are_not_used(make_sc
 def test_a_video_of_another_size_is_named(make_scene, root, video):
     shutil.copy(video("rgb.mp4", size=(48, 64)), make_scene() / "cam_01_rgb.mp4")
 
-    with pytest.raises(StorageError, match=r"11 have 32x24 pixels, but cam_01_rgb.mp4 has 64x48"):
+    with pytest.raises(StorageError, match=r"11 have 32x24, but cam_01_rgb.mp4 has 64x48"):
         describe_scene(root, KEY)
 
 
