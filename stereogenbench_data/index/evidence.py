@@ -359,8 +359,8 @@ def _same_rig(first: CameraPoses, other: CameraPoses) -> bool:
 
 def _same_world(first: CameraPoses, other: CameraPoses) -> bool:
     """Return whether two readings move the cameras alike, seen from their first place."""
-    turns = (poses.world_from_cam_rotations[0, 0] for poses in (first, other))
-    return np.allclose(*turns, atol=_SAME) and all(
+    turn, again = (poses.world_from_cam_rotations[0, 0] for poses in (first, other))
+    return np.allclose(turn, again, atol=_SAME) and all(
         np.allclose(_moved(first, frame), _moved(other, frame), atol=_SAME)
         for frame in _frames(first)
     )

@@ -310,7 +310,8 @@ def _parse_head(metadata: bytes | None, *, where: str) -> IndexHead:
             f"{where}: is an index of format {shortened(repr(head.get('format')))}, and this "
             f"version of the package reads format {_FORMAT}. {made_again(where)}"
         )
-    reasons, shards = [head.get("incomplete"), head.get("broken")], head.get("shards")
+    reasons: list[Any] = [head.get("incomplete"), head.get("broken")]
+    shards: Any = head.get("shards")
     kinds = {"size": int, "sha256": str, "members": int}
     is_right = (
         all(isinstance(each, dict) and all(type(text) is str for text in each.values())

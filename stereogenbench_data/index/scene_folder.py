@@ -654,21 +654,22 @@ def sized_as_videos(
     """
     recorded_px = size_px if document is None else document.source_size_px
     known_px = rig.image_width_px, rig.image_height_px
-    known, recorded, now = (f"{w}x{h} pixels" for w, h in (known_px, recorded_px, size_px))
+    known, recorded, now = (f"{w}x{h}" for w, h in (known_px, recorded_px, size_px))
     if document is not None and size_px != document.size_px:
         raise StorageError(
             f"{key}: {TRAINING_JSON} is for pictures of {document.size_px[0]}x"
-            f"{document.size_px[1]} pixels, and all videos have {now}. Fetch the scene again."
+            f"{document.size_px[1]} pixels, and all videos have {now} pixels. Fetch the scene "
+            f"again."
         )
     is_recorded = rig.image_size_source == "recorded"
     if is_recorded and known_px != recorded_px:
         if shape is not None and not {"image_width", "image_height"}.isdisjoint(shape.at):
             raise StorageError(
-                f"{key}: by the conventions pictures have {known}, and all videos have {recorded}. "
-                f"Correct [image_width] and [image_height], or leave them out: the videos' size "
-                f"counts."
+                f"{key}: by the conventions pictures have {known} pixels, and all videos have "
+                f"{recorded}. Correct [image_width] and [image_height], or leave them out: the "
+                f"videos' size counts."
             )
-        told = f"is for pictures of {known}, and all videos have {recorded}, which counts"
+        told = f"is for pictures of {known} pixels, and all videos have {recorded}, which counts"
         remarks.append(Remark("size", f"{key}: {BASELINE_JSON} {told}"))
     point_px = rig.principal_point_px
     if point_px is not None and known_px != recorded_px:
@@ -684,8 +685,9 @@ def sized_as_videos(
     aspect = rig.sensor_width_mm / height_mm * recorded_px[1] / recorded_px[0]
     if abs(aspect - 1) > _SQUARE:
         told = (
-            f"{key}: a sensor of {rig.sensor_width_mm:.6g} x {height_mm:.6g} mm and pictures of "
-            f"{recorded} have pixels that are not square ({aspect:.4g} times as wide as high)"
+            f"{key}: a sensor of {rig.sensor_width_mm:.6g} x {height_mm:.6g} mm and pictures "
+            f"of {recorded} pixels have pixels that are not square ({aspect:.4g} times as wide as "
+            f"high)"
         )
         remarks.append(Remark("pixels", told))
     return replace(
