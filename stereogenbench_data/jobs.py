@@ -74,8 +74,8 @@ def job_folder(
     with ExitStack() as held:
         with named_errors(root):
             root.mkdir(parents=True, exist_ok=True)
-            # Nothing is left behind in a folder of something else. A job writes its lock first: where
-            # its files are seen, so is the lock.
+            # Nothing is left behind in a folder of something else. A job writes its lock first:
+            # where its files are seen, so is the lock.
             if _holds_other_work(root, kind) and not (root / kind.lock).exists():
                 raise _other_work(root, kind)
             if not held.enter_context(try_locked(root / kind.lock)):

@@ -1,14 +1,11 @@
 """``stereogenbench pack``, ``verify``, ``unpack``: released trees into tar shards, and back."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from stereogenbench_data.cli.data import open_data
 from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import (
     CamerasOption,
@@ -48,9 +45,6 @@ def pack(  # noqa: PLR0913 - one parameter an option
         typer.Option(help="With --size: fewest bytes, or least error [balanced]."),
     ] = None,
     cameras: CamerasOption = None,
-    dry_run: Annotated[
-        bool, flag("--dry-run", "With --size: estimate bytes and core-hours; write nothing.")
-    ] = False,
     chosen: SceneOptions,
     share: ShareOptions,
     work: WorkOptions,
@@ -78,7 +72,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.shards.pack import pack as packed_by
     from stereogenbench_data.shards.plan import packed_bytes, parse_bytes
 
-    for option, value in (("--quality", quality), ("--cameras", cameras), ("--dry-run", dry_run)):
+    for option, value in (("--quality", quality), ("--cameras", cameras)):
         if value and size is None:
             raise typer.BadParameter("is of training shards: give --size.", param_hint=option)
     if size is not None and depth_codec != "released":
@@ -96,9 +90,6 @@ def pack(  # noqa: PLR0913 - one parameter an option
             for row in rows
         ]
         rows = share.rows(index, rows, sizes)
-    if dry_run and training is not None:
-        _print_estimate(index, rows or range(len(index)), training, as_json=as_json)
-        return
     with progress_bar("packing", unit="MB") as progress:
         report = packed_by(
             index,
@@ -143,38 +134,11 @@ def _training(
     return TrainingSettings(size, quality or "balanced", cameras, depth)
 
 
-def _print_estimate(
-    index: "SceneIndex", rows: Sequence[int], training: "TrainingSettings", *, as_json: bool
-) -> None:
-    from tempfile import TemporaryDirectory
-
-    from stereogenbench_data.shards.training import estimate
-
-    with TemporaryDirectory() as folder:
-        found = estimate(index, rows, training, folder=Path(folder))
-    if as_json:
-        typer.echo(json.dumps(asdict(found), indent=2))
-        return
-    typer.echo(
-        f"{counted(found.scenes, 'scene')}, {counted(found.videos, 'video')}: about "
-        f"{found.bytes / 1e6:,.1f} MB from {found.source_bytes / 1e6:,.1f} MB, in about "
-        f"{found.core_hours:,.2g} core-hours (by one camera of {len(found.sampled)} scenes)"
-    )
-
-
 @grouped
 def verify(
     shards: ShardsArgument,
     *,
     deep: Annotated[bool, flag("--deep", "Decode every video, and count its frames.")] = False,
-    comparison: Annotated[
-        str | None,
-        typer.Option(
-            "--source",
-            metavar="DATA",
-            help="With --deep: released data to compare training shards with.",
-        ),
-    ] = None,
     as_json: JsonOption = False,
     work: WorkOptions,
 ) -> None:
@@ -186,13 +150,10 @@ def verify(
     """
     from stereogenbench_data.shards.verify import verify as verified
 
-    if comparison is not None and not deep:
-        raise typer.BadParameter("compares frames: add --deep.", param_hint="--source")
     with progress_bar("verifying", unit="MB") as progress:
         report = verified(
             shards,
             mode="decode" if deep else "bytes",
-            source=None if comparison is None else open_data(comparison),
             **work.options(),
             progress=progress,
         )
@@ -202,8 +163,6 @@ def verify(
         for problem in report.problems:
             typer.echo(plain_line(str(problem)))
         decoded = f", {counted(report.videos_decoded, 'video')} decoded" if deep else ""
-        if comparison is not None:
-            decoded += f", {report.videos_compared} compared with {comparison}"
         if report.derived:
             typer.echo(plain_line(f"{report.root}: {report.derived}"))
         typer.echo(

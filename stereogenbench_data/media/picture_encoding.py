@@ -9,7 +9,6 @@ Source of the settings: ``docs/performance/README.md``, "Codecs of training shar
 
 import io
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -126,7 +125,6 @@ def write_pictures(
     *,
     quality: Quality,
     rate_hz: Fraction,
-    after_frame: Callable[[], None] = lambda: None,
 ) -> None:
     """Write pictures as an MP4 video, the same bytes for the same pictures and libraries.
 
@@ -135,7 +133,6 @@ def write_pictures(
         target: The file.
         quality: Which settings, of `QUALITIES`.
         rate_hz: Frames a second.
-        after_frame: Called after each frame.
 
     Raises:
         MediaError: If this PyAV cannot encode, or the size cannot be stored.
@@ -173,7 +170,6 @@ def write_pictures(
                     )
                     frame.pts, frame.time_base = index, 1 / rate_hz
                     container.mux(stream.encode(frame))
-                after_frame()
             if codec.codec == "h264":
                 container.mux(stream.encode(None))
     except (av.FFmpegError, ValueError) as error:
@@ -202,20 +198,13 @@ def _jpeg(pixels: UInt8[np.ndarray, "h w 3"], codec: PictureCodec) -> bytes:
     return file.getvalue()
 
 
-def measured_error(
-    pictures: Pictures,
-    video: VideoFile,
-    *,
-    name: str,
-    after_frame: Callable[[], None] = lambda: None,
-) -> PictureError:
+def measured_error(pictures: Pictures, video: VideoFile, *, name: str) -> PictureError:
     """Decode a video of pictures again, as readers do, and compare it with them.
 
     Args:
         pictures: (t, 3, h, w) uint8, what was encoded.
         video: What was written.
         name: What messages call it.
-        after_frame: Called after each frame.
 
     Returns:
         The mean over frames, and the least, of 10 log10(255^2 / mean squared error over pixels and
@@ -246,7 +235,6 @@ def measured_error(
                         f"{name}: frame {index} shows frame {other} of its source. Check the "
                         f"version of PyAV, then write it again."
                     )
-            after_frame()
     decibels = [_decibels(error) for error in found]
     worst = int(np.argmin(decibels))
     mean_db = math.floor(float(np.mean(decibels)) * 1000) / 1000

@@ -19,6 +19,7 @@ from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.scene_folder import derived_scene
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.jobs import read_json
 from stereogenbench_data.media.depth_frames import CODEC_NAME, blosc2_module
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import (
@@ -135,8 +136,8 @@ def pack(  # noqa: PLR0913 - each is an option of the command
     ]
     part_tasks = plan_tasks[number - 1 :: count]
     tasks = [task for task in part_tasks if find_packed(task) is None]
-    total = sum(task.shard.source_bytes for task in part_tasks)
-    left = sum(task.shard.source_bytes for task in tasks)
+    total = sum(task.source_bytes for task in part_tasks)
+    left = sum(task.source_bytes for task in tasks)
     advance = advance_of(progress, done=total - left, total=total)
     advance(0)
     is_counted = False
@@ -239,15 +240,17 @@ def _claim_folder(plan: ShardPlan, out: Path) -> None:
     } | ({} if plan.depth_codec == "released" else {"depth": plan.depth_codec})
     if plan.training is not None:
         expected["training"] = plan.training.describe()
-    _require_outside_release(plan, out)
+    if not is_remote(plan.root):
+        root, there = Path(plan.root).resolve(), out.resolve()
+        if there == root or any(there.is_relative_to(root / split) for split in ("train", "eval")):
+            raise ShardError(
+                f"{out}: is the release itself, or among the scenes of the release. Pack into a "
+                f"folder outside its train/ and eval/."
+            )
     is_claimed = place.exists()
-    try:
-        found = json.loads(place.read_bytes()) if is_claimed else expected
-    except ValueError:
-        found = None
+    found = read_json(place) if is_claimed else expected
     if found != expected:
-        there = found if isinstance(found, dict) else {}
-        differing = [key for key in {**expected, **there} if there.get(key) != expected.get(key)]
+        differing = [key for key in {**expected, **found} if found.get(key) != expected.get(key)]
         raise ShardError(
             f"{place}: this folder is for another plan ({', '.join(differing)} differ): of another "
             f"release, size of the shards, depth codec or training settings. Pack into an empty "
@@ -262,17 +265,3 @@ def _claim_folder(plan: ShardPlan, out: Path) -> None:
     if not is_claimed:
         place.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(place, json.dumps(expected).encode())
-
-
-def _require_outside_release(plan: ShardPlan, out: Path) -> None:
-    if is_remote(plan.root):
-        return
-    root, place = Path(plan.root).resolve(), out.resolve()
-    if place == root:
-        raise ShardError(f"{out}: is the release itself. Pack into another folder.")
-    for split in ("train", "eval"):
-        if any(place.is_relative_to(each) for each in (root / split, (root / split).resolve())):
-            raise ShardError(
-                f"{out}: is in {plan.root}/{split}, among the scenes of the release. "
-                f"Pack into a folder outside it."
-            )

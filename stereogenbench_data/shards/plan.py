@@ -34,7 +34,6 @@ from stereogenbench_data.shards.training import (
     derived_names,
     expected_bytes,
     released_name,
-    source_bytes,
 )
 
 DepthCodec = Literal["released", "blosc2"]
@@ -81,21 +80,11 @@ class PlannedShard:
     size: int
     scenes: tuple[Scene, ...]
     members: tuple[PlannedMember, ...]
-    training: TrainingSettings | None = None
 
     @property
     def keys(self) -> tuple[str, ...]:
         """The keys of its scenes, in order."""
         return tuple(scene.id.key for scene in self.scenes)
-
-    @property
-    def source_bytes(self) -> int:
-        """The size of all files that it is made from."""
-        if self.training is not None:
-            return sum(
-                source_bytes(scene, derived_names(scene, self.training)) for scene in self.scenes
-            )
-        return sum(member.size for member in self.members)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +155,7 @@ def plan_shards(
                 continue
             number = int(last.name[-len("000000.tar") : -len(".tar")]) + 1
         name = f"{group}-{number:06d}.tar"
-        shards.append(PlannedShard(name, len(END_OF_ARCHIVE) + size, (scene,), members, training))
+        shards.append(PlannedShard(name, len(END_OF_ARCHIVE) + size, (scene,), members))
     content = [
         [
             shard.name,

@@ -8,11 +8,9 @@ needs no source any more. The files of a scene are made in a folder beside the s
 
 import importlib.metadata
 import io
-import time
 import zlib
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
@@ -34,7 +32,7 @@ from stereogenbench_data.media.picture_encoding import (
     require_encodable,
     write_pictures,
 )
-from stereogenbench_data.media.video import VideoReader, probe, read_rgb, require_pixel_aspect
+from stereogenbench_data.media.video import VideoReader, probe, read_rgb, require_indexed_picture
 from stereogenbench_data.schema.records import DepthEncoding, Scene, ShardFacts
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
@@ -51,12 +49,7 @@ from stereogenbench_data.sources.members import MemberSource
 from stereogenbench_data.sources.ranged_file import require_crc32
 from stereogenbench_data.sources.retry import RetryPolicy
 
-SAMPLED_SCENES: Final = 3
-"""Of how many scenes one camera is derived to estimate the whole."""
-
 _LARGEST_DENOMINATOR: Final = 100_000
-_PICTURE_STEPS: Final = 3
-"""A picture is decoded, encoded, and decoded again."""
 _DEPTH_BITS_A_PIXEL: Final = 1.5
 _FIXED_BYTES: Final = 8192
 
@@ -230,23 +223,21 @@ def derive_scene(
                 continue
             if name == TRAINING_JSON:
                 continue
-            is_picture = name.endswith("_rgb.mp4")
-            steps = scene.frames * (_PICTURE_STEPS if is_picture else 1)
-            step = _steps(source_bytes(scene, [name]), steps, advance)
-            content = open_source(source, scene, released_name(name))
+            content = _open_source(source, scene, released_name(name))
             where = source.label(scene, released_name(name))
             target, error = folder / name, None
-            if is_picture:
-                pictures = source_pictures(content, scene, settings, name=where, after_frame=step)
+            if name.endswith("_rgb.mp4"):
+                pictures = _source_pictures(content, scene, settings, name=where)
+                advance(0)
                 rate = Fraction(scene.frame_rate_hz or FRAME_RATE_HZ)
                 write_pictures(
                     pictures,
                     target,
                     quality=settings.quality,
                     rate_hz=rate.limit_denominator(_LARGEST_DENOMINATOR),
-                    after_frame=step,
                 )
-                error = measured_error(pictures, target, name=str(target), after_frame=step)
+                advance(0)
+                error = measured_error(pictures, target, name=str(target))
                 found_keys = probe(target, name=str(target), pixel_format="later").key_frames
                 key_frames = set(found_keys) & (key_frames or set(found_keys))
             else:
@@ -257,12 +248,12 @@ def derive_scene(
                         frames=scene.frames,
                         size=settings.size,
                         encoding=settings.depth,
-                        after_frame=step,
                     )
                 )
             made = target.read_bytes()
             measured = () if error is None else astuple(error)
             files[name] = DerivedFile(len(made), zlib.crc32(made), *measured)
+            advance(source_bytes(scene, [name]))
     except ShardError:
         raise
     except (MediaError, SchemaError, StorageError) as error:
@@ -272,19 +263,7 @@ def derive_scene(
     return document
 
 
-def _steps(size: int, total: int, advance: Advance) -> Callable[[], None]:
-    """Return a function to call after each of some steps: all calls add up to the size."""
-    done = 0
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        advance(size * done // total - size * (done - 1) // total)
-
-    return step
-
-
-def open_source(source: MemberSource, scene: Scene, name: str) -> VideoFile:
+def _open_source(source: MemberSource, scene: Scene, name: str) -> VideoFile:
     """Return a source video: its path, or its bytes in memory where it is part of a shard."""
     opened = source.open(scene, name)
     if isinstance(opened, Path):
@@ -296,29 +275,15 @@ def open_source(source: MemberSource, scene: Scene, name: str) -> VideoFile:
     return io.BytesIO(content)
 
 
-def source_pictures(
-    video: VideoFile,
-    scene: Scene,
-    settings: TrainingSettings,
-    *,
-    name: str,
-    after_frame: Callable[[], None] = lambda: None,
+def _source_pictures(
+    video: VideoFile, scene: Scene, settings: TrainingSettings, *, name: str
 ) -> np.ndarray:
     """Return what ``size=`` gives of a video on the fly, (t, 3, h, w) uint8."""
     with VideoReader(video, name=name, frames=scene.frames) as reader:
-        size = reader.size_px if all(reader.size_px) else None
-        found = size or (reader.facts.width_px, reader.facts.height_px)
-        indexed = (scene.rig.image_width_px, scene.rig.image_height_px)
-        if found != indexed:
-            raise MediaError(
-                f"{name}: holds pictures of {found[0]}x{found[1]} pixels where the index says "
-                f"{indexed[0]}x{indexed[1]}. Fetch them again, or run `stereogenbench index` again."
-            )
-        require_pixel_aspect(reader.pixel_aspect, scene.rig, name=name)
+        require_indexed_picture(reader, scene.rig)
         pictures = np.empty((scene.frames, 3, *settings.size), dtype=np.uint8)
         for index in range(scene.frames):
             read_rgb(reader, index, size=settings.size, out=pictures[index], content="colour")
-            after_frame()
     return pictures
 
 
@@ -360,7 +325,11 @@ def _versions(quality: Quality) -> dict[str, str]:
 def _finished(
     derivation: Derivation, scene: Scene, folder: Path, names: Sequence[str]
 ) -> TrainingDocument | None:
-    """Return what an earlier run made, None unless it is whole and as this run would make it."""
+    """Return what an earlier run made, None unless this run would make the same.
+
+    ``training.json`` is the last of the files. What it says of the others is compared, as the
+    system may have gone down before it wrote them to the disk.
+    """
     try:
         text = (folder / TRAINING_JSON).read_bytes()
         document = parse_training(text, where=str(folder / TRAINING_JSON))
@@ -370,94 +339,9 @@ def _finished(
     videos = {name for name in names if name not in (*METADATA_FILES, TRAINING_JSON)}
     if document.text() != expected.text() or set(document.files) != videos:
         return None
-    source = derivation.source()
-    try:
-        for name in names:
-            if name == TRAINING_JSON:
-                continue
-            content = (folder / name).read_bytes()
-            if name in METADATA_FILES:
-                is_same = content == source.read(scene, name)
-            else:
-                file = document.files[name]
-                is_same = (len(content), zlib.crc32(content)) == (file.size, file.crc32)
-            if not is_same:
-                return None
-    except OSError:
-        return None
+    for name, file in document.files.items():
+        path = folder / name
+        content = path.read_bytes() if path.exists() else b""
+        if (len(content), zlib.crc32(content)) != (file.size, file.crc32):
+            return None
     return document
-
-
-# How much there is to do.
-
-
-@dataclass(frozen=True, slots=True)
-class PackingEstimate:
-    """What packing would take, by a timed sample.
-
-    Attributes:
-        scenes: How many scenes.
-        videos: How many videos of pictures and of depth.
-        bytes: Of all derived files, about.
-        source_bytes: Of all files that are read.
-        core_hours: Processor time, about, in hours.
-        sampled: Keys of the scenes of which one camera was derived.
-    """
-
-    scenes: int
-    videos: int
-    bytes: int
-    source_bytes: int
-    core_hours: float
-    sampled: tuple[str, ...]
-
-
-def estimate(
-    index: SceneIndex, rows: Sequence[int], settings: TrainingSettings, *, folder: Path
-) -> PackingEstimate:
-    """Return what deriving some scenes takes: one camera of some of them is derived and timed.
-
-    Args:
-        index: The source.
-        rows: The scenes.
-        settings: What to derive.
-        folder: Where the sample is written; the caller removes it.
-
-    Raises:
-        ShardError: As `derive_scene`; or if there are no scenes.
-    """
-    if not len(rows):
-        raise ShardError(f"{index.where}: no scene is selected. Check the filters.")
-    scenes = [index.scene(int(row)) for row in rows]
-    names = [derived_names(scene, settings) for scene in scenes]
-    places = sorted({round(each) for each in np.linspace(0, len(scenes) - 1, SAMPLED_SCENES)})
-    spent_s, made, frames = 0.0, Counter[str](), Counter[str]()
-    for place in places:
-        scene = scenes[place]
-        camera = next(int(name[4:6]) for name in names[place] if name.endswith("_rgb.mp4"))
-        one = replace(settings, cameras=(camera,))
-        derivation = Derivation.of_index(index, one, [scene])
-        began_s = time.process_time()
-        document = derive_scene(derivation, scene, folder / str(place))
-        spent_s += time.process_time() - began_s
-        for name, file in document.files.items():
-            made[name[7:]] += file.size
-            frames[name[7:]] += scene.frames
-    wanted = Counter[str]()  # frames by what follows the camera in a file's name
-    videos = texts = 0
-    for scene, each in zip(scenes, names, strict=True):
-        for name in each:
-            if name.startswith("cam_"):
-                wanted[name[7:]] += scene.frames
-                videos += 1
-            elif name in scene.members:
-                texts += scene.members[name].size
-    size = texts + sum(made[kind] * wanted[kind] / frames[kind] for kind in made)
-    return PackingEstimate(
-        scenes=len(scenes),
-        videos=videos,
-        bytes=round(size),
-        source_bytes=sum(map(source_bytes, scenes, names)),
-        core_hours=spent_s / frames.total() * wanted.total() / 3600,
-        sampled=tuple(scenes[place].id.key for place in places),
-    )

@@ -5,15 +5,14 @@ A damaged shard does not stop the others: all problems are listed, each with its
 
 import hashlib
 import io
+import tarfile
 import warnings
-import zlib
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal
-
-import numpy as np
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
 from stereogenbench_data.errors import MediaError, ShardError, cure_of
@@ -26,34 +25,15 @@ from stereogenbench_data.media.depth import (
     ANY_DEPTH,
     open_depth,
     read_depth_units,
-    resized_nearest,
     resolve_encoding,
 )
-from stereogenbench_data.media.depth_frames import DepthFrames
-from stereogenbench_data.media.picture_encoding import measured_error
 from stereogenbench_data.media.video import VideoReader, probe, require_pixel_aspect
 from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
-from stereogenbench_data.schema.release import (
-    CAMERA_COUNT,
-    METADATA_FILES,
-    depth_name,
-)
+from stereogenbench_data.schema.release import CAMERA_COUNT, depth_name
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.shards.plan import SCENE_TEXTS
-from stereogenbench_data.shards.tar import (
-    BLOCK_BYTES,
-    END_OF_ARCHIVE,
-    member_header,
-    read_chunks,
-)
-from stereogenbench_data.shards.training import (
-    Derivation,
-    TrainingSettings,
-    open_source,
-    released_name,
-    source_pictures,
-)
+from stereogenbench_data.shards.tar import read_chunks
 from stereogenbench_data.shards.writer import TEMPORARY_SUFFIX, open_shards
 from stereogenbench_data.sources.files import copy_with_crc32
 
@@ -61,8 +41,6 @@ _FETCH_AGAIN: Final = "Fetch the shard again, or pack it again."
 _WRONG_INDEX: Final = "Put the index beside the shards that it was packed with."
 _FETCH_BOTH: Final = "Fetch the shard and its index again, or pack them again."
 _SHOWN: Final = 3
-_SAME_DB: Final = 0.01
-"""How far a PSNR may be off that of another machine, in dB."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -99,19 +77,11 @@ class _ExpectedShard:
 
 @dataclass(frozen=True, slots=True)
 class _SceneTask:
-    """A scene whose videos are decoded, and compared with the source where there is one.
-
-    Attributes:
-        names: Its videos whose bytes are sound.
-        derivation: How training shards were derived; None compares nothing.
-        released: The same scene of the source; None if that has no such.
-    """
+    """A scene whose videos are decoded: those of these names, whose bytes are sound."""
 
     root: str
     scene: Scene
     names: tuple[str, ...]
-    derivation: Derivation | None = None
-    released: Scene | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,15 +99,13 @@ class VerifyReport:
     videos_decoded: int
     problems: tuple[Problem, ...]
     derived: str = ""
-    videos_compared: int = 0
 
 
-def verify(  # noqa: PLR0913 - each is an option of the command
+def verify(
     data: str | Path,
     *,
     root: str | Path | None = None,
     mode: Literal["bytes", "decode"] = "bytes",
-    source: SceneIndex | None = None,
     workers: int | None = None,
     engine: Engine = LOCAL,
     progress: Progress | None = None,
@@ -150,34 +118,24 @@ def verify(  # noqa: PLR0913 - each is an option of the command
         data: The folder of the shards, or its index file.
         root: The folder of the shards, if the index file is elsewhere.
         mode: "bytes" reads all bytes; "decode" then also decodes all frames of all videos.
-        source: The released data that training shards were derived from: with "decode", metadata
-            and depth must be equal and pictures have the PSNR that the index says.
         workers: The number of processes; None is one a core.
         engine: Where they run: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called repeatedly with the bytes done, and all of them; with "decode" those of
-            videos count twice, with a source three times.
+            videos count twice.
 
     Raises:
-        StorageError: If there is no index of shards, a source is given for shards that were not
-            derived, or a worker died.
+        StorageError: If there is no index of shards, or a worker died.
     """
     with warnings.catch_warnings():
         # A stale index is a problem, reported with the others.
         warnings.simplefilter("ignore", StaleIndexWarning)
         index = open_shards(data, root)
-    if source is not None:
-        if not index.is_derived:
-            raise ShardError(
-                f"{index.where}: holds released data, which have no source to compare with. Leave "
-                f"the source out."
-            )
-        source.require_released("A comparison")
     expected = _expected_of(index)
     problems = list(_folder_problems(index, expected))
     checks = [each for each in expected.values() if each.path.is_file()]
     scenes = [index.scene(row) for row in range(len(index))] if mode == "decode" else []
     video_bytes = sum(scene.members[name].size for scene in scenes for name in scene.held_videos)
-    total = sum(each.facts.size for each in checks) + video_bytes * (1 if source is None else 2)
+    total = sum(each.facts.size for each in checks) + video_bytes
     advance = advance_of(progress, total=total)
     sound: set[str] = set()
     for wrong, right in engine.map(
@@ -185,7 +143,14 @@ def verify(  # noqa: PLR0913 - each is an option of the command
     ):
         problems += wrong
         sound |= right
-    tasks = list(_scene_tasks(index, source, scenes, sound))
+    tasks = [
+        _SceneTask(
+            index.root,
+            scene,
+            tuple(name for name in scene.held_videos if f"{scene.id.key}.{name}" in sound),
+        )
+        for scene in scenes
+    ]
     for found in engine.map(
         _check_scene,
         tasks,
@@ -203,7 +168,6 @@ def verify(  # noqa: PLR0913 - each is an option of the command
         videos_decoded=sum(len(task.names) for task in tasks),
         problems=tuple(sorted(problems)),
         derived=index.derivation if index.is_derived else "",
-        videos_compared=sum(len(task.names) for task in tasks if task.derivation is not None),
     )
 
 
@@ -241,7 +205,7 @@ def _folder_problems(index: SceneIndex, expected: dict[str, _ExpectedShard]) -> 
             yield Problem(name, "", "", "is an unfinished shard", cure)
 
 
-# One shard: its structure, every byte, and its metadata.
+# One shard: every byte, what lies where, and its metadata.
 
 
 def _check_shard(expected: _ExpectedShard, after_bytes: Advance) -> tuple[list[Problem], set[str]]:
@@ -252,6 +216,8 @@ def _check_shard(expected: _ExpectedShard, after_bytes: Advance) -> tuple[list[P
             size = expected.path.stat().st_size
             problems, sound, sha256 = _check_contents(expected, file, size, after_bytes)
             problems += _misindexed(expected, file, sound)
+        if not problems and size == facts.size:
+            problems += _check_places(expected)
     except OSError as error:
         found = f"cannot be read ({error.strerror or error})"
         return [expected.problem("", found, cure_of(error, _FETCH_AGAIN))], set()
@@ -260,18 +226,15 @@ def _check_shard(expected: _ExpectedShard, after_bytes: Advance) -> tuple[list[P
         text = f"has {size} bytes, and the index says {facts.size}: {what}"
         problems.append(expected.problem("", text))
     elif not problems and sha256 != facts.sha256:
-        text = f"is sound, but has sha256 {sha256[:16]}..., and the index says"
-        problems.append(expected.problem("", f"{text} {facts.sha256[:16]}..."))
+        text = f"has sha256 {sha256[:16]}..., and the index says {facts.sha256[:16]}..., though"
+        problems.append(expected.problem("", f"{text} its files are sound"))
     return problems, sound
 
 
 def _check_contents(
     expected: _ExpectedShard, file: io.FileIO, size: int, after_bytes: Advance
 ) -> tuple[list[Problem], set[str], str]:
-    """Read a shard once, from its start to its end.
-
-    The index tells every byte of it: each member, the header before it, zeros up to whole blocks.
-    """
+    """Read a shard once, from its start to its end."""
     sha256, at = hashlib.sha256(), 0
     problems: list[Problem] = []
     sound: set[str] = set()
@@ -283,34 +246,36 @@ def _check_contents(
         at = end
         return copy_with_crc32(chunks, sha256.update)
 
-    def is_next(end: int, content: bytes) -> bool:
-        is_as_long = end - at == len(content)
-        return crc32_up_to(end) == zlib.crc32(content) and is_as_long
-
     for name, member in sorted(expected.members.items(), key=lambda item: item[1].offset):
-        if member.offset - BLOCK_BYTES < at or member.offset + member.size > size:
+        if member.offset < at or member.offset + member.size > size:
             scene, _, file_name = name.partition(".")
             lost[scene].append(file_name)
             continue
-        header = bytes(-at % BLOCK_BYTES) + member_header(name, member.size)
-        has_header = is_next(member.offset, header)
+        crc32_up_to(member.offset)
         crc32 = crc32_up_to(member.offset + member.size)
-        if crc32 != member.crc32:
-            indexed = "has none" if member.crc32 is None else f"says {member.crc32:08x}"
-            text = f"its bytes have crc32 {crc32:08x}, and the index {indexed}"
-            problems.append(expected.problem(name, text))
+        if crc32 == member.crc32:
+            sound.add(name)
             continue
-        sound.add(name)
-        if not has_header:
-            text = "its header in the tar, or what lies before that, is damaged or of another"
-            problems.append(expected.problem(name, text))
+        indexed = "has none" if member.crc32 is None else f"says {member.crc32:08x}"
+        text = f"its bytes have crc32 {crc32:08x}, and the index {indexed}"
+        problems.append(expected.problem(name, text))
+    crc32_up_to(size)
     for scene, names in lost.items():
         text = f"{len(names)} of its files are not whole ({_few(sorted(names))})"
         problems.append(expected.problem(scene, text))
-    is_ended = is_next(size, bytes(-at % BLOCK_BYTES) + END_OF_ARCHIVE)
-    if not is_ended and size >= expected.facts.size:
-        problems.append(expected.problem("", "holds more behind its last file than a shard has"))
     return problems, sound, sha256.hexdigest()
+
+
+def _check_places(expected: _ExpectedShard) -> Iterator[Problem]:
+    """Yield the first file that the tar itself, which other readers go by, places otherwise."""
+    listed = {}
+    with suppress(tarfile.TarError), tarfile.open(expected.path, "r:") as tar:
+        listed = {each.name: (each.offset_data, each.size) for each in tar}
+    indexed = {name: (each.offset, each.size) for name, each in expected.members.items()}
+    differing = listed.items() ^ indexed.items()
+    for name, _ in sorted(differing, key=lambda item: item[1])[:1]:
+        text = "its header in the tar is damaged, or the index does not name it"
+        yield expected.problem(name, text)
 
 
 def _misindexed(expected: _ExpectedShard, file: io.FileIO, sound: set[str]) -> Iterator[Problem]:
@@ -330,24 +295,7 @@ def _few(names: list[str]) -> str:
     return ", ".join([*names[:_SHOWN], "..."] if len(names) > _SHOWN else names)
 
 
-# One scene: every frame, and those of the source.
-
-
-def _scene_tasks(
-    index: SceneIndex, source: SceneIndex | None, scenes: Sequence[Scene], sound: Collection[str]
-) -> Iterator[_SceneTask]:
-    rows = {} if source is None else {str(key): row for row, key in enumerate(source.column("key"))}
-    for scene in scenes:
-        names = tuple(name for name in scene.held_videos if f"{scene.id.key}.{name}" in sound)
-        if source is None:
-            yield _SceneTask(index.root, scene, names)
-            continue
-        row = rows.get(scene.id.key)
-        released = None if row is None else source.scene(row)
-        size = (scene.rig.image_height_px, scene.rig.image_width_px)
-        settings = TrainingSettings(size, "high")  # nothing is encoded, and it stores any size
-        derivation = Derivation.of_index(source, settings, [] if released is None else [released])
-        yield _SceneTask(index.root, scene, names, derivation, released)
+# One scene: every frame.
 
 
 def _check_scene(task: _SceneTask, after_bytes: Advance) -> list[Problem]:
@@ -364,20 +312,6 @@ def _check_scene(task: _SceneTask, after_bytes: Advance) -> list[Problem]:
                 cure = cure_of(error, cure)
             problems.append(Problem(member.path, scene.id.key, name, reason, cure))
         after_bytes(member.size)
-    if task.derivation is None:
-        return problems
-    cure = "Derive the scene again, or pass the data that it was derived from."
-    if task.released is None:
-        place = next(iter(scene.members.values())).path
-        return [*problems, Problem(place, scene.id.key, "", "is not in the source", cure)]
-    for name, member in scene.members.items():
-        try:
-            found = _difference(task.derivation, task, task.released, name)
-        except (MediaError, OSError) as error:
-            found = f"cannot be compared: {str(error).rstrip('.')}"
-        if found:
-            problems.append(Problem(member.path, scene.id.key, name, found, cure))
-        after_bytes(member.size if name in task.names else 0)
     return problems
 
 
@@ -418,45 +352,6 @@ def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
         indexed = (*indexed, scene.depth_unit_m[camera], scene.depth_offset_m[camera])
     if found != indexed:
         raise MediaError(f"{name}: is stored as {found}, and the index says {indexed}.")
-
-
-def _difference(derivation: Derivation, task: _SceneTask, released: Scene, name: str) -> str:
-    """Return how a file differs from what deriving it gives, "" if it does not."""
-    scene, source = task.scene, derivation.source()
-    content = _content(task.root, scene.members[name])
-    if name in METADATA_FILES:
-        is_same = name in released.members and source.read(released, name) == content
-        return "" if is_same else "differs from the source's"
-    if name not in task.names:
-        return ""
-    original = released_name(name)
-    if released.held_name(original) not in released.members:
-        return "is not in the source"
-    label = source.label(released, original)
-    video = open_source(source, released, original)
-    if name.endswith("_rgb.mp4"):
-        pictures = source_pictures(video, released, derivation.settings, name=label)
-        error = measured_error(pictures, io.BytesIO(content), name=name)
-        camera = int(name[4:6])
-        facts = scene.training
-        said = (0.0, 0.0) if facts is None else (facts.psnr_db[camera], facts.worst_psnr_db[camera])
-        measured = (error.psnr_db, error.worst_psnr_db)
-        if all(abs(one - two) <= _SAME_DB for one, two in zip(measured, said, strict=True)):
-            return ""
-        return (
-            f"has a PSNR of {measured[0]:.3f} dB (worst frame {measured[1]:.3f}) against the "
-            f"source, and the index says {said[0]:.3f} ({said[1]:.3f})"
-        )
-    size = derivation.settings.size
-    with (
-        open_depth(video, name=label, frames=scene.frames) as reader,
-        DepthFrames(io.BytesIO(content), name=name, frames=scene.frames) as derived,
-    ):
-        for index in range(scene.frames):
-            units = resized_nearest(read_depth_units(reader, index, encoding=ANY_DEPTH), size=size)
-            if not np.array_equal(units, derived.units(index)):
-                return f"frame {index} has other depth than the source's nearest pixels"
-    return ""
 
 
 def _content(root: str, member: Member) -> bytes:

@@ -38,7 +38,12 @@ from stereogenbench_data.shards.tar import (
     member_header,
     read_chunks,
 )
-from stereogenbench_data.shards.training import Derivation, derive_scene, derived_names
+from stereogenbench_data.shards.training import (
+    Derivation,
+    derive_scene,
+    derived_names,
+    source_bytes,
+)
 from stereogenbench_data.sources.files import copy_with_crc32, try_locked, write_atomic
 from stereogenbench_data.sources.location import is_remote, shown
 from stereogenbench_data.sources.ranged_file import FileSlice
@@ -66,6 +71,14 @@ class ShardTask:
     def derived(self) -> Path:
         """The folder of its derived files until it is finished."""
         return self.target.parent / PARTS / f"{self.target.stem}.derived"
+
+    @property
+    def source_bytes(self) -> int:
+        """The size of all files that it is made from."""
+        if self.derivation is None:
+            return sum(member.size for member in self.shard.members)
+        settings = self.derivation.settings
+        return sum(source_bytes(each, derived_names(each, settings)) for each in self.shard.scenes)
 
     @property
     def target(self) -> Path:
@@ -414,17 +427,11 @@ def _packed_depth(
     Raises:
         ShardError: If it cannot be read, or not be packed bit for bit.
     """
-    source, size = Path(task.root, member.source), member.size
-    video = b"".join(_source_chunks(source, size, lambda count: after_bytes(0)))
-    share = size // frames
+    source = Path(task.root, member.source)
+    video = io.BytesIO(b"".join(_source_chunks(source, member.size, lambda count: after_bytes(0))))
     try:
-        content = packed_depth(
-            io.BytesIO(video),
-            name=str(source),
-            frames=frames,
-            after_frame=lambda: after_bytes(share),
-        )
+        content = packed_depth(video, name=str(source), frames=frames)
     except MediaError as error:
         raise ShardError(str(error)) from error
-    after_bytes(size - share * frames)
+    after_bytes(member.size)
     return content

@@ -20,7 +20,7 @@ from stereogenbench_data.media.seek_table import (
     read_seek_table,
 )
 from stereogenbench_data.media.video import VideoReader
-from stereogenbench_data.sources.ranged_file import PacketFile
+from stereogenbench_data.sources.ranged_file import RangedFile
 from tests.servers.tools import require_tool
 
 FRAMES = 30
@@ -108,7 +108,7 @@ def test_each_frame_is_read_from_the_bytes_that_it_needs_alone(videos, kind, fra
     content = path.read_bytes()
     table = read_seek_table(path, name=kind)
     position, ahead = Position(table), Ahead(content)
-    file = PacketFile(
+    file = RangedFile(
         ahead.fetch,
         table=table,
         ahead=ahead.read,
@@ -138,7 +138,6 @@ def test_packed_depth_has_a_table_of_its_chunks(videos):
         io.BytesIO(videos["depth.mkv"].read_bytes()),
         name="depth",
         frames=FRAMES,
-        after_frame=lambda: None,
     )
 
     table = read_seek_table(io.BytesIO(content), name="cam_00_depth.b2frame")

@@ -137,14 +137,6 @@ def test_sound_shards_verify_and_every_frame_is_decoded(packed):
     assert report.videos_decoded == 48
 
 
-def test_the_same_scenes_pack_to_the_same_bytes_by_two_workers(packed, small_release, tmp_path):
-    report = pack(small_release, tmp_path, depth_codec="blosc2", workers=2)
-
-    assert bytes_of(tmp_path) == bytes_of(packed)
-    assert pack(small_release, tmp_path, depth_codec="blosc2", workers=1).packed == ()
-    assert len(report.packed) == 3
-
-
 def test_shards_of_another_codec_are_not_mixed_in(shards, small_release):
     before = bytes_of(shards)
 
@@ -207,7 +199,7 @@ def damaged(shards):
 
 
 @pytest.mark.parametrize(
-    ("at", "found"), [(200, "its description of itself fails its checksum"), (2000, "frame ")]
+    ("at", "found"), [(200, "it has no description of itself"), (2000, "frame ")]
 )
 def test_damage_is_reported_by_decoding_with_its_place(damaged, shards, at, found):
     (reported,) = damaged("cam_03_depth.b2frame", at)
@@ -273,16 +265,6 @@ def test_unpacking_gives_the_release_back(unpacked, small_release):
         assert replace(again[key], members={}) == replace(scene, members={})
 
 
-def test_unpacked_scenes_pack_to_the_same_shards(packed, unpacked, tmp_path):
-    pack(unpacked[0], tmp_path / "again", depth_codec="blosc2", workers=1)
-
-    assert SceneIndex.open(tmp_path / "again").column("frames").tolist() == [7] * 4
-    for key, scene in scenes_of(tmp_path / "again").items():
-        before = scenes_of(packed)[key]
-        for name in before.held_videos:
-            assert scene.members[name].crc32 == before.members[name].crc32
-
-
 def test_released_videos_come_back_byte_for_byte(small_shards, small_release, tmp_path):
     unpack(small_shards, tmp_path / "tree", workers=2)
 
@@ -308,7 +290,6 @@ def test_unpacking_goes_on_where_it_was(small_shards, small_release, tmp_path):
     ("name", "change"),
     [
         ("baseline.json", lambda path: path.write_text("{}")),
-        ("cam_02_depth.mkv", lambda path: path.write_bytes(b"mine")),
         ("notes.txt", lambda path: path.write_text("mine")),
         ("cam_00_rgb.mp4", lambda path: path.unlink()),
     ],

@@ -58,7 +58,7 @@ def assert_lines(found, *expected):
 
 
 def test_sound_shards_have_no_problem(small_shards):
-    report = verify(small_shards)
+    report = verify(small_shards, workers=1)
 
     assert report.problems == ()
     assert (report.shards, report.scenes, report.members) == (3, 4, 4 * 17)
@@ -113,33 +113,27 @@ def test_a_flipped_payload_byte_is_reported_with_its_member(shards, place):
     assert reported.endswith(f", and the index says {member.crc32:08x}. {FETCH}")
 
 
-def test_a_flipped_header_byte_is_reported_and_what_follows_is_still_looked_at(shards, place):
+def test_a_flipped_header_byte_is_reported_with_its_member(shards, place):
     flip_byte(shards / PAIR, place(SCENES[0], "cam_00_rgb.mp4").offset - 512 + 5)
-    flip_byte(shards / PAIR, place(SCENES[1], "baseline.json").offset)
 
-    header, payload = lines(shards)
+    (reported,) = lines(shards)
 
-    assert header.startswith(f"{PAIR}: {SCENES[0]}: cam_00_rgb.mp4: its header ")
-    assert payload.startswith(f"{PAIR}: {SCENES[1]}: baseline.json: its bytes have crc32")
+    assert reported.startswith(f"{PAIR}: {SCENES[0]}: cam_00_rgb.mp4: its header ")
 
 
-def test_a_byte_between_members_is_reported_where_it_lies(shards, place):
+def test_a_byte_between_members_is_reported(shards, place):
     member = place(SCENES[0], "_scene_complete.json")
     assert member.size % 512
     flip_byte(shards / PAIR, member.offset + member.size)
 
-    (reported,) = lines(shards)
-
-    assert re.match(rf"{PAIR}: {SCENES[0]}: scene_desc[^:]*: its header .* lies before", reported)
+    assert_lines(lines(shards), (f"{PAIR}: has sha256 ", "though its files are sound", FETCH))
 
 
 def test_bytes_after_the_end_are_reported(shards):
     with (shards / PAIR).open("ab") as file:
         file.write(bytes(512))
 
-    assert_lines(
-        lines(shards), (f"{PAIR}: has ", "something was added", FETCH), (f"{PAIR}: holds ", FETCH)
-    )
+    assert_lines(lines(shards), (f"{PAIR}: has ", "something was added", FETCH))
 
 
 KEY = "train/Uniform/Town/scene_000001"
@@ -206,16 +200,12 @@ def test_exchanged_payloads_are_both_reported(toy):
     assert all("its bytes have crc32" in line for line in reported)
 
 
-def test_exchanged_names_are_both_reported(toy):
+def test_exchanged_names_are_reported(toy):
     exchanged = [FILES[0], (FILES[2][0], FILES[1][1]), (FILES[1][0], FILES[2][1])]
 
     reported = toy(tar_of(exchanged))
 
-    assert_lines(
-        reported,
-        (f"x.tar: {KEY}: cam_00_rgb.mp4: its header ", FETCH),
-        (f"x.tar: {KEY}: cam_01_rgb.mp4: its header ", FETCH),
-    )
+    assert_lines(reported, (f"x.tar: {KEY}: cam_0", "_rgb.mp4: its header ", FETCH))
 
 
 def test_a_missing_member_is_reported_and_so_is_what_moved(toy):
@@ -232,18 +222,13 @@ def test_a_missing_member_is_reported_and_so_is_what_moved(toy):
 def test_a_member_too_many_is_reported(toy):
     reported = toy(tar_of([*FILES, (f"{KEY}.cam_09_rgb.mp4", b"more")]))
 
-    assert_lines(
-        reported, ("x.tar: has 5120 bytes", "4096: something was added"), ("x.tar: holds ", FETCH)
-    )
+    assert_lines(reported, ("x.tar: has 5120 bytes", "4096: something was added", FETCH))
 
 
 def test_a_renamed_scene_is_of_another_pack(toy):
     reported = toy(tar_of([(name.replace("0001", "0002"), content) for name, content in FILES]))
 
-    assert [line.split(": ")[2] for line in reported] == [
-        name.removeprefix(f"{KEY}.") for name, _ in FILES
-    ]
-    assert all("its header" in line for line in reported)
+    assert_lines(reported, ("x.tar: ", FILES[0][0].partition(".")[2], "its header", FETCH))
 
 
 @pytest.mark.parametrize("at", [0, 3, 156, 600, 2 * 512, 3000, -1, -600])
@@ -263,7 +248,7 @@ def test_a_file_that_the_index_does_not_name_is_reported_though_the_checksums_ar
 
     reported = toy_with([FILES[0], added, *FILES[1:]] if place == "between" else [*FILES, added])
 
-    assert_lines(reported, ("x.tar: ", "its header" if place == "between" else "holds", FETCH))
+    assert_lines(reported, ("x.tar: a/x: txt: its header", "does not name it", FETCH))
 
 
 def test_a_missing_shard_is_reported_with_what_it_held(shards):
@@ -294,7 +279,6 @@ def test_an_index_of_another_pack_is_reported_for_every_shard_that_differs(
     assert_lines(
         reported,
         (f"{PAIR}: has ", "something was added", FETCH),
-        (f"{PAIR}: holds ", FETCH),
         ("train-Uniform-000001.tar: is missing", "1 scene"),
     )
 
@@ -364,12 +348,6 @@ def test_depth_of_another_unit_than_the_index_says_is_reported_by_decoding(repac
         "cam_05_depth.mkv: is stored as ('ffv1', 'gray16le', 0.5, 0.0), and the index says "
         "('ffv1', 'gray16le', 0.001, 0.0)"
     ) in reported
-
-
-def test_what_is_no_video_is_reported_by_decoding(repacked):
-    (reported,) = repacked("cam_00_rgb.mp4", b"no film")
-
-    assert "cam_00_rgb.mp4: cannot be opened as MP4 or Matroska" in reported
 
 
 def test_a_folder_that_was_not_finished_is_refused(shards):
@@ -469,11 +447,11 @@ def test_a_problem_is_one_line():
 
 
 def command(*words):
-    return CliRunner().invoke(app, ["verify", *map(str, words)])
+    return CliRunner().invoke(app, ["verify", *map(str, words), "--workers", "1"])
 
 
 def test_the_command_ends_with_0_where_all_is_well(small_shards):
-    result = command(small_shards, "--deep", "--workers", "1")
+    result = command(small_shards, "--deep")
 
     assert result.exit_code == 0
     assert result.stdout.startswith(f"{small_shards}: 3 shards, 4 scenes, 68 members, ")
