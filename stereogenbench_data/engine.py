@@ -313,7 +313,8 @@ class RayCluster(Engine):
         except ImportError as error:
             raise missing_extra("the engine 'ray'", "ray", error) from error
         with _connected(ray, self.address):
-            remote = ray.remote(max_retries=0, num_cpus=1, num_gpus=self.gpus)(_run_on_ray)
+            options = {"max_retries": _TRIES - 1, "num_cpus": 1, "num_gpus": self.gpus}
+            remote = ray.remote(**options)(_run_on_ray)
             there = ray.cluster_resources()
             if there.get("GPU", 0) < self.gpus:
                 raise StorageError(
@@ -322,23 +323,19 @@ class RayCluster(Engine):
                 )
             limit = workers or _PER_CORE * max(1, int(there.get("CPU", 1)))
             folder = str(Path.cwd())
-            waiting = [(item, 1) for item in reversed(work.items)]
-            running: dict[Any, tuple[Any, int]] = {}
+            waiting = list(reversed(work.items))
+            running: dict[Any, Any] = {}
             try:
                 while waiting or running:
                     while waiting and len(running) < limit:
-                        item, attempt = waiting.pop()
-                        running[remote.remote(work.task, item, folder)] = (item, attempt)
+                        item = waiting.pop()
+                        running[remote.remote(work.task, item, folder)] = item
                     finished, _ = ray.wait(list(running), num_returns=1, timeout=_RAY_POLL_S)
                     work.advance(0)
                     for reference in finished:
-                        item, attempt = running.pop(reference)
-                        found = _ray_result(ray, reference, work, item, attempt=attempt)
-                        if found is None:
-                            waiting.append((item, attempt + 1))
-                            continue
-                        work.advance(found[1])
-                        yield found[0]
+                        found, count = _ray_result(ray, reference, work, running.pop(reference))
+                        work.advance(count)
+                        yield found
             finally:
                 for reference in running:
                     ray.cancel(reference)
@@ -346,10 +343,8 @@ class RayCluster(Engine):
                     ray.wait(list(running), num_returns=len(running), timeout=_CANCEL_S)
 
 
-def _ray_result(
-    ray: Any, reference: Any, work: _Work, item: Any, *, attempt: int
-) -> tuple[Any, int] | None:
-    """Return a task's result and how much it did; None if its worker died and it is tried again."""
+def _ray_result(ray: Any, reference: Any, work: _Work, item: Any) -> tuple[Any, int]:
+    """Return a task's result and how much it did."""
     try:
         found: tuple[Any, int] = ray.get(reference)
     except ray.exceptions.RayTaskError as error:
@@ -361,8 +356,6 @@ def _ray_result(
             ) from error
         failure = cause if isinstance(cause, Exception) else error
     except ray.exceptions.RayError as error:
-        if attempt < _TRIES:
-            return None
         raise StorageError(
             f"{work.name(item)}: Ray did not finish it in {_TRIES} tries ({_first_line(error)}). "
             f"Check whether its worker was killed for lack of memory, and run it again with fewer "

@@ -14,14 +14,8 @@ import pytest
 
 from stereogenbench_data.engine import Engine, RayCluster
 from stereogenbench_data.errors import ExtraError, ShardError, StorageError
-from stereogenbench_data.evaluation.evaluate import evaluate
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol
-from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.training import TrainingSettings
-from stereogenbench_data.synthesis.produce import synthesise
-from stereogenbench_data.synthesis.request import SynthRequest
-from tests.evaluation.conftest import write_pngs
 from tests.servers.tools import require_module
 
 ONE_EACH = 250_000
@@ -103,56 +97,24 @@ class LosesAWorker:
 # The batch commands.
 
 
-@dataclass(frozen=True)
-class Data:
-    """What commands work on, and a folder for what they write."""
-
-    release: Path
-    shards: Path
-    right_views: Path
-    out: Path
-
-
-def pack_training_(data, **how):
-    pack(data.release, data.out, training=TrainingSettings((32, 32)), **how)
-    return bytes_of(data.out)
-
-
-def evaluate_(data, **how):
-    protocol = EvaluationProtocol(metrics=("psnr", "ssim"), size=(48, 64))
-    scores = evaluate(
-        data.release, data.right_views, tier="G1", protocol=protocol, pairs=[(0, 1)],
-        frames=[0], **how,
-    )  # fmt: skip
-    return [(pair.scene, pair.pair, repr(sorted(pair.tallies.items()))) for pair in scores.pairs]
-
-
-def synth_(data, **how):
-    synthesise(data.out, SynthRequest(size_px=32, frames=2, seed=9), **how)
-    return bytes_of(data.out)
-
-
 @pytest.fixture(scope="module")
 def material(small_release, tmp_path_factory):
-    place = tmp_path_factory.mktemp("material")
-    pack(small_release, place / "shards", target_bytes=ONE_EACH, workers=1)
-    index = SceneIndex.open(small_release)
-    right_views = write_pngs(place / "right", index, frames=[0])
-    return small_release, place / "shards", right_views
+    shards = tmp_path_factory.mktemp("material") / "shards"
+    pack(small_release, shards, target_bytes=ONE_EACH, workers=1)
+    return small_release, shards
 
 
 @pytest.mark.usefixtures("ray")
-@pytest.mark.parametrize("command", [pack_training_, evaluate_, synth_])
-def test_a_cluster_that_loses_a_worker_gives_what_this_process_gives(command, material, tmp_path):
-    mark = tmp_path / "died"
+def test_a_cluster_that_loses_a_worker_gives_what_this_process_gives(small_release, tmp_path):
+    """Packing training shards stands for all batch commands, which share one function."""
+    mark, training = tmp_path / "died", TrainingSettings((32, 32))
+    losing = LosesAWorker(RayCluster(), mark)
 
-    here = command(Data(*material, tmp_path / "here"), workers=1)
-    there = command(
-        Data(*material, tmp_path / "there"), workers=None, engine=LosesAWorker(RayCluster(), mark)
-    )
+    pack(small_release, tmp_path / "here", training=training, workers=1)
+    pack(small_release, tmp_path / "there", training=training, engine=losing)
 
     assert mark.exists()
-    assert there == here
+    assert bytes_of(tmp_path / "there") == bytes_of(tmp_path / "here")
 
 
 # What else Ray does.
@@ -255,7 +217,7 @@ def test_a_task_that_needs_a_gpu_is_refused_where_there_is_none():
 def test_the_command_works_on_a_cluster_by_its_address_with_relative_paths(
     cluster, material, tmp_path
 ):
-    release, shards, _ = material
+    release, shards = material
     (tmp_path / "scenes").symlink_to(release)
 
     ended = subprocess.run(
