@@ -10,7 +10,7 @@ HF_HUB_OFFLINE ...), and fsspec's settings for ``hf`` go before them.
 import os
 import re
 from collections.abc import Generator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 from urllib.parse import quote, unquote
@@ -26,7 +26,7 @@ from stereogenbench_data.sources.retry import (
     ProcessLock,
     require_expected_size,
 )
-from stereogenbench_data.sources.web import Limit, WebTransport
+from stereogenbench_data.sources.web import WebTransport
 
 _ADDRESS: Final = re.compile(
     r"hf://(datasets/|spaces/|models/)?(?!(?:datasets|spaces|models|buckets)/)([\w.-]+/[\w.-]+)"
@@ -79,8 +79,10 @@ class HubFile:
         return self.repository if self.kind == "models" else f"{self.kind}/{self.repository}"
 
 
-class HubTransport:
-    """One file of a repository of the Hub."""
+class HubTransport(WebTransport):
+    """One file of a repository of the Hub, in huggingface_hub's cache or by HTTP."""
+
+    longest_whole_bytes = _LARGEST_IN_GIT
 
     def __init__(self, url: str, *, expected_size: int | None = None) -> None:
         """Name a file; nothing is requested yet.
@@ -95,35 +97,36 @@ class HubTransport:
         found = HubFile.of_url(url)
         if found is None or re.search(r"(?:^|/)\.{1,2}(?:/|$)", found.path):
             raise StorageError(f"{shown(url)}: not a file of a repository: correct the URL.")
+        super().__init__(url, expected_size=expected_size)
         self.server = "hf://"
         self._file = found
-        self._where = shown(url)
-        self._expected_size = expected_size
-        self._opened: WebTransport | Path | None = None
-        self._opening = ProcessLock()
+        self._is_redirected = True  # so that threads do not all ask the Hub at first
+        self._is_found = False
+        self._cached: Path | None = None
+        self._finding = ProcessLock()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy in another process, without logins and signed URLs."""
-        return self.__dict__ | {"_opened": None}
+        return super().__getstate__() | {"_is_found": False, "_headers": {}}
 
     def size(self, timeout_s: float) -> int:
         """Return the size of the file in bytes."""
-        opened = self._open(timeout_s)
-        return opened.stat().st_size if isinstance(opened, Path) else opened.size(timeout_s)
+        cached = self._in_cache(timeout_s)
+        return super().size(timeout_s) if cached is None else cached.stat().st_size
 
     def part(self, start: int, stop: int, timeout_s: float) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop, or the first of them."""
-        opened = self._open(timeout_s)
-        if not isinstance(opened, Path):
-            yield from opened.part(start, stop, timeout_s)
+        cached = self._in_cache(timeout_s)
+        if cached is None:
+            yield from super().part(start, stop, timeout_s)
             return
         gone = "It was removed from the Hub's cache: open the data again."
-        with explain_os_errors(f"{opened}: cannot be read", gone), opened.open("rb") as file:
+        with explain_os_errors(f"{cached}: cannot be read", gone), cached.open("rb") as file:
             found = os.fstat(file.fileno()).st_size
-            require_expected_size(found, expected=self._expected_size, where=f"{opened}")
+            require_expected_size(found, expected=self._expected_size, where=f"{cached}")
             if found < stop:
                 raise StorageError(
-                    f"{opened}: has {found} bytes, and byte {stop - 1} is asked for. It was cut "
+                    f"{cached}: has {found} bytes, and byte {stop - 1} is asked for. It was cut "
                     f"short: remove it, and it is fetched from the Hub."
                 )
             file.seek(start)
@@ -170,14 +173,16 @@ class HubTransport:
             )  # fmt: skip
             return list(listed)
 
-    def _open(self, timeout_s: float) -> WebTransport | Path:
-        """Return the file in the Hub's cache, or else where it is on the Hub."""
-        if self._opened is None:
-            with self._opening.held(timeout_s):
-                self._opened = self._opened or self._find(timeout_s)
-        return self._opened
+    def _in_cache(self, timeout_s: float) -> Path | None:
+        """Return the file in the Hub's cache; None if it is read by HTTP, from now on."""
+        if not self._is_found:
+            with self._finding.held(timeout_s):
+                if not self._is_found:
+                    self._cached = self._find(timeout_s)
+                    self._is_found = True
+        return self._cached
 
-    def _find(self, timeout_s: float) -> WebTransport | Path:
+    def _find(self, timeout_s: float) -> Path | None:
         with require_installed(self._where, extra="hub"):
             from huggingface_hub import constants, try_to_load_from_cache
         offline = is_offline()
@@ -194,53 +199,45 @@ class HubTransport:
                 f"({constants.HF_HUB_CACHE}). Unset it, or fetch the file while online: `hf "
                 f"download`, or `stereogenbench download` and pass its folder."
             )
-        return _HubWeb(self._file, revision, where=self._where, expected_size=self._expected_size)
+        self._point_at(revision, self._file.path)
+        return None
 
-    def _commit(self, timeout_s: float, *, of: Literal["file", "folder"] = "file") -> str:
-        """Return the commit of the revision, the same for all that this process reads."""
-        if _COMMIT.fullmatch(self._file.revision):
-            return self._file.revision
-        key = (_settings()[0], f"{self._file.place}@{self._file.revision}")
-        if key not in _commits:
-            # Of a folder, which has no such URL, a file is asked for that every repository has.
-            asked = replace(self._file, path=self._file.path if of == "file" else ".gitattributes")
-            web = _HubWeb(asked, asked.revision, where=self._where, expected_size=None)
-            _commits.setdefault(key, web.commit(timeout_s))
-        return _commits[key]
-
-
-class _HubWeb(WebTransport):
-    """One file of the Hub by HTTP."""
-
-    longest_whole_bytes = _LARGEST_IN_GIT
-
-    def __init__(
-        self, file: HubFile, revision: str, *, where: str, expected_size: int | None
-    ) -> None:
-        with require_installed(where, extra="hub"):
+    def _point_at(self, revision: str, path: str) -> None:
+        """Take the address of a file by HTTP, and the login."""
+        with require_installed(self._where, extra="hub"):
             from huggingface_hub.utils import build_hf_headers
         endpoint, token = _settings()
-        headers = build_hf_headers(token=token, library_name=_LIBRARY)
-        url = f"{endpoint}/{file.place}/resolve/{quote(revision, safe='')}/{quote(file.path)}"
-        super().__init__(url, expected_size=expected_size, headers=headers)
-        self._where = where
-        self._revision = revision
+        login = build_hf_headers(token=token, library_name=_LIBRARY)
+        place = self._file.place
+        self._headers = {"Accept-Encoding": "identity", **login}
+        self._url = f"{endpoint}/{place}/resolve/{quote(revision, safe='')}/{quote(path)}"
         # A commit does not change; ETags and dates of a content network's servers may differ.
         self._is_versioned = _COMMIT.fullmatch(revision) is None
         if not self._is_versioned:  # all that reads the file asks the Hub once
             if len(_addresses) >= _MOST_ADDRESSES:
                 _addresses.clear()
-            self._addresses = _addresses.setdefault((url, headers.get("authorization", "")), {})
-        self._is_redirected = True  # so that threads do not all ask the Hub at first
+            key = (self._url, login.get("authorization", ""))
+            self._addresses = _addresses.setdefault(key, {})
 
-    def commit(self, timeout_s: float) -> str:
-        """Return the commit that a branch is at; the branch itself where the Hub does not say."""
-        response = self._ask(self._url, {"Range": "bytes=0-0"}, Limit(timeout_s), follow=False)
-        response.close()
-        found = response.headers.get("X-Repo-Commit", "")
-        if response.status >= 400 and not _COMMIT.fullmatch(found):
-            raise self.refusal(response)
-        return found if _COMMIT.fullmatch(found) else self._revision
+    def _commit(self, timeout_s: float, *, of: Literal["file", "folder"] = "file") -> str:
+        """Return the commit of the revision, the same for all that this process reads.
+
+        The branch itself where the Hub does not say.
+        """
+        branch = self._file.revision
+        if _COMMIT.fullmatch(branch):
+            return branch
+        key = (_settings()[0], f"{self._file.place}@{branch}")
+        if key not in _commits:
+            # Of a folder, which has no such URL, a file is asked for that every repository has.
+            self._point_at(branch, self._file.path if of == "file" else ".gitattributes")
+            response = self._ask(self._url, {"Range": "bytes=0-0"}, timeout_s, follow=False)
+            response.close()
+            found = response.headers.get("X-Repo-Commit", "")
+            if response.status >= 400 and not _COMMIT.fullmatch(found):
+                raise self.refusal(response)
+            _commits.setdefault(key, found if _COMMIT.fullmatch(found) else branch)
+        return _commits[key]
 
     def refusal(self, response: urllib3.BaseHTTPResponse) -> Exception:
         """Return the error of a response without content, as the Hub names it."""

@@ -21,7 +21,6 @@ from stereogenbench_data.sources.location import is_remote, joined, local_path, 
 from stereogenbench_data.sources.ranged_file import (
     FileSlice,
     MemberFile,
-    PacketFile,
     RangedFile,
     require_crc32,
 )
@@ -103,22 +102,19 @@ class MemberSource:
         ahead, offset = self._ahead, member.offset
 
         def fetch(start: int, stop: int) -> bytes:
-            found = None if ahead is None else ahead.read(member.path, offset + start)
-            if found is not None and found[0] + len(found[1]) >= offset + stop:
-                begin = offset + start - found[0]
-                return found[1][begin : begin + stop - start]
             return remote.read(offset + start, offset + stop)
 
         def fetched(at: int) -> tuple[int, bytes] | None:
             found = None if ahead is None else ahead.read(member.path, offset + at)
             return None if found is None else (found[0] - offset, found[1])
 
-        crc32 = member.crc32 if self._check == "opened" else None
-        label, table = self.label(scene, name), self._table(scene, name)
-        if table is None:
-            return RangedFile(fetch, size=member.size, name=label, crc32=crc32)
-        return PacketFile(
-            fetch, table=table, ahead=fetched, size=member.size, name=label, crc32=crc32
+        return RangedFile(
+            fetch,
+            size=member.size,
+            name=self.label(scene, name),
+            crc32=member.crc32 if self._check == "opened" else None,
+            table=self._table(scene, name),
+            ahead=fetched,
         )
 
     def fetching_by(self, ahead: FetchAhead) -> "MemberSource":

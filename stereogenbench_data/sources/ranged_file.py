@@ -6,8 +6,7 @@ import os
 import stat
 import zlib
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -39,17 +38,17 @@ class MemberFile(SeekableFile):
         self.failure: StorageError | None = None
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Return the next bytes, fewer than asked for only at the end; all the rest for -1."""
+        """Return the next bytes, all the rest for -1; fewer at the end, or at that of a packet."""
         stop = self.size if size is None or size < 0 else min(self._position + size, self.size)
         if stop <= self._position:
             return b""
         data = self._bytes(self._position, stop)
-        self._position = stop
+        self._position += len(data)
         return data
 
     @abstractmethod
     def _bytes(self, start: int, stop: int) -> bytes:
-        """Return the bytes from start to stop, which lie within the member."""
+        """Return the bytes from start to stop, which lie within the member, or the first."""
 
 
 class FileSlice(MemberFile):
@@ -111,6 +110,10 @@ class RangedFile(MemberFile):
     little and a whole pass needs few requests. A forward pass fetches no byte twice, and none
     beyond the member. Once all bytes have arrived, they are compared with their checksum.
 
+    A video whose seek table is known is opened by the table's header, and read by packets: bytes
+    are fetched up to the end of their packet, and fewer than asked for are returned there. Bytes
+    that were fetched ahead come from there.
+
     Attributes:
         failure: The error of the first fetch that failed; further fetches raise it again.
     """
@@ -122,6 +125,8 @@ class RangedFile(MemberFile):
         size: int,
         name: str = "",
         crc32: int | None = None,
+        table: SeekTable | None = None,
+        ahead: Callable[[int], tuple[int, bytes] | None] = lambda at: None,
     ) -> None:
         """Prepare to read; nothing is fetched yet.
 
@@ -130,11 +135,21 @@ class RangedFile(MemberFile):
             size: The size of the member in bytes.
             name: What messages call it.
             crc32: Its checksum; None compares nothing.
+            table: Where its packets lie, of a video.
+            ahead: Returns what was fetched ahead around a byte, and where that begins, which may
+                be before the member, and end behind it; None if nothing was.
         """
         super().__init__(size)
         self._fetch = fetch
+        self._table = table
+        self._ahead = ahead
+        self._fed_from: int | None = None
+        self.opens_by_header = table is not None and table.opening == 0
         self._blocks: list[tuple[int, bytes]] = []
         self._checksum = None if crc32 is None else _Checksum(crc32, size=size, name=name)
+        if self._checksum is not None and table is not None:
+            self._checksum.add(0, table.head)
+            self._checksum.add(table.bounds[-1], table.tail)
 
     def close(self) -> None:
         """Free what was fetched."""
@@ -142,12 +157,35 @@ class RangedFile(MemberFile):
         super().close()
 
     def _bytes(self, start: int, stop: int) -> bytes:
+        table = self._table
+        if table is not None:
+            header = table.header_bytes(start, stop - start)
+            if header or self.hides_packets:
+                return header
+            first, data = self._piece(start, table.packet_end(start))
+            return data[start - first : stop - first]
         parts: list[bytes] = []
         while start < stop:
-            first, data = self._block(start, stop)
+            first, data = self._piece(start, stop)
             parts.append(data[start - first : stop - first])
             start += len(parts[-1])
         return b"".join(parts)
+
+    def _piece(self, start: int, stop: int) -> tuple[int, bytes]:
+        """Return bytes from start on, with where they begin: fetched ahead, or now."""
+        if self.failure is not None:
+            raise self.failure  # FFmpeg may take the first one for the file's end, and try again
+        try:
+            found = self._ahead(start)
+            if found is None:
+                return self._block(start, min(stop, self.size))
+            if self._checksum is not None and found[0] != self._fed_from:
+                self._fed_from, own = found[0], max(0, found[0])
+                self._checksum.add(own, found[1][own - found[0] : max(0, self.size - found[0])])
+        except StorageError as error:
+            self.failure = error
+            raise
+        return found
 
     def _block(self, start: int, stop: int) -> tuple[int, bytes]:
         """Return a block that holds the byte at start; the last one used comes last."""
@@ -159,91 +197,13 @@ class RangedFile(MemberFile):
         length = min(2 * max(before, default=FIRST_BLOCK // 2), LARGEST_BLOCK)
         behind = [first for first, _ in self._blocks if first > start]
         end = min(max(start + length, stop), self.size, *behind)
-        with self._kept_failure():
-            block = (start, self._fetch(start, end))
-            if self._checksum is not None:
-                self._checksum.add(*block)
+        block = (start, self._fetch(start, end))
+        if self._checksum is not None:
+            self._checksum.add(*block)
         self._blocks.append(block)
         while sum(len(data) for _, data in self._blocks) > KEPT_BYTES and len(self._blocks) > 1:
             self._blocks.pop(0)
         return block
-
-    @contextmanager
-    def _kept_failure(self) -> Iterator[None]:
-        """Raise the first error again: FFmpeg may take one for the file's end, and try again."""
-        if self.failure is not None:
-            raise self.failure
-        try:
-            yield
-        except StorageError as error:
-            self.failure = error
-            raise
-
-
-class PacketFile(RangedFile):
-    """A video whose seek table is known: it is opened by the table's header, and read by packets.
-
-    Bytes that were fetched ahead come from there. Others are fetched when they are read, up to the
-    end of their packet. Fewer bytes than asked for are returned at the end of what is there.
-
-    Attributes:
-        opens_by_header: Whether the header is enough to open the video.
-        hides_packets: While it is set, the file seems to end where packets lie.
-    """
-
-    def __init__(
-        self,
-        fetch: Callable[[int, int], bytes],
-        *,
-        table: SeekTable,
-        ahead: Callable[[int], tuple[int, bytes] | None],
-        size: int,
-        name: str = "",
-        crc32: int | None = None,
-    ) -> None:
-        """Prepare to read; nothing is fetched yet.
-
-        Args:
-            fetch: Returns the bytes of the member from a start to a stop.
-            table: Where its packets lie.
-            ahead: Returns what was fetched ahead around a byte, and where that begins, which may
-                be before the member, and end behind it; None if nothing was.
-            size: The size of the member in bytes.
-            name: What messages call it.
-            crc32: Its checksum; None compares nothing.
-        """
-        super().__init__(fetch, size=size, name=name, crc32=crc32)
-        self.opens_by_header = table.opening == 0
-        self.hides_packets = False
-        self._table = table
-        self._ahead = ahead
-        self._has_fed_header = False
-        self._fed_from: int | None = None
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        """Return the next bytes: at least one, unless this is the end."""
-        at = self._position
-        size = self.size if size is None or size < 0 else size
-        if at >= self.size or size == 0:
-            return b""
-        data = self._table.header_bytes(at, size)
-        if not data and not self.hides_packets:
-            data = self._packet_bytes(at, min(size, self.size - at))
-        self._position += len(data)
-        return data
-
-    def _packet_bytes(self, at: int, size: int) -> bytes:
-        with self._kept_failure():
-            if self._checksum is not None and not self._has_fed_header:
-                self._has_fed_header = True
-                self._checksum.add(0, self._table.head)
-                self._checksum.add(self._table.bounds[-1], self._table.tail)
-            found = self._ahead(at)
-            if found is not None and self._checksum is not None and found[0] != self._fed_from:
-                self._fed_from, own = found[0], max(0, found[0])
-                self._checksum.add(own, found[1][own - found[0] : max(0, self.size - found[0])])
-        start, block = found or self._block(at, min(self._table.packet_end(at), self.size))
-        return block[at - start : at - start + size]
 
 
 class _Checksum:

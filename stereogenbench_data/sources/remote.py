@@ -1,21 +1,27 @@
 """Files behind URLs: any range of their bytes, resumed where a connection broke off.
 
-A `Transport` makes the requests: that of `web` for http and https, that of `hub` for repositories
-of the Hub, that of `filesystems` for everything else.
+A transport makes the requests for one object, each in one attempt: that of `web` for http and
+https, that of `hub` for repositories of the Hub, that of `filesystems` for everything else. It
+raises `TransientError` where another attempt may help, else `StorageError`. No wait of it for the
+server takes longer than its ``timeout_s``, and threads may make requests at the same time.
 """
 
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.sources.location import is_web, shown
-from stereogenbench_data.sources.retry import Attempts, RetryPolicy, TransientError, Transport
+from stereogenbench_data.sources.retry import Attempts, RetryPolicy, TransientError
+
+if TYPE_CHECKING:
+    from stereogenbench_data.sources.filesystems import FilesystemTransport
+    from stereogenbench_data.sources.web import WebTransport
 
 _T = TypeVar("_T")
 
 
-def _transport(url: str, *, expected_size: int | None) -> Transport:
+def _transport(url: str, *, expected_size: int | None) -> "WebTransport | FilesystemTransport":
     """Return what makes the requests; only its library is imported."""
     if is_web(url):
         from stereogenbench_data.sources.web import WebTransport

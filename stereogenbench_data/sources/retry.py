@@ -3,11 +3,11 @@
 import os
 import random
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from time import monotonic, sleep
-from typing import ClassVar, Final, Protocol
+from typing import ClassVar, Final
 
 from stereogenbench_data.errors import ShardError, StorageError
 
@@ -39,34 +39,6 @@ class TransientError(Exception):
         """Take what happened, for messages."""
         super().__init__(reason)
         self.wait_s = wait_s
-
-
-class Transport(Protocol):
-    """The requests for one object of one protocol, each in one attempt.
-
-    A method raises `TransientError` where another attempt may help, else `StorageError`. No wait of
-    it for the server takes longer than ``timeout_s``. Threads may make requests at the same time.
-
-    Attributes:
-        server: The server that may ask to wait.
-    """
-
-    server: str
-
-    def size(self, timeout_s: float) -> int:
-        """Return the size of the object in bytes."""
-
-    def part(self, start: int, stop: int, timeout_s: float) -> Generator[bytes, None, None]:
-        """Yield the bytes from start to stop, or the first of them.
-
-        The object's size, as its server states it, is compared with that of the index.
-        """
-
-    def entries(self, timeout_s: float) -> dict[str, int | None]:
-        """List a folder: name to size in bytes, None for a folder."""
-
-    def files(self, timeout_s: float) -> dict[str, tuple[int, str]]:
-        """List all files below a folder: path to size in bytes and version, "" if unknown."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -69,48 +69,28 @@ _pools: Final[dict[tuple[int, str], urllib3.PoolManager]] = {}
 """Connections by process and proxy: those of the process that forked this one stay its own."""
 
 
-class Limit:
-    """Until when a server may keep a request waiting."""
-
-    def __init__(self, timeout_s: float) -> None:
-        self.timeout_s = timeout_s
-        self.renew()
-
-    def renew(self) -> None:
-        """Begin to count anew."""
-        self._until_s = time.monotonic() + self.timeout_s
-
-    def left_s(self) -> float:
-        """Return the seconds that are left.
-
-        Raises:
-            TimeoutError: If none are.
-        """
-        left_s = self._until_s - time.monotonic()
-        if left_s <= 0:
-            raise TimeoutError(f"no answer within {self.timeout_s:g} s")
-        return left_s
-
-
-_limit: Final[ContextVar[Limit | None]] = ContextVar("_limit", default=None)
-"""The limit of the request that this thread makes."""
+_until_s: Final[ContextVar[float | None]] = ContextVar("_until_s", default=None)
+"""Until when, on the monotonic clock, the request that this thread makes may be answered."""
 
 
 class _LimitedStream(io.RawIOBase):
-    """The bytes of a connection; all waits for them together end at the limit, also of trickles.
+    """The bytes of a response; all waits for them together have the time of one, as for trickles.
 
-    urllib3 limits each wait alone.
+    urllib3 limits each wait alone. A response that takes longer is resumed by another request.
     """
 
-    def __init__(self, stream: io.RawIOBase, connection: socket.socket, limit: Limit) -> None:
+    def __init__(self, stream: io.RawIOBase, connection: socket.socket, until_s: float) -> None:
         super().__init__()
-        self._stream, self._connection, self._limit = stream, connection, limit
+        self._stream, self._connection, self._until_s = stream, connection, until_s
 
     def readable(self) -> bool:
         return True
 
     def readinto(self, buffer: Any, /) -> int | None:
-        self._connection.settimeout(self._limit.left_s())
+        left_s = self._until_s - time.monotonic()
+        if left_s <= 0:
+            raise TimeoutError("the answer is not whole in time")
+        self._connection.settimeout(left_s)
         return self._stream.readinto(buffer)
 
     def close(self) -> None:
@@ -121,9 +101,9 @@ class _LimitedStream(io.RawIOBase):
 class _LimitedResponse(http.client.HTTPResponse):
     def __init__(self, sock: socket.socket, *args: Any, **how: Any) -> None:
         super().__init__(sock, *args, **how)
-        limit = _limit.get()
-        if limit is not None:
-            self.fp = io.BufferedReader(_LimitedStream(self.fp.detach(), sock, limit))
+        until_s = _until_s.get()
+        if until_s is not None:
+            self.fp = io.BufferedReader(_LimitedStream(self.fp.detach(), sock, until_s))
 
 
 class _Pool(urllib3.HTTPConnectionPool):
@@ -187,7 +167,7 @@ class WebTransport:
 
     def size(self, timeout_s: float) -> int:
         """Return how many bytes the object has, as the response for its first byte states."""
-        response, stated = self._get(0, 1, Limit(timeout_s))
+        response, stated = self._get(0, 1, timeout_s)
         response.close()
         self._require_size_stated(response, stated)
         return stated.size
@@ -206,19 +186,16 @@ class WebTransport:
 
     def part(self, start: int, stop: int, timeout_s: float) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop, or the first of them."""
-        limit = Limit(timeout_s)
-        response, stated = self._get(start, stop, limit)
+        response, stated = self._get(start, stop, timeout_s)
         try:
             self._require_part(response, stated, start, stop)
             skipped, wanted = start - stated.first, stop - start
-            limit.renew()
             while data := response.read1(CHUNK_BYTES):
                 piece = data[skipped:][:wanted]
                 skipped -= min(skipped, len(data))
                 wanted -= len(piece)
                 if piece:
                     yield piece
-                    limit.renew()
                 if response.status == 200 and not wanted:
                     return
         except HTTPError as error:
@@ -227,16 +204,18 @@ class WebTransport:
             # A response that was read to its end is back in the pool, and is not closed.
             response.close()
 
-    def _get(self, start: int, stop: int, limit: Limit) -> tuple[urllib3.BaseHTTPResponse, _Stated]:
+    def _get(
+        self, start: int, stop: int, timeout_s: float
+    ) -> tuple[urllib3.BaseHTTPResponse, _Stated]:
         """Return a response that has content of the object that was read before."""
         part = {"Range": f"bytes={start}-{stop - 1}"}
-        response = self._ask_address(part, limit)
+        response = self._ask_address(part, timeout_s)
         if response is None:
             # One thread is redirected, and the others use the address that it found.
-            with self._resolving.held(limit.timeout_s) if self._is_redirected else nullcontext():
-                response = self._ask_address(part, limit)
+            with self._resolving.held(timeout_s) if self._is_redirected else nullcontext():
+                response = self._ask_address(part, timeout_s)
                 if response is None:
-                    response = self._ask(self._url, part, limit)
+                    response = self._ask(self._url, part, timeout_s)
         try:
             if response.status not in _WITH_CONTENT:
                 raise self.refusal(response)
@@ -252,14 +231,14 @@ class WebTransport:
         return response, stated
 
     def _ask_address(
-        self, part: Mapping[str, str], limit: Limit
+        self, part: Mapping[str, str], timeout_s: float
     ) -> urllib3.BaseHTTPResponse | None:
         """Return a response from where the URL led to; None if that is not known or refuses."""
         address = self._addresses.get(self._url)
         if address is None:
             return None
         try:
-            response = self._ask(address, part, limit)
+            response = self._ask(address, part, timeout_s)
         except TransientError:
             self._addresses.pop(self._url, None)  # its server may be gone; another one may not
             raise
@@ -271,7 +250,7 @@ class WebTransport:
         return None
 
     def _ask(
-        self, url: str, headers: Mapping[str, str], limit: Limit, *, follow: bool = True
+        self, url: str, headers: Mapping[str, str], timeout_s: float, *, follow: bool = True
     ) -> urllib3.BaseHTTPResponse:
         """Return a server's response, of which nothing but the head is read yet."""
         sent = {**self._headers, **headers}
@@ -280,13 +259,12 @@ class WebTransport:
             sent["If-Range"] = etag
         if split_url(url)[:2] != split_url(self._url)[:2]:
             sent = {name: sent[name] for name in sent if name.lower() != "authorization"}
-        limit.renew()
-        token = _limit.set(limit)
+        token = _until_s.set(time.monotonic() + timeout_s)
         try:
             response = _pool(url).request(
                 "GET", url,
                 headers=sent,
-                timeout=limit.timeout_s,
+                timeout=timeout_s,
                 retries=_REDIRECTS_ONLY,
                 redirect=follow,
                 preload_content=False,
@@ -302,7 +280,7 @@ class WebTransport:
                 ) from None
             raise TransientError(_reason(error)) from None
         finally:
-            _limit.reset(token)
+            _until_s.reset(token)
         hops = response.retries.history if response.retries is not None else ()
         for hop in hops:
             url = urljoin(url, hop.redirect_location or "")
@@ -431,5 +409,5 @@ def _reason(error: BaseException) -> str:
 for _name in ("connectionpool", "poolmanager", "util.retry"):
     # What it logs of our requests holds whole URLs, which may be signed.
     logging.getLogger(f"urllib3.{_name}").addFilter(
-        lambda record: _limit.get() is None or record.levelno >= logging.WARNING
+        lambda record: _until_s.get() is None or record.levelno >= logging.WARNING
     )

@@ -2,7 +2,6 @@
 
 import errno
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -70,18 +69,6 @@ def test_a_member_is_fetched_once(cache, shard):
 
     assert shard.fetched == [(1000, 3000)]
     assert cache.used_bytes() == 2000
-
-
-def test_a_cache_shows_its_folder_and_limit(cache, tmp_path):
-    assert repr(cache) == f"ShardCache({str(tmp_path)!r}, limit_bytes=10000)"
-
-
-def test_another_cache_in_the_folder_finds_it(cache, shard, tmp_path):
-    read(cache, member(1000, 2000), shard)
-    read(ShardCache(tmp_path, limit_bytes=5000), member(1000, 2000), shard)
-    read(pickle.loads(pickle.dumps(cache)), member(1000, 2000), shard)
-
-    assert len(shard.fetched) == 1
 
 
 @pytest.mark.parametrize(

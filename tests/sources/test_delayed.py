@@ -7,8 +7,7 @@ import pytest
 
 from benchmarks.server import Network
 from benchmarks.server import serving as delayed_serving
-from stereogenbench_data.errors import ShardError, StorageError
-from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.errors import StorageError
 from stereogenbench_data.sources.remote import RemoteObject
 from tests.servers.gate import Gate
 from tests.servers.hub import COMMIT, REPOSITORY
@@ -97,14 +96,6 @@ def test_lost_connections_cost_no_byte(store, before, shard):
             assert remote.read(start, start + 1000) == whole[start : start + 1000]
 
 
-def test_an_index_opens_through_a_network(store, before, small_shards):
-    url, point = store
-    with before(url, delay_s=0.01, connection_mb_s=20.0) as server:
-        index = SceneIndex.open(point(server.url))
-
-        assert index.digest == SceneIndex.open(small_shards).digest
-
-
 @pytest.mark.parametrize("how", ["refusing", "never answering"])
 def test_a_dead_store_is_a_named_error_within_the_longest_outage(store, how):
     def never(start, stop):
@@ -118,14 +109,3 @@ def test_a_dead_store_is_a_named_error_within_the_longest_outage(store, how):
 
         with pytest.raises(StorageError, match=rf"{root}/x.tar : cannot be read, at byte 0 of 9 "):
             ended(lambda: remote.read(0, 9))
-
-
-def test_the_size_that_the_index_records_is_compared_with_the_first_bytes(store, shard):
-    url, point = store
-    root, size = point(url), shard.stat().st_size
-    assert RemoteObject(f"{root}/{shard.name}", expected_size=size).read(0, 9)
-
-    for start in (0, size + 10):
-        remote = RemoteObject(f"{root}/{shard.name}", expected_size=size + 99)
-        with pytest.raises(ShardError, match=f"has {size} bytes, and the index says {size + 99}"):
-            remote.read(start, start + 9)
