@@ -36,12 +36,18 @@ class BinaryFile(Protocol):
 
 
 class SeekableFile(io.RawIOBase):
-    """A read-only file of so many bytes, whose subclasses read them."""
+    """A read-only file of so many bytes, whose subclasses read them.
+
+    Attributes:
+        opens_by_header: Whether a video is opened by its header, so that no packet is fetched.
+        hides_packets: While it is set, the file seems to end where packets lie.
+    """
 
     def __init__(self, size: int) -> None:
         """Begin at the start."""
         super().__init__()
         self.size = size
+        self.opens_by_header = self.hides_packets = False
         self._position = 0
 
     def readable(self) -> bool:
@@ -65,19 +71,6 @@ class SeekableFile(io.RawIOBase):
         return self._position
 
 
-@runtime_checkable
-class HeaderFirstFile(BinaryFile, Protocol):
-    """A binary file that is opened by its header, so that no packet is fetched for that.
-
-    Attributes:
-        opens_by_header: Whether its header is enough to open it.
-        hides_packets: While it is set, the file seems to end where packets lie.
-    """
-
-    opens_by_header: bool
-    hides_packets: bool
-
-
 VideoFile = str | Path | BinaryFile
 
 
@@ -92,10 +85,12 @@ class FrameReader:
     Attributes:
         name: What messages call the file.
         frames: How many frames it has.
+        header: What the file's header says; the pixel format is empty where it does not give it.
     """
 
     name: str
     frames: int
+    header: "StreamFacts"
 
     def close(self) -> None:
         """Close the reader; closing twice does nothing."""
@@ -298,7 +293,7 @@ def open_by_header(file: VideoFile, *, name: str) -> tuple[InputContainer, Place
         StorageError: If a path is missing, not a file or not readable.
         MediaError: If the content is not an MP4 or Matroska file with at least one video stream.
     """
-    if isinstance(file, HeaderFirstFile) and file.opens_by_header:
+    if isinstance(file, SeekableFile) and file.opens_by_header:
         file.hides_packets = True
         try:
             # Where its header is not enough, the whole file says what is wrong with it.

@@ -45,14 +45,12 @@ _FORMAT: Final = 1
 _BYTES_A_FRAME: Final = 64
 _BLOCK_BYTES: Final = 256 * 1024
 _LEVEL: Final = 6
+_TAGS: Final = ("tags", "stream_tags")
 _TOO_LARGE: Final = 2**31
 _TOO_LATE: Final = 2**62
-_FIXED: Final = struct.Struct(">2x8sxixQ5xxqxqxixixixhxhx2x16s")
-"""Magic, sizes of header and frame, of all units and chunks, of a unit, a block and a chunk."""
+_FIXED: Final = struct.Struct(">2x8sxixQ")
+"""Magic, size of the header and of the whole file."""
 _MAGIC: Final = b"b2frame\0"
-_NAME_AT: Final = _FIXED.size + len(b"\x93\xcd__\xde__")
-_NAME: Final = bytes([0xA0 + len(LAYER)]) + LAYER.encode()
-_LAYER_AT: Final = struct.Struct(">xi")
 
 _CHUNK: Final = struct.Struct("<4B3i16s")
 """Versions, flags, size of a unit; bytes of units, of a block, of the chunk; filters and codec."""
@@ -162,46 +160,24 @@ def frame_file(clip: StoredClip, chunks: Sequence[bytes]) -> bytes:
 
 
 def _description(header: bytes, *, name: str) -> dict[str, Any]:
-    """Return the metalayer's content."""
-    content_at = _NAME_AT + len(_NAME)
-    if header[_NAME_AT:content_at] != _NAME or len(header) < content_at + _LAYER_AT.size:
-        raise _unfit(name, f"it has no metalayer {LAYER!r} of its own")
-    (start,) = _LAYER_AT.unpack_from(header, content_at)
-    # Of a layer: a mark and four bytes of size; of its bytes: a mark and one, two or four.
-    packed = header[start + 5 :] if 0 < start < len(header) else b""
-    width = {0xC4: 1, 0xC5: 2, 0xC6: 4}.get(packed[0] if packed else 0, 0)
-    length = int.from_bytes(packed[1 : 1 + width], "big")
-    text = packed[1 + width : 1 + width + length]
-    if len(text) != length or length < 4 or zlib.crc32(text[4:]).to_bytes(4, "big") != text[:4]:
-        raise _unfit(name, "its description of itself fails its checksum")
-    try:
-        description = json.loads(text[4:])
-    except (ValueError, RecursionError):
-        description = None
-    if not isinstance(description, dict) or description.get("format") != _FORMAT:
+    """Return the metalayer's content: the end of the header, behind its own checksum."""
+    start = header.find(b'{"format":')
+    text = header[start:]
+    if start < 4 or zlib.crc32(text).to_bytes(4, "big") != header[start - 4 : start]:
+        raise _unfit(name, "it has no description of itself that fits its checksum")
+    description: dict[str, Any] = json.loads(text)
+    if description["format"] != _FORMAT:
         raise _unfit(name, "its description of itself is of another version")
     return description
 
 
 def _clip(told: Mapping[str, Any]) -> StoredClip:
-    (up, down), (time_up, time_down) = told["rate"], told["time_base"]
-    tags, stream_tags = (
-        {str(key): str(value) for key, value in told[which].items()}
-        for which in ("tags", "stream_tags")
-    )
-    clip = StoredClip(
-        width_px=int(told["width_px"]),
-        height_px=int(told["height_px"]),
-        codec=str(told["codec"]),
-        pixel_format=str(told["pixel_format"]),
-        rate=(int(up), int(down)),
-        time_base=(int(time_up), int(time_down)),
-        pts=tuple(map(int, told["pts"])),
-        tags=tags,
-        stream_tags=stream_tags,
-    )
+    lists = {name: tuple(told[name]) for name in ("rate", "time_base", "pts")}
+    tags = {name: {str(k): str(v) for k, v in told[name].items()} for name in _TAGS}
+    clip = StoredClip(**{**told, **lists, **tags})
     numbers = (clip.width_px, clip.height_px, *clip.rate, *clip.time_base)
-    if not 1 <= min(numbers) <= max(numbers) < _TOO_LARGE:
+    are_whole = len(numbers) == 6 and all(type(each) is int for each in (*numbers, *clip.pts))
+    if not are_whole or not 1 <= min(numbers) <= max(numbers) < _TOO_LARGE:
         raise ValueError(f"{clip.width_px}x{clip.height_px}, {clip.rate}, {clip.time_base}")
     if clip.codec != "ffv1" or not clip.pixel_format.startswith("gray"):
         raise ValueError(f"{clip.codec}, {clip.pixel_format}")
@@ -281,7 +257,7 @@ class DepthFrames(FrameReader):
             self.close()
             raise
         self.frames = len(self._sizes)
-        self.facts = StreamFacts(
+        self.header = self.facts = StreamFacts(
             codec=CODEC_NAME,
             pixel_format=self.clip.pixel_format,
             width_px=self.clip.width_px,
@@ -355,13 +331,11 @@ class DepthFrames(FrameReader):
         self._file_bytes = file_bytes = self._file.seek(0, 2)
         self._file.seek(0)
         header = self._file.read(FIXED_BYTES)
-        if len(header) < _NAME_AT or header[2 : 2 + len(_MAGIC)] != _MAGIC:
+        if len(header) < _FIXED.size or header[2 : 2 + len(_MAGIC)] != _MAGIC:
             raise _unfit(name, f"its first bytes are {header[:10]!r}, not those of a blosc2 frame")
-        _, size, told_bytes, units, chunks, typesize, _, chunk_bytes, *_ = _FIXED.unpack_from(
-            header
-        )
+        _, size, told_bytes = _FIXED.unpack_from(header)
         most_frames = MOST_FRAMES if frames == "any" else frames
-        if not _NAME_AT < size <= FIXED_BYTES + most_frames * _BYTES_A_FRAME:
+        if not _FIXED.size < size <= FIXED_BYTES + most_frames * _BYTES_A_FRAME:
             raise _unfit(name, f"its header claims {size} bytes")
         header += self._read(size - len(header)) if size > len(header) else b""
         if len(header) < size or told_bytes != file_bytes:
@@ -369,23 +343,29 @@ class DepthFrames(FrameReader):
                 f"{name}: is cut short or damaged: its header has {size} bytes of {told_bytes}, "
                 f"and the file {file_bytes}: fetch it again."
             )
-        description = _description(header[:size], name=name)
         try:
+            description = _description(header[:size], name=name)
             clip = self.clip = _clip(description["clip"])
             sizes, crc32s = (tuple(map(int, description[key])) for key in ("sizes", "crc32s"))
-        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        except MediaError:
+            raise
+        except (
+            ArithmeticError,
+            AttributeError,
+            LookupError,
+            RecursionError,
+            TypeError,
+            ValueError,
+        ) as error:
             reason = shortened(repr(error))
             raise _unfit(name, f"its description is malformed or incomplete ({reason})") from error
         self._sizes, self._crc32s = sizes, crc32s
         self._offsets = tuple(accumulate(sizes, initial=size))[:-1]
-        expected = (len(sizes) * clip.frame_bytes, sum(sizes), UNIT_BYTES, clip.frame_bytes)
-        found = (units, chunks, typesize, chunk_bytes)
-        counts = {len(sizes), len(crc32s), len(clip.pts)}
         largest = clip.frame_bytes + _CHUNK.size
-        if found != expected or len(counts) != 1 or not all(0 <= each <= largest for each in sizes):
-            raise _unfit(name, f"its header claims units and chunks of {found}, not {expected}")
-        if size + chunks > file_bytes:
-            raise _unfit(name, f"its chunks would end at byte {size + chunks} of {file_bytes}")
+        if not len(sizes) == len(crc32s) == len(clip.pts):
+            raise _unfit(name, "its description is of different numbers of frames")
+        if not all(0 <= each <= largest for each in sizes) or size + sum(sizes) > file_bytes:
+            raise _unfit(name, f"its chunks have {sum(sizes)} bytes of {file_bytes}")
         if frames not in ("any", len(sizes)):
             raise MediaError(
                 f"{name}: holds {len(sizes)} frames where {frames} are expected. "

@@ -29,7 +29,6 @@ from stereogenbench_data.media.container import (
     StreamFacts,
     VideoFile,
     codec_of,
-    exact,
     frames_by_duration,
     is_colour_format,
     open_by_header,
@@ -44,7 +43,6 @@ from stereogenbench_data.media.siting import (
     CENTRE,
     Converter,
     coded_siting,
-    has_coded_chroma,
     is_subsampled,
     picture_siting,
 )
@@ -155,10 +153,8 @@ class VideoReader(FrameReader):
         self.scaler = VideoReformatter()
         self.converter = Converter()
         self._file = file
-        self._picture: tuple[str, int, int] | None = None
         self._current: tuple[int, VideoFrame] | None = None
         self._is_closed = False
-        self._facts: StreamFacts | None = None
         self._decoder: Decoder | None = None
         self._is_seen = False
         container, placed = open_by_header(file, name=name)
@@ -166,15 +162,8 @@ class VideoReader(FrameReader):
             require_whole_payload(container, name=name)
             self._crc32s = packet_checksums(container, frames=frames, name=name)
             context = container.streams.video[0].codec_context
-            self.size_px = (context.width, context.height)
-            """Width and height by the header; 0 if it does not give them."""
-            self.pixel_aspect = float(exact(container.streams.video[0].sample_aspect_ratio) or 0)
-            """Width of a pixel over its height by the header; 0 if it does not give it."""
-            coded_chroma = has_coded_chroma(context.codec.canonical_name, context.extradata)
-            self._is_coded_grey = coded_chroma is False
+            self.header = stream_facts(container, name=name, frames=frames, pixel_format="later")
             self._siting = coded_siting(context.codec.canonical_name, context.extradata)
-            if context.pix_fmt is not None:
-                self._facts = stream_facts(container, name=name, frames=frames)
             steady = steady_clock(container, frames=frames)
             if steady is None and placed == "anywhere":
                 container.close()
@@ -190,17 +179,14 @@ class VideoReader(FrameReader):
 
     @property
     def facts(self) -> StreamFacts:
-        """What the header says, with ``frames`` as they were asked for.
+        """What the header says, and the pixel format by a picture where that does not.
 
         Raises:
-            MediaError: If the header lacks size or pixel format.
+            MediaError: If a picture is needed and cannot be read.
         """
-        if self._facts is None:
-            # A file object is read from one place at a time.
-            self._drop_decoder()
-            with open_container(self._file, name=self.name) as container:
-                self._facts = stream_facts(container, name=self.name, frames=self.frames)
-        return self._facts
+        if not self.header.pixel_format:
+            self.frame(0)
+        return self.header
 
     def frame(self, index: int) -> VideoFrame:
         """Return the frame that is the ``index``-th in the order of presentation, from 0.
@@ -225,8 +211,9 @@ class VideoReader(FrameReader):
             MediaError: If it cannot be read, or is not a colour picture.
         """
         frame = self.frame(index)
-        if self._is_coded_grey or not is_colour_format(frame.format.name):
-            found = "coded as grey" if self._is_coded_grey else f"stored as {frame.format.name}"
+        is_colour = is_colour_format(frame.format.name)
+        if not is_colour or self.header.is_colour is False:
+            found = "coded as grey" if is_colour else f"stored as {frame.format.name}"
             raise MediaError(f"{self.name}: frame {index} is {found}{NO_COLOUR}")
         return frame
 
@@ -283,15 +270,11 @@ class VideoReader(FrameReader):
         return clock
 
     def _require_same_picture(self, index: int, frame: VideoFrame) -> None:
+        if not self.header.pixel_format:
+            self.header = replace(self.header, pixel_format=frame.format.name)
+        header = self.header
+        expected = (header.pixel_format, header.width_px, header.height_px)
         found = (frame.format.name, frame.width, frame.height)
-        if self._facts is not None:
-            facts = self._facts
-            self._picture = (facts.pixel_format, facts.width_px, facts.height_px)
-        elif self._picture is None:
-            # The first picture seen may be one after a change; the header is of them all.
-            width_px, height_px = self.size_px
-            self._picture = (found[0], width_px or found[1], height_px or found[2])
-        expected = self._picture
         if found != expected:
             raise MediaError(
                 f"{self.name}: frame {index} is {found[0]} {found[1]}x{found[2]} where "
@@ -320,6 +303,23 @@ class VideoReader(FrameReader):
         if self._decoder is not None:
             self._decoder.close()
             self._decoder = None
+
+
+def require_indexed_picture(reader: FrameReader, rig: Rig) -> None:
+    """Refuse a video whose picture size or pixel aspect differs from the index.
+
+    Raises:
+        MediaError: If so.
+    """
+    found = (reader.header.width_px, reader.header.height_px)
+    indexed = (rig.image_width_px, rig.image_height_px)
+    if found != indexed:
+        raise MediaError(
+            f"{reader.name}: holds pictures of {found[0]}x{found[1]} pixels where the index says "
+            f"{indexed[0]}x{indexed[1]}. The video or the index was replaced or altered: fetch "
+            f"them again, or run `stereogenbench index` again."
+        )
+    require_pixel_aspect(reader.header.pixel_aspect, rig, name=reader.name)
 
 
 def require_pixel_aspect(pixel_aspect: float, rig: Rig, *, name: str) -> None:

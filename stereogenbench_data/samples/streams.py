@@ -20,7 +20,7 @@ from jaxtyping import UInt8
 
 from stereogenbench_data.errors import MediaError, StorageError
 from stereogenbench_data.media.depth import measured, open_depth, read_depth_units, resized_nearest
-from stereogenbench_data.media.video import VideoReader, read_rgb, require_pixel_aspect
+from stereogenbench_data.media.video import VideoReader, read_rgb, require_indexed_picture
 from stereogenbench_data.samples.views import StoredDepth
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
@@ -247,7 +247,7 @@ class Streams:
                     kind = open_depth if name in PACKED_DEPTH_NAMES.values() else VideoReader
                     reader = kind(file, name=label, frames=scene.frames)
                     try:
-                        _require_size(reader, scene, name=label)
+                        require_indexed_picture(reader, scene.rig)
                     except MediaError:
                         reader.close()
                         raise
@@ -272,23 +272,6 @@ class Streams:
         """Return what another process makes a pool of its own from."""
         again = partial(Streams, limit=self.limit, kept_frames=self.kept_frames)
         return again, (self._source,)
-
-
-def _require_size(reader: Any, scene: Scene, *, name: str) -> None:
-    """Refuse a video whose picture size or pixel aspect differs from the index."""
-    if isinstance(reader, VideoReader) and all(reader.size_px):
-        found = reader.size_px
-    else:
-        found = (reader.facts.width_px, reader.facts.height_px)
-    indexed = (scene.rig.image_width_px, scene.rig.image_height_px)
-    if found != indexed:
-        raise MediaError(
-            f"{name}: holds pictures of {found[0]}x{found[1]} pixels where the index says "
-            f"{indexed[0]}x{indexed[1]}. The video or the index was replaced or altered: fetch "
-            "them again, or run `stereogenbench index` again."
-        )
-    if isinstance(reader, VideoReader):
-        require_pixel_aspect(reader.pixel_aspect, scene.rig, name=name)
 
 
 def _read_only(picture: Any) -> Any:

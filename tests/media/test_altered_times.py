@@ -82,14 +82,13 @@ def test_no_flipped_bit_of_a_depth_videos_times_brings_another_frame(depth):
     for place in places:
         for bit in range(8):
             altered = flipped(depth, place, bit)
-            orders = [range(FRAMES), rng.sample(range(FRAMES), FRAMES), [rng.randrange(FRAMES)]]
-            for order in orders:
-                found = depth_numbers(altered, order)
-                wrong += [
-                    (place, bit, index, number)
-                    for index, number in found.items()
-                    if number not in (None, index)
-                ]
+            order = (range(FRAMES), rng.sample(range(FRAMES), FRAMES))[(place + bit) % 2]
+            found = depth_numbers(altered, order)
+            wrong += [
+                (place, bit, index, number)
+                for index, number in found.items()
+                if number not in (None, index)
+            ]
 
     assert len(places) > 2 * FRAMES
     assert wrong == []

@@ -2,7 +2,6 @@
 
 import io
 import json
-import struct
 import sys
 import zlib
 from dataclasses import replace
@@ -365,11 +364,11 @@ def test_a_header_of_another_version_is_refused(packed):
     [
         (b'"codec":"ffv1"', b'"codec":"h264"', "h264, gray16le"),
         (b'"gray16le"', b'"rgb48lex"', "ffv1, rgb48lex"),
-        (b'"width_px":56', b'"width_px":{}', "malformed or incomplete .TypeError"),
-        (b'"rate":[15,1]', b'"rate":[0,15]', "malformed or incomplete .ValueError"),
-        (b'"rate":[15,1]', b'"rate":[1e99]', "malformed or incomplete .ValueError"),
-        (b"[1,1000]", b"[1e99,1]", "malformed or incomplete .ValueError"),
-        (b'"tags":{', b'"tagz":{', "malformed or incomplete .KeyError"),
+        (b'"width_px":56', b'"width_px":{}', "malformed or incomplete"),
+        (b'"rate":[15,1]', b'"rate":[0,15]', "malformed or incomplete"),
+        (b'"rate":[15,1]', b'"rate":[1e99]', "malformed or incomplete"),
+        (b"[1,1000]", b"[1e99,1]", "malformed or incomplete"),
+        (b'"tags":{', b'"tagz":{', "malformed or incomplete"),
         (b'"pts":[0,67', b'"pts":[99,0', "times of frames that do not ascend"),
     ],
 )
@@ -382,14 +381,6 @@ def test_a_header_that_describes_no_packed_depth_is_refused(packed, old, new, fo
     assert altered != told
 
     with pytest.raises(MediaError, match=found):
-        opened(content)
-
-
-def test_a_header_that_ends_with_its_layers_name_is_refused(packed):
-    end = packed.index(LAYER.encode()) + len(LAYER)
-    content = packed[:11] + struct.pack(">i", end) + packed[15:]
-
-    with pytest.raises(MediaError, match="it has no metalayer 'stereogenbench_depth' of its own"):
         opened(content)
 
 
