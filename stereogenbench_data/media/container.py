@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, Literal, NoReturn, Protocol, TypeVar, runtime_checkable
+from typing import Any, Final, Literal, Protocol, TypeVar, runtime_checkable
 
 import av
 from av.container import InputContainer
@@ -113,26 +113,6 @@ class FrameReader:
     def __exit__(self, *error: object) -> None:
         """Close the reader."""
         self.close()
-
-    def __reduce__(self) -> NoReturn:
-        """Refuse to be pickled: an open file belongs to its process."""
-        raise TypeError(
-            f"{self.name}: an open {type(self).__name__} cannot be pickled: "
-            f"pass the path to the other process and open it there."
-        )
-
-
-@runtime_checkable
-class Ratio(Protocol):
-    """A `Fraction`, or the `AVRational` that PyAV 19 gives in its place."""
-
-    @property
-    def numerator(self) -> int:
-        """The number above."""
-
-    @property
-    def denominator(self) -> int:
-        """The number below."""
 
 
 _OPTIONS: Final = {"format_whitelist": "mov,matroska"}
@@ -332,7 +312,7 @@ def _require_file(path: Path, *, name: str) -> None:
         raise MediaError(f"{name}: is empty (0 bytes at {path}): fetch it again.")
 
 
-def exact(ratio: Ratio | None) -> Fraction | None:
+def exact(ratio: Any) -> Fraction | None:
     """Return a rate, time base or aspect as a fraction, None if the file does not give it.
 
     PyAV 18 gives None for a value that is not set, PyAV 19 a ratio of zero or with a zero below,

@@ -146,8 +146,6 @@ class VideoReader(FrameReader):
             MediaError: If it is not a video, is cut short or has another number of frames, as far
                 as the header shows. Other faults are raised by the frames that they concern.
         """
-        if frames < 1:
-            raise MediaError(f"{name}: frames must be at least 1, got {frames}.")
         self.name = name
         self.frames = frames
         self.scaler = VideoReformatter()

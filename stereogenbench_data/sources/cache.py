@@ -69,8 +69,12 @@ class ShardCache:
         self.limit_bytes = limit_bytes
         self._items = self.folder / "items"
         self._locks = self.folder / "locks"
+        self._ledger = self._locks / "size"  # holds how many bytes all have; empty: count them
         with _named_errors(self.folder):
-            self._make()
+            self._items.mkdir(parents=True, exist_ok=True)
+            self._locks.mkdir(exist_ok=True)
+            if not (self.folder / _TAG).exists():
+                write_atomic(self.folder / _TAG, _TAG_TEXT)
 
     def __repr__(self) -> str:
         """Return the folder and the limit."""
@@ -99,7 +103,7 @@ class ShardCache:
                     f"{member.size} bytes of a member of {remote.where}. Give the cache a larger "
                     f"limit."
                 )
-            with self._locked(key[:2]):
+            with locked(self._locks / key[:2]):
                 # Another process may have fetched it meanwhile.
                 return self._find(key, member) or self._fill(key, member, remote=remote)
 
@@ -110,7 +114,7 @@ class ShardCache:
     def drop_damaged(self, member: Member, *, where: str, revision: str) -> bool:
         """Drop a member if its bytes have changed since they were stored; return whether so."""
         key = _key(member, where=where, revision=revision)
-        with _named_errors(self.folder), _where_writable(), self._locked(key[:2]):
+        with _named_errors(self.folder), _where_writable(), locked(self._locks / key[:2]):
             place = self._place(key)
             if member.crc32 is None or not place.is_file():
                 return False
@@ -124,12 +128,6 @@ class ShardCache:
     def used_bytes(self) -> int:
         """Return the bytes of all members stored."""
         return sum(size for _, size, _ in self._own_files())
-
-    def _make(self) -> None:
-        self._items.mkdir(parents=True, exist_ok=True)
-        self._locks.mkdir(exist_ok=True)
-        if not (self.folder / _TAG).exists():
-            write_atomic(self.folder / _TAG, _TAG_TEXT)
 
     def _find(self, key: str, member: Member) -> FileSlice | None:
         """Return an item that is stored and unchanged; it counts as used now."""
@@ -165,7 +163,7 @@ class ShardCache:
             _mark_used(part, key)
             # Opened before others can see it, as they may evict it at once.
             found = FileSlice(part, Member(key, 0, member.size))
-            with self._locked("size"):
+            with locked(self._ledger):
                 # Whoever counts must find it under one name.
                 part.replace(self._place(key))
             return found
@@ -177,21 +175,21 @@ class ShardCache:
 
         Its part gets its full size at once, so other processes count it.
         """
-        with self._locked("size") as ledger:
-            recorded = ledger.read_bytes()
+        with locked(self._ledger):
+            recorded = self._ledger.read_bytes()
             used = int(recorded) if recorded.isdigit() else self.used_bytes()
             if used + size > self.limit_bytes:
                 used = self._evict(down_to=max(0, int(_FULL * self.limit_bytes) - size))
-            ledger.write_text(str(used + size))
+            self._ledger.write_text(str(used + size))
             part.touch()
             os.truncate(part, size)
 
     def _drop(self, path: Path) -> None:
         """Delete an item or a part if it exists; then all are counted anew."""
         if path.exists():
-            with self._locked("size") as ledger:
+            with locked(self._ledger):
                 path.unlink(missing_ok=True)
-                ledger.write_bytes(b"")
+                self._ledger.write_bytes(b"")
 
     def _evict(self, *, down_to: int) -> int:
         """Delete the least recently used items; return how many bytes are left."""
@@ -224,12 +222,6 @@ class ShardCache:
 
     def _place(self, key: str) -> Path:
         return self._items / f"{key}.member"
-
-    @contextmanager
-    def _locked(self, name: str) -> Iterator[Path]:
-        path = self._locks / name
-        with locked(path):
-            yield path
 
 
 def _stamp_ns(key: str) -> int:

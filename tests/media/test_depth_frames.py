@@ -382,10 +382,3 @@ def test_a_header_that_describes_no_packed_depth_is_refused(packed, old, new, fo
 
     with pytest.raises(MediaError, match=found):
         opened(content)
-
-
-def test_an_open_reader_stays_in_its_process(packed):
-    import pickle
-
-    with pytest.raises(TypeError, match="an open DepthFrames cannot be pickled"):
-        pickle.dumps(opened(packed))

@@ -1,7 +1,6 @@
 """What a reader takes, keeps, refuses and gives back."""
 
 import io
-import pickle
 
 import pytest
 
@@ -109,21 +108,6 @@ def test_a_frame_that_does_not_exist_is_refused(clips, clip, index):
         pytest.raises(MediaError, match=f"clip: has no frame {index}: ask for one of 0 to 47"),
     ):
         reader.frame(index)
-
-
-def test_a_reader_says_why_it_cannot_be_pickled(clips, clip):
-    with (
-        VideoReader(clip, name="clip", frames=clips.frames) as reader,
-        pytest.raises(
-            TypeError, match="clip: an open VideoReader cannot be pickled: pass the path"
-        ),
-    ):
-        pickle.dumps(reader)
-
-
-def test_no_frames_are_refused(clip):
-    with pytest.raises(MediaError, match="clip: frames must be at least 1, got 0"):
-        VideoReader(clip, name="clip", frames=0)
 
 
 def test_a_missing_file_is_named_with_its_path(tmp_path):
