@@ -46,8 +46,9 @@ class RetryPolicy:
     """How long reading waits for a server.
 
     Attributes:
-        timeout_s: Seconds until a server answers, and between the bytes that it sends. Reading
-            gives up 2.25 times as long after its last progress, connecting and retries included.
+        timeout_s: Seconds that an answer may take; a longer one is resumed by another request.
+            Reading gives up 2.25 times as long after its last progress, connecting and retries
+            included.
     """
 
     timeout_s: float | int = 20.0
