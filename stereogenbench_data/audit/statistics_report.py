@@ -1,13 +1,9 @@
-"""Statistics compared with the paper's figures, as Markdown, and as histograms."""
+"""Statistics compared with the paper's figures, as Markdown."""
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final, Unpack
-
-import numpy as np
-from jaxtyping import Float64
+from typing import Final
 
 from stereogenbench_data.audit.paper_numbers import (
     ADJACENT,
@@ -26,19 +22,9 @@ from stereogenbench_data.audit.paper_numbers import (
     TRAIN_MAPS_TABLE,
     map_counts,
 )
-from stereogenbench_data.audit.statistics import (
-    ADJACENT_COLUMNS,
-    FOCAL_EDGES_MM,
-    FamilyStatistics,
-    Statistics,
-    branch_rows,
-)
-from stereogenbench_data.errors import missing_extra
-from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.audit.statistics import FOCAL_EDGES_MM, FamilyStatistics, Statistics
 from stereogenbench_data.schema.release import SCENE_COUNTS
 from stereogenbench_data.schema.text import markdown_table, markdown_text
-from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
-from stereogenbench_data.sources.files import open_atomic
 
 _RELEASE_SIZED: Final = 0.1
 """Largest relative difference between a split's number of scenes and the paper's."""
@@ -240,88 +226,3 @@ def _map_rows(branches: Sequence[FamilyStatistics]) -> Iterator[Sequence[str]]:
     yield ("map", *(f"{each.split} {each.family}" for each in branches))
     for name in sorted({name for each in branches for name in each.maps}):
         yield (name, *(f"{each.maps[name]:,}" if name in each.maps else "-" for each in branches))
-
-
-_HISTOGRAM_BINS: Final = 40
-_COLOURS: Final = {"IPD_Gaussian": "#4477aa", "Uniform": "#ee6677", "Pairwise_Uniform": "#228833"}
-_COLUMNS: Final = 3
-_HEADROOM: Final = 1.3
-"""Room for the legend above the bars."""
-_INCHES: Final = (4.2, 3.2)
-
-
-def write_plots(
-    index: SceneIndex, folder: Path, **filters: Unpack[SceneFilters]
-) -> tuple[Path, Path]:
-    """Write ``baselines.png`` and ``focal_lengths.png`` into a folder, made if need be.
-
-    A panel shows the adjacent baselines of a split's family (for Pairwise_Uniform those of all 15
-    pairs), with the mean dashed and the median dotted.
-
-    Raises:
-        ExtraError: If matplotlib is not installed.
-        SelectionError: If no scene passes the filters.
-
-    Source: the StereoGenBench paper, figure of the realized baseline distributions.
-    """
-    rows = filter_scenes(index, filters)
-    panels = [
-        (f"{split} {family}", family, index.column("baselines_cm")[chosen],
-         index.column("focal_mm")[chosen])
-        for split, family, chosen in branch_rows(index, rows)
-    ]  # fmt: skip
-    paths = folder / "baselines.png", folder / "focal_lengths.png"
-    figures = [_figure(len(panels)) for _ in paths]
-    folder.mkdir(parents=True, exist_ok=True)
-    for number, (title, family, baselines_cm, focal_mm) in enumerate(panels):
-        is_pairwise = family == "Pairwise_Uniform"
-        shown_cm = baselines_cm if is_pairwise else baselines_cm[:, ADJACENT_COLUMNS]
-        what = "all pairs" if is_pairwise else "adjacent"
-        colour = _COLOURS.get(family, "#777777")
-        axes = figures[0].axes[number]
-        _histogram(axes, shown_cm.ravel(), bins=_HISTOGRAM_BINS, colour=colour)
-        axes.set(title=f"{title}, {what}", xlabel="baseline (cm)", ylabel="pairs")
-        edges = np.union1d(FOCAL_EDGES_MM, np.clip(focal_mm, None, FOCAL_EDGES_MM[0]).min())
-        edges = np.union1d(edges, np.clip(focal_mm, FOCAL_EDGES_MM[-1], None).max())
-        axes = figures[1].axes[number]
-        _histogram(axes, focal_mm, bins=edges, colour=colour)
-        axes.set(title=title, xlabel="focal length (mm)", ylabel="scenes")
-    for figure, path in zip(figures, paths, strict=True):
-        with open_atomic(path) as file:
-            figure.savefig(file, format="png", dpi=100)
-    return paths
-
-
-def _histogram(axes: Any, values: Float64[np.ndarray, " n"], *, bins: Any, colour: str) -> None:
-    axes.hist(values, bins=bins, color=colour, edgecolor="white", linewidth=0.3)
-    mean, median = float(values.mean()), float(np.median(values))
-    for place, label, style in ((mean, "mean", "--"), (median, "median", ":")):
-        axes.axvline(
-            place, ymax=1 / _HEADROOM, color="black", linestyle=style, linewidth=1.2,
-            label=f"{label} {place:.2f}",
-        )  # fmt: skip
-    axes.set_ylim(0, axes.get_ylim()[1] * _HEADROOM)
-    axes.yaxis.get_major_locator().set_params(integer=True)
-    axes.legend(
-        title=f"n = {len(values):,}", loc="upper right", fontsize=8, title_fontsize=8, ncols=2,
-        framealpha=1,
-    )  # fmt: skip
-
-
-def _figure(panels: int) -> Any:
-    """Return a figure with that many panels; the rest of its grid is blank.
-
-    Raises:
-        ExtraError: If matplotlib is not installed.
-    """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise missing_extra("plots", "plots", error) from error
-    columns = min(_COLUMNS, panels)
-    rows = -(-panels // columns)
-    figure = Figure(figsize=(_INCHES[0] * columns, _INCHES[1] * rows), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False)
-    for axes in grid.flat[panels:]:
-        axes.set_axis_off()
-    return figure

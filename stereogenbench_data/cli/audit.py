@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -29,9 +28,9 @@ _ALL = "all"
 
 
 def _complete_limit(incomplete: str) -> list[str]:
-    from stereogenbench_data.audit.geometry.records import AuditLimits
+    from stereogenbench_data.audit.geometry.checks import LIMITS
 
-    return complete_from(f"{limit.name}=" for limit in fields(AuditLimits))(incomplete)
+    return complete_from(f"{name}=" for name in LIMITS)(incomplete)
 
 
 @grouped
@@ -68,7 +67,7 @@ def audit(  # noqa: PLR0913 - one parameter an option
     Example: `stereogenbench audit shards/ --scenes 20 -o audit.md`
     """
     from stereogenbench_data.audit.geometry import audit as geometry_audit
-    from stereogenbench_data.audit.geometry.records import AuditLimits
+    from stereogenbench_data.audit.geometry.checks import parse_limits
     from stereogenbench_data.audit.geometry.table import audit_markdown
 
     if out is not None and out.is_dir():
@@ -83,7 +82,7 @@ def audit(  # noqa: PLR0913 - one parameter an option
     request = geometry_audit.AuditRequest(
         sample=scenes,
         frames=0 if per_scene == _ALL else int(per_scene),
-        limits=AuditLimits.parse(limit or []),
+        limits=parse_limits(limit or []),
     )
     options: Any = chosen.filters() | work.options()
     with progress_bar("reading the index", unit="scenes") as progress:

@@ -63,7 +63,8 @@ def test_conventions_replace_the_depth_contract(small_shards, run, tmp_path):
 
     shown = run(small_shards, *FEW, "--conventions", stated, "--json")
 
-    assert json.loads(shown.stdout)["scenes"][0]["cameras"][0]["depth_unit_m"] == 0.002
+    figures = json.loads(shown.stdout)["scenes"][0]["figures"]
+    assert {each["value"] for each in figures if each["quantity"] == "depth_unit_m"} == {0.002}
 
 
 def test_a_stopped_audit_keeps_its_journal_and_the_next_run_uses_it(

@@ -13,7 +13,7 @@ from stereogenbench_data.audit.geometry.picture_check import (
     stored_step,
     subject_m,
 )
-from stereogenbench_data.audit.geometry.records import At
+from stereogenbench_data.audit.geometry.records import Figure
 
 
 def grey(level, *, size=(24, 32)):
@@ -32,8 +32,10 @@ def test_the_darkest_and_the_flattest_picture_are_reported_with_their_frames():
     check.take(stripes(0, 10), 7, moved=True)
     check.take(grey(90), 9, moved=True)
 
-    assert check.brightness.at == At(pytest.approx(10, abs=0.01), 7)
-    assert check.contrast.at == At(pytest.approx(0, abs=0.01), 9)
+    assert list(check.figures("a.mp4")) == [
+        Figure("brightness", "a.mp4", pytest.approx(10, abs=0.01), "frame 7"),
+        Figure("contrast", "a.mp4", pytest.approx(0, abs=0.01), "frame 9"),
+    ]
 
 
 def test_change_counts_only_while_the_camera_moves():
@@ -44,7 +46,8 @@ def test_change_counts_only_while_the_camera_moves():
     check.take(stripes(24, 206), 15, moved=True)
 
     # Half of the pixels change by 2 grey levels.
-    assert check.change.at == At(pytest.approx(1.0, abs=0.01), 10)
+    *_, change = check.figures("a.mp4")
+    assert change == Figure("change", "a.mp4", pytest.approx(1.0, abs=0.01), "frame 10")
 
 
 def test_a_payload_tells_its_share_its_numbers_and_where_it_stands_still():
@@ -55,9 +58,12 @@ def test_a_payload_tells_its_share_its_numbers_and_where_it_stands_still():
     for frame, units, moved in ((0, first, False), (4, half, True), (8, half, True)):
         check.take(units, units > 0, frame, moved=moved)
 
-    assert check.valid == pytest.approx((47 / 48 + 0.5 + 0.5) / 3)
-    assert check.least_valid.at == At(0.5, 4)
-    assert (check.levels, check.step_units, check.still_from) == (47, 10.0, 4)
+    assert list(check.figures("a.mkv")) == [
+        Figure("mean_valid_depth", "a.mkv", pytest.approx((47 / 48 + 0.5 + 0.5) / 3)),
+        Figure("valid_depth", "a.mkv", 0.5, "frame 4"),
+        Figure("depth_change", "a.mkv", 0.0, "frame 4"),
+        Figure("depth_levels", "a.mkv", 47.0),
+    ]
 
 
 def test_a_payload_may_stand_still_while_the_camera_does():
@@ -66,15 +72,12 @@ def test_a_payload_may_stand_still_while_the_camera_does():
     for frame in range(3):
         check.take(units, units > 0, frame, moved=False)
 
-    assert check.still_from == -1
+    assert "depth_change" not in {each.quantity for each in check.figures("a.mkv")}
 
 
 def test_nothing_taken_is_nothing_known():
-    check = PayloadCheck()
-
-    assert math.isnan(check.valid)
-    assert math.isnan(check.step_units)
-    assert check.levels == 0
+    assert list(PayloadCheck().figures("a.mkv")) == []
+    assert list(LightCheck().figures("a.mp4")) == []
 
 
 def test_numbers_that_were_stretched_from_10_bits_are_64_apart():

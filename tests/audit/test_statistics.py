@@ -3,13 +3,9 @@
 import dataclasses
 import json
 import statistics as plain_statistics
-import sys
 
-import numpy as np
 import pytest
 import typer
-from matplotlib.figure import Figure
-from PIL import Image
 from typer.testing import CliRunner
 
 from stereogenbench_data import SceneIndex
@@ -18,10 +14,9 @@ from stereogenbench_data.audit.statistics import FOCAL_EDGES_MM, statistics
 from stereogenbench_data.audit.statistics_report import (
     compared,
     statistics_markdown,
-    write_plots,
 )
 from stereogenbench_data.cli.stats import stats
-from stereogenbench_data.errors import ExtraError, SelectionError
+from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.release import (
     CAMERA_PAIRS,
     FAMILIES,
@@ -30,7 +25,6 @@ from stereogenbench_data.schema.release import (
     UNSEEN_MAPS,
 )
 from tests.audit.release_counts import paper_scenes
-from tests.cli.command import invoke
 
 PLACES_CM = (0.0, 10.0, 25.0, 31.0, 61.0, 211.0)
 
@@ -189,55 +183,6 @@ def test_markdown_has_the_papers_tables(release):
     assert "Against the paper" not in statistics_markdown(found)
 
 
-def test_axes_count_whole_scenes_and_lines_end_below_the_legend(three, tmp_path, monkeypatch):
-    drawn = []
-    save = Figure.savefig
-    monkeypatch.setattr(
-        Figure, "savefig", lambda figure, *a, **k: (save(figure, *a, **k), drawn.append(figure))
-    )
-
-    write_plots(three, tmp_path / "plots")
-
-    axes = [each for figure in drawn for each in figure.axes if each.lines]
-    assert len(drawn) == 2
-    assert axes
-    for each in axes:
-        assert all(float(tick).is_integer() for tick in each.get_yticks())
-        legend = each.get_legend().get_window_extent()
-        assert all(line.get_window_extent().y1 <= legend.y0 for line in each.lines)
-
-
-def test_plots_show_each_family(release, tmp_path):
-    baselines, focal = write_plots(release, tmp_path / "plots")
-
-    for path in (baselines, focal):
-        picture = np.asarray(Image.open(path).convert("RGB"))
-        colours = {tuple(pixel) for pixel in picture.reshape(-1, 3)[::7].tolist()}
-        assert picture.shape == (640, 1260, 3)
-        assert {(0x44, 0x77, 0xAA), (0xEE, 0x66, 0x77), (0x22, 0x88, 0x33)} <= colours
-
-
-def test_plots_without_matplotlib_name_the_extra(three, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-
-    with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[plots\]'"):
-        write_plots(three, tmp_path / "plots")
-    assert not (tmp_path / "plots").exists()
-
-
-def test_the_command_prints_the_statistics_where_matplotlib_is_missing(
-    small_shards, tmp_path, monkeypatch
-):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    page = invoke("stats", small_shards, "-o", tmp_path / "s.md")
-    shown = invoke("stats", small_shards, "-o", tmp_path / "stats")
-
-    assert (page.exit_code, shown.exit_code) == (0, 2)
-    assert "| train | - | Uniform | 2 |" in page.stdout
-    assert (tmp_path / "s.md").read_text() == page.stdout
-    assert "the extra 'plots' is not installed" in shown.stderr
-
-
 @pytest.fixture
 def run():
     """Run the command; several commands in one app, as the real one has."""
@@ -264,9 +209,8 @@ def test_the_command_shows_other_data_without_the_papers_figures(small_shards, r
     assert "Against the paper" not in result.stdout
 
 
-def test_the_command_writes_json_plots_and_files(small_shards, run, tmp_path):
+def test_the_command_writes_json_and_files(small_shards, run, tmp_path):
     told = run(small_shards, "--split", "train", "--json", "-o", tmp_path / "out" / "stats.json")
-    run(small_shards, "-o", tmp_path / "plots")
     run(small_shards, "-o", tmp_path / "out" / "stats.md")
 
     document = json.loads(told.stdout)
@@ -275,9 +219,6 @@ def test_the_command_writes_json_plots_and_files(small_shards, run, tmp_path):
     assert document["paper"] == []
     assert len(document["focal_edges_mm"]) == len(document["families"][0]["focal_counts"]) - 1
     assert (tmp_path / "out" / "stats.md").read_text().startswith("# Statistics of ")
-    assert sorted(path.name for path in (tmp_path / "plots").iterdir()) == [
-        "baselines.png", "focal_lengths.png", "stats.md",
-    ]  # fmt: skip
 
 
 def test_names_of_the_data_are_no_markup_in_the_table(indexed_release):

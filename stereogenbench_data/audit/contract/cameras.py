@@ -8,6 +8,7 @@ camera, by either depth.
 The reference is the largest group of cameras that agree with one another, if it is the majority.
 """
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,10 +18,11 @@ import numpy as np
 from jaxtyping import Float64
 
 from stereogenbench_data.audit.contract.fitting import voted_scale
-from stereogenbench_data.audit.contract.hypotheses import Hypothesis, Question
+from stereogenbench_data.audit.contract.hypotheses import LAGS, Hypothesis, Question
 from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames
 from stereogenbench_data.audit.contract.scoring import Pair, ScoredContract, sample_along_rows
 from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.schema.text import counted
 
 LEAST_SHARE: Final = 0.5
 """Least share of a camera's matches with its neighbours that its depth must explain."""
@@ -39,6 +41,8 @@ _LEAST_AWAY: Final = 0.25
 """Two depths of a point agree if their disparities differ by fewer pixels."""
 _GAIN_ERRORS: Final = 5.0
 """About 90 readings are tried in a scene, so 3 standard errors occur by chance."""
+_LEAST_LEAD: Final = 1.1
+"""How many times as much the right lag of a camera's pictures explains as the next best."""
 _FEWEST_MATCHES: Final = 100
 _NARROWEST: Final = 2
 _ROWS_BESIDE: Final = 2
@@ -256,6 +260,10 @@ class CameraComparison:
 
     def _picture_problem(self, camera: int, row_problem: str | None) -> str:
         """Return what is wrong with a camera's pictures."""
+        late = self._late_by(camera)
+        if late:
+            word = "late" if late > 0 else "early"
+            return f"pictures of camera {camera} are {counted(abs(late), 'frame')} {word}"
         explained = max(beside.share for beside in self._of(camera))
         if row_problem is not None and explained >= LEAST_SHARE:
             return row_problem
@@ -264,6 +272,28 @@ class CameraComparison:
             f"pictures of camera {camera} do not fit those of the others, by the depth of "
             f"either: other rows, another moment or another place{found}"
         )
+
+    def _late_by(self, camera: int) -> int:
+        """Return by how many frames a camera's pictures are late, 0 if no lag explains them."""
+        nearest = self._of(camera)[0]
+        (other,) = set(nearest.pair) - {camera}
+        frames = dict.fromkeys(match.frame for match in self._matches)
+        counts = {lag: np.zeros(2) for lag in LAGS}
+        for frame, lag in itertools.product(frames, LAGS):
+            match = self._views.matched_later(frame, other, camera, lag=lag)
+            if match is None:
+                continue
+            predicted = self._views.predicted(match, self._contract.hypothesis)
+            if predicted is not None:
+                away_px = self._contract.scale * predicted[0] - match.matched_px
+                near = np.abs(away_px[predicted[1]]) < match.grain_px
+                counts[lag] += near.sum(), near.size
+        first, second = sorted(LAGS, key=lambda lag: -counts[lag][0])[:2]
+        explained, found = counts[first]
+        usual = max((each.share for each in self._pairs.values() if camera not in each.pair),
+                    default=1.0)  # fmt: skip
+        is_ahead = explained > _LEAST_LEAD * counts[second][0]
+        return first if is_ahead and explained > (usual - _LEAST_DEFICIT) * found else 0
 
     def _joined(
         self, matches: Sequence[FrameMatch], hypothesis: Hypothesis

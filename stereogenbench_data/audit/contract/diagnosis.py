@@ -11,10 +11,6 @@ from typing import Any, Final
 
 from stereogenbench_data.audit.contract.cameras import CameraCheck, CameraComparison
 from stereogenbench_data.audit.contract.fitting import (
-    NOTHING,
-    OFFSET,
-    SCALE,
-    Free,
     RayPower,
     fit_hypothesis,
     ray_power,
@@ -30,14 +26,18 @@ from stereogenbench_data.audit.contract.matching import (
 )
 from stereogenbench_data.audit.contract.scoring import (
     LEAST_ERRORS,
+    NOTHING,
+    OFFSET,
+    SCALE,
     Evidence,
+    Free,
     Pair,
     ScoredContract,
     agreement,
     evidence,
     score_hypothesis,
 )
-from stereogenbench_data.schema.records import Rig, Scene
+from stereogenbench_data.schema.records import Scene
 
 LEAST_LOG_SCALE: Final = 0.01
 """A smaller error of the unit is not called wrong."""
@@ -71,8 +71,6 @@ class SceneDiagnosis:
         textured: Pixels that were searched for.
         unit_m: The declared unit of the primary pair's left depth, in metres.
         unit_source: Where it comes from: "tag", "default", "conventions", "user" or "unreadable".
-        focal_ratios: Maps other readings of focal length and sensor, in words, to their disparity
-            over that by the sensor's width; readings with equal results are left out.
         recorded_pair: The recorded primary pair if, by the poses, its left camera stands to the
             right of the other; else None.
         declared: The declared answers.
@@ -100,7 +98,6 @@ class SceneDiagnosis:
     textured: int
     unit_m: float
     unit_source: str
-    focal_ratios: dict[str, float]
     recorded_pair: Pair | None
     declared: Hypothesis
     best: Hypothesis
@@ -134,23 +131,6 @@ def allowed_log_scale(depth_step: float) -> float:
     return max(LEAST_LOG_SCALE, depth_step / 4 + depth_step**2)
 
 
-def focal_ratios(rig: Rig) -> dict[str, float]:
-    """Return other readings of a rig's focal length, each over f / sensor width * width."""
-    by_pixels = rig.image_height_px / rig.image_width_px
-    by_sensor = rig.sensor_width_mm / rig.sensor_height_mm
-    readings = {
-        "f / sensor height * picture height": by_pixels * by_sensor,
-        "f / sensor height * picture width": by_sensor,
-        "f / sensor width * picture height": by_pixels,
-    }
-    distinct: dict[str, float] = {}
-    for words, ratio in readings.items():
-        known = (1.0, *distinct.values())
-        if all(abs(math.log(ratio / other)) > LEAST_LOG_SCALE for other in known):
-            distinct[words] = ratio
-    return distinct
-
-
 def crossed_pair(scene: Scene) -> Pair | None:
     """Return the recorded primary pair if the poses put its cameras in the other order."""
     left, right = scene.rig.primary_pair
@@ -168,18 +148,6 @@ _PROMISING: Final = 4
 FEWEST_MATCHES: Final = 200
 _LEAST_PARALLAX_PX: Final = 0.3
 """Smaller disparities (root mean square) are noise."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Candidate:
-    """A contract in the search: which lengths are fitted, and its score."""
-
-    free: Free
-    score: ScoredContract
-
-    @property
-    def hypothesis(self) -> Hypothesis:
-        return self.score.hypothesis
 
 
 class ContractSearch:
@@ -201,19 +169,19 @@ class ContractSearch:
         self._matches = [match for match in matches if match.pair in near] or list(matches)
         self._bias = BIAS_PX / max(disparity_px(matches), 1e-6)
         self._bias_beside_offset = BIAS_PX / max(spread_px(matches), 1e-6)
-        self._fitted: dict[tuple[Hypothesis, Free], _Candidate] = {}
+        self._fitted: dict[tuple[Hypothesis, Free], ScoredContract] = {}
         self._likely: dict[Hypothesis, tuple[Hypothesis, ...]] = {}
         self._powers: dict[tuple[Hypothesis, Free], RayPower] = {}
         self.declared = self.candidate(Hypothesis.declared(views.encoding), free=NOTHING)
 
-    def candidate(self, hypothesis: Hypothesis, *, free: Free) -> _Candidate:
+    def candidate(self, hypothesis: Hypothesis, *, free: Free) -> ScoredContract:
         """Return a contract, fitted."""
         if (hypothesis, free) not in self._fitted:
-            score = fit_hypothesis(self._views, self._matches, hypothesis, free=free)
-            self._fitted[hypothesis, free] = _Candidate(free, score)
+            found = fit_hypothesis(self._views, self._matches, hypothesis, free=free)
+            self._fitted[hypothesis, free] = replace(found, free=free)
         return self._fitted[hypothesis, free]
 
-    def best(self) -> _Candidate:
+    def best(self) -> ScoredContract:
         """Return the contract with the fewest changes that no further change clearly improves."""
         current = self.declared
         for _ in range(_MOST_CHANGES):
@@ -227,7 +195,7 @@ class ContractSearch:
                 break
         return self._settled(self._pruned(current))
 
-    def _settled(self, current: _Candidate) -> _Candidate:
+    def _settled(self, current: ScoredContract) -> ScoredContract:
         """Change the kind of depth if the shape of disparity asks for it.
 
         A scale explains most of the difference, so the search may have chosen a scale instead.
@@ -237,25 +205,25 @@ class ContractSearch:
         mine, theirs = (self.candidate(each, free=free) for each in (current.hypothesis, other))
         # A ray is longer than its depth by a limited factor; more than that is another scale.
         most = math.log(float(self._views.ray_per_planar.max())) + self._least_log_scale
-        if abs(math.log(mine.score.scale / current.score.scale)) > most:
+        if abs(math.log(mine.scale / current.scale)) > most:
             return current
         return self._pruned(theirs) if self.gain(theirs, mine).by_shape else current
 
-    def _one_change(self, current: _Candidate) -> Iterator[_Candidate]:
+    def _one_change(self, current: ScoredContract) -> Iterator[ScoredContract]:
         """Yield contracts that change one answer, or fit one more length."""
         yield from self._other_answers(current, current.free)
         for length in (SCALE, OFFSET):
             if not length <= current.free:
                 yield self.candidate(current.hypothesis, free=current.free | length)
 
-    def _two_changes(self, current: _Candidate) -> Iterator[_Candidate]:
+    def _two_changes(self, current: ScoredContract) -> Iterator[ScoredContract]:
         """Yield contracts that change one answer and the scale, or scale and offset."""
         free = current.free | SCALE
         if free != current.free:
             yield from self._other_answers(current, free)
             yield self.candidate(current.hypothesis, free=SCALE | OFFSET)
 
-    def _other_answers(self, current: _Candidate, free: Free) -> Iterator[_Candidate]:
+    def _other_answers(self, current: ScoredContract, free: Free) -> Iterator[ScoredContract]:
         for question in QUESTIONS:
             others = current.hypothesis.alternatives(question)
             if question == "order" and free:
@@ -273,7 +241,9 @@ class ContractSearch:
             self._likely[current] = tuple(best)
         return self._likely[current]
 
-    def _most_better(self, current: _Candidate, others: Iterator[_Candidate]) -> _Candidate | None:
+    def _most_better(
+        self, current: ScoredContract, others: Iterator[ScoredContract]
+    ) -> ScoredContract | None:
         """Return the contract that improves most on the current one, None if none clearly does."""
         better = [other for other in others if self._is_better(other, current)]
         shifted = [other for other in better if "offset" in _new(other, current)]
@@ -284,14 +254,14 @@ class ContractSearch:
                 better.remove(other)
         return max(better, key=lambda other: self.gain(other, current).mean_db, default=None)
 
-    def _pruned(self, current: _Candidate) -> _Candidate:
+    def _pruned(self, current: ScoredContract) -> ScoredContract:
         """Undo changes that another change has made unnecessary."""
         for simpler in list(self._simpler(current)):
             if not self._is_better(current, simpler):
                 return self._pruned(simpler)
         return current
 
-    def _simpler(self, current: _Candidate) -> Iterator[_Candidate]:
+    def _simpler(self, current: ScoredContract) -> Iterator[ScoredContract]:
         """Yield contracts with one change fewer."""
         declared = self.declared.hypothesis
         for question in current.hypothesis.changes_from(declared):
@@ -301,12 +271,12 @@ class ContractSearch:
             if current.hypothesis.form == declared.form or length != "scale":
                 yield self.candidate(current.hypothesis, free=current.free - {length})
 
-    def simplest(self) -> _Candidate:
+    def simplest(self) -> ScoredContract:
         """Return the declared contract, with another scale if that is clearly better."""
         scaled = self.candidate(self.declared.hypothesis, free=SCALE)
         return scaled if self._is_better(scaled, self.declared) else self.declared
 
-    def cameras(self, contract: _Candidate, *, depth_step: float) -> CameraCheck:
+    def cameras(self, contract: ScoredContract, *, depth_step: float) -> CameraCheck:
         """Return how well each camera fits a contract, its scale fitted."""
         fitted_too = self.candidate(contract.hypothesis, free=contract.free | SCALE)
         hypothesis = contract.hypothesis
@@ -315,11 +285,9 @@ class ContractSearch:
             # Other files are neighbours.
             frames = len({match.frame for match in matches})
             matches = self._views.frame_matches(frames=frames, hypothesis=hypothesis)
-        return CameraComparison(
-            self._views, matches, fitted_too.score, depth_step=depth_step
-        ).check()
+        return CameraComparison(self._views, matches, fitted_too, depth_step=depth_step).check()
 
-    def rivals(self, best: _Candidate) -> tuple[Rival, ...]:
+    def rivals(self, best: ScoredContract) -> tuple[Rival, ...]:
         """Return the other answers to every question, each with its own scale."""
         free = best.free | SCALE
         likely = self._promising(best.hypothesis)
@@ -328,25 +296,25 @@ class ContractSearch:
             for hypothesis in best.hypothesis.alternatives(question):
                 if question == "order" and hypothesis not in likely:
                     # An exchange of two cameras leaves the others, and so the scale, as they are.
-                    score = score_hypothesis(
+                    other = score_hypothesis(
                         self._views, self._matches, hypothesis,
-                        scale=best.score.scale, offsets_px=best.score.offsets_px,
+                        scale=best.scale, offsets_px=best.offsets_px,
                     )  # fmt: skip
-                    other = _Candidate(best.free, score)
+                    other = replace(other, free=best.free)
                 else:
                     other = self.candidate(hypothesis, free=free)
                 answer = getattr(hypothesis, question)
                 found.append(Rival(question, answer, self.gain(best, other)))
         return tuple(found)
 
-    def without_parallax(self, best: _Candidate) -> Evidence:
+    def without_parallax(self, best: ScoredContract) -> Evidence:
         """Return by how much a contract is better than infinite depth everywhere."""
         flat = score_hypothesis(self._views, self._matches, best.hypothesis, scale=1e-12)
-        return evidence(self._matches, best.score, flat)
+        return evidence(self._matches, best, flat)
 
-    def gain(self, better: _Candidate, worse: _Candidate) -> Evidence:
+    def gain(self, better: ScoredContract, worse: ScoredContract) -> Evidence:
         """Return by how much one contract is better than another."""
-        found = evidence(self._matches, better.score, worse.score)
+        found = evidence(self._matches, better, worse)
         kind = better.hypothesis.kind
         only_kind = better.hypothesis.changes_from(worse.hypothesis) == ("kind",)
         # Coarse depth has a shape of its own.
@@ -358,35 +326,35 @@ class ContractSearch:
                 return replace(found, by_shape=shape_kind == kind, shape=power.interval)
         return found
 
-    def _power(self, candidate: _Candidate) -> RayPower:
+    def _power(self, candidate: ScoredContract) -> RayPower:
         """Return the power of the ray's length for a contract of any kind and scale."""
         planar = candidate.hypothesis.changed("kind", "planar")
         free = candidate.free | SCALE
         if (planar, free) not in self._powers:
-            start = self.candidate(planar, free=free).score
+            start = self.candidate(planar, free=free)
             self._powers[planar, free] = ray_power(self._views, self._matches, start)
         return self._powers[planar, free]
 
-    def _is_better(self, other: _Candidate, current: _Candidate) -> bool:
+    def _is_better(self, other: ScoredContract, current: ScoredContract) -> bool:
         """Tell whether a contract is clearly better, and its fitted lengths are significant."""
         gain = self.gain(other, current)
         new = other.free - current.free
         is_same = other.hypothesis == current.hypothesis and current.free <= other.free
         if is_same and new == SCALE:
-            off = abs(math.log(other.score.scale))
+            off = abs(math.log(other.scale))
             least = max(self._least_log_scale, self._bias)
             if "offset" in current.free:
                 # Two errors at once need more evidence.
                 least = max(2 * self._least_log_scale, self._bias_beside_offset)
-            sure = off > least + LEAST_ERRORS * min(other.score.scale_error, 1e3)
+            sure = off > least + LEAST_ERRORS * min(other.scale_error, 1e3)
             return sure and gain.is_clear(least_db=_LEAST_SCALE_DB, errors=_SCALE_ERRORS)
         if "offset" in new:
-            largest_px = max(map(abs, other.score.offsets_px.values()), default=0.0)
+            largest_px = max(map(abs, other.offsets_px.values()), default=0.0)
             return largest_px >= LEAST_OFFSET_PX and gain.is_clear()
         return gain.is_clear()
 
 
-def _new(other: _Candidate, current: _Candidate) -> set[str]:
+def _new(other: ScoredContract, current: ScoredContract) -> set[str]:
     """Return which of "scale" and "offset" a contract fits beyond another one."""
     if other.hypothesis != current.hypothesis:
         return set()
@@ -394,8 +362,8 @@ def _new(other: _Candidate, current: _Candidate) -> set[str]:
 
 
 def _checked(
-    search: ContractSearch, best: _Candidate, *, depth_step: float
-) -> tuple[_Candidate, CameraCheck]:
+    search: ContractSearch, best: ScoredContract, *, depth_step: float
+) -> tuple[ScoredContract, CameraCheck]:
     """Return the contract to report, and how well each camera fits it.
 
     Single wrong files may have bent the best contract to them. Then the declared contract, with
@@ -433,7 +401,6 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         "unit_source": (
             views.encoding.source if views.encoding.unit_m else views.scene.depth_unit_source[file]
         ),
-        "focal_ratios": focal_ratios(views.scene.rig),
         "recorded_pair": crossed_pair(views.scene),
         "declared": declared,
     }
@@ -454,7 +421,7 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         return SceneDiagnosis(**basics, best=declared, problem=problem)
     search = ContractSearch(views, matches, least_log_scale=allowed_log_scale(step))
     best, check = _checked(search, search.best(), depth_step=step)
-    share_explained = agreement(views, matches, best.score)
+    share_explained = agreement(views, matches, best)
     parallax = search.without_parallax(best)
     if math.isnan(share_explained) or not parallax.is_clear():
         problem = (
@@ -467,7 +434,7 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         return SceneDiagnosis(**basics, best=declared, parallax=parallax, problem=problem)
     (other_kind,) = best.hypothesis.alternatives("kind")
     with_scale, of_other_kind = (
-        search.candidate(hypothesis, free=best.free | SCALE).score
+        search.candidate(hypothesis, free=best.free | SCALE)
         for hypothesis in (best.hypothesis, other_kind)
     )
     return SceneDiagnosis(
@@ -477,7 +444,7 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         scale=with_scale.scale,
         scale_error=with_scale.scale_error,
         other_kind_scale=of_other_kind.scale,
-        offsets_px=search.candidate(best.hypothesis, free=best.free | OFFSET).score.offsets_px,
+        offsets_px=search.candidate(best.hypothesis, free=best.free | OFFSET).offsets_px,
         gain=search.gain(best, search.declared),
         parallax=parallax,
         agreement=check.agreement,

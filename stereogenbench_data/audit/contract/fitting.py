@@ -22,18 +22,14 @@ from stereogenbench_data.audit.contract.hypotheses import Hypothesis
 from stereogenbench_data.audit.contract.matching import FrameMatch, Points, SceneFrames
 from stereogenbench_data.audit.contract.scoring import (
     LEAST_ERRORS,
+    SCALE,
+    Free,
     Pair,
     ScoredContract,
     sample_along_rows,
     score_hypothesis,
 )
 from stereogenbench_data.schema.records import DepthKind
-
-Free = frozenset[Literal["scale", "offset"]]
-"""The lengths that are fitted."""
-NOTHING: Final[Free] = frozenset()
-SCALE: Final[Free] = frozenset({"scale"})
-OFFSET: Final[Free] = frozenset({"offset"})
 
 _TOLERANCE_PX: Final = 1.0
 _BIN: Final = 0.02

@@ -340,6 +340,17 @@ class SceneFrames:
                 matches += self._both_ways(frame, left, right, row_matches)
         return matches
 
+    def matched_later(self, frame: int, file: int, other: int, *, lag: int) -> FrameMatch | None:
+        """Return the pixels of a file's frame that another file shows ``lag`` frames later.
+
+        None if there is no such frame.
+        """
+        if not 0 <= frame + lag < self.scene.frames:
+            return None
+        pictures = {file: self.band(frame, file), other: self.band(frame + lag, other)}
+        row_matches = match_pairs(pictures, [(file, other)])[file, other]
+        return self._both_ways(frame, file, other, row_matches)[0]
+
     def chosen_pairs(self, hypothesis: Hypothesis) -> list[tuple[int, int]]:
         """Return the `neighbours`, and the pairs next but one; the lower number comes first."""
         across = self._across(hypothesis)

@@ -1,46 +1,31 @@
-"""The doctor's picture: one pair warped by two contracts, and the scores of the others."""
+"""The doctor's picture: one pair warped by the declared and by the best contract."""
 
-import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float64, UInt8
-from PIL import Image, ImageDraw
+from jaxtyping import Bool, UInt8
 
 from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis
 from stereogenbench_data.audit.contract.doctor import DiagnosisTask, DoctorReport
 from stereogenbench_data.audit.contract.hypotheses import Hypothesis
 from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames
-from stereogenbench_data.audit.contract.scoring import score_hypothesis
 from stereogenbench_data.audit.scene_access import source_of
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.picture import (
-    Colour,
     ColourScale,
     Tile,
     channels_last,
     draw_sheet,
     write_png,
 )
-from stereogenbench_data.schema.records import DepthForm, DepthKind
 from stereogenbench_data.selection.filters import filter_scenes
 
 _NOT_KNOWN: Final = 255
-_WIDE_M: Final = np.logspace(-6, 6, 121)
-_NEAR: Final = np.exp(np.linspace(-0.15, 0.15, 41))
-_FLOOR: Final = 1e-4
 _TILE_PX: Final = 400
 _DIFFERENCES: Final = ColourScale(0.0, 80.0)
-_CURVES: Final[dict[str, tuple[Colour, DepthKind, DepthForm]]] = {
-    "along the axis": ((0, 104, 178), "planar", "depth"),
-    "along the ray": ((196, 52, 32), "ray", "depth"),
-    "inverse": ((34, 136, 51), "planar", "inverse"),
-}
-_DECLARED: Final[Colour] = (150, 150, 150)
 
 
 def require_picture_file(path: Path) -> None:
@@ -57,7 +42,7 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
     """Write the picture of the scene with the most to report.
 
     It shows the left and right pictures, the right one warped to the left by the declared and by
-    the best contract, the differences, and the score over the unit.
+    the best contract, and the differences.
 
     Raises:
         SelectionError: If no scene was judged.
@@ -78,13 +63,7 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
     task = DiagnosisTask(scene, source_of(index, scene), 1, verdict.declared)
     with task.scene_frames() as views:
         matches = views.frame_matches(frames=task.frames)
-        found_m = diagnosis.unit_m / diagnosis.scale
-        wide_m = np.sort([*_WIDE_M, *found_m * _NEAR])
-        above, below = _view_tiles(views, matches, diagnosis)
-        rows = [
-            [*above, _curves(views, matches, diagnosis, units_m=wide_m)],
-            [*below, _curves(views, matches, diagnosis, units_m=found_m * _NEAR)],
-        ]
+        rows = _view_tiles(views, matches, diagnosis)
     title = f"{diagnosis.key}: {_title(diagnosis)}"
     write_png(path, draw_sheet([title], rows, width_px=_TILE_PX))
 
@@ -109,7 +88,7 @@ def _title(diagnosis: SceneDiagnosis) -> str:
 
 def _view_tiles(
     views: SceneFrames, matches: Sequence[FrameMatch], diagnosis: SceneDiagnosis
-) -> tuple[list[Tile], list[Tile]]:
+) -> list[list[Tile]]:
     match = max(matches, key=lambda match: (match.left, match.right) == views.primary)
     left, right = (
         channels_last(views.rgb(match.frame, file)) for file in (match.left, match.right)
@@ -130,7 +109,7 @@ def _view_tiles(
             Tile(f"right, warped by the {words} contract", warped),
             Tile(f"|left - warped|, {words}", painted, shrink="nearest"),
         ])  # fmt: skip
-    return rows[0], rows[1]
+    return rows
 
 
 def _warped(
@@ -163,52 +142,3 @@ def _warped(
     flat = right[rows, low] * (1 - part) + right[rows, low + 1] * part
     white[inside] = flat[inside].round()
     return white.reshape(height, width, 3), inside.reshape(height, width)
-
-
-def _curves(
-    views: SceneFrames,
-    matches: Sequence[FrameMatch],
-    diagnosis: SceneDiagnosis,
-    *,
-    units_m: Float64[np.ndarray, " k"],
-) -> Tile:
-    """Draw how well the pictures agree over the unit, for planar, ray and inverse depth."""
-    height = round(_TILE_PX * views.intrinsics.height_px / views.intrinsics.width_px)
-    image = Image.new("RGB", (_TILE_PX, height), (255, 255, 255))
-    draw = ImageDraw.Draw(image)
-    first, last = np.log(units_m[[0, -1]])
-    places = (np.log(units_m) - first) / (last - first) * _TILE_PX
-    scores_db = {
-        name: np.array([
-            _score_db(
-                views, matches, replace(diagnosis.best, kind=kind, form=form),
-                scale=diagnosis.unit_m / unit_m,
-            )
-            for unit_m in units_m
-        ])
-        for name, (_, kind, form) in _CURVES.items()
-    }  # fmt: skip
-    every = np.concatenate(list(scores_db.values()))
-    low, high = every.min(), every.max()
-    key: list[tuple[Colour, str]] = []
-    for name, (colour, _, _) in _CURVES.items():
-        up = (1 - (scores_db[name] - low) / max(high - low, 1e-9)) * (height - 1)
-        draw.line(list(zip(places, up, strict=True)), fill=colour, width=2)
-        key.append((colour, f"{name}: {max(scores_db[name]):.1f} dB at best"))
-    declared = (math.log(diagnosis.unit_m) - first) / (last - first) * _TILE_PX
-    draw.line([(declared, 0), (declared, height)], fill=_DECLARED)
-    key.append((_DECLARED, f"declared unit, {diagnosis.unit_m:g} m"))
-    caption = f"dB by metres a unit, {units_m[0]:.3g} to {units_m[-1]:.3g}, log"
-    return Tile(caption, np.asarray(image), tuple(key))
-
-
-def _score_db(
-    views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis, *, scale: float
-) -> float:
-    errors = score_hypothesis(views, matches, hypothesis, scale=scale).errors
-    shares = [
-        max(float(np.nanmean(part)) / match.cap, _FLOOR)
-        for part, match in zip(errors, matches, strict=True)
-        if np.isfinite(part).any()
-    ]
-    return -10 * float(np.mean(np.log10(shares))) if shares else 0.0

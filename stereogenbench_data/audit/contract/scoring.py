@@ -7,7 +7,7 @@ scores in one scene; `pooled` takes several scenes together.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -144,6 +144,13 @@ _SMALLEST = 1e-6
 Pair = tuple[int, int]
 
 
+Free = frozenset[Literal["scale", "offset"]]
+"""The lengths that are fitted."""
+NOTHING: Final[Free] = frozenset()
+SCALE: Final[Free] = frozenset({"scale"})
+OFFSET: Final[Free] = frozenset({"offset"})
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoredContract:
     """A contract and its score.
@@ -156,6 +163,7 @@ class ScoredContract:
         scale_error: Standard error of log(scale), inf if it was not fitted.
         errors: For each frame match the capped squared difference at each pixel; nan where the
             contract predicts nothing.
+        free: Which lengths were fitted.
     """
 
     hypothesis: Hypothesis
@@ -163,6 +171,7 @@ class ScoredContract:
     offsets_px: dict[Pair, float]
     scale_error: float
     errors: list[Float32[np.ndarray, " n"]] = field(repr=False)
+    free: Free = NOTHING
 
 
 def sample_along_rows(

@@ -21,11 +21,12 @@ from stereogenbench_data.audit.contract.diagnosis import (
     SceneDiagnosis,
     allowed_log_scale,
 )
-from stereogenbench_data.audit.contract.fitting import NOTHING, SCALE
 from stereogenbench_data.audit.contract.hypotheses import LAGS, QUESTIONS, Question
 from stereogenbench_data.audit.contract.scoring import (
     LEAST_ERRORS,
     NORMAL_975,
+    NOTHING,
+    SCALE,
     Gain,
     pooled,
     weighted_mean,
@@ -33,7 +34,7 @@ from stereogenbench_data.audit.contract.scoring import (
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
-Status = Literal["confirmed", "not contradicted", "wrong", "cannot tell", "not seen alone"]
+Status = Literal["confirmed", "not contradicted", "wrong", "cannot tell"]
 """Confirmed: in every scene a 95 % interval excludes every tested rival by a stated margin. Not
 contradicted: the declared answer fits best, but some rival is not excluded."""
 
@@ -250,7 +251,10 @@ MARGIN: Final = 0.02
 _LEAST_TOLERANCE: Final = 0.005
 
 QUOTIENT: Final = "unit / (focal length x baseline)"
-_ALONE: Final = "not seen alone: only the quotient above is"
+_SOURCES: Final = {
+    "tag": "by the files' tag", "metadata": "by the scene's JSON", "default": "by default",
+    "user": "as given", "conventions": "by the conventions",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,32 +296,11 @@ def _common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
     return Unit(math.exp(log), math.hypot(NORMAL_975 * error, bias))
 
 
-def _length_answers(scenes: Sequence[SceneDiagnosis], unit: Unit) -> tuple[Answer, ...]:
-    """Return the answers for the quotient, the unit and the focal length.
-
-    The last two are never known by themselves.
-    """
-    first = scenes[0]
-    where = {
-        "tag": "by the files' tag", "metadata": "by the scene's JSON", "default": "by default",
-        "user": "as given", "conventions": "by the conventions",
-    }  # fmt: skip
-    declared = f"{first.unit_m:g} m, {where.get(first.unit_source, 'as files are not understood')}"
-    quotient = _quotient(scenes, unit)
-    of_unit = Answer("metres a unit", declared, "", "not seen alone", note=_ALONE)
-    of_focal = replace(of_unit, topic="focal length", declared="from the sensor's width")
-    if first.problem:
-        blank: dict[str, Any] = {"declared": "", "status": "cannot tell", "note": first.problem}
-        return quotient, replace(of_unit, **blank), replace(of_focal, **blank)
-    if quotient.found:
-        found = f"{unit.metres:.5g} m ± {unit.uncertainty:.2%} if the rest is right"
-        of_unit = replace(of_unit, found=found)
-    return quotient, of_unit, of_focal
-
-
 def _quotient(scenes: Sequence[SceneDiagnosis], unit: Unit) -> Answer:
+    """Return the answer for the quotient; unit, focal length and baselines are not seen alone."""
     first = scenes[0]
-    blank = _no_answer(scenes, QUOTIENT, "1 x declared")
+    source = _SOURCES.get(first.unit_source, "as files are not understood")
+    blank = _no_answer(scenes, QUOTIENT, f"{first.unit_m:g} m a unit, {source}")
     if blank.note:
         return blank
     found = f"{unit.metres / first.unit_m:.5g} x declared ± {unit.uncertainty:.2%}"
@@ -359,23 +342,16 @@ def _doubt(first: SceneDiagnosis, unit: Unit, *, found: str) -> str:
     return ""
 
 
-def _length_choices(scenes: Sequence[SceneDiagnosis], unit: Unit, pasted: str) -> tuple[str, ...]:
+def _length_choices(first: SceneDiagnosis, unit: Unit, pasted: str) -> tuple[str, ...]:
     """Return the lengths that would explain the quotient, each by itself.
 
     ``pasted`` is the contract with the unit that would be right if the other lengths are.
     """
-    first = scenes[0]
     factor = first.unit_m / unit.metres
     words = [f"if focal length and baselines are right: {pasted}"]
     if first.best.form == first.declared.form:
-        focal = (
-            f"if unit and baselines are right: a focal length of {factor:.4g} x what is recorded"
-        )
-        reading = _focal_reading(scenes, unit)
-        if reading:
-            focal += f", as {reading} gives"
         words += [
-            focal,
+            f"if unit and baselines are right: a focal length of {factor:.4g} x what is recorded",
             f"if unit and focal length are right: baselines of {factor:.4g} x those of the poses",
         ]
     return tuple(words)
@@ -393,25 +369,6 @@ def _kind_explains_scale(scenes: Sequence[SceneDiagnosis]) -> bool:
         <= allowed_log_scale(scene.depth_step) + LEAST_ERRORS * min(scene.scale_error, 1.0)
         for scene in scenes
         if scene.other_kind_scale > 0
-    )
-
-
-def _focal_reading(scenes: Sequence[SceneDiagnosis], unit: Unit) -> str | None:
-    """Return the reading of the sensor that gives the quotient found, None if there is none."""
-    first = scenes[0]
-    tolerance = max(LEAST_ERRORS * unit.uncertainty / NORMAL_975, _LEAST_TOLERANCE)
-    may_be = [
-        words
-        for words in first.focal_ratios
-        if all(
-            abs(math.log(scene.scale / scene.focal_ratios.get(words, 1.0))) <= tolerance
-            for scene in scenes
-        )
-    ]
-    return min(
-        may_be,
-        key=lambda words: abs(math.log(first.scale / first.focal_ratios[words])),
-        default=None,
     )
 
 
@@ -469,8 +426,8 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
     first = scenes[0]
     unit = _common_unit(scenes)
     hypothesis = [_question_answer(scenes, question) for question in QUESTIONS]
-    quotient, *lengths = _length_answers(scenes, unit)
-    answers = (quotient, *lengths, *hypothesis, _offset_answer(scenes))
+    quotient = _quotient(scenes, unit)
+    answers = (quotient, *hypothesis, _offset_answer(scenes))
     problems = tuple(
         f"{scene.key}: {problem}" if len(scenes) > 1 else problem
         for scene in scenes
@@ -495,7 +452,7 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
     choices: tuple[str, ...] = ()
     if is_measured and quotient.status != "confirmed" and explains and not problems:
         with_unit = _pasted(first, declared, unit_m=unit.rounded_m)
-        choices = _length_choices(scenes, unit, encoding_line(with_unit))
+        choices = _length_choices(first, unit, encoding_line(with_unit))
     return Verdict(
         scenes=tuple(scene.key for scene in scenes),
         declared=declared,

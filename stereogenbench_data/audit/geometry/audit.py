@@ -12,14 +12,13 @@ from typing import Any, Final, Unpack
 import numpy as np
 from jaxtyping import Int64
 
-from stereogenbench_data.audit.geometry.findings import broken_finding, findings_of, untested_of
-from stereogenbench_data.audit.geometry.records import (
-    AuditLimits,
-    AuditReport,
-    SceneAudit,
-    plain,
-    revived,
+from stereogenbench_data.audit.geometry.checks import (
+    LIMITS,
+    broken_finding,
+    findings_of,
+    untested_of,
 )
+from stereogenbench_data.audit.geometry.records import AuditReport, SceneAudit, plain
 from stereogenbench_data.audit.geometry.scene_audit import AuditTask, audit_scene, spread_frames
 from stereogenbench_data.audit.geometry.table import table_rows
 from stereogenbench_data.audit.scene_access import source_of
@@ -41,7 +40,7 @@ from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import MissingObject
 
 DEFAULT_FRAMES: Final = 5
-_FORMAT: Final = 4
+_FORMAT: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +52,7 @@ class AuditRequest:
         frames: How many frames of each scene, evenly spread; 0 for all, as in the paper.
         seed: Seed of the random draw.
         depth: A depth contract that overrides what the files state, or None.
-        limits: Values beyond which a scene is a finding.
+        limits: Values beyond which a figure is a finding, see `checks.LIMITS`.
 
     Raises:
         SelectionError: If a number is too small.
@@ -63,7 +62,7 @@ class AuditRequest:
     frames: int = DEFAULT_FRAMES
     seed: int = 0
     depth: DepthEncoding | None = None
-    limits: AuditLimits = field(default_factory=AuditLimits)
+    limits: Mapping[str, float] = field(default_factory=lambda: LIMITS)
 
     def __post_init__(self) -> None:
         """Refuse numbers that are too small."""
@@ -194,7 +193,7 @@ def audit(
     findings = [broken_finding(key, text) for key, text in sorted(broken.items())]
     for scene in audited:
         findings += findings_of(scene, request.limits)
-    untested = [each for scene in audited for each in untested_of(scene, request.limits)]
+    untested = [each for scene in audited for each in untested_of(scene)]
     return AuditReport(
         root=index.where,
         scenes_there=len(index) + len(index.broken) + len(index.incomplete),
@@ -202,7 +201,7 @@ def audit(
         frames=request.frames,
         seed=request.seed,
         limits=request.limits,
-        rows=table_rows(audited, request.limits, findings=findings, untested=untested),
+        rows=table_rows(audited, request.limits, findings=findings),
         findings=tuple(findings),
         untested=tuple(untested),
         notes=tuple(f"incomplete, not audited: {text}" for text in incomplete.values()),
@@ -263,8 +262,8 @@ def _known(journal: Journal, stamps: Mapping[str, str]) -> dict[str, SceneAudit]
         value = journal.value(key, stamp=stamp)
         try:
             if value is not None:
-                known[key] = revived(SceneAudit, value)
-        except (KeyError, TypeError, ValueError, IndexError, AttributeError):
+                known[key] = SceneAudit.revived(value)
+        except (KeyError, TypeError):
             continue
     return known
 

@@ -1,13 +1,14 @@
 """The paper's checks of rendered pictures: stored depth, light, motion and border occluders."""
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 
-from stereogenbench_data.audit.geometry.records import At
+from stereogenbench_data.audit.geometry.records import Figure
 
 NEAR_SHARE: Final = 0.3
 """An occluder is nearer than this share of the distance of the subject, see `subject_m`."""
@@ -19,6 +20,8 @@ _LOOKED_AT_PX: Final = 320
 _STORED_NUMBERS: Final = 1 << 16
 ENOUGH_LEVELS: Final = 64
 """Least count of different numbers whose spacing shows how they were rounded."""
+FLAT: Final = 8.0
+"""Pictures whose luma spans less (5th to 95th percentile) show nothing."""
 _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 
 Luma = Float32[np.ndarray, "h w"]
@@ -54,12 +57,17 @@ def band_passed(luma: Luma) -> Luma:
 class Least:
     """The least of some figures, and its frame."""
 
-    at: At = field(default_factory=At)
+    value: float = math.nan
+    frame: int = -1
 
     def take(self, value: float, frame: int) -> None:
         """Add a figure."""
-        if not self.at.value <= value:
-            self.at = At(float(value), frame)
+        if not self.value <= value:
+            self.value, self.frame = float(value), frame
+
+    def figure(self, quantity: str, member: str) -> Figure:
+        """Return the least figure as a row."""
+        return Figure(quantity, member, self.value, f"frame {self.frame}")
 
 
 def reduced_size(height_px: int, width_px: int) -> tuple[int, int]:
@@ -91,13 +99,20 @@ class LightCheck:
             self.change.take(float(np.abs(luma - self._last[1]).mean()), self._last[0])
         self._last = (frame, luma)
 
+    def figures(self, member: str) -> Iterator[Figure]:
+        """Yield what was found in a camera's file; flat pictures do not change."""
+        if self._last is not None:
+            yield self.brightness.figure("brightness", member)
+            yield self.contrast.figure("contrast", member)
+            if self.change.frame >= 0 and self.contrast.value >= FLAT:
+                yield self.change.figure("change", member)
+
 
 class PayloadCheck:
     """The numbers that one camera's depth stores, and whether they change."""
 
     def __init__(self) -> None:
-        self.least_valid = Least()
-        self.still_from = -1
+        self.least_valid, self.change = Least(), Least()
         self._shares: list[float] = []
         self._seen = np.zeros(_STORED_NUMBERS, dtype=np.bool_)
         self._last: tuple[int, np.ndarray] | None = None
@@ -110,25 +125,23 @@ class PayloadCheck:
         self._shares.append(share)
         self.least_valid.take(share, frame)
         self._seen[units[measured]] = True
-        last = self._last if moved and share and self.still_from < 0 else None
-        if last is not None and np.array_equal(units, last[1]):
-            self.still_from = last[0]
+        if moved and share and self._last is not None:
+            self.change.take(float((units != self._last[1]).mean()), self._last[0])
         self._last = (frame, units)
 
-    @property
-    def valid(self) -> float:
-        """The mean share of measured pixels."""
-        return float(np.mean(self._shares)) if self._shares else math.nan
-
-    @property
-    def levels(self) -> int:
-        """How many different numbers were found."""
-        return int(self._seen.sum())
-
-    @property
-    def step_units(self) -> float:
-        """The step between stored numbers, see `stored_step`."""
-        return stored_step(np.flatnonzero(self._seen))
+    def figures(self, member: str) -> Iterator[Figure]:
+        """Yield what was found in a camera's file."""
+        if not self._shares:
+            return
+        valid, numbers = float(np.mean(self._shares)), np.flatnonzero(self._seen)
+        yield Figure("mean_valid_depth", member, valid)
+        yield self.least_valid.figure("valid_depth", member)
+        if self.change.frame >= 0:
+            yield self.change.figure("depth_change", member)
+        if valid > 0:
+            yield Figure("depth_levels", member, float(len(numbers)))
+        if len(numbers) >= ENOUGH_LEVELS:
+            yield Figure("depth_step", member, stored_step(numbers))
 
 
 def stored_step(numbers: np.ndarray) -> float:

@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from stereogenbench_data.audit.geometry.records import RigAudit
 from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses, rotation_angle_rad
 from stereogenbench_data.geometry.rig import rectification_residual_px
@@ -34,8 +33,8 @@ def recorded_px(document: dict[str, Any]) -> Iterator[tuple[str, float]]:
                 yield name, float(each.value)
 
 
-def rig_audit(rig: Rig, poses: CameraPoses, documents: list[dict[str, Any]]) -> RigAudit:
-    """Return the figures of a scene's rig.
+def rig_figures(rig: Rig, poses: CameraPoses, documents: list[dict[str, Any]]) -> dict[str, float]:
+    """Return the figures of a scene's rig, by quantity.
 
     Args:
         rig: What ``baseline.json`` records.
@@ -64,15 +63,13 @@ def rig_audit(rig: Rig, poses: CameraPoses, documents: list[dict[str, Any]]) -> 
     looking_alike = replace(
         poses, world_from_cam_rotations=np.repeat(rotations[:, :1], rotations.shape[1], axis=1)
     )
-    return RigAudit(
-        fx_px=fx_px,
-        fy_px=fy_px,
-        intrinsics_px=float(max(deviations)),
-        adjacent_max_cm=float(adjacent_cm.max()),
-        pairs_max_cm=float(away_cm.max()),
-        rotation_px=rectification_residual_px(in_one_place, intrinsics),
-        lateral_px=rectification_residual_px(looking_alike, intrinsics),
-    )
+    return {
+        "intrinsics_px": float(max(deviations)),
+        "adjacent_cm": float(adjacent_cm.max()),
+        "baseline_cm": float(away_cm.max()),
+        "rotation_px": rectification_residual_px(in_one_place, intrinsics),
+        "lateral_px": rectification_residual_px(looking_alike, intrinsics),
+    }
 
 
 def motion_px(

@@ -4,8 +4,8 @@ A file that cannot be read does not stop the audit: it is noted, and the rest is
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any, Final, Literal, TypeVar
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from stereogenbench_data.audit.geometry.alignment import AlignmentCheck
 from stereogenbench_data.audit.geometry.picture_check import (
+    FLAT,
     MOVED_SHARE,
     LightCheck,
     PayloadCheck,
@@ -22,14 +23,14 @@ from stereogenbench_data.audit.geometry.picture_check import (
     reduced_size,
     subject_m,
 )
-from stereogenbench_data.audit.geometry.records import At, CameraAudit, RigAudit, SceneAudit
+from stereogenbench_data.audit.geometry.records import Figure, SceneAudit
 from stereogenbench_data.audit.geometry.reprojection import (
     MeasuredDepth,
     PairErrors,
     pair_audit,
     reproject,
 )
-from stereogenbench_data.audit.geometry.rig_check import motion_px, rig_audit
+from stereogenbench_data.audit.geometry.rig_check import motion_px, rig_figures
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
 from stereogenbench_data.geometry.camera import rig_intrinsics
@@ -95,14 +96,9 @@ class AuditedFiles:
             reason = self.scene.remark("videos" if name in VIDEO_FILES else "poses")
             raise StorageError(reason or "is missing: the index has no such file of this scene")
 
-    def counted(self, camera: int) -> tuple[int, int]:
-        """Return the number of frames of a camera's two videos, -1 for one that does not open."""
-        rgb, depth = rgb_name(camera), depth_name(camera)
-        found = (
-            self.attempt(rgb, self._probed, rgb, "later"),
-            self.attempt(depth, self._probed, depth, "needed"),
-        )
-        return -1 if found[0] is None else found[0], -1 if found[1] is None else found[1]
+    def frames_of(self, name: str) -> int | None:
+        """Return the number of frames of a video, None for one that does not open."""
+        return self.attempt(name, self._probed, name, "later" if "rgb" in name else "needed")
 
     def _probed(self, name: str, pixel_format: Literal["needed", "later"]) -> int:
         self._require_member(name)
@@ -201,8 +197,8 @@ class _SceneCheck:
         self.intrinsics = self.files.intrinsics
         self.light = [LightCheck() for _ in range(CAMERA_COUNT)]
         self.payload = [PayloadCheck() for _ in range(CAMERA_COUNT)]
-        self.occluders = [(At(0.0), "")] * CAMERA_COUNT
-        self.same: dict[tuple[int, int], bool] = {}
+        self.occluders = [Figure("occluder", depth_name(each)) for each in range(CAMERA_COUNT)]
+        self.copies: dict[tuple[int, int], list[bool]] = {}
         self.errors: dict[tuple[int, int], list[PairErrors]] = {
             self.scene.rig.primary_pair: [], LONG_PAIR: [],
         }  # fmt: skip
@@ -212,8 +208,10 @@ class _SceneCheck:
     def run(self, after_bytes: Advance) -> SceneAudit:
         """Audit the scene."""
         try:
-            rig, poses = self._metadata()
-            counts = [self.files.counted(camera) for camera in range(CAMERA_COUNT)]
+            figures, poses = self._metadata()
+            for name in VIDEO_FILES:
+                count = self.files.frames_of(name)
+                figures += [] if count is None else [Figure("frames", name, count)]
             before: int | None = None
             for frame in self.frames:
                 self._frame(frame, before, poses)
@@ -221,18 +219,21 @@ class _SceneCheck:
                 after_bytes(1)
         finally:
             self.files.streams.close()
+        pairs = tuple(pair_audit(pair, found) for pair, found in self.errors.items())
+        figures.append(Figure("reprojection_px", "", pairs[0].tolerances[-1].median_px))
+        figures += self.alignment.figures()
+        for camera in range(CAMERA_COUNT):
+            figures += self._of_camera(camera)
         return SceneAudit(
             key=self.scene.id.key,
             frames=self.scene.frames,
             audited_frames=self.frames,
-            rig=rig,
-            cameras=tuple(self._camera(camera, counts[camera]) for camera in range(CAMERA_COUNT)),
-            pairs=tuple(pair_audit(pair, found) for pair, found in self.errors.items()),
-            problems=tuple(sorted(self.files.problems.items())),
-            alignment=self.alignment.result(),
+            figures=tuple(figures),
+            pairs=pairs,
+            problems=dict(sorted(self.files.problems.items())),
         )
 
-    def _metadata(self) -> tuple[RigAudit, CameraPoses | None]:
+    def _metadata(self) -> tuple[list[Figure], CameraPoses | None]:
         documents = []
         poses: CameraPoses | None = None
         for name in (BASELINE_JSON, TRAJECTORY_JSON):
@@ -244,14 +245,15 @@ class _SceneCheck:
             if name == TRAJECTORY_JSON:
                 poses = self.files.attempt(name, poses_as, text, self.scene.pose_form, where=name)
         if poses is None:
-            return RigAudit(fx_px=self.intrinsics.fx_px, fy_px=self.intrinsics.fy_px), None
-        rig = rig_audit(self.scene.rig, poses, documents)
+            return [], None
+        of_rig = rig_figures(self.scene.rig, poses, documents)
+        figures = [Figure(quantity, "", value) for quantity, value in of_rig.items()]
         if poses.frame_count >= self.scene.frames:
-            return rig, poses
+            return figures, poses
         self.files.problems[TRAJECTORY_JSON] = (
             f"has poses of {poses.frame_count} frames, and the index says {self.scene.frames}"
         )
-        return rig, None
+        return figures, None
 
     def _frame(self, frame: int, before: int | None, poses: CameraPoses | None) -> None:
         """Decode one frame of all cameras, and add it to the checks."""
@@ -277,16 +279,19 @@ class _SceneCheck:
             depth = depths.get(camera)
             if depth is not None:
                 share, side = border_occluder(depth.depth_m, depth.measured, far_m=far_m)
-                if share > self.occluders[camera][0].value:
-                    self.occluders[camera] = (At(share, frame), side)
+                if not share <= self.occluders[camera].value:
+                    where = f"frame {frame}, {side or 'no'} border"
+                    self.occluders[camera] = replace(
+                        self.occluders[camera], value=share, where=where
+                    )
                 self.payload[camera].take(stored[camera], depth.measured, frame, moved=moved)
             picture = self._seen(camera, frame)
             if picture is not None:
                 pictures[camera] = picture
                 self.light[camera].take(picture, frame, moved=moved)
         for pair in combinations(pictures, 2):
-            if self.same.get(pair, True):
-                self.same[pair] = np.array_equal(pictures[pair[0]], pictures[pair[1]])
+            is_copy = np.array_equal(pictures[pair[0]], pictures[pair[1]])
+            self.copies.setdefault(pair, []).append(is_copy)
         if poses is not None:
             self._reproject(frame, depths, poses)
             bands = {place: found[1] for place, found in self.seen.items()}
@@ -317,23 +322,16 @@ class _SceneCheck:
                 both, camera = (depths[left], depths[right]), self.intrinsics
                 found.append(reproject(*both, intrinsics=camera, right_from_left=motion))
 
-    def _camera(self, camera: int, counts: tuple[int, int]) -> CameraAudit:
-        light, payload = self.light[camera], self.payload[camera]
-        occluder, side = self.occluders[camera]
-        twins = [a for (a, b), alike in self.same.items() if b == camera and alike]
-        return CameraAudit(
-            rgb_frames=counts[0],
-            depth_frames=counts[1],
-            depth_unit_m=self.files.unit_m(camera),
-            depth_step_units=payload.step_units,
-            depth_levels=payload.levels,
-            valid_depth=payload.valid,
-            least_valid_depth=payload.least_valid.at,
-            brightness=light.brightness.at,
-            contrast=light.contrast.at,
-            change=light.change.at,
-            still_depth=payload.still_from,
-            occluder=occluder,
-            occluder_side=side,
-            twin=twins[0] if twins else -1,
-        )
+    def _of_camera(self, camera: int) -> Iterator[Figure]:
+        light, rgb, depth = self.light[camera], rgb_name(camera), depth_name(camera)
+        yield from light.figures(rgb)
+        yield from self.payload[camera].figures(depth)
+        yield self.occluders[camera]
+        yield Figure("depth_unit_m", depth, self.files.unit_m(camera))
+        shares = {
+            other: float(np.mean(same)) for (other, copy), same in self.copies.items()
+            if copy == camera and light.contrast.value >= FLAT
+        }  # fmt: skip
+        if shares:
+            other = max(shares, key=lambda other: shares[other])
+            yield Figure("copied", rgb, shares[other], f"as in {rgb_name(other)}")

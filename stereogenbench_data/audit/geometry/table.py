@@ -1,20 +1,16 @@
 """The audit's table, and the report as Markdown: our figures, the paper's, and the limits."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from operator import attrgetter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 
-from stereogenbench_data.audit.geometry.alignment import CERTAIN
-from stereogenbench_data.audit.geometry.findings import CHECKS, PARAMETERS
+from stereogenbench_data.audit.geometry.checks import CHECKS
 from stereogenbench_data.audit.geometry.records import (
     QUANTILES,
-    AuditLimits,
     AuditReport,
     AuditRow,
-    CameraAudit,
     Finding,
     SceneAudit,
     ToleranceAudit,
@@ -22,17 +18,14 @@ from stereogenbench_data.audit.geometry.records import (
 from stereogenbench_data.audit.geometry.reprojection import TOLERANCES
 from stereogenbench_data.audit.geometry.scene_audit import LONG_PAIR
 from stereogenbench_data.audit.paper_numbers import AUDIT, AUDIT_TABLE, FRAMES_A_SCENE
+from stereogenbench_data.schema.release import VIDEO_FILES
 from stereogenbench_data.schema.text import counted, markdown_table, markdown_text
 
 _LISTED: Final = 500
 
 
 def table_rows(
-    scenes: Sequence[SceneAudit],
-    limits: AuditLimits,
-    *,
-    findings: Sequence[Finding],
-    untested: Sequence[Finding],
+    scenes: Sequence[SceneAudit], limits: Mapping[str, float], *, findings: Sequence[Finding]
 ) -> tuple[AuditRow, ...]:
     """Return the table of an audit over scenes."""
     counts = [
@@ -40,47 +33,28 @@ def table_rows(
         for check in dict.fromkeys(finding.check for finding in findings)
     ]
     return (
-        *_check_rows(scenes, limits, untested),
-        *_fit_rows(scenes, limits, untested),
+        *_check_rows(scenes, limits),
         *_reprojection_rows(scenes),
         *_frame_rows(scenes, limits),
-        *_depth_rows([camera for scene in scenes for camera in scene.cameras]),
+        *_depth_rows(scenes),
         AuditRow("findings", "scenes with", ", ".join(counts) or "none", "none", "none"),
     )
 
 
-def _check_rows(
-    scenes: Sequence[SceneAudit], limits: AuditLimits, untested: Sequence[Finding]
-) -> Iterator[AuditRow]:
-    for check in CHECKS:
-        worst = _over(check.worst, (value for scene in scenes for _, value, _ in check.of(scene)))
-        blind = {each.scene for each in untested if each.check == check.name}
-        ours = check.text(worst) + _not_testable(blind, scenes)
-        limit = check.text(getattr(limits, check.limit))
-        yield AuditRow(check.name, check.what, ours, check.paper, limit)
+def _values(scenes: Sequence[SceneAudit], quantity: str) -> list[float]:
+    return [each.value for scene in scenes for each in scene.figures if each.quantity == quantity]
 
 
-def _fit_rows(
-    scenes: Sequence[SceneAudit], limits: AuditLimits, untested: Sequence[Finding]
-) -> Iterator[AuditRow]:
-    for (check, what), parameter in PARAMETERS.items():
-        sizes = [
-            (abs(each.value), each.error) for scene in scenes for each in scene.alignment.estimates
-            if (each.check, each.what) == (check, what) and abs(each.value) > CERTAIN * each.error
-        ]  # fmt: skip
-        size, error = max(sizes, default=(0.0, 0.0))
-        ours = f"{size:.2g} ± {1.96 * error:.2g}" if sizes else "none"
+def _check_rows(scenes: Sequence[SceneAudit], limits: Mapping[str, float]) -> Iterator[AuditRow]:
+    for quantity, check in CHECKS.items():
+        ours = check.text(_over(check.worst, _values(scenes, quantity)))
         blind = {
-            each.scene for each in untested
-            if each.check == f"{check} fit" and each.found.startswith(parameter.what)
+            scene.key for scene in scenes for each in scene.figures
+            if each.quantity == quantity and math.isnan(each.value) and each.where
         }  # fmt: skip
-        ours += _not_testable(blind, scenes)
-        limit = f"{getattr(limits, parameter.limit):g}"
-        yield AuditRow(f"{check} fit", parameter.what, ours, "", limit)
-
-
-def _not_testable(blind: set[str], scenes: Sequence[SceneAudit]) -> str:
-    return f"; not testable in {len(blind)} of {counted(len(scenes), 'scene')}" if blind else ""
+        if blind:
+            ours += f"; not testable in {len(blind)} of {counted(len(scenes), 'scene')}"
+        yield AuditRow(check.name, check.what, ours, check.paper, check.text(limits[quantity]))
 
 
 def _reprojection_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
@@ -109,13 +83,17 @@ def _reprojection_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
         )
 
 
-def _frame_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
-    expected = [int(limits.frames) or scene.frames for scene in scenes for _ in scene.cameras]
+def _frame_rows(scenes: Sequence[SceneAudit], limits: Mapping[str, float]) -> Iterator[AuditRow]:
     for name in ("RGB", "depth"):
-        count_of = attrgetter(f"{name.lower()}_frames")
-        found = [count_of(camera) for scene in scenes for camera in scene.cameras]
-        counts = [count for count in found if count >= 0] or [0]
-        missing = sum(max(0, most - max(0, got)) for most, got in zip(expected, found, strict=True))
+        found = {
+            (scene.key, each.member): int(each.value) for scene in scenes for each in scene.figures
+            if each.quantity == "frames" and name.lower() in each.member
+        }  # fmt: skip
+        missing = sum(
+            max(0, (int(limits["frames"]) or scene.frames) - found.get((scene.key, member), 0))
+            for scene in scenes for member in VIDEO_FILES if name.lower() in member
+        )  # fmt: skip
+        counts = list(found.values()) or [0]
         low, high = min(counts), max(counts)
         span = f"{low}" if low == high else f"{low} to {high}"
         yield AuditRow(
@@ -123,18 +101,20 @@ def _frame_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[A
             f"{name} frames in all (of a video), missing",
             f"{sum(counts):,} ({span}), {missing:,} missing",
             f"{FRAMES_A_SCENE} of a video, 0 missing",
-            f"{limits.frames:g}" if limits.frames else "as poses",
+            f"{limits['frames']:g}" if limits["frames"] else "as poses",
         )
 
 
-def _depth_rows(cameras: Sequence[CameraAudit]) -> Iterator[AuditRow]:
-    valid = _percent(_over(np.mean, (camera.valid_depth for camera in cameras)))
+def _depth_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
+    valid = _percent(_over(np.mean, _values(scenes, "mean_valid_depth")))
     quantity = "mean valid-depth ratio over audited frames and cameras"
     yield AuditRow("depth validity", quantity, valid, AUDIT["valid_depth"])
-    units = _distinct(camera.depth_unit_m for camera in cameras)
-    steps = _distinct(camera.depth_step_units * camera.depth_unit_m for camera in cameras)
-    quantity = f"step of stored depth, estimated from the numbers (unit: {units})"
-    yield AuditRow("depth quantum", quantity, steps, "0.1 m without a tag")
+    units = sorted({float(f"{each:.6g}") for each in _values(scenes, "depth_unit_m")})
+    known = [unit_m for unit_m in units if not math.isnan(unit_m)]
+    span = ", ".join(f"{unit_m:g}" for unit_m in known)
+    span = f"{known[0]:g} to {known[-1]:g}" if len(known) > 4 else span
+    ours = f"{span} m" if known else "-"
+    yield AuditRow("depth unit", "metres in a stored unit", ours, "0.1 m without a tag")
 
 
 def pooled_px(audits: Iterable[ToleranceAudit], share: float) -> float:
@@ -170,8 +150,8 @@ def audit_markdown(report: AuditReport) -> str:
             *((row.check, row.quantity, row.ours, row.paper, row.limit) for row in report.rows),
         ),
         "",
-        "A row with a limit shows the worst figure of all scenes, a fit the largest that is "
-        "certain. What pictures say of depth: `stereogenbench doctor`.",
+        "A row with a limit shows the worst figure of all scenes. What pictures say of depth, and "
+        "the cause of a residual: `stereogenbench doctor`.",
         "",
         "Reprojection: left depth to the right camera, and back by the right depth; pixels whose "
         "two depths differ by more than the tolerance (share of depth + steps of stored depth) "
@@ -224,13 +204,3 @@ def _number(value: float) -> str:
 
 def _percent(value: float) -> str:
     return "-" if math.isnan(value) else f"{value * 100:.4g} %"
-
-
-def _distinct(values: Iterable[float]) -> str:
-    """Return lengths in m, each once; their range if they are many."""
-    found = sorted({float(f"{value:.6g}") for value in values if not math.isnan(value)})
-    if not found:
-        return "-"
-    if len(found) > 4:
-        return f"{found[0]:g} to {found[-1]:g} m"
-    return ", ".join(f"{value:g}" for value in found) + " m"
