@@ -62,9 +62,6 @@ ALL_PAIRS: Final[dict[tuple[str, str], dict[str, str]]] = {
     },
 }  # fmt: skip
 """Baselines of all 15 pairs in cm."""
-SHORT_PAIRS: Final = {"below_cm": 10.0, "baselines": 150, "scenes": 30}
-"""Of train Pairwise_Uniform: baselines below 10 cm, all of scenes of UndergroundSciFi."""
-SHORT_PAIRS_MAP: Final = "UndergroundSciFi"
 
 BINS_TABLE: Final = "table of baseline-stratified diagnostics (N_s)"
 BINS: Final = {"[1,10)": 52, "[10,30)": 65, "[30,60)": 70, "[60,100)": 55, "[100,150]": 39}

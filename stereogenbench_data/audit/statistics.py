@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from stereogenbench_data.audit.geometry.records import plain
-from stereogenbench_data.audit.paper_numbers import SHORT_PAIRS
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
@@ -20,9 +19,6 @@ from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.selection.pairs import PAIR_NUMBER, in_bin
 
 ADJACENT_COLUMNS: Final = [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]
-FOCAL_EDGES_MM: Final = np.arange(15.0, 86.0, 5.0)
-"""Edges of the focal histogram, around the paper's 18 to 85 mm; two more bins lie outside."""
-
 _SPLITS: Final = ("train", "eval")
 _SUBSETS: Final = ("", "seen_map", "unseen_map")
 
@@ -65,8 +61,6 @@ class FamilyStatistics:
         all_pairs_cm: Baselines of all 15 pairs of each scene.
         bins: Maps each baseline bin to its number of primary, adjacent and all pairs.
         focal_mm: Focal lengths.
-        focal_counts: Scenes in each bin of the focal histogram: below 15 mm, 14 bins of 5 mm,
-            above 85 mm.
     """
 
     split: str
@@ -78,16 +72,6 @@ class FamilyStatistics:
     all_pairs_cm: Distribution
     bins: dict[str, tuple[int, int, int]]
     focal_mm: Distribution
-    focal_counts: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class ShortPairs:
-    """Train Pairwise_Uniform baselines below 10 cm: how many, of how many scenes, on which maps."""
-
-    baselines: int
-    scenes: int
-    maps: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +83,6 @@ class Statistics:
         scenes: Number of scenes.
         families: Figures of each (split, subset, family) of the data.
         branches: Figures of each (split, family), the subsets of eval together.
-        short_pairs: The short baselines of Pairwise_Uniform.
         derived: What training shards were derived from, and how; empty for released data.
     """
 
@@ -107,13 +90,11 @@ class Statistics:
     scenes: int
     families: tuple[FamilyStatistics, ...]
     branches: tuple[FamilyStatistics, ...]
-    short_pairs: ShortPairs
     derived: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return the statistics as values for `json.dumps`."""
         document: dict[str, Any] = plain(asdict(self))
-        document["focal_edges_mm"] = [float(edge) for edge in FOCAL_EDGES_MM]
         return document
 
 
@@ -139,17 +120,11 @@ def statistics(index: SceneIndex, **filters: Unpack[SceneFilters]) -> Statistics
         for subset in _in_order(subsets, _SUBSETS):
             chosen = of_branch[subsets == subset]
             families.append(_family(index, chosen, split=split, subset=subset, family=family))
-    train = _texts(index, "split", rows) == "train"
-    pairwise = rows[train & (_texts(index, "family", rows) == "Pairwise_Uniform")]
-    short = index.column("baselines_cm")[pairwise] < SHORT_PAIRS["below_cm"]
-    concerned = pairwise[short.any(axis=1)]
-    maps = np.unique(_texts(index, "map_name", concerned)).tolist()
     return Statistics(
         root=index.where,
         scenes=len(rows),
         families=tuple(families),
         branches=tuple(branches),
-        short_pairs=ShortPairs(int(short.sum()), len(concerned), tuple(maps)),
         derived=index.derivation if index.is_derived else "",
     )
 
@@ -173,7 +148,6 @@ def _family(
     primary_cm = baselines_cm[np.arange(len(rows)), PAIR_NUMBER[left, right]]
     focal_mm = index.column("focal_mm")[rows]
     names, counts = np.unique(_texts(index, "map_name", rows), return_counts=True)
-    edges = [-np.inf, *FOCAL_EDGES_MM[:-1], np.nextafter(FOCAL_EDGES_MM[-1], np.inf), np.inf]
     return FamilyStatistics(
         split=split,
         subset=subset,
@@ -192,7 +166,6 @@ def _family(
             if in_bin(baselines_cm, name).any()
         },
         focal_mm=Distribution.of(focal_mm),
-        focal_counts=tuple(np.histogram(focal_mm, edges)[0].tolist()),
     )
 
 

@@ -1,6 +1,5 @@
 """Statistics compared with the paper's figures, as Markdown."""
 
-import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -16,13 +15,11 @@ from stereogenbench_data.audit.paper_numbers import (
     EVAL_MAPS,
     EVAL_MAPS_TABLE,
     FOCAL_MM,
-    SHORT_PAIRS,
-    SHORT_PAIRS_MAP,
     SPLITS,
     TRAIN_MAPS_TABLE,
     map_counts,
 )
-from stereogenbench_data.audit.statistics import FOCAL_EDGES_MM, FamilyStatistics, Statistics
+from stereogenbench_data.audit.statistics import FamilyStatistics, Statistics
 from stereogenbench_data.schema.release import SCENE_COUNTS
 from stereogenbench_data.schema.text import markdown_table, markdown_text
 
@@ -58,7 +55,6 @@ def compared(found: Statistics) -> tuple[Line, ...]:
     lines = [
         *_count_lines(found),
         *_baseline_lines(found),
-        *_short_lines(found),
         *_bin_lines(found),
         *_focal_lines(found),
         *_map_lines(found),
@@ -98,16 +94,6 @@ def _baseline_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
                     ours = f"{getattr(getattr(branch, attribute), name):.{decimals}f}"
                 item = f"{kind}, {split} {family}: {name}" + (" (cm)" if name != "count" else "")
                 yield split, Line(table, item, paper, ours)
-
-
-def _short_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
-    short, item = found.short_pairs, "Pairwise_Uniform below 10 cm: "
-    for name, paper, ours in (
-        ("baselines", str(SHORT_PAIRS["baselines"]), str(short.baselines)),
-        ("scenes", str(SHORT_PAIRS["scenes"]), str(short.scenes)),
-        ("maps", SHORT_PAIRS_MAP, ", ".join(short.maps) or "-"),
-    ):
-        yield "train", Line(ALL_PAIRS_TABLE, item + name, paper, ours)
 
 
 def _bin_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
@@ -161,10 +147,10 @@ def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
         f"# Statistics of {markdown_text(str(found.root))}",
         *([] if not found.derived else ["", f"These are {found.derived}."]),
         *_section("Scenes", _count_rows(found)),
-        *_section("Adjacent baselines (cm)", _spread_rows(found.branches, "adjacent")),
-        *_section("Baselines of all 15 pairs (cm)", _spread_rows(found.branches, "all pairs")),
+        *_section("Adjacent baselines (cm)", _spread_rows(found.branches, "adjacent_cm")),
+        *_section("Baselines of all 15 pairs (cm)", _spread_rows(found.branches, "all_pairs_cm")),
         *_section("Pairs by baseline (cm): primary / adjacent / all", _bin_rows(found.families)),
-        *_section("Scenes by focal length (mm)", _focal_rows(found.branches)),
+        *_section("Focal lengths (mm)", _spread_rows(found.branches, "focal_mm")),
         *_section("Scenes by map", _map_rows(found.branches)),
     ]
     if lines:
@@ -191,10 +177,10 @@ def _count_rows(found: Statistics) -> Iterator[Sequence[str]]:
     yield ("all", "", "total", f"{found.scenes:,}")
 
 
-def _spread_rows(branches: Sequence[FamilyStatistics], kind: str) -> Iterator[Sequence[str]]:
+def _spread_rows(branches: Sequence[FamilyStatistics], name: str) -> Iterator[Sequence[str]]:
     yield ("split", "family", "count", "min", "max", "mean", "std", "median")
     for each in branches:
-        spread = each.adjacent_cm if kind == "adjacent" else each.all_pairs_cm
+        spread = getattr(each, name)
         lengths = (spread.min, spread.max, spread.mean, spread.std, spread.median)
         cells = (f"{length:.4f}" for length in lengths)
         yield (each.split, each.family, f"{spread.count:,}", *cells)
@@ -209,17 +195,6 @@ def _bin_rows(families: Sequence[FamilyStatistics]) -> Iterator[Sequence[str]]:
             " / ".join(f"{count:,}" for count in each.bins.get(name, (0, 0, 0))) for name in names
         ]
         yield (each.split, each.subset or "-", each.family, *cells)
-
-
-def _focal_rows(branches: Sequence[FamilyStatistics]) -> Iterator[Sequence[str]]:
-    yield ("focal length", *(f"{each.split} {each.family}" for each in branches), "all")
-    totals = [sum(counts) for counts in zip(*(each.focal_counts for each in branches), strict=True)]
-    edges = [f"{edge:g}" for edge in FOCAL_EDGES_MM]
-    names = [f"below {edges[0]}", *map(" to ".join, itertools.pairwise(edges)),
-             f"above {edges[-1]}"]  # fmt: skip
-    for place, (name, total) in enumerate(zip(names, totals, strict=True)):
-        if total or 0 < place < len(names) - 1:
-            yield (name, *(f"{each.focal_counts[place]:,}" for each in branches), f"{total:,}")
 
 
 def _map_rows(branches: Sequence[FamilyStatistics]) -> Iterator[Sequence[str]]:

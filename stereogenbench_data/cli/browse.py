@@ -34,7 +34,7 @@ def browse(
 
     index, shown_data = source.open(), full_place(source.data)
     reader = SceneReader(index)
-    service = Service(Catalogue(index, shown_data=shown_data, depth=None), reader)
+    service = Service(Catalogue(index, shown_data=shown_data), reader)
     with PageServer(service, port=port) as server:
         typer.echo(f"{server.url}: {counted(len(index), 'scene')} of {shown_data}; Ctrl-C ends it")
         if index.is_derived:

@@ -41,11 +41,11 @@ def doctor(  # noqa: PLR0913 - one parameter an option
     Example: `stereogenbench doctor scenes/ -o doctor.png`
     """
     from stereogenbench_data.audit.contract.doctor import diagnose
-    from stereogenbench_data.audit.contract.picture import draw_report, require_picture_file
+    from stereogenbench_data.audit.contract.picture import draw_report
     from stereogenbench_data.audit.contract.report import doctor_json, doctor_lines
 
-    if out is not None:
-        require_picture_file(out)
+    if out is not None and out.suffix.lower() != ".png":
+        raise typer.BadParameter(f"{out}: name a picture, *.png.", param_hint="--out")
     filters: Any = chosen.filters()
     index = source.open()
     with progress_bar("examining", unit="scenes") as progress:

@@ -2,10 +2,9 @@
 
 import dataclasses
 
-import numpy as np
 import pytest
 
-from stereogenbench_data import DepthEncoding, SceneIndex, SelectionError, StereoPairs
+from stereogenbench_data import SceneIndex, SelectionError
 from stereogenbench_data.audit.browser.catalogue import Catalogue, parse_choice
 from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
 from tests.audit.browsing import run
@@ -56,14 +55,6 @@ def test_the_line_of_a_sample_gives_it(catalogue, indexed_release):
 
     assert sample["__key__"] == f"{SCENE}/01-04/005"
     assert line.startswith("from stereogenbench_data import StereoPairs\n")
-
-
-def test_the_line_states_the_depth_contract_that_is_shown(index, indexed_release):
-    shown = Catalogue(index, shown_data=str(indexed_release), depth=DepthEncoding(unit_m=0.002))
-    mine = run(shown.sample_line(SCENE, pair=(0, 1), frame=0))["sample"]["disparity"]
-    stated = StereoPairs(indexed_release, scenes=SCENE)[0]["disparity"]
-
-    np.testing.assert_allclose(mine * 2, stated, rtol=1e-5)
 
 
 def test_a_value_counts_what_all_other_filters_leave(catalogue, index):
@@ -121,20 +112,20 @@ def test_a_scenes_pairs_go_from_the_narrowest_to_the_widest(catalogue, index):
     assert sum(pair["primary"] for pair in scene["pairs"]) == 1
 
 
-def test_a_list_of_thousands_comes_in_parts(index):
+def test_a_long_list_comes_in_parts(index):
     scene = dataclasses.replace(index.scene(0), members={})
     scenes = [
         dataclasses.replace(
             scene, id=dataclasses.replace(scene.id, key=f"train/scene_{number:06d}")
         )
-        for number in range(8493)
+        for number in range(450)
     ]
     catalogue = Catalogue(SceneIndex.from_scenes(scenes, index.root), shown_data="x")
-    listed = catalogue.listed({}, first=8400, count=10_000)
+    listed = catalogue.listed({}, first=400, count=10_000)
 
-    assert (listed["total"], listed["first"], len(listed["rows"])) == (8493, 8400, 93)
+    assert (listed["total"], listed["first"], len(listed["rows"])) == (450, 400, 50)
     assert len(catalogue.listed({}, first=0, count=10_000)["rows"]) == 200
-    assert catalogue.place({}, "train/scene_004321") == 4321
+    assert catalogue.place({}, "train/scene_000321") == 321
 
 
 def test_a_scene_outside_the_choice_has_no_place_in_the_list(catalogue):

@@ -498,12 +498,11 @@ def test_files_numbered_one_too_high_are_seen_and_nothing_is_pasted(verdict_on):
 @pytest.mark.parametrize(
     ("camera", "change", "words"),
     [
-        (5, scaled(0.5), r"is 0\.[45]\d* x that of the others"),
         (1, scaled(1.05), r"is 1\.0[45]\d* x that of the others"),
         (3, late(2), r"fits better with a lag of \+2 frames"),
         (0, lambda units: np.flip(units, 1), r"fits better flipped \(vertical\)"),
     ],
-    ids=["halved", "5 % more", "lagged", "flipped"],
+    ids=["5 % more", "lagged", "flipped"],
 )
 def test_depth_of_one_camera_that_is_wrong_is_named(verdict_on, camera, change, words):
     verdict = verdict_on(lambda folder: rewrite_one_depth(folder, camera, change), frames=3)
@@ -535,10 +534,9 @@ def test_inverse_depth_of_one_camera_is_named(verdict_on):
     ("camera", "change", "words"),
     [
         (0, lambda pictures: np.roll(pictures, -1, axis=1), r"are [01]\.\d px higher"),
-        (3, lambda pictures: np.roll(pictures, 1, axis=1), r"are [01]\.\d px lower"),
         (1, lambda pictures: pictures[:, :, ::-1], "do not fit those of the others.*"),
     ],
-    ids=["higher", "lower", "mirrored"],
+    ids=["higher", "mirrored"],
 )
 def test_pictures_of_one_camera_that_are_wrong_are_named(verdict_on, camera, change, words):
     verdict = verdict_on(lambda folder: rewrite_rgb(folder, camera, change), frames=3)
@@ -683,17 +681,6 @@ def test_ray_depth_is_not_taken_for_what_explains_few_of_the_matches(tmp_path):
     assert answer(verdict, "flip of depth").status != "confirmed"
     assert verdict.encoding is None
     assert not verdict.fits
-
-
-def test_equal_views_of_which_noise_alone_makes_disparity_decide_nothing(tmp_path):
-    request = SynthRequest(family="Uniform", size_px=174, frames=7, seed=3001, focal_mm=48)
-    (key,) = synthesise(tmp_path, request)
-    exchange(tmp_path / key, dict.fromkeys(range(6), 2))
-
-    (verdict,) = diagnose(tmp_path, frames=1, workers=1).verdicts
-
-    assert not verdict.is_wrong
-    assert "too little parallax: disparities are of 0.0" in verdict.answers[0].note
 
 
 def test_a_scene_in_which_nothing_moves_does_not_tell_the_lag(verdict_on):

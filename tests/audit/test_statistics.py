@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.audit import paper_numbers
-from stereogenbench_data.audit.statistics import FOCAL_EDGES_MM, statistics
+from stereogenbench_data.audit.statistics import statistics
 from stereogenbench_data.audit.statistics_report import (
     compared,
     statistics_markdown,
@@ -90,10 +90,7 @@ def test_baselines_bins_and_focal_lengths_of_three_scenes(three):
     assert family.bins["[100,150]"][:2] == (0, 1)
     assert family.bins["(150,inf)"][:2] == (0, 2)
     assert sum(every for _, _, every in family.bins.values()) == 45
-    # 20 mm opens a bin, 85 mm is the last of its own, 90 mm is beyond.
-    counts = dict(zip(FOCAL_EDGES_MM.tolist(), family.focal_counts[1:], strict=True))
-    assert (counts[20.0], counts[80.0], counts[85.0]) == (1, 1, 1)
-    assert sum(family.focal_counts) == 3
+    assert (family.focal_mm.min, family.focal_mm.median, family.focal_mm.max) == (20, 85, 90)
 
 
 def test_filters_choose_what_is_counted(three):
@@ -111,7 +108,7 @@ def test_an_index_with_the_papers_counts_agrees_with_the_paper_in_every_figure(r
     lines = compared(found)
 
     assert [line for line in lines if not line.agrees] == []
-    assert len(lines) == 154
+    assert len(lines) == 151
     assert {line.table for line in lines} >= {
         paper_numbers.COUNTS_TABLE,
         paper_numbers.ADJACENT_TABLE,
@@ -135,7 +132,7 @@ def test_one_scene_less_is_seen_in_every_figure_that_it_moves(release):
     assert items["scenes, train IPD_Gaussian"].ours == "3288"
     assert items["adjacent, train IPD_Gaussian: count"].ours == "16440"
     assert not any("eval" in item for item in items)
-    assert f"## Against the paper: {154 - len(items)} of 154 figures agree" in markdown
+    assert f"## Against the paper: {151 - len(items)} of 151 figures agree" in markdown
     assert markdown.rindex("| **differs** | ") < markdown.index("| same | ")
 
 
@@ -168,7 +165,6 @@ def test_the_papers_tables_close():
         scenes = sum(n for (of, _, by), n in counts.items() if (of, by) == (split, family))
         assert int(told["count"]) == 5 * scenes
     assert int(paper_numbers.ALL_PAIRS["train", "Pairwise_Uniform"]["count"]) == 15 * 3691
-    assert paper_numbers.SHORT_PAIRS["baselines"] == 5 * paper_numbers.SHORT_PAIRS["scenes"]
 
 
 def test_markdown_has_the_papers_tables(release):
@@ -178,7 +174,7 @@ def test_markdown_has_the_papers_tables(release):
 
     row = "| train | Uniform | 3,870 | 1.0113 | 149.8906 | 52.7908 | 38.9500 | 43.2916 |"
     assert row in markdown
-    assert "## Against the paper: 154 of 154 figures agree" in markdown
+    assert "## Against the paper: 151 of 151 figures agree" in markdown
     assert "| same | scenes, train Uniform | 774 | 774 |" in markdown
     assert "Against the paper" not in statistics_markdown(found)
 
@@ -198,7 +194,7 @@ def test_the_command_compares_a_release_by_itself(written_release, run):
     result = run(written_release)
 
     assert result.exit_code == 0
-    assert "## Against the paper: 154 of 154 figures agree" in result.stdout
+    assert "## Against the paper: 151 of 151 figures agree" in result.stdout
 
 
 def test_the_command_shows_other_data_without_the_papers_figures(small_shards, run):
@@ -217,7 +213,6 @@ def test_the_command_writes_json_and_files(small_shards, run, tmp_path):
     assert document == json.loads((tmp_path / "out" / "stats.json").read_text())
     assert document["scenes"] == 3
     assert document["paper"] == []
-    assert len(document["focal_edges_mm"]) == len(document["families"][0]["focal_counts"]) - 1
     assert (tmp_path / "out" / "stats.md").read_text().startswith("# Statistics of ")
 
 

@@ -8,13 +8,12 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from jaxtyping import Int64
 
-from stereogenbench_data.audit.contract.verdict import encoding_line
 from stereogenbench_data.audit.pictures.scene_pictures import derived_text
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.conventions import depth_of
-from stereogenbench_data.schema.records import DepthEncoding, Scene
+from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
 from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.selection.filters import filter_scenes, find_scene
@@ -98,19 +97,10 @@ class ChosenPairs:
 class Catalogue:
     """The scenes of an index as the page asks for them; may be used by any thread."""
 
-    def __init__(
-        self, index: SceneIndex, *, shown_data: str, depth: DepthEncoding | None = None
-    ) -> None:
-        """Take an index.
-
-        Args:
-            index: The index of the data.
-            shown_data: The argument of `StereoPairs` for these data.
-            depth: A depth contract in place of the files' own, or None.
-        """
+    def __init__(self, index: SceneIndex, *, shown_data: str) -> None:
+        """Take an index, and the argument of `StereoPairs` for its data."""
         self.index = index
         self._data = shown_data
-        self._depth = depth
         self._row_of = {str(key): row for row, key in enumerate(index.column("key"))}
 
     def row(self, key: str) -> int:
@@ -129,14 +119,12 @@ class Catalogue:
         """Return what the page shows of the data as a whole."""
         focal_mm = self.index.column("focal_mm")
         rows = np.arange(len(self.index), dtype=np.int64)
-        depth = "" if self._depth is None else f"depth as asked: {encoding_line(self._depth)}"
         found = baselines_cm(self.index, choose_pairs(self.index, rows, pairs="all"))
         return {
             "data": self._data,
             "scenes": len(self.index),
             "focal_mm": [float(focal_mm.min()), float(focal_mm.max())],
             "baseline_cm": [float(found.min()), float(found.max())],
-            "depth": depth,
             "left_out": {**self.index.broken, **self.index.incomplete},
         }
 
@@ -203,7 +191,7 @@ class Catalogue:
         selected = set(
             zip(pairs.source[mine].tolist(), pairs.targets[mine, 0].tolist(), strict=True)
         )
-        return _facts(scene, depth=self._depth) | {
+        return _facts(scene) | {
             "place": self.place(choice, key),
             "pairs": [
                 {
@@ -229,13 +217,9 @@ class Catalogue:
         return self._line("sample", {"scenes": key, "pairs": [pair], "frames": frame}) + "[0]"
 
     def _line(self, name: str, options: Mapping[str, Any]) -> str:
-        imports = "StereoPairs"
         given = "".join(f", {option}={value!r}" for option, value in options.items())
-        if self._depth is not None:
-            imports = "DepthEncoding, StereoPairs"
-            given += f", depth={encoding_line(self._depth)}"
         return (
-            f"from stereogenbench_data import {imports}\n"
+            f"from stereogenbench_data import StereoPairs\n"
             f"{name} = StereoPairs({self._data!r}{given})"
         )
 
@@ -268,9 +252,9 @@ class Catalogue:
         return {name: int(in_bin(found, name).sum()) for name in BASELINE_BINS}
 
 
-def _facts(scene: Scene, *, depth: DepthEncoding | None) -> dict[str, Any]:
+def _facts(scene: Scene) -> dict[str, Any]:
     rig, camera = scene.rig, rig_intrinsics(scene.rig)
-    encoding = scene.depth_encoding(0, depth or depth_of(scene))
+    encoding = scene.depth_encoding(0, depth_of(scene))
     return {
         "key": scene.id.key,
         "caption": scene.caption,
@@ -285,7 +269,7 @@ def _facts(scene: Scene, *, depth: DepthEncoding | None) -> dict[str, Any]:
         "focal_mm": rig.focal_mm,
         "fx_px": camera.fx_px,
         "depth_unit_m": encoding.unit_m,
-        "depth_unit_source": "as asked" if encoding.source == "user" else encoding.source,
+        "depth_unit_source": encoding.source,
         "rig_residual_px": scene.rig_residual_px,
         "derived": derived_text(scene),
     }

@@ -33,7 +33,6 @@ from stereogenbench_data.audit.contract.scoring import (
     Free,
     Pair,
     ScoredContract,
-    agreement,
     evidence,
     score_hypothesis,
 )
@@ -421,15 +420,14 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         return SceneDiagnosis(**basics, best=declared, problem=problem)
     search = ContractSearch(views, matches, least_log_scale=allowed_log_scale(step))
     best, check = _checked(search, search.best(), depth_step=step)
-    share_explained = agreement(views, matches, best)
     parallax = search.without_parallax(best)
-    if math.isnan(share_explained) or not parallax.is_clear():
+    if math.isnan(check.agreement) or not parallax.is_clear():
         problem = (
-            "no depth: none of the pixels that were found in both pictures has any"
-            if math.isnan(share_explained)
+            "no depth: too few of the pixels that were found in both pictures have any"
+            if math.isnan(check.agreement)
             else f"nothing fits: of disparities of {basics['disparity_px']:.1f} px the best "
-            f"contract explains {share_explained:.0%} to a pixel, and pictures no better than none "
-            f"does"
+            f"contract explains {check.agreement:.0%} to a pixel, and pictures no better than "
+            f"none does"
         )
         return SceneDiagnosis(**basics, best=declared, parallax=parallax, problem=problem)
     (other_kind,) = best.hypothesis.alternatives("kind")

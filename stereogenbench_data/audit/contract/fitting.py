@@ -22,7 +22,6 @@ from stereogenbench_data.audit.contract.hypotheses import Hypothesis
 from stereogenbench_data.audit.contract.matching import FrameMatch, Points, SceneFrames
 from stereogenbench_data.audit.contract.scoring import (
     LEAST_ERRORS,
-    SCALE,
     Free,
     Pair,
     ScoredContract,
@@ -38,7 +37,6 @@ _STEPS: Final = 10
 _LARGEST_STEP_PX: Final = 1.0
 _LARGEST_BENT: Final[dict[object, float]] = {"scale": 0.1, "ray": 0.5}
 """Largest steps while the power of the ray is fitted, which moves wide disparities far."""
-_DRAWS: Final = 300
 _FEWEST_USABLE: Final = 10
 _NEAR_PX: Final = 3 * _TOLERANCE_PX
 """Matches further from the prediction are not used to refine it."""
@@ -131,18 +129,12 @@ def _joined(terms: Iterable[_Term]) -> tuple[Points, Points]:
 
 def _start(terms: Sequence[_Term], *, free: Free) -> _Lengths:
     """Return a scale and offsets from the matches alone."""
-    if free == SCALE:
-        return _Lengths(voted_scale(*_joined(terms)), {})
-    by_pair = {
-        pair: _joined(term for term in terms if term.match.pair == pair) for pair in _pairs(terms)
-    }
-    scale = 1.0
-    if "scale" in free:
-        most_matches = max(terms, key=lambda term: len(term.predicted_px)).match.pair
-        scale = _drawn_scale(*by_pair[most_matches])
-    return _Lengths(scale, {
-        pair: _densest(found - scale * predicted) for pair, (found, predicted) in by_pair.items()
-    })  # fmt: skip
+    scale = voted_scale(*_joined(terms)) if "scale" in free else 1.0
+    offsets_px = {}
+    for pair in _pairs(terms) if "offset" in free else ():
+        found, predicted = _joined(term for term in terms if term.match.pair == pair)
+        offsets_px[pair] = _densest(found - scale * predicted)
+    return _Lengths(scale, offsets_px)
 
 
 def _agreement(found: Points, predicted: Points) -> float:
@@ -164,24 +156,6 @@ def voted_scale(found: Points, predicted: Points) -> float:
     best = smooth.argsort()[-12:]
     scales = [1.0, *np.exp((edges[best] + edges[best + 1]) / 2), math.exp(np.median(ratios))]
     return float(max(scales, key=lambda scale: _agreement(found, scale * predicted)))
-
-
-def _drawn_scale(found: Points, predicted: Points) -> float:
-    """Return the scale of the line, with any offset, on which most matches lie."""
-    rng = np.random.default_rng(0)
-    first, second = rng.integers(len(found), size=(2, _DRAWS))
-    apart = predicted[first] - predicted[second]
-    wide = np.abs(apart) > 0
-    first, second, apart = first[wide], second[wide], apart[wide]
-    scales = (found[first] - found[second]) / apart
-    best, most = 1.0, -1.0
-    few = rng.integers(len(found), size=min(len(found), 1500))
-    for scale, anchor in zip(scales, first, strict=True):
-        if scale > 0:
-            shift = found[anchor] - scale * predicted[anchor]
-            agree = _agreement(found[few], scale * predicted[few] + shift)
-            best, most = (float(scale), agree) if agree > most else (best, most)
-    return best
 
 
 def _densest(values: Points) -> float:

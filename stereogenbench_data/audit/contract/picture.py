@@ -28,16 +28,6 @@ _TILE_PX: Final = 400
 _DIFFERENCES: Final = ColourScale(0.0, 80.0)
 
 
-def require_picture_file(path: Path) -> None:
-    """Refuse a file whose name is not of a picture, before anything is read.
-
-    Raises:
-        SelectionError: If the name does not end in .png.
-    """
-    if path.suffix.lower() != ".png":
-        raise SelectionError(f"{path}: name a picture, *.png.")
-
-
 def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
     """Write the picture of the scene with the most to report.
 

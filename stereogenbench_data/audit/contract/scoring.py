@@ -292,17 +292,3 @@ def _mean_db(ours: np.ndarray, theirs: np.ndarray) -> Float64[np.ndarray, " k"]:
     ratios = np.maximum(theirs, _SMALLEST) / np.maximum(ours, _SMALLEST)
     mean: Float64[np.ndarray, " k"] = 10 * np.log10(ratios).mean(axis=0)
     return mean
-
-
-def agreement(views: SceneFrames, matches: Sequence[FrameMatch], contract: ScoredContract) -> float:
-    """Return the share of matches that a contract explains to a pixel; nan if it predicts none."""
-    near, count = 0, 0
-    for match in matches:
-        predicted = views.predicted(match, contract.hypothesis)
-        if predicted is not None:
-            disparity_px, known = predicted
-            shift_px = match.shift_px(contract.offsets_px)
-            away = contract.scale * disparity_px + shift_px - match.matched_px
-            near += int((np.abs(away[known]) < match.grain_px).sum())
-            count += int(known.sum())
-    return near / count if count else math.nan

@@ -53,7 +53,6 @@ function showAbout() {
   state.colours = palette(about.colours.stops);
   $("data").textContent = about.data;
   document.title = `${about.data.split("/").filter(Boolean).pop() ?? ""} - StereoGenBench scenes`;
-  tell($("contract"), about.depth);
   const left = Object.entries(about.left_out);
   tell($("left-out"), left.length ? `${plural(left.length, "scene")} left out` : "");
   $("left-out-list").querySelector("ul").replaceChildren(...left.map(([key, reason]) => {
