@@ -1,21 +1,25 @@
-"""A stereo network: features, a cost volume at a quarter of the size, two refinements.
+"""A stereo network: features, a cost volume at a quarter of the size, and a refinement.
 
 To train another network, give it the same two methods: `train.py` and `score.py` know no others.
 """
 
+from functools import partial
+
 import torch
 from torch import nn
-from torch.nn.functional import grid_sample, interpolate, normalize, pad, smooth_l1_loss
+from torch.nn.functional import grid_sample, normalize, pad, pixel_shuffle, smooth_l1_loss, unfold
 
-GROUPS = 4
+GROUPS, UNSEEN_WEIGHT = 4, 0.1
 
 
-def block(inputs: int, outputs: int, *, stride: int = 1, dilation: int = 1) -> nn.Sequential:
-    """Return a convolution, batch normalisation and a rectifier."""
+def block(
+    inputs: int, outputs: int, *, stride: int = 1, dilation: int = 1, norm: type = nn.BatchNorm2d
+) -> nn.Sequential:
+    """Return a convolution, a normalisation and a rectifier."""
     convolution = nn.Conv2d(
         inputs, outputs, 3, stride=stride, padding=dilation, dilation=dilation, bias=False
     )
-    return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU())
+    return nn.Sequential(convolution, norm(outputs), nn.ReLU())
 
 
 class Refinement(nn.Module):
@@ -32,9 +36,7 @@ class Refinement(nn.Module):
     def forward(
         self, left: torch.Tensor, right: torch.Tensor, disparity: torch.Tensor
     ) -> torch.Tensor:
-        """Return the disparity at the views' size, (n, 1, h, w) in their pixels."""
-        scale = left.shape[-1] / disparity.shape[-1]
-        disparity = scale * interpolate(disparity, size=left.shape[-2:], mode="bilinear")
+        """Return the corrected disparity, (n, 1, h, w) as it was given."""
         moved = warped(right, disparity)
         return disparity + self.layers(torch.cat([left, left - moved, disparity / 16], 1))
 
@@ -49,6 +51,18 @@ def warped(right: torch.Tensor, disparity: torch.Tensor) -> torch.Tensor:
     return grid_sample(right, grid, padding_mode="border", align_corners=True)
 
 
+def enlarged(disparity: torch.Tensor, weights: torch.Tensor, *, by: int) -> torch.Tensor:
+    """Return a map as so many times larger; each pixel is a mean of 3 x 3 with weights of its own.
+
+    Teed and Deng, RAFT, ECCV 2020, section 3.3.
+    """
+    n, _, height, width = disparity.shape
+    around = unfold(pad(by * disparity, (1, 1, 1, 1), mode="replicate"), 3)
+    around = around.view(n, 9, 1, height, width)
+    weights = weights.view(n, 9, by * by, height, width).softmax(1)
+    return pixel_shuffle((weights * around).sum(1), by)
+
+
 class StereoNetwork(nn.Module):
     """Predicts disparity from 0 to `max_disparity` pixels, of views of any size.
 
@@ -59,10 +73,12 @@ class StereoNetwork(nn.Module):
     def __init__(self, max_disparity: int = 96, channels: int = 32) -> None:
         super().__init__()
         self.max_disparity = max_disparity
+        # Each view by its own brightness and contrast: real pictures differ from drawn ones.
+        own = partial(block, norm=nn.InstanceNorm2d)
+        self.stem = nn.Sequential(own(3, channels, stride=2), own(channels, channels, stride=2))
         self.features = nn.Sequential(
-            block(3, channels, stride=2), block(channels, channels, stride=2),
-            block(channels, channels), block(channels, channels, dilation=2),
-            block(channels, channels, dilation=4), nn.Conv2d(channels, channels, 3, padding=1),
+            own(channels, channels), own(channels, channels, dilation=2),
+            own(channels, channels, dilation=4), nn.Conv2d(channels, channels, 3, padding=1),
         )  # fmt: skip
         self.smooth = nn.Sequential(
             nn.Conv3d(GROUPS, 16, 3, padding=1), nn.BatchNorm3d(16), nn.ReLU(),
@@ -70,29 +86,24 @@ class StereoNetwork(nn.Module):
             nn.Conv3d(16, 1, 3, padding=1),
         )  # fmt: skip
         self.sharpness = nn.Parameter(torch.tensor(5.0))
-        self.refinements = nn.ModuleList([Refinement(), Refinement()])
+        self.weights = nn.Sequential(block(channels, 64), nn.Conv2d(64, 9 * 16, 1))
+        self.refine = Refinement()
 
     def stages(self, left: torch.Tensor, right: torch.Tensor) -> list[torch.Tensor]:
-        """Return the disparity from coarse to fine, each at the views' size in their pixels."""
+        """Return the disparity before and after refinement."""
         height, width = left.shape[-2:]
         # A quarter of the size must be whole: repeat the last row, and the first column.
         filling = (-width % 4, 0, 0, -height % 4)
         left, right = (pad(view / 255 - 0.5, filling, mode="replicate") for view in (left, right))
-        disparity = self.coarse(left, right)
-        found = [4 * interpolate(disparity, size=left.shape[-2:], mode="bilinear")]
-        for scale, refine in zip((0.5, 1.0), self.refinements, strict=True):
-            views = [
-                view if scale == 1 else interpolate(view, scale_factor=scale, mode="area")
-                for view in (left, right)
-            ]
-            disparity = refine(*views, disparity)
-            found.append(interpolate(disparity / scale, size=left.shape[-2:], mode="bilinear"))
+        ours, theirs = self.stem(left), self.stem(right)
+        disparity = enlarged(self.coarse(ours, theirs), self.weights(ours), by=4)
+        found = [disparity, self.refine(left, right, disparity)]
         return [each[..., :height, -width:] for each in found]
 
     def coarse(self, left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-        """Return the disparity at a quarter of the views' size, in its pixels."""
+        """Return the disparity at a quarter of the views' size, in its pixels, from the stems."""
         shifts = self.max_disparity // 4
-        ours, theirs = (normalize(self.features(view), dim=1) for view in (left, right))
+        ours, theirs = (normalize(self.features(view).float(), dim=1) for view in (left, right))
         width, theirs = ours.shape[-1], pad(theirs, (shifts, 0))
         shifted = [theirs[..., shifts - by :][..., :width] for by in range(shifts)]
         cosines = [(ours * view).unflatten(1, (GROUPS, -1)).sum(2) for view in shifted]
@@ -111,11 +122,18 @@ class StereoNetwork(nn.Module):
         return self.stages(left, right)[-1]
 
     def loss(
-        self, left: torch.Tensor, right: torch.Tensor, disparity: torch.Tensor, valid: torch.Tensor
+        self,
+        left: torch.Tensor,
+        right: torch.Tensor,
+        disparity: torch.Tensor,
+        valid: torch.Tensor,
+        visible: torch.Tensor,
     ) -> torch.Tensor:
-        """Return how wrong all stages are, the finer ones counting more."""
+        """Return how wrong both stages are; what the right view does not show counts little."""
         kept = valid & (disparity < self.max_disparity)
-        errors = [
-            smooth_l1_loss(stage[kept], disparity[kept]) for stage in self.stages(left, right)
-        ]
-        return sum(weight * error for weight, error in zip((0.25, 0.5, 1.0), errors, strict=True))
+        weight = torch.where(visible, 1.0, UNSEEN_WEIGHT)[kept]
+        before, after = (
+            (weight * smooth_l1_loss(stage[kept], disparity[kept], reduction="none")).sum()
+            for stage in self.stages(left, right)
+        )
+        return (0.5 * before + after) / weight.sum()

@@ -4,13 +4,14 @@
 
 DIR holds folders of Middlebury pairs as they are downloaded (2003, 2006, 2014). Pictures wider than
 800 pixels are reduced, those of 2014 to a quarter. Every method is scored on the same pixels: those
-whose disparity was measured and that the right camera sees.
+whose disparity was measured and that the right camera sees. Of runs that differ by their seeds, the
+mean is printed, and in brackets the best and the worst.
 """
 
 import argparse
 from collections import defaultdict
+from functools import partial
 from pathlib import Path
-from statistics import mean
 
 import cv2
 import numpy as np
@@ -98,6 +99,15 @@ def by_network(network: StereoNetwork, left: np.ndarray, right: np.ndarray) -> n
         return network(*views)[0, 0].numpy()
 
 
+def cell(scores: np.ndarray) -> str:
+    """Return the error in px and the share over 2 px of runs, (runs, 2), for the table."""
+    texts = []
+    for values, unit, form in ((scores[:, 0], "px", ".2f"), (100 * scores[:, 1], "%", ".1f")):
+        spread = f" ({values.min():{form}} to {values.max():{form}})" if len(values) > 1 else ""
+        texts.append(f"{values.mean():{form}} {unit}{spread}")
+    return ", ".join(texts)
+
+
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("runs", nargs="*", type=Path)
@@ -108,38 +118,36 @@ def main() -> None:
     pairs = {name: pair for name, pair in found.items() if pair is not None}
     if not pairs:
         options.error(f"{given.middlebury}: no folder holds a Middlebury pair.")
-    methods = {"OpenCV SGBM": by_opencv}
+    methods = {"OpenCV SGBM": [by_opencv]}
     for run in given.runs:
         saved = torch.load(run / "checkpoint.pt", weights_only=True)
         network = StereoNetwork().eval()
         network.load_state_dict(saved["network"])
-        methods[f"trained on {saved['pairs']} pairs ({run.name})"] = (
-            lambda left, right, network=network: by_network(network, left, right)
-        )
+        of_kind = methods.setdefault(f"trained on {saved['pairs']} pairs", [])
+        of_kind.append(partial(by_network, network))
 
     figure = Figure(figsize=(3 * (2 + len(methods)), 2.3 * len(pairs)), layout="constrained")
     tiles = figure.subplots(len(pairs), 2 + len(methods), squeeze=False)
-    scores = defaultdict(dict)
+    scores = defaultdict(list)  # of each method: of each pair, (runs, 2)
     for row, (name, (left, right, truth)) in zip(tiles, pairs.items(), strict=True):
         scored = seen_by_both(truth)
         shown = [(name, left), ("measured", truth)]
-        for method, predict in methods.items():
-            predicted = predict(left, right)
-            wrong = np.abs(predicted - truth)[scored]
-            scores[method][name] = (wrong.mean(), (wrong > 2).mean())
-            shown.append((method, predicted))
+        for method, runs in methods.items():
+            predicted = [predict(left, right) for predict in runs]
+            wrong = np.stack([np.abs(each - truth)[scored] for each in predicted])
+            scores[method].append(np.stack([wrong.mean(1), (wrong > 2).mean(1)], axis=1))
+            shown.append((method, predicted[0]))
         for tile, (title, picture) in zip(row, shown, strict=True):
             tile.imshow(picture, vmin=0, vmax=truth.max(), cmap="turbo")
             tile.set_title(title, fontsize=8)
             tile.set_axis_off()
     if given.picture:
-        figure.savefig(given.picture, dpi=110)
+        figure.savefig(given.picture, dpi=80)
 
     print("| method | " + " | ".join(pairs) + " | mean |\n|---|" + "---|" * (len(pairs) + 1))
-    for method, of_pair in scores.items():
-        errors, off = zip(*of_pair.values(), strict=True)
-        cells = [*of_pair.values(), (mean(errors), mean(off))]
-        print(f"| {method} | " + " | ".join(f"{e:.2f} px, {o:.1%}" for e, o in cells) + " |")
+    for method, of_pairs in scores.items():
+        cells = map(cell, [*of_pairs, np.mean(of_pairs, axis=0)])
+        print(f"| {method} | " + " | ".join(cells) + " |")
 
 
 if __name__ == "__main__":

@@ -88,6 +88,32 @@ def test_a_real_training_goes_on_where_it_was_stopped_and_is_scored(tmp_path, gr
     assert float(opencv[-1].split(" px")[0]) < 1 < float(network[-1].split(" px")[0])
 
 
+def test_runs_of_one_kind_are_scored_as_a_mean_with_the_best_and_the_worst(tmp_path, ground_truth):
+    stereo, runs = EXAMPLES / "stereo", [tmp_path / seed for seed in "01"]
+    for trained in runs:
+        train = (stereo / "train.py", EXAMPLES.parent / "shards", trained, "--seed", trained.name)
+        run(tmp_path, *train, "--crop", 64, 64, "--steps", 2, "--workers", 0)
+
+    said = [
+        run(tmp_path, stereo / "score.py", "--middlebury", ground_truth, *given)
+        for given in (runs[:1], runs[1:], runs)
+    ]
+
+    one, other, both = (text.splitlines()[-1].split(" | ")[1] for text in said)
+    errors = sorted(float(text.split(" px")[0]) for text in (one, other))
+    assert f"px ({errors[0]:.2f} to {errors[1]:.2f}), " in both
+    assert float(both.split(" px")[0]) == pytest.approx(sum(errors) / 2, abs=0.011)
+
+
+def test_the_waiting_for_data_is_printed_for_each_number_of_workers(tmp_path):
+    shards = EXAMPLES.parent / "shards"
+    said = run(tmp_path, EXAMPLES / "stereo" / "waiting.py", shards, shards, "--steps", 2)
+
+    rows = [line.strip("| ").split(" | ") for line in said.splitlines()[2:]]
+    assert [row[1] for row in rows] == ["0", "1", "2"] * 2
+    assert all(0 < float(row[3].rstrip("%")) < 100 for row in rows)
+
+
 def test_a_learned_right_view_is_better_than_warping(tmp_path):
     said = run(tmp_path, EXAMPLES / "learned_fill.py", "--steps", 60)
 
@@ -95,7 +121,7 @@ def test_a_learned_right_view_is_better_than_warping(tmp_path):
     for line in said.splitlines():
         cells = line.strip("| ").split(" | ")
         if cells[0] in ("warp and fill", "learned"):
-            means.setdefault(cells[0], []).append(float(cells[-2]))
+            means.setdefault(cells[0], []).append(float(cells[-2].split()[0]))
     assert len(means["learned"]) > 5
     assert sum(means["learned"]) > sum(means["warp and fill"])
     assert (tmp_path / "demo" / "learned_fill.png").exists()
