@@ -5,7 +5,7 @@
 DIR holds folders of Middlebury pairs as they are downloaded (2003, 2006, 2014). Pictures wider than
 800 pixels are reduced, those of 2014 to a quarter. Every method is scored on the same pixels: those
 whose disparity was measured and that the right camera sees. Of runs that differ by their seeds, the
-mean is printed, and in brackets the best and the worst.
+mean is printed, and in brackets the least and the most.
 """
 
 import argparse
