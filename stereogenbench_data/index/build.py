@@ -32,7 +32,6 @@ from stereogenbench_data.index.scene_folder import (
 )
 from stereogenbench_data.index.tree import (
     FoundScenes,
-    SceneFolder,
     find_remote_scenes,
     find_scene_folders,
     folder_of,
@@ -318,10 +317,7 @@ class DescribeTask:
     def __call__(self, key: str, advance: Advance = no_advance) -> Outcome:
         """Return what the scene is."""
         advance(0)
-        return self.outcome(folder_of(self.root, key), key)
-
-    def outcome(self, folder: SceneFolder, key: str) -> Outcome:
-        """Return what the scene of a folder is, whose files are all read."""
+        folder = folder_of(self.root, key)
         files: dict[str, tuple[int, int]] = {}
         try:
             files = folder.stamps()

@@ -28,7 +28,6 @@ from stereogenbench_data.index.alike_rigs import RigReader
 from stereogenbench_data.index.build import (
     ALIKE,
     POOL_FROM,
-    DescribeTask,
     Outcome,
     TreeReport,
     find_scenes,
@@ -112,7 +111,7 @@ class ListedTree:
         is_part: Whether the user chose only some of the scenes.
         stamp: A digest that changes when a file is added, removed or changed.
         conventions: How the files are read.
-        described: The outcomes of scenes behind a URL that were described in full.
+        described: The outcomes of scenes that were described in full.
     """
 
     root: Path | str
@@ -160,15 +159,34 @@ class ListedTree:
         """Yield what is read of each scene, in order; several wait at a time."""
         return in_parallel(read, keys) if self.is_remote else _of_each(read, keys)
 
-    def describe(self, key: str) -> Outcome:
-        """Return what a scene is, whose files are all read."""
-        if key in self.described:
-            return self.described[key]
-        task = DescribeTask(str(self.root), conventions=self.conventions)
-        outcome = task.outcome(self.folder(key), key)
-        if self.is_remote:
-            self.described[key] = outcome
-        return outcome
+    def describe(self, key: str, videos: Collection[str] | None = None) -> Scene:
+        """Return a scene as its files say, or as the user's cache holds it; see `describe_scene`.
+
+        Raises:
+            StorageError: If it cannot be used.
+        """
+        folder, scene = self.folder(key), None
+        name = f"{key} {' '.join(sorted(videos or ()))} {stamp_of(folder.stamps())}"
+        kept = self.cache.read("scenes", name)
+        with suppress(ValueError, KeyError, TypeError, IndexError, AttributeError):
+            scene = None if kept is None else scene_of_json(json.loads(kept))
+        if scene is None:
+            scene = describe_scene(
+                self.root, key, conventions=self.conventions, folder=folder, videos=videos
+            )
+            self.cache.keep("scenes", name, json.dumps(json_of(scene)).encode())
+        return scene
+
+    def outcome(self, key: str) -> Outcome:
+        """Return what becomes of a scene whose files are all read."""
+        if key not in self.described:
+            files = self.files[key]
+            has_mark = isinstance(files, StorageError) or not files or COMPLETE_JSON in files
+            try:
+                self.described[key] = Outcome(key, self.describe(key), has_mark=has_mark)
+            except StereoGenBenchError as error:
+                self.described[key] = Outcome(key, error, has_mark=has_mark)
+        return self.described[key]
 
     @property
     def has_one_shape(self) -> bool:
@@ -253,7 +271,7 @@ def presumed_report(tree: ListedTree, baselines: Baselines) -> TreeReport | None
         if isinstance(found, StereoGenBenchError):
             # A focal length in pixels may need the size of the videos.
             is_of_rig = isinstance(found, SchemaError)
-            outcomes[key] = tree.describe(key) if is_of_rig else Outcome(key, found)
+            outcomes[key] = tree.outcome(key) if is_of_rig else Outcome(key, found)
             if len(outcomes) == ALIKE and not groups:
                 return None
             continue
@@ -267,9 +285,7 @@ def presumed_report(tree: ListedTree, baselines: Baselines) -> TreeReport | None
             count = max(count, _LOOKED_AT // len(groups))
         places = np.unique(np.linspace(0, len(group) - 1, count).astype(int)).tolist()
         keys = [group[place].id.key for place in places]
-        looked_at = [*in_parallel(tree.describe, keys)] if tree.is_remote else [
-            tree.describe(key) for key in keys
-        ]  # fmt: skip
+        looked_at = [*in_parallel(tree.outcome, keys)]
         outcomes |= {outcome.key: outcome for outcome in looked_at}
         models = [outcome.found for outcome in looked_at if isinstance(outcome.found, Scene)]
         others = [each for each in group if each.id.key not in outcomes]
@@ -282,7 +298,7 @@ def presumed_report(tree: ListedTree, baselines: Baselines) -> TreeReport | None
             key = each.id.key
             has_mark = COMPLETE_JSON in each.files
             outcomes[key] = (
-                tree.describe(key) if scene is None else Outcome(key, scene, has_mark=has_mark)
+                tree.outcome(key) if scene is None else Outcome(key, scene, has_mark=has_mark)
             )
     in_order = [outcomes[key] for key in tree.folders.keys]
     return report_of(tree.root, tree.folders, in_order, is_part=tree.is_part)
@@ -495,22 +511,10 @@ class Presumption:
         return scene
 
     def _read(self, key: str, *, videos: frozenset[str] | None) -> Scene:
-        tree, part = self._tree, "" if videos is None else " ".join(sorted(videos))
         try:
-            folder = tree.folder(key)
-            stamp = stamp_of(folder.stamps())
-            kept, scene = tree.cache.read("scenes", f"{key} {part} {stamp}"), None
-            with suppress(ValueError, KeyError, TypeError, IndexError, AttributeError):
-                scene = None if kept is None else scene_of_json(json.loads(kept))
-            if scene is None:
-                scene = describe_scene(
-                    tree.root, key, conventions=tree.conventions, folder=folder, videos=videos
-                )
-                row = json.dumps(json_of(scene)).encode()
-                tree.cache.keep("scenes", f"{key} {part} {stamp}", row)
+            return self._tree.describe(key, videos)
         except StereoGenBenchError as error:
             raise StorageError(self._contradicted(key, [str(error)])) from error
-        return scene
 
     def _compared(self, presumed: Scene, scene: Scene) -> Scene:
         """Return a scene that is as presumed."""

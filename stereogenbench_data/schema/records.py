@@ -158,6 +158,10 @@ class Trajectory:
         return len(self.locations)
 
 
+def _is_length(value: object, *, least: float) -> bool:
+    return isinstance(value, int | float) and least <= value <= sys.float_info.max
+
+
 @dataclass(frozen=True, slots=True)
 class DepthEncoding:
     """The depth contract: how a number stored in a depth video becomes metres.
@@ -197,35 +201,28 @@ class DepthEncoding:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        unit_m: object = self.unit_m
-        is_number = isinstance(unit_m, int | float) and 0 < unit_m <= sys.float_info.max
-        if unit_m is not None and not is_number:
-            raise SchemaError(f"unit_m must be a positive number of metres, got {self.unit_m!r}.")
-        offset_m: object = self.offset_m
-        if not (isinstance(offset_m, int | float) and abs(offset_m) <= sys.float_info.max):
-            raise SchemaError(f"offset_m must be a number of metres, got {self.offset_m!r}.")
-        if offset_m != 0 and (unit_m is None or self.form != "depth"):
+        kinds, forms = get_args(DepthKind), get_args(DepthForm)
+        numbers = [number for number in self.no_depth if number != "max"]
+        unit_m, unknown = self.unit_m, set(self.accept) - set(get_args(DepthRisk))
+        for is_right, rule, value in (
+            (unit_m is None or _is_length(unit_m, least=sys.float_info.min),
+             "unit_m must be a positive number of metres", unit_m),
+            (_is_length(self.offset_m, least=-sys.float_info.max),
+             "offset_m must be a number of metres", self.offset_m),
+            (type(self.frame_lag) is int, "frame_lag must be a whole number", self.frame_lag),
+            (all(type(number) is int for number in numbers),
+             "no_depth must contain whole numbers", self.no_depth),
+            (self.kind in kinds, f"kind must be one of {kinds}", self.kind),
+            (self.form in forms, f"form must be one of {forms}", self.form),
+            (not unknown, f"accept may hold {get_args(DepthRisk)}", sorted(unknown)),
+        ):  # fmt: skip
+            if not is_right:
+                raise SchemaError(f"{rule}, got {value!r}.")
+        if self.offset_m != 0 and (unit_m is None or self.form != "depth"):
             raise SchemaError(
                 f"offset_m={self.offset_m!r} needs unit_m, the range over the stored numbers that "
                 f'it has, and form="depth".'
             )
-        for name, numbers in (
-            ("frame_lag", (self.frame_lag,)),
-            ("no_depth", [number for number in self.no_depth if number != "max"]),
-        ):
-            if not all(type(number) is int for number in numbers):
-                raise SchemaError(
-                    f"{name} must contain whole numbers, got {getattr(self, name)!r}."
-                )
-        for name, value, choices in (
-            ("kind", self.kind, ("planar", "ray")),
-            ("form", self.form, ("depth", "inverse")),
-        ):
-            if value not in choices:
-                raise SchemaError(f"{name} must be one of {choices}, got {value!r}.")
-        unknown = set(self.accept) - set(get_args(DepthRisk))
-        if unknown:
-            raise SchemaError(f"accept may hold {get_args(DepthRisk)}, got {sorted(unknown)}.")
 
     @property
     def known_unit_m(self) -> float:
