@@ -110,14 +110,13 @@ def survey(  # noqa: PLR0913 - each names one thing that a user chooses
         progress: Called with the number of scenes read and of all.
 
     Raises:
-        SelectionError: If no scene is wanted, or a number is below 1.
-        StorageError: If the tree holds no scenes, or none of those looked at is finished.
+        SelectionError: If a number is below 1.
+        StorageError: If the tree holds no scenes, none is wanted, or none of those looked at is
+            finished.
     """
     if scenes < 1 or pictured < 0:
         raise SelectionError(f"scenes must be at least 1, got {scenes}: ask for more.")
     keys = chosen_scenes(root, count=scenes, wanted=wanted)
-    if not keys:
-        raise SelectionError(f"{shown(root)}: no scene passes the filters. Check their spelling.")
     found = list[Examined]()
     # Reading takes less time than starting processes, unless each file is fetched.
     readers = workers if is_remote(root) or engine is not LOCAL else 1

@@ -16,12 +16,11 @@ import numpy as np
 
 from stereogenbench_data.errors import MediaError, SchemaError, StereoGenBenchError
 from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.index.build import find_scenes
 from stereogenbench_data.index.evidence import understood_poses
 from stereogenbench_data.index.scene_folder import IncompleteScene, describe_scene, keys_in
 from stereogenbench_data.index.tree import (
     SceneFolder,
-    find_remote_scenes,
-    find_scene_folders,
     folder_of,
 )
 from stereogenbench_data.media.container import StreamFacts
@@ -114,10 +113,9 @@ def chosen_scenes(
     Raises:
         StorageError: If there are no scenes.
     """
-    found = find_remote_scenes(str(root)) if is_remote(root) else find_scene_folders(root)
-    keys = [key for key in found.keys if wanted is None or wanted(parse_scene_key(key))]
+    found, _ = find_scenes(root, wanted=wanted)
     by_map: dict[str, list[str]] = {}
-    for key in keys:
+    for key in found.keys:
         by_map.setdefault(key.rpartition("/")[0], []).append(key)
     rounds = zip_longest(*by_map.values())
     spread = [key for each in rounds for key in each if key is not None]

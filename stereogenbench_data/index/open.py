@@ -16,7 +16,7 @@ import functools
 import gc
 import warnings
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -546,8 +546,6 @@ def assumptions(scenes: Iterable[Scene], *, where: str) -> str:
 
 
 _NAMED: Final = 3
-_MOST: Final = 1000
-"""The most new scenes that are counted: each one's own folder is listed."""
 
 
 class StaleIndexWarning(UserWarning):
@@ -565,52 +563,49 @@ def stale_message(table: pa.Table, head: IndexHead, *, index_file: Path) -> str:
         head: What is known besides them; its root is a folder of this machine.
         index_file: Where the index is.
     """
-    root = Path(head.root)
-    # Folders of scenes may have other names than the scenes' keys.
-    keys = table.column("key").to_pylist() if head.shards else _folders_of(table)
-    keys, listed = set(keys), PlacedFolders(root)
-    found = []
+    root, shards = Path(head.root), set(head.shards)
+    if shards:  # folders of scenes may have other names than the scenes' keys
+        keys = set(table.column("key").to_pylist())
+    else:
+        members = one_array(table.column("members"))
+        first = pc.struct_field(members.values, "path").take(members.offsets[:-1])
+        keys = {path.rpartition("/")[0] for path in first.to_pylist()}
+    listed = PlacedFolders(root)
+    new, tars, gone = set[str](), set[str](), {key for key in keys if not listed.may_hold(key)}
     if not head.is_part:
         left_out = head.broken.keys() | set(head.passed_over)
-        new = sorted(listed.keys - keys - (left_out - head.incomplete.keys()))
-        finished = [key for key in new[:_MOST] if _is_finished(root, key)]
-        if finished:
-            found.append(_describe(finished, "scene", "not in the index", is_more=len(new) > _MOST))
-    if head.shards:
-        shards, there = set(head.shards), set(_tars(root, head.shards))
-        if new_shards := sorted(there - shards):
-            found.append(_describe(new_shards, "shard", "not in the index"))
-        gone = sorted(path for path in shards - there if not (root / path).exists())
-        if 0 < len(gone) < len(shards):
-            found.append(_describe(gone, "shard", "of the index, and not there"))
+        new = listed.keys - keys - (left_out - head.incomplete.keys())
+    for folder in {path.rpartition("/")[0] for path in shards} | {""} if shards else ():
+        names = (path.name for path in (root / folder).glob("*.tar"))
+        tars |= {f"{folder}/{name}".lstrip("/") for name in names if name[0] != "."}
+    gone_shards = {path for path in shards - tars if not (root / path).exists()}
+    gone_scenes = set() if shards else gone - listed.keys
+    found = [
+        f"{counted(len(names), what)} {why} "
+        f"({', '.join(names[:_NAMED])}{', ...' if len(names) > _NAMED else ''})"
+        for names, what, why in (
+            ([key for key in sorted(new) if _is_finished(root, key)], "scene", "not in the index"),
+            (sorted(tars - shards), "shard", "not in the index"),
+            (sorted(gone_shards if gone_shards != shards else ()), "shard", _GONE),
+            (sorted(gone_scenes if gone_scenes != keys else ()), "scene", _GONE),
+        )
+        if names
+    ]
+    if not found:
+        return ""
+    place = "" if index_file.parent == root else f" --out {index_file}"
+    cure = f"Run `stereogenbench index {root}{place}`."
+    if shards:
         cure = (
             "Fetch the index that belongs to these shards, move away what is not of it, or pack "
             "all scenes into an empty folder."
         )
-    else:
-        gone = sorted(key for key in keys - listed.keys if not listed.may_hold(key))
-        if 0 < len(gone) < len(keys):
-            found.append(_describe(gone, "scene", "of the index, and not there"))
-        place = "" if index_file.parent == root else f" --out {index_file}"
-        cure = f"Run `stereogenbench index {root}{place}`."
-        if head.is_part:
-            cure = "It is of a part of the folder: make it again."
-    if not found:
-        return ""
+    elif head.is_part:
+        cure = "It is of a part of the folder: make it again."
     return f"{index_file}: is older than the folder {root}: {'; '.join(found)}. {cure}"
 
 
-def _describe(names: list[str], what: str, why: str, *, is_more: bool = False) -> str:
-    shown = ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
-    number = counted(len(names), what)
-    return f"{f'at least {number}' if is_more else number} {why} ({shown})"
-
-
-def _folders_of(table: pa.Table) -> list[str]:
-    """Return the folder of each scene's first file, below the root."""
-    members = one_array(table.column("members"))
-    first = pc.struct_field(members.values, "path").take(members.offsets[:-1])
-    return [path.rpartition("/")[0] for path in first.to_pylist()]
+_GONE: Final = "of the index, and not there"
 
 
 def _is_finished(root: Path, key: str) -> bool:
@@ -621,17 +616,3 @@ def _is_finished(root: Path, key: str) -> bool:
     except (SchemaError, OSError):
         return False
     return COMPLETE_JSON in names and not names.isdisjoint(VIDEO_FILES)
-
-
-def _tars(root: Path, shards: Collection[str]) -> Iterator[str]:
-    """Yield the paths of all tars in the folders that hold shards."""
-    for folder in {"", *(path.rpartition("/")[0] for path in shards)}:
-        try:
-            names = [path.name for path in (root / folder).iterdir()]
-        except OSError:
-            continue
-        yield from (
-            f"{folder}/{name}" if folder else name
-            for name in names
-            if name.endswith(".tar") and not name.startswith(".")
-        )
