@@ -130,19 +130,15 @@ def _feed(digest: "hashlib._Hash", values: Any) -> None:
         _feed(digest, values.flatten())
     elif pa.types.is_string(kind):
         lengths, texts = _stored_strings(values)
-        _feed_array(digest, lengths)
+        _feed_numbers(digest, lengths)
         digest.update(texts)
     else:
         _feed_numbers(digest, values)
 
 
 def _feed_numbers(digest: "hashlib._Hash", values: Any) -> None:
-    numbers = _stored_numbers(values)
-    if values.null_count:
+    numbers = values if isinstance(values, np.ndarray) else _stored_numbers(values)
+    if not isinstance(values, np.ndarray) and values.null_count:
         numbers = np.where(as_numpy(values.is_valid()), numbers, numbers.dtype.type(0))
-    _feed_array(digest, numbers)
-
-
-def _feed_array(digest: "hashlib._Hash", numbers: np.ndarray) -> None:
     stored = numbers.astype(numbers.dtype.newbyteorder("<"), order="C", copy=False)
     digest.update(stored.data)

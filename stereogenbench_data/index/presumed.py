@@ -419,6 +419,7 @@ class Presumption:
     """Describes scenes of which a table holds what is presumed, when they are needed.
 
     Attributes:
+        tree: The tree; of a folder of this machine without its files.
         was_told: Whether a scene that is odd, and can be used, was told in this process.
         is_remote: Whether the scenes are behind a URL.
         baselines: Whether each ``baseline.json`` was read.
@@ -432,22 +433,12 @@ class Presumption:
         self.is_remote = tree.is_remote
         self.baselines = baselines
         # On a disk files are listed anew when a scene is needed, so they need not be kept.
-        self._tree = tree if tree.is_remote else replace(tree, files={}, described={})
+        self.tree = tree if tree.is_remote else replace(tree, files={}, described={})
         self._agreed = agreed_forms(forms)
         self._ahead = FetchAhead()
         self._planned: dict[str, int] = {}
         self._count = 0
         self._described: OrderedDict[str, tuple[Scene, frozenset[str]]] = OrderedDict()
-
-    @property
-    def stamp(self) -> str:
-        """A digest of the listing."""
-        return self._tree.stamp
-
-    @property
-    def tree(self) -> ListedTree:
-        """The tree; of a folder of this machine without its files."""
-        return self._tree
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy in another process."""
@@ -512,7 +503,7 @@ class Presumption:
 
     def _read(self, key: str, *, videos: frozenset[str] | None) -> Scene:
         try:
-            return self._tree.describe(key, videos)
+            return self.tree.describe(key, videos)
         except StereoGenBenchError as error:
             raise StorageError(self._contradicted(key, [str(error)])) from error
 
@@ -529,27 +520,27 @@ class Presumption:
         """Return the captions of scenes; one that cannot be read is empty."""
 
         def caption(key: str) -> str:
-            folder, texts = self._tree.folder(key), dict[str, bytes]()
+            folder, texts = self.tree.folder(key), dict[str, bytes]()
             for name in DESCRIPTIONS:
                 with suppress(StereoGenBenchError):
                     texts[name] = folder.read(name)
             return caption_of(texts, key=key)[0]
 
-        return list(self._tree.of_each(caption, [*keys]))
+        return list(self.tree.of_each(caption, [*keys]))
 
     def cures(self) -> str:
         """Return what to do about a scene that is not as presumed."""
         away = "select other scenes" if self.is_remote else "move this scene's folder away"
         return (
             f"A folder without an index is opened by a few of its scenes, and length and order of "
-            f"an epoch rest on that. Run `stereogenbench index {shown(self._tree.root)}`, which "
+            f"an epoch rest on that. Run `stereogenbench index {shown(self.tree.root)}`, which "
             f"reads all scenes and tells such ones beforehand, or {away}."
         )
 
     def _contradicted(self, key: str, found: list[str]) -> str:
         told = shortened("; ".join(found), _LONGEST_TOLD)
         return (
-            f"{shown(self._tree.root)}: {key} is not as was presumed of it: {told}. {self.cures()}"
+            f"{shown(self.tree.root)}: {key} is not as was presumed of it: {told}. {self.cures()}"
         )
 
 

@@ -370,7 +370,7 @@ class SceneIndex:
             presumption = self.presumption
             if presumption is not None and presumption.is_remote:
                 # Its rows change once baselines are read.
-                self._digest = presumption.stamp
+                self._digest = presumption.tree.stamp
             else:
                 self._digest = table_digest(self._table)
         return self._digest

@@ -312,15 +312,10 @@ def value_at(document: Any, path: str) -> Any:
     node, at = document, 1
     while at < len(path):
         step = _STEP.match(path, at)
-        if step is None:
+        plain, number, quoted = step.groups() if step else (None, None, None)
+        if step is None or not isinstance(node, list if number else dict):
             raise LookupError(path)
-        plain, number, quoted = step.groups()
-        if isinstance(node, dict) and not number:
-            node = node[json.loads(quoted) if quoted else plain]
-        elif isinstance(node, list) and number:
-            node = node[int(number)]
-        else:
-            raise LookupError(path)
+        node = node[int(number) if number else json.loads(quoted) if quoted else plain]
         at = step.end()
     return node
 
