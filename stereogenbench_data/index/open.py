@@ -571,7 +571,7 @@ def stale_message(table: pa.Table, head: IndexHead, *, index_file: Path) -> str:
         first = pc.struct_field(members.values, "path").take(members.offsets[:-1])
         keys = {path.rpartition("/")[0] for path in first.to_pylist()}
     listed = PlacedFolders(root)
-    new, tars, gone = set[str](), set[str](), {key for key in keys if not listed.may_hold(key)}
+    new, tars, gone_scenes = set[str](), set[str](), set[str]()
     if not head.is_part:
         left_out = head.broken.keys() | set(head.passed_over)
         new = listed.keys - keys - (left_out - head.incomplete.keys())
@@ -579,7 +579,8 @@ def stale_message(table: pa.Table, head: IndexHead, *, index_file: Path) -> str:
         names = (path.name for path in (root / folder).glob("*.tar"))
         tars |= {f"{folder}/{name}".lstrip("/") for name in names if name[0] != "."}
     gone_shards = {path for path in shards - tars if not (root / path).exists()}
-    gone_scenes = set() if shards else gone - listed.keys
+    if not shards:
+        gone_scenes = {key for key in keys - listed.keys if not listed.may_hold(key)}
     found = [
         f"{counted(len(names), what)} {why} "
         f"({', '.join(names[:_NAMED])}{', ...' if len(names) > _NAMED else ''})"
