@@ -315,7 +315,8 @@ def value_at(document: Any, path: str) -> Any:
         plain, number, quoted = step.groups() if step else (None, None, None)
         if step is None or not isinstance(node, list if number else dict):
             raise LookupError(path)
-        node = node[int(number) if number else json.loads(quoted) if quoted else plain]
+        key: Any = int(number) if number else json.loads(quoted) if quoted else plain
+        node = node[key]
         at = step.end()
     return node
 
