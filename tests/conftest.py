@@ -19,6 +19,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.index.tree import CACHE_VARIABLE
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
+from tests.servers.tools import made_once
 
 pytest_plugins = ("tests.servers.fixtures", "tests.servers.scene_fixtures")
 
@@ -106,31 +107,34 @@ def small_release(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     Of those seeds each family has a scene with sky, whose depth is not measured.
     """
-    root = tmp_path_factory.mktemp("release")
-    for request in (
-        SynthRequest(family="IPD_Gaussian", scenes=1, size_px=64, frames=7, seed=2),
-        SynthRequest(family="Uniform", scenes=2, size_px=64, frames=7, seed=13),
-        SynthRequest(
-            family="Uniform", scenes=1, size_px=64, frames=7, seed=6, split="eval",
-            subset="seen_map",
-        ),
-    ):  # fmt: skip
-        synthesise(root, request, workers=1)
-    return root
+
+    def make(root: Path) -> None:
+        for request in (
+            SynthRequest(family="IPD_Gaussian", scenes=1, size_px=64, frames=7, seed=2),
+            SynthRequest(family="Uniform", scenes=2, size_px=64, frames=7, seed=13),
+            SynthRequest(
+                family="Uniform", scenes=1, size_px=64, frames=7, seed=6, split="eval",
+                subset="seen_map",
+            ),
+        ):  # fmt: skip
+            synthesise(root, request, workers=1)
+
+    return made_once(tmp_path_factory, "small_release", make)
 
 
 @pytest.fixture(scope="session")
 def indexed_release(small_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same tree with an index, which opens at once, for tests that only read it."""
-    root = tmp_path_factory.mktemp("indexed")
-    shutil.copytree(small_release, root, dirs_exist_ok=True, copy_function=os.link)
-    SceneIndex.open(root).write(root / INDEX_NAME)
-    return root
+
+    def make(root: Path) -> None:
+        shutil.copytree(small_release, root, copy_function=os.link)
+        SceneIndex.open(root).write(root / INDEX_NAME)
+
+    return made_once(tmp_path_factory, "indexed_release", make)
 
 
 @pytest.fixture(scope="session")
 def detailed_release(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tree with one scene of 160 x 160 pixels, large enough for textures to warp well."""
-    root = tmp_path_factory.mktemp("detailed")
-    synthesise(root, SynthRequest(family="IPD_Gaussian", scenes=1, size_px=160, frames=2, seed=6))
-    return root
+    request = SynthRequest(family="IPD_Gaussian", scenes=1, size_px=160, frames=2, seed=6)
+    return made_once(tmp_path_factory, "detailed_release", lambda root: synthesise(root, request))

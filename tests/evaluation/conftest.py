@@ -13,6 +13,7 @@ from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
+from tests.servers.tools import made_once
 
 FRAMES = 4
 SIZE = (48, 64)
@@ -21,17 +22,19 @@ SIZE = (48, 64)
 @pytest.fixture(scope="session")
 def scored_index(tmp_path_factory) -> SceneIndex:
     """Three scenes of eval, two families and both subsets, 64 px and 4 frames."""
-    root = tmp_path_factory.mktemp("scored")
-    for family, scenes, subset in (
-        ("Uniform", 2, "seen_map"),
-        ("IPD_Gaussian", 1, "unseen_map"),
-    ):
-        request = SynthRequest(
-            family=family, scenes=scenes, size_px=64, frames=FRAMES, seed=7, split="eval",
-            subset=subset, map_name="SynthYard" if subset == "unseen_map" else "SynthStage",
-        )  # fmt: skip
-        synthesise(root, request, workers=1)
-    return SceneIndex.open(root)
+
+    def make(root: Path) -> None:
+        for family, scenes, subset in (
+            ("Uniform", 2, "seen_map"),
+            ("IPD_Gaussian", 1, "unseen_map"),
+        ):
+            request = SynthRequest(
+                family=family, scenes=scenes, size_px=64, frames=FRAMES, seed=7, split="eval",
+                subset=subset, map_name="SynthYard" if subset == "unseen_map" else "SynthStage",
+            )  # fmt: skip
+            synthesise(root, request, workers=1)
+
+    return SceneIndex.open(made_once(tmp_path_factory, "scored_scenes", make))
 
 
 @pytest.fixture
@@ -81,10 +84,14 @@ def photograph(path: Path) -> np.ndarray:
 @pytest.fixture(scope="session")
 def right_views(scored_index, tmp_path_factory) -> Path:
     """The rendered right views of all scenes as predictions; not to be changed."""
-    return write_pngs(tmp_path_factory.mktemp("right_views"), scored_index)
+    return made_once(
+        tmp_path_factory, "right_views", lambda folder: write_pngs(folder, scored_index)
+    )
 
 
 @pytest.fixture(scope="session")
 def other_views(scored_index, tmp_path_factory) -> Path:
     """The views of camera 2 as predictions of camera 1; not to be changed."""
-    return write_pngs(tmp_path_factory.mktemp("other_views"), scored_index, camera=2)
+    return made_once(
+        tmp_path_factory, "other_views", lambda folder: write_pngs(folder, scored_index, camera=2)
+    )

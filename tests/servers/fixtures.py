@@ -14,7 +14,7 @@ from stereogenbench_data.shards.pack import pack
 from tests.servers.failing_server import FailingServer, serving
 from tests.servers.hub import hub_serving
 from tests.servers.nginx import Nginx, nginx_serving
-from tests.servers.tools import require_module, require_tool
+from tests.servers.tools import made_once, require_module, require_tool
 
 BUCKET = "some-bucket"
 NOISE_PX = 320
@@ -23,24 +23,26 @@ NOISE_PX = 320
 @pytest.fixture(scope="session")
 def small_shards(small_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The scenes of `small_release` in shards."""
-    out = tmp_path_factory.mktemp("packed") / "shards"
-    pack(small_release, out, workers=1)
-    return out
+    return made_once(
+        tmp_path_factory, "small_shards", lambda out: pack(small_release, out, workers=1)
+    )
 
 
 @pytest.fixture(scope="session")
 def large_release(small_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One scene whose videos are noise: far larger than what is fetched at once."""
-    root = tmp_path_factory.mktemp("large")
     key = "train/Uniform/SynthStage/scene_000000"
-    folder = Path(shutil.copytree(small_release / key, root / key))
-    rig = folder / "baseline.json"
-    document = json.loads(rig.read_text())
-    rig.write_text(json.dumps(document | {"image_width": NOISE_PX, "image_height": NOISE_PX}))
-    noise = np.random.default_rng(0)
-    for path in (*folder.glob("*.mp4"), *folder.glob("*.mkv")):
-        _write_noise(path, noise)
-    return root
+
+    def make(root: Path) -> None:
+        folder = Path(shutil.copytree(small_release / key, root / key))
+        rig = folder / "baseline.json"
+        document = json.loads(rig.read_text())
+        rig.write_text(json.dumps(document | {"image_width": NOISE_PX, "image_height": NOISE_PX}))
+        noise = np.random.default_rng(0)
+        for path in (*folder.glob("*.mp4"), *folder.glob("*.mkv")):
+            _write_noise(path, noise)
+
+    return made_once(tmp_path_factory, "large_release", make)
 
 
 def _write_noise(path: Path, noise: np.random.Generator) -> None:
@@ -65,9 +67,9 @@ def _write_noise(path: Path, noise: np.random.Generator) -> None:
 @pytest.fixture(scope="session")
 def large_shards(large_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The scene of `large_release` in a shard."""
-    out = tmp_path_factory.mktemp("packed_large") / "shards"
-    pack(large_release, out, workers=1)
-    return out
+    return made_once(
+        tmp_path_factory, "large_shards", lambda out: pack(large_release, out, workers=1)
+    )
 
 
 @pytest.fixture
