@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypedDict, TypeVar
 
 import av
 
@@ -181,15 +181,27 @@ def read_item(path: Path) -> dict[str, Any] | None:
     return None
 
 
+class WorkOptions(TypedDict, total=False):
+    """How the items of a job are done; the result does not depend on it.
+
+    Attributes:
+        workers: How many processes, None for one a core.
+        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
+        progress: Called with how much is done by now, and how much there is.
+    """
+
+    workers: int | None
+    engine: Engine
+    progress: Progress | None
+
+
 def do_items(  # noqa: PLR0913 - what to do, how, and what is told of it
     task: Callable[[Work, Advance], Result],
     works: Sequence[Work],
     *,
     name: Callable[[Work], str],
     keep: Callable[[Result], object] = lambda result: None,
-    engine: Engine = LOCAL,
-    workers: int | None = None,
-    progress: Progress | None = None,
+    options: WorkOptions,
     done: int = 0,
     total: int,
 ) -> None:
@@ -200,14 +212,13 @@ def do_items(  # noqa: PLR0913 - what to do, how, and what is told of it
         works: What is still to be done; it can be pickled.
         name: Returns what errors call an item.
         keep: Called in this process with each result as it comes.
-        engine: Where the items are done.
-        workers: How many processes, None for one a core.
-        progress: Called with (done, total).
+        options: How they are done.
         done: How much was there before.
         total: How much there is in all.
     """
-    advance = advance_of(progress, done=done, total=total)
+    advance = advance_of(options.get("progress"), done=done, total=total)
     advance(0)
+    engine, workers = options.get("engine", LOCAL), options.get("workers")
     made = engine.map(task, works, name=name, workers=workers, advance=advance)
     with closing(made) as results:
         for result in results:

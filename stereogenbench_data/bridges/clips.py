@@ -26,10 +26,17 @@ import numpy as np
 from stereogenbench_data.bridges.exports import scene_filters, training_selection
 from stereogenbench_data.bridges.generation import Captions, describe_pair
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
-from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
+from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, SelectionError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.jobs import do_items, job_folder, json_bytes, named_errors, read_json
+from stereogenbench_data.jobs import (
+    WorkOptions,
+    do_items,
+    job_folder,
+    json_bytes,
+    named_errors,
+    read_json,
+)
 from stereogenbench_data.media.encoder import Encoding, VideoEncoder
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.load import SampleLoader
@@ -168,7 +175,7 @@ LAYOUTS: Final[Mapping[LayoutName, ClipLayout]] = {
     "stereocrafter": ClipLayout(lambda root, clips: {}, kinds=("grid", "right"), frames_step=1),
 }
 
-_FORMAT: Final = 2
+_FORMAT: Final = 3
 _CLIPS_JSONL: Final = "clips.jsonl"
 _CLIPS: Final = "clips"
 
@@ -182,37 +189,30 @@ _FIELDS: Final[Mapping[Kind, tuple[str, ...]]] = {
 _FACTS: Final = ("scene", "split", "pair", "caption", "baseline_m", "frame_rate_hz")
 
 
-class ClipOptions(SceneFilters, PairOptions, total=False):
+class ClipOptions(WorkOptions, SceneFilters, PairOptions, total=False):
     """What a clip is, which pairs of which scenes clips are made of, and how they are written.
+
+    Progress is in frames.
 
     Attributes:
         length: Its frames; the longest that every scene has and the layout takes unless given.
         stride: Every so many frames of the video is one of the clip.
         step: Frames of the video from one clip's first to the next one's; no overlap unless given.
         size: (height, width) in pixels, or a text "WIDTHxHEIGHT"; None for the stored size.
-        rate_hz: The rate that the files state; the video's own, divided by the stride, unless
-            given. No frame is dropped or repeated for it.
         captions: "plain", or "with baseline" for captions that tell it.
         encoding: How videos are encoded; masks are lossless in any case.
         seed: That of a balanced subsample.
         depth: A depth contract instead of the one that files and release state.
-        workers: How many processes write, None for one a core.
-        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
-        progress: Called with (frames written, frames in all).
     """
 
     length: int | None
     stride: int
     step: int | None
     size: tuple[int, int] | str | None
-    rate_hz: float | None
     captions: Captions
     encoding: Encoding
     seed: int
     depth: DepthEncoding | None
-    workers: int | None
-    engine: Engine
-    progress: Progress | None
 
 
 class ClipReport(NamedTuple):
@@ -283,7 +283,6 @@ def export_clips(
         "layout": layout,
         "frames": chosen["frames"],
         "size": pairs.request.size,
-        "rate_hz": options.get("rate_hz"),
         "captions": options.get("captions", "plain"),
         "encoding": asdict(encoding),
         "depth": repr(options.get("depth")),
@@ -310,9 +309,7 @@ def export_clips(
             _write_clip,
             due,
             name=lambda work: work.name,
-            workers=options.get("workers"),
-            engine=options.get("engine", LOCAL),
-            progress=options.get("progress"),
+            options=options,
             done=total - still,
             total=total,
         )
@@ -361,12 +358,10 @@ def _facts(sample: Sample, frames: tuple[int, ...], options: ClipOptions) -> dic
     baseline_m = float(sample["baseline_m"])
     if options.get("captions") == "with baseline":
         caption = describe_pair(caption, baseline_m=baseline_m)
-    asked_hz = options.get("rate_hz")
-    rate_hz = float(sample["frame_rate_hz"] if asked_hz is None else asked_hz)
+    rate_hz = float(sample["frame_rate_hz"])
     if not 0 < rate_hz < math.inf:
         raise MediaError(
-            f"{sample['scene']}: the clip's rate is {rate_hz:g} frames a second: give rate_hz "
-            "above 0."
+            f"{sample['scene']}: its videos state {rate_hz:g} frames a second: leave it out."
         )
     return {
         "scene": sample["scene"],

@@ -32,10 +32,10 @@ from stereogenbench_data.bridges.multiview import (
     posed_images,
 )
 from stereogenbench_data.datasets.mapped import Data, SceneViews
-from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
+from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.jobs import atomic_folder, do_items, job_folder, named_errors
+from stereogenbench_data.jobs import WorkOptions, atomic_folder, do_items, job_folder, named_errors
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.records import DepthEncoding
@@ -306,8 +306,8 @@ USUAL_POINTS: Final[dict[str, int]] = {"colmap": 5_000, "transforms": 5_000, "pl
 """How many points are taken from each picture, unless another number is asked for."""
 
 
-class ViewExportOptions(SceneFilters, total=False):
-    """Which scenes and views are exported, and how.
+class ViewExportOptions(WorkOptions, SceneFilters, total=False):
+    """Which scenes and views are exported, and how; progress is in pictures.
 
     Attributes:
         cameras: Numbers of cameras, or "all" (the default).
@@ -316,9 +316,6 @@ class ViewExportOptions(SceneFilters, total=False):
         points: How many points are taken from each picture, "all" for every measured pixel; None
             for `USUAL_POINTS`.
         depth: A depth contract instead of the one that files and release state.
-        workers: How many processes, None for one a core.
-        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
-        progress: Called with (pictures done, pictures in all).
     """
 
     cameras: Sequence[int] | Literal["all"]
@@ -326,9 +323,6 @@ class ViewExportOptions(SceneFilters, total=False):
     size: tuple[int, int] | str | None
     points: int | Literal["all"] | None
     depth: DepthEncoding | None
-    workers: int | None
-    engine: Engine
-    progress: Progress | None
 
 
 def export_views(
@@ -405,9 +399,7 @@ def export_views(
             _export_scene,
             works,
             name=lambda work: str(work.index.column("key")[0]),
-            workers=options.get("workers"),
-            engine=options.get("engine", LOCAL),
-            progress=options.get("progress"),
+            options=options,
             done=len(cameras) * (len(folders) - sum(len(work.addresses) for work in works)),
             total=len(cameras) * len(folders),
         )

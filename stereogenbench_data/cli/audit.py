@@ -15,7 +15,6 @@ from stereogenbench_data.cli.options import (
     OutOption,
     SceneOptions,
     WorkOptions,
-    complete_from,
     grouped,
 )
 from stereogenbench_data.cli.progress import progress_bar
@@ -25,12 +24,6 @@ if TYPE_CHECKING:
     from stereogenbench_data.audit.geometry.audit import AuditRequest
 
 _ALL = "all"
-
-
-def _complete_limit(incomplete: str) -> list[str]:
-    from stereogenbench_data.audit.geometry.checks import LIMITS
-
-    return complete_from(f"{name}=" for name in LIMITS)(incomplete)
 
 
 @grouped
@@ -49,7 +42,6 @@ def audit(  # noqa: PLR0913 - one parameter an option
         typer.Option(
             metavar="NAME=NUMBER",
             help="Such as baseline_cm=0.01. May be repeated.",
-            autocompletion=_complete_limit,
         ),
     ] = None,
     out: OutOption = None,

@@ -1,6 +1,5 @@
 """``stereogenbench download``: copy the part of a release that a selection needs to this disk."""
 
-import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -9,7 +8,6 @@ import typer
 from stereogenbench_data.cli.options import (
     CamerasOption,
     DataOptions,
-    JsonOption,
     SceneOptions,
     ShareOptions,
     flag,
@@ -33,7 +31,6 @@ def download(  # noqa: PLR0913 - one parameter an option
     share: ShareOptions,
     workers: Annotated[int, typer.Option(min=1, help="Files to fetch at a time.")] = 8,
     dry_run: Annotated[bool, flag("--dry-run", "Print the size and fetch nothing.")] = False,
-    as_json: JsonOption = False,
 ) -> None:
     """Fetch only what a selection needs, in the released layout.
 
@@ -63,8 +60,4 @@ def download(  # noqa: PLR0913 - one parameter an option
     if not dry_run:
         with progress_bar("downloading", unit="MB") as progress:
             fetched(index, wanted, out, workers=workers, progress=progress)
-    if as_json:
-        summary = {"scenes": len(rows), "files": len(wanted.files), "bytes": wanted.size_bytes}
-        typer.echo(json.dumps(summary | {"out": None if dry_run else str(out)}, indent=2))
-    elif not dry_run:
         typer.echo(f"{out}: {scenes}, {size:,.1f} MB")

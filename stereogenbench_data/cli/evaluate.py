@@ -7,19 +7,18 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import (
-    SCENES,
     DataOptions,
     JsonOption,
     OutArgument,
     SampleOptions,
+    SplitOption,
     WorkOptions,
-    complete_from,
     grouped,
     size_of,
 )
@@ -31,17 +30,6 @@ if TYPE_CHECKING:
     from stereogenbench_data.evaluation.aggregate import Scores
     from stereogenbench_data.evaluation.protocol import EvaluationProtocol
     from stereogenbench_data.evaluation.tables import Table
-
-
-def _stratum_of(text: str) -> tuple[str, tuple[float, ...]]:
-    """Return the column of ``--by`` with its edges."""
-    column, _, edges = text.partition(":")
-    try:
-        return column, tuple(float(edge) for edge in edges.split(",")) if edges else ()
-    except ValueError:
-        raise typer.BadParameter(
-            f"{text!r}: the edges {edges!r} are not numbers such as 18,35."
-        ) from None
 
 
 _METRICS = "How metrics are computed"
@@ -65,15 +53,7 @@ PAPER_SIZE = "832x480"
 class ScoredOptions(SampleOptions):
     """Which samples are scored: those of the eval split by default."""
 
-    split: Annotated[
-        str,
-        typer.Option(
-            metavar="train|eval|all",
-            help="The split.",
-            autocompletion=complete_from(("train", "eval", "all")),
-            rich_help_panel=SCENES,
-        ),
-    ] = "eval"
+    split: SplitOption = "eval"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,14 +135,7 @@ class ReportOptions:
     ] = None
     as_json: JsonOption = False
 
-    def write(
-        self,
-        folder: Path,
-        results: "Sequence[Scores]",
-        tables: "Sequence[Table]",
-        *,
-        plots: Literal["write", "skip"] = "write",
-    ) -> None:
+    def write(self, folder: Path, results: "Sequence[Scores]", tables: "Sequence[Table]") -> None:
         """Print the report as a page or as JSON, write its files, and compare it.
 
         Raises:
@@ -184,7 +157,7 @@ class ReportOptions:
             typer.echo(json.dumps(content, allow_nan=False))
         else:
             typer.echo(page(results, tables).rstrip())
-        files = write_report(folder, results, tables, plots=plots)
+        files = write_report(folder, results, tables)
         names = ", ".join(str(path.relative_to(folder)) for path in files)
         typer.echo(f"{folder}: {names}", err=True)
         if there is None:
@@ -247,14 +220,6 @@ def score(  # noqa: PLR0913 - one parameter an option
     ] = None,
     chosen: ScoredOptions,
     scoring: ProtocolOptions,
-    by: Annotated[
-        list[Any] | None,
-        typer.Option(
-            parser=_stratum_of,
-            metavar="COLUMN[:EDGES]",
-            help="Also score by map_name or focal_mm:18,35,85. May be repeated.",
-        ),
-    ] = None,
     allow_missing: Annotated[
         int,
         typer.Option(min=0, help="Most pairs without a usable right view."),
@@ -265,8 +230,8 @@ def score(  # noqa: PLR0913 - one parameter an option
     """Score a method's right views by the paper's protocol.
 
     `stereogenbench eval inputs` writes what the method is given. PREDICTIONS holds, for each
-    item, a folder of PNGs or a video of the same name. The report (Markdown, JSON, CSV, plots)
-    and partial results go to --out [evaluation/NAME-TIER]. To continue a stopped run, run it
+    item, a folder of PNGs or a video of the same name. The report (Markdown, LaTeX, JSON, CSV,
+    plots) and partial results go to --out [evaluation/NAME-TIER]. To continue a stopped run, run it
     again.
 
     Example: `stereogenbench eval score shards/ predictions/ --tier G1`
@@ -275,12 +240,9 @@ def score(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.evaluation.tables import tables_of
 
     protocol, selection = scoring.protocol(), chosen.selection()
-    strata: dict[str, tuple[float, ...]] = dict(by or ())
     called = name or predictions.resolve().name
     folder = report.out or Path("evaluation") / f"{called}-{tier}"
     index = source.open()
-    for column in strata:
-        index.column(column)  # refuses an unknown one before the work
     with progress_bar("scoring", unit="frames") as progress:
         scores = evaluate(
             index,
@@ -294,7 +256,7 @@ def score(  # noqa: PLR0913 - one parameter an option
             progress=progress,
             **selection,
         )
-    report.write(folder, [scores], tables_of([scores], by=strata))
+    report.write(folder, [scores], tables_of([scores]))
 
 
 @grouped
@@ -330,4 +292,4 @@ def controls(
             **selection,
         )
     tables = [table_of(results, name) for name in ("controls", "branches", "explanations")]
-    report.write(folder, results, tables, plots="skip")
+    report.write(folder, results, tables)

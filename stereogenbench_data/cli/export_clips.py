@@ -1,6 +1,5 @@
 """``stereogenbench export clips``: stereo video for the trainers of video models."""
 
-import json
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -8,7 +7,6 @@ import typer
 
 from stereogenbench_data.cli.options import (
     DataOptions,
-    JsonOption,
     OutArgument,
     PairsOption,
     SceneOptions,
@@ -40,36 +38,23 @@ class ClipOptions:
         int | None, typer.Option(help="Start a clip every so many frames [no overlap].")
     ] = None
     size: SizeOption = None
-    rate_hz: Annotated[
-        float | None,
-        typer.Option(help="Frames a second that files state [the video's, by the stride]."),
-    ] = None
     baseline_in_caption: Annotated[
         bool, flag("--baseline-in-caption", "Tell the baseline in the captions.")
     ] = False
-    crf: Annotated[int, typer.Option(help="Constant rate factor, 0 to 51; fewer is better.")] = 12
 
     def form(self) -> dict[str, Any]:
-        """Return what a clip is.
-
-        Raises:
-            MediaError: If the rate factor is out of range.
-        """
-        from stereogenbench_data.media.encoder import Encoding
-
+        """Return what a clip is."""
         return {
             "length": self.length,
             "stride": self.stride,
             "step": self.step,
             "size": self.size,
-            "rate_hz": self.rate_hz,
             "captions": "with baseline" if self.baseline_in_caption else "plain",
-            "encoding": Encoding(crf=self.crf),
         }
 
 
 @grouped
-def clips(  # noqa: PLR0913 - one parameter an option
+def clips(
     source: DataOptions,
     out: OutArgument,
     *,
@@ -80,7 +65,6 @@ def clips(  # noqa: PLR0913 - one parameter an option
     chosen: ExportedPairOptions,
     clip: ClipOptions,
     work: WorkOptions,
-    as_json: JsonOption = False,
 ) -> None:
     """Write stereo clips with captions and manifest for video trainers.
 
@@ -110,9 +94,5 @@ def clips(  # noqa: PLR0913 - one parameter an option
     if report.without_caption:
         typer.echo(f"{counted(report.without_caption, 'clip')} without a caption", err=True)
     names = [path.name for path in report.manifests]
-    if as_json:
-        clips_of = {"written": list(report.written), "kept": list(report.kept)}
-        typer.echo(json.dumps({"out": str(out), "manifests": names} | clips_of, indent=2))
-        return
     clips_now = counted(len(report.written), "clip")
     typer.echo(f"{out}: {clips_now} written, {len(report.kept)} kept; {', '.join(names)}")

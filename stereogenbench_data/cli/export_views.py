@@ -6,14 +6,13 @@ from typing import Annotated, Any
 import typer
 
 from stereogenbench_data.cli.options import (
-    SCENES,
     CamerasOption,
     DataOptions,
+    FramesOption,
     OutArgument,
     SceneOptions,
     SizeOption,
     WorkOptions,
-    frames_of,
     grouped,
 )
 from stereogenbench_data.cli.progress import progress_bar
@@ -32,15 +31,7 @@ class ViewOptions(SceneOptions):
     """Which views of which scenes are exported: of the train split unless another is named."""
 
     cameras: CamerasOption = None
-    frames: Annotated[
-        Any,
-        typer.Option(
-            parser=frames_of,
-            metavar="FRAMES",
-            help="all, first, every:K, or such as 0,40,80.",
-            rich_help_panel=SCENES,
-        ),
-    ] = "first"
+    frames: FramesOption = "first"
     size: SizeOption = None
 
     def selection(self) -> dict[str, Any]:

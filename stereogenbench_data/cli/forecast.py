@@ -29,13 +29,6 @@ def _trained_frames(text: str) -> Any:
     return (kind, int(number)) if is_drawn else frames_of(text)
 
 
-def _numbers_of(text: str) -> tuple[int, ...]:
-    """Return numbers of accelerators."""
-    if not all(part.isdecimal() and int(part) > 0 for part in text.split(",")):
-        raise typer.BadParameter(f"{text!r}: write numbers from 1, such as 1,8,64.")
-    return tuple(map(int, text.split(",")))
-
-
 @dataclass(frozen=True, kw_only=True)
 class TrainedOptions(SampleOptions):
     """Which samples of which scenes are trained on."""
@@ -56,9 +49,6 @@ class MachineOptions:
     """What trains, and where the data will be."""
 
     samples_s: Annotated[float, _of("Samples a second that an accelerator takes.", min=0.001)]
-    accelerators: Annotated[Any, _of("How many, in all.", parser=_numbers_of, metavar="N,N")] = (
-        "1,8,64,512,1000,10000"
-    )
     per_machine: Annotated[int, _of("Accelerators of a machine.", min=1)] = 8
     cores: Annotated[int | None, _of("Cores of a machine [as here].", min=1)] = None
     delay_ms: Annotated[float | None, _of("Until the first byte [of a URL: measured].", min=0)] = (

@@ -21,7 +21,7 @@ from stereogenbench_data.cli.options import (
     grouped,
 )
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.writing import require_writable, writing
+from stereogenbench_data.cli.writing import writing
 from stereogenbench_data.schema.text import counted, plain_line
 
 _INDEX_NAME = "index.parquet"
@@ -73,8 +73,6 @@ def index(  # noqa: PLR0913 - one parameter an option
             f"{target} is not a regular file: name one, such as {target / _INDEX_NAME}.",
             param_hint="--out",
         )
-    if out is None and target.parent.is_dir():
-        require_writable(target, "file")
     recorded_root(root, beside=target.parent)  # Refuses a root before hours of work.
     stated = None if conventions is None else Conventions.read(conventions)
     how = f"valid_depth={mode} {'' if stated is None else [each.text() for each in stated.shapes]}"

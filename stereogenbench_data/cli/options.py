@@ -5,7 +5,7 @@ shows typer the fields in its place.
 """
 
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from functools import wraps
 from pathlib import Path
@@ -28,16 +28,6 @@ _RANGES: Final = ("focal_mm", "valid_depth_ratio", "baseline_cm")
 """Filters of ``--where`` that take two numbers."""
 _OF_PATH: Final = ("split", "family", "map", "scenes")
 """Filters that the path of a scene answers."""
-_FILTERS: Final = (
-    "scene",
-    "family",
-    "map",
-    "subset",
-    "caption",
-    "min_frames",
-    "character",
-    "animation",
-)
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
@@ -77,38 +67,6 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 def flag(name: str, text: str) -> Any:
     """Return an option that takes no value; newer typer shows the type ``<bool>`` for such."""
     return typer.Option(name, help=text, metavar="")
-
-
-def complete_from(values: Iterable[str]) -> Callable[[str], list[str]]:
-    """Return a function for shell completion that lists the values with the typed beginning."""
-    known = sorted(values)
-    return lambda incomplete: [
-        value for value in known if value.lower().startswith(incomplete.lower())
-    ]
-
-
-def complete_scene(context: typer.Context, incomplete: str) -> list[str]:
-    """Return the keys of scenes with the typed beginning, if DATA has an index."""
-    from stereogenbench_data.errors import StereoGenBenchError
-    from stereogenbench_data.index.parquet import INDEX_NAME
-    from stereogenbench_data.index.table import SceneIndex
-
-    # While an option lacks its value, typer has parsed the arguments but not assigned them.
-    data = Path(str(context.params.get("data") or next(iter(context.args), "")))
-    if not (data.is_file() or (data / INDEX_NAME).is_file()):
-        return []
-    try:
-        keys = SceneIndex.open(data).column("key")
-    except StereoGenBenchError:
-        return []
-    return complete_from(map(str, keys))(incomplete)
-
-
-def _complete_where(context: typer.Context, incomplete: str) -> list[str]:
-    name, equals, value = incomplete.partition("=")
-    if name == "scene" and equals:
-        return [f"scene={key}" for key in complete_scene(context, value)]
-    return complete_from(f"{name}=" for name in (*_FILTERS, *_RANGES))(incomplete)
 
 
 def out_folder(text: str) -> Path:
@@ -208,6 +166,23 @@ SizeOption = Annotated[
         "--size", parser=size_of, metavar="WxH", help="Width x height, such as 832x480 [as stored]."
     ),
 ]
+SplitOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="train|eval|all",
+        help="The split [all; to export: train].",
+        rich_help_panel=SCENES,
+    ),
+]
+FramesOption = Annotated[
+    Any,
+    typer.Option(
+        parser=frames_of,
+        metavar="FRAMES",
+        help="all, first, every:K, or such as 0,40,80.",
+        rich_help_panel=SCENES,
+    ),
+]
 CamerasOption = Annotated[
     Any,
     typer.Option(
@@ -250,7 +225,6 @@ class DataOptions:
         typer.Option(
             metavar="LOSS",
             help="Accept depth that is 8-bit ... 14-bit, lossy, chroma.",
-            autocompletion=complete_from(("8-bit", "10-bit", "12-bit", "lossy", "chroma")),
         ),
     ] = None
 
@@ -280,15 +254,7 @@ class DataOptions:
 class SceneOptions:
     """Which scenes of the data a command takes."""
 
-    split: Annotated[
-        str | None,
-        typer.Option(
-            metavar="train|eval",
-            help="The split [both].",
-            autocompletion=complete_from(("train", "eval")),
-            rich_help_panel=SCENES,
-        ),
-    ] = None
+    split: SplitOption = None
     where: Annotated[
         list[Any] | None,
         typer.Option(
@@ -296,7 +262,6 @@ class SceneOptions:
             metavar="NAME=VALUE",
             help="Such as scene=KEY (or a part of it), family=Uniform, map=Stylized_Egypt, "
             "subset=unseen_map, focal_mm=18:35, min_frames=60, caption=WORDS. May be repeated.",
-            autocompletion=_complete_where,
             rich_help_panel=SCENES,
         ),
     ] = None
@@ -342,15 +307,7 @@ class SampleOptions(SceneOptions):
     """Which pairs and frames of which scenes a command takes."""
 
     pairs: PairsOption = "primary"
-    frames: Annotated[
-        Any,
-        typer.Option(
-            parser=frames_of,
-            metavar="FRAMES",
-            help="all, first, every:K, or such as 0,40,80.",
-            rich_help_panel=SCENES,
-        ),
-    ] = "all"
+    frames: FramesOption = "all"
 
     def selection(self) -> dict[str, Any]:
         """Return the options of `StereoPairs` that select samples."""

@@ -52,7 +52,6 @@ def pack(  # noqa: PLR0913 - one parameter an option
         Literal["released", "blosc2"],
         typer.Option(help="As released, or lossless and ten times as fast to decode."),
     ] = "released",
-    as_json: JsonOption = False,
 ) -> None:
     """Pack scenes into WebDataset shards.
 
@@ -102,16 +101,6 @@ def pack(  # noqa: PLR0913 - one parameter an option
             **work.options(),
             progress=progress,
         )
-    if as_json:
-        document = {
-            "index": None if report.index is None else str(report.index),
-            "packed": report.packed,
-            "part": report.part,
-            "missing": report.missing,
-            "scenes": report.scenes,
-        }
-        typer.echo(json.dumps(document, indent=2))
-        return
     kept = len(report.part) - len(report.packed)
     typer.echo(f"{out}: {counted(len(report.packed), 'shard')} packed, {kept} kept")
     if report.index is None:
@@ -180,7 +169,6 @@ def unpack(
     out: OutArgument,
     *,
     work: WorkOptions,
-    as_json: JsonOption = False,
 ) -> None:
     """Turn shards back into scenes.
 
@@ -193,14 +181,6 @@ def unpack(
     from stereogenbench_data.shards.unpack import unpack as unpacked
 
     with progress_bar("unpacking", unit="MB") as progress:
-        report = unpacked(
-            shards,
-            out,
-            **work.options(),
-            progress=progress,
-        )
-    if as_json:
-        typer.echo(json.dumps(asdict(report) | {"out": str(out)}, indent=2))
-        return
+        report = unpacked(shards, out, **work.options(), progress=progress)
     unpacked_now = counted(len(report.unpacked), "scene")
     typer.echo(f"{out}: {unpacked_now} unpacked, {len(report.kept)} kept")

@@ -1,4 +1,4 @@
-"""The progress bar of long commands on stderr: count, rate and time left.
+"""The progress bar of long commands on stderr: count and time left.
 
 If stderr is not a terminal, as in the log of a batch job, a line is printed every minute.
 """
@@ -11,37 +11,16 @@ from typing import Final
 from rich.console import Console
 from rich.progress import (
     BarColumn,
+    MofNCompleteColumn,
     Progress,
-    ProgressColumn,
-    Task,
     TextColumn,
     TimeRemainingColumn,
 )
-from rich.text import Text
 
 Report = Callable[[int, int], None]
 
 _BYTES_IN: Final = {"MB": 1_000_000}
 """Units of progress that is reported in bytes, with the bytes in each."""
-_WIDTH_WITH_BAR: Final = 60
-"""Columns of the narrowest terminal in which a bar is shown."""
-
-
-class _CountColumn(ProgressColumn):
-    """The count and the rate so far."""
-
-    def __init__(self, unit: str) -> None:
-        super().__init__()
-        self._unit = unit
-
-    def render(self, task: Task) -> Text:
-        """Return ``3/8 scenes 1.5 scenes/s``, without what is not known yet."""
-        shown = Text()
-        if task.total is not None:
-            total = f"{task.total:,.0f}"
-            shown.append(f"{task.completed:>{len(total)},.0f}/{total} {self._unit} ", "cyan")
-        rate = task.finished_speed or task.speed
-        return shown if rate is None else shown.append(f"{rate:,.1f} {self._unit}/s")
 
 
 @contextmanager
@@ -58,13 +37,14 @@ def progress_bar(doing: str, *, unit: str, log_every_s: float = 60) -> Iterator[
     """
     divisor = _BYTES_IN.get(unit, 1)
     console = Console(stderr=True)
-    columns = (
+    bar = Progress(
         TextColumn(doing),
-        *([BarColumn()] if console.width >= _WIDTH_WITH_BAR else []),
-        _CountColumn(unit),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn(unit),
         TimeRemainingColumn(compact=True, elapsed_when_finished=True),
+        console=console,
     )
-    bar = Progress(*columns, console=console)
     task = bar.add_task(doing, total=None)
     last_line_s = time.monotonic()
     if console.is_terminal:

@@ -1,17 +1,13 @@
 """``stereogenbench publish croissant``, ``card``, ``upload``: describe shards and upload them."""
 
-import json
-import re
-from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import (
-    JsonOption,
     ShardsArgument,
     flag,
     grouped,
@@ -21,17 +17,6 @@ from stereogenbench_data.schema.text import counted
 
 if TYPE_CHECKING:
     from stereogenbench_data.bridges.dataset_facts import About
-
-_REPOSITORY: Final = re.compile(r"[\w.-]+/[\w.-]+")
-
-
-def _require_repository(text: str) -> str:
-    if not _REPOSITORY.fullmatch(text):
-        raise typer.BadParameter(
-            f"{text!r} is not a repository: write ORG/NAME, such as my-lab/stereo-scenes."
-        )
-    return text
-
 
 AboutOption = Annotated[
     str | None,
@@ -50,9 +35,7 @@ def _stated(about: str | None) -> "About | None":
 
 RepositoryArgument = Annotated[
     str,
-    typer.Argument(
-        metavar="ORG/NAME", help="Dataset repository on the Hub.", callback=_require_repository
-    ),
+    typer.Argument(metavar="ORG/NAME", help="Dataset repository on the Hub."),
 ]
 
 
@@ -60,7 +43,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     data: Annotated[
         str | None,
         typer.Argument(
-            help="Folder of shards or scenes, an index file, or a URL; with --check a descriptor "
+            help="Folder of shards, their index file, or a URL; with --check a descriptor "
             "[the public release]."
         ),
     ] = None,
@@ -174,7 +157,6 @@ def upload(
     *,
     branch: Annotated[str, typer.Option(help="Branch to commit to.")] = "main",
     about: AboutOption = None,
-    as_json: JsonOption = False,
 ) -> None:
     """Upload shards with card and descriptor to the Hub.
 
@@ -190,7 +172,4 @@ def upload(
         report = uploaded(
             Path(shards), repository, branch=branch, about=_stated(about), progress=progress
         )
-    if as_json:
-        typer.echo(json.dumps(asdict(report), indent=2))
-        return
     typer.echo(f"{counted(report.files, 'file')}: StereoPairs({report.url!r})")

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, TypedDict, Unpack
+from typing import Any, Final, Unpack
 
 from stereogenbench_data.datasets.mapped import Data, StereoPairs, opened
-from stereogenbench_data.engine import LOCAL, Engine, Progress
+from stereogenbench_data.engine import LOCAL
 from stereogenbench_data.errors import EvaluationError, PredictionError, StorageError
 from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, tally
 from stereogenbench_data.evaluation.frame_metrics import fields_of, models_of
@@ -37,7 +37,7 @@ from stereogenbench_data.evaluation.scene_scores import (
     score_scene,
 )
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.jobs import do_items, job_folder
+from stereogenbench_data.jobs import WorkOptions, do_items, job_folder
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.text import counted
@@ -49,26 +49,20 @@ from stereogenbench_data.selection.windows import Random
 _PROBLEMS_SHOWN: Final = 2
 
 
-class RunOptions(TypedDict, total=False):
+class RunOptions(WorkOptions, total=False):
     """How an evaluation is run; none of it changes a score.
+
+    Progress is in frames. A callable is called, and its right views scored, in this process.
 
     Attributes:
         out: A folder that keeps partial results, so that a stopped evaluation goes on; without
             it they are lost.
-        workers: How many processes score scenes, None for one a core. A callable is called, and
-            its right views scored, in this process.
-        engine: Where scenes are scored, `engine.LOCAL` or an `engine.RayCluster`; a callable
-            stays in this process.
         allow_missing: How many right views of pairs may be missing or unusable; they are counted
             in the tables. 0 makes the first an error.
-        progress: Called with (frames done, frames in all).
     """
 
     out: str | Path | None
-    workers: int | None
-    engine: Engine
     allow_missing: int
-    progress: Progress
 
 
 class EvaluationOptions(RunOptions, Selection, total=False):
@@ -350,9 +344,7 @@ def _score_missing_scenes(
         works,
         name=lambda work: work.scene,
         keep=keep,
-        engine=options.get("engine", LOCAL),
-        workers=options.get("workers"),
-        progress=options.get("progress"),
+        options=options,
         done=done_frames,
         total=workload.frames,
     )

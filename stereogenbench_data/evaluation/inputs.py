@@ -21,7 +21,7 @@ import numpy as np
 from PIL import Image
 
 from stereogenbench_data.datasets.mapped import Data
-from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
+from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.evaluate import select_workload
 from stereogenbench_data.evaluation.predictions import PairFrames, frame_name, open_frames
@@ -34,6 +34,7 @@ from stereogenbench_data.evaluation.protocol import (
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import (
     JobKind,
+    WorkOptions,
     atomic_folder,
     do_items,
     job_folder,
@@ -49,18 +50,8 @@ _FAST: Final = 1
 """zlib's level of the PNGs: three times as fast as the default, a tenth larger."""
 
 
-class ExportOptions(Selection, total=False):
-    """Which scenes, pairs and frames (`Selection`), and how they are written.
-
-    Attributes:
-        workers: How many processes, None for one a core.
-        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
-        progress: Called with (frames done, frames in all).
-    """
-
-    workers: int | None
-    engine: Engine
-    progress: Progress
+class ExportOptions(WorkOptions, Selection, total=False):
+    """How inputs are written (`WorkOptions`; progress is in frames), and which (`Selection`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,9 +116,7 @@ def export_inputs(
             _write_item,
             works,
             name=lambda work: work.wanted.label,
-            engine=options.get("engine", LOCAL),
-            workers=options.get("workers"),
-            progress=options.get("progress"),
+            options=options,
             done=total - sum(len(work.wanted.frames) for work in works),
             total=total,
         )

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from stereogenbench_data.errors import EvaluationError, explain_os_errors
 from stereogenbench_data.evaluation.aggregate import CONTROL, Cell, Scores
@@ -16,7 +16,7 @@ from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.predictions import pair_name
 from stereogenbench_data.evaluation.protocol import PROTOCOL_VERSION, TIERS
 from stereogenbench_data.evaluation.tables import Table, Value
-from stereogenbench_data.schema.text import counted, markdown_text
+from stereogenbench_data.schema.text import counted, markdown_table, markdown_text
 from stereogenbench_data.sources.files import write_atomic
 
 FORMAT: Final = 4
@@ -83,18 +83,12 @@ def page(results: Sequence[Scores], tables: Sequence[Table]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def write_report(
-    folder: Path,
-    results: Sequence[Scores],
-    tables: Sequence[Table],
-    *,
-    plots: Literal["write", "skip"] = "write",
-) -> list[Path]:
+def write_report(folder: Path, results: Sequence[Scores], tables: Sequence[Table]) -> list[Path]:
     """Write results.json, report.md, tables.tex, pairs.csv and plots; return the files.
 
     Raises:
         StorageError: If a file cannot be written.
-        ExtraError: If plots are wanted and matplotlib is not installed.
+        ExtraError: If matplotlib is not installed.
     """
     written = {
         "results.json": json.dumps(
@@ -110,7 +104,7 @@ def write_report(
         for name, text in written.items():
             write_atomic(folder / name, text.encode())
     files = [folder / name for name in written]
-    if plots == "skip":
+    if results[0].tier == CONTROL:  # Controls do not depend on the baseline.
         return files
     from stereogenbench_data.evaluation.plots import write_plots
 
@@ -151,12 +145,9 @@ def _coverage(one: Scores) -> dict[str, Any]:
 
 def markdown(table: Table) -> str:
     """Return a table in Markdown, with its title and notes."""
-    head, *rows = _texts(table)
-    rule = ["---"] * (1 + len(table.keys)) + ["---:"] * (len(head) - 1 - len(table.keys))
-    lines = [head, rule, *(list(map(markdown_text, row)) for row in rows)]
-    pipes = ["| " + " | ".join(texts) + " |" for texts in lines]
     notes = ["", *(f"- {note}" for note in table.notes)] if table.notes else []
-    return "\n".join([f"### {table.title}", "", *pipes, *notes]) + "\n"
+    lines = [f"### {table.title}", "", *markdown_table(*_texts(table)), *notes]
+    return "\n".join(lines) + "\n"
 
 
 def latex(table: Table) -> str:

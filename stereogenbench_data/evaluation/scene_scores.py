@@ -317,26 +317,14 @@ class PartialResults:
             stamps: What identifies the right views now.
 
         Returns:
-            None if the scene is to be scored: it was not, or a right view that was missing or
-            unusable has changed since.
-
-        Raises:
-            EvaluationError: If right views that were scored have changed since.
+            None if the scene is to be scored: it was not, or a right view has changed since.
         """
         pairs = (read_item(self._path(scene)) or {}).get("pairs", {})
-        if pairs.keys() != {_place_name(place) for place in stamps}:
+        if {name: each["stamp"] for name, each in pairs.items()} != {
+            _place_name(place): stamp for place, stamp in stamps.items()
+        }:
             return None
-        changed = [
-            place for place, stamp in stamps.items() if pairs[_place_name(place)]["stamp"] != stamp
-        ]
-        for source, pair in changed:
-            if not pairs[_place_name((source, pair))]["fault"]:
-                raise EvaluationError(
-                    f"{self.folder}: holds scores of other right views of {scene}, cameras "
-                    f"{pair_name(pair)} ({source}): they were changed since. Choose another "
-                    f"folder with --out, or remove this one."
-                )
-        return None if changed else [each["fault"] for each in pairs.values() if each["fault"]]
+        return [each["fault"] for each in pairs.values() if each["fault"]]
 
     def read(self, scene: str, places: Iterable[tuple[str, Pair]]) -> SceneScores:
         """Return the scores of a scene that was scored.

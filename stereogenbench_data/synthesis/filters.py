@@ -84,14 +84,12 @@ class Refusal:
         value: What was measured.
         limit: What the filter allows.
         text: The same in words.
-        rendered: Whether it was found in what was rendered.
     """
 
     reason: str
     value: float
     limit: float
     text: str
-    rendered: bool = False
 
 
 # Where the subject stands.

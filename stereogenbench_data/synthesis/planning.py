@@ -1,7 +1,8 @@
 """The search for scenes: proposals are drawn and examined until one passes all filters."""
 
 from collections import Counter
-from typing import Final
+from collections.abc import Sequence
+from typing import Final, NamedTuple
 
 from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.synthesis.filters import Refusal
@@ -51,26 +52,42 @@ def propose(
     )
 
 
+class Planned(NamedTuple):
+    """What was found for a scene.
+
+    Attributes:
+        plan: The first proposal that passes all filters, with its path.
+        refused: The proposals before it, and why each was refused.
+    """
+
+    plan: ScenePlan
+    refused: list[tuple[Proposal, Refusal]]
+
+
 def plan_scene(
-    request: SynthRequest, *, index: int, renderer: Renderer = RAY_CASTING, first: int = 0
-) -> tuple[ScenePlan, list[tuple[Proposal, Refusal]]]:
+    request: SynthRequest,
+    *,
+    index: int,
+    renderer: Renderer = RAY_CASTING,
+    before: Sequence[tuple[Proposal, Refusal]] = (),
+) -> Planned:
     """Return the first proposal of a scene that passes all filters, and those refused before it.
 
     Args:
         request: The scenes.
         index: The scene's number. Scenes do not depend on each other.
         renderer: Whose maps are asked.
-        first: The proposal to begin with.
+        before: The first proposals, if they were refused already.
 
     Raises:
         SynthesisError: If 4,000 proposals are refused.
     """
-    refused: list[tuple[Proposal, Refusal]] = []
-    for number in range(first, first + MOST_PROPOSALS):
+    refused = list(before)
+    for number in range(len(before), len(before) + MOST_PROPOSALS):
         proposal = propose(request, index=index, number=number, renderer=renderer)
         result = examine(proposal, world=renderer.world(proposal))
         if isinstance(result, ScenePlan):
-            return result, refused
+            return Planned(result, refused)
         refused.append((proposal, result))
     reasons = Counter(refusal.reason for _, refusal in refused)
     raise SynthesisError(

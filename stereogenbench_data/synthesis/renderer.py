@@ -128,7 +128,6 @@ class ScenePlan:
         centres_m: The middle of the rig at each frame, in map axes.
         rotators_deg: Pitch, yaw in -180..180 and roll of all cameras at each frame.
         subject_m: Depth of the subject's middle at each frame, from the middle of the rig.
-        splices: How often a part of the path was thrown away and connected anew.
     """
 
     proposal: Proposal
@@ -136,7 +135,6 @@ class ScenePlan:
     centres_m: Float64[np.ndarray, "frames 3"]
     rotators_deg: Float64[np.ndarray, "frames 3"]
     subject_m: Float64[np.ndarray, " frames"]
-    splices: int
 
     @property
     def request(self) -> SynthRequest:

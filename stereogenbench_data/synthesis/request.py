@@ -16,8 +16,6 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.selection.options import did_you_mean
 
 RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
-Check = Literal["pictures", "audit"]
-"""What a rendered scene must pass."""
 
 SENSOR_MM: Final = (23.76, 23.76)
 """Width and height of the sensor, where a renderer has no others."""
@@ -70,9 +68,6 @@ class SynthRequest:
             proposal draws one.
         focal_mm: The focal length, 4 to 1,000; None for a random one in 18..85 mm per scene.
         contract: How the files are written.
-        check: What a rendered scene must pass: "pictures" looks for pixels without depth, dark and
-            flat pictures, and near things at the border; "audit" also lets the audit and the
-            doctor look at the scene.
 
     Raises:
         SynthesisError: If a value is unknown or out of range.
@@ -89,14 +84,12 @@ class SynthRequest:
     map_name: str | tuple[str, ...] = "SynthStage"
     focal_mm: float | None = None
     contract: ExportContract = field(default_factory=ExportContract)
-    check: Check = "pictures"
 
     def __post_init__(self) -> None:
         """Refuse values that no scene can have."""
         _require_choice("family", self.family, choices=FAMILIES)
         _require_choice("split", self.split, choices=get_args(Split))
         _require_choice("subset", self.subset, choices=get_args(Subset))
-        _require_choice("check", self.check, choices=get_args(Check))
         _require_split(self)
         _require_range("scenes", self.scenes, 1, math.inf)
         _require_range("frames", self.frames, 1, math.inf)

@@ -2,17 +2,17 @@
 
 from contextlib import closing
 from pathlib import Path
-from typing import Final
+from typing import Final, Unpack
 
 import numpy as np
 
 from stereogenbench_data.audit.geometry.audit import open_for_audit
 from stereogenbench_data.audit.pictures.scene_pictures import scene_sheet
 from stereogenbench_data.audit.pictures.scene_reader import SceneReader
-from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
+from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import SynthesisError, explain_os_errors
 from stereogenbench_data.index.open import warn_if_stale
-from stereogenbench_data.jobs import do_items
+from stereogenbench_data.jobs import WorkOptions, do_items
 from stereogenbench_data.samples.picture import write_png
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import DepthEncoding
@@ -60,15 +60,13 @@ def hold_out(out: str | Path, keys: list[str]) -> list[str]:
     return moved
 
 
-def write_sheets(  # noqa: PLR0913 - each names one thing that a user chooses
+def write_sheets(
     out: str | Path,
     keys: list[str],
     *,
     folder: str | Path,
     unit_m: float,
-    workers: int | None = 1,
-    engine: Engine = LOCAL,
-    progress: Progress | None = None,
+    **options: Unpack[WorkOptions],
 ) -> list[Path]:
     """Write the sheets of each scene at its first, middle and last frame, one below the other.
 
@@ -78,9 +76,7 @@ def write_sheets(  # noqa: PLR0913 - each names one thing that a user chooses
         folder: Where the pictures go, one a scene, named after its path; those that are newer than
             their scenes are kept.
         unit_m: Metres in one stored unit of depth.
-        workers: The number of processes; None is one a core.
-        engine: Where they run.
-        progress: Called with the numbers of scenes done and in all.
+        **options: How it is done; progress is in scenes.
 
     Returns:
         The pictures' paths, as ``keys``.
@@ -102,9 +98,7 @@ def write_sheets(  # noqa: PLR0913 - each names one thing that a user chooses
             _write_sheet,
             tasks,
             name=lambda task: task[1],
-            engine=engine,
-            workers=workers,
-            progress=progress,
+            options=options,
             done=len(keys) - len(tasks),
             total=len(keys),
         )

@@ -157,8 +157,7 @@ def completion_text(proposal: Proposal, *, renderer: str) -> str:
             "focal_mm": proposal.focal_mm,
             "contract": repr(request.contract),
             "renderer": renderer,
-        }
-        | ({"check": request.check} if request.check != "pictures" else {}),
+        },
     }
     return json.dumps(marker, indent=2)
 

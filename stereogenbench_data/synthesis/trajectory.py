@@ -65,7 +65,7 @@ def examine(proposal: Proposal, *, world: World) -> ScenePlan | Refusal:
     centres_m, rotators_deg = search.poses(path, np.arange(frames))
     ahead = rotation_from_rotator_deg(rotators_deg)[..., 0]
     subject_m = ((body_m.mean(axis=1) - centres_m) * ahead).sum(axis=1)
-    plan = ScenePlan(proposal, spawn, centres_m, rotators_deg, subject_m, search.splices)
+    plan = ScenePlan(proposal, spawn, centres_m, rotators_deg, subject_m)
     refusal = _check_motion(plan)
     checks = search.checks(centres_m, rotators_deg, frames=slice(None))
     if refusal is None and not checks.passed.all():
@@ -89,7 +89,6 @@ class _Search:
         self.rig = proposal.rig
         self.rng = proposal.rng("path")
         self.frames = len(body_m)
-        self.splices = 0
         middle = (body_m.min(axis=1) + body_m.max(axis=1)) / 2
         padded = np.pad(middle, ((_SMOOTH_FRAMES, _SMOOTH_FRAMES), (0, 0)), mode="edge")
         window = 2 * _SMOOTH_FRAMES + 1
@@ -193,7 +192,6 @@ class _Search:
             held = self._held(viewpoints, first=knot.frame)
             reached = max(reached, knot.frame + 1 + held)
             if held < len(viewpoints) - 1:
-                self.splices += 1
                 continue
             last = knot.frame + held
             path[knot.frame + 1 : last + 1] = viewpoints[1:]
@@ -203,8 +201,7 @@ class _Search:
             return np.round(path, _DIGITS)
         return Refusal(
             "transition", reached, self.frames,
-            f"the path breaks off after {reached} of {self.frames} frames, "
-            f"{self.splices} transitions failed",
+            f"the path breaks off after {reached} of {self.frames} frames",
         )  # fmt: skip
 
     def _targets(self, pool: Array, viewpoint: Array) -> Iterator[Array]:

@@ -39,7 +39,6 @@ scenes = list(load_dataset(sys.argv[1], "scenes", split="eval_unseen_map", strea
 scenes = [row | {"preview.jpg": row["preview.jpg"].format} for row in scenes]
 print(json.dumps({"videos": found, "scenes": scenes}))
 """
-WITHOUT_TORCHCODEC = "import sys; sys.modules['torchcodec'] = None\n"
 
 
 @pytest.fixture(scope="module")
@@ -93,18 +92,16 @@ def test_the_counts_are_those_of_the_index():
     assert "(0.01 m here)" in text
 
 
-@pytest.mark.parametrize("torchcodec", ["present", "absent"])
-def test_load_dataset_finds_configs_and_splits_and_leaves_videos_as_bytes(tmp_path, torchcodec):
+def test_load_dataset_finds_configs_and_splits_and_leaves_videos_as_bytes(tmp_path):
     require_module("datasets")
     folder = shutil.copytree(SAMPLE, tmp_path / "hub")
     write_card_over(folder)
     wanted = [["Uniform", "train"], ["IPD_Gaussian", "eval_unseen_map"], [None, "train"]]
-    code = LOAD if torchcodec == "present" else WITHOUT_TORCHCODEC + LOAD
 
     with serving(folder, handler=HubHandler) as server:
         settings = {"HF_ENDPOINT": server.url, "HF_HOME": str(tmp_path / "home")}
         done = subprocess.run(
-            [sys.executable, "-c", code, REPOSITORY, json.dumps(wanted)],
+            [sys.executable, "-c", LOAD, REPOSITORY, json.dumps(wanted)],
             capture_output=True, text=True, check=False, timeout=120, env=os.environ | settings,
         )  # fmt: skip
 

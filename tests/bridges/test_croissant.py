@@ -27,9 +27,6 @@ HOME = Path(__file__).resolve().parents[2]
 SHIPPED = HOME / "croissant"
 LOADER = Path(__file__).with_name("load_records.py")
 DAY = Publication(published=date(2026, 11, 21))
-AT_HOME = Publication(
-    published=date(2026, 11, 21), data_url="https://huggingface.co/datasets/some-group/some-data"
-)
 
 
 def validated(*paths):
@@ -202,24 +199,6 @@ def test_the_sample_behind_a_url_passes_the_steps_of_the_conference_checker(web,
     assert records["first_of_each"] == [True] * len(document["recordSet"])
 
 
-def test_a_tree_is_read_from_its_own_files(small_release, tmp_path):
-    tree = SceneIndex.open(small_release)
-    path = tmp_path / "tree.json"
-    write_descriptor(tree, path, publication=AT_HOME)
-
-    records = loaded(path, tmp_path / "cache", {"repository": str(small_release)})
-
-    assert validated(path) == [(0, [])]
-    assert records["counts"]["scenes"] == len(tree)
-    assert records["counts"]["pairs"] == 15 * len(tree)
-    assert records["counts"]["rgb_videos"] == records["counts"]["depth_videos"] == 6 * len(tree)
-    assert records["backwards"] == records["counts"]
-    assert {row["scenes/scene_id"]: row["scenes/focal_mm"] for row in records["scenes"]} == dict(
-        zip(tree.column("key"), tree.column("focal_mm"), strict=True)
-    )
-    assert sorted(records["baselines"]) == sorted(tree.column("baselines_cm").reshape(-1).tolist())
-
-
 def test_shards_of_packed_depth_are_described_by_its_suffix(small_release, tmp_path):
     require_module("blosc2")
     pack(small_release, tmp_path / "shards", workers=1, depth_codec="blosc2")
@@ -239,20 +218,16 @@ def test_shards_of_packed_depth_are_described_by_its_suffix(small_release, tmp_p
 
 @pytest.mark.parametrize("stream", ["rgb", "depth"])
 def test_a_partial_download_is_described_by_its_videos(small_shards, tmp_path, stream):
-    """Two cameras, one kind of video: as a tree and packed again."""
     whole = SceneIndex.open(small_shards)
     part = plan_download(whole, [0, 1], cameras=(2, 3), streams=(stream,))
-    tree = download(whole, part, tmp_path / "tree")
+    download(whole, part, tmp_path / "tree")
     pack(tmp_path / "tree", tmp_path / "shards", workers=1)
+    path = tmp_path / "data.json"
+    written = write_descriptor(SceneIndex.open(tmp_path / "shards"), path, publication=DAY)
 
-    for name in ("tree", "shards"):
-        index = tree if name == "tree" else SceneIndex.open(tmp_path / name)
-        path = tmp_path / f"{name}.json"
-        written = write_descriptor(index, path, publication=AT_HOME if name == "tree" else DAY)
-
-        kinds = [each["@id"] for each in written["recordSet"] if each["@id"].endswith("_videos")]
-        assert kinds == [f"{stream}_videos"]
-        assert check_descriptor(path) == []
+    kinds = [each["@id"] for each in written["recordSet"] if each["@id"].endswith("_videos")]
+    assert kinds == [f"{stream}_videos"]
+    assert check_descriptor(path) == []
 
 
 def test_shards_of_any_folder_are_named_relative_to_the_descriptor(index, tmp_path):
@@ -302,8 +277,8 @@ def test_a_descriptor_that_cannot_be_written_names_the_place(index, tmp_path):
         write_descriptor(index, tmp_path / "file" / "data.json", publication=DAY)
 
 
-def test_a_tree_of_ones_own_needs_the_url_of_its_repository(small_release, tmp_path):
-    with pytest.raises(DescriptorError, match=r"as a git repository, so name its URL \(--base-url"):
+def test_a_tree_is_to_be_packed_first(small_release, tmp_path):
+    with pytest.raises(DescriptorError, match="Pack them first"):
         write_descriptor(SceneIndex.open(small_release), tmp_path / "data.json", publication=DAY)
 
 

@@ -6,7 +6,6 @@ import pytest
 from typer.testing import CliRunner
 
 from stereogenbench_data.cli.commands import app
-from tests.servers.tools import require_module
 
 USUAL = ("--size", "16x16", "--workers", "1")
 
@@ -85,14 +84,3 @@ def test_a_text_that_is_not_understood_is_named(indexed_release, tmp_path, optio
     assert done.exit_code == 2
     assert message in " ".join(done.output.replace("│", " ").split())
     assert not (tmp_path / "out").exists()
-
-
-def test_a_recording_is_written_by_the_ending_of_its_name(indexed_release, tmp_path, monkeypatch):
-    require_module("rerun")
-    monkeypatch.chdir(tmp_path)
-    key, name = "train/Uniform/SynthStage/scene_000001", "scene_000001.rrd"
-    options = ("--width", "16", "--pair", "0-2", "-o", name)
-    done = run("show", indexed_release, "scene_000001", *options)
-
-    assert (done.exit_code, done.stdout) == (0, f"{name}: {key}\n"), done.output
-    assert (tmp_path / name).read_bytes().startswith(b"RRF")

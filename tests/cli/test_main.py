@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.cli.command import run
+from tests.cli.command import invoke, run
 
 
 def test_help_tells_a_newcomer_what_to_do_first():
@@ -46,12 +46,12 @@ def test_a_wrong_call_is_a_usage_error(arguments, tmp_path):
 
 
 def test_scenes_are_drawn_indexed_and_opened(tmp_path):
-    drawn = run("synth", "scenes", "--family", "Uniform", "--scenes", 2, "--size", 32,
-                "--frames", 3, "--seed", 1, cwd=tmp_path)  # fmt: skip
-    indexed = run("index", "scenes", cwd=tmp_path)
+    drawn = run("synth", "scenes", "--family", "Uniform", "--size", 32, "--frames", 3,
+                "--seed", 1, "--workers", 1, cwd=tmp_path)  # fmt: skip
+    indexed = invoke("index", tmp_path / "scenes", "--workers", 1)
 
     from stereogenbench_data import StereoPairs
 
-    assert (drawn.returncode, indexed.returncode) == (0, 0)
+    assert (drawn.returncode, indexed.exit_code) == (0, 0)
     assert (tmp_path / "scenes" / "index.parquet").is_file()
-    assert len(StereoPairs(tmp_path / "scenes", pairs="all", frames="all")) == 2 * 15 * 3
+    assert len(StereoPairs(tmp_path / "scenes", pairs="all", frames="all")) == 15 * 3

@@ -73,7 +73,6 @@ def refused(*words):
         (["eval", "controls", "d"], "--size", "480", "WIDTHxHEIGHT"),
         (["eval", "controls", "d"], "--pairs", "0:1", "0-1,0-5"),
         (["eval", "controls", "d"], "--frames", "some", "every:K"),
-        (["eval", "score", "d", "p", "--tier", "G1"], "--by", "focal_mm:wide", "18,35"),
         (["audit", "d"], "--per-scene", "0", "'all'"),
         (["audit", "d"], "--where", "wide", "NAME=VALUE"),
         (["stats", "d"], "--where", "focal_mm=wide", "18:35"),
@@ -102,14 +101,6 @@ def test_filters_are_named_and_texts_are_gathered():
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("command", ["card", "upload"])
-@pytest.mark.parametrize("repository", ["name", "a/b/c", "https://huggingface.co/a/b", ""])
-def test_card_and_upload_take_a_repository_alike(command, repository, small_shards):
-    message = refused("publish", command, small_shards, repository)
-
-    assert f"{repository!r} is not a repository: write ORG/NAME" in message
-
-
 def test_the_card_of_shards_names_the_repository(small_shards):
     shown = invoke("publish", "card", small_shards, "my-lab/stereo.scenes")
 
@@ -117,8 +108,11 @@ def test_the_card_of_shards_names_the_repository(small_shards):
     assert "my-lab/stereo.scenes" in shown.stdout
 
 
-def test_synth_takes_one_number_for_width_and_height_and_names_the_option_of_another():
-    assert "'--size'" in refused("synth", "out", "--size", "64x48")
+def test_synth_takes_one_number_for_width_and_height(tmp_path):
+    words = ("synth", tmp_path, "--frames", 1, "--plan-only", "--workers", 1, "--size")
+
+    assert [invoke(*words, size).exit_code for size in ("64", "64x48")] == [0, 0]
+    assert "WIDTHxHEIGHT" in refused(*words, "64x")
 
 
 def test_a_size_that_looks_swapped_gives_a_warning_that_names_the_option(small_shards, tmp_path):

@@ -8,7 +8,6 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from stereogenbench_data.cli import index as index_module
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.index import build as walk_module
 from stereogenbench_data.index.open import IncompleteSceneWarning
@@ -126,10 +125,14 @@ def test_a_tree_that_cannot_be_written_asks_for_a_file_elsewhere(
 ):
     make_scene()
 
-    def refuse(path, kind):
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+    journal = walk_module.scene_journal
 
-    monkeypatch.setattr(index_module, "require_writable", refuse)
+    def refuse(path, **how):
+        if path.parent == root:
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+        return journal(path, **how)
+
+    monkeypatch.setattr(walk_module, "scene_journal", refuse)
     refused, elsewhere = run(root), run(root, "-o", tmp_path / "elsewhere.parquet")
 
     assert refused.exit_code == 2

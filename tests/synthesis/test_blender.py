@@ -92,7 +92,6 @@ def plan(made, *, eye=(-4.0, -1.5, 1.7), target=(0.0, 0.0, 0.9), place=(0.0, 0.0
         centres_m=np.tile(np.array(eye), (frames, 1)),
         rotators_deg=np.tile(np.array(rotator), (frames, 1)),
         subject_m=np.full(frames, 4.0),
-        splices=0,
     )
 
 
@@ -366,7 +365,6 @@ def test_two_parts_write_the_files_of_one_run(renderer, tmp_path):
 
 FAULTS = {
     "empty.blend": r"empty\.blend: the map is empty.*Show its",
-    "dark.blend": r"dark\.blend: it has no light.*set light = \"sky\"",
     "huge.blend": r"huge\.blend: its width is 8e\+04 m.*Set scale = 0\.001",
     "vast.blend": r"vast\.blend: its height inside is 280 m.*Set scale = 0\.01",
     "tiny.blend": r"tiny\.blend: its width is 0\.08 m.*Set scale = 100",

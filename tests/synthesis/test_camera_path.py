@@ -49,7 +49,7 @@ def test_centres_keep_their_distances_at_any_offset(rotator_deg, offset_cm):
     plan = ScenePlan(
         replace(drawn, places_cm=places_cm, offset_cm=offset_cm), Spawn(np.zeros(3), 0.0),
         centres_m=np.array([[-5.23, 0.77, 1.81]]), rotators_deg=rotator_deg[None],
-        subject_m=np.ones(1), splices=0,
+        subject_m=np.ones(1),
     )  # fmt: skip
 
     centres_cm = plan.world_locations_cm(0)

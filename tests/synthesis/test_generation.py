@@ -14,17 +14,11 @@ from typer.testing import CliRunner
 from stereogenbench_data.cli.synth import synth
 from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.schema.release import FAMILIES
-from stereogenbench_data.synthesis.decisions import (
-    ALL_MAPS,
-    FOLDER,
-    all_decisions,
-    report_markdown,
-    report_of,
-)
-from stereogenbench_data.synthesis.filters import LIMITS, Refusal, check_poses
+from stereogenbench_data.synthesis.acceptance import acceptance_markdown
+from stereogenbench_data.synthesis.filters import LIMITS, check_poses
 from stereogenbench_data.synthesis.maps import MAPS, open_map
 from stereogenbench_data.synthesis.planning import plan_scene, propose
-from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
+from stereogenbench_data.synthesis.produce import FOLDER, plan_scenes, synthesise
 from stereogenbench_data.synthesis.render import RAY_CASTING, RayCasting
 from stereogenbench_data.synthesis.renderer import RenderedView
 from stereogenbench_data.synthesis.request import SynthRequest
@@ -109,31 +103,15 @@ def test_parts_together_are_the_same_scenes_as_one_run(tmp_path):
     assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
 
 
-def test_a_run_goes_on_from_the_decisions_of_a_plan(tmp_path, monkeypatch):
-    request = SynthRequest(scenes=4, family="Uniform", map_name=MIXED, **SMALL)
-    decisions = plan_scenes(tmp_path, request)
-    refused = sum(len(decision.refused) for decision in decisions)
-    asked = []
-    monkeypatch.setattr(
-        RayCasting, "world", lambda self, proposal: asked.append(1) or open_map(proposal)
-    )
+def test_what_a_plan_found_is_drawn_without_another_search(tmp_path, monkeypatch):
+    request = SynthRequest(scenes=2, family="Uniform", map_name=MIXED, **SMALL)
+    planned = plan_scenes(tmp_path / "planned", request)
+    whole = synthesise(tmp_path / "whole", request)
+    monkeypatch.setattr(RayCasting, "world", None)
 
-    synthesise(tmp_path, request)
-
-    assert refused > 0
-    assert len(asked) == 4  # Only the accepted proposals are examined again.
-    asked.clear()
-    synthesise(tmp_path, request)
-    assert not asked
-
-
-def test_decisions_that_were_cut_short_are_taken_again(tmp_path):
-    request = SynthRequest(scenes=1, **SMALL)
-    (before,) = plan_scenes(tmp_path, request)
-    (path,) = tmp_path.glob(f"{FOLDER}/*/scene_000000.json")
-    path.write_text(path.read_text()[:40])
-
-    assert plan_scenes(tmp_path, request) == [before]
+    assert synthesise(tmp_path / "planned", request, planned=planned) == whole
+    assert contents(tmp_path / "planned") == contents(tmp_path / "whole")
+    assert plan_scenes(tmp_path / "planned", request) == {}
 
 
 @pytest.mark.parametrize("part", [(0, 2), (3, 2), (0, 0)])
@@ -197,14 +175,15 @@ def test_a_scene_that_fails_after_rendering_is_replaced_by_its_next_proposal(
     request = SynthRequest(map_name="SynthYard", **SMALL)
     first = plan_scene(request, index=0)[0].proposal.number
 
-    (key,) = synthesise(tmp_path, request, renderer=Spoilt(number=first, **spoilt))
+    renderer = Spoilt(number=first, **spoilt)
+    planned = plan_scenes(tmp_path, request, renderer=renderer)
 
-    ((_, (decision,)),) = all_decisions(tmp_path)
-    refused = decision.refused[first]
-    assert (refused.number, refused.refusal.reason) == (first, reason)
-    assert decision.is_accepted
+    (key,) = synthesise(tmp_path, request, renderer=renderer, planned=planned)
+
+    proposal, refusal = planned[0].refused[first]
+    assert (proposal.number, refusal.reason) == (first, reason)
     marker = json.loads((tmp_path / key / "_scene_complete.json").read_text())
-    assert marker["synthesis"]["proposal"] == decision.proposals[-1].number
+    assert marker["synthesis"]["proposal"] == planned[0].plan.proposal.number > first
 
 
 def test_a_renderer_that_always_fails_its_checks_ends_with_the_reason(tmp_path, monkeypatch):
@@ -220,42 +199,7 @@ def test_a_renderer_that_always_fails_its_checks_ends_with_the_reason(tmp_path, 
     assert not list(tmp_path.rglob("*.mp4"))
 
 
-# Another check, another request.
-
-
-@pytest.mark.parametrize(("first", "then"), [("audit", "pictures"), ("pictures", "audit")])
-def test_scenes_of_another_check_are_neither_kept_nor_replaced(tmp_path, monkeypatch, first, then):
-    monkeypatch.setattr("stereogenbench_data.synthesis.produce._audited", lambda root, plan: None)
-    (done,) = synthesise(tmp_path, SynthRequest(check=first, **SMALL))
-    before = contents(tmp_path)
-
-    with pytest.raises(SynthesisError, match="scene_000000: another request wrote this scene"):
-        synthesise(tmp_path, SynthRequest(check=then, **SMALL))
-
-    assert contents(tmp_path) == before
-    assert synthesise(tmp_path, SynthRequest(check=first, **SMALL)) == [done]
-
-
-def test_what_the_audit_refused_is_not_rendered_again_by_the_next_run(tmp_path, monkeypatch):
-    seen = []
-
-    def refuse_first(root, plan):
-        seen.append(plan.proposal.number)
-        return Refusal("audit", 1, 0, "as the test wants") if len(seen) == 1 else None
-
-    def stop(done, total):
-        if seen:  # The next proposal is being drawn.
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr("stereogenbench_data.synthesis.produce._audited", refuse_first)
-    request = SynthRequest(check="audit", **SMALL)
-    with pytest.raises(KeyboardInterrupt):
-        synthesise(tmp_path, request, progress=stop)
-
-    synthesise(tmp_path, request)
-
-    assert len(seen) == 2
-    assert seen[1] > seen[0]
+# Another request.
 
 
 def test_a_request_that_does_not_fit_the_tree_decides_nothing(tmp_path):
@@ -269,16 +213,6 @@ def test_a_request_that_does_not_fit_the_tree_decides_nothing(tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_scene_can_be_made_to_pass_the_audit_and_the_doctor(tmp_path):
-    request = SynthRequest(
-        map_name="SynthYard", size_px=128, frames=3, seed=2, focal_mm=25, check="audit"
-    )
-
-    (key,) = synthesise(tmp_path, request)
-
-    assert json.loads((tmp_path / key / "_scene_complete.json").read_text())["synthesis"]["check"]
-
-
 # Reports, sheets and the holdout.
 
 
@@ -286,21 +220,25 @@ def test_the_report_counts_acceptance_by_map_and_reason_and_wide_rigs_are_refuse
     request = SynthRequest(
         scenes=24, family="Uniform", map_name=("SynthYard", "SynthHall"), **SMALL
     )
-    decisions = plan_scenes(tmp_path, request)
+    planned = plan_scenes(tmp_path, request).values()
+    refused = [each for scene in planned for each in scene.refused]
+    proposed_cm, realised_cm = (
+        np.median([np.diff(proposal.places_cm) for proposal in proposals])
+        for proposals in (
+            [proposal for proposal, _ in refused] + [scene.plan.proposal for scene in planned],
+            [scene.plan.proposal for scene in planned],
+        )
+    )
 
-    report = report_of([("Uniform", decisions)])
+    *_, hall, yard, everything = acceptance_markdown(planned).splitlines()
 
-    by_map = {each["map_name"]: each for each in report}
-    assert list(by_map) == ["SynthHall", "SynthYard", ALL_MAPS]
-    everything = by_map[ALL_MAPS]
-    assert everything["accepted"] == 24
-    assert everything["proposals"] == 24 + sum(len(each.refused) for each in decisions)
-    assert sum(everything["reasons"].values()) == everything["proposals"] - 24
-    assert everything["proposed_cm"]["median"] == pytest.approx(75.5, abs=12)
-    assert everything["realised_cm"]["median"] < everything["proposed_cm"]["median"] - 5
-    assert everything["reasons"]["collision"] > 0
-    assert report_of(all_decisions(tmp_path)) == report
-    assert "| Uniform | SynthHall " in report_markdown(report)
+    assert (hall[:11], yard[:11]) == ("| SynthHall", "| SynthYard")
+    assert f"| all maps | {24 + len(refused)} | 24 (" in everything
+    collisions = sum(refusal.reason == "collision" for _, refusal in refused)
+    assert f"collision {collisions}" in everything
+    assert collisions > 0
+    assert proposed_cm == pytest.approx(75.5, abs=12)
+    assert realised_cm < proposed_cm - 5
 
 
 def test_contact_sheets_show_every_scene_once(tmp_path):
@@ -349,11 +287,9 @@ def test_the_command_plans_and_reports(tmp_path):
     mixed += ["--map", "SynthYard", "--map", "SynthHall", "--scenes", "2", "-o", str(report)]
 
     planned = CliRunner().invoke(app, [*mixed, "--plan-only"], catch_exceptions=False)
-    told = json.loads((report / "report.json").read_text())
-    drawn = CliRunner().invoke(app, [*mixed, "--part", "1/2", "--json"], catch_exceptions=False)
+    drawn = CliRunner().invoke(app, [*mixed, "--part", "1/2"], catch_exceptions=False)
 
     assert "all maps" in planned.stdout
-    assert {each["map_name"] for each in told} >= {ALL_MAPS}
-    assert len(json.loads(drawn.stdout)["scenes"]) == 1
+    assert drawn.stdout.startswith(f"{out}: 1 scene in ")
     assert len(list(report.glob("*.png"))) == 1
     assert "all maps" in (report / "report.md").read_text()

@@ -3,9 +3,8 @@
 Its files and record sets are templates, one for each kind of data:
 
     shards.json     shards, with tables of scenes and pairs beside the descriptor
-    folders.json    a git repository with scenes as folders, read from their JSON files
     release.json    the public release, whose record sets hold their data themselves
-    common.json     the context and the enumerations of all three
+    common.json     the context and the enumerations of both
 
 mlcroissant parses no JSON inside a tar, so what the shards' JSON files hold is written once as
 Parquet tables, from the index. Where there are many shards, record sets of files use only a few.
@@ -189,9 +188,8 @@ class Publication:
         name: The dataset's name; None for what its maker states.
         version: MAJOR.MINOR.PATCH; None for what its maker states, else 1.0.0.
         published: The day of publication; None for what its maker states, else today.
-        data_url: URL of the folder of shards, pinned to a revision, or of the git repository of a
-            tree. With None, shards have paths relative to the descriptor, and a tree of the
-            release has the URL of the release's own repository.
+        data_url: URL of the folder of shards, pinned to a revision. With None, shards have paths
+            relative to the descriptor.
         about: What the user states of the scenes, as for `dataset_facts.facts_of`.
     """
 
@@ -217,8 +215,7 @@ def write_descriptor(
     """Write the descriptor of an index's data, and its tables beside it.
 
     Args:
-        index: The index of shards, or of a tree in the released layout; None for the release in
-            its own repository.
+        index: The index of shards; None for the release in its own repository.
         path: The descriptor to write, such as ``croissant/sample.json``; the tables of shards are
             written into the folder of the same name without its suffix.
         publication: What it states about name, version and URLs.
@@ -228,8 +225,8 @@ def write_descriptor(
 
     Raises:
         DescriptorError: If a file cannot be written, the version or a URL is not valid,
-            ``data_url`` is None but shards are behind a URL or a tree is not the release's, a URL
-            contains a login or a query, or who made the scenes is not known.
+            ``data_url`` is None but shards are behind a URL, a URL contains a login or a query,
+            the data are not shards, or who made the scenes is not known.
     """
     publication = publication or Publication()
     _require_valid(publication)
@@ -244,13 +241,10 @@ def write_descriptor(
         files = _shard_nodes(index, tables, data_url=data_url, tables_url=tables_url)
         facts = facts | dataset_facts.packing_facts(index, facts)
     else:
-        data_url = publication.data_url or facts.get("url", "")
-        if not data_url:
-            raise DescriptorError(
-                f"{index.where}: folders of scenes are described as a git repository, so name its "
-                "URL (--base-url). Or pack them: shards are described where they are."
-            )
-        files = _of_videos("folders", index, repository=data_url)
+        raise DescriptorError(
+            f"{index.where}: these are folders of scenes. Pack them first: shards are described "
+            "where they are."
+        )
     head = _head(facts, publication, url=_page(data_url, beside=path))
     records = [*_enumerations(index), *files["recordSet"]]
     descriptor = head | {"distribution": files["distribution"], "recordSet": records}
@@ -284,9 +278,10 @@ def _require_valid(publication: Publication) -> None:
         )
 
 
-def _of_videos(name: str, index: SceneIndex, **words: str) -> Node:
-    """Return a template with the suffixes of the data's videos, without the kinds they lack."""
+def _of_videos(index: SceneIndex) -> Node:
+    """Return the template of shards with the suffixes of videos, without the kinds they lack."""
     held = index.scene(0).held_videos
+    words: dict[str, str] = {}
     missing = set()
     for kind in ("rgb", "depth"):
         suffix = next((each.rpartition(".")[2] for each in held if f"_{kind}." in each), "")
@@ -294,7 +289,7 @@ def _of_videos(name: str, index: SceneIndex, **words: str) -> Node:
         words |= {kind: suffix, f"{kind}_type": media_type}
         if not suffix:
             missing |= {f"{kind}-files", f"{kind}_videos"}
-    nodes = template(name, **words)
+    nodes = template("shards", **words)
     for files in nodes["distribution"]:
         if isinstance(files["encodingFormat"], list):
             files["encodingFormat"] = [each for each in files["encodingFormat"] if each]
@@ -308,7 +303,7 @@ def _shard_nodes(
     index: SceneIndex, tables: Mapping[str, bytes], *, data_url: str, tables_url: str
 ) -> Node:
     """Return the files and record sets of shards."""
-    nodes = _of_videos("shards", index)
+    nodes = _of_videos(index)
     bound = bound_shards(index)
     is_listed = SHARD_LIST in tables
     files = []

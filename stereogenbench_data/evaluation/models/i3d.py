@@ -28,7 +28,7 @@ Size = tuple[int, int, int]
 
 
 class I3dFeatures:
-    """FVD's features of clips; `VideoFeatures`."""
+    """FVD's features of clips."""
 
     name = "I3D (Kinetics-400)"
     min_frames = 10

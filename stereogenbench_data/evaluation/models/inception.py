@@ -37,7 +37,7 @@ _BATCH: Final = 8
 
 
 class InceptionFeatures:
-    """FID's features of pictures; `ImageFeatures`."""
+    """FID's features of pictures."""
 
     name = "Inception-v3 (TensorFlow, 2015-12-05)"
 

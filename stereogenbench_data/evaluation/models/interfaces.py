@@ -1,4 +1,4 @@
-"""The interfaces of the models that metrics use; any object with these members will do.
+"""The interfaces of the matchers that metrics use; any object with these members will do.
 
 Pictures are uint8 RGB, channel first.
 """
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Float32, Int64, UInt8
 
 Picture = UInt8[np.ndarray, "3 h w"]
 Pictures = UInt8[np.ndarray, "n 3 h w"]
@@ -30,7 +30,7 @@ class Keypoints:
 
 
 class Model(Protocol):
-    """What every model has."""
+    """What every matcher has."""
 
     @property
     def name(self) -> str:
@@ -61,31 +61,3 @@ class StereoMatcher(Model, Protocol):
 
         x_right = x_left - disparity: positive in front of the cameras.
         """
-
-
-@runtime_checkable
-class PairMetric(Model, Protocol):
-    """Scores pictures against their targets."""
-
-    def __call__(self, predicted: Pictures, target: Pictures) -> Float64[np.ndarray, " n"]:
-        """Return one number for each picture."""
-
-
-@runtime_checkable
-class ImageFeatures(Model, Protocol):
-    """Describes pictures by numbers."""
-
-    def __call__(self, pictures: Pictures) -> Float64[np.ndarray, "n dim"]:
-        """Return the features of each picture."""
-
-
-@runtime_checkable
-class VideoFeatures(Model, Protocol):
-    """Describes clips by numbers."""
-
-    @property
-    def min_frames(self) -> int:
-        """How many frames a clip needs."""
-
-    def __call__(self, clips: Clips) -> Float64[np.ndarray, "n dim"]:
-        """Return the features of each clip."""

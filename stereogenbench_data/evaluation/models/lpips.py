@@ -41,7 +41,7 @@ _BATCH: Final = 8
 
 
 class Lpips:
-    """LPIPS of pictures against their targets; a `PairMetric`."""
+    """LPIPS of pictures against their targets."""
 
     name = "LPIPS"
 

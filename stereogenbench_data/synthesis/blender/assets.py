@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from operator import lt
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.synthesis.renderer import Spawn, View
@@ -85,6 +85,15 @@ class AnimationAsset:
     repeat: Repeat = "onward"
 
 
+class Asked(NamedTuple):
+    """The folder of the assets, and those of one proposal."""
+
+    root: str
+    map: MapAsset
+    character: CharacterAsset
+    animation: AnimationAsset
+
+
 @dataclass(frozen=True, slots=True)
 class RenderSettings:
     """How Cycles renders.
@@ -140,11 +149,6 @@ class Assets:
     sensors_mm: tuple[tuple[float, float], ...]
     settings: RenderSettings
     digest: str
-
-    @property
-    def root(self) -> Path:
-        """The asset folder."""
-        return self.path.parent
 
 
 def read_assets(path: str | Path) -> Assets:

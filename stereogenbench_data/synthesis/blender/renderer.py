@@ -17,9 +17,8 @@ from stereogenbench_data.errors import SynthesisError, missing_extra
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.synthesis.blender.assets import (
-    AnimationAsset,
+    Asked,
     Assets,
-    CharacterAsset,
     MapAsset,
     Shot,
     read_assets,
@@ -37,10 +36,6 @@ from stereogenbench_data.synthesis.request import SENSOR_MM
 
 _VERSION: Final = 1
 """Goes up when the same assets give other scenes."""
-
-
-Asked = tuple[str, MapAsset, CharacterAsset, AnimationAsset]
-"""The folder of the assets, and those of one proposal."""
 
 
 class BlenderAssetWarning(UserWarning):
@@ -110,7 +105,7 @@ class BlenderRenderer:
             process = blender(self.map_of(proposal).file)
             what = f"{plan.key}, frame {frame}"
             shot = Shot(frame, plan.spawn, seen, seed, settings, process.folder)
-            depths_m = process.call("render", *self.asked(proposal), shot, what=what)
+            depths_m = process.call("render", self.asked(proposal), shot, what=what)
             for number, depth_m in enumerate(depths_m):
                 path = process.folder / f"view_{number}.png"
                 try:
@@ -139,11 +134,12 @@ class BlenderRenderer:
 
     def asked(self, proposal: Proposal) -> Asked:
         """Return the assets of a proposal, as the process of Blender wants them."""
-        return (
-            str(self.assets.root),
+        assets = self.assets
+        return Asked(
+            str(assets.path.parent),
             self.map_of(proposal),
-            self.assets.characters[proposal.character],
-            self.assets.animations[proposal.animation],
+            assets.characters[proposal.character],
+            assets.animations[proposal.animation],
         )
 
     def description(self, plan: ScenePlan) -> dict[str, object]:
@@ -187,9 +183,9 @@ class BlenderWorld:
 
         The insides of solids are not known: the filter of visibility refuses what is in them.
         """
-        root, asset, *_ = self._asked
+        asset = self._asked.map
         found_m: Float64[np.ndarray, " n"] = blender(asset.file).call(
-            "cast", root, asset, origins_m, directions, what=f"{asset.where}: rays"
+            "cast", self._asked, origins_m, directions, what=f"{asset.where}: rays"
         )
         return found_m
 
@@ -206,11 +202,11 @@ def _facts(asked: Asked, frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
     Bounds are two corners, and points are (frames, p, 3).
     """
-    _, asset, *_ = asked
-    *found, notes = blender(asset.file).call("facts", *asked, frames, what=asset.where)
+    place = asked.map
+    *found, notes = blender(place.file).call("facts", asked, frames, what=place.where)
     if notes:
         warnings.warn(
-            f"{asset.where}: left out or not run: {'; '.join(notes)}.",
+            f"{place.where}: left out or not run: {'; '.join(notes)}.",
             BlenderAssetWarning,
             stacklevel=2,
         )

@@ -24,6 +24,7 @@ from mathutils.bvhtree import BVHTree
 
 from stereogenbench_data.synthesis.blender.assets import (
     AnimationAsset,
+    Asked,
     CharacterAsset,
     MapAsset,
     RenderSettings,
@@ -385,32 +386,6 @@ def _rendered(layer: Any) -> Iterator[Any]:
 # Light.
 
 
-_GLOWING: Final = {
-    "ShaderNodeBackground": ("Color", "Strength"),
-    "ShaderNodeEmission": ("Color", "Strength"),
-    "ShaderNodeBsdfPrincipled": ("Emission Color", "Emission Strength"),
-}
-
-
-def _is_lit(scene: Any) -> bool:
-    """Return whether there is a lamp, a background or a glowing material."""
-    shown = [item for item in scene.objects if not item.hide_render]
-    if any(item.type == "LIGHT" and item.data.energy > 0 for item in shown):
-        return True
-    materials = [slot.material for item in shown for slot in item.material_slots]
-    trees = [owner.node_tree for owner in (scene.world, *materials) if owner is not None]
-    for node in (node for tree in trees if tree is not None for node in tree.nodes):
-        sockets = [node.inputs[name] for name in _GLOWING.get(node.bl_idname, ())]
-        if sockets and not node.mute and all(map(_is_set, sockets)):
-            return True
-    return False
-
-
-def _is_set(socket: Any) -> bool:
-    """Return whether a colour (whose alpha does not count) or a number may be above 0."""
-    return socket.is_linked or bool(np.max(np.atleast_1d(socket.default_value)[:3]) > 0)
-
-
 def _add_sky(scene: Any) -> None:
     """Light a map that has no light of its own: a sun, and a bluish sky."""
     sun = bpy.data.lights.new("StereoGenBench sun", "SUN")
@@ -721,11 +696,6 @@ class Stage:
         self.still = self._gather()
         self.bounds_m, self.spawn_bounds_m = self._bounds()
         self._own = {*bpy.data.objects, *bpy.data.actions}
-        if not _is_lit(self.scene):
-            raise AssetError(
-                f"{where}: it has no light: no lamp, no background and no glowing material. Add "
-                f'lamps in Blender, or set light = "sky" there for a sun and a sky.'
-            )
 
     def _prepare(self) -> None:
         """Switch off what this program does not render alike in picture and depth."""
@@ -995,38 +965,24 @@ class Server:
     def __init__(self) -> None:
         self._stage: Stage | None = None
 
-    def _open(self, root: str, asset: MapAsset) -> Stage:
-        if self._stage is None or (self._stage.root, self._stage.asset) != (root, asset):
+    def _open(self, asked: Asked) -> Stage:
+        if self._stage is None or (self._stage.root, self._stage.asset) != asked[:2]:
             self._stage = None
-            self._stage = Stage(root, asset)
+            self._stage = Stage(asked.root, asked.map)
         return self._stage
 
-    def cast(self, root: str, asset: MapAsset, origins_m: Array, directions: Array) -> Array:
+    def cast(self, asked: Asked, origins_m: Array, directions: Array) -> Array:
         """See `Stage.cast`."""
-        return self._open(root, asset).cast(origins_m, directions)
+        return self._open(asked).cast(origins_m, directions)
 
-    def facts(
-        self,
-        root: str,
-        asset: MapAsset,
-        character: CharacterAsset,
-        animation: AnimationAsset,
-        frames: int,
-    ) -> tuple[Array, Array, Array, list[str]]:
+    def facts(self, asked: Asked, frames: int) -> tuple[Array, Array, Array, list[str]]:
         """Return bounds, those of spawns, the subject's points (frames, p, 3), and notes."""
-        stage = self._open(root, asset)
-        subject = stage.set_subject(character, animation)
+        stage = self._open(asked)
+        subject = stage.set_subject(asked.character, asked.animation)
         points_m = np.stack([subject.points_m(frame) for frame in range(frames)])
         return stage.bounds_m, stage.spawn_bounds_m, points_m, stage.notes
 
-    def render(
-        self,
-        root: str,
-        asset: MapAsset,
-        character: CharacterAsset,
-        animation: AnimationAsset,
-        shot: Shot,
-    ) -> Array:
+    def render(self, asked: Asked, shot: Shot) -> Array:
         """See `Stage.render`."""
-        stage = self._open(root, asset)
-        return stage.render(stage.set_subject(character, animation), shot)
+        stage = self._open(asked)
+        return stage.render(stage.set_subject(asked.character, asked.animation), shot)
