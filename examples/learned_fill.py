@@ -55,7 +55,7 @@ class Correction(nn.Module):
 
 
 def draw(methods: dict, pairs: StereoPairs, picture: Path) -> None:
-    """Draw the right view of the first pair of three scenes, rendered and by each method."""
+    """Draw the right view of a pair of three scenes, rendered and by each method."""
     samples = list({sample["scene"]: sample for sample in pairs}.values())[:3]
     figure = Figure(figsize=(3 * (1 + len(methods)), 3 * len(samples)), layout="constrained")
     for row, sample in zip(figure.subplots(len(samples), 1 + len(methods)), samples, strict=True):
@@ -108,8 +108,8 @@ def main() -> None:
         for name, method in methods.items()
     ]
     DEMO.mkdir(exist_ok=True)
-    held_out = StereoPairs(given.data, fields=(*FIELDS, "scene"), **selection)
-    draw(methods, held_out, DEMO / "learned_fill.png")
+    drawn = StereoPairs(given.data, fields=(*FIELDS, "scene"), baseline_cm=(30, 100), **selection)
+    draw(methods, drawn, DEMO / "learned_fill.png")
     form = TableForm("Baseline in cm, all pairs", ("baseline",), pairs="all")
     table = table_of(scores, "by_baseline", form=form)
     (DEMO / "learned_fill.md").write_text(markdown(table))
