@@ -301,9 +301,8 @@ def _tier(block: Block, kind: list[str], axes: str, hints: frozenset[str]) -> in
     """
     said = hints | block.words
     text = "_".join(("", *(key for key in block.name if key != "*"), *sorted(said)))
-    is_from_world = any(f"_{word}" in text for word in _FROM_WORLD) and not any(
-        f"_{word}" in text for word in _FROM_CAMERA
-    )
+    is_from_camera = any(f"_{word}" in text for word in _FROM_CAMERA)
+    is_from_world = not is_from_camera and any(f"_{word}" in text for word in _FROM_WORLD)
     is_vector = kind[0] == "vector" and not block.unit.startswith("deg")
     is_rad = is_vector or block.unit.startswith("rad") or any(w.startswith("rad") for w in said)
     fits = is_from_world == ("w2c" in kind) and (
@@ -315,7 +314,8 @@ def _tier(block: Block, kind: list[str], axes: str, hints: frozenset[str]) -> in
         tier = 1
     named_axes = {*AXES} & hints
     if named_axes:
-        return tier if axes in named_axes else tier + 3
+        is_denied = not fits and (is_from_camera or is_from_world)  # what it names is wrong, then
+        return tier if axes in named_axes or is_denied else tier + 3
     return tier if axes == "unreal" else 2
 
 

@@ -60,6 +60,7 @@ class Understood:
             was taken first.
         is_named: Whether the file itself names that one.
         other_pair: Where the file states another primary pair than the rig has; "" if nowhere.
+        first_frame: The number of the first frame that has poses.
         form: What the index keeps of it, for `poses_as`: None for the first form that the file
             itself names, if it is the only one to pass.
     """
@@ -69,6 +70,7 @@ class Understood:
     is_named: bool
     form: str | None
     other_pair: str = ""
+    first_frame: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +117,8 @@ def understood_poses(
         if rig.primary_pair not in (pair, (pair[0] - 1, pair[1] - 1))
     )
     if named is None:
-        return replace(_fitting(readings(recorded), rig, where=where), other_pair=other)
+        plain = _fitting(readings(recorded), rig, where=where)
+        return replace(plain, other_pair=other, first_frame=recorded.first_frame)
     found, own, reason = None, None, ""
     try:
         found = _fitting(_readings_as(recorded, named), rig, where=where)
@@ -125,7 +128,8 @@ def understood_poses(
         own = _fitting(readings(recorded), rig, where=where)
     own_poses = own.poses if own is not None and own.is_named else None
     if found is not None and (own_poses is None or same_poses(found.poses, own_poses)):
-        return replace(found, form="|".join(found.names), other_pair=other)
+        form, first_frame = "|".join(found.names), recorded.first_frame
+        return replace(found, form=form, other_pair=other, first_frame=first_frame)
     reason = reason or "the file names another form, which fits as well and differs"
     fits = "" if own is None else f" What fits is: {shortened(own.names[0], 300)}."
     stated = ((name, getattr(named, name)) for name in ("rotation", "form", "axes", "unit"))

@@ -227,6 +227,7 @@ class _Description:
         if self.unread:
             self.remark("videos", "; ".join(self.unread.values()))
         poses, pose_form = self.poses(rig, frames)
+        frames = frames if poses is None else min(frames, poses.frame_count)
         own = {name: facts for name, facts in self.facts.items() if name in _DEPTHS}
         some = next(iter(own.items()), (depth_name(0), _NO_DEPTH))
         names = map(depth_name, range(CAMERA_COUNT))
@@ -286,6 +287,11 @@ class _Description:
                     )
                     if is_picture and facts.is_colour is None:
                         facts = probe(video, name=where)
+                    if name in _DEPTHS:  # lossy depth passes: a `DepthEncoding` may accept it
+                        require_depth_stream(
+                            codec=depth_coding(facts), pixel_format=facts.pixel_format,
+                            encoding=ANY_DEPTH, name=where,
+                        )  # fmt: skip
                     self.facts[name] = facts
                     if (table := read_seek_table(video, name=where, reads=reads)) is not None:
                         self.tables[held] = table
@@ -350,21 +356,13 @@ class _Description:
             raise StorageError(f"{told}. Fetch those again.")
 
     def require_kinds(self, rig: Rig) -> None:
-        """Refuse views without colours, and depth videos that hold colours.
-
-        Lossy depth passes: a user's own `DepthEncoding` may accept it.
-        """
+        """Refuse views without colours, and depth videos that hold colours."""
         for name, fact in self.facts.items():
             where = self.where(name)
             require_pixel_aspect(fact.pixel_aspect, rig, name=where)
             if name.endswith("_rgb.mp4") and not fact.is_colour:
                 stored = fact.pixel_format or "grey"
                 raise MediaError(f"{where}: is stored by codec {fact.codec} as {stored}{NO_COLOUR}")
-            if name in _DEPTHS:
-                require_depth_stream(
-                    codec=depth_coding(fact), pixel_format=fact.pixel_format, encoding=ANY_DEPTH,
-                    name=where,
-                )  # fmt: skip
         depths = {name: fact for name, fact in self.facts.items() if name in _DEPTHS}
         grey = sum(not fact.is_colour for fact in depths.values())
         for name, fact in depths.items():
@@ -385,7 +383,9 @@ class _Description:
         found, reason = self.understood(rig, where)
         count = frames if found is None else found.poses.frame_count
         told = f"{where}: has poses of {count} frames, and the videos have {frames}"
-        if not 0 <= count - frames <= MOST_EXTRA_FRAMES:
+        # Without the last frame poses are those of the others; without the first they are not.
+        fewest = 0 if found is None or found.first_frame else -MOST_EXTRA_FRAMES
+        if not fewest <= count - frames <= MOST_EXTRA_FRAMES:
             found, reason = None, f"{told}."
         if found is None:
             if not assumed_places_m(rig):
@@ -396,8 +396,10 @@ class _Description:
                 )
             self.remark("poses", reason)
             return None, None
-        if count > frames and not any(each.about == "frames" for each in self.remarks):
-            self.remark("frames", f"{told}. The first {frames} are used")
+        if count < frames or (
+            count > frames and not any(each.about == "frames" for each in self.remarks)
+        ):
+            self.remark("frames", f"{told}. The first {min(count, frames)} are used")
         if found.other_pair:
             left, right = rig.primary_pair
             told = (
@@ -443,10 +445,12 @@ class _Description:
             SchemaError: If conventions state another unit than a tag.
         """
         stated: list[Statement] = []
-        for name in (BASELINE_JSON, TRAJECTORY_JSON, COMPLETE_JSON):
-            text = self.folder.read(name) if name in self.files else b""
-            if b"depth" in text.lower():
-                with suppress(SchemaError):
+        own = [name for name in (BASELINE_JSON, TRAJECTORY_JSON, COMPLETE_JSON)
+               if name in self.files]  # fmt: skip
+        for name in (*own, *self.folder.other_json()):
+            with suppress(SchemaError):
+                text = self.folder.read(name)
+                if b"depth" in text.lower():
                     stated += stated_in_json(parse_object(text, where=name), name=self.where(name))
         found: list[DepthEncoding | None] = []
         problems: list[str] = []

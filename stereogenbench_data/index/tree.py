@@ -204,6 +204,10 @@ class SceneFolder:
             found = {entry.name: entry.stat() for entry in entries if entry.name in FILES}
         return {name: (found[name].st_size, found[name].st_mtime_ns) for name in sorted(found)}
 
+    def other_json(self) -> list[str]:
+        """Return the names of JSON files that are none of a release; behind a URL, of none."""
+        return sorted({path.name for path in Path(self._root, self._key).glob("*.json")} - FILES)
+
     def fetch(self, names: Iterable[str]) -> None:
         """Fetch files at a time, if they are behind a URL."""
 

@@ -39,6 +39,7 @@ from stereogenbench_data.schema.quantities import (
     Stated,
     Values,
     as_stated,
+    named_unit_m,
     without_unit,
     words,
 )
@@ -619,13 +620,16 @@ class _RigFile(MetadataFile):
                 for key, inner in node.items() if isinstance(node, dict) else enumerate(node):
                     own, at = words(str(key)), child_path(place, key)
                     named = _pair_of(own) if isinstance(key, str) else None
-                    pair = named if row is None or not own.isdigit() else (row, int(own))
+                    camera = (
+                        int(own) if own.isdigit() else camera_of(key) if named is None else None
+                    )
+                    pair = named if row is None or camera is None else (row, camera)
                     if is_of_pairs and pair is not None:
                         self._add_pair(pair, inner, own_m, at)
                         continue
-                    is_row = own.isdigit() and _is_row(inner, of=node)
+                    is_row = camera is not None and _is_row(inner, of=node)
                     longer = words_ if isinstance(key, int) or is_row else f"{words_}_{own}"
-                    waiting.append((inner, longer, at, int(own) if is_row else None, inner_m))
+                    waiting.append((inner, longer, at, camera if is_row else None, inner_m))
 
     def _are_neighbours(self, value: Any, name: str) -> bool:
         """Return whether a value lists the baselines of neighbours, which may be all that is."""
@@ -687,7 +691,9 @@ def _roles(name: str) -> frozenset[str]:
     >>> [*_roles("baseline_cm"), *_roles("target_baseline"), *_roles("camera_index_a")]
     ['length', 'figure', 'camera']
     """
-    if name in UNITS_M or re.search(r"baseline|distance|length|count|separation|\Avalue\Z", name):
+    if name in UNITS_M or re.search(
+        r"baseline|distance|length|count|separation|delta|\Avalue\Z", name
+    ):
         is_length = name in UNITS_M or re.search(
             r"(?:baseline|distance|separation|length|value)\Z", without_unit(name)[0]
         )
@@ -705,6 +711,8 @@ def _entry_form(
     """Return which keys may name cameras, the baselines with their units, and the unit's key."""
     roles = {key: _roles(words(key)) for key in keys}
     naming = [(key, each) for key, each in roles.items() if not each & {"length", "figure"}]
+    if sum(camera_of(key) is not None for key in keys) > 2:
+        naming = []  # keys of a table
     lengths = [(key, words(key) if words(key) in UNITS_M else without_unit(words(key))[1])
                for key in keys if "length" in roles[key]]  # fmt: skip
     return naming, lengths, next((key for key in keys if words(key) in ("unit", "units")), None)
@@ -785,7 +793,8 @@ def _unit_below(node: Any, above_m: float) -> float:
     named = node.get("unit", node.get("units")) if isinstance(node, dict) else None
     if not isinstance(named, str):
         return above_m
-    return UNITS_M.get(words(named), UNITS_M.get(words(named).partition("_")[0], math.nan))
+    unit_m = named_unit_m(named)
+    return math.nan if unit_m is None else unit_m
 
 
 def _are_columns(table: dict[str, Any]) -> bool:
@@ -802,7 +811,7 @@ def _are_numbers(value: Any, count: int) -> bool:
 def _is_row(value: Any, *, of: dict[str, Any] | list[Any]) -> bool:
     """Return whether a value is a row of a table with a number for each two cameras."""
     if isinstance(value, dict):
-        return bool(value) and all(key.isdigit() for key in value)
+        return bool(value) and all(key.isdigit() or camera_of(key) is not None for key in value)
     return isinstance(value, list) and len(of) == len(value) == CAMERA_COUNT
 
 
@@ -876,7 +885,7 @@ def see_rig(text: bytes, *, where: str) -> Seen:
         common = itertools.takewhile(lambda each: len({*each}) == 1, by_step)
         place = "$" + "".join(each[0] for each in common)
         unit_m = first.cm / 100 / first.stated.value
-        known = [name for name in ("mm", "cm", "m") if math.isclose(UNITS_M[name], unit_m)]
+        known = [name for name, metres in UNITS_M.items() if math.isclose(metres, unit_m)]
         at["baselines"] = At(place=place, unit=next(iter(known), None))
         found["baselines"] = [
             f"{first.stated.path} is {first.stated.value:g}, {first.cm:g} cm of cameras "

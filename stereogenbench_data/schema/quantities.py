@@ -16,7 +16,7 @@ from decimal import Decimal
 from types import MappingProxyType
 from typing import Any, Final
 
-from stereogenbench_data.schema.document import child_path, is_number
+from stereogenbench_data.schema.document import camera_of, child_path, is_number
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
 NAMES: Final[dict[str, str]] = {
@@ -71,6 +71,13 @@ PAIRS: Final[dict[str, tuple[str, str]]] = {
 MATRICES: Final = frozenset({"k", "camera_matrix", "intrinsic_matrix", "intrinsics_matrix",
                              "intrinsics", "camera_intrinsics"})  # fmt: skip
 """Keys of a camera matrix, in pixels: 3 rows of 3 numbers, or 9 numbers."""
+
+LENS_PARAMS: Final = {
+    "pinhole": {"fx": 0, "fy": 1, "cx": 2, "cy": 3},
+    "simple_pinhole": {"fx": 0, "fy": 0, "cx": 1, "cy": 2},
+}
+"""What stands where in COLMAP's ``params`` of a ``model``, in pixels."""
+_MATRIX_PLACES: Final = {"fx": 0, "fy": 4, "cx": 2, "cy": 5}
 
 UNITS_M: Final = {
     **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1e-3),
@@ -200,7 +207,10 @@ def nodes_of(document: Any) -> list[Node]:
                 break
             name = words(key.rpartition(".")[2]) if isinstance(key, str) else ""
             if name or isinstance(inner, dict | list):
-                waiting.append(Node(key, node, inner, *without_unit(name), name, above))
+                own = (*without_unit(name), name, above)
+                if node.name and isinstance(key, str) and camera_of(key) is not None:
+                    own = node.plain, node.unit, node.name, node.parent  # one camera's share
+                waiting.append(Node(key, node, inner, *own))
                 depths.append(depth + 1)
     return [node for node in waiting if node.name and node.value is not None]
 
@@ -262,9 +272,20 @@ class Values:
     @property
     def length_unit_m(self) -> float | None:
         """The metres in the unit that the document names for its lengths, None without one."""
-        named = (words(each.value) for each in self.stated("unit") if isinstance(each.value, str))
-        known = (UNITS_M.get(name, UNITS_M.get(name.partition("_")[0])) for name in named)
+        named = (each.value for each in self.stated("unit") if isinstance(each.value, str))
+        known = map(named_unit_m, named)
         return next((unit_m for unit_m in known if unit_m is not None), None)
+
+
+def named_unit_m(text: str) -> float | None:
+    """Return the metres in the unit that a text begins with, or in the only one that it names.
+
+    >>> named_unit_m("cm, as in Unreal"), named_unit_m("Unreal units (1 uu = 1 cm)")
+    (0.01, 0.01)
+    """
+    named = words(text).split("_")
+    found = {UNITS_M[name] for name in (words(text), *named) if name in UNITS_M}
+    return UNITS_M.get(named[0], found.pop() if len(found) == 1 else None)
 
 
 @functools.lru_cache(maxsize=4096)
@@ -286,15 +307,23 @@ def _parts(node: Node) -> Iterator[tuple[int, str, Stated]]:
             yield 0, quantity, Stated(value[at], node.unit, child_path(node.path, at))
         else:
             yield 0, quantity, Stated(value, node.unit, node)
+    places: dict[str, int] = {}
     if node.plain in MATRICES and isinstance(value, dict):
         value = value.get("data")  # as OpenCV writes it
     if node.plain in MATRICES and isinstance(value, list):
         if len(value) in (3, 4) and all(isinstance(row, list) for row in value):
             value = [number for row in value[:3] for number in row[:3]]
         if len(value) == 9 and value[8] == 1:
-            for name, at in (("fx", 0), ("fy", 4), ("cx", 2), ("cy", 5)):
-                for quantity, rank in _quantities(name, "", name):
-                    yield rank, quantity, Stated(value[at], "px", node)
+            places = _MATRIX_PLACES
+    if node.plain == "params" and isinstance(value, list) and node.up is not None:
+        model = next(
+            (words(str(each)) for key, each in node.up.value.items() if "model" in key), ""
+        )
+        places = LENS_PARAMS.get(model, places)
+        places = places if len(value) == max(places.values(), default=0) + 1 else {}
+    for name, at in places.items():
+        for quantity, rank in _quantities(name, "", name):
+            yield rank, quantity, Stated(value[at], "px", node)
 
 
 _STEP: Final = re.compile(r'\.([A-Za-z_][A-Za-z0-9_]*)|\[([0-9]{1,6})\]|\[("(?:[^"\\]|\\.)*")\]')
@@ -329,8 +358,8 @@ def as_stated(value: Any, unit: str, at: Node | str | tuple[str, str | int]) -> 
         value, unit = value["value"], words(value["unit"])
     if isinstance(value, list) and [*map(type, value)] in ([float, str], [int, str]):
         value, unit = value[0], words(value[1])
-    if isinstance(value, list) and len(value) == CAMERA_COUNT and is_number(value[0]):
-        value = value[0] if value.count(value[0]) == CAMERA_COUNT else value
+    if isinstance(value, list) and len(value) >= CAMERA_COUNT and is_number(value[0]):
+        value = value[0] if value.count(value[0]) == len(value) else value
     text = _TEXT_NUMBER.match(value) if isinstance(value, str) else None
     if text is not None and (text[2] or unit):
         with suppress(ValueError):

@@ -223,6 +223,7 @@ class DepthEncoding:
                 f"offset_m={self.offset_m!r} needs unit_m, the range over the stored numbers that "
                 f'it has, and form="depth".'
             )
+        object.__setattr__(self, "accept", frozenset(self.accept))  # a set has no hash
 
     @property
     def known_unit_m(self) -> float:
@@ -377,9 +378,11 @@ class Scene:
         found = self.members.get(self.held_name(name))
         if found is None:
             there = ", ".join(self.held_videos) or "no video"
+            reasons = self.remark("videos").split("; ")
+            reason = next((f" ({each})" for each in reasons if f"{name}: " in each), "")
             raise StorageError(
-                f"{self.id.key}: {name} is not in the data; the scene has {there}. Select these "
-                "or download the others too."
+                f"{self.id.key}: {name} is {'unusable' if reason else 'not in the data'}{reason}; "
+                f"the scene has {there}. Select these or download the others too."
             )
         return found
 

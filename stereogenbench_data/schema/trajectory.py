@@ -91,6 +91,7 @@ class RecordedPoses:
         primary_pairs: The places where it names the primary pair, and the cameras there.
         lens: The key of a focal length or a field of view that is not the same everywhere, and its
             least and greatest number; "" where there is none.
+        first_frame: The least number that frames have, 0 where they have none.
     """
 
     blocks: tuple[Block, ...]
@@ -98,6 +99,7 @@ class RecordedPoses:
     unit_m: float | None
     primary_pairs: tuple[tuple[str, tuple[int, int]], ...] = ()
     lens: str = ""
+    first_frame: int = 0
 
 
 def record_poses(text: bytes, *, where: str) -> RecordedPoses:
@@ -115,7 +117,7 @@ def record_poses(text: bytes, *, where: str) -> RecordedPoses:
     document = parse_document(text, where=where)
     if not isinstance(document, dict):
         document = {"frames": document}
-    columns = _columns(document)
+    columns = _unwrapped(_columns(document))
     if sum(len(values) for _, values in columns.values()) > _MOST_VALUES:
         raise SchemaError(f"{where}: has over {_MOST_VALUES:,} values. Replace it with the file of "
                           "the release.")  # fmt: skip
@@ -140,7 +142,16 @@ def record_poses(text: bytes, *, where: str) -> RecordedPoses:
     pairs = [(each.path, named_pair(each.value)) for each in head.stated("primary_pair")]
     known = tuple((path, pair) for path, pair in pairs if pair is not None)
     unit_m = _unit_m(document, where)
-    return RecordedPoses(tuple(blocks), _hints(document), unit_m, known, _changing_lens(columns))
+    lens, first_frame = _changing_lens(columns), _first_frame(columns)
+    return RecordedPoses(tuple(blocks), _hints(document), unit_m, known, lens, first_frame)
+
+
+def _first_frame(columns: Columns) -> int:
+    named = (values for place, (lengths, values) in columns.items()
+             if lengths and place[-1] in ("#", *_FRAME_KEYS) and "frame" in "".join(place[-3:])
+             and "cam" not in "".join(place[-2:]))  # fmt: skip
+    numbers = (number for values in named for number in map(_frame_of, values))
+    return min((number for number in numbers if number is not None), default=0)
 
 
 def _changing_lens(columns: Columns) -> str:
@@ -227,6 +238,17 @@ def _columns(node: Any, depth: int = 0) -> Columns:
     if isinstance(node, list):
         return _stacked(_by_frame(node), depth)
     return {(): ((), [node])}
+
+
+def _unwrapped(columns: Columns) -> Columns:
+    """Return columns without the axes of one element below those of frames and cameras."""
+    found: Columns = {}
+    for place, (lengths, values) in columns.items():
+        axes = [at for at, key in enumerate(place) if key == "*"]
+        ones = [at for at, length in enumerate(lengths) if at >= 2 and length == 1]
+        kept = tuple(key for at, key in enumerate(place) if at not in [axes[one] for one in ones])
+        found[kept] = tuple(n for at, n in enumerate(lengths) if at not in ones), values
+    return found
 
 
 def _counted(node: dict[str, Any]) -> dict[str, list[tuple[int, Any]]]:

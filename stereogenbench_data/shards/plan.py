@@ -12,8 +12,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
-import numpy as np
-
 from stereogenbench_data.errors import ShardError
 from stereogenbench_data.index.open import MOST_LEFT_OUT, IncompleteSceneWarning
 from stereogenbench_data.index.rows import row_of
@@ -243,14 +241,12 @@ def _whole_rows(index: SceneIndex, rows: Sequence[int] | None) -> list[int]:
         ShardError: If no row is left, or more than a few scenes lack a file.
     """
     chosen = list(range(len(index))) if rows is None else list(map(int, rows))
-    reasons = {}
-    for row in np.union1d(index.remarked("videos"), index.remarked("poses")).tolist():
-        scene = index.scene(row)
-        missing = scene.remark("videos")
-        if TRAJECTORY_JSON not in scene.members:
-            missing = missing or scene.remark("poses")
-        if missing:
-            reasons[row] = missing
+    remarked = {row: index.scene(row) for row in index.remarked("poses").tolist()}
+    reasons = {row: scene.remark("poses") for row, scene in remarked.items()
+               if TRAJECTORY_JSON not in scene.members}  # fmt: skip
+    if {*chosen} <= {*reasons}:
+        reasons = {}  # data without poses
+    reasons |= {row: index.scene(row).remark("videos") for row in index.remarked("videos").tolist()}
     lacking = [row for row in chosen if row in reasons]
     if not lacking:
         return chosen

@@ -4,6 +4,7 @@ import os
 import re
 import shutil
 
+import av
 import pytest
 
 from stereogenbench_data.errors import SchemaError, StorageError
@@ -171,13 +172,46 @@ def test_videos_that_differ_by_a_frame_give_the_frames_that_all_have(make_scene,
     assert "11 have 4, but cam_05_depth.mkv has 3. The first 3 of all" in scene.remark("frames")
 
 
-def test_a_trajectory_of_fewer_frames_is_not_used(make_scene, root, rewrite):
+def test_frames_without_poses_at_the_end_are_not_used(make_scene, root, rewrite):
     rewrite(make_scene() / "trajectory.json", lambda document: document["frames"].pop())
+
+    scene = describe_scene(root, KEY)
+
+    assert (scene.frames, scene.remark("poses")) == (3, "")
+    assert "poses of 3 frames, and the videos have 4. The first 3 are" in scene.remark("frames")
+
+
+def test_a_trajectory_without_the_first_frame_is_not_used(make_scene, root, rewrite):
+    rewrite(make_scene() / "trajectory.json", lambda document: document["frames"].pop(0))
 
     scene = describe_scene(root, KEY)
 
     assert scene.frames == 4
     assert "has poses of 3 frames, and the videos have 4" in scene.remark("poses")
+
+
+def test_depth_in_a_form_that_nothing_reads_stops_no_pictures(make_scene, root):
+    with av.open(str(make_scene() / "cam_00_depth.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=15)
+        stream.height, stream.width, stream.pix_fmt = 24, 32, "yuva444p"
+        for _ in range(4):
+            frame = av.VideoFrame(32, 24, "yuva444p")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+    scene = describe_scene(root, KEY)
+
+    assert len(scene.held_videos) == 11
+    with pytest.raises(StorageError, match=r"cam_00_depth.mkv is unusable \(.* depth is stored by"):
+        scene.member("cam_00_depth.mkv")
+
+
+def test_a_unit_of_depth_in_a_file_of_its_own_is_read(make_scene, root, video):
+    folder = make_scene()
+    shutil.copy(video("depth.mkv", tags={}), folder / "cam_00_depth.mkv")
+    (folder / "depth_meta.json").write_text('{"depth_unit": "mm"}')
+
+    assert describe_scene(root, KEY).depth_unit_m[0] == 0.001
 
 
 @pytest.mark.parametrize(

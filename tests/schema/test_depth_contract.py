@@ -52,6 +52,7 @@ def test_a_tag_of_millimetres_is_understood(tag):
         {"depth_scale": 0.001},
         {"depth_scale": 1000},
         {"depth_scales_m": [0.001] * 6},
+        {"depth_scales_m": {f"cam_{camera:02d}": 0.001 for camera in range(6)}},
         {"depth_unit": "mm"},
         {"depthUnitMeters": 0.001},
         {"depth_units_per_meter": 1000},

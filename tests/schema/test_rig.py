@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.parse import parse_rig, require_unit
+from stereogenbench_data.schema.parse import parse_rig, require_unit, see_rig
 from stereogenbench_data.schema.records import Rig
 
 BASELINES_CM = (6.5, 13.25, 19.0, 26.0, 32.5, 6.75, 12.5, 19.5, 26.0, 5.75, 12.75, 19.25)
@@ -307,6 +307,13 @@ def test_a_principal_point_that_is_not_understood_stops_no_disparity(rig_documen
           "sensor_width_mm": 23.76}, {}),
         ({"vertical_fov_degrees": 30.66233813, "sensor_width_mm": 23.76}, {}),
         ({"focal_length": {"value": 3.25, "unit": "cm"}, "sensor_width_mm": 23.76}, {}),
+        ({"focal_length_mm": [32.5] * 81, "sensor_width_mm": 23.76}, {}),
+        ({"model": "PINHOLE", "params": [875.4208754, 875.4208754, 320, 240],
+          "sensor_width_mm": 23.76}, {}),
+        ({"model": "SIMPLE_PINHOLE", "params": [875.4208754, 320, 240], "sensor_width_mm": 23.76},
+         {}),
+        ({"K": {f"cam_{camera:02d}": [[875.4208754, 0, 320], [0, 875.4208754, 240], [0, 0, 1]]
+                for camera in range(6)}, "sensor_width_mm": 23.76}, {}),
     ],
 )  # fmt: skip
 def test_a_lens_is_found_under_likely_keys(rig_document, dumped, intrinsics, size):
@@ -468,6 +475,16 @@ def pairs_as(document, write):
                 {"camera_index_a": a + 1, "camera_index_b": b + 1, "baseline_cm": cm}
                 for a, b, cm in pairs
             ]}, id="cameras from 1 and names from 0"),
+        pytest.param(
+            lambda pairs: {"baselines_cm": {
+                f"cam_{a:02d}": {f"cam_{b:02d}": cm for c, b, cm in pairs if c == a}
+                for a in range(5)
+            }}, id="names below names"),
+        pytest.param(
+            lambda pairs: {"pairwise_pairs": [
+                {"camera_index_a": a, "camera_index_b": b, "baseline_cm": cm, "index_delta": b - a}
+                for a, b, cm in pairs
+            ]}, id="a difference of numbers"),
     ],
 )  # fmt: skip
 def test_baselines_are_found_in_likely_forms(rig_document, dumped, write):
@@ -475,6 +492,17 @@ def test_baselines_are_found_in_likely_forms(rig_document, dumped, write):
 
     assert rig.baselines_cm == pytest.approx(BASELINES_CM, rel=1e-12)
     assert rig.primary_pair == (0, 1)
+
+
+def test_conventions_state_the_unit_that_baselines_were_read_in(rig_document, dumped):
+    for pair in rig_document["pairwise_pairs"]:
+        pair["baseline_in"] = pair.pop("baseline_cm") / 2.54
+
+    shape = see_rig(dumped(rig_document), where="baseline.json").shape
+
+    assert shape.at["baselines"].unit == "inch"
+    rig, _, _ = parse_rig(dumped(rig_document), where="baseline.json", shape=shape)
+    assert rig.baselines_cm == pytest.approx(BASELINES_CM, rel=1e-12)
 
 
 def test_a_pair_that_is_not_recorded_follows_from_the_others(rig_document, dumped):

@@ -125,6 +125,12 @@ def named(place):
                                   for f in range(3)]},
             id="an order of its own",
         ),
+        pytest.param(
+            lambda d: {"frames": [{"cameras": {f"Cam_{c:02d}": [{"loc": p}]
+                                               for k, c, p in poses_of(d) if k == f}}
+                                  for f in range(3)]},
+            id="a list of one",
+        ),
     ],
 )  # fmt: skip
 def test_locations_are_found_at_any_depth_and_in_any_order(trajectory_document, write):
@@ -154,7 +160,14 @@ def test_a_world_offset_keeps_every_digit(trajectory_document):
 
 
 @pytest.mark.parametrize(
-    ("unit", "metres"), [("cm", 0.01), (" Centimetres ", 0.01), ("m", 1.0), ("mm", 1e-3)]
+    ("unit", "metres"),
+    [
+        ("cm", 0.01),
+        (" Centimetres ", 0.01),
+        ("m", 1.0),
+        ("mm", 1e-3),
+        ("Unreal units (1 uu = 1 cm)", 0.01),
+    ],
 )
 def test_a_unit_is_read_in_each_spelling(trajectory_document, unit, metres):
     assert recorded(trajectory_document | {"unit": unit}).unit_m == metres

@@ -609,6 +609,16 @@ def test_the_command_refuses_a_release_where_many_scenes_lack_a_file(tree, tmp_p
     assert not (tmp_path / "out").exists()
 
 
+def test_the_command_packs_a_release_without_poses(tree, tmp_path):
+    for place in list(tree.rglob("trajectory.json")):
+        place.unlink()
+
+    result = command(tree, tmp_path / "out", "--workers", "1")
+
+    assert result.exit_code == 0, result.output
+    assert len(SceneIndex.open(tmp_path / "out")) == 4
+
+
 @pytest.mark.parametrize("part", ["3", "a/b", "1/2/3", ""])
 def test_a_part_that_is_not_written_as_one_is_a_usage_error(small_release, tmp_path, part):
     result = command(small_release, tmp_path, "--part", part)
