@@ -19,9 +19,17 @@ def __getattr__(name: str) -> object:
         return sorted(modules)
     if name not in modules:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import gc
     from importlib import import_module
 
-    found = globals()[name] = getattr(import_module(modules[name]), name)
+    # What is imported stays: collecting garbage on the way would only search all of torch.
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        found = globals()[name] = getattr(import_module(modules[name]), name)
+    finally:
+        if was_on:
+            gc.enable()
     return found
 
 

@@ -2,6 +2,8 @@
 
 from stereogenbench_data.datasets.adapters import to_raft_stereo as to_raft_stereo
 from stereogenbench_data.datasets.adapters import to_torchvision as to_torchvision
+from stereogenbench_data.datasets.batch_buffers import collate as collate
+from stereogenbench_data.datasets.batch_buffers import to_device as to_device
 from stereogenbench_data.datasets.batches import EpochBatches as EpochBatches
 from stereogenbench_data.datasets.batches import OpenVideosWarning as OpenVideosWarning
 from stereogenbench_data.datasets.batches import (
@@ -18,8 +20,6 @@ from stereogenbench_data.datasets.mapped import SeekTableWarning as SeekTableWar
 from stereogenbench_data.datasets.mapped import StereoPairs as StereoPairs
 from stereogenbench_data.datasets.shared_epoch import RepeatedEpochWarning as RepeatedEpochWarning
 from stereogenbench_data.datasets.streamed import StereoPairStream as StereoPairStream
-from stereogenbench_data.datasets.tensors import collate as collate
-from stereogenbench_data.datasets.tensors import to_device as to_device
 from stereogenbench_data.errors import DescriptorError as DescriptorError
 from stereogenbench_data.errors import EvaluationError as EvaluationError
 from stereogenbench_data.errors import ExtraError as ExtraError

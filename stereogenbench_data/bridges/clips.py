@@ -44,8 +44,7 @@ from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.selection.options import require_options
-from stereogenbench_data.selection.plan import Address, PairOptions
-from stereogenbench_data.selection.windows import FramesSpec, parse_frames
+from stereogenbench_data.selection.plan import Address, FramesSpec, PairOptions, parse_frames
 from stereogenbench_data.sources.files import open_atomic, write_atomic
 
 Kind = Literal["right", "left", "warped", "mask", "grid"]

@@ -41,8 +41,7 @@ from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters
 from stereogenbench_data.selection.options import require_options
-from stereogenbench_data.selection.plan import Address
-from stereogenbench_data.selection.windows import FramesSpec
+from stereogenbench_data.selection.plan import Address, FramesSpec
 from stereogenbench_data.sources.files import write_atomic
 
 ABOUT_JSON: Final = "stereogenbench.json"

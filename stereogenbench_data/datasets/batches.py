@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Final, Literal, Protocol, TypedDict, Unpack
+from typing import Any, Final, Literal, TypedDict, Unpack
 
 import numpy as np
 import torch.distributed
@@ -21,7 +21,6 @@ from stereogenbench_data.datasets.shared_epoch import SharedEpoch, require_epoch
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Stream
-from stereogenbench_data.samples.streams import OPEN_STREAMS
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.order import (
@@ -32,7 +31,6 @@ from stereogenbench_data.selection.order import (
     DropLast,
     EpochOrder,
     OrderRule,
-    Runs,
     last_batch,
     rank_share,
 )
@@ -90,14 +88,6 @@ class EpochOptions(TypedDict, total=False):
     shuffle_groups: int
     open_scenes: int
     open_frames: int
-
-
-class Numbered(Protocol):
-    """A dataset whose samples a plan numbers."""
-
-    index: SceneIndex
-    plan: Plan
-    shared_epoch: SharedEpoch
 
 
 class EpochBatch(list[int]):
@@ -266,38 +256,6 @@ class Passes:
         return self.__dict__ | {"_running": [], "latest": None}
 
 
-class KnownOrder:
-    """What the batches of all ranks are, without the dataset that they are of."""
-
-    def __init__(self, rule: OrderRule, *, is_padded: bool) -> None:
-        """Take what the order depends on, and whether the last batches are filled up."""
-        self.rule = rule
-        self.is_padded = is_padded
-        self._order: EpochOrder | None = None
-
-    def order(self, runs: Runs, epoch: int) -> EpochOrder:
-        """Return the order of an epoch; the last one is kept."""
-        if self._order is None or self._order.epoch != epoch:
-            self._order = EpochOrder(runs, self.rule, epoch=epoch)
-        return self._order
-
-    def batch(self, runs: Runs, number: int, *, epoch: int) -> EpochBatch:
-        """Return the samples of a global batch, without saying which of them are padding."""
-        order = self.order(runs, epoch)
-        samples = order.batch(number) if number < order.batches else np.empty(0, dtype=np.int64)
-        return EpochBatch(
-            (order.full_batch(number) if self.is_padded else samples).tolist(),
-            epoch=epoch,
-            ends_of_runs=samples[order.ends_run(number)].tolist() if len(samples) else (),
-            number=number,
-            group=number % order.groups,
-        )
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy in another process needs; it computes the order itself."""
-        return self.__dict__ | {"_order": None}
-
-
 class EpochBatches(Sampler[list[int]]):
     """A batch sampler: the samples of each batch of an epoch, for one rank.
 
@@ -326,7 +284,7 @@ class EpochBatches(Sampler[list[int]]):
         passes: Where its passes are: the position.
     """
 
-    def __init__(self, dataset: Numbered, batch_size: int, **options: Unpack[EpochOptions]) -> None:
+    def __init__(self, dataset: Any, batch_size: int, **options: Unpack[EpochOptions]) -> None:
         """Order the samples of a dataset; nothing is computed before the first batch.
 
         Args:
@@ -361,7 +319,7 @@ class EpochBatches(Sampler[list[int]]):
         self._drop_last = options.get("drop_last", rule.shuffle)
         self.drop_last, self.is_padded = self._drop_last is True, self._drop_last == "pad"
         self._follows_the_group = "rank" not in options
-        self.known_order = KnownOrder(self.rule, is_padded=self.is_padded)
+        self._order: EpochOrder | None = None
         self.passes = Passes(dataset.shared_epoch, then="same epoch")
         if self.end() == 0:
             raise SelectionError(
@@ -527,10 +485,16 @@ class EpochBatches(Sampler[list[int]]):
 
     def batch(self, number: int, *, epoch: int) -> EpochBatch:
         """Return the samples of a global batch."""
-        batch = self.known_order.batch(self.dataset.plan.runs, number, epoch=epoch)
-        if self.is_padded:
-            batch.is_padding = self.is_padding(number).tolist()
-        return batch
+        order = self.order(epoch)
+        samples = order.batch(number) if number < order.batches else np.empty(0, dtype=np.int64)
+        return EpochBatch(
+            (order.full_batch(number) if self.is_padded else samples).tolist(),
+            epoch=epoch,
+            is_padding=self.is_padding(number).tolist() if self.is_padded else None,
+            ends_of_runs=samples[order.ends_run(number)].tolist() if len(samples) else (),
+            number=number,
+            group=number % order.groups,
+        )
 
     def is_padding(self, number: int) -> np.ndarray:
         """Return, for each sample of a global batch, whether it fills up after the epoch's end."""
@@ -539,7 +503,9 @@ class EpochBatches(Sampler[list[int]]):
 
     def order(self, epoch: int) -> EpochOrder:
         """Return the order of an epoch; the last one is kept."""
-        return self.known_order.order(self.dataset.plan.runs, epoch)
+        if self._order is None or self._order.epoch != epoch:
+            self._order = EpochOrder(self.dataset.plan.runs, self.rule, epoch=epoch)
+        return self._order
 
     def state_at(self, epoch: int, batches: int) -> State:
         """Return the state after so many global batches of an epoch."""
@@ -559,12 +525,6 @@ class EpochBatches(Sampler[list[int]]):
         if not isinstance(state, Mapping):
             raise StateError(
                 f"a state is a dict as state_dict() returns it, got {state!r:.60}: {_STATES}"
-            )
-        if state.get("version", ORDER_VERSION) != ORDER_VERSION:
-            raise StateError(
-                f"the state was saved for other batches: version is {ORDER_VERSION} here and "
-                f"{state['version']!r} there. Begin the epoch anew without it, or go on with the "
-                "version of the package that saved it."
             )
         own = {"version": ORDER_VERSION, **self._identity}
         missing = sorted({*own, "epoch", "batches_consumed"} - state.keys())
@@ -606,6 +566,10 @@ class EpochBatches(Sampler[list[int]]):
             "selection": self.dataset.plan.digest,
             "index": self.dataset.index.digest,
         }
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy needs; it computes the order itself."""
+        return self.__dict__ | {"_order": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Become a copy, with passes of its own."""
@@ -701,6 +665,8 @@ def videos_to_keep(
     warning says what to do if the process may not open so many files, or if several processes
     decode the same videos and more groups would avoid it.
     """
+    from stereogenbench_data.samples.streams import OPEN_STREAMS  # slow to import: decoders
+
     lengths = plan.runs.lengths
     groups = rule.groups_of(lengths)
     together = processes // math.gcd(rule.shuffle_groups, processes)

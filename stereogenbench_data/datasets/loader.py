@@ -21,22 +21,19 @@ from weakref import WeakSet
 
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, DistributedSampler, Sampler, SequentialSampler
+from torch.utils.data import DataLoader, DistributedSampler, SequentialSampler
 
-from stereogenbench_data.datasets.batch_buffers import forget_slots, held_batches
 from stereogenbench_data.datasets.batches import (
-    EpochBatch,
     EpochBatches,
     EpochOptions,
     Pass,
     State,
 )
-from stereogenbench_data.datasets.workers import WorkerContext
+from stereogenbench_data.datasets.workers import Workers
 from stereogenbench_data.errors import (
     PassError,
     StateError,
     StereoGenBenchError,
-    WorkerError,
 )
 from stereogenbench_data.selection.order import EpochOrder, Numbers
 from stereogenbench_data.selection.plan import Plan
@@ -68,8 +65,6 @@ class LoaderStats(NamedTuple):
         workers: How many worker processes run for it.
         videos_open: How many videos this process has open for it; each worker has its own.
         videos_limit: How many videos a process opens for it at most.
-        batches_held: How many batches of its workers are open in shared slots: the loop holds a
-            part of them, or they arrived early.
         mixing: How many scenes and moments a batch shows, beside one of a fully shuffled sampler,
             in one line (of the first batches of epoch 0); empty of more than 100,000 samples.
         waiting: The share of the time that the loop has waited for batches, from the beginning of
@@ -81,7 +76,6 @@ class LoaderStats(NamedTuple):
     workers: int
     videos_open: int
     videos_limit: int
-    batches_held: int
     mixing: str
     waiting: float
 
@@ -184,10 +178,10 @@ class PairsLoader(DataLoader[Any]):
         )
         self.batches = batches
         self._loadable = dataset
-        self._workers: WeakSet[_Workers] = WeakSet()
+        self._workers: WeakSet[Workers] = WeakSet()
         self._begun_passes = 0
         self._pass_began_s = self._passed_s = self._waited_s = 0.0
-        self._persistent: _Workers | None = None
+        self._persistent: Workers | None = None
         self._set_sampler()
         dataset.keep_open(batches, processes=batches.world_size * max(1, num_workers))
 
@@ -260,7 +254,6 @@ class PairsLoader(DataLoader[Any]):
             workers=len(pids),
             videos_open=videos.videos_open,
             videos_limit=videos.videos_limit,
-            batches_held=held_batches(pids),
             mixing=self._mixing,
             waiting=self._waited_s / self._passed_s if self._passed_s else 0.0,
         )
@@ -347,19 +340,21 @@ class PairsLoader(DataLoader[Any]):
             self.__dict__["batch_sampler"] = self.batches
         self._set_sampler()
 
-    def _forget(self, workers: "_Workers") -> None:
+    def _forget(self, workers: Workers) -> None:
         """End workers; the next pass starts others."""
         if workers is self._persistent:
             self._persistent = None
         workers.end()
 
-    def _workers_of_a_pass(self) -> "_Workers":
+    def _workers_of_a_pass(self) -> Workers:
         """Return the workers of a pass that begins: those that persist, or new ones."""
-        if not self.persistent_workers:
-            return _Workers(self)
-        if self._persistent is None or not self._persistent.is_of_this_process:
-            self._persistent = _Workers(self)
-        return self._persistent
+        if self._persistent is not None and self._persistent.is_of_this_process:
+            return self._persistent
+        workers = Workers(self)
+        self._workers.add(workers)
+        if self.persistent_workers:
+            self._persistent = workers
+        return workers
 
     def _begin(self, begun: Pass) -> None:
         """Record that a pass begins."""
@@ -403,7 +398,7 @@ class LoaderPass(Iterator[Any]):
         """Represent the next pass of a loader; workers start with the first batch."""
         self._loader = loader
         self._pass: Pass | None = None
-        self._workers: _Workers | None = None
+        self._workers: Workers | None = None
         self._loaded: Iterator[Any] = iter(())
         self._is_closed = False
         self._error: str | None = None
@@ -411,25 +406,9 @@ class LoaderPass(Iterator[Any]):
         # Threads that share a pass take turns.
         self._lock = threading.RLock()
 
-    @property
-    def epoch(self) -> int:
-        """The epoch of its batches."""
-        return (self._pass or self._loader.batches.next_pass()).epoch
-
-    @property
-    def taken(self) -> int:
-        """How many batches it has given."""
-        return 0 if self._pass is None else self._pass.taken
-
     def __len__(self) -> int:
         """Return how many batches it has in all."""
         return len((self._pass or self._loader.batches.next_pass()).share)
-
-    def __repr__(self) -> str:
-        """Return a summary."""
-        if self._pass is None:
-            return "<LoaderPass: not begun>"
-        return f"<LoaderPass: {self.taken} of {len(self)} batches of epoch {self.epoch}>"
 
     def __next__(self) -> Any:
         """Return the next batch.
@@ -458,7 +437,7 @@ class LoaderPass(Iterator[Any]):
             raise StopIteration
         if workers.serves is not begun:
             raise PassError(
-                f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} "
+                f"this pass over epoch {begun.epoch} ended after {begun.taken} of {len(self)} "
                 "batches, as another one was begun: workers that persist serve one pass at a time. "
                 "Use a loader for each, or persistent_workers=False."
             )
@@ -489,12 +468,12 @@ class LoaderPass(Iterator[Any]):
         with self._ended_by_errors():
             self._loaded = workers.begin(begun, numbers)
 
-    def _load(self, workers: "_Workers") -> Any:
+    def _load(self, workers: Workers) -> Any:
         """Return what the workers have next; an error that a dead worker caused names it."""
         try:
             return next(self._loaded)
         except (RuntimeError, OSError, EOFError) as error:
-            death = None if isinstance(error, StereoGenBenchError) else workers.death(error)
+            death = None if isinstance(error, StereoGenBenchError) else workers.error(error)
             if death is None:
                 raise
             self._loader._forget(workers)
@@ -506,11 +485,12 @@ class LoaderPass(Iterator[Any]):
         try:
             yield
         except BaseException as error:
-            if isinstance(error, StopIteration) and self._pass is not None:
-                self._pass.is_exhausted = True
+            begun = self._pass or self._loader.batches.next_pass()
+            if isinstance(error, StopIteration):
+                begun.is_exhausted = True
             else:
                 self._error = (
-                    f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} "
+                    f"this pass over epoch {begun.epoch} ended after {begun.taken} of {len(self)} "
                     "batches with an error: begin another one, or load a state."
                 )
             self.close()
@@ -536,114 +516,13 @@ class LoaderPass(Iterator[Any]):
             PassError: Always.
         """
         raise PassError(
-            f"{self!r} cannot be copied: its workers serve one loop. Call iter(loader) for "
-            "another pass, or copy the loader."
+            "a pass over a loader cannot be copied: its workers serve one loop. Call iter(loader) "
+            "for another pass, or copy the loader."
         )
 
     def __del__(self) -> None:
         """End the pass when no reference is left."""
         self.close()
-
-
-class _Workers:
-    """The workers of one pass, or of several one after another where they persist."""
-
-    def __init__(self, loader: PairsLoader) -> None:
-        self._torch: DataLoader[Any] | None = None
-        self._batches: Iterator[Any] = iter(())
-        _running.add(self)
-        loader._workers.add(self)
-        self.serves: Pass | None = None
-        self._numbers = _Numbers()
-        self._context = None
-        if loader.num_workers > 0:
-            self._context = WorkerContext(loader.multiprocessing_context)
-        self._torch = DataLoader(
-            loader.dataset,
-            batch_sampler=self._numbers,
-            num_workers=loader.num_workers,
-            collate_fn=loader.collate_fn,
-            pin_memory=loader.pin_memory,
-            timeout=loader.timeout,
-            worker_init_fn=loader.worker_init_fn,
-            multiprocessing_context=self._context and self._context.context,
-            generator=loader.generator,
-            prefetch_factor=loader.prefetch_factor,
-            persistent_workers=loader.persistent_workers,
-        )
-
-    @property
-    def is_of_this_process(self) -> bool:
-        """Whether this process started them, and not one that it was forked from."""
-        return self._context is None or self._context.is_of_this_process
-
-    @property
-    def pids(self) -> set[int]:
-        """The numbers of the processes that run."""
-        return set() if self._context is None or self._torch is None else self._context.pids
-
-    def begin(self, begun: Pass, numbers: Iterator[Any]) -> Iterator[Any]:
-        """Return the batches of a pass; the pass that these workers served before has ended."""
-        if self._torch is None:
-            raise PassError("these workers have ended: call iter(loader) again.")
-        are_new, self.serves = self.serves is None, begun
-        self._numbers.due = numbers
-        self._batches = iter(self._torch)
-        if self._context is not None and are_new:
-            self._context.watch()
-        return self._batches
-
-    def death(self, noticed: Exception) -> WorkerError | None:
-        """Return an error that names a worker that died; None if none did."""
-        return None if self._context is None else self._context.error(noticed)
-
-    def __del__(self) -> None:
-        """End the workers when no reference is left."""
-        self.end()
-
-    def end(self) -> None:
-        """End the workers, and release the memory that came from them."""
-        batches, self._batches = self._batches, iter(())
-        loader, self._torch = self._torch, None
-        if loader is None or self._context is None or sys.is_finalizing():
-            return
-        if not self._context.is_of_this_process:
-            _inherited.append((loader, batches))
-            return
-        self._context.stop()
-        # Now, and not when the last traceback is gone that knows the iterator. Lightning ends
-        # workers in this way, too; where none could be started there is nothing to end.
-        shutdown = getattr(batches, "_shutdown_workers", None)
-        if shutdown is not None:
-            shutdown()
-        forget_slots(self._context.pids)
-
-
-class _Numbers(Sampler[list[int]]):
-    """The batch sampler of workers: the numbers of the samples that are due."""
-
-    def __init__(self) -> None:
-        self.due: Iterator[EpochBatch] = iter(())
-
-    def __iter__(self) -> Iterator[EpochBatch]:
-        return self.due
-
-
-_running: Final[WeakSet[_Workers]] = WeakSet()
-"""The workers of the passes of this process."""
-
-_inherited: Final[list[object]] = []
-"""Workers that a fork copied. They are the parent's: if the last reference to torch's iterator were
-dropped here, torch would end them. The operating system frees all of it when this process ends."""
-
-
-def _keep_inherited() -> None:
-    _inherited.extend(_running)
-    _running.clear()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_keep_inherited)
 
 
 def accelerates_epoch(dataset: object) -> int | None:

@@ -6,17 +6,21 @@ import operator
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Literal, Self, TypedDict, Unpack, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypedDict, Unpack, get_args
 
 import numpy as np
 from torch.utils.data import Dataset, get_worker_info
 
-from stereogenbench_data.datasets.batch_buffers import BatchArrays, BatchBuffers, Buffers
+from stereogenbench_data.datasets.batch_buffers import (
+    BatchArrays,
+    BatchBuffers,
+    Buffers,
+    to_tensors,
+)
 from stereogenbench_data.datasets.batches import (
     EpochBatch,
     EpochBatches,
     EpochOptions,
-    KnownOrder,
     Passes,
     videos_to_keep,
 )
@@ -26,31 +30,38 @@ from stereogenbench_data.datasets.loader import (
     accelerates_epoch,
 )
 from stereogenbench_data.datasets.shared_epoch import DrawnSamples, SharedEpoch
-from stereogenbench_data.datasets.tensors import to_tensors
 from stereogenbench_data.errors import FieldError, SelectionError, text_without_secrets
 from stereogenbench_data.index.open import Rows
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.checks import check_samples, without_odd_scenes
-from stereogenbench_data.samples.coming import Step
 from stereogenbench_data.samples.fields import (
     DEFAULT_PAIR_FIELDS,
     DEFAULT_VIEW_FIELDS,
     Sample,
 )
-from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.samples.request import Layout, Request, Transform, parse_request
-from stereogenbench_data.samples.streams import StreamStats
 from stereogenbench_data.samples.writer import Allocate, new_array
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import SceneFilters, may_pass
 from stereogenbench_data.selection.options import options_of, require_options, split_options
-from stereogenbench_data.selection.plan import Address, Plan, Selection, plan_pairs, plan_views
-from stereogenbench_data.selection.windows import FramesSpec, Random
+from stereogenbench_data.selection.plan import (
+    Address,
+    FramesSpec,
+    Plan,
+    Random,
+    Selection,
+    Step,
+    plan_pairs,
+    plan_views,
+)
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.fetch_ahead import FETCH_AHEAD_BYTES, FetchAhead
 from stereogenbench_data.sources.location import is_remote
+
+if TYPE_CHECKING:
+    from stereogenbench_data.samples.streams import StreamStats
 
 Data = str | Path | SceneIndex
 
@@ -126,6 +137,8 @@ class _MappedScenes(Dataset[Sample]):
     def __init__(
         self, index: SceneIndex, plan: Plan, request: Request, options: ReadOptions
     ) -> None:
+        from stereogenbench_data.samples.load import SampleLoader  # slow to import: decoders
+
         selected = len(plan.scene_rows)
         plan = without_odd_scenes(index, plan, request)
         check_samples(index, plan, request)
@@ -158,8 +171,8 @@ class _MappedScenes(Dataset[Sample]):
         self.buffers = BatchBuffers(options.get("buffers", "reused"))
         self._streams = request.streams
         self.shared_epoch = SharedEpoch()
-        self._drawn = DrawnSamples(len(plan)) if _is_random(plan, request) else None
-        self._known_order: KnownOrder | None = None
+        self._drawn = DrawnSamples() if _is_random(plan, request) else None
+        self._batches: EpochBatches | None = None
         self._step = self._stop = 0
         self._next_batch: tuple[int, int] | None = None
 
@@ -241,6 +254,7 @@ class _MappedScenes(Dataset[Sample]):
 
         They lie side by side in memory where `BatchBuffers.collate` makes batches of them.
         """
+        self._mark_drawn(batch)
         self._expect(batch, batch)
         arrays = self.buffers.allocate(len(batch)) if self.buffers.makes_batches else None
         for place in range(start, len(batch)):
@@ -252,25 +266,25 @@ class _MappedScenes(Dataset[Sample]):
         if batch.number is None or this != self._next_batch or not self._loader.has_order:
             self._loader.expect(self.steps(batch, reading))
         self._next_batch = None
-        if batch.number is not None and self._known_order is not None:
+        if batch.number is not None and self._batches is not None:
             self._next_batch = (batch.epoch, batch.number + self._step)
 
     def steps(self, batch: EpochBatch, reading: Sequence[int]) -> Iterator[Step]:
         """Yield the samples of a batch, and of those that this process gets after it."""
-        known, number = self._known_order, batch.number
+        batches, number = self._batches, batch.number
         while True:
             for each in reading:
                 if -len(self.plan) <= each < len(self.plan):
                     address = self._address(each, batch.epoch, group=batch.group)
                     yield Step(address, each in batch.ends_of_runs)
-            if number is None or known is None or number + self._step >= self._stop:
+            if number is None or batches is None or number + self._step >= self._stop:
                 return
             number += self._step
-            batch = reading = known.batch(self.plan.runs, number, epoch=batch.epoch)
+            batch = reading = batches.batch(number, epoch=batch.epoch)
 
     def _address(self, number: int, epoch: int, *, group: int) -> Address:
         address = self.plan.locate(number % len(self.plan), epoch=epoch, group=group)
-        return address._replace(run=0) if self._known_order is None else address
+        return address._replace(run=0) if self._batches is None else address
 
     def _load_into(
         self, arrays: BatchArrays | None, place: int, number: int, *, batch: EpochBatch
@@ -353,7 +367,7 @@ class _MappedScenes(Dataset[Sample]):
         if epoch is not None:
             twin.shared_epoch = SharedEpoch(epoch)
             twin._drawn = None
-        twin._known_order = twin._next_batch = None
+        twin._batches = twin._next_batch = None
         return twin
 
     def keep_open(self, batches: EpochBatches, *, processes: int) -> None:
@@ -367,7 +381,7 @@ class _MappedScenes(Dataset[Sample]):
                 self.plan, batches.rule, streams=self._streams, processes=processes
             )
             self._loader.keep_open(videos, frames=batches.rule.open_frames)
-        self._known_order, self._step, self._stop = batches.known_order, processes, batches.end()
+        self._batches, self._step, self._stop = batches, processes, batches.end()
         self._next_batch = None
 
     def stop_fetching(self) -> None:
@@ -375,7 +389,7 @@ class _MappedScenes(Dataset[Sample]):
         self._next_batch = None
         self._loader.stop_fetching()
 
-    def stats(self) -> StreamStats:
+    def stats(self) -> "StreamStats":
         """Return how many videos this process has open for this dataset, and may have.
 
         A loader has its own videos: see its ``stats()``.

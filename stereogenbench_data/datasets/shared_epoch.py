@@ -13,20 +13,16 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import pyarrow as pa
 import torch
-from torch.utils.data import get_worker_info
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
-
-_WATCHED: Final = 1 << 14
-"""Of so many samples `DrawnSamples` knows whether they were drawn."""
 
 _rows: Final[WeakKeyDictionary[SceneIndex, torch.Tensor]] = WeakKeyDictionary()
 """The rows of each index that was sent to other processes, laid out once."""
 
 
 class RepeatedEpochWarning(UserWarning):
-    """A second pass draws the same random frames and transforms, or has the same order."""
+    """A second pass draws the same random frames and transforms."""
 
 
 class SharedNumbers:
@@ -107,45 +103,38 @@ def require_epoch(epoch: int) -> int:
 
 
 class DrawnSamples:
-    """Which samples torch's own `DataLoader` has drawn in an epoch, so that a second pass is told.
+    """Whether the random samples of an epoch are drawn a second time, by torch's own `DataLoader`.
 
     Its passes are of the same epoch until ``set_epoch`` is called, so each would draw the same
-    random frames and transforms. All processes mark what they draw, the first 16,384 samples of a
-    dataset at most; the first worker, or the process itself where it has none, warns once.
+    random frames and transforms. The first sample that any process draws in an epoch is watched;
+    the process that draws it again warns, once.
     """
 
-    def __init__(self, samples: int) -> None:
-        """Begin without any; the first number is the epoch that is marked, the second the word."""
-        self._numbers = SharedNumbers([-1, 0])
-        self._drawn = SharedNumbers([0] * min(samples, _WATCHED))
+    def __init__(self) -> None:
+        """Begin with none: an epoch, the sample that is watched, and whether it was told."""
+        self._watched = SharedNumbers([-1, -1, 0])
 
     def mark(self, numbers: Sequence[int], *, epoch: tuple[int, int], dataset: object) -> None:
-        """Mark the samples of a batch, and warn if one of them was marked before.
+        """Take samples as drawn, and warn if the watched one is drawn again.
 
         Args:
             numbers: The samples.
             epoch: Their epoch, and how often it was set.
             dataset: What draws them, for the warning.
         """
-        marked = hash(epoch)
-        if self._numbers[0] != marked:
-            self._drawn.tensor.zero_()
-            self._numbers[0] = marked
-        watched = len(self._drawn.tensor)
-        places = torch.tensor([number for number in numbers if 0 <= number < watched])
-        info = get_worker_info()
-        speaks = (info is None or info.id == 0) and not self._numbers[1]
-        if len(places) and speaks and self._drawn.tensor[places].any():
-            self._numbers[1] = 1
+        watched, marked = self._watched, hash(epoch)
+        if watched[0] != marked and numbers:
+            watched[1], watched[0] = numbers[0], marked
+        elif watched[1] in numbers and not watched[2]:
+            watched[2] = 1
             warnings.warn(
                 f"{dataset!r} is read by torch's own DataLoader, and samples of epoch {epoch[0]} "
                 "come a second time, with the same random frames and transforms. Call "
-                "set_epoch(epoch) of the dataset before each pass, or use its loader(...), whose "
+                "set_epoch(epoch) before each pass, or use StereoPairs(...).loader(...), whose "
                 "every pass is of the next epoch.",
                 RepeatedEpochWarning,
                 stacklevel=3,
             )
-        self._drawn.tensor[places] = 1
 
 
 def _parted(index: SceneIndex) -> tuple[Any, ...]:

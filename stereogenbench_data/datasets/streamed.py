@@ -1,9 +1,8 @@
 """An iterable dataset with the order of the map-style ones, for trainers that want one."""
 
 import os
-import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, Final, Unpack, cast
+from typing import Any, Final, Unpack
 
 from torch.utils.data import IterableDataset, get_worker_info
 
@@ -11,87 +10,24 @@ from stereogenbench_data.datasets.batches import (
     EpochBatches,
     EpochOptions,
     Pass,
-    Passes,
     Position,
     State,
     require_count,
 )
 from stereogenbench_data.datasets.mapped import Data, PairsOptions, StereoPairs
-from stereogenbench_data.datasets.shared_epoch import (
-    RepeatedEpochWarning,
-    SharedEpoch,
-    SharedNumbers,
-)
+from stereogenbench_data.datasets.shared_epoch import SharedNumbers
 from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.selection.options import require_options, split_options
 
 _MOST_WORKERS: Final = 4096
-"""Workers with a number of their own in `StreamPasses`."""
+"""Workers for each of which a stream counts passes."""
 
 
 class StreamOptions(PairsOptions, EpochOptions, total=False):
     """What `StereoPairs` takes, and `EpochOptions`; ``seed`` is the seed of both."""
 
     fields: Iterable[str]
-
-
-class StreamPasses(Passes):
-    """The passes of a stream. Worker processes begin them, so all processes see where."""
-
-    def __init__(self, epoch: SharedEpoch) -> None:
-        """Begin with the epoch of a dataset; a stream sets it, too."""
-        self._set_to = SharedNumbers([epoch.value, 0])
-        self._begun_by_worker = SharedNumbers([0] * _MOST_WORKERS)
-        super().__init__(epoch, then="same epoch")
-
-    def go_to(self, epoch: int, start: int) -> None:
-        """Let the next pass of each worker begin at a global batch of an epoch."""
-        self.latest = None
-        self._set_to[0], self._set_to[1] = epoch, start
-        self._begun_by_worker.tensor.zero_()
-
-    @property
-    def first_position(self) -> Position:
-        """Where the first pass began since the position was set; workers may have begun it."""
-        epoch = self._dataset_epoch.value
-        return epoch, self._set_to[1] if self._set_to[0] == epoch else 0
-
-    @property
-    def next_position(self) -> Position:
-        """Where the next pass of this process begins."""
-        return (self._dataset_epoch.value, 0) if self._times_begun else self.first_position
-
-    @property
-    def position(self) -> Position:
-        """The position after what this process has taken."""
-        epoch = self._dataset_epoch.value
-        is_of_pass = self.latest is not None and self.latest.epoch == epoch
-        return self.latest.position if self.latest and is_of_pass else self.next_position
-
-    @property
-    def are_begun_by_workers(self) -> bool:
-        """Whether worker processes alone have begun passes since the position was set."""
-        return self.latest is None and bool(self._begun_by_worker.tensor.any())
-
-    @property
-    def is_second_of_unset_epoch(self) -> bool:
-        """Whether the next pass would be the first one to repeat an epoch that nobody chose."""
-        return self._times_begun == 1 and self._dataset_epoch.times_set == 0
-
-    def begin(self, begun: Pass) -> None:
-        """Record that a pass begins in this process."""
-        self._begun_by_worker[_worker_number()] += 1
-        self.latest = begun
-
-    @property
-    def _times_begun(self) -> int:
-        return self._begun_by_worker[_worker_number()]
-
-
-def _worker_number() -> int:
-    info = get_worker_info()
-    return 0 if info is None else info.id % _MOST_WORKERS
 
 
 class StereoPairStream(IterableDataset[Sample]):
@@ -131,7 +67,11 @@ class StereoPairStream(IterableDataset[Sample]):
             others["seed"] = ordering["seed"]
         self.pairs = StereoPairs(data, **others)
         self.batches = EpochBatches(self.pairs, batch_size, **ordering)
-        self.batches.passes = StreamPasses(self.pairs.shared_epoch)
+        # Worker processes begin passes, so all processes see the position that was set (an epoch,
+        # a global batch), and how many passes each worker has begun since.
+        self._set_to = SharedNumbers([self.epoch, 0])
+        self._begun = SharedNumbers([0] * _MOST_WORKERS)
+        self._latest: Pass | None = None
         # A pass that was loaded, and the process that may go on with it: no worker forked from it.
         self._resumed: tuple[Pass, int] | None = None
 
@@ -158,7 +98,25 @@ class StereoPairStream(IterableDataset[Sample]):
         Raises:
             SelectionError: If it is negative.
         """
-        self.batches.set_epoch(epoch)
+        is_loaded = self.epoch == epoch and not self._has_begun
+        self._go_to(epoch, self._first_position[1] if is_loaded else 0)
+
+    def _go_to(self, epoch: int, start: int) -> None:
+        """Let the next pass of each worker begin at a global batch of an epoch."""
+        self.pairs.set_epoch(epoch)
+        self._set_to[0], self._set_to[1] = epoch, start
+        self._begun.tensor.zero_()
+        self._latest = None
+
+    @property
+    def _has_begun(self) -> bool:
+        """Whether this process, or this worker, has begun a pass since the position was set."""
+        return self._begun[self._place["worker"] % _MOST_WORKERS] > 0
+
+    @property
+    def _first_position(self) -> Position:
+        """Where the first pass begins, or has begun, since the position was set."""
+        return self.epoch, self._set_to[1] if self._set_to[0] == self.epoch else 0
 
     def __len__(self) -> int:
         """Return how many samples this rank has in a whole epoch."""
@@ -182,18 +140,13 @@ class StereoPairStream(IterableDataset[Sample]):
         self.batches.require_shared_once(self)
         place = self._place
         self.pairs.keep_open(self.batches, processes=place["world_size"] * place["workers"])
-        if self._passes.is_second_of_unset_epoch and place["worker"] == 0:
-            warnings.warn(
-                f"{self!r} begins epoch {self.epoch} a second time: with the same order, random "
-                "frames and transforms. Call set_epoch(epoch) of the stream before each pass.",
-                RepeatedEpochWarning,
-                stacklevel=2,
-            )
         begun, pid = self._resumed or (None, 0)
         self._resumed = None
         if begun is None or pid != os.getpid() or begun.epoch != self.epoch:
-            begun = self._pass_of_worker(*self._passes.next_position)
-        self._passes.begin(begun)
+            epoch, start = self._first_position
+            begun = self._pass_of_worker(epoch, 0 if self._has_begun else start)
+        self._begun[place["worker"] % _MOST_WORKERS] += 1
+        self._latest = begun
         return self._samples(begun)
 
     def _samples(self, begun: Pass) -> Iterator[Sample]:
@@ -211,10 +164,6 @@ class StereoPairStream(IterableDataset[Sample]):
         begun = self.batches.pass_from(epoch, start)
         begun.share = begun.share[self._place["worker"] :: self._place["workers"]]
         return begun
-
-    @property
-    def _passes(self) -> StreamPasses:
-        return cast("StreamPasses", self.batches.passes)
 
     @property
     def _place(self) -> dict[str, int]:
@@ -235,22 +184,23 @@ class StereoPairStream(IterableDataset[Sample]):
         Raises:
             StateError: If the number is needed and not given.
         """
+        latest = self._latest
         if batches is not None:
-            taken = self.batches.pass_from(*self._passes.first_position)
+            taken = self.batches.pass_from(*self._first_position)
             taken.taken = batches
             return self.batches.state_at(*taken.position)
-        latest = self._passes.latest
-        if latest is None and self._passes.are_begun_by_workers and get_worker_info() is None:
+        if latest is not None and latest.epoch == self.epoch:
+            given = latest.taken * self.batches.batch_size + latest.part
+            own = {"start": latest.start, "samples_given": given, **self._place}
+            return self.batches.state_at(*latest.position) | own
+        if latest is None and get_worker_info() is None and self._begun.tensor.any():
             raise StateError(
                 "worker processes iterate this stream and read ahead: pass the number of "
                 "batches the loop has taken, state_dict(batches=...), or use the loader of "
                 "StereoPairs or torchdata's StatefulDataLoader, which count them."
             )
-        state = self.batches.state_dict()
-        if latest is not None and latest.epoch == state["epoch"]:
-            given = latest.taken * self.batches.batch_size + latest.part
-            state |= {"start": latest.start, "samples_given": given, **self._place}
-        return state
+        epoch, start = self._first_position
+        return self.batches.state_at(epoch, 0 if self._has_begun else start)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go to a saved position: the next pass begins there, all later ones at the beginning.
@@ -261,33 +211,29 @@ class StereoPairStream(IterableDataset[Sample]):
             StateError: If it belongs to other samples or another order, naming what differs; or,
                 in a worker, to another one.
         """
-        epoch, _ = self.batches.position_in(state)
-        resumed = self._resumed_in(state, epoch)
-        if get_worker_info() is None:
-            self.batches.load_state_dict(state)
-        else:
-            self.pairs.set_epoch(epoch)
-        self._resumed = None if resumed is None else (resumed, os.getpid())
-
-    def _resumed_in(self, state: Mapping[str, Any], epoch: int) -> Pass | None:
-        """Return the pass of this very worker that a state holds; None if it is another's."""
+        epoch, start = self.batches.position_in(state)
+        is_worker = get_worker_info() is not None
         differing = [
             f"{name} is {value} here and {state.get(name)} there"
             for name, value in self._place.items()
             if state.get(name) != value
         ]
-        if differing and get_worker_info() is None:
-            return None
-        if differing:
+        if differing and is_worker:
             raise StateError(
                 f"the position is that of another worker: {'; '.join(differing)}. Load it under "
                 "the same ranks and workers; the state of a stream itself goes with any."
             )
-        start = require_count(state, "start", most=self.batches.batches_of_all)
-        begun, size = self._pass_of_worker(epoch, start), self.batches.batch_size
-        given = require_count(state, "samples_given", most=len(begun.share) * size)
-        begun.taken, begun.part = divmod(given, size)
-        return begun
+        resumed = None
+        if not differing:
+            first = require_count(state, "start", most=self.batches.batches_of_all)
+            resumed, size = self._pass_of_worker(epoch, first), self.batches.batch_size
+            given = require_count(state, "samples_given", most=len(resumed.share) * size)
+            resumed.taken, resumed.part = divmod(given, size)
+        if is_worker:
+            self.pairs.set_epoch(epoch)
+        else:
+            self._go_to(epoch, start)
+        self._resumed = None if resumed is None else (resumed, os.getpid())
 
     def close(self) -> None:
         """Close the videos that this process holds open; the stream can be used again."""
@@ -296,4 +242,4 @@ class StereoPairStream(IterableDataset[Sample]):
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs."""
         self.batches.require_shared_once(self)
-        return self.__dict__ | {"_resumed": None}
+        return self.__dict__ | {"_latest": None, "_resumed": None}

@@ -15,15 +15,21 @@ import functools
 import os
 import queue
 import signal
+import sys
 import threading
 import time
+from collections.abc import Iterator
 from multiprocessing import connection, get_context
 from multiprocessing.context import BaseContext
 from multiprocessing.process import BaseProcess
 from multiprocessing.queues import Queue
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
+from weakref import WeakSet
 
-from stereogenbench_data.errors import WorkerError
+from torch.utils.data import DataLoader, Sampler
+
+from stereogenbench_data.datasets.batch_buffers import forget_slots
+from stereogenbench_data.errors import PassError, WorkerError
 
 _BEGUN_WITHIN_S = 20.0
 """How long a forked worker may take to its first line of Python; usually milliseconds."""
@@ -35,52 +41,97 @@ _NOTICED_AFTER_S = 2.0
 """How long torch may know of a death before this module's thread does."""
 
 
-class WorkerContext:
-    """What starts the workers of a pass: a `multiprocessing` context of the requested start method.
+class Workers:
+    """The workers of one pass, or of several one after another where they persist.
 
     Attributes:
-        context: To be passed to `DataLoader`.
+        serves: The pass whose batches they load; None before the first.
         dead: The first worker that ended while it was watched.
     """
 
-    def __init__(self, given: BaseContext | str | None) -> None:
-        """Begin without workers.
+    def __init__(self, loader: DataLoader[Any]) -> None:
+        """Begin without processes; they are started as a loader says, when the first pass begins.
 
-        Args:
-            given: A start method ("fork", "spawn", "forkserver"), a context, or None for the
-                system's own.
+        Without worker processes this one loads.
         """
-        base = given.get_context() if isinstance(given, BaseContext) else get_context(given)
-        kind: Any = type(base)
-        self.context: Any = _watched(kind)()
+        self._torch: DataLoader[Any] | None = None
+        self._batches: Iterator[Any] = iter(())
+        self.serves: object | None = None
         self.dead: BaseProcess | None = None
+        self._numbers = _DueBatches()
+        self._context: Any = None
+        if loader.num_workers > 0:
+            given: Any = loader.multiprocessing_context
+            base = given.get_context() if isinstance(given, BaseContext) else get_context(given)
+            self._context = _watched(type(base))()
+        self._torch = DataLoader(
+            loader.dataset,
+            batch_sampler=self._numbers,
+            num_workers=loader.num_workers,
+            collate_fn=loader.collate_fn,
+            pin_memory=loader.pin_memory,
+            timeout=loader.timeout,
+            worker_init_fn=loader.worker_init_fn,
+            multiprocessing_context=self._context,
+            generator=loader.generator,
+            prefetch_factor=loader.prefetch_factor,
+            persistent_workers=loader.persistent_workers,
+        )
         self._is_dead = threading.Event()
         self._stop_reader, self._stop_writer = connection.Pipe(duplex=False)
         self._thread: threading.Thread | None = None
         self._pid = os.getpid()
+        _running.add(self)
 
     @property
     def pids(self) -> set[int]:
-        """The numbers of the worker processes."""
-        return {process.pid for process in self.context.processes}
+        """The numbers of the processes that run."""
+        if self._context is None or self._torch is None:
+            return set()
+        return {process.pid for process in self._context.processes}
 
     @property
     def is_of_this_process(self) -> bool:
-        """Whether the workers are this process's, not those of one that it was forked from."""
-        return os.getpid() == self._pid
+        """Whether this process started them, and not one that it was forked from."""
+        return self._context is None or os.getpid() == self._pid
 
-    def watch(self) -> None:
-        """Begin to wait for the end of each worker that was started."""
-        self._thread = threading.Thread(target=self._wait, name="worker-watch", daemon=True)
-        self._thread.start()
+    def begin(self, begun: object, numbers: Iterator[Any]) -> Iterator[Any]:
+        """Return the batches of a pass; the pass that these workers served before has ended."""
+        if self._torch is None:
+            raise PassError("these workers have ended: call iter(loader) again.")
+        are_new, self.serves = self.serves is None, begun
+        self._numbers.due = numbers
+        self._batches = iter(self._torch)
+        if self._context is not None and are_new:
+            self._thread = threading.Thread(target=self._wait, name="worker-watch", daemon=True)
+            self._thread.start()
+        return self._batches
 
-    def stop(self) -> None:
-        """Stop waiting: from now on workers may end."""
-        if self._thread is not None and self.is_of_this_process:
+    def __del__(self) -> None:
+        """End the workers when no reference is left."""
+        self.end()
+
+    def end(self) -> None:
+        """End the workers, and release the memory that came from them."""
+        batches, self._batches = self._batches, iter(())
+        loader, self._torch = self._torch, None
+        if loader is None or self._context is None or sys.is_finalizing():
+            return
+        if not self.is_of_this_process:
+            _inherited.append((loader, batches))
+            return
+        if self._thread is not None:
+            # From now on workers may end.
             self._stop_writer.send_bytes(b"stop")
             if threading.current_thread() is not self._thread:
                 self._thread.join()
-        self._thread = None
+            self._thread = None
+        # Now, and not when the last traceback is gone that knows the iterator. Lightning ends
+        # workers in this way, too; where none could be started there is nothing to end.
+        shutdown = getattr(batches, "_shutdown_workers", None)
+        if shutdown is not None:
+            shutdown()
+        forget_slots({process.pid for process in self._context.processes})
 
     def error(self, noticed: BaseException) -> WorkerError | None:
         """Return an error that names the worker that died; None if none did.
@@ -90,6 +141,8 @@ class WorkerContext:
                 death; where it says so of its thread that pins memory, that thread may have read
                 what a dead worker left behind.
         """
+        if self._context is None:
+            return None
         is_a_workers_own = "in DataLoader worker process" in str(noticed).partition("\n")[0]
         if is_a_workers_own or not self._is_dead.wait(_NOTICED_AFTER_S) or self.dead is None:
             return None
@@ -111,17 +164,45 @@ class WorkerContext:
         )
 
     def _wait(self) -> None:
-        sentinels = {process.sentinel: process for process in self.context.processes}
+        """Wait for the end of each worker: where one ends too soon, kill the others."""
+        sentinels = {process.sentinel: process for process in self._context.processes}
         ready = connection.wait([self._stop_reader, *sentinels])
-        if self._stop_reader in ready or self.context.told_to_end():
+        if self._stop_reader in ready or self._context.told_to_end():
             return
         self.dead = next(sentinels[each] for each in ready if isinstance(each, int))
-        for process in self.context.processes:
+        for process in self._context.processes:
             if process is not self.dead:
                 process.kill()
         # torch makes the queue of results first; the others lead to one worker each.
-        self.context.queues[0].end()
+        self._context.queues[0].end()
         self._is_dead.set()
+
+
+class _DueBatches(Sampler[list[int]]):
+    """The batch sampler of workers: the numbers of the samples that are due."""
+
+    def __init__(self) -> None:
+        self.due: Iterator[list[int]] = iter(())
+
+    def __iter__(self) -> Iterator[list[int]]:
+        return self.due
+
+
+_running: Final[WeakSet[Workers]] = WeakSet()
+"""The workers of the passes of this process."""
+
+_inherited: Final[list[object]] = []
+"""Workers that a fork copied. They are the parent's: if the last reference to torch's iterator were
+dropped here, torch would end them. The operating system frees all of it when this process ends."""
+
+
+def _keep_inherited() -> None:
+    _inherited.extend(_running)
+    _running.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_keep_inherited)
 
 
 class _LocklessEvent:

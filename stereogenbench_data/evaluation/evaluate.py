@@ -43,8 +43,7 @@ from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import may_pass
 from stereogenbench_data.selection.options import require_options
-from stereogenbench_data.selection.plan import Selection
-from stereogenbench_data.selection.windows import Random
+from stereogenbench_data.selection.plan import Random, Selection
 
 _PROBLEMS_SHOWN: Final = 2
 

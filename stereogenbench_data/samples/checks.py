@@ -2,7 +2,7 @@
 
 import multiprocessing
 import warnings
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -10,10 +10,9 @@ from stereogenbench_data.errors import MediaError, StorageError, text_without_se
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
 from stereogenbench_data.index.open import MOST_LEFT_OUT
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.media.depth import DEPTH_CURES, NO_DEPTH_UNIT, require_depth_stream
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.samples.size import EnlargedSizeWarning, warn_if_swapped
-from stereogenbench_data.schema.conventions import shape_of_text
+from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT, DEFAULT_DEPTH_UNIT_M, depth_name
 from stereogenbench_data.schema.text import counted
@@ -121,64 +120,43 @@ def _missing_videos(index: SceneIndex, plan: Plan, request: Request, place: int)
 
 
 def _require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> None:
-    """Refuse depth that its contract does not accept, or whose unit is not known."""
-    scenes = index.column("conventions")[plan.scene_rows]
-    for text in [None] if request.depth is not None else dict.fromkeys(scenes):
-        stated = None if text is None else shape_of_text(text).depth
-        encoding = request.depth or (DepthEncoding() if stated is None else stated.encoding)
-        rows = plan.scene_rows if request.depth else plan.scene_rows[scenes == text]
-        _require_whole(index, plan, request, encoding=encoding, rows=rows)
+    """Refuse depth that its contract does not accept, or whose unit is not known.
 
-
-def _require_whole(
-    index: SceneIndex, plan: Plan, request: Request, *, encoding: DepthEncoding, rows: np.ndarray
-) -> None:
-    """Refuse depth of some scenes that a contract does not accept."""
-    units_known = index.column("depth_unit_source") != "unreadable"
-    codecs, codec = index.categories("depth_codec")
-    pixel_formats, pixel_format = index.categories("depth_pixel_format")
-    keeps_depth = np.zeros((len(codecs) + 1, len(pixel_formats) + 1), dtype=bool)
-    for row, column in np.ndindex(len(codecs), len(pixel_formats)):  # -1 is unknown: not kept
-        keeps_depth[row, column] = _keeps_depth(codecs[row], pixel_formats[column], encoding)
-    usable = keeps_depth[codec, pixel_format] & (units_known | (encoding.unit_m is not None))
-    if usable[rows].all():
-        return
+    Files that are stored alike are one kind, of which the first is looked at.
+    """
     pairs = plan.pairs
-    is_of_rows = np.isin(pairs.row, rows)[:, None]
-    for stream, cameras in (
-        ("source_depth", pairs.source[:, None]),
-        ("target_depth", pairs.targets),
-    ):
-        is_refused = is_of_rows & (cameras >= 0) & ~usable[pairs.row[:, None], cameras]
-        refused = np.argwhere(is_refused)
-        if stream in request.streams and len(refused):
-            pair, place = refused[0]
-            scene = index.indexed_scene(int(pairs.row[pair]))
-            _refuse_depth(scene, int(cameras[pair, place]), encoding=encoding)
+    cameras = np.concatenate([pairs.source[:, None], pairs.targets], axis=1)
+    if "source_depth" not in request.streams:
+        cameras = cameras[:, 1:]
+    if "target_depth" not in request.streams:
+        cameras = cameras[:, :1]
+    pair, place = np.nonzero(cameras >= 0)
+    rows, cameras = pairs.row[pair], cameras[pair, place]
+    kinds = index.categories("conventions")[1][rows].astype(np.int64)
+    for name in ("depth_codec", "depth_pixel_format", "depth_unit_source"):
+        values, value = index.categories(name)
+        kinds = kinds * (len(values) + 1) + value[rows, cameras] + 1
+    for first in np.sort(np.unique(kinds, return_index=True)[1]):
+        _require_whole(index.indexed_scene(int(rows[first])), int(cameras[first]), request.depth)
 
 
-def _keeps_depth(codec: str, pixel_format: str, encoding: DepthEncoding) -> bool:
-    try:
-        require_depth_stream(
-            codec=codec, pixel_format=pixel_format, encoding=encoding, name="depth"
-        )
-    except MediaError:
-        return False
-    return True
+def _require_whole(scene: Scene, camera: int, contract: DepthEncoding | None) -> None:
+    from stereogenbench_data.media import depth  # slow to import
 
-
-def _refuse_depth(scene: Scene, camera: int, *, encoding: DepthEncoding) -> NoReturn:
     held = scene.held_name(depth_name(camera))
     name = scene.members[held].path
     if not name.endswith(held):
         name = f"{name}: {scene.id.key}.{held}"
-    require_depth_stream(
+    encoding = scene.depth_encoding(camera, contract or depth_of(scene))
+    depth.require_depth_stream(
         codec=scene.depth_codec[camera],
         pixel_format=scene.depth_pixel_format[camera],
         encoding=encoding,
         name=name,
     )
-    raise MediaError(scene.remark("depth") or f"{name}: {NO_DEPTH_UNIT}. {DEPTH_CURES}")
+    if encoding.unit_m is None:
+        unknown = f"{name}: {depth.NO_DEPTH_UNIT}. {depth.DEPTH_CURES}"
+        raise MediaError(scene.remark("depth") or unknown)
 
 
 def _warn_of_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> None:

@@ -32,7 +32,6 @@ from stereogenbench_data.geometry.projection import (
     visible_in_target,
 )
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
-from stereogenbench_data.media.depth import depth_m_from_units
 from stereogenbench_data.samples.views import StoredDepth, Views
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 
@@ -280,6 +279,8 @@ class PairGeometry(Direction):
         """Depth along the optical axis, 0 where not measured; computed once for all pairs."""
         derived, key = self.stored.derived, ("depth_m", self._views.intrinsics)
         if key not in derived:
+            from stereogenbench_data.media.depth import depth_m_from_units  # slow to import
+
             derived[key] = depth_m_from_units(
                 self.stored.units,
                 measured=self.stored.measured,

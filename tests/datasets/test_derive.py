@@ -25,7 +25,7 @@ from stereogenbench_data import (
     collate,
     derive,
 )
-from stereogenbench_data.datasets.tensors import to_tensors
+from stereogenbench_data.datasets.batch_buffers import to_tensors
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.samples.request import Request

@@ -365,9 +365,19 @@ def test_a_script_without_a_main_guard_is_told_to_have_one(small_index, tmp_path
     assert re.search(r"WorkerError: .* below `if __name__ == '__main__':`", last)
 
 
-@pytest.mark.parametrize("pin_memory", [False, True])
-@pytest.mark.parametrize("persistent", [False, True])
-@pytest.mark.parametrize("how", ["nothing", "queue's lock", "half a message", "index queue's lock"])
+@pytest.mark.parametrize(
+    ("how", "persistent", "pin_memory"),
+    [
+        ("nothing", False, False),
+        ("nothing", True, True),
+        ("queue's lock", False, True),
+        ("queue's lock", True, False),
+        ("half a message", False, True),
+        ("half a message", True, False),
+        ("index queue's lock", False, False),
+        ("index queue's lock", True, True),
+    ],
+)
 @pytest.mark.filterwarnings("ignore:'pin_memory' argument is set as true but no accelerator")
 def test_a_worker_that_dies_ends_the_pass_whatever_it_held(
     small_index, how, persistent, pin_memory

@@ -88,12 +88,27 @@ def test_shares_are_not_shared_again(ranks):
         assert "Prepare pairs.loader(...) instead" in stream
 
 
+@pytest.fixture(scope="module")
+def whole_runs(indexed_release, tmp_path_factory):
+    """The steps of a run that is not stopped, by the trainer and what it was given."""
+    folder = tmp_path_factory.mktemp("whole")
+
+    def pairs():
+        return runs.random_frames(indexed_release)
+
+    return {
+        "lightning": runs.lightning(pairs().loader(4, num_workers=1), folder),
+        "loader": runs.hugging_face(pairs(), folder, loader=pairs().loader(4, num_workers=1)),
+        "dataset": runs.hugging_face(pairs(), folder),
+    }
+
+
 @pytest.mark.parametrize("stop", [4, 15, 22], ids=["mid-epoch", "last batch", "second epoch"])
-def test_lightning_goes_on_as_if_it_had_not_stopped(indexed_release, tmp_path, stop):
+def test_lightning_goes_on_as_if_it_had_not_stopped(whole_runs, indexed_release, tmp_path, stop):
     def loader():
         return runs.random_frames(indexed_release).loader(4, num_workers=1)
 
-    whole = runs.lightning(loader(), tmp_path)
+    whole = whole_runs["lightning"]
     before = runs.lightning(loader(), tmp_path, stop_at=stop)
     after = runs.lightning(loader(), tmp_path, resume=True)
 
@@ -105,14 +120,14 @@ def test_lightning_goes_on_as_if_it_had_not_stopped(indexed_release, tmp_path, s
 @pytest.mark.parametrize("stop", [15, 22], ids=["last batch", "second epoch"])
 @pytest.mark.parametrize("given", ["loader", "dataset"])
 def test_hugging_faces_trainer_goes_on_as_if_it_had_not_stopped(
-    indexed_release, tmp_path, stop, given
+    whole_runs, indexed_release, tmp_path, stop, given
 ):
     def run(**options):
         pairs = runs.random_frames(indexed_release)
         loader = pairs.loader(4, num_workers=1) if given == "loader" else None
         return runs.hugging_face(pairs, tmp_path / "run", loader=loader, **options)
 
-    whole = run()
+    whole = whole_runs[given]
     before = run(stop_at=stop)
     after = run(resume=True)
 

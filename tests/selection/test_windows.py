@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import SelectionError
-from stereogenbench_data.selection.windows import Clips, key_distance, parse_frames
+from stereogenbench_data.selection.plan import Clips, key_distance, parse_frames
 
 DRAW = (3, 0, 12)
 
