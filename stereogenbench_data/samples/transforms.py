@@ -7,6 +7,7 @@ no more measured than the padding. Every frame and camera of a sample is treated
 docstring says otherwise.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -191,9 +192,9 @@ class RandomScale:
 
     def __post_init__(self) -> None:
         """Require ascending ranges, a probability and at least one pixel."""
-        _require_range(self, -8.0, "low", "high")
-        _require_range(self, 0.0, "stretch")
-        _require_probabilities(self, "stretch_probability")
+        _require_numbers(self, "low", "high", least=-8, most=math.inf)
+        _require_numbers(self, "stretch", most=math.inf)
+        _require_numbers(self, "stretch_probability")
         _require_size(*self.at_least)
 
     def __call__(self, views: Views, generator: Generator) -> Views:
@@ -222,7 +223,7 @@ class HorizontalFlip:
 
     def __post_init__(self) -> None:
         """Require a probability."""
-        _require_probabilities(self, "probability")
+        _require_numbers(self, "probability")
 
     def __call__(self, views: Views, generator: Generator) -> Views:
         """Return the views, or their mirror image."""
@@ -266,9 +267,8 @@ class ColorJitter:
 
     def __post_init__(self) -> None:
         """Require factors and a probability of 0 to 1."""
-        _require_probabilities(
-            self, "brightness", "contrast", "saturation", "hue", "asymmetric_probability"
-        )
+        for name in ("brightness", "contrast", "saturation", "hue", "asymmetric_probability"):
+            _require_numbers(self, name)
 
     def __call__(self, views: Views, generator: Generator) -> Views:
         """Return views with other colours."""
@@ -305,8 +305,8 @@ class Eraser:
 
     def __post_init__(self) -> None:
         """Require a probability, and boxes of at least one pixel."""
-        _require_probabilities(self, "probability")
-        _require_range(self, 1, "low", "high")
+        _require_numbers(self, "probability")
+        _require_numbers(self, "low", "high", least=1, most=math.inf)
         _require_size(self.most_boxes, 1)
 
     def __call__(self, views: Views, generator: Generator) -> Views:
@@ -341,20 +341,15 @@ def _require_size(height: Any, width: Any) -> None:
         )
 
 
-def _require_probabilities(transform: Any, *names: str) -> None:
-    for name in names:
-        value = getattr(transform, name)
-        if not isinstance(value, int | float) or not 0 <= value <= 1:
-            raise FieldError(f"{name} of {type(transform).__name__} must be 0 to 1, got {value!r}.")
-
-
-def _require_range(transform: Any, least: float, *names: str) -> None:
+def _require_numbers(transform: Any, *names: str, least: float = 0, most: float = 1) -> None:
+    """Require that attributes are numbers, each at least the one before, within two bounds."""
     values = [getattr(transform, name) for name in names]
     numbers = all(isinstance(value, int | float) for value in values)
-    if not numbers or not all(a <= b for a, b in pairwise([least, *values])):
+    if not numbers or not all(a <= b for a, b in pairwise([least, *values, most])):
+        order = ", ascending" if len(names) > 1 else ""
         raise FieldError(
-            f"{', '.join(names)} of {type(transform).__name__} must ascend from {least}, got "
-            f"{', '.join(map(repr, values))}."
+            f"{', '.join(names)} of {type(transform).__name__} must be {least:g} to {most:g}"
+            f"{order}, got {', '.join(map(repr, values))}."
         )
 
 
