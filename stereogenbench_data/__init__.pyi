@@ -50,8 +50,8 @@ from stereogenbench_data.index.table import SceneIndex as SceneIndex
 from stereogenbench_data.samples.checks import OddSceneWarning as OddSceneWarning
 from stereogenbench_data.samples.fields import PAIR_FIELDS as PAIR_FIELDS
 from stereogenbench_data.samples.fields import VIEW_FIELDS as VIEW_FIELDS
-from stereogenbench_data.samples.size import EnlargedSizeWarning as EnlargedSizeWarning
-from stereogenbench_data.samples.size import SwappedSizeWarning as SwappedSizeWarning
+from stereogenbench_data.samples.request import EnlargedSizeWarning as EnlargedSizeWarning
+from stereogenbench_data.samples.request import SwappedSizeWarning as SwappedSizeWarning
 from stereogenbench_data.samples.transforms import ColorJitter as ColorJitter
 from stereogenbench_data.samples.transforms import Compose as Compose
 from stereogenbench_data.samples.transforms import Crop as Crop

@@ -23,7 +23,7 @@ StaleIndexWarning        index.open           a folder differs from its index
 IncompleteSceneWarning   index.open           some scenes of the data cannot be used
 AssumptionWarning        index.open           files are not as the paper prints them
 OddSceneWarning          samples.checks       selected scenes differ from what the release promises
-SwappedSizeWarning       samples.size         a size looks like (width, height)
+SwappedSizeWarning       samples.request      a size looks like (width, height)
 OpenVideosWarning        datasets.batches more videos are needed than may be open
 RepeatedDecodingWarning  datasets.batches several processes decode the same videos
 FewerPairsWarning        selection.pairs      the data hold some cameras alone

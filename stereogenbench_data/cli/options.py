@@ -79,7 +79,7 @@ def out_folder(text: str) -> Path:
 def size_of(text: str) -> tuple[int, int]:
     """Return (height, width) of a size, which is WIDTHxHEIGHT."""
     from stereogenbench_data.errors import FieldError
-    from stereogenbench_data.samples.size import parse_size
+    from stereogenbench_data.samples.request import parse_size
 
     try:
         return parse_size(text)

@@ -18,7 +18,7 @@ from stereogenbench_data.evaluation.columns import (
     require_metrics,
 )
 from stereogenbench_data.evaluation.models.registry import ModelOptions
-from stereogenbench_data.samples.size import require_size
+from stereogenbench_data.samples.request import require_size
 from stereogenbench_data.schema.records import DepthEncoding
 
 PROTOCOL_VERSION: Final = 1

@@ -1,4 +1,9 @@
-"""One sample: decoded, transformed, written; read and decoded only as far as the fields need."""
+"""One sample: decoded, transformed, written; read and decoded only as far as the fields need.
+
+Which bytes the coming samples need follows from the order in which they will be read. A `Position`
+for each open video follows what the decoder will do, so that each byte is fetched once as long as
+its video stays open. Where the order turns out to be another one, planning starts anew.
+"""
 
 import copy
 import os

@@ -1,7 +1,8 @@
 """The plan of a dataset: from a sample's number to its scene, cameras and frames, and nothing more.
 
 Samples are numbered scene by scene; within a scene window by window, so that reading in order
-decodes every stream once; within a window pair by pair, so that pairs share their frames.
+decodes every stream once; within a window pair by pair, so that pairs share their frames. A window
+is the frames of one sample: one frame, or a clip of several.
 """
 
 import hashlib

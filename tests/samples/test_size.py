@@ -6,7 +6,7 @@ import pytest
 
 from stereogenbench_data import SceneViews, StereoPairs
 from stereogenbench_data.errors import FieldError
-from stereogenbench_data.samples.size import (
+from stereogenbench_data.samples.request import (
     SwappedSizeWarning,
     parse_size,
     require_size,

@@ -76,7 +76,7 @@ def test_a_moved_pair_still_warps_onto_itself(detailed_release, plain, transform
     assert warped_psnr_db(moved) > min(30, warped_psnr_db(plain)) - 1.5
 
 
-@pytest.mark.filterwarnings("ignore::stereogenbench_data.samples.size.SwappedSizeWarning")
+@pytest.mark.filterwarnings("ignore::stereogenbench_data.samples.request.SwappedSizeWarning")
 @pytest.mark.parametrize("size", [(96, 160), (120, 64), (200, 200)])
 def test_scaling_in_the_decoder_is_a_resize(detailed_release, plain, size):
     decoded = StereoPairs(detailed_release, fields=FIELDS, size=size)[0]
@@ -87,7 +87,7 @@ def test_scaling_in_the_decoder_is_a_resize(detailed_release, plain, size):
     assert warped_psnr_db(decoded) > min(30, warped_psnr_db(plain)) - 1.5
 
 
-@pytest.mark.filterwarnings("ignore::stereogenbench_data.samples.size.SwappedSizeWarning")
+@pytest.mark.filterwarnings("ignore::stereogenbench_data.samples.request.SwappedSizeWarning")
 def test_disparity_scales_with_the_width_alone(plain, detailed_release):
     half = StereoPairs(detailed_release, fields=FIELDS, size=(160, 80))[0]
 
