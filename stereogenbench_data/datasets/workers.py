@@ -29,6 +29,7 @@ from weakref import WeakSet
 from torch.utils.data import DataLoader, Sampler
 
 from stereogenbench_data.datasets.batch_buffers import forget_slots
+from stereogenbench_data.datasets.batches import Pass
 from stereogenbench_data.errors import PassError, WorkerError
 
 _BEGUN_WITHIN_S = 20.0
@@ -56,14 +57,15 @@ class Workers:
         """
         self._torch: DataLoader[Any] | None = None
         self._batches: Iterator[Any] = iter(())
-        self.serves: object | None = None
+        self.serves: Pass | None = None
         self.dead: BaseProcess | None = None
         self._numbers = _DueBatches()
         self._context: Any = None
         if loader.num_workers > 0:
             given: Any = loader.multiprocessing_context
             base = given.get_context() if isinstance(given, BaseContext) else get_context(given)
-            self._context = _watched(type(base))()
+            kind: Any = type(base)
+            self._context = _watched(kind)()
         self._torch = DataLoader(
             loader.dataset,
             batch_sampler=self._numbers,
@@ -95,7 +97,7 @@ class Workers:
         """Whether this process started them, and not one that it was forked from."""
         return self._context is None or os.getpid() == self._pid
 
-    def begin(self, begun: object, numbers: Iterator[Any]) -> Iterator[Any]:
+    def begin(self, begun: Pass, numbers: Iterator[Any]) -> Iterator[Any]:
         """Return the batches of a pass; the pass that these workers served before has ended."""
         if self._torch is None:
             raise PassError("these workers have ended: call iter(loader) again.")

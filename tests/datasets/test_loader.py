@@ -25,6 +25,7 @@ from stereogenbench_data import (
 )
 from stereogenbench_data.datasets.batches import (
     OpenVideosWarning,
+    Pass,
     RepeatedDecodingWarning,
     videos_per_scene,
 )
@@ -494,7 +495,7 @@ def test_a_killed_worker_ends_the_loop_with_an_error_that_says_so(keyed):
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_a_worker_that_ends_after_the_last_batch_has_not_died(method):
     workers = Workers(DataLoader(range(4), num_workers=2, multiprocessing_context=method))
-    batches = workers.begin(object(), ([number] for number in range(4)))
+    batches = workers.begin(Pass(0, range(4), 0, 4, 1), ([number] for number in range(4)))
 
     assert len(list(batches)) == 4
     assert workers.error(RuntimeError("a worker ended")) is None
@@ -503,7 +504,7 @@ def test_a_worker_that_ends_after_the_last_batch_has_not_died(method):
 
 def test_a_death_is_named_though_the_thread_that_pins_memory_met_it_first():
     workers = Workers(DataLoader(range(400), num_workers=2, multiprocessing_context="fork"))
-    batches = workers.begin(object(), ([number] for number in range(400)))
+    batches = workers.begin(Pass(0, range(400), 0, 400, 1), iter([[n] for n in range(400)]))
     next(batches)
     victim = next(each for each in multiprocessing.active_children() if each.pid in workers.pids)
     # Torch's own handler would raise between any two lines of this test.
