@@ -527,6 +527,8 @@ class EpochBatches(Sampler[list[int]]):
                 f"a state is a dict as state_dict() returns it, got {state!r:.60}: {_STATES}"
             )
         own = {"version": ORDER_VERSION, **self._identity}
+        if state.get("version", ORDER_VERSION) != ORDER_VERSION:
+            own = {"version": ORDER_VERSION}  # the rest may have other names
         missing = sorted({*own, "epoch", "batches_consumed"} - state.keys())
         if missing:
             raise StateError(
