@@ -513,19 +513,20 @@ def test_a_death_is_named_though_the_thread_that_pins_memory_met_it_first():
     # Where torch notices it depends on what the worker was doing.
     with pytest.raises((RuntimeError, OSError, EOFError)):
         list(batches)
-    workers.end()  # torch joins the workers, and its handler would raise then
-    del batches
-    gc.collect()
-    signal.signal(signal.SIGCHLD, torchs_own)
-
     of_a_worker = ConnectionResetError(
         "Caught ConnectionResetError in DataLoader worker process 0."
     )
     of_the_thread = ConnectionResetError(
         "Caught ConnectionResetError in pin memory thread for device 0."
     )
-    assert workers.error(of_a_worker) is None
-    assert f"pid {victim.pid}) was killed by SIGKILL" in str(workers.error(of_the_thread))
+    found = workers.error(of_a_worker), workers.error(of_the_thread)
+    workers.end()  # torch joins the workers, and its handler would raise then
+    del batches
+    gc.collect()
+    signal.signal(signal.SIGCHLD, torchs_own)
+
+    assert found[0] is None
+    assert f"pid {victim.pid}) was killed by SIGKILL" in str(found[1])
 
 
 @pytest.fixture

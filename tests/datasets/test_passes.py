@@ -142,7 +142,7 @@ def test_a_copy_of_a_loader_has_passes_of_its_own(pairs, truth, copied):
 def test_a_pass_is_not_copied(pairs, workers, begun, copied):
     batches = iter(pairs.loader(9, num_workers=workers))
     taken = [next(batches)] if begun else []
-    with pytest.raises(PassError, match=r"LoaderPass: (1 of 15|not begun).* cannot be copied"):
+    with pytest.raises(PassError, match="a pass over a loader cannot be copied"):
         copied(batches)
     gc.collect()
 
