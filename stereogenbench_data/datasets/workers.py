@@ -47,7 +47,6 @@ class Workers:
 
     Attributes:
         serves: The pass whose batches they load; None before the first.
-        dead: The first worker that ended while it was watched.
     """
 
     def __init__(self, loader: DataLoader[Any]) -> None:
@@ -58,7 +57,6 @@ class Workers:
         self._torch: DataLoader[Any] | None = None
         self._batches: Iterator[Any] = iter(())
         self.serves: Pass | None = None
-        self.dead: BaseProcess | None = None
         self._numbers = _DueBatches()
         self._context: Any = None
         if loader.num_workers > 0:
@@ -79,7 +77,7 @@ class Workers:
             prefetch_factor=loader.prefetch_factor,
             persistent_workers=loader.persistent_workers,
         )
-        self._is_dead = threading.Event()
+        self._death = _Death()
         self._stop_reader, self._stop_writer = connection.Pipe(duplex=False)
         self._thread: threading.Thread | None = None
         self._pid = os.getpid()
@@ -105,7 +103,11 @@ class Workers:
         self._numbers.due = numbers
         self._batches = iter(self._torch)
         if self._context is not None and are_new:
-            self._thread = threading.Thread(target=self._wait, name="worker-watch", daemon=True)
+            # The thread does not refer to these workers: without other references they end.
+            of_thread = (self._context, self._stop_reader, self._death)
+            self._thread = threading.Thread(
+                target=_watch, args=of_thread, name="worker-watch", daemon=True
+            )
             self._thread.start()
         return self._batches
 
@@ -146,12 +148,13 @@ class Workers:
         if self._context is None:
             return None
         is_a_workers_own = "in DataLoader worker process" in str(noticed).partition("\n")[0]
-        if is_a_workers_own or not self._is_dead.wait(_NOTICED_AFTER_S) or self.dead is None:
+        if is_a_workers_own or not self._death.is_handled.wait(_NOTICED_AFTER_S):
             return None
-        self.dead.join(_NOTICED_AFTER_S)
-        code = self.dead.exitcode
+        dead: Any = self._death.process
+        dead.join(_NOTICED_AFTER_S)
+        code = dead.exitcode
         how, cure = f"exited with status {code}", "Its traceback is above."
-        method = getattr(self.dead, "_start_method", "fork")
+        method = getattr(dead, "_start_method", "fork")
         if code is not None and code < 0:
             how = f"was killed by {signal.Signals(-code).name}"
             cure = "If memory ran out, use fewer workers or open_scenes."
@@ -161,23 +164,32 @@ class Workers:
                 "stand below `if __name__ == '__main__':`."
             )
         return WorkerError(
-            f"a DataLoader worker (pid {self.dead.pid}) {how} in the middle of a pass "
+            f"a DataLoader worker (pid {dead.pid}) {how} in the middle of a pass "
             f"({type(noticed).__name__}: {noticed}). {cure} Load the last state_dict() to go on."
         )
 
-    def _wait(self) -> None:
-        """Wait for the end of each worker: where one ends too soon, kill the others."""
-        sentinels = {process.sentinel: process for process in self._context.processes}
-        ready = connection.wait([self._stop_reader, *sentinels])
-        if self._stop_reader in ready or self._context.told_to_end():
-            return
-        self.dead = next(sentinels[each] for each in ready if isinstance(each, int))
-        for process in self._context.processes:
-            if process is not self.dead:
-                process.kill()
-        # torch makes the queue of results first; the others lead to one worker each.
-        self._context.queues[0].end()
-        self._is_dead.set()
+
+class _Death:
+    """The first worker that ended too soon, and whether all that follows from it is done."""
+
+    def __init__(self) -> None:
+        self.process: BaseProcess | None = None
+        self.is_handled = threading.Event()
+
+
+def _watch(context: Any, stop_reader: Any, death: _Death) -> None:
+    """Wait for the end of each worker: where one ends too soon, kill the others."""
+    sentinels = {process.sentinel: process for process in context.processes}
+    ready = connection.wait([stop_reader, *sentinels])
+    if stop_reader in ready or context.told_to_end():
+        return
+    death.process = next(sentinels[each] for each in ready if isinstance(each, int))
+    for process in context.processes:
+        if process is not death.process:
+            process.kill()
+    # torch makes the queue of results first; the others lead to one worker each.
+    context.queues[0].end()
+    death.is_handled.set()
 
 
 class _DueBatches(Sampler[list[int]]):

@@ -499,7 +499,6 @@ def test_a_worker_that_ends_after_the_last_batch_has_not_died(method):
 
     assert len(list(batches)) == 4
     assert workers.error(RuntimeError("a worker ended")) is None
-    assert workers.dead is None
 
 
 def test_a_death_is_named_though_the_thread_that_pins_memory_met_it_first():
