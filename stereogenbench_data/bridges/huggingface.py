@@ -1,14 +1,29 @@
 """Stereo samples as a Hugging Face ``datasets.IterableDataset``, and the features of raw shards."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import closing
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Unpack
 
 from stereogenbench_data.bridges.in_memory import SampleOptions, samples_of, to_arrays
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
-from stereogenbench_data.errors import ExtraError, SelectionError, StorageError, missing_extra
+from stereogenbench_data.errors import (
+    ExtraError,
+    FieldError,
+    SelectionError,
+    StorageError,
+    missing_extra,
+)
 from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS, Sample
+from stereogenbench_data.samples.transforms import (
+    ColorJitter,
+    Compose,
+    Crop,
+    Eraser,
+    HorizontalFlip,
+    Letterbox,
+    RandomCrop,
+    Resize,
+)
 from stereogenbench_data.schema.release import (
     DESCRIPTION_TXT,
     METADATA_FILES,
@@ -21,11 +36,16 @@ _DEPTH_NAMES: Final[dict[str, Mapping[str, str]]] = {"mkv": {}, "b2frame": PACKE
 """Suffix of depth members to their names in shards, by released name."""
 
 if TYPE_CHECKING:
-    from datasets import Features, IterableDataset
+    from datasets import Features
+
+    from stereogenbench_data.bridges.huggingface_iterable import SampleIterable
 
 
-def iterable(data: Data, *, epoch: int = 0, **options: Any) -> "IterableDataset":
+def iterable(data: Data, **options: Any) -> "SampleIterable":
     """Return the samples of `StereoPairs` as an iterable dataset of Hugging Face ``datasets``.
+
+    The dataset has `sample_features` where all samples are of one size. So ``interleave_datasets``,
+    ``concatenate_datasets``, ``cast_column`` and ``to_parquet`` keep dtypes: pictures stay uint8.
 
     Every scene is one shard of the dataset. So ``split_dataset_by_node``, worker processes,
     ``shuffle`` and ``state_dict`` work on scenes. Samples are flat dicts of numpy arrays with the
@@ -35,12 +55,11 @@ def iterable(data: Data, *, epoch: int = 0, **options: Any) -> "IterableDataset"
 
     ``shuffle(seed=0, buffer_size=1)`` shuffles the scenes; a larger shuffle buffer holds whole
     samples in memory. The loader of `StereoPairs` mixes scenes without a shuffle buffer, and
-    resumes without decoding samples a second time.
+    resumes without decoding samples a second time. ``set_epoch`` draws new random frames and
+    transforms, also on datasets derived from this one.
 
     Args:
         data: As for `StereoPairs`.
-        epoch: Seeds random frames and transforms, with the seed. The dataset's own ``set_epoch``
-            changes only the order: for other frames, make a dataset for each epoch.
         **options: As for `StereoPairs`.
 
     Raises:
@@ -48,22 +67,91 @@ def iterable(data: Data, *, epoch: int = 0, **options: Any) -> "IterableDataset"
         StereoGenBenchError: As `StereoPairs` does.
     """
     try:
-        from datasets import IterableDataset
+        from stereogenbench_data.bridges.huggingface_iterable import SampleIterable
     except ImportError as error:
         raise _missing(error) from error
     pairs = StereoPairs(data, **options)
-    scenes = list(range(len(pairs.plan.scene_rows)))
-    return IterableDataset.from_generator(
-        _samples_of_scenes, gen_kwargs={"pairs": pairs, "epoch": epoch, "scenes": scenes}
+    return SampleIterable.of(pairs, _features_of(pairs))
+
+
+def sample_features(pairs: StereoPairs) -> "Features":
+    """Return the features of the samples of a dataset, for ``map(decode(...), features=...)``.
+
+    A field of two to five axes is an ``Array2D`` to ``Array5D`` of its dtype, one of one axis a
+    ``List`` of fixed length.
+
+    Args:
+        pairs: The dataset; it is not read.
+
+    Raises:
+        FieldError: If its samples differ in size, or a transform is not one of this package's.
+        ExtraError: If ``datasets`` is not installed.
+    """
+    features = _features_of(pairs)
+    if features is None:
+        raise FieldError(
+            f"{pairs!r}: samples have no fixed features: their pictures or their number of views "
+            "differ, or a transform may change the size. Give size=(height, width), or end the "
+            "transform with Resize, Letterbox, Crop or RandomCrop."
+        )
+    return features
+
+
+def _features_of(pairs: StereoPairs) -> "Features | None":
+    """Return the features of samples, None where they differ or cannot be foreseen."""
+    try:
+        from datasets import Features
+    except ImportError as error:
+        raise _missing(error) from error
+    request = pairs.request
+    size, targets = _size_of(pairs), set((pairs.plan.pairs.targets >= 0).sum(axis=1).tolist())
+    is_stacked = request.layout == "stacked"
+    if size is None or (is_stacked and len(targets) > 1):
+        return None
+    frames = pairs.plan.windows.window(0, frames=int(pairs.plan.frame_counts[0]), draw=(0,))
+    features: dict[str, Any] = {}
+    for name in request.fields:
+        known = request.known[name]
+        sides = {"H": size[0], "W": size[1]}
+        shape = [
+            sides.get(word) or int(word) for word in known.shape.strip("()").split(",") if word
+        ]
+        if known.per_frame and pairs.plan.windows.is_clip:
+            shape = [len(frames), *shape]
+        if known.per_target and is_stacked:
+            shape = [*targets, *shape]
+        features[name] = _feature("string" if known.dtype == "str" else known.dtype, tuple(shape))
+    return Features(features)
+
+
+def _size_of(pairs: StereoPairs) -> tuple[int, int] | None:
+    """Return (height, width) of all samples, None where they differ or cannot be foreseen."""
+    rows, column = pairs.plan.scene_rows, pairs.index.column
+    stored = set(
+        zip(
+            column("image_height_px")[rows].tolist(),
+            column("image_width_px")[rows].tolist(),
+            strict=True,
+        )
     )
+    size = pairs.request.size or (stored.pop() if len(stored) == 1 else None)
+    transform = pairs.request.transform
+    for step in transform.steps() if isinstance(transform, Compose) else [transform]:
+        if isinstance(step, Resize | Letterbox | Crop | RandomCrop):
+            size = (step.height, step.width)
+        elif step is not None and not isinstance(step, ColorJitter | Eraser | HorizontalFlip):
+            size = None
+    return size
 
 
-def _samples_of_scenes(pairs: StereoPairs, epoch: int, scenes: list[int]) -> Iterator[Sample]:
-    with closing(pairs.with_own_videos(epoch=epoch)) as drawn:
-        first: Any = pairs.plan.first_sample
-        for scene in scenes:
-            for number in range(int(first[scene]), int(first[scene + 1])):
-                yield to_arrays(drawn[number])
+def _feature(dtype: str, shape: tuple[int, ...]) -> Any:
+    """Return the feature of a field."""
+    import datasets
+
+    if len(shape) < 2:
+        value = datasets.Value(dtype)
+        return datasets.List(value, length=shape[0]) if shape else value
+    return getattr(datasets, f"Array{len(shape)}D")(shape=shape, dtype=dtype)
 
 
 def features(*, depth_suffix: str = "mkv") -> "Features":

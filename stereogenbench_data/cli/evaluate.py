@@ -32,6 +32,17 @@ if TYPE_CHECKING:
     from stereogenbench_data.evaluation.tables import Table
 
 
+def _stratum_of(text: str) -> tuple[str, tuple[float, ...]]:
+    """Return the column of ``--by`` with its edges."""
+    column, _, edges = text.partition(":")
+    try:
+        return column, tuple(float(edge) for edge in edges.split(",")) if edges else ()
+    except ValueError:
+        raise typer.BadParameter(
+            f"{text!r}: the edges {edges!r} are not numbers such as 18,35."
+        ) from None
+
+
 _METRICS = "How metrics are computed"
 """Panel of the help for the options of metrics."""
 TierOption = Annotated[
@@ -220,6 +231,14 @@ def score(  # noqa: PLR0913 - one parameter an option
     ] = None,
     chosen: ScoredOptions,
     scoring: ProtocolOptions,
+    by: Annotated[
+        list[Any] | None,
+        typer.Option(
+            parser=_stratum_of,
+            metavar="COLUMN[:EDGES]",
+            help="Also score by map_name or focal_mm:18,35,85. May be repeated.",
+        ),
+    ] = None,
     allow_missing: Annotated[
         int,
         typer.Option(min=0, help="Most pairs without a usable right view."),
@@ -240,9 +259,12 @@ def score(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.evaluation.tables import tables_of
 
     protocol, selection = scoring.protocol(), chosen.selection()
+    strata: dict[str, tuple[float, ...]] = dict(by or ())
     called = name or predictions.resolve().name
     folder = report.out or Path("evaluation") / f"{called}-{tier}"
     index = source.open()
+    for column in strata:
+        index.column(column)  # refuses an unknown one before the work
     with progress_bar("scoring", unit="frames") as progress:
         scores = evaluate(
             index,
@@ -256,7 +278,7 @@ def score(  # noqa: PLR0913 - one parameter an option
             progress=progress,
             **selection,
         )
-    report.write(folder, [scores], tables_of([scores]))
+    report.write(folder, [scores], tables_of([scores], by=strata))
 
 
 @grouped

@@ -1,4 +1,4 @@
-"""``stereogenbench show``: one scene as a picture or a clip."""
+"""``stereogenbench show``: one scene as a picture, a clip or a recording of Rerun."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,7 +23,7 @@ def show(
         typer.Option(
             "--out",
             "-o",
-            help="File to write: .png a sheet, .mp4 or .gif a clip [KEY.png].",
+            help="File to write: .png a sheet, .mp4 or .gif a clip, .rrd for Rerun [KEY.png].",
         ),
     ] = None,
     pair: Annotated[
@@ -42,7 +42,7 @@ def show(
 
     A sheet shows the six views, and a pair's disparity, depth, visibility and warp. The bar of
     disparity shows pixels and metres, of the stored pictures. A clip shows left, right, disparity
-    and anaglyph over time.
+    and anaglyph over time. A recording for Rerun's viewer has all six cameras over time.
 
     Example: `stereogenbench show shards/ scene_000001 --pair 0-5 -o sheet.png`
     """
@@ -52,14 +52,14 @@ def show(
     from stereogenbench_data.selection.filters import find_scene
 
     ending = ".png" if out is None else out.suffix.lower()
-    if ending not in (".png", ".mp4", ".gif"):
+    if ending not in (".png", ".mp4", ".gif", ".rrd"):
         raise typer.BadParameter(
-            f"{out}: a sheet is .png, a clip .mp4 or .gif.", param_hint="--out"
+            f"{out}: a sheet is .png, a clip .mp4 or .gif, a recording .rrd.", param_hint="--out"
         )
     index = source.open()
     row = 0 if scene is None else find_scene(index, scene)
     recorded = index.scene(row)
-    key = recorded.id.key
+    key, rig = recorded.id.key, recorded.rig
     target = out or Path(key.replace("/", "_") + ".png")
     with writing(target):
         if ending == ".png":
@@ -67,6 +67,13 @@ def show(
                 SceneReader(index), row, pair=pair, frame=frame, tile_px=width
             )
             write_png(target, sheet)
+        elif ending == ".rrd":
+            from stereogenbench_data.bridges.rerun import write_recording
+
+            height = rig.image_height_px * (width or 0) / rig.image_width_px
+            size = None if width is None else (max(1, round(height)), width)
+            with progress_bar("logging", unit="frames") as progress:
+                write_recording(target, index, key, pair=pair, size=size, progress=progress)
         else:
             with progress_bar("drawing", unit="frames") as progress:
                 scene_pictures.write_clip(

@@ -6,8 +6,10 @@ reference is part of it, and an empty cell for a dash.
 """
 
 import csv
+import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -23,6 +25,7 @@ from stereogenbench_data.evaluation.aggregate import (
     cell,
     group_by,
     require_comparable,
+    strata,
 )
 from stereogenbench_data.evaluation.columns import COLUMNS, FRAME_METRICS
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
@@ -111,7 +114,6 @@ PairsShown = Literal["primary", "all"]
 _BRANCH: Final = ("subset", "family")
 _BINS: Final = (*_BRANCH, "baseline")
 _ORDER: Final = ("seen_map", "unseen_map", *FAMILIES, *BASELINE_BINS)
-_RANKS: Final = {label: rank for rank, label in enumerate(_ORDER)}
 """The release's order of what groups are called."""
 
 
@@ -120,7 +122,7 @@ class TableForm(NamedTuple):
 
     Attributes:
         title: What it shows, in words.
-        keys: What groups are made by: "subset", "family" or "baseline".
+        keys: What groups are made by: "subset", "family", "baseline" or a column of the index.
         pairs: Which pairs are in them.
         paper: The paper's tables whose rows stand in it.
     """
@@ -138,7 +140,7 @@ TABLES: Final[Mapping[str, TableForm]] = {
     "explanations": TableForm("What explains the scores, primary pairs", _BRANCH),
     "controls": TableForm("Calibration controls", (), pairs="all", paper=("controls",)),
 }
-"""The tables by name."""
+"""The tables by name; those by a column of the index (`stratum_table`) come on top."""
 
 Value = Cell | FrechetDistance | str
 """The numbers of a column of frames, a distance between sets, or what the paper printed."""
@@ -190,30 +192,68 @@ class Table:
     notes: tuple[str, ...] = ()
 
 
-def tables_of(results: Sequence[Scores]) -> list[Table]:
+def tables_of(
+    results: Sequence[Scores], *, by: Mapping[str, Sequence[float]] | None = None
+) -> list[Table]:
     """Return all tables of methods of one tier.
+
+    Args:
+        results: Each method's scores.
+        by: Columns of the index to stratify by, besides branches and baselines; with the edges
+            of numbers, or () to choose them.
 
     Raises:
         EvaluationError: If the methods are of different tiers or were scored in different ways.
     """
     require_comparable(results)
     has_others = any(not pair.is_primary for one in results for pair in one.pairs)
-    names = ("branches", "bins_primary", *(["bins_all"] if has_others else []), "explanations")
-    return [table_of(results, name) for name in names]
+    names = ["branches", "bins_primary", *(["bins_all"] if has_others else [])]
+    return [
+        *(table_of(results, name) for name in names),
+        *(stratum_table(results, column, edges=edges) for column, edges in (by or {}).items()),
+        table_of(results, "explanations"),
+    ]
 
 
-def table_of(results: Sequence[Scores], name: str) -> Table:
+def stratum_table(results: Sequence[Scores], column: str, *, edges: Sequence[float] = ()) -> Table:
+    """Return primary pairs by a column of the index.
+
+    Raises:
+        EvaluationError: If the index has no such column with one value a scene.
+    """
+    index = results[0].index
+    values = index.column(column)
+    if values.ndim != 1:
+        raise EvaluationError(
+            f"{column} has {values.shape[1]} values a scene: stratify by a column that has one."
+        )
+    used = sorted({pair.row for one in results for pair in one.pairs})
+    plain = ["" if value is None else value for value in values[used].tolist()]
+    strata_of = dict(zip(used, strata(plain, name=column, edges=edges), strict=True))
+    form = TableForm(f"By {column}, primary pairs", (*_BRANCH, column))
+    return table_of(results, f"by_{column}", form=form, strata_of=strata_of)
+
+
+def table_of(
+    results: Sequence[Scores],
+    name: str,
+    *,
+    form: TableForm | None = None,
+    strata_of: Mapping[int, str] | None = None,
+) -> Table:
     """Return a table: headline columns, or those that explain them, and distances of branches.
 
     Args:
         results: Each method's scores.
-        name: Its name, one of `TABLES`.
+        name: Its name, one of `TABLES` unless a form is given.
+        form: What it shows.
+        strata_of: For a key that is a column of the index, the group of each row of the index.
     """
-    first, form = results[0], TABLES[name]
+    first, form = results[0], form or TABLES[name]
     scored_rows = {pair.row for one in results for pair in one.pairs if not pair.problem}
     scored = "all" if name == "controls" else "some"
     differs = release_difference(first.index, scored_rows, scored=scored) if form.paper else ""
-    rows = _rows(results, form, differs=differs)
+    rows = _rows(results, form, strata_of or {}, differs=differs)
     explains = name == "explanations"
     columns = [
         each for each in first.protocol.columns if (COLUMNS[each].better == "neither") == explains
@@ -234,14 +274,22 @@ def table_of(results: Sequence[Scores], name: str) -> Table:
     )
 
 
-def _rows(results: Sequence[Scores], form: TableForm, *, differs: str) -> list[TableRow]:
+def _rows(
+    results: Sequence[Scores],
+    form: TableForm,
+    strata_of: Mapping[int, str],
+    *,
+    differs: str,
+) -> list[TableRow]:
     """Return the rows of groups in the order of tables: every method's, then the paper's."""
     index = results[0].index
 
     def label_of(pair: PairMeans, key: str) -> str:
         if key == "baseline":
             return baseline_bin(pair.baseline_cm)
-        return str(index.column(key)[pair.row] or "")
+        if key in _BRANCH:
+            return str(index.column(key)[pair.row] or "")
+        return strata_of[pair.row]
 
     groups_of = [
         group_by(
@@ -253,7 +301,7 @@ def _rows(results: Sequence[Scores], form: TableForm, *, differs: str) -> list[T
     rows = []
     for labels in sorted(
         {labels for groups in groups_of for labels in groups},
-        key=lambda labels: [(_RANKS.get(label, len(_RANKS)), label) for label in labels],
+        key=lambda labels: list(map(_rank, labels)),
     ):
         where = dict(zip(form.keys, labels, strict=True)) | {"tier": results[0].tier}
         paper = [
@@ -269,6 +317,15 @@ def _rows(results: Sequence[Scores], form: TableForm, *, differs: str) -> list[T
                     rows += [row for row in paper if row.method.startswith(f"{one.name} (")]
         rows += paper if form.keys else []
     return rows
+
+
+def _rank(label: str) -> tuple[float, str]:
+    """Return what orders labels: the release's order, else the first number in them."""
+    if label in _ORDER:
+        return _ORDER.index(label), ""
+    with suppress(ValueError):
+        return float(label.lstrip("[(").partition(",")[0]), label
+    return math.inf, label
 
 
 def _row(one: Scores, labels: Labels, pairs: Sequence[PairMeans]) -> TableRow:

@@ -1,18 +1,21 @@
 """Samples through Hugging Face datasets: the same fields and dtypes, shared, resumed."""
 
+import subprocess
 import sys
 
 import datasets
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from datasets.distributed import split_dataset_by_node
 from torch.utils.data import DataLoader
 from torchdata.stateful_dataloader import StatefulDataLoader
 
-from stereogenbench_data import StereoPairs
+from stereogenbench_data import PAIR_FIELDS, Compose, HorizontalFlip, RandomCrop, StereoPairs
 from stereogenbench_data.bridges import huggingface
-from stereogenbench_data.errors import ExtraError, SelectionError, StorageError
+from stereogenbench_data.errors import FieldError, SelectionError, StorageError
 from stereogenbench_data.shards.pack import pack
 from tests.servers.tools import require_module
 
@@ -98,16 +101,100 @@ def test_torchdatas_loader_resumes_with_workers(small_shards, stream, expected):
 
 
 def test_an_epoch_has_new_random_frames_and_a_new_order(small_shards):
-    options = {"fields": ("frame_index", "scene"), "frames": ("random", 3)}
+    stream = huggingface.iterable(
+        small_shards, fields=("frame_index", "scene"), frames=("random", 3)
+    )
 
     def drawn(epoch):
-        stream = huggingface.iterable(small_shards, epoch=epoch, **options).shuffle(seed=epoch)
+        stream.set_epoch(epoch)
         return [(sample["scene"], int(sample["frame_index"])) for sample in stream]
 
     assert drawn(0) == drawn(0)
     assert set(drawn(0)) != set(drawn(1))
     orders = {tuple(scene for scene, _ in drawn(epoch)) for epoch in range(4)}
     assert len(orders) > 1
+
+
+def test_running_workers_follow_the_epoch(small_shards):
+    stream = huggingface.iterable(
+        small_shards, fields=("frame_index", "scene"), frames=("random", 3)
+    )
+    loader = DataLoader(stream, batch_size=None, num_workers=1, persistent_workers=True)
+
+    def drawn(epoch):
+        stream.set_epoch(epoch)
+        return {(sample["scene"], int(sample["frame_index"])) for sample in loader}
+
+    assert drawn(0) != drawn(1)
+    assert drawn(0) == drawn(0)
+
+
+EVERY_FIELD = tuple(name for name in PAIR_FIELDS if name not in ("__key__", "__url__"))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"size": (24, 40)},
+        {"frames": ("clips", 3)},
+        {"pairs": "sweep", "frames": ("clips", 3)},
+        {"transform": Compose([HorizontalFlip(), RandomCrop(16, 24)])},
+    ],
+    ids=str,
+)
+def test_samples_are_as_their_features_say(small_shards, options):
+    pairs = StereoPairs(small_shards, fields=EVERY_FIELD, **options)
+
+    features = huggingface.sample_features(pairs)
+
+    assert list(features) == list(EVERY_FIELD)
+    for name, value in pairs[0].items():
+        feature = features[name]
+        if isinstance(value, str):
+            assert feature == datasets.Value("string")
+        elif value.ndim < 2:
+            one = feature.feature if value.ndim else feature
+            assert f"torch.{one.dtype}" == str(value.dtype), name
+            assert value.ndim == 0 or feature.length == len(value), name
+        else:
+            assert (f"torch.{feature.dtype}", feature.shape) == (str(value.dtype), value.shape)
+
+
+def test_features_that_differ_are_refused_by_name(small_shards):
+    odd = StereoPairs(small_shards, transform=Compose([Odd()]))
+
+    with pytest.raises(FieldError, match=r"shards.*Give size="):
+        huggingface.sample_features(odd)
+    assert huggingface.iterable(small_shards, transform=Odd()).features is None
+
+
+class Odd:
+    """A transform of somebody else, of which nothing is known."""
+
+    swaps_views = False
+
+    def __call__(self, views, generator):
+        return views
+
+
+def test_datasets_of_ours_are_interleaved_cast_and_written_with_their_dtypes(stream, tmp_path):
+    cast = stream.cast_column("pair", datasets.List(datasets.Value("int32"), length=2))
+    mixed = datasets.interleave_datasets([stream, stream])
+    joined = datasets.concatenate_datasets([stream, stream])
+
+    cast.to_parquet(tmp_path / "samples.parquet")
+
+    for each in (cast, mixed, joined):
+        sample = next(iter(each))
+        assert sample["left"].dtype == np.uint8
+        assert sample["pair"].shape == (2,)
+        assert each.features["left"] == datasets.Array3D(shape=(3, 64, 64), dtype="uint8")
+    rows = pq.read_table(tmp_path / "samples.parquet")
+    assert rows.schema.field("pair").type.value_type == pa.int32()
+    assert rows["__key__"].to_pylist() == keys(stream)
+    left = np.array(rows["left"][0].as_py(), dtype=np.uint8)
+    assert np.array_equal(left, next(iter(stream))["left"])
 
 
 def raw(urls, **options):
@@ -161,11 +248,50 @@ def test_videos_that_datasets_decoded_are_refused(urls):
         huggingface.decode(FIELDS)(row)
 
 
-def test_without_datasets_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "datasets", None)
+def test_without_datasets_the_extra_is_named():
+    code = (
+        "import sys; sys.modules['datasets'] = None\n"
+        "from stereogenbench_data.bridges import huggingface\n"
+        "from stereogenbench_data.errors import ExtraError\n"
+        "try:\n    huggingface.features()\n"
+        "except ExtraError as error:\n    print(error)\n"
+    )
 
-    with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[huggingface\]'"):
-        huggingface.features()
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    assert "pip install 'stereogenbench-data[huggingface]'" in done.stdout
+
+
+DERIVED = {
+    "shuffled": lambda stream: stream.shuffle(seed=0, buffer_size=1),
+    "mapped": lambda stream: stream.map(lambda sample: sample),
+    "a rank's": lambda stream: split_dataset_by_node(stream, rank=0, world_size=2),
+    "a shard's": lambda stream: stream.shard(num_shards=2, index=1),
+    "shuffled, a rank's": lambda stream: split_dataset_by_node(
+        stream.shuffle(seed=0, buffer_size=1), rank=1, world_size=2
+    ),
+}
+
+
+@pytest.mark.parametrize("workers", [None, 2])
+@pytest.mark.parametrize("name", DERIVED)
+def test_derived_datasets_use_their_own_epoch(small_shards, name, workers):
+    options = {"fields": ("frame_index", "__key__"), "frames": ("random", 3)}
+    expected = StereoPairs(small_shards, **options)
+    derived = DERIVED[name](huggingface.iterable(small_shards, **options))
+    loader = DataLoader(derived, batch_size=None, num_workers=workers or 0)
+
+    def drawn(epoch):
+        derived.set_epoch(epoch)
+        return {sample["__key__"] for sample in (derived if workers is None else loader)}
+
+    epochs = {epoch: drawn(epoch) for epoch in (3, 0, 1)}
+
+    for epoch, found in epochs.items():
+        expected.set_epoch(epoch)
+        assert found <= set(keys(expected))
+        assert len(found) in {6, 12}
+    assert epochs[0] != epochs[1] != epochs[3]
 
 
 @pytest.fixture(scope="module")

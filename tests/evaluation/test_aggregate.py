@@ -8,7 +8,8 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stereogenbench_data.evaluation.aggregate import PairMeans, cell, half_interval, tally
+from stereogenbench_data import EvaluationError
+from stereogenbench_data.evaluation.aggregate import PairMeans, cell, half_interval, strata, tally
 
 finite = st.floats(-1e6, 1e6)
 
@@ -87,3 +88,43 @@ def test_the_mean_does_not_depend_on_the_order(numbers, random):
     shuffled = random.sample(numbers, len(numbers))
 
     assert tally(numbers) == tally(shuffled)
+
+
+def test_edges_are_half_open_but_for_the_last():
+    assert strata([18, 35, 50, 85, 10, 90], name="focal_mm", edges=(18, 35, 85)) == [
+        "[18,35)", "[35,85]", "[35,85]", "[35,85]", "(-inf,18)", "(85,inf)",
+    ]  # fmt: skip
+
+
+def test_texts_and_few_numbers_are_strata_themselves():
+    assert strata(["Town", "", "Egypt"], name="map_name") == ["Town", "not recorded", "Egypt"]
+    assert strata([24, 50.5, 24], name="focal_mm") == ["24", "50.5", "24"]
+
+
+def test_many_numbers_fall_into_quarters():
+    found = strata([float(number) for number in range(101)], name="focal_mm")
+
+    assert {each: found.count(each) for each in dict.fromkeys(found)} == {
+        "[0,25)": 25, "[25,50)": 25, "[50,75)": 25, "[75,100]": 26,
+    }  # fmt: skip
+
+
+@given(st.lists(finite, min_size=1, max_size=50))
+def test_every_number_has_a_stratum(numbers):
+    found = strata(numbers, name="focal_mm")
+
+    assert len(found) == len(numbers)
+    assert not any("inf" in each for each in found)
+
+
+def test_a_column_that_is_not_known_is_refused():
+    with pytest.raises(EvaluationError, match="valid_depth_ratio is not known for any scene"):
+        strata([math.nan, math.nan], name="valid_depth_ratio")
+
+
+@pytest.mark.parametrize("edges", [(3, 2), (1,), (1, 1)])
+def test_edges_that_do_not_ascend_are_refused(edges):
+    with pytest.raises(
+        EvaluationError, match="edges of focal_mm must be at least two ascending numbers"
+    ):
+        strata([1.0], name="focal_mm", edges=edges)

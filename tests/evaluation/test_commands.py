@@ -23,12 +23,13 @@ def test_predictions_are_scored_and_reported(scenes, other_views, tmp_path):
     out = tmp_path / "report"
     shown = run(
         "eval", "score", scenes, other_views, "--tier", "G1", "--where", "subset=seen_map",
-        "--name", "next camera", "--out", out, *SMALL,
+        "--name", "next camera", "--by", "map_name", "--out", out, *SMALL,
     )  # fmt: skip
 
     assert shown.exit_code == 0, shown.output
     assert "# next camera, tier G1: calibrated target camera" in shown.stdout
     assert "StereoSpace (paper, other scenes) | seen_map | Uniform" in shown.stdout
+    assert "By map_name" in shown.stdout
     assert {path.name for path in out.iterdir()} == {
         "results.json", "report.md", "tables.tex", "pairs.csv", "plots", "partial",
     }  # fmt: skip
@@ -96,6 +97,8 @@ def test_an_evaluation_that_scored_nothing_does_not_hinder_another_one(
         ("--size", "832", "WIDTHxHEIGHT"),
         ("--frames", "some", "is not all, first, every:K"),
         ("--pairs", "0_1", "is not primary, adjacent, all or pairs"),
+        ("--by", "focal_mm:wide", "are not numbers"),
+        ("--by", "nope", "has no column 'nope'"),
         ("--metrics", "mse", "there is no metric 'mse'"),
         ("--stereo-matcher", "eyes", "'eyes'"),
         ("--tier", "G9", "there is no tier 'G9'"),

@@ -12,7 +12,7 @@ from stereogenbench_data import EvaluationError, EvaluationProtocol, tables_of, 
 from stereogenbench_data.evaluation.aggregate import PairMeans, Scores, tally
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.report import document, latex, markdown
-from stereogenbench_data.evaluation.tables import release_difference, table_of
+from stereogenbench_data.evaluation.tables import release_difference, stratum_table, table_of
 
 PAPERS = EvaluationProtocol()
 INF, NAN = float("inf"), float("nan")
@@ -110,6 +110,16 @@ def test_all_pairs_have_a_table_of_their_own(scores):
 
     assert names == ["branches", "bins_primary", "bins_all", "explanations"]
     assert ("ours", "unseen_map", "IPD_Gaussian", "[10,30)") in rows(table)
+
+
+def test_a_column_of_the_index_makes_strata(scores, scored_index):
+    by_map = stratum_table([scores()], "map_name")
+    by_focal = stratum_table([scores()], "focal_mm", edges=(0, 1000))
+
+    assert [row.labels[2] for row in by_map.rows] == ["SynthStage", "SynthYard"]
+    assert [row.labels[2] for row in by_focal.rows] == ["[0,1000]", "[0,1000]"]
+    with pytest.raises(EvaluationError, match="baselines_cm has 15 values a scene"):
+        stratum_table([scores()], "baselines_cm")
 
 
 def test_methods_of_one_tier_share_a_table_and_those_of_two_do_not(scores):
@@ -233,7 +243,7 @@ def test_a_distance_says_its_sample_and_its_dimension(scores):
 
 def test_no_output_holds_nan_and_json_reads_back(scores, tmp_path):
     results = [scores(psnr=((INF, INF), (20, 24), (NAN, NAN)))]
-    tables = tables_of(results)
+    tables = tables_of(results, by={"focal_mm": ()})
     files = write_report(tmp_path, results, tables)
     told = json.loads(
         (tmp_path / "results.json").read_text(), parse_constant=lambda text: pytest.fail(text)

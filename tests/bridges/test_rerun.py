@@ -1,0 +1,227 @@
+"""Recordings for Rerun, read back: cameras, pictures, depth and disparity at every frame."""
+
+import io
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stereogenbench_data import SceneViews, StereoPairs
+from stereogenbench_data.bridges import rerun as bridge
+from stereogenbench_data.errors import ExtraError, SelectionError, StorageError
+from tests.servers.tools import require_module, small_disk
+
+SCENE = "train/Uniform/SynthStage/scene_000001"
+
+
+@pytest.fixture(scope="module")
+def rerun():
+    return require_module("rerun")
+
+
+def read_back(path):
+    """Return by entity and component the values at each frame, None for what holds always."""
+    chunks = require_module("rerun.chunk")
+    found = {}
+    for chunk in chunks.RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        frames = [None] * batch.num_rows
+        if "frame" in batch.schema.names:
+            frames = batch.column("frame").to_pylist()
+        for name in batch.schema.names:
+            if ":" not in name:
+                continue
+            for frame, value in zip(frames, batch.column(name).to_pylist(), strict=True):
+                if value is not None:
+                    found.setdefault((str(chunk.entity_path), name), {})[frame] = value[0]
+    return found
+
+
+@pytest.fixture(scope="module")
+def recorded(rerun, indexed_release, tmp_path_factory):
+    path = tmp_path_factory.mktemp("recording") / "scene.rrd"
+    done = []
+    key = bridge.write_recording(
+        path, indexed_release, "scene_000001", frames=[0, 4], pair=(1, 4),
+        progress=lambda *counts: done.append(counts),
+    )  # fmt: skip
+    assert (key, done[-1]) == (SCENE, (2, 2))
+    return read_back(path)
+
+
+@pytest.fixture(scope="module")
+def views(indexed_release):
+    return SceneViews(indexed_release, scenes=SCENE, frames=[0, 4])
+
+
+def image_of(value, frame_format, dtype):
+    shape = (frame_format["height"], frame_format["width"])
+    return np.array(value, dtype=np.uint8).view(dtype).reshape(shape)
+
+
+def test_every_camera_has_its_pose_at_every_frame_from_the_first_camera(recorded, views):
+    origin = views[0]["world_from_cam"][0, :3, 3].numpy()
+    for camera in range(6):
+        place = f"/world/cam_{camera:02d}"
+        steps = recorded[place, "Transform3D:translation"]
+        rotations = recorded[place, "Transform3D:mat3x3"]
+        assert steps.keys() == rotations.keys() == {0, 4}
+        for number, frame in enumerate((0, 4)):
+            pose = views[number]["world_from_cam"][camera].numpy()
+            np.testing.assert_allclose(steps[frame], pose[:3, 3] - origin, atol=1e-5)
+            # Rerun keeps matrices column by column.
+            rotation = np.array(rotations[frame]).reshape(3, 3).T
+            np.testing.assert_allclose(rotation, pose[:3, :3], atol=1e-6)
+
+
+def test_every_camera_has_its_lens(recorded, views):
+    for camera in range(6):
+        place = f"/world/cam_{camera:02d}"
+        (matrix,) = recorded[place, "Pinhole:image_from_camera"].values()
+        (resolution,) = recorded[place, "Pinhole:resolution"].values()
+        expected = views[0]["intrinsics"].numpy()
+        np.testing.assert_allclose(np.array(matrix).reshape(3, 3).T, expected, rtol=1e-6)
+        assert list(resolution) == [64, 64]
+
+
+def test_depth_is_in_metres_exactly_as_in_samples(recorded, views):
+    for camera in range(6):
+        place = f"/world/cam_{camera:02d}/depth"
+        formats = recorded[place, "DepthImage:format"]
+        for number, frame in enumerate((0, 4)):
+            buffer = recorded[place, "DepthImage:buffer"][frame]
+            depth = image_of(buffer, formats[frame], np.float32)
+            np.testing.assert_array_equal(depth, views[number]["depth"][camera, 0])
+            assert recorded[place, "DepthImage:meter"][frame] == 1.0
+
+
+def test_pictures_are_those_of_the_cameras(recorded, views):
+    for camera in range(6):
+        pictures = recorded[f"/world/cam_{camera:02d}/rgb", "EncodedImage:blob"]
+        for number, frame in enumerate((0, 4)):
+            with Image.open(io.BytesIO(bytes(pictures[frame]))) as file:
+                picture = np.asarray(file).astype(int)
+            expected = views[number]["image"][camera].permute(1, 2, 0).numpy()
+            assert np.abs(picture - expected).mean() < 6
+
+
+def test_disparity_is_that_of_the_pair(recorded, indexed_release):
+    pairs = StereoPairs(indexed_release, scenes=SCENE, pairs=[(1, 4)], frames=[0, 4])
+    formats = recorded["/pair/disparity", "DepthImage:format"]
+
+    for number, frame in enumerate((0, 4)):
+        buffer = recorded["/pair/disparity", "DepthImage:buffer"][frame]
+        disparity = image_of(buffer, formats[frame], np.float32)
+        np.testing.assert_array_equal(disparity, pairs[number]["disparity"][0])
+
+
+def test_a_text_says_which_scene_is_shown(recorded):
+    (text,) = recorded["/scene", "TextDocument:text"].values()
+
+    assert SCENE in text
+
+
+def test_the_time_of_a_frame_follows_from_its_rate(rerun, indexed_release, tmp_path):
+    chunks = require_module("rerun.chunk")
+    bridge.write_recording(tmp_path / "a.rrd", indexed_release, frames=[3], size=(16, 16))
+    times = set()
+    for chunk in chunks.RrdReader(tmp_path / "a.rrd").stream():
+        batch = chunk.to_record_batch()
+        if "time" in batch.schema.names:
+            times.update(each.total_seconds() for each in batch.column("time").to_pylist())
+
+    (seconds,) = times
+    assert seconds == pytest.approx(3 / 15)
+
+
+def test_wide_pictures_are_made_smaller_unless_a_size_is_asked_for(
+    rerun, indexed_release, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(bridge, "USUAL_WIDTH_PX", 40)
+    sizes = []
+    for size in (None, (50, 60)):
+        bridge.write_recording(tmp_path / "a.rrd", indexed_release, frames="first", size=size)
+        (resolution,) = read_back(tmp_path / "a.rrd")[
+            "/world/cam_00", "Pinhole:resolution"
+        ].values()
+        sizes.append(list(resolution))
+
+    assert sizes == [[40, 40], [60, 50]]
+
+
+def test_a_recording_of_ones_own_takes_a_scene(rerun, indexed_release, tmp_path):
+    recording = rerun.RecordingStream("mine")
+    recording.save(tmp_path / "mine.rrd")
+    key = bridge.log_scene(recording, indexed_release, SCENE, frames="first", size=(16, 16))
+    recording.disconnect()
+
+    assert key == SCENE
+    assert ("/pair/disparity", "DepthImage:buffer") in read_back(tmp_path / "mine.rrd")
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"scene": "scene_7"}, r"scene_7"),
+        ({"frames": [99]}, r"frame 99 is asked for"),
+        ({"frames": ("clips", 2)}, r"are clips"),
+        ({"pair": (0, 9)}, r"\(0, 9\)|0 to 5"),
+    ],
+)
+def test_what_a_scene_does_not_have_is_refused_and_the_file_that_was_there_stays(
+    rerun, indexed_release, tmp_path, asked, message
+):
+    path = tmp_path / "a.rrd"
+    path.write_bytes(b"before")
+
+    with pytest.raises(SelectionError, match=message):
+        bridge.write_recording(path, indexed_release, **asked)
+    assert [each.name for each in tmp_path.iterdir()] == ["a.rrd"]
+    assert path.read_bytes() == b"before"
+
+
+def test_a_full_disk_is_named_and_the_file_that_was_there_stays(rerun, indexed_release, tmp_path):
+    with small_disk(tmp_path / "disk", size="100k") as disk:
+        (disk / "a.rrd").write_bytes(b"before")
+        with pytest.raises(StorageError, match=r"a\.rrd: cannot be written .*Make room"):
+            bridge.write_recording(disk / "a.rrd", indexed_release)
+        assert [each.name for each in disk.iterdir()] == ["a.rrd"]
+        assert (disk / "a.rrd").read_bytes() == b"before"
+
+
+def test_a_folder_that_is_not_there_is_named(rerun, indexed_release, tmp_path):
+    with pytest.raises(StorageError, match=r"a\.rrd: cannot be written .*another place"):
+        bridge.write_recording(tmp_path / "none" / "a.rrd", indexed_release, frames="first")
+
+
+def test_without_rerun_the_extra_is_named(indexed_release, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+
+    for call in (
+        lambda: bridge.write_recording(tmp_path / "a.rrd", indexed_release),
+        lambda: bridge.view_live(indexed_release),
+        lambda: bridge.log_scene(None, indexed_release),
+    ):
+        with pytest.raises(ExtraError, match=r"stereogenbench-data\[rerun\]"):
+            call()
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_viewer_that_does_not_start_is_named(rerun, indexed_release, monkeypatch):
+    def refuse(**_options):
+        raise RuntimeError("Failed to find Rerun Viewer executable in PATH.\nInstall it ...")
+
+    monkeypatch.setattr(rerun, "spawn", refuse)
+    with pytest.raises(ExtraError, match=r"viewer does not start \(Failed .*an \.rrd file"):
+        bridge.view_live(indexed_release)
+
+
+def test_the_viewer_is_sent_the_scene(rerun, indexed_release, tmp_path, monkeypatch):
+    def save_instead(*, recording, executable_path):
+        recording.save(tmp_path / "live.rrd")
+
+    monkeypatch.setattr(rerun, "spawn", save_instead)
+    bridge.view_live(indexed_release, SCENE, frames=[1], size=(16, 16))
+
+    assert 1 in read_back(tmp_path / "live.rrd")["/world/cam_05/depth", "DepthImage:buffer"]
