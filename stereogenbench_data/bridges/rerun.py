@@ -32,7 +32,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.text import markdown_text
 from stereogenbench_data.selection.filters import find_scene
-from stereogenbench_data.selection.windows import FramesSpec
+from stereogenbench_data.selection.plan import FramesSpec
 from stereogenbench_data.sources.files import open_output
 
 USUAL_WIDTH_PX: Final = 512

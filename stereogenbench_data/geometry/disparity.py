@@ -60,6 +60,23 @@ def disparity_from_depth(
     return xp.astype(disparity_px, depth_m.dtype, copy=False)
 
 
+def depth_from_disparity(
+    disparity_px: Float[Any, "*batch h w"], *, focal_px: float, baseline_m: float
+) -> Float[Any, "*batch h w"]:
+    """Return depth along the optical axis in metres, in the disparity's dtype.
+
+    Depth is 0 ("not measured") where disparity is 0, nan, or of the sign opposite to the
+    baseline's. Disparity 0 does not distinguish sky from pixels that were not measured.
+
+    >>> depth_from_disparity(np.array([[40.0, 0.0]]), focal_px=800.0, baseline_m=0.1)
+    array([[2., 0.]])
+    """
+    xp = array_namespace(disparity_px)
+    size_px = disparity_px if baseline_m > 0 else -disparity_px
+    depth_m = quotient(focal_px * abs(baseline_m), as_float64(_inf_where_not_positive(size_px)))
+    return xp.astype(depth_m, disparity_px.dtype, copy=False)
+
+
 def disparity_from_units(
     units: Integer[Any, "*batch h w"],
     *,

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Float64, Int64, Shaped
 
 from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry.arrays import (
+    Array,
     array_namespace,
     as_float64,
     is_numpy_array,
@@ -168,6 +169,26 @@ def project_by_homography(
     )
 
 
+def lands_inside(
+    projection: Projection, *, height_px: int, width_px: int
+) -> Bool[Any, "*batch h w"]:
+    """Return which source pixels land inside a target image of this size.
+
+    Raises:
+        GeometryError: If rows do not change but the two images differ in height.
+    """
+    u_px, v_px = projection.u_px, projection.v_px
+    inside = (u_px >= 0) & (u_px < width_px)
+    if v_px is not None:
+        inside &= (v_px >= 0) & (v_px < height_px)
+    elif u_px.shape[-2] != height_px:
+        raise GeometryError(
+            f"a rectified projection of {u_px.shape[-2]} rows cannot land in an image of "
+            f"{height_px} rows: resize or crop both views alike."
+        )
+    return inside
+
+
 def landing_pixels(
     projection: Projection, *, height_px: int, width_px: int
 ) -> tuple[Bool[Any, "*batch h w"], Int64[Any, "*batch h w"]]:
@@ -179,23 +200,20 @@ def landing_pixels(
     Raises:
         GeometryError: If rows do not change but the two images differ in height.
     """
-    u_px, v_px = projection.u_px, projection.v_px
-    *batch, rows, _ = u_px.shape
-    inside = (u_px >= 0) & (u_px < width_px)
-    if v_px is None and rows != height_px:
-        raise GeometryError(
-            f"a rectified projection of {rows} rows cannot land in an image of {height_px} rows: "
-            "resize or crop both views alike."
-        )
-    if v_px is not None:
-        inside &= (v_px >= 0) & (v_px < height_px)
-    pixel = whole_where(inside, u_px)
-    if v_px is None:
-        pixel += leading_offsets((*batch, height_px, 1), step=width_px, like=u_px)
-    else:
-        pixel += leading_offsets((*batch, 1, 1), step=height_px * width_px, like=u_px)
-        pixel += whole_where(inside, v_px) * width_px
+    inside = lands_inside(projection, height_px=height_px, width_px=width_px)
+    pixel = whole_where(inside, projection.u_px)
+    pixel += _starts(projection, height_px=height_px, width_px=width_px)
+    if projection.v_px is not None:
+        pixel += whole_where(inside, projection.v_px) * width_px
     return inside, pixel
+
+
+def _starts(projection: Projection, *, height_px: int, width_px: int) -> Int64[Any, "*batch h1 1"]:
+    """Return the flat index at which each target map begins; where rows do not change, each row."""
+    batch = projection.u_px.shape[:-2]
+    if projection.v_px is None:
+        return leading_offsets((*batch, height_px, 1), step=width_px, like=projection.u_px)
+    return leading_offsets((*batch, 1, 1), step=height_px * width_px, like=projection.u_px)
 
 
 def visible_in_target(
@@ -351,3 +369,61 @@ def splat(
         splatted, projection, image, measured, height_px=image.shape[-2]
     )
     return found
+
+
+def backward_warp(
+    image: Shaped[Any, "*batch c target_h target_w"], projection: Projection
+) -> tuple[Float[Any, "*batch c h w"], Bool[Any, "*batch h w"]]:
+    """Return the target image sampled where each source pixel lands, and which pixels land inside.
+
+    Sampling is bilinear between pixel centres; in the outer half pixel of the border it takes the
+    outermost pixel. At an occluded pixel the result shows the occluder: mask it by visibility.
+
+    Args:
+        image: The target image, of any real dtype.
+        projection: Where source pixels land in it.
+
+    Returns:
+        The image in the source view, in its own dtype if that is a float and else float32,
+        0 outside; and True where a source pixel lands inside the target image.
+
+    Raises:
+        GeometryError: If a rectified projection's rows are not the image's.
+    """
+
+    def sampled(here: Projection, image: Any) -> tuple[Any, Any]:
+        xp = array_namespace(image)
+        dtype = image.dtype if xp.isdtype(image.dtype, "real floating") else xp.float32
+        size = {"height_px": image.shape[-2], "width_px": image.shape[-1]}
+        inside = lands_inside(here, **size)
+        starts = _starts(here, **size)
+        left, right, to_right = _neighbours(here.u_px, inside, size_px=size["width_px"])
+        to_right = xp.astype(to_right, dtype, copy=False)
+
+        def sample_rows(starts: Array) -> Array:
+            at_left = xp.astype(take_pixels(image, starts + left), dtype, copy=False)
+            at_right = xp.astype(take_pixels(image, starts + right), dtype, copy=False)
+            return at_left + (at_right - at_left) * to_right
+
+        if here.v_px is None:
+            warped = sample_rows(starts)
+        else:
+            upper, lower, down = _neighbours(here.v_px, inside, size_px=size["height_px"])
+            above, below = (sample_rows(starts + row * size["width_px"]) for row in (upper, lower))
+            warped = above + (below - above) * xp.astype(down, dtype, copy=False)
+        return xp.where(inside[..., None, :, :], warped, 0.0), inside
+
+    found: tuple[Any, Any] = by_rows(sampled, projection, image, height_px=image.shape[-2])
+    return found
+
+
+def _neighbours(
+    position_px: Float[Any, "*batch h w"], inside: Bool[Any, "*batch h w"], *, size_px: int
+) -> tuple[Int64[Any, "*batch h w"], Int64[Any, "*batch h w"], Float[Any, "*batch 1 h w"]]:
+    """Return the two pixels around a position, and its distance from the first one's centre."""
+    xp = array_namespace(position_px)
+    position = xp.clip(xp.where(inside, position_px, 0.5) - 0.5, 0.0, size_px - 1.0)
+    low = xp.floor(position)
+    low_index = xp.astype(low, xp.int64)
+    high_index = xp.clip(low_index + 1, 0, size_px - 1)
+    return low_index, high_index, (position - low)[..., None, :, :]

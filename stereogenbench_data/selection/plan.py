@@ -393,12 +393,10 @@ def plan_pairs(index: SceneIndex, *, seed: int = 0, **selection: Unpack[Selectio
     rows = filter_scenes(index, cast("SceneFilters", options))
     pairs = choose_pairs(index, rows, **chosen)
     if balance is not None:
-        if balance != "bins":
-            raise SelectionError(f"balance must be 'bins', got {balance!r}.")
         if pairs.targets.shape[1] != 1:
-            raise SelectionError("balance='bins' needs single pairs, not a sweep.")
+            raise SelectionError(f"balance={balance!r} needs single pairs, not a sweep.")
         found = baselines_cm(index, pairs)[:, 0]
-        pairs = pairs[balanced(found, limit=limit, seed=seed)]
+        pairs = pairs[balanced(found, by=balance, limit=limit, seed=seed)]
     elif limit is not None:
         raise SelectionError(
             f"limit={limit} is the size of a balanced subsample: give balance too."

@@ -12,12 +12,14 @@ from stereogenbench_data.geometry.arrays import (
 )
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import (
+    depth_from_disparity,
     disparity_error_px,
     disparity_from_depth,
     disparity_from_units,
     planar_from_ray,
 )
 from stereogenbench_data.geometry.projection import (
+    backward_warp,
     project_rectified,
     project_through_poses,
     splat,
@@ -45,6 +47,7 @@ def maps(units, image):
     made = {
         "disparity of units": disparity_from_units(units, **PAIR, unit_m=0.1),
         "disparity": disparity_from_depth(depth_m, **PAIR),
+        "depth": depth_from_disparity(depth_m, **PAIR),
         "error": disparity_error_px(depth_m, shift_px_m=2.7, half_step_m=0.05),
         "planar": planar_from_ray(depth_m, CAMERA),
     }
@@ -56,6 +59,7 @@ def maps(units, image):
         )
         made[f"visible from source {name}"] = visible_from_source(projection, **judged)
         made[f"splat {name}"], made[f"hole {name}"] = splat(image, projection, measured=measured)
+        made[f"warp {name}"], made[f"inside {name}"] = backward_warp(image, projection)
     return made
 
 

@@ -7,6 +7,7 @@ from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry import disparity as disparity_module
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import (
+    depth_from_disparity,
     disparity_error_px,
     disparity_from_depth,
     disparity_from_units,
@@ -106,6 +107,34 @@ def test_any_integer_that_a_decoder_returns_is_read(library, stored):
 
     expected_px = np.array([[0.0, 200.0, 10.0, 200 / 255]], dtype=np.float32)
     np.testing.assert_array_equal(library.numpy(disparity_px), expected_px)
+
+
+@given(depth_m=metres, focal_px=focals_px, baseline_m=baselines_m)
+def test_depth_survives_the_round_trip(library, depth_m, focal_px, baseline_m):
+    pair = {"focal_px": focal_px, "baseline_m": baseline_m}
+
+    back_m = depth_from_disparity(
+        disparity_from_depth(library.array(np.array([[depth_m]])), **pair), **pair
+    )
+
+    np.testing.assert_allclose(library.numpy(back_m), [[depth_m]], rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("disparity_px", "baseline_m"),
+    [
+        pytest.param(0.0, 0.1, id="sky or nothing"),
+        pytest.param(np.nan, 0.1, id="nan"),
+        pytest.param(-40.0, 0.1, id="moved to the wrong side"),
+        pytest.param(40.0, -0.1, id="moved to the wrong side of a target to the left"),
+    ],
+)
+def test_a_disparity_that_no_depth_explains_has_none(library, disparity_px, baseline_m):
+    disparity = library.array(np.array([[disparity_px]], dtype=np.float32))
+
+    depth_m = depth_from_disparity(disparity, focal_px=800.0, baseline_m=baseline_m)
+
+    np.testing.assert_array_equal(library.numpy(depth_m), np.zeros((1, 1), np.float32))
 
 
 @pytest.mark.parametrize(

@@ -12,16 +12,16 @@ import pytest
 from PIL import Image
 
 from stereogenbench_data.geometry.camera import Intrinsics
-from stereogenbench_data.geometry.disparity import disparity_from_depth
+from stereogenbench_data.geometry.disparity import depth_from_disparity
 from stereogenbench_data.geometry.projection import (
     Projection,
-    landing_pixels,
+    backward_warp,
+    lands_inside,
     project_rectified,
     project_through_poses,
     visible_from_source,
     visible_in_target,
 )
-from tests.geometry.warping import sampled_where_points_land
 
 
 def read(path: Path) -> np.ndarray:
@@ -73,9 +73,7 @@ def warped_db(psnr_db):
 
     def measure(left: View, right: View, *, by: np.ndarray | None = None) -> float:
         disparity_px = left.disparity_px if by is None else by
-        warped, inside = sampled_where_points_land(
-            right.image, project_rectified(disparity_px, disparity_px)
-        )
+        warped, inside = backward_warp(right.image, project_rectified(disparity_px, disparity_px))
         visible = visible_within_a_pixel(left.disparity_px, right.disparity_px)
         return psnr_db(warped, left.image, visible & inside)
 
@@ -94,7 +92,7 @@ def test_visibility_is_the_occlusion_map_of_cones(ground_truth, judge, least):
         read(ground_truth / "cones" / f"disp_{side}.tif") for side in ("left", "right")
     )
     visible_there = read(ground_truth / "cones" / "occlusion.png").astype(bool)
-    depth = disparity_from_depth(left_px, focal_px=1.0, baseline_m=1.0)
+    depth = depth_from_disparity(left_px, focal_px=1.0, baseline_m=1.0)
     known = left_px > 0
     projection = project_rectified(depth, left_px)
 
@@ -102,7 +100,7 @@ def test_visibility_is_the_occlusion_map_of_cones(ground_truth, judge, least):
         visible = visible_in_target(
             projection,
             measured=known,
-            target_depth_m=disparity_from_depth(right_px, focal_px=1.0, baseline_m=1.0),
+            target_depth_m=depth_from_disparity(right_px, focal_px=1.0, baseline_m=1.0),
             target_measured=right_px > 0,
             quantum_m=0.0,
         )
@@ -178,7 +176,7 @@ def test_the_right_view_of_the_motorcycle_is_to_the_left(motorcycle, psnr_db, si
     left, right, disparity_px, known = motorcycle
     projection = project_rectified(disparity_px, sign * disparity_px)
 
-    warped, inside = sampled_where_points_land(right, projection)
+    warped, inside = backward_warp(right, projection)
 
     assert psnr_db(warped, left, known & inside) == pytest.approx(expected_db, abs=0.05)
 
@@ -188,7 +186,7 @@ def test_principal_points_that_differ_are_part_of_the_disparity(motorcycle):
     *_, disparity_px, known = motorcycle
     left = Intrinsics(994.978, 994.978, 311.193, 254.877, 741, 500)
     right = Intrinsics(994.978, 994.978, 311.193 + 31.086, 254.877, 741, 500)
-    depth_m = disparity_from_depth(
+    depth_m = depth_from_disparity(
         np.where(known, disparity_px.astype(np.float64) + 31.086, 0.0),
         focal_px=994.978,
         baseline_m=0.193001,
@@ -204,5 +202,5 @@ def test_principal_points_that_differ_are_part_of_the_disparity(motorcycle):
     assert depth_m[known].max() == pytest.approx(5.02, abs=0.005)
     measured_u_px = project_rectified(depth_m, disparity_px.astype(np.float64)).u_px
     np.testing.assert_allclose(chain.u_px[known], measured_u_px[known], rtol=0, atol=1e-9)
-    inside, _ = landing_pixels(chain, height_px=500, width_px=741)
+    inside = lands_inside(chain, height_px=500, width_px=741)
     assert inside[known].mean() > 0.9

@@ -11,6 +11,7 @@ from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import disparity_from_depth
 from stereogenbench_data.geometry.projection import (
     landing_pixels,
+    lands_inside,
     project_rectified,
     project_through_poses,
 )
@@ -208,8 +209,7 @@ def test_a_point_that_the_target_cannot_see_lands_nowhere(library, depth_m):
     )
 
     assert np.isnan(library.numpy(projection.u_px)).all()
-    inside, _ = landing_pixels(projection, height_px=1, width_px=3)
-    assert not library.numpy(inside).any()
+    assert not library.numpy(lands_inside(projection, height_px=1, width_px=3)).any()
 
 
 def test_a_rectified_pixel_lands_d_to_the_left_in_its_row_at_its_depth(library):

@@ -12,7 +12,8 @@ from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import disparity_from_depth, disparity_from_units
 from stereogenbench_data.geometry.pose import CameraPoses, invert_rigid
 from stereogenbench_data.geometry.projection import (
-    landing_pixels,
+    backward_warp,
+    lands_inside,
     project_rectified,
     project_through_poses,
     visible_from_source,
@@ -20,7 +21,6 @@ from stereogenbench_data.geometry.projection import (
 )
 from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
 from stereogenbench_data.schema.records import Trajectory
-from tests.geometry.warping import sampled_where_points_land
 
 SCENE = "train/Pairwise_Uniform/SeyeonjeongPavilion/scene_000003"
 QUANTUM_M = 0.001
@@ -123,7 +123,7 @@ def warp_pair(frames_of, intrinsics, psnr_db):
                 }
             decide = {"target": visible_in_target, "source": visible_from_source}[judge]
             visible = decide(projection, **own)
-            warped, inside = sampled_where_points_land(
+            warped, inside = backward_warp(
                 target.rgb[frame], project_rectified(depth_m, disparity_px * scale)
             )
             psnrs_db.append(psnr_db(warped, source.rgb[frame], visible & inside))
@@ -227,8 +227,8 @@ def test_depth_carried_to_another_frame_by_the_poses_is_the_depth_measured_there
     stayed = project_through_poses(depth_m, target_from_source=np.eye(4), **cameras)
 
     seen = visible_in_target(carried, **judged)
-    seen_there, _ = sampled_where_points_land(camera.depth_m[frame][None], carried)
+    seen_there, _ = backward_warp(camera.depth_m[frame][None], carried)
     assert np.median(np.abs(seen_there[0] - carried.depth_m)[seen]) < QUANTUM_M / 2
-    inside, _ = landing_pixels(carried, height_px=320, width_px=320)
+    inside = lands_inside(carried, height_px=320, width_px=320)
     assert seen[inside & camera.measured[0]].mean() > (0.95 if frame == 1 else 0.6)
     assert visible_in_target(stayed, **judged).sum() < seen.sum() / 2

@@ -2,12 +2,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import map_coordinates
 
 from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry import projection as projection_module
 from stereogenbench_data.geometry.projection import (
     Projection,
-    landing_pixels,
+    backward_warp,
     project_rectified,
     splat,
     visible_from_source,
@@ -87,11 +88,78 @@ def test_depths_that_differ_in_the_last_bit_are_ordered(library):
     assert library.numpy(warped).tolist() == [[[10, 0]]]
 
 
-def test_a_rectified_projection_into_an_image_with_other_rows_is_refused():
+@settings(deadline=None, max_examples=40)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    dtype=st.sampled_from([np.uint8, np.float32, np.float64]),
+    rows=st.sampled_from(["kept", "moved"]),
+)
+def test_a_backward_warp_is_scipys_interpolation_between_pixel_centres(library, seed, dtype, rows):
+    rng = np.random.default_rng(seed)
+    image = (rng.random((2, 3, 6, 7)) * 255).astype(dtype)
+    shape = (2, 6, 5) if rows == "kept" else (2, 4, 5)
+    u_px = rng.uniform(-1, 8, shape)
+    v_px = rng.uniform(-1, 7, shape)
+    u_px[0, 0, 0] = v_px[0, 0, 0] = np.nan
+    if rows == "kept":
+        v_px = np.broadcast_to((np.arange(6) + 0.5)[:, None], shape)
+
+    warped, inside = backward_warp(
+        library.array(image),
+        Projection(
+            library.array(u_px),
+            None if rows == "kept" else library.array(v_px),
+            library.array(np.ones(shape)),
+        ),
+    )
+
+    expected_inside = (u_px >= 0) & (u_px < 7) & (v_px >= 0) & (v_px < 6)
+    np.testing.assert_array_equal(library.numpy(inside), expected_inside)
+    assert library.numpy(warped).dtype == (np.float64 if dtype == np.float64 else np.float32)
+    for item, channel in np.ndindex(2, 3):
+        sampled = map_coordinates(
+            image[item, channel].astype(np.float64),
+            [np.nan_to_num(v_px[item]) - 0.5, np.nan_to_num(u_px[item]) - 0.5],
+            order=1,
+            mode="nearest",
+        )
+        expected = np.where(expected_inside[item], sampled, 0.0)
+        np.testing.assert_allclose(library.numpy(warped)[item, channel], expected, atol=1e-4)
+
+
+def test_a_warp_by_disparity_samples_to_the_left_by_as_much(library):
+    image = library.array(np.array([[[0, 100, 200, 250]]], dtype=np.uint8))
+    disparity_px = library.array(np.array([[0.0, 0.25, 1.0, 9.0]], dtype=np.float32))
+    depth_m = library.array(np.ones((1, 4), dtype=np.float32))
+
+    warped, inside = backward_warp(image, project_rectified(depth_m, disparity_px))
+
+    assert library.numpy(warped).tolist() == [[[0.0, 75.0, 100.0, 0.0]]]
+    assert library.numpy(inside).tolist() == [[True, True, True, False]]
+
+
+def test_a_splat_can_be_sampled_back_where_nothing_occludes_it(library):
+    """A slanted plane: whole-pixel disparities, so that both warps are exact."""
+    rng = np.random.default_rng(1)
+    disparity = np.broadcast_to(np.array([3, 3, 2, 2, 1, 1, 0, 0], np.float32), (4, 8)).copy()
+    image = rng.integers(1, 255, (3, 4, 8)).astype(np.uint8)
+    projection = project_rectified(library.array(6 / (disparity + 1)), library.array(disparity))
+
+    warped, _ = splat(
+        library.array(image), projection, measured=library.array(np.ones((4, 8), bool))
+    )
+    back, inside = backward_warp(warped, projection)
+
+    inside = library.numpy(inside)
+    assert inside.sum() == 4 * 6
+    np.testing.assert_array_equal(library.numpy(back)[:, inside], image[:, inside])
+
+
+def test_a_rectified_warp_of_an_image_with_other_rows_is_refused():
     projection = project_rectified(np.ones((4, 6)), np.ones((4, 6)))
 
     with pytest.raises(GeometryError, match="of 4 rows cannot land in an image of 5 rows"):
-        landing_pixels(projection, height_px=5, width_px=6)
+        backward_warp(np.ones((3, 5, 6)), projection)
 
 
 @pytest.mark.parametrize("quantum", ["a number", "a map"])
@@ -107,6 +175,7 @@ def test_blocks_of_rows_give_the_result_of_one_block(monkeypatch, quantum):
     def all_of_it():
         return (
             *splat(image, projection, measured=measured),
+            *backward_warp(image, projection),
             visible_from_source(projection, measured=measured, quantum_m=quantum_m),
             visible_in_target(
                 projection, measured=measured, target_depth_m=target_m, target_measured=seen,

@@ -1,9 +1,10 @@
-"""A balanced subsample holds equally many of every bin."""
+"""A balanced subsample holds equally many of every stratum."""
 
 from collections import Counter
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.release import baseline_bin
@@ -17,7 +18,7 @@ def crowded_cm():
 
 
 def test_bins_are_filled_alike_up_to_the_poorest(crowded_cm):
-    drawn = balanced(crowded_cm, limit=None, seed=0)
+    drawn = balanced(crowded_cm, by="bins", limit=None, seed=0)
     available = Counter(map(baseline_bin, crowded_cm))
 
     assert Counter(map(baseline_bin, crowded_cm[drawn])) == dict.fromkeys(
@@ -25,8 +26,17 @@ def test_bins_are_filled_alike_up_to_the_poorest(crowded_cm):
     )
 
 
+def test_log_baseline_comes_out_uniform(crowded_cm):
+    drawn = balanced(crowded_cm, by="log_baseline", limit=320, seed=0)
+    logs = np.log(crowded_cm[drawn])
+    uniform = stats.uniform(np.log(crowded_cm).min(), np.ptp(np.log(crowded_cm)))
+
+    assert stats.kstest(logs, uniform.cdf).pvalue > 0.05
+    assert stats.kstest(np.log(crowded_cm), uniform.cdf).pvalue < 1e-6
+
+
 def test_a_limit_is_met_exactly_and_shared_out(crowded_cm):
-    drawn = balanced(crowded_cm, limit=52, seed=0)
+    drawn = balanced(crowded_cm, by="bins", limit=52, seed=0)
     shares = Counter(map(baseline_bin, crowded_cm[drawn]))
 
     assert len(drawn) == 52
@@ -34,26 +44,35 @@ def test_a_limit_is_met_exactly_and_shared_out(crowded_cm):
 
 
 def test_nothing_is_drawn_twice_and_the_order_is_kept(crowded_cm):
-    drawn = balanced(crowded_cm, limit=None, seed=5)
+    drawn = balanced(crowded_cm, by="bins", limit=None, seed=5)
 
     assert (np.diff(drawn) > 0).all()
 
 
 def test_the_draw_depends_on_the_seed_alone(crowded_cm):
-    one, same, other = (balanced(crowded_cm, limit=50, seed=seed) for seed in (1, 1, 2))
+    one, same, other = (balanced(crowded_cm, by="bins", limit=50, seed=seed) for seed in (1, 1, 2))
 
     assert np.array_equal(one, same)
     assert not np.array_equal(one, other)
 
 
-def test_a_limit_beyond_the_poorest_bin_names_it(crowded_cm):
+def test_a_limit_beyond_the_poorest_stratum_names_it(crowded_cm):
     with pytest.raises(
         SelectionError,
         match=r"500 pairs are wanted of the bin \[30,60\) cm, which has 318; the most .* is 785",
     ):
-        balanced(crowded_cm, limit=2500, seed=0)
+        balanced(crowded_cm, by="bins", limit=2500, seed=0)
 
 
-def test_a_limit_below_the_number_of_bins_is_refused(crowded_cm):
-    with pytest.raises(SelectionError, match="less than one pair for each of 5 bins"):
-        balanced(crowded_cm, limit=3, seed=0)
+def test_a_limit_below_the_number_of_strata_is_refused(crowded_cm):
+    with pytest.raises(SelectionError, match="less than one pair for each of 5 strata"):
+        balanced(crowded_cm, by="bins", limit=3, seed=0)
+
+
+def test_one_baseline_for_all_is_one_stratum():
+    assert len(balanced(np.full(7, 6.0), by="log_baseline", limit=None, seed=0)) == 7
+
+
+def test_an_unknown_balance_is_refused():
+    with pytest.raises(SelectionError, match="must be 'bins' or 'log_baseline', got 'log'"):
+        balanced(np.ones(3), by="log", limit=None, seed=0)

@@ -92,7 +92,6 @@ def test_a_balanced_plan_draws_pairs_evenly(wide_index):
     [
         ({"limit": 5}, "give balance too"),
         ({"balance": "bins", "pairs": "sweep"}, "needs single pairs"),
-        ({"balance": "log", "pairs": "all"}, "must be 'bins', got 'log'"),
         ({"pears": "all"}, "no filter 'pears'"),
     ],
 )
