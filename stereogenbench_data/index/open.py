@@ -43,9 +43,7 @@ from stereogenbench_data.index.parquet import (
     table_of_scenes,
 )
 from stereogenbench_data.index.rows import SCHEMA, scene_of
-from stereogenbench_data.index.tree import PlacedFolders
 from stereogenbench_data.schema.conventions import Conventions
-from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Scene, SceneId
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
@@ -563,6 +561,8 @@ def stale_message(table: pa.Table, head: IndexHead, *, index_file: Path) -> str:
         head: What is known besides them; its root is a folder of this machine.
         index_file: Where the index is.
     """
+    from stereogenbench_data.index.tree import PlacedFolders  # slow to import
+
     root, shards = Path(head.root), set(head.shards)
     if shards:  # folders of scenes may have other names than the scenes' keys
         keys = set(table.column("key").to_pylist())
@@ -611,6 +611,8 @@ _GONE: Final = "of the index, and not there"
 
 def _is_finished(root: Path, key: str) -> bool:
     """Return whether a folder is a scene that an index would hold, by its names."""
+    from stereogenbench_data.schema.parse import parse_scene_key  # slow to import
+
     try:
         parse_scene_key(key)
         names = {path.name for path in (root / key).iterdir()}

@@ -40,8 +40,7 @@ from stereogenbench_data.schema.records import REMARKS, Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.sources.files import open_atomic
-from stereogenbench_data.sources.location import is_remote, local_path, shown
-from stereogenbench_data.sources.members import UNSAFE_PATH
+from stereogenbench_data.sources.location import UNSAFE_PATH, is_remote, local_path, shown
 
 INDEX_NAME: Final = "index.parquet"
 

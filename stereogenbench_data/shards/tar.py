@@ -17,7 +17,7 @@ from typing import Final
 from stereogenbench_data.engine import Advance, no_advance
 from stereogenbench_data.errors import ShardError
 from stereogenbench_data.media.container import BinaryFile
-from stereogenbench_data.sources.members import UNSAFE_PATH
+from stereogenbench_data.sources.location import UNSAFE_PATH
 
 BLOCK_BYTES: Final = tarfile.BLOCKSIZE
 END_OF_ARCHIVE: Final = bytes(2 * BLOCK_BYTES)

@@ -10,6 +10,9 @@ from stereogenbench_data.schema.text import shortened
 
 WEB_SCHEMES: Final = ("http", "https")
 
+UNSAFE_PATH: Final = r"^/|\\|:|(?:^|/)\.{0,2}(?:/|$)|[\x00-\x1f]"
+"""What a member's path may not hold: a root, a drive, a backslash, an empty part, '.' or '..'."""
+
 
 def is_remote(location: str | Path) -> bool:
     """Return whether a location is a URL, and not one of a file of this machine."""

@@ -17,7 +17,7 @@ from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.fetch_ahead import FetchAhead, Wanted
-from stereogenbench_data.sources.location import is_remote, joined, local_path, shown
+from stereogenbench_data.sources.location import UNSAFE_PATH, is_remote, joined, local_path, shown
 from stereogenbench_data.sources.ranged_file import (
     FileSlice,
     MemberFile,
@@ -26,10 +26,6 @@ from stereogenbench_data.sources.ranged_file import (
 )
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy
-
-UNSAFE_PATH: Final = r"^/|\\|:|(?:^|/)\.{0,2}(?:/|$)|[\x00-\x1f]"
-"""What a member's path may not hold: a root, a drive, a backslash, an empty part, '.' or '..'."""
-
 
 _KEPT_TABLES: Final = 256
 """Of how many scenes the seek tables are kept."""
