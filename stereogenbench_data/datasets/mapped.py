@@ -132,6 +132,7 @@ class _MappedScenes(Dataset[Sample]):
 
     Attributes:
         left_out: How many scenes were selected and cannot give what is requested.
+        is_random: Whether the samples of an epoch may differ from those of another.
     """
 
     def __init__(
@@ -171,7 +172,8 @@ class _MappedScenes(Dataset[Sample]):
         self.buffers = BatchBuffers(options.get("buffers", "reused"))
         self._streams = request.streams
         self.shared_epoch = SharedEpoch()
-        self._drawn = DrawnSamples() if _is_random(plan, request) else None
+        self.is_random = _is_random(plan, request)
+        self._drawn = DrawnSamples() if self.is_random else None
         self._batches: EpochBatches | None = None
         self._step = self._stop = 0
         self._next_batch: tuple[int, int] | None = None

@@ -22,7 +22,7 @@ _rows: Final[WeakKeyDictionary[SceneIndex, torch.Tensor]] = WeakKeyDictionary()
 
 
 class RepeatedEpochWarning(UserWarning):
-    """A second pass draws the same random frames and transforms."""
+    """A second pass draws the same random frames and transforms, or has the same order."""
 
 
 class SharedNumbers:

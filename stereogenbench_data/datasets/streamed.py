@@ -1,6 +1,7 @@
 """An iterable dataset with the order of the map-style ones, for trainers that want one."""
 
 import os
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final, Unpack
 
@@ -15,7 +16,7 @@ from stereogenbench_data.datasets.batches import (
     require_count,
 )
 from stereogenbench_data.datasets.mapped import Data, PairsOptions, StereoPairs
-from stereogenbench_data.datasets.shared_epoch import SharedNumbers
+from stereogenbench_data.datasets.shared_epoch import RepeatedEpochWarning, SharedNumbers
 from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.selection.options import require_options, split_options
@@ -145,6 +146,15 @@ class StereoPairStream(IterableDataset[Sample]):
         if begun is None or pid != os.getpid() or begun.epoch != self.epoch:
             epoch, start = self._first_position
             begun = self._pass_of_worker(epoch, 0 if self._has_begun else start)
+        has_begun_once = self._begun[place["worker"] % _MOST_WORKERS] == 1
+        is_told_elsewhere = self.pairs.is_random or place["worker"] > 0
+        if has_begun_once and not self.pairs.shared_epoch.times_set and not is_told_elsewhere:
+            warnings.warn(
+                f"{self!r} begins epoch {self.epoch} a second time, in the same order. Call "
+                "set_epoch(epoch) of the stream before each pass.",
+                RepeatedEpochWarning,
+                stacklevel=2,
+            )
         self._begun[place["worker"] % _MOST_WORKERS] += 1
         self._latest = begun
         return self._samples(begun)

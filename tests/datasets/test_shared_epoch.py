@@ -109,9 +109,11 @@ def main():
     warnings.simplefilter("always")
     index = SceneIndex.open(sys.argv[1], root=sys.argv[2])
     chosen = dict(fields=("__key__",), frames=("random", 2))
-    for kind in ("map-style", "stream"):
+    for kind in ("map-style", "stream", "stream of fixed frames"):
+        if kind == "stream of fixed frames":
+            chosen["frames"] = "first"
         for workers, persistent, told in ((0, 0, 0), (2, 0, 0), (2, 1, 0), (0, 0, 1), (2, 1, 1)):
-            if kind == "stream":
+            if kind != "map-style":
                 data, options = StereoPairStream(index, 2, **chosen), {}
             else:
                 data = StereoPairs(index, **chosen)
@@ -143,7 +145,7 @@ def test_passes_that_repeat_an_epoch_are_warned_of_once(small_index, tmp_path):
 
     assert done.returncode == 0, done.stderr
     *loops, _ = done.stderr.split("END")
-    assert [each.count("RepeatedEpochWarning") for each in loops] == [1, 1, 1, 0, 0] * 2, (
+    assert [each.count("RepeatedEpochWarning") for each in loops] == [1, 1, 1, 0, 0] * 3, (
         done.stderr
     )
 
