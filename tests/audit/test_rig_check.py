@@ -55,6 +55,21 @@ def test_a_baseline_that_is_off_is_reported():
     assert found["baseline_cm"] == pytest.approx(0.6)
 
 
+def test_baselines_that_are_rounded_agree_within_their_rounding():
+    centres = poses().centres + np.array([0, 1, 0]) * np.arange(6)[:, None] * 0.00123
+    rounded = dataclasses.replace(
+        RIG,
+        baselines_cm=tuple(
+            float(np.round(centres[0, b, 1] - centres[0, a, 1], 2)) for a, b in CAMERA_PAIRS
+        ),
+    )
+    posed = dataclasses.replace(poses(), centres=centres)
+    off = dataclasses.replace(rounded, baselines_cm=(*rounded.baselines_cm[:-1], 12.52))
+
+    assert rig_figures(rounded, posed, [])["baseline_cm"] == 0.0
+    assert rig_figures(off, posed, [])["baseline_cm"] == pytest.approx(0.0188, abs=1e-3)
+
+
 def test_a_turned_camera_is_reported_in_pixels():
     found = rig_figures(RIG, poses(turned=Rotation.from_euler("z", 1.0, degrees=True)), [])
 

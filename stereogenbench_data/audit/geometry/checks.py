@@ -9,6 +9,7 @@ from stereogenbench_data.audit.geometry.picture_check import FLAT
 from stereogenbench_data.audit.geometry.records import Figure, Finding, SceneAudit
 from stereogenbench_data.audit.paper_numbers import AUDIT
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.media.clock import MOST_EXTRA_FRAMES
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,8 +139,11 @@ def _beyond(
     """Return the check and what a figure beyond its limit says, None for any other."""
     if figure.quantity == "frames":
         expected = int(limits["frames"]) or scene.frames
-        is_right = figure.value == expected
-        return None if is_right else ("missing frames", f"has {figure.value} frames of {expected}")
+        more = figure.value - expected
+        # Opening tells of a few more than the scene uses.
+        is_right = more == 0 or (0 < more <= MOST_EXTRA_FRAMES and not limits["frames"])
+        kind = "missing frames" if more < 0 else "more frames"
+        return None if is_right else (kind, f"has {figure.value} frames of {expected}")
     check, limit = CHECKS.get(figure.quantity), limits.get(figure.quantity, math.nan)
     if check is None or figure.value == limit or check.worst(figure.value, limit) != figure.value:
         return None

@@ -5,7 +5,7 @@ equation. The release's files record millimetres; `schema.quantities` finds pixe
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -36,6 +36,8 @@ def recorded_px(document: dict[str, Any]) -> Iterator[tuple[str, float]]:
 def rig_figures(rig: Rig, poses: CameraPoses, documents: list[dict[str, Any]]) -> dict[str, float]:
     """Return the figures of a scene's rig, by quantity.
 
+    A recorded baseline agrees with the poses where their difference is within its own rounding.
+
     Args:
         rig: What ``baseline.json`` records.
         poses: What ``trajectory.json`` records, over all frames.
@@ -57,6 +59,7 @@ def rig_figures(rig: Rig, poses: CameraPoses, documents: list[dict[str, Any]]) -
     left, right = (list(cameras) for cameras in zip(*CAMERA_PAIRS, strict=True))
     posed_cm = np.linalg.norm(poses.centres[:, right] - poses.centres[:, left], axis=-1)
     away_cm = np.abs(posed_cm * (poses.unit_m * 100) - np.array(rig.baselines_cm))
+    away_cm[away_cm <= _rounding_cm(rig.baselines_cm) + 1e-9] = 0.0
     adjacent_cm = away_cm[:, [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]]
     rotations = poses.world_from_cam_rotations
     in_one_place = replace(poses, centres=np.zeros_like(poses.centres))
@@ -70,6 +73,14 @@ def rig_figures(rig: Rig, poses: CameraPoses, documents: list[dict[str, Any]]) -
         "rotation_px": rectification_residual_px(in_one_place, intrinsics),
         "lateral_px": rectification_residual_px(looking_alike, intrinsics),
     }
+
+
+def _rounding_cm(baselines_cm: Sequence[float]) -> float:
+    """Return half of the last decimal of baselines in centimetres, if that is one of 2 to 5."""
+    for decimals in range(2, 6):
+        if np.allclose(np.round(baselines_cm, decimals), baselines_cm, rtol=0, atol=1e-9):
+            return float(0.5 * 10.0**-decimals)
+    return 0.0
 
 
 def motion_px(
