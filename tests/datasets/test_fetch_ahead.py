@@ -18,7 +18,7 @@ from stereogenbench_data import SceneIndex, StereoPairs, StereoPairStream
 from stereogenbench_data.datasets.mapped import SeekTableWarning
 from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.media.seek_table import packed_tables, parse_tables
-from stereogenbench_data.samples import coming
+from stereogenbench_data.samples import load
 from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.fetch_ahead import FetchAhead
@@ -176,7 +176,7 @@ def test_what_is_planned_stays_within_the_bound(served, monkeypatch, alone):
 
 
 def test_what_is_requested_grows_with_what_was_read(served, large_shards, monkeypatch, alone):
-    monkeypatch.setattr(coming, "_FIRST_BYTES", 1)
+    monkeypatch.setattr(load, "_FIRST_BYTES", 1)
     options = {"fields": ("left",), "frames": "all"}
     loader = StereoPairs(served.url, **options).loader(1, shuffle=False)
     expected = [*StereoPairs(large_shards, **options).loader(1, shuffle=False)]
