@@ -22,10 +22,12 @@ class Gate:
                 with socket.create_connection((host, int(port))) as server:
                     back = threading.Thread(target=pump, args=(server, self.request), daemon=True)
                     back.start()
-                    while request := self.request.recv(65536):
-                        gate.pass_on()
-                        server.sendall(request)
-                    server.shutdown(socket.SHUT_RDWR)
+                    with suppress(OSError):  # whoever asked may reset the connection
+                        while request := self.request.recv(65536):
+                            gate.pass_on()
+                            server.sendall(request)
+                    with suppress(OSError):
+                        server.shutdown(socket.SHUT_RDWR)
                     back.join()
 
         def pump(server, client):
