@@ -274,7 +274,7 @@ class _ClosableQueue(_Queue):
 def _forked(kind: Any) -> Any:
     """Return a class of forked processes that are sure to have begun once they were started."""
 
-    class Forked(kind):  # type: ignore[misc]  # the class depends on the context
+    class Forked(kind):  # type: ignore[misc]  # mypy knows no base chosen at run time
         _begun_signal: Any
         _target: Any
         _args: Any
@@ -315,7 +315,7 @@ def _forked(kind: Any) -> Any:
 def _watched(kind: Any) -> Any:
     """Return a context's class whose processes and queues can be watched."""
 
-    class Watched(kind):  # type: ignore[misc]  # the class depends on the start method
+    class Watched(kind):  # type: ignore[misc]  # mypy knows no base chosen at run time
         def __init__(self) -> None:
             self.processes: list[BaseProcess] = []
             self.queues: list[_ClosableQueue] = []
