@@ -31,6 +31,7 @@ from stereogenbench_data.selection.order import (
     DropLast,
     EpochOrder,
     OrderRule,
+    Runs,
     last_batch,
     rank_share,
 )
@@ -256,6 +257,42 @@ class Passes:
         return self.__dict__ | {"_running": [], "latest": None}
 
 
+class KnownOrder:
+    """What the batches of all ranks are, without the dataset that they are of.
+
+    The dataset keeps it to read ahead. With the batches themselves it would refer to itself, and
+    videos would stay open after the last reference to it.
+    """
+
+    def __init__(self, rule: OrderRule, *, is_padded: bool) -> None:
+        """Take what the order depends on, and whether the last batches are filled up."""
+        self.rule = rule
+        self.is_padded = is_padded
+        self._order: EpochOrder | None = None
+
+    def order(self, runs: Runs, epoch: int) -> EpochOrder:
+        """Return the order of an epoch; the last one is kept."""
+        if self._order is None or self._order.epoch != epoch:
+            self._order = EpochOrder(runs, self.rule, epoch=epoch)
+        return self._order
+
+    def batch(self, runs: Runs, number: int, *, epoch: int) -> EpochBatch:
+        """Return the samples of a global batch, without saying which of them are padding."""
+        order = self.order(runs, epoch)
+        samples = order.batch(number) if number < order.batches else np.empty(0, dtype=np.int64)
+        return EpochBatch(
+            (order.full_batch(number) if self.is_padded else samples).tolist(),
+            epoch=epoch,
+            ends_of_runs=samples[order.ends_run(number)].tolist() if len(samples) else (),
+            number=number,
+            group=number % order.groups,
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy in another process needs; it computes the order itself."""
+        return self.__dict__ | {"_order": None}
+
+
 class EpochBatches(Sampler[list[int]]):
     """A batch sampler: the samples of each batch of an epoch, for one rank.
 
@@ -319,7 +356,7 @@ class EpochBatches(Sampler[list[int]]):
         self._drop_last = options.get("drop_last", rule.shuffle)
         self.drop_last, self.is_padded = self._drop_last is True, self._drop_last == "pad"
         self._follows_the_group = "rank" not in options
-        self._order: EpochOrder | None = None
+        self.known_order = KnownOrder(self.rule, is_padded=self.is_padded)
         self.passes = Passes(dataset.shared_epoch, then="same epoch")
         if self.end() == 0:
             raise SelectionError(
@@ -485,16 +522,10 @@ class EpochBatches(Sampler[list[int]]):
 
     def batch(self, number: int, *, epoch: int) -> EpochBatch:
         """Return the samples of a global batch."""
-        order = self.order(epoch)
-        samples = order.batch(number) if number < order.batches else np.empty(0, dtype=np.int64)
-        return EpochBatch(
-            (order.full_batch(number) if self.is_padded else samples).tolist(),
-            epoch=epoch,
-            is_padding=self.is_padding(number).tolist() if self.is_padded else None,
-            ends_of_runs=samples[order.ends_run(number)].tolist() if len(samples) else (),
-            number=number,
-            group=number % order.groups,
-        )
+        batch = self.known_order.batch(self.dataset.plan.runs, number, epoch=epoch)
+        if self.is_padded:
+            batch.is_padding = self.is_padding(number).tolist()
+        return batch
 
     def is_padding(self, number: int) -> np.ndarray:
         """Return, for each sample of a global batch, whether it fills up after the epoch's end."""
@@ -503,9 +534,7 @@ class EpochBatches(Sampler[list[int]]):
 
     def order(self, epoch: int) -> EpochOrder:
         """Return the order of an epoch; the last one is kept."""
-        if self._order is None or self._order.epoch != epoch:
-            self._order = EpochOrder(self.dataset.plan.runs, self.rule, epoch=epoch)
-        return self._order
+        return self.known_order.order(self.dataset.plan.runs, epoch)
 
     def state_at(self, epoch: int, batches: int) -> State:
         """Return the state after so many global batches of an epoch."""
@@ -568,10 +597,6 @@ class EpochBatches(Sampler[list[int]]):
             "selection": self.dataset.plan.digest,
             "index": self.dataset.index.digest,
         }
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy needs; it computes the order itself."""
-        return self.__dict__ | {"_order": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Become a copy, with passes of its own."""

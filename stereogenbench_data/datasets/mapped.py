@@ -21,6 +21,7 @@ from stereogenbench_data.datasets.batches import (
     EpochBatch,
     EpochBatches,
     EpochOptions,
+    KnownOrder,
     Passes,
     videos_to_keep,
 )
@@ -174,7 +175,7 @@ class _MappedScenes(Dataset[Sample]):
         self.shared_epoch = SharedEpoch()
         self.is_random = _is_random(plan, request)
         self._drawn = DrawnSamples() if self.is_random else None
-        self._batches: EpochBatches | None = None
+        self._known_order: KnownOrder | None = None
         self._step = self._stop = 0
         self._next_batch: tuple[int, int] | None = None
 
@@ -268,25 +269,25 @@ class _MappedScenes(Dataset[Sample]):
         if batch.number is None or this != self._next_batch or not self._loader.has_order:
             self._loader.expect(self.steps(batch, reading))
         self._next_batch = None
-        if batch.number is not None and self._batches is not None:
+        if batch.number is not None and self._known_order is not None:
             self._next_batch = (batch.epoch, batch.number + self._step)
 
     def steps(self, batch: EpochBatch, reading: Sequence[int]) -> Iterator[Step]:
         """Yield the samples of a batch, and of those that this process gets after it."""
-        batches, number = self._batches, batch.number
+        known, number = self._known_order, batch.number
         while True:
             for each in reading:
                 if -len(self.plan) <= each < len(self.plan):
                     address = self._address(each, batch.epoch, group=batch.group)
                     yield Step(address, each in batch.ends_of_runs)
-            if number is None or batches is None or number + self._step >= self._stop:
+            if number is None or known is None or number + self._step >= self._stop:
                 return
             number += self._step
-            batch = reading = batches.batch(number, epoch=batch.epoch)
+            batch = reading = known.batch(self.plan.runs, number, epoch=batch.epoch)
 
     def _address(self, number: int, epoch: int, *, group: int) -> Address:
         address = self.plan.locate(number % len(self.plan), epoch=epoch, group=group)
-        return address._replace(run=0) if self._batches is None else address
+        return address._replace(run=0) if self._known_order is None else address
 
     def _load_into(
         self, arrays: BatchArrays | None, place: int, number: int, *, batch: EpochBatch
@@ -369,7 +370,7 @@ class _MappedScenes(Dataset[Sample]):
         if epoch is not None:
             twin.shared_epoch = SharedEpoch(epoch)
             twin._drawn = None
-        twin._batches = twin._next_batch = None
+        twin._known_order = twin._next_batch = None
         return twin
 
     def keep_open(self, batches: EpochBatches, *, processes: int) -> None:
@@ -383,7 +384,7 @@ class _MappedScenes(Dataset[Sample]):
                 self.plan, batches.rule, streams=self._streams, processes=processes
             )
             self._loader.keep_open(videos, frames=batches.rule.open_frames)
-        self._batches, self._step, self._stop = batches, processes, batches.end()
+        self._known_order, self._step, self._stop = batches.known_order, processes, batches.end()
         self._next_batch = None
 
     def stop_fetching(self) -> None:

@@ -1,5 +1,6 @@
 """StereoPairs and SceneViews as torch sees them."""
 
+import gc
 import os
 import pickle
 import re
@@ -7,6 +8,7 @@ import signal
 import subprocess
 import sys
 import warnings
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from functools import partial
@@ -464,3 +466,16 @@ def test_workers_do_not_repeat_what_was_told_of_splits(small_release, tmp_path, 
     assert done.returncode == 0, done.stderr
 
     assert done.stderr.count("no split was chosen") == 1
+
+
+def test_a_dataset_ends_with_the_last_reference_to_its_loader(small_release):
+    loader = StereoPairs(small_release, split="train", fields=("left",)).loader(1)
+    next(iter(loader))
+    dataset = weakref.ref(loader.batches.dataset)
+
+    gc.disable()
+    try:
+        del loader
+        assert dataset() is None
+    finally:
+        gc.enable()
