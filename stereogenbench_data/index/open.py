@@ -573,8 +573,7 @@ def stale_message(table: pa.Table, head: IndexHead, *, index_file: Path) -> str:
     listed = PlacedFolders(root)
     new, tars, gone_scenes = set[str](), set[str](), set[str]()
     if not head.is_part:
-        left_out = head.broken.keys() | set(head.passed_over)
-        new = listed.keys - keys - (left_out - head.incomplete.keys())
+        new = listed.keys - keys - (head.broken.keys() - head.incomplete.keys())
     for folder in {path.rpartition("/")[0] for path in shards} | {""} if shards else ():
         names = (path.name for path in (root / folder).glob("*.tar"))
         tars |= {f"{folder}/{name}".lstrip("/") for name in names if name[0] != "."}

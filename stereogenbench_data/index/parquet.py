@@ -69,7 +69,6 @@ class IndexHead:
     broken: dict[str, str] = field(default_factory=dict)
     shards: dict[str, ShardFacts] = field(default_factory=dict)
     is_part: bool = False
-    passed_over: tuple[str, ...] = ()
 
 
 def made_again(where: str) -> str:
@@ -240,7 +239,6 @@ def write_index_file(
         "incomplete": head.incomplete,
         "broken": head.broken,
         "part": head.is_part,
-        "passed_over": list(head.passed_over),
         "shards": {name: asdict(facts) for name, facts in sorted(head.shards.items())},
     }
     if seek_tables is not None and seek_tables.null_count < len(seek_tables):
@@ -316,7 +314,6 @@ def _parse_head(metadata: bytes | None, *, where: str) -> IndexHead:
         all(isinstance(each, dict) and all(type(text) is str for text in each.values())
             for each in reasons)
         and isinstance(head.get("root"), str)
-        and isinstance(head.get("passed_over", []), list)
         and isinstance(shards, dict)
         and not any(re.search(UNSAFE_PATH, path) for path in shards)
         and all(isinstance(facts, dict)
@@ -335,7 +332,6 @@ def _parse_head(metadata: bytes | None, *, where: str) -> IndexHead:
         shards={path: ShardFacts(**facts) for path, facts in shards.items()},
         # An index of an earlier version that lies elsewhere may have been made of a part.
         is_part=head.get("part", head["root"] != ".") is True,
-        passed_over=tuple(map(str, head.get("passed_over", ()))),
     )
 
 

@@ -62,7 +62,6 @@ class SceneIndex:
         broken: Key to what is wrong, for scenes that were left out because of it.
         shards: What is known of each shard, by its path below the root; empty for folders.
         is_part: Whether it was made of a part of the root on purpose.
-        passed_over: Keys of scenes that the root holds and the index omits on purpose.
         stale: How the root differs from the index, and the cure; empty if no difference was found.
             URLs are not checked.
         is_from_file: Whether it was read from an index file, so that scenes which it leaves out
@@ -79,7 +78,6 @@ class SceneIndex:
         self.broken = head.broken
         self.shards = head.shards
         self.is_part = head.is_part
-        self.passed_over = head.passed_over
         self.stale = opened.stale
         self.is_from_file = bool(head.digest)
         self._table = opened.table
@@ -195,8 +193,9 @@ class SceneIndex:
             )
         self.load_seek_tables()
         tables = None if isinstance(self._seek_tables, Path) else self._seek_tables
-        left_out = {name: getattr(self, name) for name in ("incomplete", "broken", "passed_over")}
-        head = replace(self._head, digest=self.digest, **left_out)
+        head = replace(
+            self._head, digest=self.digest, incomplete=self.incomplete, broken=self.broken
+        )
         write_index_file(Path(path), self._table, head, seek_tables=tables)
 
     @property

@@ -6,7 +6,7 @@ them lists only what is there. Whole files are kept, so a run that was stopped c
 
 import shutil
 import zlib
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, replace
@@ -18,7 +18,6 @@ from stereogenbench_data.engine import Progress, advance_of
 from stereogenbench_data.errors import StorageError, explain_os_errors
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.index.tree import PlacedFolders
 from stereogenbench_data.schema.records import Member, Scene
 from stereogenbench_data.shards.plan import SCENE_TEXTS
 from stereogenbench_data.shards.tar import read_chunks
@@ -140,33 +139,56 @@ def download(
         progress: Called repeatedly with the bytes done, and all of them.
 
     Returns:
-        The index of the wanted scenes. Other scenes that an earlier download left in the folder
-        stay on the disk but are not in the index.
+        The index of all scenes in the folder, those of earlier downloads included.
 
     Raises:
-        StorageError: If a file cannot be fetched or stored, its checksum differs, or the disk is
-            too small.
+        StorageError: If a file cannot be fetched or stored, its checksum differs, the disk is too
+            small, or the folder has an index that cannot be read.
     """
     dest = local_path(dest)
     if not is_remote(index.root):
         if dest == local_path(index.root):
             raise StorageError(f"{dest}: is the folder of the data. Choose another folder.")
         require_own_files(index.root, sorted({each.member.path for each in wanted.files}))
+    scenes = _scenes_before(dest)
     _fetch_missing(index, wanted, dest, workers=workers, progress=progress)
-    scenes = [
-        replace(
-            scene,
-            members={
-                name: replace(member, path=f"{scene.id.key}/{name}", offset=0)
-                for name, member in scene.members.items()
-            },
-        )
-        for scene in wanted.scenes
-    ]
-    here = SceneIndex.from_scenes(scenes, dest)
-    here.passed_over = tuple(sorted(PlacedFolders(dest).keys - {scene.id.key for scene in scenes}))
+    for scene in wanted.scenes:
+        members = {
+            name: replace(member, path=f"{scene.id.key}/{name}", offset=0)
+            for name, member in scene.members.items()
+        }
+        before = scenes.get(scene.id.key, scene).members
+        if _texts(before) == _texts(members):
+            members = before | members
+        scenes[scene.id.key] = replace(scene, members=members)
+    here = SceneIndex.from_scenes(scenes.values(), dest)
     here.write(dest / INDEX_NAME)
     return here
+
+
+def _scenes_before(dest: Path) -> dict[str, Scene]:
+    """Return what an earlier download left whole in the folder, by key."""
+    if not (dest / INDEX_NAME).exists():
+        return {}
+    index = SceneIndex.open(dest)
+    if index.shards or is_remote(index.root) or local_path(index.root) != dest:
+        raise StorageError(
+            f"{dest}: has the index of other data, and the download would replace it. Choose "
+            f"another folder."
+        )
+    return {
+        scene.id.key: scene
+        for scene in map(index.scene, range(len(index)))
+        if all(
+            _is_whole(WantedFile(scene.id.key, name, member), dest)
+            for name, member in scene.members.items()
+        )
+    }
+
+
+def _texts(members: Mapping[str, Member]) -> dict[str, tuple[int, int | None]]:
+    """Return size and checksum of a scene's metadata, which differ in another revision."""
+    return {name: (each.size, each.crc32) for name, each in members.items() if name in SCENE_TEXTS}
 
 
 def _fetch_missing(

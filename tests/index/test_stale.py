@@ -185,7 +185,7 @@ def test_an_index_that_lies_elsewhere_names_itself_in_the_cure(tree, tmp_path):
         SceneIndex.open(tmp_path / "all.parquet")
 
 
-def test_scenes_of_an_earlier_download_are_known_and_later_ones_are_not(tree, tmp_path):
+def test_a_scene_put_beside_two_downloads_is_named(tree, tmp_path):
     there = tmp_path / "there"
     for family in ("Uniform", "IPD_Gaussian"):
         done = invoke(
@@ -193,7 +193,7 @@ def test_scenes_of_an_earlier_download_are_known_and_later_ones_are_not(tree, tm
         )
         assert done.exit_code == 0
 
-    assert len(SceneIndex.open(there)) == 1
+    assert len(SceneIndex.open(there)) == 3
     add_scene(there)
     with pytest.warns(StaleIndexWarning, match=rf"1 scene not in the index \({MAP}/scene_000009"):
         SceneIndex.open(there)

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import StorageError
+from stereogenbench_data.index.open import StaleIndexWarning
 from stereogenbench_data.shards.download import download, download_sizes, plan_download
 from stereogenbench_data.shards.pack import pack
 from tests.servers.failing_server import Answer
@@ -253,3 +254,49 @@ def test_a_link_within_the_data_is_copied(small_release, tmp_path, root, target)
     for path in (tmp_path / "part").rglob("baseline.json"):
         here = path.relative_to(tmp_path / "part")
         assert path.read_bytes() == (small_release / here).read_bytes()
+
+
+def test_downloads_into_one_folder_add_up(shards_on_the_web, small_release, tmp_path):
+    fetched(shards_on_the_web, tmp_path / "part", rows=(0, 1), streams=("rgb",))
+    fetched(shards_on_the_web, tmp_path / "part", rows=(1, 2), cameras=(1, 2))
+
+    index = SceneIndex.open(tmp_path / "part")
+    videos = [
+        sorted(name for name in index.scene(row).members if name.startswith("cam_"))
+        for row in range(3)
+    ]
+    assert not index.stale
+    assert videos == [
+        ["cam_00_rgb.mp4", "cam_01_rgb.mp4"],
+        [
+            "cam_00_rgb.mp4",
+            "cam_01_depth.mkv",
+            "cam_01_rgb.mp4",
+            "cam_02_depth.mkv",
+            "cam_02_rgb.mp4",
+        ],
+        ["cam_01_depth.mkv", "cam_01_rgb.mp4", "cam_02_depth.mkv", "cam_02_rgb.mp4"],
+    ]
+
+
+def test_what_was_removed_since_an_earlier_download_is_not_listed(shards_on_the_web, tmp_path):
+    first = fetched(shards_on_the_web, tmp_path / "part", rows=(0, 1))
+    shutil.rmtree(tmp_path / "part" / first.scene(0).id.key)
+
+    with pytest.warns(StaleIndexWarning, match="1 scene of the index, and not there"):
+        index = fetched(shards_on_the_web, tmp_path / "part", rows=(2,))
+    fetched_key = SceneIndex.open(shards_on_the_web).scene(2).id.key
+
+    keys = [index.scene(row).id.key for row in range(len(index))]
+    assert set(keys) == {first.scene(1).id.key, fetched_key}
+
+
+def test_a_folder_with_the_index_of_other_data_is_refused(
+    shards_on_the_web, small_release, tmp_path
+):
+    pack(small_release, tmp_path / "shards", workers=1)
+    before = (tmp_path / "shards" / "index.parquet").read_bytes()
+
+    with pytest.raises(StorageError, match="shards: has the index of other data"):
+        fetched(shards_on_the_web, tmp_path / "shards")
+    assert (tmp_path / "shards" / "index.parquet").read_bytes() == before
