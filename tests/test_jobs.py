@@ -1,9 +1,13 @@
-"""Two jobs that begin at once in one folder: one of them works, the other is refused."""
+"""A folder belongs to one job: others are refused, also such as begin at the same moment."""
 
 import subprocess
 import sys
 
+import pytest
+
 from stereogenbench_data.bridges.clips import export_clips
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.jobs import job_folder
 from stereogenbench_data.media.encoder import Encoding
 
 ONE_OF_TWO = """
@@ -50,3 +54,29 @@ def test_of_two_jobs_at_once_one_is_whole_and_the_other_refused(indexed_release,
     refusals = ("another process works on this folder", "of other")
     assert any(refusal in done[loser][0] for refusal in refusals)
     assert files_of(both) == files_of(tmp_path / "alone")
+
+
+def refusal(folder):
+    """Return what a job with the settings 1 is told of a folder."""
+    with pytest.raises(StorageError) as refused, job_folder(folder, {"a": 1}):
+        pass
+    return str(refused.value)
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("mine")
+
+    assert "is not empty and holds no export.json: choose a new folder" in refusal(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_settings_that_are_not_json_are_named(tmp_path):
+    (tmp_path / "export.json").write_text("{")
+    (tmp_path / "right.mp4").write_text("")
+
+    assert "export.json: is not JSON" in refusal(tmp_path)
+
+
+def test_a_folder_that_a_job_holds_is_refused(tmp_path):
+    with job_folder(tmp_path, {"a": 1}):
+        assert f"{tmp_path}: another process works on this folder" in refusal(tmp_path)

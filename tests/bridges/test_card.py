@@ -42,11 +42,16 @@ print(json.dumps({"videos": found, "scenes": scenes}))
 
 
 @pytest.fixture(scope="module")
-def head():
-    return yaml.safe_load(card(SceneIndex.open(SAMPLE), repository="a/b").split("---")[1])
+def sample_card():
+    return card(SceneIndex.open(SAMPLE), repository="a/b")
 
 
-def test_every_family_is_a_config_with_its_splits(head):
+@pytest.fixture(scope="module")
+def head(sample_card):
+    return yaml.safe_load(sample_card.split("---")[1])
+
+
+def test_every_family_is_a_config_with_its_splits_and_all_has_every_shard_once(head):
     configs = {each["config_name"]: each["data_files"] for each in head["configs"]}
 
     assert list(configs) == ["all", "IPD_Gaussian", "Pairwise_Uniform", "Uniform", "scenes"]
@@ -59,11 +64,7 @@ def test_every_family_is_a_config_with_its_splits(head):
     assert configs["Pairwise_Uniform"] == [
         {"split": "train", "path": ["train-Pairwise_Uniform-*.tar"]}
     ]
-
-
-def test_the_patterns_of_all_find_every_shard_once(head):
-    patterns = [pattern for each in head["configs"][0]["data_files"] for pattern in each["path"]]
-
+    patterns = [pattern for each in configs["all"] for pattern in each["path"]]
     found = sorted(path.name for pattern in patterns for path in SAMPLE.glob(pattern))
     assert found == sorted(path.name for path in SAMPLE.glob("*.tar"))
 
@@ -76,26 +77,20 @@ def test_the_head_says_what_the_hub_lists_datasets_by(head):
     assert head["license"] == "mit"
 
 
-def test_a_card_of_drawn_scenes_claims_nothing_of_the_release():
-    text = card(SceneIndex.open(SAMPLE), repository="a/b")
-
-    assert "stereogenbench synth" in text
-    assert not re.search(r"Unreal|Qwen2|Yangzhi|cc-by", text, re.IGNORECASE)
-
-
-def test_the_counts_are_those_of_the_index():
-    text = card(SceneIndex.open(SAMPLE), repository="a/b")
-
-    assert "| train |  | Uniform | 2 | 30 |" in text
-    assert "| eval | unseen_map | IPD_Gaussian | 1 | 15 |" in text
-    assert "- 8 scenes on 2 maps, in 7 shards" in text
-    assert "(0.01 m here)" in text
+def test_a_card_counts_its_own_scenes_and_claims_nothing_of_the_release(sample_card):
+    assert "stereogenbench synth" in sample_card
+    assert not re.search(r"Unreal|Qwen2|Yangzhi|cc-by", sample_card, re.IGNORECASE)
+    assert "| train |  | Uniform | 2 | 30 |" in sample_card
+    assert "| eval | unseen_map | IPD_Gaussian | 1 | 15 |" in sample_card
+    assert "- 8 scenes on 2 maps, in 7 shards" in sample_card
+    assert "(0.01 m here)" in sample_card
 
 
 def test_load_dataset_finds_configs_and_splits_and_leaves_videos_as_bytes(tmp_path):
     require_module("datasets")
     folder = shutil.copytree(SAMPLE, tmp_path / "hub")
-    write_card_over(folder)
+    (folder / "README.md").unlink()
+    write_card(SceneIndex.open(folder), folder, repository=REPOSITORY)
     wanted = [["Uniform", "train"], ["IPD_Gaussian", "eval_unseen_map"], [None, "train"]]
 
     with serving(folder, handler=HubHandler) as server:
@@ -124,11 +119,6 @@ def test_load_dataset_finds_configs_and_splits_and_leaves_videos_as_bytes(tmp_pa
     for key, kind, size in (row for rows in found.values() for row in rows):
         assert kind == "bytes"
         assert size == scenes[key].members["cam_00_depth.mkv"].size
-
-
-def write_card_over(folder):
-    (folder / "README.md").unlink()
-    write_card(SceneIndex.open(folder), folder, repository=REPOSITORY)
 
 
 def test_the_rows_of_the_viewer_are_written_once_for_an_index(small_shards, tmp_path):

@@ -2,11 +2,8 @@
 
 import json
 import shutil
-import signal
-import subprocess
 import sys
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,10 +17,8 @@ from stereogenbench_data.bridges.multiview import PosedImage
 from stereogenbench_data.errors import FieldError, SelectionError, StorageError
 from stereogenbench_data.geometry.pose import rotation_from_quaternion_xyzw
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.sources.files import try_locked
-from tests.servers.tools import require_module, small_disk
+from tests.servers.tools import kill_at, killed_fork, require_module, small_disk
 
-LAYOUTS = ("colmap", "transforms", "ply", "moge")
 CLOSE_PX = 0.01
 
 exported = partial(export_views, workers=1)
@@ -102,19 +97,23 @@ def moment(detailed_release):
     return SceneViews(detailed_release)[0]
 
 
-@pytest.fixture(scope="module")
-def scene_folder():
-    return Path("train", "IPD_Gaussian", "SynthStage", "scene_000000")
-
-
 def test_points_of_a_colmap_model_project_onto_their_observations(
     detailed_release, moment, tmp_path
 ):
     (folder,) = exported(detailed_release, tmp_path, layout="colmap", points=200)
     size, lens, images, points = read_colmap(folder)
+    about = json.loads((folder / "stereogenbench.json").read_text())
+    scene_from_export = np.array(about["scene_from_export"])
 
+    assert (about["scene"], about["frame"]) == ("train/IPD_Gaussian/SynthStage/scene_000000", 0)
     assert size == (160, 160)
     np.testing.assert_array_equal(lens, moment["intrinsics"].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]])
+    for name, rotation, step, _ in images.values():
+        cam_from_export = np.eye(4)
+        cam_from_export[:3, :3], cam_from_export[:3, 3] = rotation, step
+        scene_from_cam = scene_from_export @ np.linalg.inv(cam_from_export)
+        expected = moment["world_from_cam"][int(name[4:6])].numpy()
+        np.testing.assert_allclose(scene_from_cam, expected, atol=1e-9)
     assert len(points) == 6 * 200
     for position, colour, track in points.values():
         for image, place in track:
@@ -132,23 +131,6 @@ def test_points_of_a_colmap_model_project_onto_their_observations(
         assert abs(depth_m - moment["depth"][camera, 0, row, column].item()) < 1e-9
 
 
-def test_poses_of_a_colmap_model_are_those_of_the_scene_from_its_first_camera(
-    detailed_release, moment, tmp_path
-):
-    (folder,) = exported(detailed_release, tmp_path, layout="colmap", points=1)
-    _, _, images, _ = read_colmap(folder)
-    about = json.loads((folder / "stereogenbench.json").read_text())
-    scene_from_export = np.array(about["scene_from_export"])
-
-    for name, rotation, step, _ in images.values():
-        cam_from_export = np.eye(4)
-        cam_from_export[:3, :3], cam_from_export[:3, 3] = rotation, step
-        scene_from_cam = scene_from_export @ np.linalg.inv(cam_from_export)
-        expected = moment["world_from_cam"][int(name[4:6])].numpy()
-        np.testing.assert_allclose(scene_from_cam, expected, atol=1e-9)
-    assert (about["scene"], about["frame"]) == ("train/IPD_Gaussian/SynthStage/scene_000000", 0)
-
-
 @pytest.mark.skipif(sys.version_info >= (3, 15), reason="pycolmap has no wheel for Python 3.15 yet")
 def test_colmap_reads_the_model(shared_scenes, tmp_path):
     pycolmap = require_module("pycolmap")
@@ -163,11 +145,16 @@ def test_colmap_reads_the_model(shared_scenes, tmp_path):
             assert np.abs(landed - observed.xy).max() < CLOSE_PX
 
 
-def test_points_of_transforms_project_onto_the_pixels_they_are_of(
-    detailed_release, moment, tmp_path
-):
-    (folder,) = exported(detailed_release, tmp_path, layout="transforms", points="all")
-    about = json.loads((folder / "transforms.json").read_text())
+@pytest.fixture(scope="module")
+def transforms(detailed_release, tmp_path_factory):
+    """An export for nerfstudio of every measured pixel: its folder, and what its file says."""
+    out = tmp_path_factory.mktemp("transforms")
+    (folder,) = exported(detailed_release, out, layout="transforms", points="all")
+    return folder, json.loads((folder / "transforms.json").read_text())
+
+
+def test_points_of_transforms_project_onto_the_pixels_they_are_of(transforms, moment):
+    folder, about = transforms
     lens = tuple(about[name] for name in ("fl_x", "fl_y", "cx", "cy"))
     world, colours = read_ply(folder / about["ply_file_path"])
     first = 0
@@ -187,9 +174,11 @@ def test_points_of_transforms_project_onto_the_pixels_they_are_of(
     assert first == len(world)
 
 
-def test_transforms_name_pictures_and_depth_in_millimetres(detailed_release, moment, tmp_path):
-    (folder,) = exported(detailed_release, tmp_path, layout="transforms", points=1)
-    about = json.loads((folder / "transforms.json").read_text())
+def test_transforms_name_pictures_depth_in_millimetres_and_a_world_whose_z_is_up(
+    transforms, moment
+):
+    folder, about = transforms
+    applied = np.array(about["applied_transform"])
 
     assert (about["w"], about["h"], about["camera_model"]) == (160, 160, "OPENCV")
     for camera, frame in enumerate(about["frames"]):
@@ -199,14 +188,6 @@ def test_transforms_name_pictures_and_depth_in_millimetres(detailed_release, mom
         depth_mm = np.load(folder / frame["depth_file_path"], allow_pickle=False)
         assert depth_mm.dtype == np.float32
         np.testing.assert_allclose(depth_mm, moment["depth"][camera, 0] * 1000, rtol=1e-6)
-
-
-def test_the_world_of_transforms_has_its_z_axis_upwards(detailed_release, moment, tmp_path):
-    (folder,) = exported(detailed_release, tmp_path, layout="transforms", points=1)
-    about = json.loads((folder / "transforms.json").read_text())
-    applied = np.array(about["applied_transform"])
-
-    for camera, frame in enumerate(about["frames"]):
         pose = np.array(frame["transform_matrix"])
         scene = moment["world_from_cam"][camera].numpy()
         np.testing.assert_allclose(applied[:, :3] @ scene[:3, :3] * (1, -1, -1), pose[:3, :3])
@@ -216,8 +197,15 @@ def test_the_world_of_transforms_has_its_z_axis_upwards(detailed_release, moment
     assert np.linalg.det(applied[:, :3]) == pytest.approx(1)
 
 
-def test_points_of_a_cloud_project_onto_the_pixels_they_are_of(detailed_release, moment, tmp_path):
-    (folder,) = exported(detailed_release, tmp_path, layout="ply", points="all", cameras=(3, 1))
+@pytest.mark.parametrize("contract", [None, DepthEncoding(unit_m=0.02, kind="ray")], ids=str)
+def test_points_of_a_cloud_lie_on_their_pixels_at_the_depth_of_the_contract(
+    detailed_release, tmp_path, contract
+):
+    (folder,) = exported(
+        detailed_release, tmp_path, layout="ply", depth=contract, points="all", cameras=(3, 1)
+    )
+    moment = SceneViews(detailed_release, depth=contract)[0]
+    lens = moment["intrinsics"].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]
     world, _ = read_ply(folder / "points.ply")
     about = json.loads((folder / "stereogenbench.json").read_text())
     export_from_scene = np.linalg.inv(about["scene_from_export"])
@@ -226,24 +214,13 @@ def test_points_of_a_cloud_project_onto_the_pixels_they_are_of(detailed_release,
         cam_from_export = np.linalg.inv(
             export_from_scene @ moment["world_from_cam"][camera].numpy()
         )
-        expected, _ = measured_pixels(moment["depth"][camera, 0].numpy())
-        cam = world[first : first + len(expected)] @ cam_from_export[:3, :3].T
-        lens = moment["intrinsics"].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]
-        landed = pixels_of(cam + cam_from_export[:3, 3], lens)
-        assert np.abs(landed - expected).max() < CLOSE_PX
+        expected, depth_m = measured_pixels(moment["depth"][camera, 0].numpy())
+        own = world[first : first + len(expected)]
+        cam = own @ cam_from_export[:3, :3].T + cam_from_export[:3, 3]
+        assert np.abs(pixels_of(cam, lens) - expected).max() < CLOSE_PX
+        np.testing.assert_allclose(cam[:, 2], depth_m, rtol=1e-5)
         first += len(expected)
     assert first == len(world)
-
-
-def test_so_many_points_are_drawn_the_same_each_time(detailed_release, tmp_path):
-    clouds = []
-    for name in "ab":
-        (folder,) = exported(detailed_release, tmp_path / name, layout="ply", points=50)
-        clouds.append(read_ply(folder / "points.ply")[0])
-
-    assert len(clouds[0]) == 300
-    np.testing.assert_array_equal(*clouds)
-    assert len(np.unique(clouds[0], axis=0)) == 300
 
 
 def read_moge_depth(path):
@@ -260,12 +237,13 @@ def read_moge_depth(path):
 
 
 def test_moges_folders_hold_depth_picture_and_normalised_intrinsics(
-    detailed_release, moment, tmp_path, scene_folder
+    detailed_release, moment, tmp_path
 ):
     exported(detailed_release, tmp_path, layout="moge")
     names = (tmp_path / ".index.txt").read_text().splitlines()
+    moment_folder = "train/IPD_Gaussian/SynthStage/scene_000000/frame_000"
 
-    assert names == [str(scene_folder / "frame_000" / f"cam_{camera:02d}") for camera in range(6)]
+    assert names == [f"{moment_folder}/cam_{camera:02d}" for camera in range(6)]
     for camera, name in enumerate(names):
         folder = tmp_path / name
         depth = read_moge_depth(folder / "depth.png")
@@ -326,19 +304,6 @@ def test_the_size_of_an_export_is_that_of_its_pictures_depth_and_cameras(
     assert lens == tuple(sample["intrinsics"].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]])
 
 
-def test_a_depth_contract_is_followed(detailed_release, tmp_path):
-    contract = DepthEncoding(unit_m=0.02, kind="ray")
-    (folder,) = exported(
-        detailed_release, tmp_path, layout="ply", depth=contract, points="all", cameras=(0,)
-    )
-    world, _ = read_ply(folder / "points.ply")
-    sample = SceneViews(detailed_release, depth=contract)[0]
-    _, depth_m = measured_pixels(sample["depth"][0, 0].numpy())
-    rotation = sample["world_from_cam"][0, :3, :3].numpy()
-
-    np.testing.assert_allclose((world @ rotation)[:, 2], depth_m, rtol=1e-5)
-
-
 def test_every_moment_has_a_folder_of_its_own(indexed_release, tmp_path):
     chosen = {"layout": "colmap", "frames": ("every", 3), "family": "Uniform", "points": 5}
     moments = exported(indexed_release, tmp_path, **chosen)
@@ -352,7 +317,7 @@ def test_every_moment_has_a_folder_of_its_own(indexed_release, tmp_path):
     assert names == {path.name for path in (moments[1] / "images").iterdir()}
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("layout", ["colmap", "moge"])
 def test_what_was_exported_before_is_kept(indexed_release, tmp_path, layout):
     options = {"layout": layout, "frames": [0, 4], "size": (32, 32)}
     folders = exported(indexed_release, tmp_path, **options)
@@ -374,30 +339,17 @@ def test_what_was_exported_before_is_kept(indexed_release, tmp_path, layout):
 
 
 def test_an_export_that_was_killed_goes_on_and_is_whole(indexed_release, tmp_path):
-    options = {"layout": "transforms", "frames": "all", "points": 2000, "family": "Uniform"}
-    expected = tmp_path / "expected"
+    options = {"layout": "transforms", "frames": [0, 2, 4], "points": 500, "family": "Uniform"}
+    expected, killed = tmp_path / "expected", tmp_path / "killed"
     exported(indexed_release, expected, **options)
-    killed = tmp_path / "killed"
-    code = (
-        "import os, signal, sys\n"
-        "from stereogenbench_data.bridges.export_views import export_views\n"
-        "def kill(done, total):\n"
-        "    if done >= 30: os.kill(os.getpid(), signal.SIGKILL)\n"
-        f"export_views(sys.argv[1], sys.argv[2], workers=1, progress=kill, **{options!r})"
-    )
-    ended = subprocess.run(
-        [sys.executable, "-c", code, str(indexed_release), str(killed)],
-        cwd=Path(__file__).resolve().parents[2], check=False,
-    )  # fmt: skip
 
-    assert ended.returncode == -signal.SIGKILL
-    assert len([*killed.rglob("frame_*/transforms.json")]) >= 4
+    assert killed_fork(lambda: exported(indexed_release, killed, progress=kill_at(12), **options))
+    assert [*killed.rglob("frame_*/transforms.json")]
     assert [*killed.rglob(".frame_*.unfinished")]
     for folder in killed.rglob("frame_*"):
         assert folder.suffix or (folder / "transforms.json").is_file()
-    folders = exported(indexed_release, killed, **options)
+    assert len(exported(indexed_release, killed, **options)) == 6
     assert files_of(killed) == files_of(expected)
-    assert len(folders) == 14
 
 
 def test_moges_index_keeps_what_was_exported_before(indexed_release, tmp_path):
@@ -432,54 +384,23 @@ def test_both_splits_and_a_contract_go_on_in_their_folder(indexed_release, tmp_p
     assert json.loads((tmp_path / "export.json").read_text())["split"] == ["eval", "train"]
 
 
-@pytest.mark.parametrize(
-    ("changed", "name"),
-    [
-        ({"layout": "ply"}, "layout"),
-        ({"size": (20, 20)}, "size"),
-        ({"points": 7}, "points"),
-        ({"cameras": (0, 1)}, "cameras"),
-        ({"depth": DepthEncoding(unit_m=0.5)}, "depth"),
-    ],
-)
-def test_a_folder_holds_one_kind_of_export(indexed_release, tmp_path, changed, name):
+def test_a_folder_holds_one_kind_of_export_of_the_same_data(
+    indexed_release, detailed_release, tmp_path
+):
     options = {"layout": "colmap", "size": (16, 16), "points": 5}
     exported(indexed_release, tmp_path, **options)
 
-    with pytest.raises(StorageError, match=rf"an export of other {name}: .*another folder"):
-        exported(indexed_release, tmp_path, **(options | changed))
-
-
-def test_other_data_go_elsewhere(indexed_release, detailed_release, tmp_path):
-    exported(indexed_release, tmp_path, layout="ply", size=(16, 16))
-
+    for name, changed in (
+        ("layout", {"layout": "ply"}),
+        ("size", {"size": (20, 20)}),
+        ("points", {"points": 7}),
+        ("cameras", {"cameras": (0, 1)}),
+        ("depth", {"depth": DepthEncoding(unit_m=0.5)}),
+    ):
+        with pytest.raises(StorageError, match=rf"an export of other {name}: .*another folder"):
+            exported(indexed_release, tmp_path, **(options | changed))
     with pytest.raises(StorageError, match=r"other data: .*another folder"):
-        exported(detailed_release, tmp_path, layout="ply", size=(16, 16))
-
-
-def test_a_folder_of_something_else_is_left_alone(indexed_release, tmp_path):
-    (tmp_path / "thesis.tex").write_text("mine")
-
-    with pytest.raises(StorageError, match=r"not empty and holds no export.*a new folder"):
-        exported(indexed_release, tmp_path, layout="ply")
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
-
-
-def test_a_description_that_is_none_is_named(indexed_release, tmp_path):
-    (tmp_path / "export.json").write_text("{")
-    (tmp_path / "a_picture.ply").write_text("")
-
-    with pytest.raises(StorageError, match=r"export\.json: is not JSON"):
-        exported(indexed_release, tmp_path, layout="ply")
-
-
-def test_two_processes_do_not_export_into_one_folder(indexed_release, tmp_path):
-    exported(indexed_release, tmp_path, layout="ply", size=(16, 16), family="Uniform")
-
-    with try_locked(tmp_path / ".export.lock") as is_ours:
-        assert is_ours
-        with pytest.raises(StorageError, match=r"another process works on this folder"):
-            exported(indexed_release, tmp_path, layout="ply", size=(16, 16))
+        exported(detailed_release, tmp_path, **options)
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,7 @@ def test_embedded_coordinates_say_where_a_warped_pixel_came_from(item):
     assert torch.equal(item["src_coords_embed"][11:], item["source"])
 
 
-@pytest.mark.parametrize("size", [(160, 160), (120, 200), (200, 120)])
+@pytest.mark.parametrize("size", [(120, 200), (200, 120)])
 @pytest.mark.filterwarnings("ignore::stereogenbench_data.samples.request.SwappedSizeWarning")
 def test_clip_is_given_what_its_own_processor_makes(detailed_release, size):
     transformers = require_module("transformers")
@@ -167,7 +167,7 @@ def test_what_cannot_be_is_refused(indexed_release):
 
 
 @pytest.mark.parametrize(
-    ("frames", "stride"), [("all", 1), ([3], 1), (("clips", 2, 3), 3), (("clips", 1), 1)]
+    ("frames", "stride"), [("all", 1), (("clips", 2, 3), 3), (("clips", 1), 1)]
 )
 def test_the_frame_rate_is_a_field(indexed_release, frames, stride):
     from stereogenbench_data import SceneViews

@@ -27,11 +27,10 @@ from stereogenbench_data.index.table import SceneIndex
 
 ADAPTERS = [
     pytest.param(RaftStereo, {}, id="RAFT-Stereo"),
-    pytest.param(IgevStereo, {}, id="IGEV-Stereo"),
-    pytest.param(UniMatch, {}, id="UniMatch"),
     pytest.param(DynamicStereo, {"frames": ("clips", 2)}, id="DynamicStereo"),
 ]
-FLIPPED = [None, HorizontalFlip(1.0)]
+"""One of frames and one of clips: what is tested with them is their base's."""
+MOVED = Compose([HorizontalFlip(1.0), RandomCrop(96, 128)])
 
 
 def fetched(right, shift_px):
@@ -71,7 +70,7 @@ def test_the_loop_of_raft_stereo_unpacks_four_after_the_names(indexed_release):
 
 
 @pytest.mark.parametrize(("adapter", "sign"), [(RaftStereo, 1), (IgevStereo, -1)])
-@pytest.mark.parametrize("transform", FLIPPED)
+@pytest.mark.parametrize("transform", [None, MOVED], ids=["as it is", "flipped and cropped"])
 def test_the_right_picture_fetched_by_the_flow_is_the_left_one(
     detailed_release, adapter, sign, transform
 ):
@@ -85,27 +84,19 @@ def test_the_right_picture_fetched_by_the_flow_is_the_left_one(
 
 
 def test_raft_stereo_names_both_pictures_and_the_ground_truth(indexed_release):
-    names = RaftStereo(
-        indexed_release, family="Uniform", split="train", pairs=[(1, 4)], frames=[3]
-    )[0][0]
-    flipped = RaftStereo(
-        indexed_release,
-        family="Uniform",
-        split="train",
-        pairs=[(1, 4)],
-        transform=HorizontalFlip(1),
-    )[0][0]
+    options = {"family": "Uniform", "split": "train", "pairs": [(1, 4)], "frames": [3]}
+    names = RaftStereo(indexed_release, **options)[0][0]
+    flipped = RaftStereo(indexed_release, transform=HorizontalFlip(1), **options)[0][0]
 
     scene = "train/Uniform/SynthStage/scene_000000"
     assert names == [f"{scene}/cam_{each}/003" for each in ("01_rgb", "04_rgb", "01_depth")]
-    assert flipped == [f"{scene}/cam_{each}/000" for each in ("04_rgb", "01_rgb", "04_depth")]
+    assert flipped == [f"{scene}/cam_{each}/003" for each in ("04_rgb", "01_rgb", "04_depth")]
 
 
-@pytest.mark.parametrize("adapter", [RaftStereo, IgevStereo])
-def test_pixels_of_large_disparity_are_not_valid(indexed_release, adapter):
+def test_pixels_of_large_disparity_are_not_valid(indexed_release):
     largest = StereoPairs(indexed_release)[0]["disparity"].max()
-    whole = adapter(indexed_release)[0]
-    cut = adapter(indexed_release, valid_below_px=float(largest) / 2)[0]
+    whole = RaftStereo(indexed_release)[0]
+    cut = RaftStereo(indexed_release, valid_below_px=float(largest) / 2)[0]
 
     np.testing.assert_array_equal(cut[3], whole[3])
     assert torch.equal(cut[4], whole[4] * (whole[3][0].abs() < largest / 2))
@@ -136,12 +127,11 @@ def test_the_loop_of_unimatch_takes_normalised_tensors(indexed_release):
     assert torch.equal(mask[0], plain["valid"][0])
 
 
-@pytest.mark.parametrize("transform", FLIPPED)
 def test_the_right_picture_of_unimatch_fetched_by_its_disparity_is_the_left_one(
-    detailed_release, transform
+    detailed_release,
 ):
-    item = UniMatch(detailed_release, transform=transform)[0]
-    visible = visible_pixels(detailed_release, transform=transform)[0]
+    item = UniMatch(detailed_release, transform=MOVED)[0]
+    visible = visible_pixels(detailed_release, transform=MOVED)[0]
     mean, std = (torch.tensor(each)[:, None, None] for each in (IMAGENET_MEAN, IMAGENET_STD))
     left, right = ((item[name] * std + mean) * 255 for name in ("left", "right"))
 
@@ -165,11 +155,8 @@ def test_the_loop_of_dynamic_stereo_takes_clips_of_both_views(indexed_release):
         assert (flow[used] < 0).all()
 
 
-@pytest.mark.parametrize("transform", FLIPPED)
-def test_both_views_of_dynamic_stereo_have_the_disparity_of_their_own_pixels(
-    detailed_release, transform
-):
-    options = {"frames": ("clips", 2), "transform": transform}
+def test_both_views_of_dynamic_stereo_have_the_disparity_of_their_own_pixels(detailed_release):
+    options = {"frames": ("clips", 2), "transform": MOVED}
     item = DynamicStereo(detailed_release, **options)[0]
     there = StereoPairs(detailed_release, fields=("visible", "visible_right"), **options)[0]
 
@@ -187,7 +174,8 @@ def test_torchs_own_loader_and_ours_give_the_same_items(indexed_release, adapter
     )
 
     ours = next(iter(dataset.loader(2, shuffle=False)))
-    torchs = next(iter(DataLoader(dataset, batch_size=2, num_workers=1)))
+    sent = pickle.loads(pickle.dumps(dataset))  # as other processes get it
+    torchs = next(iter(DataLoader(sent, batch_size=2, num_workers=1)))
 
     assert flat(ours).keys() == flat(torchs).keys()
     for name, value in flat(ours).items():
@@ -211,13 +199,6 @@ def test_a_pass_draws_other_transforms_than_the_one_before(indexed_release, adap
 
     name = next(key for key in first if torch.is_tensor(first[key]))
     assert not torch.equal(first[name], second[name])
-
-
-@pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
-def test_a_dataset_can_be_pickled_for_other_processes(indexed_release, adapter, options):
-    dataset = pickle.loads(pickle.dumps(adapter(indexed_release, **options)))
-
-    assert len(dataset[0]) == len(adapter(indexed_release, **options)[0])
 
 
 @pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
@@ -254,12 +235,3 @@ def test_clips_and_single_frames_are_not_mixed_up(indexed_release):
         RaftStereo(indexed_release, frames=("clips", 2))
     with pytest.raises(SelectionError, match=r"DynamicStereo takes clips: .* got 'first'"):
         DynamicStereo(indexed_release)
-
-
-def test_a_transform_of_ours_moves_what_the_project_reads(detailed_release):
-    transform = Compose([HorizontalFlip(1.0), RandomCrop(96, 128)])
-    item = RaftStereo(detailed_release, transform=transform)[0]
-    visible = visible_pixels(detailed_release, transform=transform)[0]
-
-    assert item[1].shape == (3, 96, 128)
-    assert psnr(fetched(item[2], item[3][0]), item[1], visible) > 27

@@ -62,10 +62,11 @@ def test_what_dust3r_unprojects_at_whole_pixels_are_the_points_of_the_scene(mome
         np.testing.assert_array_equal(view["depthmap"] > 0, valid.numpy())
 
 
-def test_a_view_of_dust3r_has_the_types_that_its_base_class_demands(moment):
+def test_a_view_of_dust3r_is_its_picture_with_the_types_that_its_base_class_demands(moment):
     view = dust3r_views(moment[0])[2]
 
     assert isinstance(view["img"], Image.Image)
+    np.testing.assert_array_equal(np.asarray(view["img"]), moment[0]["image"][2].permute(1, 2, 0))
     assert (view["img"].mode, view["img"].size) == ("RGB", view["depthmap"].shape[::-1])
     for name in ("depthmap", "camera_pose", "camera_intrinsics"):
         assert view[name].dtype == np.float32
@@ -73,11 +74,6 @@ def test_a_view_of_dust3r_has_the_types_that_its_base_class_demands(moment):
     assert (view["camera_pose"].shape, view["camera_intrinsics"].shape) == ((4, 4), (3, 3))
     assert view["label"] == "train/IPD_Gaussian/SynthStage/scene_000000/000"
     assert (view["dataset"], view["instance"]) == ("StereoGenBench", "cam_02")
-
-
-def test_the_pictures_of_dust3r_are_those_of_the_sample(moment):
-    for view, picture in zip(dust3r_views(moment[0]), moment[0]["image"], strict=True):
-        np.testing.assert_array_equal(np.asarray(view["img"]), picture.permute(1, 2, 0))
 
 
 def test_a_point_of_the_left_view_lands_a_disparity_to_the_left_in_the_right_one(
@@ -98,11 +94,10 @@ def test_a_point_of_the_left_view_lands_a_disparity_to_the_left_in_the_right_one
     assert np.abs(pixels[rows, columns, 1] - rows).max() < 0.01
 
 
-@pytest.mark.parametrize("far_m", [1e4, 1e6])
-def test_a_scene_far_from_the_origin_keeps_its_points_in_float32(moment, far_m):
+def test_a_scene_far_from_the_origin_keeps_its_points_in_float32(moment):
     sample, truth = moment
     away = dict(sample) | {"world_from_cam": sample["world_from_cam"].clone()}
-    away["world_from_cam"][:, :3, 3] += far_m
+    away["world_from_cam"][:, :3, 3] += 1e6
 
     for view, points, valid in zip(dust3r_views(away), truth, sample["valid"][:, 0], strict=True):
         found = moved(
@@ -111,39 +106,24 @@ def test_a_scene_far_from_the_origin_keeps_its_points_in_float32(moment, far_m):
         assert np.abs(found - points)[valid.numpy()].max() < 1e-5
 
 
-def test_views_come_in_the_order_of_the_sample(indexed_release):
-    sample = SceneViews(indexed_release, cameras=(4, 0, 2), frames=[3], **TRAIN)[1]
-    views = dust3r_views(sample)
-
-    assert [view["instance"] for view in views] == ["cam_04", "cam_00", "cam_02"]
-    np.testing.assert_array_equal(views[0]["camera_pose"][:3, 3], 0)
-
-
-@pytest.mark.parametrize(
-    ("sample", "message"),
-    [
-        (lambda data: StereoPairs(data)[0], r"has no .*world_from_left.*load pair with fields="),
-        (
-            lambda data: SceneViews(data, fields=VIEW_FIELDS, frames=("clips", 2))[0],
-            r"not clips, sweeps or batches",
-        ),
-        (
-            lambda data: StereoPairs(data, fields=PAIR_FIELDS, pairs="sweep")[0],
-            r"not clips, sweeps or batches",
-        ),
-    ],
-    ids=["fields", "clip", "sweep"],
-)
-def test_samples_of_another_form_are_refused(indexed_release, sample, message):
-    with pytest.raises(FieldError, match=message):
-        posed_images(sample(indexed_release))
-
-
-def test_a_single_view_is_a_list_of_one(indexed_release):
-    sample = SceneViews(indexed_release, cameras="each", fields=VIEW_FIELDS)[3]
-    (image,) = posed_images(sample)
-
+def test_a_single_view_is_taken_and_samples_of_other_forms_are_refused(indexed_release):
+    single = SceneViews(indexed_release, cameras="each", fields=VIEW_FIELDS)[3]
+    (image,) = posed_images(single)
     assert (image.camera, image.name, image.size) == (3, "cam_03_frame_000", (64, 64))
+
+    for sample, message in (
+        (StereoPairs(indexed_release)[0], r"has no .*world_from_left.*load pair with fields="),
+        (
+            SceneViews(indexed_release, fields=VIEW_FIELDS, frames=("clips", 2))[0],
+            r"not clips, sweeps or batches",
+        ),
+        (
+            StereoPairs(indexed_release, fields=PAIR_FIELDS, pairs="sweep")[0],
+            r"not clips, sweeps or batches",
+        ),
+    ):
+        with pytest.raises(FieldError, match=message):
+            posed_images(sample)
 
 
 def example(monkeypatch, name, module, base):
@@ -187,18 +167,14 @@ def test_dust3rs_base_class_crops_the_views(indexed_release, trained_on_dust3r):
     dataset = trained_on_dust3r(pairs, split="train", resolution=(48, 32))
     whole, cropped = dust3r_views(pairs[7]), dataset[7]
 
+    moments = SceneViews(indexed_release, fields=VIEW_FIELDS, **TRAIN)
+    assert len(trained_on_dust3r(moments, resolution=(16, 16))[0]) == 6
     assert (len(dataset), dataset.split) == (len(pairs), "train")
     for before, after in zip(whole, cropped, strict=True):
         assert after["img"].size == (48, 32)
         np.testing.assert_array_equal(after["depthmap"], before["depthmap"][4:36, 4:52])
         assert after["camera_intrinsics"].dtype == np.float32
         assert after["camera_intrinsics"][0, 2] == before["camera_intrinsics"][0, 2] - 4
-
-
-def test_more_than_two_views_are_what_the_base_expects(indexed_release, trained_on_dust3r):
-    moments = SceneViews(indexed_release, fields=VIEW_FIELDS, **TRAIN)
-
-    assert len(trained_on_dust3r(moments, resolution=(16, 16))[0]) == 6
 
 
 class CUT3RBase(BaseStereoViewDataset):
@@ -343,36 +319,15 @@ def test_vggts_base_class_crops_the_views(indexed_release, trained_on_vggt):
         assert record["original_sizes"][number].tolist() == [64, 64]
 
 
-def test_vggts_configuration_decides_whether_views_are_drawn_twice(
+def test_vggts_configuration_decides_whether_views_and_sequences_are_drawn_by_chance(
     indexed_release, trained_on_vggt
 ):
     once = trained_on_vggt(configuration(allow_duplicate_img=False), indexed_release)
-    twice = trained_on_vggt(configuration(), indexed_release)
+    twice = trained_on_vggt(configuration(inside_random=True), indexed_release)
+    torch.manual_seed(0)
 
     assert sorted(once[0, 6, 1.0]["ids"].tolist()) == [0, 1, 2, 3, 4, 5]
     assert len(once[0, 9, 1.0]["ids"]) == 9
-    assert len(twice[0, 24, 1.0]["ids"]) == 24
-    assert any(len(set(twice[0, 6, 1.0]["ids"].tolist())) < 6 for _ in range(20))
-
-
-def test_vggts_configuration_decides_whether_the_number_of_a_sequence_counts(
-    indexed_release, trained_on_vggt
-):
-    dataset = trained_on_vggt(configuration(inside_random=True), indexed_release)
-    torch.manual_seed(0)
-
-    assert len({dataset[0, 1, 1.0]["seq_name"] for _ in range(30)}) == 3
-
-
-def test_the_records_of_the_real_scene_are_those_of_its_views(shared_scenes):
-    sample = SceneViews(shared_scenes, frames=[20])[0]
-    record = vggt_record(sample)
-
-    for number in range(6):
-        mask = record["point_masks"][number]
-        np.testing.assert_array_equal(mask, sample["valid"][number, 0])
-        cam = record["world_points"][number] @ record["extrinsics"][number][:, :3].T
-        pixels = (cam + record["extrinsics"][number][:, 3]) @ record["intrinsics"][number].T
-        rows, columns = np.nonzero(mask)
-        landed = pixels[mask][:, :2] / pixels[mask][:, 2:]
-        assert np.abs(landed - np.stack([columns, rows], axis=-1)).max() < 0.01
+    drawn = [twice[0, 6, 1.0] for _ in range(15)]
+    assert any(len(set(record["ids"].tolist())) < 6 for record in drawn)
+    assert len({record["seq_name"] for record in drawn}) == 3

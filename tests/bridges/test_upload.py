@@ -1,7 +1,6 @@
 """Uploading shards by the Hub's own client, to a server that answers as the Hub does."""
 
 import json
-import os
 import re
 import shutil
 
@@ -10,7 +9,7 @@ import pytest
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.card import MARK
 from stereogenbench_data.bridges.croissant.check import check_descriptor
-from tests.cli.command import invoke, run
+from tests.cli.command import invoke
 from tests.servers.failing_server import serving
 from tests.servers.hub import REPOSITORY
 from tests.servers.hub_upload import TOKEN, UploadHubHandler
@@ -31,26 +30,33 @@ def upload_hub(tmp_path):
         yield server
 
 
-def uploaded(folder, hub, home, *, token=TOKEN, **more):
-    """Run the command in its own process: the client reads its settings when it is imported."""
-    settings = {
-        "HF_ENDPOINT": hub.url, "HF_HOME": str(home), "HF_HUB_DISABLE_XET": "1",
-        "HF_HUB_DISABLE_TELEMETRY": "1", **({"HF_TOKEN": token} if token else {}), **more,
-    }  # fmt: skip
-    return run("publish", "upload", folder, REPOSITORY, env=os.environ | settings)
+@pytest.fixture
+def uploaded(folder, upload_hub, tmp_path, monkeypatch):
+    """Run the command in this process, whose client takes our server for the Hub."""
+    constants = require_module("huggingface_hub.constants")
+    monkeypatch.setattr(constants, "ENDPOINT", upload_hub.url)
+    monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", True)
+
+    def upload(*, token=TOKEN):
+        settings = {"HF_TOKEN": token, "HF_HOME": str(tmp_path / "home")}
+        return invoke("publish", "upload", folder, REPOSITORY, env=settings)
+
+    return upload
 
 
-def test_shards_index_card_and_descriptor_arrive_whole_and_once(folder, upload_hub, tmp_path):
+@pytest.mark.filterwarnings("ignore")  # what the client's threads warn of would end them
+def test_shards_index_card_and_descriptor_arrive_whole_and_once(folder, upload_hub, uploaded):
     index, there = SceneIndex.open(folder), upload_hub.folder
 
     def objects():
         return {path.name: path.stat().st_mtime_ns for path in (there / ".objects").iterdir()}
 
-    done = uploaded(folder, upload_hub, tmp_path / "home")
+    done = uploaded()
+    assert done.exit_code == 0, done.stderr
     sent = objects()
-    again = uploaded(folder, upload_hub, tmp_path / "home")
+    again = uploaded()
 
-    assert (done.returncode, again.returncode) == (0, 0), done.stderr + again.stderr
+    assert again.exit_code == 0, again.stderr
     assert objects() == sent
     assert TOKEN not in done.stdout + done.stderr
     for path in (*folder.rglob("*"), *there.rglob("*")):
@@ -73,19 +79,20 @@ def test_shards_index_card_and_descriptor_arrive_whole_and_once(folder, upload_h
     assert check_descriptor(there / "beside.json") == []
 
 
-def test_a_refused_login_says_how_to_log_in(folder, upload_hub, tmp_path):
-    done = uploaded(folder, upload_hub, tmp_path / "home", token="hf_other")
+def test_a_refused_login_says_how_to_log_in(uploaded):
+    done = uploaded(token="hf_other")
 
-    assert done.returncode == 2
+    assert done.exit_code == 2
     assert "the Hub refused the upload (it answers 401)" in done.stderr
     assert "hf auth login" in done.stderr
     assert "hf_other" not in done.stderr
 
 
-def test_offline_mode_is_kept(folder, upload_hub, tmp_path):
-    done = uploaded(folder, upload_hub, tmp_path / "home", HF_HUB_OFFLINE="1")
+def test_offline_mode_is_kept(upload_hub, uploaded, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    done = uploaded()
 
-    assert done.returncode == 2
+    assert done.exit_code == 2
     assert "the Hub cannot be reached (OfflineModeIsEnabled). Check" in done.stderr
     assert not (upload_hub.folder / ".commits").exists()
 

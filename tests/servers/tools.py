@@ -3,6 +3,7 @@
 import importlib
 import os
 import shutil
+import signal
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -41,6 +42,28 @@ def require_module(name: str) -> ModuleType:
     except ImportError:
         _missing(f"needs the Python module {name}")
         raise
+
+
+def killed_fork(act: Callable[[], object]) -> bool:
+    """Run a function in a fork of this process; return whether it was killed while it ran."""
+    child = os.fork()
+    if child == 0:
+        signal.alarm(60)  # ends a fork that hangs
+        try:
+            act()
+        finally:
+            os._exit(1)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+
+
+def kill_at(most: int) -> Callable[[int, int], None]:
+    """Return a progress function that kills its process once so much is done."""
+
+    def progress(done: int, total: int) -> None:
+        if done >= most:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    return progress
 
 
 @contextmanager
