@@ -180,19 +180,6 @@ def _open_file(path: Path, *, root: str | None) -> Opened:
     return Opened(table, head, stale, path)
 
 
-def warn_if_stale(root: str | Path) -> None:
-    """Warn if a folder has an index that lacks what was just written into it."""
-    path = local_path(root) / INDEX_NAME
-    if not path.is_file():
-        return
-    try:
-        stale = _open_file(path, root=None).stale
-    except StorageError:
-        return  # opening an index that cannot be read raises the error
-    if stale:
-        warnings.warn(stale, StaleIndexWarning, stacklevel=3)
-
-
 def _open_url(
     url: str,
     *,

@@ -6,17 +6,20 @@ depth) the others are presumed to have, with cameras on a line as the baselines 
 trajectory and the heads of its videos are read when its first sample is: length and order of an
 epoch rest on what was presumed, so a scene that is different ends the run.
 
-Behind a URL each ``baseline.json`` is read where a selection needs them (`SceneIndex.column`), and
-of a scene only the videos that its samples need are opened, ahead of them where the order is known.
+Behind a URL each ``baseline.json`` is read where a selection needs them (`SceneIndex.column`), or a
+file of the release that has them all (`merged`), if it agrees with those of the scenes that were
+described; and of a scene only the videos that its samples need are opened, ahead of them where the
+order is known.
 """
 
 import hashlib
 import json
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from operator import eq
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -35,6 +38,7 @@ from stereogenbench_data.index.build import (
     tell_requests,
 )
 from stereogenbench_data.index.evidence import agreed_forms
+from stereogenbench_data.index.merged import merged_records
 from stereogenbench_data.index.rows import json_of, scene_of_json
 from stereogenbench_data.index.scene_folder import (
     DESCRIPTIONS,
@@ -60,9 +64,10 @@ from stereogenbench_data.index.tree import (
     in_parallel,
     stamp_of,
 )
-from stereogenbench_data.schema.conventions import Conventions
+from stereogenbench_data.schema.conventions import Conventions, Shape
 from stereogenbench_data.schema.parse import (
     parse_complete,
+    parse_rig,
     parse_scene_key,
     require_unit,
 )
@@ -78,6 +83,7 @@ from stereogenbench_data.schema.release import (
     BASELINE_JSON,
     CAMERA_PAIRS,
     COMPLETE_JSON,
+    DESCRIPTION_JSON,
     TRAINING_JSON,
     VIDEO_FILES,
     depth_name,
@@ -96,6 +102,8 @@ _KEPT_SCENES: Final = 512
 _READERS: Final = 8
 _AT_A_TIME: Final = 128
 _LONGEST_TOLD: Final = 2000
+_ROUNDING: Final = 1e-6
+"""A file of all scenes may round what ``baseline.json`` has in full."""
 _OF_A_FORMAT: Final = ("poses", "world", "left")
 """Remarks that are presumed of all scenes of a group where each one that was read has them."""
 
@@ -192,6 +200,11 @@ class ListedTree:
     def has_one_shape(self) -> bool:
         """Whether the conventions concern all scenes alike, whatever keys their files have."""
         return self.conventions is None or not self.conventions.shapes[0].has
+
+    @property
+    def stated(self) -> Shape | None:
+        """What conventions state of all scenes."""
+        return None if self.conventions is None else self.conventions.shapes[0]
 
     @property
     def read_as(self) -> str:
@@ -294,7 +307,7 @@ def presumed_report(tree: ListedTree, baselines: Baselines) -> TreeReport | None
         if others and baselines != "read" and len({each.rig.primary_pair for each in models}) > 1:
             return presumed_report(tree, "read")
         for each in others:
-            scene = _presumed(each, models, tree.conventions)
+            scene = _presumed(each, models, tree.stated)
             key = each.id.key
             has_mark = COMPLETE_JSON in each.files
             outcomes[key] = (
@@ -308,17 +321,19 @@ def _metadata(
     tree: ListedTree, baselines: Baselines
 ) -> Iterator[tuple[str, _Metadata | StereoGenBenchError]]:
     """Yield what is known of each scene before it is described, or why it cannot be used."""
-    rigs = RigReader(None if tree.conventions is None else tree.conventions.shapes[0])
+    rigs, keys = RigReader(tree.stated), tree.folders.keys
+    merged = _merged(tree) if baselines == "read" and tree.is_remote else {}
 
     def read(key: str) -> tuple[Files, bytes] | StereoGenBenchError:
         try:
             files = tree.finished(key)
-            return files, tree.folder(key).read(BASELINE_JSON) if baselines == "read" else b""
+            if baselines != "read" or merged:
+                return files, merged.get(key, b"")
+            return files, tree.folder(key).read(BASELINE_JSON)
         except StereoGenBenchError as error:
             return error
 
-    keys = tree.folders.keys
-    if baselines == "read" and tree.is_remote:
+    if baselines == "read" and tree.is_remote and not merged:
         tell_requests(tree.root, len(keys), each=1, what=BASELINE_JSON)
     for key, found in zip(keys, tree.of_each(read, keys), strict=True):
         if isinstance(found, StereoGenBenchError):
@@ -326,22 +341,53 @@ def _metadata(
             continue
         files, text = found
         try:
-            scene_id = parse_scene_key(key)
-            if baselines != "read":
-                yield key, _Metadata(scene_id, files)
-                continue
-            where = f"{key}/{BASELINE_JSON}"
-            rig, labels, odd = rigs.read(text, where=where)
-            odd = (*odd, *require_unit(rig, family=scene_id.family, where=where))
-            is_lacking = labels.character is None or labels.animation is None
-            if is_lacking and COMPLETE_JSON in files:  # scenes are chosen by these
-                where = f"{key}/{COMPLETE_JSON}"
-                marked, _ = parse_complete(tree.folder(key).read(COMPLETE_JSON), where=where)
-                labels = merged_labels(labels, marked)
+            known = _Metadata(parse_scene_key(key), files)
+            if baselines == "read":
+                known = _with_rig(known, text, rigs, None if merged else tree.folder(key))
         except StereoGenBenchError as error:
             yield key, error
         else:
-            yield key, _Metadata(scene_id, files, rig, labels, odd)
+            yield key, known
+
+
+def _with_rig(
+    known: _Metadata, text: bytes, rigs: RigReader, folder: SceneFolder | None
+) -> _Metadata:
+    """Return what is known of a scene with what a ``baseline.json`` says."""
+    where = f"{known.id.key}/{BASELINE_JSON}"
+    rig, labels, odd = rigs.read(text, where=where)
+    odd = (*odd, *require_unit(rig, family=known.id.family, where=where))
+    if folder is not None:
+        labels = _with_marked(labels, folder, known.files)
+    return replace(known, rig=rig, labels=labels, remarks=odd)
+
+
+def _with_marked(labels: SceneLabels, folder: SceneFolder, files: Files) -> SceneLabels:
+    """Return labels, with those by which scenes are chosen if only the completion mark has them."""
+    if COMPLETE_JSON not in files or None not in (labels.character, labels.animation):
+        return labels
+    marked, _ = parse_complete(folder.read(COMPLETE_JSON), where=f"{folder.key}/{COMPLETE_JSON}")
+    return merged_labels(labels, marked)
+
+
+def _merged(tree: ListedTree) -> Mapping[str, bytes]:
+    """Return a record of each scene that says what some scenes' own files say, if there is one."""
+    keys = tree.folders.keys
+    places = np.unique(np.linspace(0, len(keys) - 1, _LOOKED_AT).astype(int)).tolist()
+    some = [keys[place] for place in places]
+
+    def own(key: str) -> tuple[Any, ...]:
+        folder = tree.folder(key)
+        rig, labels, _ = parse_rig(folder.read(BASELINE_JSON), where=key, shape=tree.stated)
+        return rig, _with_marked(labels, folder, tree.finished(key))
+
+    for records in merged_records(str(tree.root), keys):
+        with suppress(SchemaError, StorageError):  # of a record, or of the files of one of these
+            stated = (parse_rig(records[key], where=key, shape=tree.stated) for key in some)
+            both = zip(stated, in_parallel(own, some), strict=True)
+            if all(a[1] == b[1] and not [*_rig_differences(a[0], b[0])] for a, b in both):
+                return records
+    return {}
 
 
 def _are_alike(models: Sequence[Scene]) -> bool:
@@ -364,16 +410,13 @@ def _format_of(scene: Scene) -> dict[str, object]:
     }
 
 
-def _presumed(
-    each: _Metadata, models: Sequence[Scene], conventions: Conventions | None
-) -> Scene | None:
+def _presumed(each: _Metadata, models: Sequence[Scene], stated: Shape | None) -> Scene | None:
     """Return a scene that is like others; None where its baselines are not those of a line."""
     key, like = each.id.key, models[0]
     remarks = [*each.remarks]
     size_px = like.rig.image_width_px, like.rig.image_height_px
-    shape = None if conventions is None else conventions.shapes[0]
     rig = sized_as_videos(
-        key, each.rig or like.rig, size_px, document=None, remarks=remarks, shape=shape
+        key, each.rig or like.rig, size_px, document=None, remarks=remarks, shape=stated
     )
     places_m = assumed_places_m(rig)
     if not places_m:
@@ -526,7 +569,12 @@ class Presumption:
                     texts[name] = folder.read(name)
             return caption_of(texts, key=key)[0]
 
-        return list(self.tree.of_each(caption, [*keys]))
+        keys = [*keys]
+        for merged in merged_records(str(self.tree.root), keys) if self.is_remote else ():
+            found = [caption_of({DESCRIPTION_JSON: merged[key]}, key=key)[0] for key in keys]
+            if any(found) and all(map(eq, found, map(caption, keys[:_LEAST_OF_A_GROUP]))):
+                return found
+        return list(self.tree.of_each(caption, keys))
 
     def cures(self) -> str:
         """Return what to do about a scene that is not as presumed."""
@@ -582,13 +630,20 @@ def _differences(presumed: Scene, found: Scene, *, baselines: Baselines) -> Iter
         yield "its files have changed since it was opened"
     if found.remark("left") and not presumed.remark("left"):
         yield found.remark("left")
-    own = ("baselines_cm", "focal_mm", "sensor_width_mm") if baselines == "read" else ()
-    for name in ("primary_pair", *own):
-        value, there = getattr(presumed.rig, name), getattr(found.rig, name)
-        if there != value:
-            yield f"{name} of {BASELINE_JSON} read as {value}, and it is {there}"
+    if baselines == "read":
+        yield from _rig_differences(presumed.rig, found.rig)
+    elif presumed.rig.primary_pair != found.rig.primary_pair:
+        yield f"primary pair presumed {presumed.rig.primary_pair}, found {found.rig.primary_pair}"
     before_m, now_m = presumed.lateral_m, found.lateral_m
     if any((before_m[b] > before_m[a]) != (now_m[b] > now_m[a]) for a, b in CAMERA_PAIRS):
         yield f"places of cameras in m presumed {presumed.lateral_m}, found {found.lateral_m}"
     if presumed.rig_residual_px <= RECTIFIED_PX < found.rig_residual_px:
         yield f"a rectified rig presumed, found one that is off by {found.rig_residual_px:.3g} px"
+
+
+def _rig_differences(before: Rig, now: Rig) -> Iterator[str]:
+    """Yield what of two rigs differs by more than the rounding of a text."""
+    for name in ("primary_pair", "baselines_cm", "focal_mm", "sensor_width_mm"):
+        value, there = getattr(before, name), getattr(now, name)
+        if not np.allclose(there, value, rtol=_ROUNDING, atol=0):
+            yield f"{name} of {BASELINE_JSON} read as {value}, and it is {there}"

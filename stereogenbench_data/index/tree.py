@@ -183,12 +183,16 @@ def stamp_of(files: Files) -> str:
 
 
 class SceneFolder:
-    """A scene's folder on this machine."""
+    """A scene's folder on this machine.
+
+    Attributes:
+        key: The scene's key.
+    """
 
     def __init__(self, root: str | Path, key: str) -> None:
         """Name the folder by the data's root and the scene's key; nothing is read yet."""
         self._root = root
-        self._key = key
+        self.key = key
 
     def stamps(self) -> dict[str, tuple[int, int]]:
         """Return the size in bytes and the modification time in ns of each file.
@@ -196,7 +200,7 @@ class SceneFolder:
         Raises:
             StorageError: If the folder cannot be read.
         """
-        folder = Path(self._root, self._key)
+        folder = Path(self._root, self.key)
         with (
             explain_os_errors(f"{folder}: cannot be read", "Fetch the scene again."),
             os.scandir(folder) as entries,
@@ -206,7 +210,7 @@ class SceneFolder:
 
     def other_json(self) -> list[str]:
         """Return the names of JSON files that are none of a release; behind a URL, of none."""
-        return sorted({path.name for path in Path(self._root, self._key).glob("*.json")} - FILES)
+        return sorted({path.name for path in Path(self._root, self.key).glob("*.json")} - FILES)
 
     def fetch(self, names: Iterable[str]) -> None:
         """Fetch files at a time, if they are behind a URL."""
@@ -218,7 +222,7 @@ class SceneFolder:
             StorageError: If it cannot be read.
             SchemaError: If it is too large for a metadata file.
         """
-        where = f"{self._key}/{name}"
+        where = f"{self.key}/{name}"
         return read_text_file(Path(self._root, where), where=where)
 
     def video(self, name: str) -> Path | MemberFile:
@@ -227,7 +231,7 @@ class SceneFolder:
         Raises:
             StorageError: If it cannot be read.
         """
-        return Path(self._root, self._key, name)
+        return Path(self._root, self.key, name)
 
 
 class RemoteFolder(SceneFolder):
@@ -246,7 +250,7 @@ class RemoteFolder(SceneFolder):
     @property
     def _files(self) -> Files:
         if self._listed is None:
-            found = RemoteObject(joined(str(self._root), self._key)).entries()
+            found = RemoteObject(joined(str(self._root), self.key)).entries()
             sizes = {name: found[name] for name in sorted(found) if name in FILES}
             self._listed = {name: (size, 0) for name, size in sizes.items() if size is not None}
         return self._listed
@@ -267,7 +271,7 @@ class RemoteFolder(SceneFolder):
             is_read = is_video or self._files.get(name, (0, 0))[0] <= MAX_TEXT_BYTES
             if name in self._files and name not in self._objects and is_read:
                 size, _ = self._files[name]
-                url = joined(str(self._root), f"{self._key}/{name}")
+                url = joined(str(self._root), f"{self.key}/{name}")
                 self._objects[name] = RemoteObject(url, expected_size=size)
                 if is_video and size > _READ_WHOLE:
                     parts += (name, 0, FIRST_BLOCK), (name, size - FIRST_BLOCK, size)
@@ -284,8 +288,8 @@ class RemoteFolder(SceneFolder):
             SchemaError: If it is too large for a metadata file.
         """
         if name not in self._files:
-            raise StorageError(f"{self._key}/{name}: is missing.")
-        require_text_size(self._files[name][0], where=f"{self._key}/{name}")
+            raise StorageError(f"{self.key}/{name}: is missing.")
+        require_text_size(self._files[name][0], where=f"{self.key}/{name}")
         self.fetch([name])
         return self._parts[name][0][1]
 
@@ -310,7 +314,7 @@ class RemoteFolder(SceneFolder):
         name, start, stop = part
         if name.startswith("cam_"):
             return self._objects[name].read(start, stop)
-        version = f"{self._key}/{name} {self._files[name]}"
+        version = f"{self.key}/{name} {self._files[name]}"
         kept = None if self._kept is None else self._kept.read("files", version)
         if kept is None:
             kept = self._objects[name].read(start, stop)

@@ -15,7 +15,6 @@ from typing import Any, Final
 
 from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
 from stereogenbench_data.errors import ShardError, explain_os_errors
-from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.scene_folder import derived_scene
 from stereogenbench_data.index.table import SceneIndex
@@ -195,7 +194,6 @@ def _finish(tasks: Sequence[ShardTask], out: Path) -> PackReport:
     )
     # The index is written last: where it exists, every shard does, too.
     index.write(out / INDEX_NAME)
-    warn_if_stale(out)
     return replace(report, index=out / INDEX_NAME)
 
 

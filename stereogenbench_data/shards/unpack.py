@@ -12,7 +12,6 @@ from typing import Final, Literal
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
 from stereogenbench_data.errors import MediaError, ShardError, describe_os_error
-from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.jobs import atomic_folder
 from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.depth_packing import write_depth_video
@@ -120,7 +119,6 @@ def unpack(
             raise
         what = f"{error.filename or out}: cannot be written"
         raise ShardError(describe_os_error(what, error, "Unpack into another folder.")) from error
-    warn_if_stale(out)
     return UnpackReport(
         out,
         tuple(sorted(key for key, work in found.items() if work == "unpacked")),

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
+from http import HTTPStatus
 from typing import Any, Final
 
 from stereogenbench_data.errors import ExtraError, StorageError, missing_extra
@@ -206,7 +207,8 @@ class FilesystemTransport:
             if status == _CHANGED:
                 raise replaced(self._where, "in its store", "its ETag is another") from None
             if 400 <= status < 500 and status not in PASSING:
-                raise StorageError(f"{self._where}: {_reason(error)}. {MISSING}") from None
+                kind = MissingObject if status == HTTPStatus.NOT_FOUND else StorageError
+                raise kind(f"{self._where}: {_reason(error)}. {MISSING}") from None
             raise TransientError(_reason(error), wait_s=wait_s) from None
         except _loaded(_SETUP_ERRORS) as error:
             raise self._no_permission(error) from None

@@ -27,7 +27,6 @@ from stereogenbench_data.errors import (
     SynthesisError,
     explain_os_errors,
 )
-from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.jobs import do_items
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
 from stereogenbench_data.sources.files import try_locked
@@ -110,7 +109,6 @@ def synthesise(  # noqa: PLR0913 - each names one thing that a user chooses
             with run.held(part) as unfinished:
                 planned |= run.draw(due, unfinished=unfinished, progress=progress, done=len(there))
             there = run.existing(indices)
-    warn_if_stale(run.out)
     return [key for _, key in sorted(there.items()) if key is not None]
 
 

@@ -11,7 +11,6 @@ from stereogenbench_data.audit.pictures.scene_pictures import scene_sheet
 from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import SynthesisError, explain_os_errors
-from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.jobs import WorkOptions, do_items
 from stereogenbench_data.samples.picture import write_png
 from stereogenbench_data.schema.parse import parse_scene_key
@@ -56,7 +55,6 @@ def hold_out(out: str | Path, keys: list[str]) -> list[str]:
         with explain_os_errors(where, "Check that both may be written to.", kind=SynthesisError):
             target.parent.mkdir(parents=True, exist_ok=True)
             (root / key).rename(target)
-    warn_if_stale(root)
     return moved
 
 

@@ -20,6 +20,8 @@ KEYS = [f"train/Uniform/Map_{number % 2}/scene_{number:06d}" for number in range
 ]
 ODD = "eval/MapSeenInTrain/Uniform/Map_0/scene_000007"
 """A scene that opening the tree does not look at."""
+UNREAD = "eval/MapSeenInTrain/Uniform/Map_0/scene_000008"
+"""A scene with which a file of all scenes is not compared."""
 
 
 @pytest.fixture(scope="module")
@@ -160,3 +162,68 @@ def test_too_many_scenes_are_not_all_described_each_time(monkeypatch):
 
     with pytest.raises(StorageError, match=r" 50 are too many .*`stereogenbench index hf://"):
         SceneIndex.open(HUB, rows="read")
+
+
+def as_path(key, record):
+    return record | {"scene_path": f"/data/out/{key}"}
+
+
+def as_parts(key, record):
+    split, subset, *_ = key.split("/")
+    names = dict(zip(("family", "map", "scene"), key.split("/")[-3:], strict=True))
+    return record | names | {"split": split, "eval_subset": subset}
+
+
+def write_records(release, name, record_of):
+    """Write a file of all scenes, as records of their own ``baseline.json``."""
+    records = {key: record_of(key, json.loads((release / key / "baseline.json").read_text()))
+               for key in KEYS}  # fmt: skip
+    (release / "metadata").mkdir(exist_ok=True)
+    if name.endswith(".jsonl"):
+        text = "\n".join(json.dumps(record) for record in records.values())
+    else:
+        text = json.dumps({"version": 1, "scenes": records})
+    (release / "metadata" / name).write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("name", "record_of"),
+    [("scenes.jsonl", as_path), ("all.jsonl", as_parts), ("m.json", lambda key, record: record)],
+)
+def test_one_file_of_all_scenes_stands_for_each_baseline_json(hub, release, name, record_of):
+    write_records(release, name, record_of)
+    index, local = SceneIndex.open(HUB), SceneIndex.open(release, rows="read")
+
+    np.testing.assert_array_equal(index.column("scene_label"), local.column("scene_label"))
+    np.testing.assert_array_equal(index.column("baselines_cm"), local.column("baselines_cm"))
+    assert not read_names(hub, UNREAD)
+
+
+def scaled(key, record):
+    for pair in record["pairwise_pairs"]:
+        pair["baseline_cm"] *= 1.001
+    return as_path(key, record)
+
+
+def of_another_scene(key, record):
+    return as_path(KEYS[0], record)
+
+
+@pytest.mark.parametrize("record_of", [scaled, of_another_scene, lambda key, record: {"a": key}])
+def test_a_file_that_other_files_contradict_is_not_used(hub, release, record_of):
+    write_records(release, "scenes.jsonl", record_of)
+    (release / "metadata" / "notes.json").write_text("{")
+    index, local = SceneIndex.open(HUB), SceneIndex.open(release, rows="read")
+
+    np.testing.assert_array_equal(index.column("baselines_cm"), local.column("baselines_cm"))
+    assert read_names(hub, UNREAD) == {"baseline.json"}
+
+
+def test_captions_come_from_one_file_of_all_scenes(hub, release):
+    (drawn,) = {(release / key / "scene_description_qwen_dataset_level.json").read_bytes()
+                for key in KEYS}  # fmt: skip
+    write_records(release, "captions.jsonl", lambda key, _: as_path(key, json.loads(drawn)))
+    captions = SceneIndex.open(HUB).column("caption")
+
+    assert captions.tolist() == SceneIndex.open(release, rows="read").column("caption").tolist()
+    assert not read_names(hub, UNREAD)
