@@ -159,7 +159,7 @@ def download(
         }
         before = scenes.get(scene.id.key, scene).members
         if _texts(before) == _texts(members):
-            members = before | members
+            members = {**before, **members}
         scenes[scene.id.key] = replace(scene, members=members)
     here = SceneIndex.from_scenes(scenes.values(), dest)
     here.write(dest / INDEX_NAME)
