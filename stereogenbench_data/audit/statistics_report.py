@@ -31,6 +31,7 @@ _RELEASE_SIZED: Final = 0.1
 class Line:
     """One figure of the paper and ours, both as texts with the paper's number of digits."""
 
+    split: str
     table: str
     item: str
     paper: str
@@ -59,27 +60,25 @@ def compared(found: Statistics) -> tuple[Line, ...]:
         *_focal_lines(found),
         *_map_lines(found),
     ]
-    return tuple(line for split, line in lines if split in splits)
+    return tuple(line for line in lines if line.split in splits)
 
 
 def _scenes_of(found: Statistics, split: str) -> int:
     return sum(each.scenes for each in found.branches if each.split == split)
 
 
-def _count_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
+def _count_lines(found: Statistics) -> Iterator[Line]:
     ours = {(each.split, each.subset, each.family): each.scenes for each in found.families}
     for place in dict.fromkeys([*SCENE_COUNTS, *ours]):
         item = "scenes, " + " ".join(part for part in place if part)
-        yield (
-            place[0],
-            Line(COUNTS_TABLE, item, str(SCENE_COUNTS.get(place, 0)), str(ours.get(place, 0))),
-        )
+        paper, here = (str(counts.get(place, 0)) for counts in (SCENE_COUNTS, ours))
+        yield Line(place[0], COUNTS_TABLE, item, paper, here)
     for split, count in SPLITS.items():
         total = _scenes_of(found, split)
-        yield split, Line(COUNTS_TABLE, f"scenes, {split} total", str(count), str(total))
+        yield Line(split, COUNTS_TABLE, f"scenes, {split} total", str(count), str(total))
 
 
-def _baseline_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
+def _baseline_lines(found: Statistics) -> Iterator[Line]:
     branches = {(each.split, each.family): each for each in found.branches}
     for table, kind, attribute, figures in (
         (ADJACENT_TABLE, "adjacent", "adjacent_cm", ADJACENT),
@@ -93,10 +92,10 @@ def _baseline_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
                     decimals = len(paper.partition(".")[2])
                     ours = f"{getattr(getattr(branch, attribute), name):.{decimals}f}"
                 item = f"{kind}, {split} {family}: {name}" + (" (cm)" if name != "count" else "")
-                yield split, Line(table, item, paper, ours)
+                yield Line(split, table, item, paper, ours)
 
 
-def _bin_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
+def _bin_lines(found: Statistics) -> Iterator[Line]:
     bins = {
         name: primary
         for each in found.families
@@ -105,10 +104,10 @@ def _bin_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
     }
     for name in dict.fromkeys([*BINS, *(name for name, count in bins.items() if count)]):
         item = f"scenes by primary baseline, eval seen_map Uniform, {name} cm"
-        yield "eval", Line(BINS_TABLE, item, str(BINS.get(name, 0)), str(bins.get(name, 0)))
+        yield Line("eval", BINS_TABLE, item, str(BINS.get(name, 0)), str(bins.get(name, 0)))
 
 
-def _focal_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
+def _focal_lines(found: Statistics) -> Iterator[Line]:
     low, high = FOCAL_MM
     paper = f"{low:g} to {high:g}"
     for split in SPLITS:
@@ -118,10 +117,10 @@ def _focal_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
         least, most = min(each.min for each in spreads), max(each.max for each in spreads)
         ours = paper if low <= least and most <= high else f"{least:g} to {most:g}"
         item = f"focal lengths within (mm), {split}"
-        yield split, Line("appendix on generation parameters", item, paper, ours)
+        yield Line(split, "appendix on generation parameters", item, paper, ours)
 
 
-def _map_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
+def _map_lines(found: Statistics) -> Iterator[Line]:
     paper = map_counts()
     ours = {
         (each.split, each.family, name): count
@@ -132,13 +131,13 @@ def _map_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
         split, family, name = place
         table = TRAIN_MAPS_TABLE if split == "train" else EVAL_MAPS_TABLE
         item = f"scenes, {split} {family} {name}"
-        yield split, Line(table, item, str(paper.get(place, 0)), str(ours.get(place, 0)))
+        yield Line(split, table, item, str(paper.get(place, 0)), str(ours.get(place, 0)))
     subsets = {
         name: each.subset for each in found.families if each.split == "eval" for name in each.maps
     }
     for name, (subset, _, _) in EVAL_MAPS.items():
         item = f"subset of {name}"
-        yield "eval", Line(EVAL_MAPS_TABLE, item, subset, subsets.get(name, "-"))
+        yield Line("eval", EVAL_MAPS_TABLE, item, subset, subsets.get(name, "-"))
 
 
 def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:

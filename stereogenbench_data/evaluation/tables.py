@@ -36,6 +36,7 @@ from stereogenbench_data.schema.release import (
     BASELINE_BINS,
     FAMILIES,
     FRAME_COUNT,
+    SCENE_COUNTS,
     TRAIN_MAPS,
     UNSEEN_MAPS,
     baseline_bin,
@@ -54,12 +55,11 @@ SOURCES: Final[dict[str, str]] = {
 """Where each table stands in the paper: its LaTeX label and what it is."""
 
 SCENES_SCORED: Final[Mapping[tuple[str, str], int]] = {
-    ("seen_map", "IPD_Gaussian"): 265,
-    ("seen_map", "Uniform"): 281,
-    ("unseen_map", "IPD_Gaussian"): 91,
-    ("unseen_map", "Uniform"): 102,
+    (subset, family): count
+    for (split, subset, family), count in SCENE_COUNTS.items()
+    if split == "eval"
 }
-"""How many scenes the paper's numbers are of, by subset and family."""
+"""How many scenes the paper's numbers are of, by subset and family: all of the split."""
 
 
 @cache

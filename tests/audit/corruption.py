@@ -37,7 +37,7 @@ def write_depth(folder: Path, camera: int, units: np.ndarray, tags: dict[str, st
 
 
 def rewrite_depth(folder: Path, change, *, unit_factor: float = 1.0) -> None:
-    """Replace every camera's depth by change(units), and multiply what the tag says."""
+    """Replace every camera's depth by change(units), and multiply what the tags say."""
     for camera in CAMERAS:
         rewrite_one_depth(folder, camera, change, unit_factor=unit_factor)
 
@@ -97,16 +97,24 @@ def scale_camera(folder: Path, **factors: float) -> None:
     edit_baseline(folder, change)
 
 
+def edit_pairs(folder: Path, change) -> None:
+    """Let change(pair) alter each recorded pair of cameras."""
+
+    def change_all(document):
+        for pair in (*document["adjacent_pairs"], *document["pairwise_pairs"]):
+            change(pair)
+
+    edit_baseline(folder, change_all)
+
+
 def lengthen_label(folder: Path, cameras: tuple[int, int], *, by_cm: float) -> None:
     """Make the recorded baseline of two cameras longer; the poses stay."""
 
-    def change(document):
-        for name in ("adjacent_pairs", "pairwise_pairs"):
-            for pair in document[name]:
-                if (pair["camera_index_a"], pair["camera_index_b"]) == cameras:
-                    pair["baseline_cm"] += by_cm
+    def change(pair):
+        if (pair["camera_index_a"], pair["camera_index_b"]) == cameras:
+            pair["baseline_cm"] += by_cm
 
-    edit_baseline(folder, change)
+    edit_pairs(folder, change)
 
 
 def place_cameras(folder: Path, factors: dict[int, float]) -> None:
@@ -125,13 +133,11 @@ def place_cameras(folder: Path, factors: dict[int, float]) -> None:
         for camera in document["frames"][0]["cameras"]
     ]
 
-    def change(baseline):
-        for name in ("adjacent_pairs", "pairwise_pairs"):
-            for pair in baseline[name]:
-                a, b = pair["camera_index_a"], pair["camera_index_b"]
-                pair["baseline_cm"] = float(np.linalg.norm(places[a] - places[b]))
+    def change(pair):
+        a, b = pair["camera_index_a"], pair["camera_index_b"]
+        pair["baseline_cm"] = float(np.linalg.norm(places[a] - places[b]))
 
-    edit_baseline(folder, change)
+    edit_pairs(folder, change)
 
 
 def ray_lengths(folder: Path, *, shape: tuple[int, int]) -> np.ndarray:

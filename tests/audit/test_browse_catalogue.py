@@ -24,7 +24,6 @@ def catalogue(index, indexed_release):
 
 QUERIES = [
     {},
-    {"family": ["Uniform"]},
     {"family": ["Uniform", "IPD_Gaussian"], "split": ["train"]},
     {"subset": ["seen_map"], "pairs": ["primary"]},
     {"baseline_low": ["10"], "baseline_high": ["60.5"], "pairs": ["adjacent"]},
@@ -69,13 +68,6 @@ def test_a_value_counts_what_all_other_filters_leave(catalogue, index):
         name: int(((split == name) & (family == "Uniform")).sum()) for name in ("eval", "train")
     }
     assert counts["subset"] == {"seen_map": 0}
-
-
-def test_bins_count_the_pairs_that_fall_into_them(catalogue, index):
-    counts = catalogue.summary(parse_choice({"bin": ["[1,10)"]}))["counts"]["bin"]
-    found = [baseline_bin(cm) for cm in index.column("baselines_cm").ravel()]
-
-    assert counts == {name: found.count(name) for name in BASELINE_BINS}
 
 
 def test_the_edges_of_bins_belong_where_the_paper_puts_them(index):

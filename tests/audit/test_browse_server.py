@@ -1,22 +1,21 @@
 """The page's server: what it gives, and what it refuses."""
 
 import http.client
+import io
 import json
 import re
+import shutil
 import socket
-import threading
 from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
 from urllib.parse import urlencode
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from stereogenbench_data import SceneIndex, StereoPairs
-from stereogenbench_data.audit.browser.catalogue import Catalogue
-from stereogenbench_data.audit.browser.server import PageServer
-from stereogenbench_data.audit.browser.service import STATIC, Service
-from stereogenbench_data.audit.pictures.scene_reader import SceneReader
+from stereogenbench_data.audit.browser.service import STATIC
 from tests.audit.browsing import serving
 
 SCENE = "train/Uniform/SynthStage/scene_000001"
@@ -45,61 +44,43 @@ def ask(server, path, *, method="GET", headers=None, body=None):
         connection.close()
 
 
-@pytest.mark.parametrize("path", STATIC)
-def test_the_page_is_shipped_whole_and_loads_nothing_from_elsewhere(server, path):
-    status, content, headers = ask(server, path)
+def test_the_page_is_shipped_whole_and_loads_nothing_from_elsewhere(server):
+    folder = resources.files("stereogenbench_data.audit.browser") / "static"
 
-    assert status == 200
-    assert content
-    assert b"https://" not in content
-    assert b"http://" not in content.replace(b"http://www.w3.org/2000/svg", b"")
-    assert "default-src 'none'" in headers["Content-Security-Policy"]
+    assert {name for name, _ in STATIC.values()} == {file.name for file in folder.iterdir()}
+    for path, (name, _) in STATIC.items():
+        status, content, headers = ask(server, path)
+
+        assert (status, content) == (200, (folder / name).read_bytes())
+        assert set(re.findall(r'from "(/[^"]+)"', content.decode())) <= STATIC.keys()
+        assert b"https://" not in content
+        assert b"http://" not in content.replace(b"http://www.w3.org/2000/svg", b"")
+        assert "default-src 'none'" in headers["Content-Security-Policy"]
 
 
-@pytest.mark.parametrize("name", ["disparity", "depth"])
-def test_maps_are_the_datasets_own_numbers_with_nan_where_nothing_was_measured(
-    server, indexed_release, name
-):
-    status, content, _ = ask(server, f"/{name}.f32?{MOMENT}")
-    found = np.frombuffer(content, dtype="<f4").reshape(64, 64)
-    sample = StereoPairs(indexed_release, scenes=SCENE, pairs=[(0, 3)], frames=2,
-                         fields=(name, "valid"))[0]  # fmt: skip
+def test_maps_and_pictures_are_the_datasets_own(server, indexed_release):
+    fields = ("left", "right", "disparity", "depth", "visible", "valid")
+    sample = StereoPairs(indexed_release, scenes=SCENE, pairs=[(0, 3)], frames=2, fields=fields)[0]
     valid = sample["valid"][0].numpy()
 
-    assert status == 200
-    assert np.array_equal(np.isnan(found), ~valid)
-    assert np.array_equal(found[valid], sample[name][0].numpy()[valid])
-
-
-def test_visibility_is_one_byte_a_pixel(server, indexed_release):
-    _, content, _ = ask(server, f"/visible.u8?{MOMENT}")
-    sample = StereoPairs(
-        indexed_release, scenes=SCENE, pairs=[(0, 3)], frames=2, fields=["visible"]
-    )
-
-    assert content == sample[0]["visible"].numpy().astype(np.uint8).tobytes()
-
-
-def test_pictures_are_the_two_views(server, indexed_release):
-    import io
-
-    from PIL import Image
-
-    sample = StereoPairs(indexed_release, scenes=SCENE, pairs=[(0, 3)], frames=2)[0]
+    for name in ("disparity", "depth"):  # nan where nothing was measured
+        _, content, _ = ask(server, f"/{name}.f32?{MOMENT}")
+        wanted = np.where(valid, sample[name][0].numpy(), np.nan)
+        np.testing.assert_array_equal(np.frombuffer(content, "<f4").reshape(64, 64), wanted)
     for name in ("left", "right"):
         _, content, headers = ask(server, f"/{name}.jpg?{MOMENT}")
         found = np.asarray(Image.open(io.BytesIO(content))).astype(int)
-        wanted = sample[name].numpy().transpose(1, 2, 0)
-
         assert headers["Content-Type"] == "image/jpeg"
-        assert np.abs(found - wanted).mean() < 3
+        assert np.abs(found - sample[name].numpy().transpose(1, 2, 0)).mean() < 3
+    _, content, _ = ask(server, f"/visible.u8?{MOMENT}")
+    assert content == sample["visible"].numpy().astype(np.uint8).tobytes()
 
 
 @pytest.mark.parametrize(
     "path",
     [
-        "/../../../../etc/passwd", "/..%2f..%2f..%2fetc%2fpasswd", "//etc/passwd", "/page.css/..",
-        "/static/index.html", "/server.py", "/page.css%00", "/api", "/index.parquet",
+        "/../../../../etc/passwd", "/..%2f..%2fetc%2fpasswd", "//etc/passwd", "/page.css/..",
+        "/static/index.html", "/page.css%00", "/index.parquet",
     ],
 )  # fmt: skip
 def test_no_path_leads_out_of_the_page(server, path):
@@ -109,20 +90,7 @@ def test_no_path_leads_out_of_the_page(server, path):
     assert json.loads(content) == {"error": "there is nothing here"}
 
 
-def test_every_file_of_the_page_is_served_and_scripts_import_only_such(server):
-    folder = resources.files("stereogenbench_data.audit.browser") / "static"
-    names = {file.name for file in folder.iterdir()}
-
-    assert {name for name, _ in STATIC.values()} == names
-    for path, (name, _) in STATIC.items():
-        status, content, _ = ask(server, path)
-        imported = re.findall(r'from "(/[^"]+)"', content.decode())
-
-        assert (status, content) == (200, (folder / name).read_bytes())
-        assert set(imported) <= STATIC.keys()
-
-
-@pytest.mark.parametrize("key", ["../../etc/passwd", "/etc/passwd", "", "train", SCENE + "/"])
+@pytest.mark.parametrize("key", ["../../etc/passwd", "", SCENE + "/"])
 def test_a_scene_is_requested_by_its_key_alone(server, key):
     moment = urlencode({"key": key, "left": 0, "right": 1, "frame": 0})
 
@@ -149,7 +117,7 @@ def test_a_moment_that_is_not_there_is_refused_with_a_reason(server, change, rea
     assert reason in json.loads(content)["error"]
 
 
-@pytest.mark.parametrize("host", ["evil.example", "evil.example:{port}", "127.0.0.1", "", None])
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:{port}", "127.0.0.1", None])
 def test_a_name_that_was_made_to_point_here_is_refused(server, host):
     port = server.server_address[1]
 
@@ -157,6 +125,7 @@ def test_a_name_that_was_made_to_point_here_is_refused(server, host):
     status, content, _ = ask(server, "/api/about", headers={"Host": told})
     assert status == 403
     assert b"another host" in content
+    assert ask(server, "/", headers={"Host": f"localhost:{port}"})[0] == 200
 
 
 def test_a_long_name_in_a_request_comes_back_shortened(server):
@@ -167,18 +136,11 @@ def test_a_long_name_in_a_request_comes_back_shortened(server):
     assert len(content) < 500
 
 
-@pytest.mark.parametrize("target", ["http://[", "http://[::1/"])
-def test_a_malformed_target_is_answered_with_400(server, target):
-    assert ask(server, target)[0] == 400
+def test_a_malformed_target_is_answered_with_400(server):
+    assert ask(server, "http://[::1/")[0] == 400
 
 
-def test_localhost_is_its_name_too(server):
-    host = f"localhost:{server.server_address[1]}"
-
-    assert ask(server, "/", headers={"Host": host})[0] == 200
-
-
-@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE"])
+@pytest.mark.parametrize("method", ["POST", "OPTIONS"])
 def test_nothing_but_reading_is_allowed(server, method):
     status, _, _ = ask(server, "/api/about", method=method)
 
@@ -203,21 +165,12 @@ def test_only_the_loopback_interface_listens(server):
 
 
 def test_a_broken_scene_is_reported_by_name(indexed_release, tmp_path):
-    import shutil
-
     shutil.copytree(indexed_release, tmp_path / "data")
     index = SceneIndex.open(tmp_path / "data")
     (tmp_path / "data" / SCENE / "cam_03_rgb.mp4").write_bytes(b"cut short")
-    service = Service(Catalogue(index, shown_data="x"), SceneReader(index))
-    with PageServer(service) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            good = ask(server, f"/left.jpg?{MOMENT}")
-            status, content, _ = ask(server, f"/right.jpg?{MOMENT}")
-        finally:
-            server.shutdown()
-            thread.join()
+    with serving(index, tmp_path / "data") as server:
+        good = ask(server, f"/left.jpg?{MOMENT}")
+        status, content, _ = ask(server, f"/right.jpg?{MOMENT}")
     told = json.loads(content)["error"]
 
     assert good[0] == 200

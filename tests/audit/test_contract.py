@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from stereogenbench_data.audit.contract.cameras import CameraCheck, CameraFigures
 from stereogenbench_data.audit.contract.diagnosis import Rival, SceneDiagnosis
 from stereogenbench_data.audit.contract.doctor import diagnose
-from stereogenbench_data.audit.contract.fitting import RayPower
 from stereogenbench_data.audit.contract.hypotheses import LAGS, Hypothesis
-from stereogenbench_data.audit.contract.matching import match_pairs, relative_step
+from stereogenbench_data.audit.contract.matching import match_pairs
 from stereogenbench_data.audit.contract.scoring import Evidence, pooled
 from stereogenbench_data.audit.contract.verdict import (
     QUOTIENT,
@@ -116,12 +115,11 @@ def test_a_right_contract_is_confirmed_question_by_question(verdict_on):
     assert verdict.quotient == pytest.approx(1, rel=0.005)
 
 
-@pytest.mark.parametrize("factor", [0.97, 500.0])
-def test_a_wrong_quotient_is_measured_and_no_unit_is_pasted(verdict_on, factor):
-    verdict = verdict_on(lambda folder: rewrite_depth(folder, lambda u: u, unit_factor=factor))
+def test_a_wrong_quotient_is_measured_and_no_unit_is_pasted(verdict_on):
+    verdict = verdict_on(lambda folder: rewrite_depth(folder, lambda u: u, unit_factor=0.97))
 
     assert wrong_topics(verdict) == {QUOTIENT}
-    assert verdict.quotient == pytest.approx(1 / factor, rel=0.005)
+    assert verdict.quotient == pytest.approx(1 / 0.97, rel=0.005)
     assert verdict.gain.low_db > 0
     assert verdict.encoding is None
     assert verdict.choices[0] == "if focal length and baselines are right: " + encoding_line(
@@ -136,13 +134,6 @@ def test_a_wrong_focal_length_is_not_called_a_wrong_unit(verdict_on):
     assert verdict.encoding is None
     (told,) = (choice for choice in verdict.choices if choice.startswith("if unit and baselines"))
     assert float(told.split(" of ")[1].split(" x ")[0]) == pytest.approx(1 / 0.95, rel=0.005)
-
-
-def test_ray_depth_is_distinguished_from_planar(verdict_on):
-    verdict = verdict_on(lambda folder: rewrite_depth(folder, as_ray(folder)))
-
-    assert wrong_topics(verdict) == {"depth along"}
-    assert verdict.encoding == DepthEncoding(kind="ray")
 
 
 def test_ray_depth_behind_a_long_lens_is_distinguished_from_a_unit_that_is_a_little_off(
@@ -172,7 +163,7 @@ def diagnosed(**changes):
     basics = {
         "key": "scene", "views": 1, "pairs": ((0, 1),), "matches": 999, "textured": 999,
         "unit_m": UNIT_M, "unit_source": "tag", "recorded_pair": None,
-        "declared": planar, "best": planar, "scale_error": 0.001, "agreement": 0.9,
+        "declared": planar, "best": planar, "scale_error": 0.001,
         "offsets_px": {(0, 1): 0.0}, "check": FITTING,
     }  # fmt: skip
     return SceneDiagnosis(**(basics | changes))
@@ -220,13 +211,10 @@ def test_an_answer_is_confirmed_only_where_all_others_were_tested_and_lost(quest
 @pytest.mark.parametrize(
     ("best", "tested", "status", "found"),
     [
-        (0, (), "cannot tell", ""),
         (0, (1,), "cannot tell", ""),
         (0, (-1, 1), "confirmed", "0"),
         (1, (-1, 0), "wrong", "1 or 2"),
-        (1, (-1, 0, 2), "wrong", "1"),
         (3, (-1, 0, 1), "wrong", "3 or 2 or beyond"),
-        (-3, (-2, -1, 0, 1, 2, 3), "wrong", "-3 or beyond"),
     ],
 )
 def test_a_lag_whose_neighbours_no_frame_could_test_is_left_open(best, tested, status, found):
@@ -254,31 +242,12 @@ def test_a_scene_of_one_frame_does_not_tell_the_lag(tmp_path):
     assert answer(verdict, "depth along").status == "confirmed"
 
 
-@pytest.mark.parametrize("scale", [0.98, 1.5, 2.0, 10.0])
-@pytest.mark.parametrize("source", ["tag", "default", "user"])
-def test_of_a_wrong_quotient_no_part_is_blamed(scale, source):
-    verdict = judged(
-        changed=frozenset({"scale"}), scale=scale, unit_source=source, gain=Evidence(3.0, 0.05),
-        rivals=(Rival("kind", "ray", Evidence(9.0, 0.1)),),
-    )  # fmt: skip
-
-    assert verdict.is_wrong
-    assert wrong_topics(verdict) == {QUOTIENT}
-    assert verdict.quotient == pytest.approx(1 / scale)
-    assert verdict.encoding is None
-    assert [choice.split(" are right")[0] for choice in verdict.choices] == [
-        "if focal length and baselines", "if unit and baselines", "if unit and focal length",
-    ]  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ("scale", "error", "status"),
     [
         (1.001, 0.001, "confirmed"),
         (1.008, 0.001, "cannot tell"),
-        (1.001, 0.006, "confirmed"),
         (1.013, 0.006, "cannot tell"),
-        (1.009, 0.0075, "cannot tell"),
         (1.001, 0.020, "cannot tell"),
     ],
 )
@@ -294,9 +263,7 @@ def test_a_quotient_is_confirmed_if_its_interval_lies_within_the_margin(scale, e
     [
         # Mean and its two errors: one for the search, a wider one for the interval.
         ([(0.39, 0.10, 0.24)], "not contradicted"),
-        ([(9.0, 0.1, 0.1)], "confirmed"),
         ([(9.0, 0.1, 0.1), (1.0, 0.1, 0.1)], "confirmed"),
-        ([(9.0, 0.1, 0.1), (0.39, 0.1, 0.24)], "not contradicted"),
         ([(9.0, 0.1, 0.1), (0.5, 0.1, 0.2)], "not contradicted"),
     ],
 )
@@ -325,7 +292,6 @@ def test_confirmed_never_stands_beside_an_interval_that_reaches_the_margin(scene
             "camera 2",
         ),
         (CameraCheck((*FITTING.cameras[:5], CameraFigures(5, 999, 0.4, 1.0, 0.0))), ""),
-        (CameraCheck(FITTING.cameras[:5]), ""),
         (CameraCheck((*FITTING.cameras[:5], CameraFigures(5, 9, 0.9, 1.0, 0.0))), ""),
     ],
 )
@@ -366,17 +332,6 @@ def test_a_scene_with_a_faulty_camera_gets_a_verdict_of_its_own():
     assert sorted([scene.key for scene in group] for group in groups) == [["a", "c"], ["b"]]
 
 
-def test_cameras_of_which_too_little_was_found_are_untested():
-    few = CameraFigures(4, 20, 0.9, 1.0, 0.0)
-    low = CameraFigures(5, 999, 0.3, 1.0, 0.0)
-
-    check = CameraCheck((*FITTING.cameras[:4], few, low))
-
-    assert check.untested == (4,)
-    assert check.unexplained == (5,)
-    assert check.agreement == pytest.approx((4 * 0.9 + 0.3) / 5)
-
-
 @pytest.mark.parametrize(("offset_px", "status"), [(0.1, "not contradicted"), (0.8, "cannot tell")])
 def test_an_offset_that_fits_and_is_not_clearly_better_is_left_open(offset_px, status):
     verdict = judged(offsets_px={(0, 1): offset_px, (1, 2): 0.0})
@@ -404,31 +359,8 @@ def test_a_shifted_picture_is_not_distinguished_from_depth_of_the_other_camera()
     assert not any(swapped in line for line in shifted.beside)
 
 
-@pytest.mark.parametrize(
-    ("power", "error", "kind"),
-    [
-        (0.1, 0.05, "planar"),
-        (0.9, 0.05, "ray"),
-        (0.45, 0.01, None),
-        (0.1, 0.2, None),
-        (3.0, 0.1, None),
-        (0.0, math.inf, None),
-    ],
-)
-def test_a_power_of_the_ray_tells_only_what_it_is_near_and_sure_of(power, error, kind):
-    assert RayPower(power, error).kind == kind
-
-
-@pytest.mark.parametrize(
-    ("numbers", "step"),
-    [([1000, 1001, 1002, 1003], 0.001), ([100, 200, 200, 200], 0.5), ([50] * 9, 0.02), ([], 0.0)],
-)
-def test_the_step_of_depth_is_a_share_of_it(numbers, step):
-    assert relative_step(np.array(numbers, np.uint16)) == pytest.approx(step, rel=1e-3)
-
-
-@pytest.mark.parametrize(("bits", "status"), [(10, "cannot tell"), (13, "cannot tell")])
-def test_depth_in_few_steps_gives_no_false_alarm(verdict_on, bits, status):
+@pytest.mark.parametrize("bits", [10, 13])
+def test_depth_in_few_steps_gives_no_false_alarm(verdict_on, bits):
     def coarse(units):
         known = (units > 0) & (units < 65535)
         return np.where(known, (units >> bits << bits) | 1 << (bits - 1), units)
@@ -436,7 +368,7 @@ def test_depth_in_few_steps_gives_no_false_alarm(verdict_on, bits, status):
     verdict = verdict_on(lambda folder: rewrite_depth(folder, coarse))
 
     assert not verdict.is_wrong
-    assert answer(verdict, QUOTIENT).status == status
+    assert answer(verdict, QUOTIENT).status == "cannot tell"
 
 
 def test_inverse_depth_is_found_with_its_unit(verdict_on):
@@ -457,13 +389,12 @@ def test_inverse_depth_is_found_with_its_unit(verdict_on):
     assert told.unit_m == pytest.approx(seen["unit_m"], rel=0.005)
 
 
-@pytest.mark.parametrize("lag", [-2, 2])
-def test_a_lag_is_found(verdict_on, lag):
-    verdict = verdict_on(lambda folder: rewrite_depth(folder, late(lag)), frames=5)
+def test_a_lag_is_found(verdict_on):
+    verdict = verdict_on(lambda folder: rewrite_depth(folder, late(-2)), frames=5)
 
     assert wrong_topics(verdict) == {"frame lag"}
-    assert f"{lag}" in answer(verdict, "frame lag").found.split(" or ")
-    assert verdict.encoding in (None, DepthEncoding(frame_lag=lag))
+    assert "-2" in answer(verdict, "frame lag").found.split(" or ")
+    assert verdict.encoding in (None, DepthEncoding(frame_lag=-2))
 
 
 @pytest.mark.parametrize(
@@ -472,7 +403,6 @@ def test_a_lag_is_found(verdict_on, lag):
         (("rgb.mp4", "depth.mkv"), {1: 2, 2: 1}, "cameras 1 and 2 exchanged"),
         (("rgb.mp4",), {1: 2, 2: 1}, "pictures of cameras 1 and 2 exchanged"),
         (("depth.mkv",), {2: 4, 4: 2}, "depth of cameras 2 and 4 exchanged"),
-        (("depth.mkv",), {c: 5 - c for c in range(6)}, "depth reversed"),
     ],
 )
 def test_exchanged_files_are_found_and_no_unit_stands_for_them(verdict_on, kinds, cameras, found):
@@ -495,64 +425,40 @@ def test_files_numbered_one_too_high_are_seen_and_nothing_is_pasted(verdict_on):
     assert "confirmed" not in {found.status for found in verdict.answers}
 
 
+def depth_of(camera, change):
+    return lambda folder: rewrite_one_depth(folder, camera, change)
+
+
+def pictures_of(camera, change):
+    return lambda folder: rewrite_rgb(folder, camera, change)
+
+
 @pytest.mark.parametrize(
-    ("camera", "change", "words"),
+    ("corrupt", "words"),
     [
-        (1, scaled(1.05), r"is 1\.0[45]\d* x that of the others"),
-        (3, late(2), r"fits better with a lag of \+2 frames"),
-        (0, lambda units: np.flip(units, 1), r"fits better flipped \(vertical\)"),
+        (depth_of(1, scaled(1.05)), r"depth of camera 1 is 1\.0[45]\d* x that of the others"),
+        (depth_of(3, late(2)), r"depth of camera 3 fits better with a lag of \+2 frames"),
+        (depth_of(0, lambda units: np.flip(units, 1)),
+         r"depth of camera 0 fits better flipped \(vertical\)"),
+        (lambda folder: rewrite_one_depth(folder, 4, as_inverse(folder)),
+         "depth of camera 4 fits better as inverse depth"),
+        (pictures_of(0, lambda pictures: np.roll(pictures, -1, axis=1)),
+         r"pictures of camera 0 are [01]\.\d px higher"),
+        (pictures_of(1, lambda pictures: pictures[:, :, ::-1]),
+         "pictures of camera 1 do not fit those of the others.*"),
+        (pictures_of(5, late(3)), "pictures of camera 5 are 3 frames late"),
     ],
-    ids=["5 % more", "lagged", "flipped"],
-)
-def test_depth_of_one_camera_that_is_wrong_is_named(verdict_on, camera, change, words):
-    verdict = verdict_on(lambda folder: rewrite_one_depth(folder, camera, change), frames=3)
+    ids=["5 % more", "lagged", "flipped", "inverse", "higher", "mirrored", "late"],
+)  # fmt: skip
+def test_what_is_wrong_with_files_of_one_camera_is_named(verdict_on, corrupt, words):
+    verdict = verdict_on(corrupt, frames=2)
 
     (problem,) = verdict.problems
-    assert re.fullmatch(f"depth of camera {camera} {words}", problem)
+    assert re.fullmatch(words, problem)
     assert verdict.is_wrong
     assert not verdict.fits
     assert verdict.encoding is None
     assert "confirmed" not in {found.status for found in verdict.answers}
-
-
-def test_a_tag_of_one_camera_that_is_wrong_is_named(verdict_on):
-    verdict = verdict_on(
-        lambda folder: rewrite_one_depth(folder, 3, lambda units: units, unit_factor=2.0)
-    )
-
-    (problem,) = verdict.problems
-    assert re.fullmatch(r"depth of camera 3 is (2|1\.99\d*|2\.00\d*) x that of the others", problem)
-
-
-def test_inverse_depth_of_one_camera_is_named(verdict_on):
-    verdict = verdict_on(lambda folder: rewrite_one_depth(folder, 4, as_inverse(folder)))
-
-    assert verdict.problems == ("depth of camera 4 fits better as inverse depth",)
-
-
-@pytest.mark.parametrize(
-    ("camera", "change", "words"),
-    [
-        (0, lambda pictures: np.roll(pictures, -1, axis=1), r"are [01]\.\d px higher"),
-        (1, lambda pictures: pictures[:, :, ::-1], "do not fit those of the others.*"),
-    ],
-    ids=["higher", "mirrored"],
-)
-def test_pictures_of_one_camera_that_are_wrong_are_named(verdict_on, camera, change, words):
-    verdict = verdict_on(lambda folder: rewrite_rgb(folder, camera, change), frames=3)
-
-    (problem,) = verdict.problems
-    assert re.fullmatch(f"pictures of camera {camera} {words}", problem)
-    assert not verdict.fits
-    assert verdict.encoding is None
-
-
-def test_late_pictures_of_one_camera_are_named_with_their_lag(verdict_on):
-    verdict = verdict_on(lambda folder: rewrite_rgb(folder, 5, late(3)), frames=2)
-
-    assert verdict.problems == ("pictures of camera 5 are 3 frames late",)
-    assert not verdict.fits
-    assert verdict.encoding is None
 
 
 def test_a_camera_that_is_recorded_elsewhere_is_named(verdict_on):
@@ -566,14 +472,14 @@ def test_a_camera_that_is_recorded_elsewhere_is_named(verdict_on):
 
 def test_two_cameras_that_differ_are_both_named(verdict_on):
     def corrupt(folder):
-        rewrite_one_depth(folder, 1, scaled(0.5))
+        rewrite_one_depth(folder, 1, lambda units: units, unit_factor=2.0)
         rewrite_one_depth(folder, 4, scaled(1.2))
 
     verdict = verdict_on(corrupt)
 
-    assert [problem.split(" is ")[0] for problem in verdict.problems] == [
-        "depth of camera 1", "depth of camera 4",
-    ]  # fmt: skip
+    first, second = verdict.problems
+    assert re.fullmatch(r"depth of camera 1 is (2|1\.99\d*|2\.00\d*) x that of the others", first)
+    assert second.startswith("depth of camera 4 is 1.")
 
 
 def test_a_primary_pair_named_the_wrong_way_round_is_found(verdict_on):
@@ -590,12 +496,11 @@ def test_a_primary_pair_named_the_wrong_way_round_is_found(verdict_on):
     assert answer(verdict, "left and right").found == "mirrored or reversed"
 
 
-@pytest.mark.parametrize(("flip", "axis"), [("vertical", 1), ("horizontal", 2)])
-def test_flipped_depth_is_found(verdict_on, flip, axis):
-    verdict = verdict_on(lambda folder: rewrite_depth(folder, lambda u: np.flip(u, axis)))
+def test_flipped_depth_is_found(verdict_on):
+    verdict = verdict_on(lambda folder: rewrite_depth(folder, lambda u: np.flip(u, 2)))
 
     assert wrong_topics(verdict) == {"flip of depth"}
-    assert answer(verdict, "flip of depth").found == flip
+    assert answer(verdict, "flip of depth").found == "horizontal"
 
 
 def test_a_shifted_camera_is_found(verdict_on):
@@ -609,26 +514,25 @@ def test_a_shifted_camera_is_found(verdict_on):
     assert float(told.split("+")[1].split()[0]) == pytest.approx(3, abs=0.2)
 
 
-def test_pictures_without_texture_decide_nothing(verdict_on):
-    def corrupt(folder):
-        for camera in range(6):
-            rewrite_rgb(folder, camera, lambda pictures: np.full_like(pictures, 120))
+def without_texture(folder):
+    for camera in range(6):
+        rewrite_rgb(folder, camera, lambda pictures: np.full_like(pictures, 120))
 
+
+def six_equal_views(folder):
+    exchange(folder, dict.fromkeys(range(6), 0))
+
+
+@pytest.mark.parametrize(
+    ("corrupt", "note"),
+    [(without_texture, "no texture"), (six_equal_views, "too little parallax")],
+)
+def test_pictures_that_show_no_disparity_decide_nothing(verdict_on, corrupt, note):
     verdict = verdict_on(corrupt)
 
     assert not verdict.is_wrong
     assert {answer.status for answer in verdict.answers} == {"cannot tell"}
-    assert "no texture" in verdict.answers[0].note
-
-
-def test_six_equal_views_decide_nothing(verdict_on):
-    def corrupt(folder):
-        exchange(folder, dict.fromkeys(range(6), 0))
-
-    verdict = verdict_on(corrupt)
-
-    assert not verdict.is_wrong
-    assert "too little parallax" in verdict.answers[0].note
+    assert note in verdict.answers[0].note
 
 
 @pytest.fixture(scope="module")
@@ -638,7 +542,7 @@ def small_parallax(tmp_path_factory):
     def small_parallax(*, renderer=RAY_CASTING, **changes):
         root = tmp_path_factory.mktemp("small_parallax")
         request = SynthRequest(
-            family="IPD_Gaussian", frames=11, seed=905311003, focal_mm=79.7,
+            family="IPD_Gaussian", frames=7, seed=905311003, focal_mm=79.7,
             contract=ExportContract(depth_unit_m=0.0005), **changes,
         )  # fmt: skip
         (key,) = synthesise(root, request, renderer=renderer)
@@ -651,7 +555,7 @@ def test_a_shift_where_little_is_seen_does_not_make_the_unit_wrong_too(small_par
     root, folder = small_parallax(size_px=130, height_px=98)
     rewrite_rgb(folder, 1, lambda pictures: np.roll(pictures, 2, axis=2))
 
-    (verdict,) = diagnose(root, frames=2, workers=1).verdicts
+    (verdict,) = diagnose(root, frames=1, workers=1).verdicts
 
     assert wrong_topics(verdict) == {"disparity offset"}
     assert answer(verdict, "disparity offset").found.startswith("camera 1's picture is +2.0")
@@ -661,7 +565,7 @@ def test_a_unit_where_little_is_seen_is_not_taken_for_a_lag(small_parallax):
     root, folder = small_parallax(size_px=128, height_px=84, renderer=FULL_FRAME)
     rewrite_depth(folder, lambda units: units, unit_factor=0.976)
 
-    (verdict,) = diagnose(root, frames=2, workers=1).verdicts
+    (verdict,) = diagnose(root, frames=1, workers=1).verdicts
 
     assert answer(verdict, "frame lag").status == "cannot tell"
     assert verdict.encoding is None
@@ -709,28 +613,20 @@ def test_the_contract_requested_about_may_be_given(verdict_on):
 
 
 def test_scenes_with_different_contracts_get_verdicts_of_their_own(right_scene, tmp_path):
-    first = copied(right_scene, tmp_path)
-    rewrite_depth(first, lambda units: units, unit_factor=10.0)
-    first.rename(first.with_name("scene_000007"))
+    for number, change, unit_factor in ((7, scaled(1 / 23.9), 23.9), (8, scaled(1), 10.0)):
+        folder = copied(right_scene, tmp_path)
+        rewrite_depth(folder, change, unit_factor=unit_factor)
+        folder.rename(folder.with_name(f"scene_{number:06d}"))
     copied(right_scene, tmp_path)
 
     report = diagnose(tmp_path, frames=1, workers=1)
 
-    assert [verdict.is_wrong for verdict in report.verdicts].count(True) == 1
-    assert len(report.verdicts) == 2
+    (wrong,) = (verdict for verdict in report.verdicts if verdict.is_wrong)
+    right = [verdict for verdict in report.verdicts if verdict is not wrong]
     assert report.is_wrong
-
-
-def test_scenes_of_different_units_are_confirmed_each_by_itself(right_scene, tmp_path):
-    first = copied(right_scene, tmp_path)
-    rewrite_depth(first, scaled(1 / 23.9), unit_factor=23.9)
-    first.rename(first.with_name("scene_000007"))
-    copied(right_scene, tmp_path)
-
-    verdicts = diagnose(tmp_path, frames=1, workers=1).verdicts
-
-    assert [len(verdict.scenes) for verdict in verdicts] == [1, 1]
-    for verdict in verdicts:
+    assert wrong.scenes[0].endswith("scene_000008")
+    assert [len(verdict.scenes) for verdict in right] == [1, 1]
+    for verdict in right:
         assert verdict.quotient == pytest.approx(1, rel=0.01)
         assert answer(verdict, QUOTIENT).status == "confirmed"
 
@@ -744,13 +640,6 @@ def test_depth_of_a_stated_range_is_confirmed(verdict_on):
 
     assert answer(verdict, QUOTIENT).status == "confirmed"
     assert verdict.fits
-
-
-def test_a_unit_that_files_do_not_tell_is_measured(verdict_on):
-    verdict = verdict_on(lambda folder: rewrite_tags(folder, {"DEPTH_FOO": "0.001"}))
-
-    unit_m = float(verdict.choices[0].rpartition("unit_m=")[2].removesuffix(")"))
-    assert unit_m == pytest.approx(UNIT_M, rel=0.005)
 
 
 def test_the_scene_that_was_rendered_elsewhere_is_confirmed(shared_scenes):
@@ -777,16 +666,6 @@ def test_matching_finds_a_shift_of_either_sign_to_a_part_of_a_pixel():
 
         assert len(matches.rows) > 1000
         np.testing.assert_allclose(matches.disparity_px, shift_px, atol=0.2)
-
-
-@pytest.mark.parametrize("order", Hypothesis().alternatives("order"), ids=lambda s: s.order)
-def test_an_exchange_of_files_pairs_each_picture_with_the_depth_of_its_camera(order):
-    for file in range(6):
-        camera = order.camera_of(file, content="rgb")
-
-        depth = order.depth_file(file)
-
-        assert order.camera_of(depth, content="depth") == camera
 
 
 def test_every_exchange_of_two_cameras_is_requested_about():

@@ -5,8 +5,6 @@ import json
 import statistics as plain_statistics
 
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.audit import paper_numbers
@@ -15,7 +13,6 @@ from stereogenbench_data.audit.statistics_report import (
     compared,
     statistics_markdown,
 )
-from stereogenbench_data.cli.stats import stats
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.release import (
     CAMERA_PAIRS,
@@ -25,6 +22,7 @@ from stereogenbench_data.schema.release import (
     UNSEEN_MAPS,
 )
 from tests.audit.release_counts import paper_scenes
+from tests.cli.command import invoke
 
 PLACES_CM = (0.0, 10.0, 25.0, 31.0, 61.0, 211.0)
 
@@ -136,16 +134,6 @@ def test_one_scene_less_is_seen_in_every_figure_that_it_moves(release):
     assert markdown.rindex("| **differs** | ") < markdown.index("| same | ")
 
 
-def test_a_split_by_itself_is_compared_by_itself(release):
-    found = statistics(release, split="eval")
-
-    lines = compared(found)
-
-    assert len(lines) > 60
-    assert not any("train" in line.item for line in lines)
-    assert all(line.agrees for line in lines)
-
-
 def test_the_papers_tables_close():
     counts, maps = SCENE_COUNTS, paper_numbers.map_counts()
 
@@ -167,47 +155,33 @@ def test_the_papers_tables_close():
     assert int(paper_numbers.ALL_PAIRS["train", "Pairwise_Uniform"]["count"]) == 15 * 3691
 
 
-def test_markdown_has_the_papers_tables(release):
-    found = statistics(release)
-
-    markdown = statistics_markdown(found, compared(found))
+def test_the_command_compares_a_release_by_itself(written_release):
+    result = invoke("stats", written_release)
+    evaluated = invoke("stats", written_release, "--split", "eval", "--json")
 
     row = "| train | Uniform | 3,870 | 1.0113 | 149.8906 | 52.7908 | 38.9500 | 43.2916 |"
-    assert row in markdown
-    assert "## Against the paper: 151 of 151 figures agree" in markdown
-    assert "| same | scenes, train Uniform | 774 | 774 |" in markdown
-    assert "Against the paper" not in statistics_markdown(found)
-
-
-@pytest.fixture
-def run():
-    """Run the command; several commands in one app, as the real one has."""
-    app = typer.Typer()
-    app.command()(stats)
-    app.command("other")(lambda: None)
-    return lambda *words: CliRunner().invoke(
-        app, ["stats", *map(str, words)], catch_exceptions=False
-    )
-
-
-def test_the_command_compares_a_release_by_itself(written_release, run):
-    result = run(written_release)
-
     assert result.exit_code == 0
+    assert row in result.stdout
     assert "## Against the paper: 151 of 151 figures agree" in result.stdout
+    assert "| same | scenes, train Uniform | 774 | 774 |" in result.stdout
+    compared = json.loads(evaluated.stdout)["paper"]
+    assert len(compared) > 60
+    assert all(line["agrees"] and "train" not in line["item"] for line in compared)
 
 
-def test_the_command_shows_other_data_without_the_papers_figures(small_shards, run):
-    result = run(small_shards)
+def test_the_command_shows_other_data_without_the_papers_figures(small_shards):
+    result = invoke("stats", small_shards)
 
     assert result.exit_code == 0
     assert "| train | - | Uniform | 2 |" in result.stdout
     assert "Against the paper" not in result.stdout
 
 
-def test_the_command_writes_json_and_files(small_shards, run, tmp_path):
-    told = run(small_shards, "--split", "train", "--json", "-o", tmp_path / "out" / "stats.json")
-    run(small_shards, "-o", tmp_path / "out" / "stats.md")
+def test_the_command_writes_json_and_files(small_shards, tmp_path):
+    told = invoke(
+        "stats", small_shards, "--split", "train", "--json", "-o", tmp_path / "out" / "stats.json"
+    )
+    invoke("stats", small_shards, "-o", tmp_path / "out" / "stats.md")
 
     document = json.loads(told.stdout)
     assert document == json.loads((tmp_path / "out" / "stats.json").read_text())

@@ -3,22 +3,15 @@
 import json
 import re
 import shutil
-from contextlib import closing
 
 import pytest
 import torch
 
-from stereogenbench_data.audit.contract.matching import SceneFrames
-from stereogenbench_data.audit.contract.worlds import explained_shares, judge_worlds
-from stereogenbench_data.audit.scene_access import source_of
+from stereogenbench_data.audit.contract.worlds import judge_worlds
 from stereogenbench_data.datasets.mapped import SceneViews
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.pose_forms import readings
-from stereogenbench_data.index.open import AssumptionWarning
-from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.conventions import Conventions
-from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.trajectory import record_poses
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
@@ -61,9 +54,6 @@ def test_a_second_camera_must_confirm_what_one_camera_of_one_scene_chooses():
     assert verdict.chosen == ""
     assert "confirming camera" in verdict.reason
     assert judge_worlds(scenes((0.9, 0.1))).chosen == RIGHT
-
-
-def test_a_reading_that_does_not_fit_all_scenes_is_none():
     assert judge_worlds([{RIGHT: (0.9, 0.9)}, {WRONG: (0.1, 0.1)}]).chosen == ""
 
 
@@ -84,32 +74,6 @@ def write_matrices(root, *, still=False):
             pose.pop("rotation"), pose.pop("location")
             pose["pose"] = as_unreal.world_from_cam(0 if still else frame, camera).tolist()
     path.write_text(json.dumps({"frames": document["frames"], "unit": "m"}))
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    """A tree of one scene of matrices."""
-    root = tmp_path_factory.mktemp("small")
-    synthesise(root, SynthRequest(family="Uniform", scenes=1, size_px=64, frames=9, seed=6))
-    write_matrices(root)
-    return root
-
-
-def test_depth_tells_which_way_a_camera_looks(small):
-    with pytest.warns(AssumptionWarning, match="several readings of the poses fit"):
-        index = SceneIndex.open(small)
-    scene = index.scene(0)
-    source = source_of(index, scene)
-    with closing(Streams(source)) as streams:
-        views = SceneFrames(scene, streams, encoding=DepthEncoding())
-        text = source.read(scene, "trajectory.json")
-        shares = explained_shares(views, text, scene.pose_form.split("|"))
-
-    (right, most), (wrong, least) = sorted(shares.items(), key=lambda each: -each[1][0])
-    assert "opencv axes" in right
-    assert "opengl axes" in wrong
-    assert min(most) > 0.8
-    assert most[0] - least[0] > 0.1
 
 
 def test_conventions_of_poses_that_depth_does_not_tell_stay_open_and_say_what_is_refused(

@@ -3,15 +3,10 @@
 import json
 
 import pytest
-from typer.testing import CliRunner
 
-from stereogenbench_data.cli.commands import app
+from tests.cli.command import invoke as run
 
 SMALL = ("--metrics", "psnr,ssim", "--size", "64x48", "--workers", "1")
-
-
-def run(*arguments):
-    return CliRunner().invoke(app, [str(each) for each in arguments])
 
 
 @pytest.fixture
@@ -69,17 +64,6 @@ def test_a_second_run_says_whether_it_reproduces_the_first(scenes, other_views, 
     assert "results.json: 2 differences" in other.stderr
 
 
-def test_a_missing_prediction_ends_with_2_and_is_named(scenes, tmp_path):
-    (tmp_path / "none").mkdir()
-    shown = run(
-        "eval", "score", scenes, tmp_path / "none", "--tier", "G0", "--out", tmp_path / "out",
-        *SMALL,
-    )  # fmt: skip
-
-    assert shown.exit_code == 2
-    assert "3 predictions missing or unusable, and 0 allowed" in shown.stderr
-
-
 def test_an_evaluation_that_scored_nothing_does_not_hinder_another_one(
     scenes, right_views, tmp_path
 ):
@@ -89,6 +73,7 @@ def test_an_evaluation_that_scored_nothing_does_not_hinder_another_one(
     again = run("eval", "score", scenes, right_views, *out, "--metrics", "psnr", *SMALL[2:])
 
     assert (failed.exit_code, again.exit_code) == (2, 0), again.output
+    assert "3 predictions missing or unusable, and 0 allowed" in failed.stderr
 
 
 @pytest.mark.parametrize(
@@ -104,17 +89,9 @@ def test_an_evaluation_that_scored_nothing_does_not_hinder_another_one(
         ("--tier", "G9", "there is no tier 'G9'"),
     ],
 )
-def test_an_option_that_is_off_is_reported(
-    scenes,
-    right_views,
-    tmp_path,
-    option,
-    value,
-    message,
-):
-    shown = run(
-        "eval", "score", scenes, right_views, "--tier", "G0", "--out", tmp_path, option, value
-    )
+def test_an_option_that_is_off_is_reported(scenes, right_views, tmp_path, option, value, message):
+    scoring = ("eval", "score", scenes, right_views, "--tier", "G0", "--out", tmp_path)
+    shown = run(*scoring, option, value)
 
     assert shown.exit_code == 2
     assert message in " ".join(shown.stderr.replace("│", " ").split())

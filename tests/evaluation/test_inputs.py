@@ -133,10 +133,3 @@ def test_a_folder_of_other_inputs_is_refused_by_what_differs(scored_index, tmp_p
         export(scored_index, tmp_path, "G1", frames=[0])
     with pytest.raises(EvaluationError, match="holds inputs of other frames"):
         export(scored_index, tmp_path, "G2", frames=[1])
-
-
-def test_a_folder_of_something_else_is_refused(scored_index, tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-
-    with pytest.raises(EvaluationError, match=r"is not empty and holds no inputs\.json"):
-        export(scored_index, tmp_path, "G2")

@@ -8,7 +8,6 @@ import pytest
 
 from stereogenbench_data.evaluation.metrics.matching import (
     match_error,
-    match_settings,
     mutual_matches,
     target_matches,
 )
@@ -88,17 +87,6 @@ def test_matches_are_counted_as_worked_by_hand(listed):
     assert score.e_match == pytest.approx(100 * (1 - 2 / 4))
 
 
-def test_the_target_itself_has_no_error(listed):
-    assert error_of(listed, TARGET).e_match == 0
-
-
-def test_the_copied_left_matches_every_keypoint_so_its_error_is_what_the_target_lacks(listed):
-    score = error_of(listed, LEFT)
-
-    assert score.predicted_matches == score.keypoints == 5
-    assert score.e_match == pytest.approx(100 * (1 - 3 / 5))
-
-
 def test_where_only_one_side_matches_the_error_is_whole_and_where_none_does_there_is_none(listed):
     assert error_of(listed, NOTHING).e_match == 100
     assert math.isnan(error_of(listed, NOTHING, target=NOTHING).e_match)
@@ -110,12 +98,6 @@ def test_left_keypoints_are_detected_once_for_all_predictions(listed):
         match_error(view(predicted), against=against, matcher=listed)
 
     assert listed.detected == [LEFT, TARGET, TARGET, PREDICTED]
-
-
-def test_the_settings_name_the_matcher_and_its_own_choices(listed):
-    settings = match_settings(listed)
-
-    assert (settings["matcher"], settings["epipolar_px"], settings["keypoints"]) == ("listed", 2, 5)
 
 
 def described(*values: float) -> Keypoints:
@@ -140,31 +122,6 @@ def described(*values: float) -> Keypoints:
 )
 def test_mutual_matches_are_those_worked_by_hand(left, right, pairs):
     assert mutual_matches(described(*left), described(*right)).tolist() == [list(p) for p in pairs]
-
-
-def test_mutual_matches_are_those_of_a_search_by_loops():
-    rng = np.random.default_rng(0)
-    sides = [rng.normal(size=(40, 3)).astype(np.float32) for _ in range(2)]
-    one, two = (side.astype(np.float64) for side in sides)
-    distances = np.linalg.norm(one[:, None] - two, axis=2)
-
-    def clear(row: np.ndarray) -> bool:
-        nearest, second = np.sort(row)[:2]
-        return nearest <= 0.9 * second
-
-    expected = [
-        [i, j]
-        for i in range(40)
-        for j in range(40)
-        if distances[i].argmin() == j
-        and distances[:, j].argmin() == i
-        and clear(distances[i])
-        and clear(distances[:, j])
-    ]
-    made = [Keypoints(np.zeros((40, 2), dtype=np.float32), side) for side in sides]
-
-    assert expected
-    assert mutual_matches(*made).tolist() == expected
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,6 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from stereogenbench_data.errors import EvaluationError, ExtraError
 from stereogenbench_data.evaluation.metrics.pixels import (
-    PSNR_SETTINGS,
-    SSIM_SETTINGS,
     psnr_db,
     ssim,
 )
@@ -38,14 +36,12 @@ def noisy(picture: np.ndarray, *, sigma: float) -> np.ndarray:
     return np.clip(picture + noise, 0, 255).astype(np.uint8)
 
 
-@pytest.fixture(
-    scope="module", params=["cones/left.png", "cloth3/view1.png", "motorcycle/motorcycle_left.png"]
-)
+@pytest.fixture(scope="module", params=["cones/left.png", "cloth3/view1.png"])
 def photographed(request, ground_truth):
     return photograph(ground_truth / request.param)
 
 
-@pytest.mark.parametrize("sigma", [0.3, 5, 80])
+@pytest.mark.parametrize("sigma", [0.3, 80])
 def test_photographs_score_as_in_scikit_image(photographed, sigma):
     other = noisy(photographed, sigma=sigma)
 
@@ -55,7 +51,7 @@ def test_photographs_score_as_in_scikit_image(photographed, sigma):
     assert ssim(other, photographed) == pytest.approx(true_ssim(photographed, other), abs=1e-9)
 
 
-@pytest.mark.parametrize("size", [(11, 11), (11, 200), (74, 75), (138, 31), (480, 832)])
+@pytest.mark.parametrize("size", [(11, 200), (138, 31)])
 def test_random_pictures_of_any_size_score_as_in_scikit_image(size):
     rng = np.random.default_rng(1)
     one, two = (rng.integers(0, 256, (3, *size)).astype(np.uint8) for _ in range(2))
@@ -66,7 +62,7 @@ def test_random_pictures_of_any_size_score_as_in_scikit_image(size):
     assert ssim(one, two) == pytest.approx(true_ssim(one, two), abs=1e-9)
 
 
-@pytest.mark.parametrize("other", [254, 128, 1, 0])
+@pytest.mark.parametrize("other", [254, 0])
 def test_flat_pictures_score_as_in_scikit_image(other):
     white = np.full((3, 20, 30), 255, dtype=np.uint8)
     flat = np.full_like(white, other)
@@ -75,26 +71,14 @@ def test_flat_pictures_score_as_in_scikit_image(other):
     assert ssim(white, flat) == pytest.approx(true_ssim(white, flat), abs=1e-9)
 
 
-def test_one_level_off_everywhere_is_48_db():
-    picture = np.full((3, 2, 2), 7, dtype=np.uint8)
-
-    assert psnr_db(picture, picture + np.uint8(1)) == pytest.approx(48.1308036086791, abs=1e-12)
-
-
 @settings(max_examples=25, deadline=None)
 @given(one=pictures, two=pictures)
 def test_scores_do_not_depend_on_which_is_the_target_nor_on_a_mirror(one, two):
     assert psnr_db(one, two) == psnr_db(two, one) == psnr_db(one[..., ::-1], two[..., ::-1])
     assert ssim(one, two) == ssim(two, one)
     assert ssim(one, two) == pytest.approx(ssim(one[:, ::-1], two[:, ::-1]), abs=1e-12)
-    assert -1 <= ssim(one, two) <= 1
-
-
-@settings(max_examples=25, deadline=None)
-@given(picture=pictures)
-def test_a_picture_is_infinitely_and_wholly_like_itself(picture):
-    assert psnr_db(picture, picture) == math.inf
-    assert ssim(picture, picture) == 1
+    assert -1 <= ssim(one, two) <= ssim(one, one) == 1
+    assert psnr_db(one, one) == math.inf
 
 
 def test_a_picture_below_the_window_has_no_ssim():
@@ -110,9 +94,3 @@ def test_without_opencv_ssim_names_the_extra(monkeypatch):
 
     with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[evaluation\]'"):
         ssim(picture, picture)
-
-
-def test_every_choice_is_named():
-    assert PSNR_SETTINGS["data_range"] == SSIM_SETTINGS["data_range"] == 255
-    assert (SSIM_SETTINGS["window_px"], SSIM_SETTINGS["sigma_px"]) == (11, 1.5)
-    assert (SSIM_SETTINGS["k1"], SSIM_SETTINGS["k2"]) == (0.01, 0.03)

@@ -1,14 +1,12 @@
 """Plots: one of each metric that has numbers, of one tier alone."""
 
-import math
-
 import numpy as np
 import pytest
 from PIL import Image
 
-from stereogenbench_data import EvaluationError, EvaluationProtocol, score_controls
+from stereogenbench_data import EvaluationProtocol, score_controls
 from stereogenbench_data.evaluation.plots import write_plots
-from tests.evaluation.conftest import SIZE, scored
+from tests.evaluation.conftest import SIZE
 
 
 @pytest.fixture(scope="module")
@@ -34,14 +32,3 @@ def test_a_metric_without_a_finite_number_has_no_plot(results, tmp_path):
     files = write_plots(tmp_path, results[:1])
 
     assert "psnr_by_baseline.png" not in [path.name for path in files]
-
-
-def test_methods_of_two_tiers_are_not_drawn_together(scored_index, tmp_path, protocol):
-    both = [
-        scored(scored_index, lambda inputs: inputs["left"], protocol, tier=tier, frames=[0])
-        for tier in ("G1", "G2")
-    ]
-
-    assert not math.isnan(both[0].pairs[0].tallies["psnr"].mean)
-    with pytest.raises(EvaluationError, match=r"cannot share a table: their tier differs"):
-        write_plots(tmp_path, both)

@@ -64,16 +64,10 @@ def test_an_items_name_tells_neither_scene_nor_cameras_and_differs_for_each():
     assert all(len(name) == 16 and set(name) <= set("0123456789abcdef") for name in names)
 
 
-def test_pictures_are_found_by_item(item, tmp_path):
+@pytest.mark.parametrize("place", [item_name(SCENE, (0, 1)), f"{SCENE}/00-01"])
+def test_pictures_are_found_by_item_and_by_scene_and_cameras(tmp_path, place):
     for frame in (0, 2):
-        write_png(item, frame, picture(10 + frame))
-
-    assert levels(find_prediction(tmp_path, WANTED)) == [10, 12]
-
-
-def test_pictures_are_found_by_scene_and_cameras(tmp_path):
-    for frame in (0, 2):
-        write_png(tmp_path / SCENE / "00-01", frame, picture(10 + frame))
+        write_png(tmp_path / place, frame, picture(10 + frame))
 
     assert levels(find_prediction(tmp_path, WANTED)) == [10, 12]
 
@@ -121,98 +115,68 @@ def test_two_predictions_of_one_pair_are_refused(item, tmp_path):
         find_prediction(tmp_path, WANTED)
 
 
-def test_a_missing_frame_is_named(item):
-    write_png(item, 0, picture(1))
-
-    with pytest.raises(PredictionError, match=r"lacks 1 of 2 frames, the first is 002\.png"):
-        read(item)
+NOISE = np.random.default_rng(0).integers(0, 256, (8, 16, 3), dtype=np.uint8)
 
 
-def test_a_frame_beyond_the_scene_is_named(item):
-    for frame in (0, 1, 2, 3):
-        write_png(item, frame, picture(1))
-
-    with pytest.raises(PredictionError, match=r"holds 003\.png, and the scene has 3 frames"):
-        read(item)
+def pictures(pixels, frames=(0, 2)):
+    return lambda item: [write_png(item, frame, pixels) for frame in frames]
 
 
-def test_a_picture_of_another_size_is_named_with_those_that_would_do(item):
-    for frame in (0, 2):
-        write_png(item, frame, picture(1, size=(9, 16)))
+def last_picture(change):
+    """Write pictures of which the last is cut, overwritten or gone."""
 
-    with pytest.raises(
-        PredictionError, match=r"000\.png is 16x9; expected 16x8, or the scene's own 32x32"
-    ):
-        read(item)
+    def write(item):
+        pictures(NOISE)(item)
+        (item / "002.png").write_bytes(change((item / "002.png").read_bytes()))
 
-
-@pytest.mark.parametrize(("mode", "shape"), [("L", (8, 16)), ("RGBA", (8, 16, 4))])
-def test_pictures_without_three_channels_are_refused(item, mode, shape):
-    for frame in (0, 2):
-        write_png(item, frame, np.zeros(shape, dtype=np.uint8))
-
-    with pytest.raises(PredictionError, match=rf"pixels of mode {mode} of 8 bits: write 8-bit RGB"):
-        read(item)
+    return write
 
 
-def test_pictures_of_16_bits_are_refused_not_halved(item):
+def wide_numbers(item):
     item.mkdir()
     for frame in (0, 2):
         cv2.imwrite(str(item / frame_name(frame)), np.full((8, 16, 3), 300, dtype=np.uint16))
 
-    with pytest.raises(PredictionError, match=r"000\.png has pixels of mode RGB of 16 bits"):
-        read(item)
 
-
-def test_a_link_to_nowhere_is_a_picture_that_cannot_be_read(item):
-    write_png(item, 0, picture(1))
+def link_to_nowhere(item):
+    pictures(NOISE, frames=[0])(item)
     (item / frame_name(2)).symlink_to(item / "gone.png")
 
-    assert stamp_prediction(item)
-    with pytest.raises(PredictionError, match=r"002\.png cannot be read as a picture"):
-        read(item, 2)
+
+def video(levels, **options):
+    return lambda item: write_video(item.with_name(f"{item.name}.mkv"), levels, **options)
 
 
-@pytest.mark.parametrize("damage", ["cut", "text", "payload"])
-def test_a_damaged_picture_is_named(item, damage):
-    noise = np.random.default_rng(0).integers(0, 256, (8, 16, 3), dtype=np.uint8)
-    for frame in (0, 2):
-        write_png(item, frame, noise)
-    path = item / "002.png"
-    content = path.read_bytes()
-    changed = {
-        "cut": content[: len(content) // 2],
-        "text": b"not a picture",
-        "payload": content[:60] + bytes(40) + content[100:],
-    }
-    path.write_bytes(changed[damage])
-
-    with pytest.raises(PredictionError, match=r"00-01: .*002\.png cannot be read as a picture"):
-        read(item, 2)
-
-
-def test_a_video_of_another_number_of_frames_is_named_with_those_that_would_do(item):
-    path = write_video(item.with_name(f"{item.name}.mkv"), [1, 2, 3, 4])
-
-    with pytest.raises(
-        PredictionError, match=r"holds 4 frames; expected 3 \(the scene's\) or 2 \(those evaluated"
-    ):
-        read(path)
-
-
-def test_a_video_of_another_size_is_named(item):
-    path = write_video(item.with_name(f"{item.name}.mkv"), [1, 2], size=(16, 16))
-
-    with pytest.raises(PredictionError, match=r"is 16x16; expected 16x8"):
-        read(path)
-
-
-def test_a_cut_video_is_named(item):
-    path = write_video(item.with_name(f"{item.name}.mkv"), [1, 2])
+def cut_video(item):
+    path = video([1, 2])(item)
     path.write_bytes(path.read_bytes()[:200])
 
-    with pytest.raises(PredictionError, match=rf"{SCENE}, cameras 00-01: .*\.mkv"):
-        levels(path)
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (pictures(NOISE, frames=[0]), r"lacks 1 of 2 frames, the first is 002\.png"),
+        (pictures(NOISE, frames=range(4)), r"holds 003\.png, and the scene has 3 frames"),
+        (pictures(np.zeros((9, 16, 3), np.uint8)),
+         r"000\.png is 16x9; expected 16x8, or the scene's own 32x32"),
+        (pictures(np.zeros((8, 16), np.uint8)), r"mode L of 8 bits: write 8-bit RGB"),
+        (pictures(np.zeros((8, 16, 4), np.uint8)), r"mode RGBA of 8 bits: write 8-bit RGB"),
+        (wide_numbers, r"000\.png has pixels of mode RGB of 16 bits"),
+        (link_to_nowhere, r"002\.png cannot be read as a picture"),
+        (last_picture(lambda content: content[: len(content) // 2]), r"002\.png cannot be read"),
+        (last_picture(lambda content: b"not a picture"), r"002\.png cannot be read as a picture"),
+        (last_picture(lambda content: content[:60] + bytes(40) + content[100:]),
+         r"002\.png cannot be read as a picture"),
+        (video([1, 2, 3, 4]), r"4 frames; expected 3 \(the scene's\) or 2 \(those evaluated"),
+        (video([1, 2], size=(16, 16)), r"is 16x16; expected 16x8"),
+        (cut_video, r"\.mkv"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_a_prediction_is_named_with_its_place(item, tmp_path, write, message):
+    write(item)
+
+    with pytest.raises(PredictionError, match=rf"{SCENE}, cameras 00-01: .*{message}"):
+        levels(find_prediction(tmp_path, WANTED))
 
 
 def test_a_stamp_changes_with_the_files(item):

@@ -1,6 +1,5 @@
 """The paper's tables as data: cells read off the paper, sums that it states, its discrepancies."""
 
-import math
 import re
 
 import pytest
@@ -49,16 +48,6 @@ def test_the_bins_of_every_method_cover_the_281_scenes():
 
         assert [int(row["n_scenes"]) for row in rows] == [52, 65, 70, 55, 39]
         assert [row["baseline"] for row in rows] == list(BASELINE_BINS)[1:6]
-
-
-def test_every_number_is_one():
-    for name in SOURCES:
-        for row in reference_table(name):
-            numbers = [
-                value for key, value in row.items() if key in ("psnr", "ssim", "sd") and value
-            ]
-
-            assert all(not math.isnan(float(number)) for number in numbers)
 
 
 def test_bins_and_branches_differ_by_what_the_note_says():

@@ -10,12 +10,9 @@ from PIL import Image
 from scipy.stats import linregress
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.frame_metrics import MetricModels, TargetFrame
 from stereogenbench_data.evaluation.metrics.scale import fit_scale, scale_settings
 from stereogenbench_data.evaluation.models.interfaces import StereoMatcher
 from stereogenbench_data.evaluation.models.opencv import Sgbm
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol
-from stereogenbench_data.evaluation.scene_scores import PairScorer
 from tests.evaluation.conftest import photograph
 
 METHODS = ("filtered", "least_squares")
@@ -29,9 +26,7 @@ def truth():
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize(
-    ("factor", "slope", "drift"), [(1, 1, 0), (2, 0.5, 0.5), (0.5, 2, 1), (-1, -1, 2)]
-)
+@pytest.mark.parametrize(("factor", "slope", "drift"), [(2, 0.5, 0.5), (-1, -1, 2)])
 def test_a_disparity_that_is_scaled_drifts_by_its_inverse(truth, method, factor, slope, drift):
     fit = fit_scale(factor * truth, truth, scored=EVERYWHERE, method=method)
 
@@ -41,41 +36,6 @@ def test_a_disparity_that_is_scaled_drifts_by_its_inverse(truth, method, factor,
     assert (fit.pixels, fit.outliers) == (600, 0)
     assert fit.valid == fit.answered == 1
     assert fit.r2 == pytest.approx(1)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_an_offset_is_distinguished_from_a_scale(truth, method):
-    fit = fit_scale(truth / 2 + 1000, truth, scored=EVERYWHERE, method=method)
-
-    assert fit.slope == pytest.approx(2, abs=1e-4)
-    assert fit.offset_px == pytest.approx(-2000, abs=0.1)
-
-
-def test_least_squares_are_those_of_numpy(truth):
-    noisy = truth + np.random.default_rng(1).normal(0, 3, SIZE).astype(np.float32)
-    slope, offset = np.polyfit(noisy.ravel().astype(float), truth.ravel().astype(float), 1)
-    residual = truth - slope * noisy - offset
-
-    fit = fit_scale(noisy, truth, scored=EVERYWHERE, method="least_squares")
-
-    assert fit.slope == pytest.approx(slope, abs=1e-6)
-    assert fit.offset_px == pytest.approx(offset, abs=1e-5)
-    assert fit.residual_px == pytest.approx(residual.std(), abs=1e-5)
-    assert fit.r2 == pytest.approx(np.corrcoef(noisy.ravel(), truth.ravel())[0, 1] ** 2, abs=1e-5)
-
-
-def test_few_gross_outliers_ruin_least_squares_and_are_left_out_by_the_filter(truth):
-    estimated = 2 * truth
-    estimated.reshape(-1)[::50] += 200
-
-    plain = fit_scale(estimated, truth, scored=EVERYWHERE, method="least_squares")
-    filtered = fit_scale(estimated, truth, scored=EVERYWHERE)
-
-    assert plain.drift > 0.7
-    assert filtered.drift == pytest.approx(0.5, abs=1e-3)
-    assert (filtered.pixels, filtered.outliers) == (588, 12 / 600)
-    assert filtered.valid == pytest.approx(588 / 600)
-    assert filtered.answered == 1
 
 
 def test_both_fits_are_those_worked_by_hand():
@@ -98,7 +58,7 @@ def test_both_fits_are_those_worked_by_hand():
     assert (plain.pixels, plain.outliers) == (200, 0)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_both_fits_are_those_of_scipy_with_and_without_what_lies_off_the_line(seed):
     rng = np.random.default_rng(seed)
     true = rng.uniform(3, 40, SIZE)
@@ -114,7 +74,12 @@ def test_both_fits_are_those_of_scipy_with_and_without_what_lies_off_the_line(se
     assert plain.slope == pytest.approx(whole.slope, rel=1e-9)
     assert plain.offset_px == pytest.approx(whole.intercept, rel=1e-9)
     assert plain.r2 == pytest.approx(whole.rvalue**2, rel=1e-9)
+    assert plain.residual_px == pytest.approx(
+        (true - plain.slope * estimated - plain.offset_px).std(), abs=1e-5
+    )
     assert filtered.outliers == 60 / 600
+    assert filtered.valid == pytest.approx(540 / 600)
+    assert filtered.answered == 1
     assert filtered.slope == pytest.approx(inliers.slope, rel=1e-9)
     assert filtered.offset_px == pytest.approx(inliers.intercept, rel=1e-9)
     assert filtered.drift < 0.21
@@ -130,18 +95,6 @@ def test_an_unrelated_disparity_drifts_by_about_1(method):
 
     assert fit.drift == pytest.approx(1, abs=0.05)
     assert abs(fit.r2) < 0.01
-
-
-def test_noise_of_the_matcher_alone_makes_the_slope_smaller_as_the_variances_say():
-    rng = np.random.default_rng(3)
-    truth = rng.normal(20, 2, (300, 300))
-    estimated = truth + rng.normal(0, 1, (300, 300))
-
-    fit = fit_scale(
-        estimated, truth, scored=np.ones((300, 300), dtype=bool), method="least_squares"
-    )
-
-    assert fit.slope == pytest.approx(2**2 / (2**2 + 1**2), abs=0.01)
 
 
 @given(factor=st.floats(0.1, 10), offset=st.floats(-50, 50))
@@ -189,33 +142,6 @@ def test_a_few_answers_of_a_large_picture_are_no_scale():
 
     assert math.isnan(fit.drift)
     assert fit.answered == pytest.approx(0.005)
-
-
-@pytest.mark.parametrize(("outliers", "filtered", "least_squares"), [(0, 0.5, 0.5), (30, 0.5, 1.0)])
-def test_a_frames_record_has_sd_by_every_fit_of_one_estimate(
-    truth, outliers, filtered, least_squares
-):
-    estimated = 2 * truth
-    estimated.reshape(-1)[:outliers] += 900
-    calls = []
-    models = MetricModels(EvaluationProtocol(metrics=("sd",)))
-    models.stereo_matcher = lambda left, right: calls.append(1) or estimated
-    picture = np.zeros((3, *SIZE), dtype=np.uint8)
-    sample = {
-        "left": picture, "right": picture, "disparity": truth[None], "visible": EVERYWHERE[None],
-    }  # fmt: skip
-    frame = TargetFrame(sample, None, load_stored=lambda: sample)
-    scorer = PairScorer(models, lambda wanted, samples: [picture], wanted=None)
-
-    scorer.add([frame])
-    columns = scorer.scores().columns
-
-    assert tuple(columns) == models.protocol.columns
-    assert columns["sd_filtered"] == [pytest.approx(filtered, abs=1e-3)]
-    assert columns["sd_least_squares"] == [pytest.approx(least_squares, abs=0.02)]
-    assert columns["sd_filtered_outliers"] == [outliers / 600]
-    assert columns["sd_least_squares_outliers"] == [0]
-    assert len(calls) == 1
 
 
 @pytest.fixture(scope="module")

@@ -46,15 +46,3 @@ def test_scores_fall_from_bin_to_bin_of_baseline(warp_and_fill):
 
             assert len(means) == bins
             assert means == sorted(means, reverse=True), (subset, column)
-
-
-def test_scores_fall_with_the_baseline_on_a_scene_rendered_elsewhere(warp_and_fill, shared_scenes):
-    scores = evaluate(
-        shared_scenes, warp_and_fill, tier="G0", pairs="all", frames="first",
-        protocol=EvaluationProtocol(metrics=("psnr", "ssim"), size=(320, 320)),
-    )  # fmt: skip
-    table = next(table for table in tables_of([scores]) if table.name == "bins_all")
-    means = [row.values["psnr"].mean for row in table.rows]
-
-    assert len(means) == 6
-    assert means == sorted(means, reverse=True)

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from stereogenbench_data.audit.contract.fitting import voted_scale
+from stereogenbench_data.audit.contract.fitting import voted
 from stereogenbench_data.audit.contract.hypotheses import LAGS, Hypothesis, Question
 from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames
 from stereogenbench_data.audit.contract.scoring import Pair, ScoredContract, sample_along_rows
@@ -295,18 +295,6 @@ class CameraComparison:
         is_ahead = explained > _LEAST_LEAD * counts[second][0]
         return first if is_ahead and explained > (usual - _LEAST_DEFICIT) * found else 0
 
-    def _joined(
-        self, matches: Sequence[FrameMatch], hypothesis: Hypothesis
-    ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-        """Return the disparities of matches, found and predicted."""
-        found, predicted = [np.zeros(0)], [np.zeros(0)]
-        for match in matches:
-            prediction = self._views.predicted(match, hypothesis)
-            if prediction is not None:
-                found.append(match.matched_px[prediction[1]])
-                predicted.append(prediction[0][prediction[1]])
-        return np.concatenate(found), np.concatenate(predicted)
-
     def _depth_problems(
         self, scales: Sequence[float], scale_problems: dict[int, str], *, beside: set[int]
     ) -> dict[int, str]:
@@ -387,7 +375,7 @@ class CameraComparison:
         is multiplied by ``factor``; another form of depth has a factor of its own.
         """
         if hypothesis.form != self._contract.hypothesis.form:
-            factor = voted_scale(*self._joined(matches, hypothesis)) / self._contract.scale
+            factor = voted(self._views, matches, hypothesis)[0] / self._contract.scale
         shares = np.full(len(matches), np.nan)
         for place, match in enumerate(matches):
             predicted = self._views.predicted(match, hypothesis, depth_file=file)

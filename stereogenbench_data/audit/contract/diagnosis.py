@@ -14,7 +14,7 @@ from stereogenbench_data.audit.contract.fitting import (
     RayPower,
     fit_hypothesis,
     ray_power,
-    voted_agreement,
+    voted,
 )
 from stereogenbench_data.audit.contract.hypotheses import QUESTIONS, Hypothesis, Question
 from stereogenbench_data.audit.contract.matching import (
@@ -74,20 +74,18 @@ class SceneDiagnosis:
             right of the other; else None.
         declared: The declared answers.
         best: The answers of the best contract.
+        problem: Why the scene could not be judged; empty if it could.
         changed: What else the best contract changes: the scale, the offset, or both.
         scale: Found over declared disparity, fitted with the best contract's answers.
         scale_error: Standard error of log(scale).
         other_kind_scale: Scale with the other kind of depth, all else as in the best contract.
         offsets_px: Constant disparity of each pair with the best contract.
         gain: By how much the best contract is better than the declared one.
-        parallax: By how much it is better than no disparity at all.
-        agreement: Share of the matches of neighbouring cameras that the best contract explains.
         rivals: The other answers.
         disparity_px: Root mean square of the disparities found.
         spread_px: The same, less the mean of each view.
         depth_step: The `relative_step` of stored depths.
         check: How well each camera fits the best contract.
-        problem: Why the scene could not be judged; empty if it could.
     """
 
     key: str
@@ -100,20 +98,18 @@ class SceneDiagnosis:
     recorded_pair: Pair | None
     declared: Hypothesis
     best: Hypothesis
+    problem: str = ""
     changed: Free = NOTHING
     scale: float = 1.0
     scale_error: float = math.inf
     other_kind_scale: float = math.nan
     offsets_px: dict[Pair, float] = field(default_factory=dict)
     gain: Evidence = _NOTHING
-    parallax: Evidence = _NOTHING
-    agreement: float = math.nan
     rivals: tuple[Rival, ...] = ()
     disparity_px: float = math.inf
     spread_px: float = math.inf
     depth_step: float = 0.0
     check: CameraCheck = field(default_factory=CameraCheck)
-    problem: str = ""
 
     @property
     def fits_scale(self) -> bool:
@@ -235,7 +231,7 @@ class ContractSearch:
         if current not in self._likely:
             orders = current.alternatives("order")
             few = [match for match in self._matches if match.frame == self._matches[0].frame]
-            shares = {order: voted_agreement(self._views, few, order) for order in orders}
+            shares = {order: voted(self._views, few, order)[1] for order in orders}
             best = sorted(orders, key=lambda order: -shares[order])[:_PROMISING]
             self._likely[current] = tuple(best)
         return self._likely[current]
@@ -390,53 +386,57 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
     matches = views.frame_matches(frames=frames)
     file = views.primary[0]
     declared = Hypothesis.declared(views.encoding)
-    basics: dict[str, Any] = {
-        "key": views.scene.id.key,
-        "views": len(matches) // 2,
-        "pairs": tuple(views.chosen_pairs(Hypothesis())),
-        "matches": sum(len(match.rows) for match in matches[::2]),
-        "textured": sum(match.textured for match in matches[::2]),
-        "unit_m": views.unit_m(file),
-        "unit_source": (
+    scene = SceneDiagnosis(
+        key=views.scene.id.key,
+        views=len(matches) // 2,
+        pairs=tuple(views.chosen_pairs(Hypothesis())),
+        matches=sum(len(match.rows) for match in matches[::2]),
+        textured=sum(match.textured for match in matches[::2]),
+        unit_m=views.unit_m(file),
+        unit_source=(
             views.encoding.source if views.encoding.unit_m else views.scene.depth_unit_source[file]
         ),
-        "recorded_pair": crossed_pair(views.scene),
-        "declared": declared,
-    }
-    if basics["matches"] < FEWEST_MATCHES:
+        recorded_pair=crossed_pair(views.scene),
+        declared=declared,
+        best=declared,
+    )
+    if scene.matches < FEWEST_MATCHES:
         problem = (
-            f"no texture: {basics['textured']:,} pixels have any, and "
-            f"{basics['matches']:,} were found in both pictures"
+            f"no texture: {scene.textured:,} pixels have any, and {scene.matches:,} were found in "
+            f"both pictures"
         )
-        return SceneDiagnosis(**basics, best=declared, problem=problem)
+        return replace(scene, problem=problem)
     units, known = views.depth(matches[0].frame, file)
-    step = basics["depth_step"] = relative_step(units[known])
-    if step > _COARSEST_STEP:
-        problem = f"stored depth is too coarse: its steps are {step:.0%} of it"
-        return SceneDiagnosis(**basics, best=declared, problem=problem)
-    basics |= {"disparity_px": disparity_px(matches), "spread_px": spread_px(matches)}
-    if basics["disparity_px"] < _LEAST_PARALLAX_PX:
-        problem = f"too little parallax: disparities are of {basics['disparity_px']:.2f} px"
-        return SceneDiagnosis(**basics, best=declared, problem=problem)
-    search = ContractSearch(views, matches, least_log_scale=allowed_log_scale(step))
-    best, check = _checked(search, search.best(), depth_step=step)
-    parallax = search.without_parallax(best)
-    if math.isnan(check.agreement) or not parallax.is_clear():
+    scene = replace(
+        scene,
+        depth_step=relative_step(units[known]),
+        disparity_px=disparity_px(matches),
+        spread_px=spread_px(matches),
+    )
+    if scene.depth_step > _COARSEST_STEP:
+        problem = f"stored depth is too coarse: its steps are {scene.depth_step:.0%} of it"
+        return replace(scene, problem=problem)
+    if scene.disparity_px < _LEAST_PARALLAX_PX:
+        problem = f"too little parallax: disparities are of {scene.disparity_px:.2f} px"
+        return replace(scene, problem=problem)
+    search = ContractSearch(views, matches, least_log_scale=allowed_log_scale(scene.depth_step))
+    best, check = _checked(search, search.best(), depth_step=scene.depth_step)
+    if math.isnan(check.agreement):
+        problem = "no depth: too few of the pixels that were found in both pictures have any"
+        return replace(scene, problem=problem)
+    if not search.without_parallax(best).is_clear():
         problem = (
-            "no depth: too few of the pixels that were found in both pictures have any"
-            if math.isnan(check.agreement)
-            else f"nothing fits: of disparities of {basics['disparity_px']:.1f} px the best "
-            f"contract explains {check.agreement:.0%} to a pixel, and pictures no better than "
-            f"none does"
+            f"nothing fits: of disparities of {scene.disparity_px:.1f} px the best contract "
+            f"explains {check.agreement:.0%} to a pixel, and pictures no better than none does"
         )
-        return SceneDiagnosis(**basics, best=declared, parallax=parallax, problem=problem)
+        return replace(scene, problem=problem)
     (other_kind,) = best.hypothesis.alternatives("kind")
     with_scale, of_other_kind = (
         search.candidate(hypothesis, free=best.free | SCALE)
         for hypothesis in (best.hypothesis, other_kind)
     )
-    return SceneDiagnosis(
-        **basics,
+    return replace(
+        scene,
         best=best.hypothesis,
         changed=best.free,
         scale=with_scale.scale,
@@ -444,8 +444,6 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         other_kind_scale=of_other_kind.scale,
         offsets_px=search.candidate(best.hypothesis, free=best.free | OFFSET).offsets_px,
         gain=search.gain(best, search.declared),
-        parallax=parallax,
-        agreement=check.agreement,
         check=check,
         rivals=search.rivals(best),
     )

@@ -107,15 +107,16 @@ def _pairs(terms: Iterable[_Term]) -> list[Pair]:
     return list(dict.fromkeys(term.match.pair for term in terms))
 
 
-def voted_agreement(
+def voted(
     views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis
-) -> float:
-    """Return how many matches a hypothesis explains at the scale that most of them agree on."""
+) -> tuple[float, float]:
+    """Return the scale of a hypothesis that most matches agree on, and how many it explains."""
     terms = _fit_terms(views, matches, hypothesis)
     if not terms:
-        return 0.0
+        return 1.0, 0.0
     found, predicted = _joined(terms)
-    return _agreement(found, voted_scale(found, predicted) * predicted)
+    scale = _voted_scale(found, predicted)
+    return scale, _agreement(found, scale * predicted)
 
 
 def _joined(terms: Iterable[_Term]) -> tuple[Points, Points]:
@@ -129,7 +130,7 @@ def _joined(terms: Iterable[_Term]) -> tuple[Points, Points]:
 
 def _start(terms: Sequence[_Term], *, free: Free) -> _Lengths:
     """Return a scale and offsets from the matches alone."""
-    scale = voted_scale(*_joined(terms)) if "scale" in free else 1.0
+    scale = _voted_scale(*_joined(terms)) if "scale" in free else 1.0
     offsets_px = {}
     for pair in _pairs(terms) if "offset" in free else ():
         found, predicted = _joined(term for term in terms if term.match.pair == pair)
@@ -143,7 +144,7 @@ def _agreement(found: Points, predicted: Points) -> float:
     return float((1 / (1 + away * away)).sum())
 
 
-def voted_scale(found: Points, predicted: Points) -> float:
+def _voted_scale(found: Points, predicted: Points) -> float:
     """Return the scale, among those that the ratios propose, on which most matches agree."""
     usable = (found * predicted > 0) & (np.abs(found) > 0.1)
     if not usable.any():

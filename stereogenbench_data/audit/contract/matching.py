@@ -12,7 +12,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt16
@@ -374,21 +374,36 @@ class SceneFrames:
         self, frame: int, left: int, right: int, row_matches: RowMatches
     ) -> tuple[FrameMatch, FrameMatch]:
         """Return one set of matches from both sides, so that both cameras' depth is tested."""
-        here, there = self.band(frame, left), self.band(frame, right)
         keep = np.arange(len(row_matches.rows))
         if len(keep) > _MOST_POINTS:
             keep = np.sort(np.random.default_rng(0).choice(keep, _MOST_POINTS, replace=False))
         rows, columns = row_matches.rows[keep], row_matches.columns[keep]
         matched_px = row_matches.disparity_px[keep].astype(np.float64)
-        width = here.shape[1]
+        height, width = self.band(frame, left).shape
         found = np.clip(np.rint(columns - matched_px), 0, width - 1).astype(np.int64)
-        counts: dict[str, Any] = {
-            "frame": frame, "textured": row_matches.textured, "grain_px": row_matches.grain_px
-        }  # fmt: skip
-        return (
-            _frame_match(here, rows, columns, matched_px, left=left, right=right, **counts),
-            _frame_match(there, rows, found, -matched_px, left=right, right=left, **counts),
-        )
+        sides = []
+        for file, other, at, away_px in (
+            (left, right, columns, matched_px), (right, left, found, -matched_px),
+        ):  # fmt: skip
+            band = self.band(frame, file)
+            after, before = np.minimum(at + 1, width - 1), np.maximum(at - 1, 0)
+            sides.append(
+                FrameMatch(
+                    frame=frame,
+                    left=file,
+                    right=other,
+                    rows=rows,
+                    columns=at,
+                    matched_px=away_px,
+                    brightness=band[rows, at],
+                    slope=(band[rows, after] - band[rows, before]) / 2,
+                    cells=rows * SIDE_CELLS // height * SIDE_CELLS + at * SIDE_CELLS // width,
+                    cap=2 * float((band[rows, at] ** 2).mean()) if len(rows) else 1.0,
+                    textured=row_matches.textured,
+                    grain_px=row_matches.grain_px,
+                )
+            )
+        return sides[0], sides[1]
 
     def predicted(
         self, match: FrameMatch, hypothesis: Hypothesis, *, depth_file: int | None = None
@@ -413,30 +428,15 @@ class SceneFrames:
         if not 0 <= frame < self.scene.frames:
             return None
         units, known = self._numbers(match, frame=frame, file=file)[hypothesis.flip]
-        number = np.where(known, units, 1).astype(np.float64)
-        place = match.rows, match.columns
-        disparity_px = self.disparity_of(number, match, hypothesis, place=place, file=file)
-        disparity_px.flags.writeable = known.flags.writeable = False
-        return disparity_px, known
-
-    def disparity_of(
-        self,
-        number: Points,
-        match: FrameMatch,
-        hypothesis: Hypothesis,
-        *,
-        place: tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]],
-        file: int,
-    ) -> Points:
-        """Return the disparity between a match's files by stored depths."""
-        unit_m = self.unit_m(file)
+        number, unit_m = np.where(known, units, 1).astype(np.float64), self.unit_m(file)
         offset_m = self.scene.depth_encoding(file, self.encoding).offset_m
         is_depth = hypothesis.form == "depth"
         per_m = 1 / (offset_m + unit_m * number) if is_depth else number / unit_m
         if hypothesis.kind == "ray":
-            per_m *= self.ray_per_planar[place]
-        disparity_px: Points = self.intrinsics.fx_px * self.baseline_m(match, hypothesis) * per_m
-        return disparity_px
+            per_m *= self.ray_per_planar[match.rows, match.columns]
+        disparity_px = self.intrinsics.fx_px * self.baseline_m(match, hypothesis) * per_m
+        disparity_px.flags.writeable = known.flags.writeable = False
+        return disparity_px, known
 
     def baseline_m(self, match: FrameMatch, hypothesis: Hypothesis) -> float:
         """Return the signed baseline of a match's two files."""
@@ -446,29 +446,6 @@ class SceneFrames:
         lateral_m = self.scene.lateral_m
         baseline_m = lateral_m[right] - lateral_m[left]
         return -baseline_m if hypothesis.is_mirrored else baseline_m
-
-
-def _frame_match(
-    here: Luma,
-    rows: Int64[np.ndarray, " n"],
-    columns: Int64[np.ndarray, " n"],
-    matched_px: Points,
-    **counts: Any,
-) -> FrameMatch:
-    """Return a match of a band-passed picture; ``counts`` are the other fields."""
-    brightness = here[rows, columns]
-    height, width = here.shape
-    after, before = np.minimum(columns + 1, width - 1), np.maximum(columns - 1, 0)
-    return FrameMatch(
-        **counts,
-        rows=rows,
-        columns=columns,
-        matched_px=matched_px,
-        brightness=brightness,
-        slope=(here[rows, after] - here[rows, before]) / 2,
-        cells=rows * SIDE_CELLS // height * SIDE_CELLS + columns * SIDE_CELLS // width,
-        cap=2 * float((brightness**2).mean()) if len(rows) else 1.0,
-    )
 
 
 def disparity_px(matches: Sequence[FrameMatch]) -> float:

@@ -1,6 +1,7 @@
 """The doctor's picture: one pair warped by the declared and by the best contract."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -13,6 +14,7 @@ from stereogenbench_data.audit.contract.hypotheses import Hypothesis
 from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames
 from stereogenbench_data.audit.scene_access import source_of
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.geometry.projection import Projection, backward_warp
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.picture import (
     ColourScale,
@@ -91,7 +93,7 @@ def _view_tiles(
         ("left", left, "declared", diagnosis.declared, (1.0, 0.0)),
         ("right", right, "best", diagnosis.best, (best_scale, shift_px)),
     ):
-        warped, known = _warped(views, match, hypothesis, right, *lengths)
+        warped, known = _warped(views, match, hypothesis, *lengths)
         away = np.abs(left.astype(np.float32) - warped).mean(axis=-1)
         painted = _DIFFERENCES.paint(away, measured=known)
         rows.append([
@@ -103,32 +105,18 @@ def _view_tiles(
 
 
 def _warped(
-    views: SceneFrames,
-    match: FrameMatch,
-    hypothesis: Hypothesis,
-    right: UInt8[np.ndarray, "h w 3"],
-    scale: float,
-    shift_px: float,
+    views: SceneFrames, match: FrameMatch, hypothesis: Hypothesis, scale: float, shift_px: float
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """Return the right picture warped to the left, and where depth and picture are known."""
-    height, width = right.shape[:2]
-    rows, columns = np.divmod(np.arange(height * width), width)
-    everywhere = FrameMatch(
-        frame=match.frame, left=match.left, right=match.right,
-        rows=rows, columns=columns,
-        matched_px=np.zeros(0), brightness=np.zeros(0, np.float32),
-        slope=np.zeros(0, np.float32), cells=np.zeros(0, np.int64), cap=1.0, textured=0,
-    )  # fmt: skip
-    white = np.full((height * width, 3), _NOT_KNOWN, dtype=np.uint8)
-    predicted = views.predicted(everywhere, hypothesis)
+    size = views.intrinsics.height_px, views.intrinsics.width_px
+    rows, columns = np.indices(size).reshape(2, -1)
+    predicted = views.predicted(replace(match, rows=rows, columns=columns), hypothesis)
     if predicted is None:
-        return white.reshape(height, width, 3), np.zeros((height, width), dtype=bool)
+        return np.full((*size, 3), _NOT_KNOWN, dtype=np.uint8), np.zeros(size, dtype=bool)
     disparity_px, known = predicted
-    place = columns - scale * disparity_px - shift_px
-    inside = known & (place >= 0) & (place <= width - 1)
-    place = np.clip(place, 0, width - 2)
-    low = place.astype(np.int64)
-    part = (place - low)[:, None]
-    flat = right[rows, low] * (1 - part) + right[rows, low + 1] * part
-    white[inside] = flat[inside].round()
-    return white.reshape(height, width, 3), inside.reshape(height, width)
+    landing_px = (columns + 0.5 - scale * disparity_px - shift_px).reshape(size)
+    landing = Projection(u_px=landing_px, v_px=None, depth_m=np.ones(size))
+    warped, inside = backward_warp(views.rgb(match.frame, match.right), landing)
+    shown = known.reshape(size) & inside
+    pixels = channels_last(warped.round().astype(np.uint8))
+    return np.where(shown[..., None], pixels, np.uint8(_NOT_KNOWN)), shown

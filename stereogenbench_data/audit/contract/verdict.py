@@ -218,7 +218,7 @@ def _offset_answer(scenes: Sequence[SceneDiagnosis]) -> Answer:
         found = offset_words(first.offsets_px)
         return replace(blank, found=found, status="wrong", behind=gain, note=note)
     largest_px = max((abs(px) for scene in scenes for px in scene.offsets_px.values()), default=0.0)
-    if largest_px > LEAST_OFFSET_PX or math.isnan(first.agreement):
+    if largest_px > LEAST_OFFSET_PX or math.isnan(first.check.agreement):
         return replace(blank, note=f"fits up to {largest_px:.2g} px, none clearly better than 0")
     found = f"0 px (all pairs within {largest_px:.2f})"
     return replace(blank, found=found, status="not contradicted")
@@ -458,9 +458,9 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
         declared=declared,
         answers=answers,
         gain=pooled([scene.gain for scene in scenes]),
-        agreement=float(np.nanmean([scene.agreement for scene in scenes]))
-        if not first.problem
-        else math.nan,
+        agreement=math.nan
+        if first.problem
+        else float(np.nanmean([scene.check.agreement for scene in scenes])),
         encoding=pasted if is_sure else None,
         quotient=unit.metres / first.unit_m if is_measured else math.nan,
         quotient_error=unit.uncertainty if is_measured else math.nan,
