@@ -21,59 +21,30 @@ def clear():
 
 
 def box(name, size, centre, material, *, turn_deg=0.0):
-    x, y, z = (side / 2 for side in size)
-    corners = [(sx * x, sy * y, sz * z) for sx in (-1, 1) for sy in (-1, 1) for sz in (-1, 1)]
-    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    return item(name, corners, faces, centre, material, turn_deg=turn_deg)
+    turn = (0, 0, math.radians(turn_deg))
+    bpy.ops.mesh.primitive_cube_add(size=1, location=centre, scale=size, rotation=turn)
+    return finished(name, material)
 
 
-def item(name, corners, faces, centre, material, *, turn_deg=0.0):
-    mesh = bpy.data.meshes.new(name)
-    mesh.from_pydata([tuple(corner) for corner in corners], [], faces)
+def ball(name, radius, centre, material):
+    bpy.ops.mesh.primitive_uv_sphere_add(segments=12, ring_count=8, radius=radius, location=centre)
+    return finished(name, material)
+
+
+def finished(name, material):
+    """Name the object that was added, and lay texture coordinates in metres onto its faces."""
+    bpy.ops.object.transform_apply(location=False, rotation=False)
+    made, mesh = bpy.context.object, bpy.context.object.data
+    made.name = name
     mesh.materials.append(material)
-    project(mesh)
-    made = bpy.data.objects.new(name, mesh)
-    made.location = centre
-    made.rotation_euler = (0, 0, math.radians(turn_deg))
-    bpy.context.scene.collection.objects.link(made)
-    return made
-
-
-def project(mesh):
-    """Lay texture coordinates in metres onto each face."""
-    layer = mesh.uv_layers.new(name="UVMap")
+    layer = mesh.uv_layers.active or mesh.uv_layers.new()
     for face in mesh.polygons:
         drop = max(range(3), key=lambda axis: abs(face.normal[axis]))
         keep = [axis for axis in range(3) if axis != drop]
         for corner in face.loop_indices:
             place = mesh.vertices[mesh.loops[corner].vertex_index].co
             layer.data[corner].uv = (place[keep[0]] / 2, place[keep[1]] / 2)
-
-
-def ball(name, radius, centre, material):
-    rings, parts = 8, 12
-    corners = [(0, 0, radius)]
-    for ring in range(1, rings):
-        angle = math.pi * ring / rings
-        for part in range(parts):
-            turn = 2 * math.pi * part / parts
-            corners.append(
-                (
-                    radius * math.sin(angle) * math.cos(turn),
-                    radius * math.sin(angle) * math.sin(turn),
-                    radius * math.cos(angle),
-                )
-            )
-    corners.append((0, 0, -radius))
-    faces = [(0, 1 + part, 1 + (part + 1) % parts) for part in range(parts)]
-    for ring in range(rings - 2):
-        first = 1 + ring * parts
-        for part in range(parts):
-            after = (part + 1) % parts
-            faces.append((first + part, first + parts + part, first + parts + after, first + after))
-    last, first = len(corners) - 1, 1 + (rings - 2) * parts
-    faces += [(last, first + (part + 1) % parts, first + part) for part in range(parts)]
-    return item(name, corners, faces, centre, material)
+    return made
 
 
 def matte(name, colour):
@@ -87,26 +58,8 @@ def matte(name, colour):
     return material
 
 
-def noisy(name, colour, *, scale):
-    """A matte material with a procedural texture."""
-    material = matte(name, colour)
-    nodes, links = material.node_tree.nodes, material.node_tree.links
-    place = nodes.new("ShaderNodeTexCoord")
-    noise = nodes.new("ShaderNodeTexNoise")
-    noise.inputs["Scale"].default_value = scale
-    noise.inputs["Detail"].default_value = 3.0
-    ramp = nodes.new("ShaderNodeValToRGB")
-    ramp.color_ramp.elements[0].position, ramp.color_ramp.elements[1].position = 0.3, 0.7
-    ramp.color_ramp.elements[0].color = (*(0.25 * part for part in colour), 1)
-    ramp.color_ramp.elements[1].color = (*colour, 1)
-    links.new(place.outputs["Object"], noise.inputs["Vector"])
-    links.new(noise.outputs["Fac"], ramp.inputs["Fac"])
-    links.new(ramp.outputs["Color"], nodes["Principled BSDF"].inputs["Base Color"])
-    return material
-
-
 def pictured(name, colour, *, folder, seed):
-    """A matte material with a small picture, for files that hold no procedural textures."""
+    """A matte material with a small picture, which files of all kinds can hold."""
     side = 64
     rng = np.random.default_rng(seed)
     coarse = rng.uniform(0.35, 1.0, (8, 8))
@@ -121,9 +74,8 @@ def pictured(name, colour, *, folder, seed):
     material = matte(name, colour)
     node = material.node_tree.nodes.new("ShaderNodeTexImage")
     node.image = image
-    material.node_tree.links.new(
-        node.outputs["Color"], material.node_tree.nodes["Principled BSDF"].inputs["Base Color"]
-    )
+    shader = material.node_tree.nodes["Principled BSDF"]
+    material.node_tree.links.new(node.outputs["Color"], shader.inputs["Base Color"])
     return material
 
 
@@ -142,15 +94,17 @@ def make_yard(folder):
     """An open ground with crates, balls and posts under a sun."""
     clear()
     rng = random.Random(7)
-    ground = noisy("ground", (0.45, 0.4, 0.3), scale=3.0)
-    item("ground", [(-20, -20, 0), (20, -20, 0), (20, 20, 0), (-20, 20, 0)], [(0, 1, 2, 3)],
-         (0, 0, 0), ground)  # fmt: skip
-    walls = noisy("wall", (0.6, 0.35, 0.25), scale=2.0)
+    ground, walls, crates = (
+        pictured(name, colour, folder=folder, seed=seed)
+        for seed, (name, colour) in enumerate(
+            [("ground", (0.45, 0.4, 0.3)), ("wall", (0.6, 0.35, 0.25)), ("crate", (0.3, 0.45, 0.6))]
+        )
+    )
+    box("ground", (40, 40, 0.2), (0, 0, -0.1), ground)
     for number, (centre, size) in enumerate(
         [((0, 12, 2), (24, 0.4, 4)), ((0, -12, 2), (24, 0.4, 4)), ((12, 0, 2), (0.4, 24, 4))]
     ):
         box(f"wall{number}", size, centre, walls)
-    crates = noisy("crate", (0.3, 0.45, 0.6), scale=4.0)
     for number in range(10):
         angle, away = 2 * math.pi * number / 10 + rng.uniform(-0.2, 0.2), rng.uniform(5, 9)
         side = rng.uniform(0.5, 1.4)
@@ -175,6 +129,7 @@ def make_yard(folder):
     fan.keyframe_insert("rotation_euler", frame=1)
     fan.rotation_euler = (0, math.radians(180), 0)
     fan.keyframe_insert("rotation_euler", frame=49)
+    bpy.ops.file.pack_all()
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "yard.blend"), compress=True)
 
 
@@ -198,9 +153,6 @@ def make_room(folder):
     bpy.ops.export_scene.gltf(
         filepath=str(folder / "room.glb"), export_lights=True, export_format="GLB"
     )
-
-
-"""Parent, head, tail and radius of each bone."""
 
 
 def glowing(name, colour):
@@ -229,8 +181,12 @@ def make_screen(folder):
     links.new(holes.outputs[0], mix.inputs[1])
     links.new(nodes["Emission"].outputs[0], mix.inputs[2])
     links.new(mix.outputs[0], nodes["Material Output"].inputs["Surface"])
-    item("card", [(0.05, -2, 0), (0.05, 2, 0), (0.05, 2, 3), (0.05, -2, 3)], [(0, 1, 2, 3)],
-         (2, 0, 0.5), red)  # fmt: skip
+    # Off the plane where the checker's squares meet.
+    bpy.ops.mesh.primitive_plane_add(size=1, location=(0.05, 0, 1.5), rotation=(0, math.pi / 2, 0))
+    bpy.context.object.scale = (3, 4, 1)
+    bpy.ops.object.transform_apply()
+    bpy.context.object.location = (2, 0, 0.5)
+    bpy.context.object.data.materials.append(red)
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "screen.blend"), compress=True)
 
 
@@ -247,31 +203,27 @@ BONES = {
     "arm.R": ("spine", (-0.23, 0, 1.45), (-0.23, 0, 1.15), 0.05),
     "hand.R": ("arm.R", (-0.23, 0, 1.15), (-0.23, 0, 0.85), 0.045),
 }
+"""Parent, head, tail and radius of each bone."""
 
 
 def make_figure(folder):
     """A figure that faces -y, with the takes Walk (moves on), Turn and Fall (ends elsewhere)."""
     clear()
     cloth = pictured("cloth", (0.7, 0.3, 0.3), folder=folder, seed=3)
-    corners, faces, groups = [], [], []
+    parts = []
     for name, (_, head, tail, radius) in BONES.items():
         head, tail = Vector(head), Vector(tail)
-        for end in (head, tail):
-            for part in range(8):
-                angle = math.pi * part / 4
-                corners.append(end + radius * Vector((math.cos(angle), math.sin(angle), 0)))
-                groups.append(name)
-        first = len(corners) - 16
-        faces += [
-            (first + part, first + (part + 1) % 8, first + 8 + (part + 1) % 8, first + 8 + part)
-            for part in range(8)
-        ]
-        faces += [tuple(first + part for part in range(8))[::-1],
-                  tuple(first + 8 + part for part in range(8))]  # fmt: skip
-    body = item("body", corners, faces, (0, 0, 0), cloth)
-    for name in BONES:
-        group = body.vertex_groups.new(name=name)
-        group.add([index for index, owner in enumerate(groups) if owner == name], 1.0, "REPLACE")
+        bpy.ops.mesh.primitive_cylinder_add(
+            vertices=8, radius=radius, depth=(tail - head).length, location=(head + tail) / 2
+        )
+        parts.append(bpy.context.object)
+        whole = list(range(len(parts[-1].data.vertices)))
+        parts[-1].vertex_groups.new(name=name).add(whole, 1.0, "REPLACE")
+    for part in parts:
+        part.select_set(state=True)
+    bpy.ops.object.join()
+    bpy.ops.object.transform_apply()
+    body = finished("body", cloth)
     frame = bpy.data.armatures.new("skeleton")
     rig = bpy.data.objects.new("skeleton", frame)
     bpy.context.scene.collection.objects.link(rig)
@@ -399,9 +351,6 @@ def make_broken(folder):
     lit_floor()
     bpy.context.scene.objects["floor"].hide_render = True
     save("empty.blend")
-    lit_floor()
-    bpy.data.objects.remove(bpy.context.scene.objects["sun"])
-    save("dark.blend")
     for name, scale in (("huge.blend", 10000.0), ("tiny.blend", 0.01)):
         lit_floor()
         bpy.context.scene.objects["floor"].scale = (scale,) * 3
