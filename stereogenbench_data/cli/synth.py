@@ -90,7 +90,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
 
     Example: `stereogenbench synth scenes/ --family Uniform --scenes 4 --size 256`
     """
-    from stereogenbench_data.synthesis.acceptance import acceptance_markdown
+    from stereogenbench_data.synthesis.planning import acceptance_markdown
     from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
     from stereogenbench_data.synthesis.render import RAY_CASTING
     from stereogenbench_data.synthesis.review import write_sheets

@@ -1,10 +1,11 @@
-"""The search for scenes: proposals are drawn and examined until one passes all filters."""
+"""The search for scenes: proposals are drawn and examined until one passes; and a report on it."""
 
-from collections import Counter
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 from stereogenbench_data.errors import SynthesisError
+from stereogenbench_data.schema.text import markdown_table
 from stereogenbench_data.synthesis.filters import Refusal
 from stereogenbench_data.synthesis.proposal import (
     Proposal,
@@ -21,6 +22,7 @@ MOST_PROPOSALS: Final = 4000
 """How many proposals of one scene are examined before the request counts as impossible."""
 
 _OFFSET_RANGE_CM: Final = 1e6
+_ALL_MAPS: Final = "all maps"
 _FOCAL_RANGE_MM: Final = (18.0, 85.0)
 
 
@@ -95,3 +97,26 @@ def plan_scene(
         + ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
         + "). Choose wider maps, another family or a shorter focal length."
     )
+
+
+def acceptance_markdown(planned: Iterable[Planned]) -> str:
+    """Return what became of proposals as a table in Markdown, by map and over all maps."""
+    groups: dict[str, list[Refusal | None]] = defaultdict(list)
+    for scene in planned:
+        for proposal, refusal in (*scene.refused, (scene.plan.proposal, None)):
+            for name in (_ALL_MAPS, proposal.map_name):
+                groups[name].append(refusal)
+    rows = [("map", "proposals", "accepted", "refused for")]
+    for name in sorted(groups, key=lambda each: (each == _ALL_MAPS, each)):
+        found = groups[name]
+        reasons = Counter(refusal.reason for refusal in found if refusal)
+        accepted = len(found) - reasons.total()
+        rows.append(
+            (
+                name,
+                f"{len(found):,}",
+                f"{accepted:,} ({accepted / len(found):.1%})",
+                ", ".join(f"{reason} {count:,}" for reason, count in reasons.most_common()),
+            )
+        )
+    return "".join(f"{line}\n" for line in markdown_table(*rows))
