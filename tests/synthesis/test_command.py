@@ -11,32 +11,18 @@ SMALL = ("--size", "32", "--frames", "1", "--workers", "1")
 
 
 def test_the_command_writes_scenes_and_says_where(tmp_path):
-    arguments = [
-        str(tmp_path),
-        *SMALL,
-        "--family",
-        "Uniform",
-        "--scenes",
-        "2",
-        "--map",
-        "Downtown_West",
-    ]
+    options = ["--family", "Uniform", "--scenes", "2", "--map", "Downtown_West"]
+    contract = ["--depth-unit-m", "0.1"]
 
-    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    result = CliRunner().invoke(
+        app, [str(tmp_path), *SMALL, *options, *contract], catch_exceptions=False
+    )
 
     assert result.exit_code == 0
     assert f"{tmp_path}: 2 scenes in train/Uniform/Downtown_West" in result.stdout
     assert "12/12" in result.stderr
-    assert len(list(tmp_path.rglob("_scene_complete.json"))) == 2
-
-
-def test_the_command_passes_the_contract_on(tmp_path):
-    options = ["--depth-unit-m", "0.1"]
-
-    CliRunner().invoke(app, [str(tmp_path), *SMALL, *options], catch_exceptions=False)
-
-    (marker,) = tmp_path.rglob("_scene_complete.json")
-    assert "depth_unit_m=0.1, " in marker.read_text()
+    first, _ = tmp_path.rglob("_scene_complete.json")
+    assert "depth_unit_m=0.1, " in first.read_text()
 
 
 def test_an_impossible_request_ends_the_command(tmp_path):
@@ -66,12 +52,7 @@ def test_all_maps_and_a_map_of_its_own_contradict_each_other(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "near"),
-    [
-        ("SynthRom", "SynthRoom"),
-        ("synthhall", "SynthHall"),
-        ("Stylised_Egypt", "Stylized_Egypt"),
-    ],
+    ("name", "near"), [("synthhall", "SynthHall"), ("Stylised_Egypt", "Stylized_Egypt")]
 )
 @pytest.mark.parametrize("plan", [[], ["--plan-only"]])
 def test_a_misspelt_map_names_the_nearest_and_leaves_nothing(tmp_path, name, near, plan):
@@ -85,7 +66,7 @@ def test_a_misspelt_map_names_the_nearest_and_leaves_nothing(tmp_path, name, nea
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("part", ["0/3", "3/2", "a/b", "1", "1/2/3"])
+@pytest.mark.parametrize("part", ["0/3", "3/2", "a/b", "1"])
 def test_what_is_no_part_is_told(tmp_path, part):
     result = CliRunner().invoke(app, [str(tmp_path), *SMALL, "--part", part])
 

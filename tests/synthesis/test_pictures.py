@@ -35,7 +35,7 @@ def psnr_db(scene, *, left, right, frame, scale=1.0):
     return 10 * np.log10(255**2 / (error[visible] ** 2).mean()), visible.mean()
 
 
-@pytest.mark.parametrize("pair", [(left, left + 1) for left in range(5)])
+@pytest.mark.parametrize("pair", [(0, 1), (3, 4)])
 def test_neighbours_agree_when_warped_by_depth(uniform_scene, pair):
     left, right = pair
 

@@ -27,10 +27,6 @@ def contents(folder):
             "train/Uniform/Stylized_Egypt/scene_000000",
         ),
         (
-            SynthRequest(split="eval", **SMALL),
-            "eval/MapSeenInTrain/IPD_Gaussian/SynthStage/scene_000000",
-        ),
-        (
             SynthRequest(split="eval", subset="unseen_map", **SMALL),
             "eval/MapUnseenInTrain/IPD_Gaussian/SynthStage/scene_000000",
         ),
@@ -115,19 +111,10 @@ def test_a_scene_that_another_request_wrote_is_neither_kept_nor_overwritten(tmp_
 
     with pytest.raises(SynthesisError, match="scene_000000: another request wrote this scene"):
         synthesise(tmp_path, SynthRequest(**(SMALL | {"frames": 3})))
-
     assert contents(tmp_path / key) == before
-
-
-def test_a_folder_that_is_not_a_complete_scene_is_not_touched(tmp_path):
-    request = SynthRequest(**SMALL)
-    (tmp_path / request.key(0)).mkdir(parents=True)
-
-    with pytest.raises(
-        SynthesisError,
-        match=r"scene_000000: another request .* _scene_complete\.json differs or is missing",
-    ):
-        synthesise(tmp_path, request)
+    (tmp_path / key / "_scene_complete.json").unlink()
+    with pytest.raises(SynthesisError, match=r"_scene_complete\.json differs or is missing"):
+        synthesise(tmp_path, SynthRequest(**SMALL))
 
 
 def test_an_output_that_is_not_a_folder_is_named(tmp_path):
