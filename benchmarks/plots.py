@@ -1,6 +1,5 @@
 """Plots of the results, from the JSON file."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
@@ -8,7 +7,7 @@ import numpy as np
 
 from benchmarks.field import LIMIT
 from benchmarks.network import network_plot
-from benchmarks.results import Spread, entry, ratios
+from benchmarks.results import entry, ratios
 from benchmarks.workloads import WORKLOADS, Workload
 
 _INK: Final = "#222222"
@@ -53,13 +52,6 @@ def _save(figure: Any, path: Path) -> None:
 
     figure.savefig(path, metadata={"Software": None})
     plt.close(figure)
-
-
-def _medians(spreads: Iterable[Spread]) -> tuple[np.ndarray, np.ndarray]:
-    """Return medians, and how far the quartiles are below and above them, shaped (2, n)."""
-    kept = [(each.low, each.median, each.high) for each in spreads]
-    low, middle, high = np.array(kept).reshape(-1, 3).T
-    return middle, np.stack([middle - low, high - middle])
 
 
 _SHOWN: Final = (

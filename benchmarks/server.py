@@ -1,7 +1,6 @@
 """A web server on this machine that answers ranges and counts, as if it were far away.
 
-``python -m benchmarks.server FOLDER --delay-ms 60`` serves a folder until it is stopped; with
-``--to URL`` it stands before another server of this machine, which it delays.
+``python -m benchmarks.server FOLDER --delay-ms 60`` serves a folder until it is stopped.
 
 It waits before the first byte of each response, limits the bandwidth of each connection and of all
 together, cuts connections and answers 503. It does not imitate handshakes, TCP's slow start or lost
@@ -91,10 +90,10 @@ class WebServer:
 
 @contextlib.contextmanager
 def serving(
-    folder: Path, *, network: Network, to: str = "", kind: Literal["plain", "hub"] = "plain"
+    folder: Path, *, network: Network, kind: Literal["plain", "hub"] = "plain"
 ) -> Iterator[WebServer]:
-    """Serve a folder on a free port of this machine through a network, or stand before a server."""
-    command = [sys.executable, "-m", "benchmarks.server", str(folder), f"--to={to}"]
+    """Serve a folder on a free port of this machine through a network."""
+    command = [sys.executable, "-m", "benchmarks.server", str(folder)]
     command += ["--hub"] if kind == "hub" else []
     command += network.words()
     place = Path(__file__).parents[1]
@@ -287,54 +286,6 @@ class _Hub(_Server):
         return json.dumps(entries).encode(), more
 
 
-class _Proxy:
-    """Passes connections on to another server, as if through a network."""
-
-    def __init__(self, url: str, network: Network) -> None:
-        self.url = ""
-        parts = urlsplit(url)
-        self._host, self._port = str(parts.hostname), parts.port or 80
-        self._network = network
-        self._total = _Line(network.total_mb_s)
-        self._chance = random.Random(7)
-
-    async def answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Pass on a connection."""
-        there = await asyncio.open_connection(self._host, self._port)
-        ways = (
-            asyncio.create_task(self._pass_on(reader, there[1], _Line(0), delayed=True)),
-            asyncio.create_task(
-                self._pass_on(there[0], writer, _Line(self._network.connection_mb_s), delayed=False)
-            ),
-        )
-        try:
-            await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for way in ways:
-                way.cancel()
-            for end in (writer, there[1]):
-                end.close()
-
-    async def _pass_on(
-        self,
-        reader: asyncio.StreamReader,
-        writer: asyncio.StreamWriter,
-        line: _Line,
-        *,
-        delayed: bool,
-    ) -> None:
-        while data := await reader.read(65_536):
-            if delayed:
-                await sleep(self._network.delay_s)
-                if self._chance.random() < self._network.lost:
-                    return
-            else:
-                wait_s = max(line.reserve(len(data)), self._total.reserve(len(data)))
-                await sleep(wait_s)
-            writer.write(data)
-            await writer.drain()
-
-
 async def _next_request(reader: asyncio.StreamReader) -> _Asked | None:
     """Return the next request of a connection, None at its end."""
     try:
@@ -366,11 +317,7 @@ def _head(status: int, reason: str, length: int, more: str) -> bytes:
 
 
 async def _serve(options: argparse.Namespace, network: Network) -> None:
-    server: _Proxy | _Server
-    if options.to:
-        server = _Proxy(options.to, network)
-    else:
-        server = (_Hub if options.hub else _Server)(options.folder, network)
+    server = (_Hub if options.hub else _Server)(options.folder, network)
     listening = await asyncio.start_server(
         server.answer, "127.0.0.1", options.port, limit=_LARGEST_HEAD, backlog=512
     )
@@ -391,7 +338,6 @@ def main() -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("folder", type=Path, help="what to serve")
-    parser.add_argument("--to", default="", help="the URL of a server to stand before")
     parser.add_argument("--hub", action="store_true", help=f"answer as the Hub, for {REPOSITORY}")
     parser.add_argument("--port", type=int, default=0, help="0 is a free one [0]")
     parser.add_argument("--delay-s", type=float, default=0.0, help=argparse.SUPPRESS)
