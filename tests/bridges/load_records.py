@@ -1,4 +1,4 @@
-"""Load every record set of a descriptor with mlcroissant, and print the records as JSON.
+"""Load every record set of descriptors with mlcroissant, and print the records as JSON, by path.
 
 It runs in its own process, because mlcroissant reads the place of its cache when it is imported,
 and names what it unpacked by URL alone.
@@ -14,13 +14,11 @@ import mlcroissant as mlc
 MEDIA = ("rgb_videos", "depth_videos", "baseline_json", "trajectory_json", "scene_complete_json")
 
 
-def main(path: str, mapping: dict[str, str]) -> None:
-    """Print the records of every set, in both orders, and whether a dict gives a first of each."""
+def loaded(path: str) -> dict:
+    """Return the records of every set, in both orders, and whether a dict gives a first of each."""
     document = json.loads(Path(path).read_text())
     names = [records["@id"] for records in document["recordSet"]]
-    local = {name: Path(place) for name, place in mapping.items()} or None
-    forwards = mlc.Dataset(jsonld=path, mapping=local)
-    backwards = mlc.Dataset(jsonld=path, mapping=local)
+    forwards, backwards = mlc.Dataset(jsonld=path), mlc.Dataset(jsonld=path)
     found = {name: list(forwards.records(name)) for name in names}
     again = {name: len(list(backwards.records(name))) for name in reversed(names)}
     report = {
@@ -40,9 +38,9 @@ def main(path: str, mapping: dict[str, str]) -> None:
         "baselines": [row["pairs/baseline_cm"] for row in found.get("pairs", [])],
     }
     if all("://" in each.get("contentUrl", "://") for each in document["distribution"]):
-        strict = mlc.Dataset(jsonld=document, mapping=local)
+        strict = mlc.Dataset(jsonld=document)
         report["first_of_each"] = [bool(next(iter(strict.records(name)))) for name in names]
-    print(json.dumps(report))  # noqa: T201 - the parent process reads it
+    return report
 
 
 def _crc(row: dict, name: str) -> int:
@@ -53,4 +51,4 @@ def _text(value: object) -> object:
     return value.decode() if isinstance(value, bytes) else value
 
 
-main(sys.argv[1], json.loads(sys.argv[2]))
+print(json.dumps([loaded(path) for path in sys.argv[1:]]))  # noqa: T201 - the parent reads it

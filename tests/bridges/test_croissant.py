@@ -42,9 +42,10 @@ def validated(*paths):
     return found
 
 
-def loaded(path, cache, mapping=None):
+def loaded(cache, *paths):
+    """Return the records of descriptors, which a process of its own loads."""
     done = subprocess.run(
-        [sys.executable, str(LOADER), str(path), json.dumps(mapping or {})],
+        [sys.executable, str(LOADER), *map(str, paths)],
         capture_output=True, text=True, check=False, timeout=300,
         env=os.environ | {"CROISSANT_CACHE": str(cache)},
     )  # fmt: skip
@@ -95,9 +96,15 @@ def test_the_shipped_descriptors_name_where_their_own_data_come_from_and_their_s
         }
 
 
-def test_the_descriptor_of_the_release_needs_no_file_of_it(tmp_path):
+@pytest.fixture(scope="module")
+def shipped_records(tmp_path_factory):
+    """The records of the shipped descriptors: of the release and of the sample."""
+    return loaded(tmp_path_factory.mktemp("c"), SHIPPED / "release.json", SHIPPED / "sample.json")
+
+
+def test_the_descriptor_of_the_release_needs_no_file_of_it(shipped_records):
     """Reading one through its repository would clone hundreds of gigabytes."""
-    records = loaded(SHIPPED / "release.json", tmp_path)
+    records = shipped_records[0]
 
     assert records["counts"] == {
         "splits": 2, "eval_subsets": 2, "families": 3, "maps": 25, "parts": 7,
@@ -111,10 +118,8 @@ def test_the_descriptor_of_the_release_needs_no_file_of_it(tmp_path):
     )
 
 
-def test_the_shipped_descriptor_of_the_sample_loads_every_record_in_both_orders(tmp_path):
-    sample = SceneIndex.open(HOME / "shards")
-
-    records = loaded(SHIPPED / "sample.json", tmp_path)
+def test_the_shipped_descriptor_of_the_sample_loads_every_record_in_both_orders(shipped_records):
+    sample, records = SceneIndex.open(HOME / "shards"), shipped_records[1]
 
     assert records["counts"] == {
         "splits": 2, "eval_subsets": 2, "families": 3, "maps": 2, "scenes": 8,
@@ -170,7 +175,7 @@ def test_absolute_addresses_pass_the_steps_of_the_conference_checker(web, index,
     publication = Publication(published=date(2026, 11, 21), data_url=f"{web.url}/rev1/shards")
     write_descriptor(index, place, publication=publication)
 
-    records = loaded(place, tmp_path / "cache")
+    (records,) = loaded(tmp_path / "cache", place)
 
     assert records["counts"]["scenes"] == len(index)
     assert records["counts"]["pairs"] == 15 * len(index)
@@ -189,7 +194,7 @@ def test_shards_of_packed_depth_are_described_by_its_suffix(small_release, tmp_p
     path = tmp_path / "data.json"
     write_descriptor(packed, path, publication=DAY)
 
-    records = loaded(path, tmp_path / "cache")
+    (records,) = loaded(tmp_path / "cache", path)
 
     cameras = range(6)
     depth = stored(packed, *((camera, f"cam_{camera:02d}_depth.b2frame") for camera in cameras))
@@ -231,7 +236,8 @@ def test_many_shards_are_listed_in_a_file(index, tmp_path, monkeypatch):
     assert check_descriptor(path) == []
     assert (tmp_path / "many" / "shards.txt").read_text().split() == sorted(index.shards)
     assert [file["@id"] for file in written["distribution"]][-1] == "shard-files"
-    assert loaded(path, tmp_path / "cache")["counts"]["shards"] == len(index.shards)
+    (records,) = loaded(tmp_path / "cache", path)
+    assert records["counts"]["shards"] == len(index.shards)
 
 
 def test_shards_behind_a_url_need_an_address_to_name(small_release, web, tmp_path):
