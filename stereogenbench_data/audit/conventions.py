@@ -388,25 +388,13 @@ def _tested(
 
 def _in_words(verdict: Verdict) -> str:
     """Return a verdict with its figures in a line."""
-    quotient, *_ = [answer for answer in verdict.answers if answer.topic == QUOTIENT]
-    wrong = [
-        f"{answer.topic} {answer.found}, not {answer.declared}"
-        for answer in verdict.answers
-        if answer.status == "wrong"
-    ]
-    if wrong or verdict.problems:
-        return (
-            f"{encoding_line(verdict.declared)} is WRONG: {'; '.join([*wrong, *verdict.problems])}"
-        )
-    parts = [f"{answer.topic} {answer.found}" for answer in verdict.answers
-             if answer.status == "confirmed" and answer.topic in TOPICS.values()]  # fmt: skip
-    if quotient.status == "confirmed":
-        parts.insert(0, f"{QUOTIENT} {quotient.found}")
-    held = [f"{answer.topic} {answer.found}" for answer in verdict.answers
-            if answer.status == "not contradicted"]  # fmt: skip
-    open_topics = [answer.topic for answer in verdict.answers if answer.status == "cannot tell"]
-    told = {"confirmed": parts, "not contradicted": held, "cannot tell": open_topics}
-    return "; ".join(f"{word}: {', '.join(topics)}" for word, topics in told.items() if topics)
+    if verdict.is_wrong:
+        return f"{encoding_line(verdict.declared)} is WRONG: {'; '.join(verdict.contradicted)}"
+    told: dict[str, list[str]] = {"confirmed": [], "not contradicted": [], "cannot tell": []}
+    for answer in verdict.answers:
+        found = "" if answer.status == "cannot tell" else f" {answer.found}"
+        told[answer.status].append(answer.topic + found)
+    return "; ".join(f"{status}: {', '.join(each)}" for status, each in told.items() if each)
 
 
 def _head(surveyed: Survey) -> list[str]:

@@ -147,7 +147,12 @@ def _gain_words(gain: Gain) -> str:
 def doctor_json(report: DoctorReport) -> dict[str, Any]:
     """Return a report as values for `json.dumps`, with None for nan."""
     verdicts = [
-        {**asdict(each), "paste": None if each.encoding is None else encoding_line(each.encoding)}
+        {
+            **asdict(each),
+            "is_wrong": each.is_wrong,
+            "tested_cameras": each.tested_cameras,
+            "paste": None if each.encoding is None else encoding_line(each.encoding),
+        }
         for each in report.verdicts
     ]
     scenes = []

@@ -389,12 +389,10 @@ class Verdict:
         quotient_error: Half its 95 % interval, as a share.
         choices: The lengths that would explain that quotient, each by itself, in words.
         problems: What is wrong with single cameras, in words.
-        tested_cameras: Cameras whose depth was tested in every scene.
         untested_cameras: Cameras whose depth was not tested in some scene.
         unexplained_cameras: Cameras whose depth explains less than half of their matches in some
             scene.
         beside: Advice that a `DepthEncoding` cannot express.
-        is_wrong: Whether another contract is clearly better, or a camera does not fit.
         fits: Whether the declared contract fits, with all cameras tested.
     """
 
@@ -408,12 +406,30 @@ class Verdict:
     quotient_error: float
     choices: tuple[str, ...]
     problems: tuple[str, ...]
-    tested_cameras: tuple[int, ...]
     untested_cameras: tuple[int, ...]
     unexplained_cameras: tuple[int, ...]
     beside: tuple[str, ...]
-    is_wrong: bool
     fits: bool
+
+    @property
+    def contradicted(self) -> list[str]:
+        """What pictures contradict, in words: what is declared, and files of single cameras."""
+        answers = [
+            f"{answer.topic} {answer.found}, not {answer.declared}"
+            for answer in self.answers
+            if answer.status == "wrong"
+        ]
+        return [*answers, *self.problems]
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether another contract is clearly better, or a camera does not fit."""
+        return bool(self.contradicted)
+
+    @property
+    def tested_cameras(self) -> tuple[int, ...]:
+        """Cameras whose depth was tested in every scene."""
+        return tuple(c for c in range(CAMERA_COUNT) if c not in self.untested_cameras)
 
 
 def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdict:
@@ -466,11 +482,9 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
         quotient_error=unit.uncertainty if is_measured else math.nan,
         choices=choices,
         problems=problems,
-        tested_cameras=tuple(c for c in range(CAMERA_COUNT) if c not in untested),
         untested_cameras=tuple(sorted(untested)),
         unexplained_cameras=tuple(sorted(unexplained)),
         beside=tuple(_beside(scenes, answers)),
-        is_wrong=bool(wrong or problems),
         fits=explains and not (wrong or problems or untested)
         and all(answer.status != "cannot tell" for answer in (quotient, *hypothesis)),
     )  # fmt: skip
