@@ -152,17 +152,6 @@ def test_the_table_has_the_papers_figures_beside(exact):
     assert (frames.ours, frames.paper) == ("168 (7), 0 missing", "81 of a video, 0 missing")
 
 
-def test_the_report_is_json_and_markdown(exact):
-    document = json.loads(json.dumps(exact.to_json(), allow_nan=False))
-    markdown = audit_markdown(exact)
-    assert markdown.startswith("# Nothing wrong found")
-
-    assert document["limits"]["baseline_cm"] == 1e-3
-    assert len(document["scenes"]) == 4
-    assert all(f"| {row.check} | {row.quantity} | " in markdown for row in exact.rows)
-    assert "## Findings" not in markdown
-
-
 def pictures(camera, change, **options):
     return lambda folder: rewrite_rgb(folder, camera, change, **options)
 

@@ -11,7 +11,7 @@ from stereogenbench_data.evaluation.metrics.matching import (
     mutual_matches,
     target_matches,
 )
-from stereogenbench_data.evaluation.models.interfaces import KeypointMatcher, Keypoints
+from stereogenbench_data.evaluation.models.interfaces import Keypoints
 from stereogenbench_data.evaluation.models.opencv import Sift
 from tests.evaluation.conftest import photograph
 
@@ -180,9 +180,3 @@ def test_a_flat_picture_has_no_keypoint_and_no_match(sift):
 
     assert found.xy_px.shape == (0, 2)
     assert sift.match(found, found).shape == (0, 2)
-
-
-def test_sift_is_a_keypoint_matcher_that_names_its_choices(sift):
-    assert isinstance(sift, KeypointMatcher)
-    assert sift.name.startswith("SIFT (OpenCV ")
-    assert (sift.settings["ratio"], sift.settings["keypoints"]) == (0.9, 2048)

@@ -10,8 +10,7 @@ from PIL import Image
 from scipy.stats import linregress
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.metrics.scale import fit_scale, scale_settings
-from stereogenbench_data.evaluation.models.interfaces import StereoMatcher
+from stereogenbench_data.evaluation.metrics.scale import fit_scale
 from stereogenbench_data.evaluation.models.opencv import Sgbm
 from tests.evaluation.conftest import photograph
 
@@ -195,17 +194,6 @@ def test_sgbm_also_gives_a_small_negative_shift(sgbm):
     disparity = sgbm(wide[..., 8:], wide[..., :-8])
 
     assert np.nanmedian(disparity) == -8
-
-
-def test_sgbm_is_a_stereo_matcher_and_the_settings_name_the_choices(sgbm):
-    settings = scale_settings(sgbm)
-
-    assert isinstance(sgbm, StereoMatcher)
-    assert settings["matcher"].startswith("SGBM (OpenCV ")
-    assert settings["numDisparities"] == 128
-    assert settings["sd_least_squares"] == "least squares of all answered pixels"
-    assert "3 robust standard deviations and 1 px" in settings["sd_filtered"]
-    assert "does not state its rule for outliers" in settings["paper"]
 
 
 def test_pictures_narrower_than_the_search_are_refused():
