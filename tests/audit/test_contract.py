@@ -161,7 +161,7 @@ def diagnosed(**changes):
     """A scene's diagnosis: the declared contract holds, and no other answer was tested."""
     planar = Hypothesis()
     basics = {
-        "key": "scene", "views": 1, "pairs": ((0, 1),), "matches": 999, "textured": 999,
+        "key": "scene", "views": 1, "pairs": ((0, 1),), "matches": 999,
         "unit_m": UNIT_M, "unit_source": "tag", "recorded_pair": None,
         "declared": planar, "best": planar, "scale_error": 0.001,
         "offsets_px": {(0, 1): 0.0}, "check": FITTING,

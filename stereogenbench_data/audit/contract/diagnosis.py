@@ -67,7 +67,6 @@ class SceneDiagnosis:
         views: How many views (a pair in a frame) were compared.
         pairs: The pairs.
         matches: Pixels that were found in both pictures of a view.
-        textured: Pixels that were searched for.
         unit_m: The declared unit of the primary pair's left depth, in metres.
         unit_source: Where it comes from: "tag", "default", "conventions", "user" or "unreadable".
         recorded_pair: The recorded primary pair if, by the poses, its left camera stands to the
@@ -92,7 +91,6 @@ class SceneDiagnosis:
     views: int
     pairs: tuple[Pair, ...]
     matches: int
-    textured: int
     unit_m: float
     unit_source: str
     recorded_pair: Pair | None
@@ -391,7 +389,6 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         views=len(matches) // 2,
         pairs=tuple(views.chosen_pairs(Hypothesis())),
         matches=sum(len(match.rows) for match in matches[::2]),
-        textured=sum(match.textured for match in matches[::2]),
         unit_m=views.unit_m(file),
         unit_source=(
             views.encoding.source if views.encoding.unit_m else views.scene.depth_unit_source[file]
@@ -402,8 +399,8 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
     )
     if scene.matches < FEWEST_MATCHES:
         problem = (
-            f"no texture: {scene.textured:,} pixels have any, and {scene.matches:,} were found in "
-            f"both pictures"
+            f"only {scene.matches:,} pixels were found in both pictures: they have no texture, or "
+            f"show different things"
         )
         return replace(scene, problem=problem)
     units, known = views.depth(matches[0].frame, file)

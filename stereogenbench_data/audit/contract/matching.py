@@ -53,14 +53,12 @@ class RowMatches:
         rows: (n,) rows.
         columns: (n,) columns.
         disparity_px: (n,) how far to the left each was found, negative to the right.
-        textured: How many pixels were searched for.
         grain_px: Size of the compared pixels, in pixels of the picture.
     """
 
     rows: Int64[np.ndarray, " n"]
     columns: Int64[np.ndarray, " n"]
     disparity_px: Float32[np.ndarray, " n"]
-    textured: int
     grain_px: float = 1.0
 
 
@@ -89,7 +87,6 @@ def match_pairs(
     rows = inner[np.unique(np.linspace(0, len(inner) - 1, min(_ROWS, len(inner))).astype(int))]
     found: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray, np.ndarray]]]
     found = {pair: [] for pair in pairs}
-    textured = dict.fromkeys(pairs, 0)
     left_numbers = {left for left, _ in pairs}
     side = 2 * _RADIUS_PX + 1
     for row in rows:
@@ -107,13 +104,13 @@ def match_pairs(
             for number, each in slopes.items()
         }
         for left, right in pairs:
-            is_textured = has_texture[left]
-            textured[left, right] += int(is_textured.sum())
-            columns, disparity_px = _match_row(_product(patches[left], patches[right]), is_textured)
+            columns, disparity_px = _match_row(
+                _product(patches[left], patches[right]), has_texture[left]
+            )
             found[left, right].append(
                 (np.full(len(columns), row), columns + _RADIUS_PX, disparity_px)
             )
-    return {pair: _gathered(found[pair], factor=factor, textured=textured[pair]) for pair in pairs}
+    return {pair: _gathered(found[pair], factor=factor) for pair in pairs}
 
 
 def _normalised(
@@ -162,9 +159,7 @@ def _match_row(
     return columns, (columns - best - np.clip(shift, -0.5, 0.5)).astype(np.float32)
 
 
-def _gathered(
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]], *, factor: int, textured: int
-) -> RowMatches:
+def _gathered(found: list[tuple[np.ndarray, np.ndarray, np.ndarray]], *, factor: int) -> RowMatches:
     """Join the rows, and scale to the full size; a block's centre is a pixel or nearly so."""
     empty = (np.zeros(0, int), np.zeros(0, int), np.zeros(0, np.float32))
     rows, columns, disparity_px = (
@@ -174,7 +169,6 @@ def _gathered(
         rows=rows.astype(np.int64) * factor + factor // 2,
         columns=columns.astype(np.int64) * factor + factor // 2,
         disparity_px=(disparity_px * factor).astype(np.float32),
-        textured=textured,
         grain_px=float(factor),
     )
 
@@ -206,7 +200,6 @@ class FrameMatch:
         slope: (n,) their horizontal derivative.
         cells: (n,) the part of the picture that each pixel lies in.
         cap: The squared difference between unrelated pixels.
-        textured: How many pixels were searched for.
         grain_px: Size of the compared pixels, in pixels of the picture.
     """
 
@@ -220,7 +213,6 @@ class FrameMatch:
     slope: Float32[np.ndarray, " n"]
     cells: Int64[np.ndarray, " n"]
     cap: float
-    textured: int
     grain_px: float = 1.0
 
     @property
@@ -399,7 +391,6 @@ class SceneFrames:
                     slope=(band[rows, after] - band[rows, before]) / 2,
                     cells=rows * SIDE_CELLS // height * SIDE_CELLS + at * SIDE_CELLS // width,
                     cap=2 * float((band[rows, at] ** 2).mean()) if len(rows) else 1.0,
-                    textured=row_matches.textured,
                     grain_px=row_matches.grain_px,
                 )
             )

@@ -5,7 +5,7 @@ Pictures are uint8 RGB, channel first.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float32, Int64, UInt8
@@ -41,7 +41,6 @@ class Model(Protocol):
         """Every choice that its answers depend on, so that scores of other choices differ."""
 
 
-@runtime_checkable
 class KeypointMatcher(Model, Protocol):
     """Finds keypoints in one picture, and the same keypoints in another."""
 
@@ -52,7 +51,6 @@ class KeypointMatcher(Model, Protocol):
         """Return indices of matched keypoints (left, right), each left keypoint at most once."""
 
 
-@runtime_checkable
 class StereoMatcher(Model, Protocol):
     """Estimates the disparity of a rectified pair."""
 
