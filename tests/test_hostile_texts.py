@@ -9,30 +9,20 @@ from stereogenbench_data.errors import SchemaError, StereoGenBenchError, url_wit
 from stereogenbench_data.schema.parse import parse_description, parse_scene_key
 from tests.hostile import run_bounded
 
-MANY = 2_000_000
+MANY = 500_000
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "'a' * {many}",
-        "'a.' * {many}",
-        "'a::' * {many}",
-        "'http://' + 'a::' * {many}",
-        "'a:' * {many}",
-        "'http://h/' + 'a:' * {many}",
-        "'https://' + '@' * {many}",
-        "'http:/' * {many}",
-    ],
-)
-def test_a_message_of_any_length_is_searched_for_urls_once(text):
+def test_a_message_of_any_length_is_searched_for_urls_once():
+    starts = ["", "http://", "http://h/", "https://"]
     told = run_bounded(
         "from stereogenbench_data.errors import StereoGenBenchError\n"
-        f"text = {text.format(many=MANY)}\n"
-        "print(len(str(StereoGenBenchError(text))) <= len(text))"
+        f"for start in {starts}:\n"
+        "    for part in ('a', 'a.', 'a:', 'a::', '@', 'http:/'):\n"
+        f"        text = start + part * {MANY}\n"
+        "        print(len(str(StereoGenBenchError(text))) <= len(text))"
     )
 
-    assert told == "True\n"
+    assert told.split() == ["True"] * 24
 
 
 @pytest.mark.parametrize(
@@ -59,7 +49,7 @@ def test_a_chain_of_many_file_systems_keeps_no_secret():
 def test_keys_that_are_all_written_twice_are_counted_once():
     told = run_bounded(
         "from stereogenbench_data.schema.document import parse_object\n"
-        "text = '{' + ','.join(f'\"k{n // 2}\":1' for n in range(1_000_000)) + '}'\n"
+        "text = '{' + ','.join(f'\"k{n // 2}\":1' for n in range(300_000)) + '}'\n"
         "try:\n"
         "    parse_object(text.encode(), where='a.json')\n"
         "except ValueError as error:\n"
@@ -89,14 +79,14 @@ def test_a_key_written_twice_is_told_without_the_keys_around_it():
 def test_many_keys_that_may_be_baselines_are_listed_in_few_words():
     told = run_bounded(
         "from stereogenbench_data.schema.parse import parse_rig\n"
-        "text = '{' + ','.join(f'\"pairs{n}\":{{\"0-{n}\":-1}}' for n in range(200_000)) + '}'\n"
+        "text = '{' + ','.join(f'\"pairs{n}\":{{\"0-{n}\":-1}}' for n in range(50_000)) + '}'\n"
         "try:\n"
         "    parse_rig(text.encode(), where='a.json')\n"
         "except ValueError as error:\n"
         "    print(error)"
     )
 
-    assert "a.json: 200" in told
+    assert "a.json: 50" in told
     assert "more" in told
     assert len(told) < 5000
 

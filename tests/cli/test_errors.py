@@ -92,23 +92,11 @@ def test_a_warning_is_one_line_and_afterwards_looks_as_before(capsys):
     assert warnings.formatwarning is before
 
 
-def test_a_sheet_that_cannot_be_written_is_reported_in_two_lines_at_most(small_shards, tmp_path):
-    shown = invoke("show", small_shards, "-o", tmp_path / "nowhere" / "sheet.png")
-
-    assert shown.exit_code == 2
-    assert "sheet.png (No such file or directory). Check the path." in shown.stderr
-    assert len(shown.stderr.strip().splitlines()) <= 2
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_a_full_disk_is_reported(small_shards, tmp_path):
-    (tmp_path / "sheet.png").symlink_to("/dev/full")
+def test_a_full_disk_is_reported():
     with Path("/dev/full").open("w") as full:
         printed = run("--version", stdout=full)
-    shown = invoke("show", small_shards, "-o", tmp_path / "sheet.png")
 
-    assert shown.exit_code == 2
-    assert "sheet.png (No space left on device). Make room" in shown.stderr
     assert printed.returncode == 2
     assert printed.stderr.startswith(
         "StorageError: the output cannot be written (No space left on device). Make room"
@@ -116,19 +104,19 @@ def test_a_full_disk_is_reported(small_shards, tmp_path):
     assert len(printed.stderr.splitlines()) == 1
 
 
-def test_output_that_nobody_reads_ends_quietly(small_shards, tmp_path):
+def test_output_that_nobody_reads_ends_quietly(tmp_path):
     """As `| head` does it: the pipe is closed before anything is written."""
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing, "w") as closed:
-        ended = run("show", small_shards, "-o", tmp_path / "sheet.png", stdout=closed)
+        words = ("publish", "croissant", "--template", "-o", tmp_path / "about.json")
+        ended = run(*words, stdout=closed)
 
     assert (ended.returncode, ended.stderr) == (141, "")
 
 
 @pytest.mark.usefixtures("usual_signals")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_browser_at_once_with_130(small_shards, number):
+def test_a_signal_ends_the_browser_at_once_with_130(small_shards):
     with subprocess.Popen(
         [*COMMAND, "browse", str(small_shards), "--no-open"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -137,7 +125,7 @@ def test_a_signal_ends_the_browser_at_once_with_130(small_shards, number):
         assert browsing.stdout is not None
         line = browsing.stdout.readline()
         time.sleep(0.2)
-        browsing.send_signal(number)
+        browsing.send_signal(signal.SIGTERM)
         try:
             _, message = browsing.communicate(timeout=60)
         finally:

@@ -35,13 +35,6 @@ def test_training_scenes_are_exported_and_those_left_out_are_counted(
     assert (folder / file).is_file()
 
 
-def test_evaluation_scenes_are_exported_if_the_split_names_them(indexed_release, tmp_path):
-    done = run("export", "ply", indexed_release, tmp_path, *USUAL, "--split", "eval")
-
-    assert done.stdout == f"{tmp_path}: 1 folder\n"
-    assert "left out" not in done.stderr
-
-
 def test_filters_cameras_frames_and_points_are_taken(indexed_release, tmp_path):
     done = run(
         "export", "ply", indexed_release, tmp_path, *USUAL, "--where", "family=Uniform",
@@ -60,13 +53,6 @@ def test_evaluation_scenes_that_would_not_match_are_not_counted(indexed_release,
 
     assert done.stdout == f"{tmp_path}: 1 folder\n"
     assert "left out" not in done.stderr
-
-
-def test_the_same_command_again_finds_all_done(indexed_release, tmp_path):
-    first = run("export", "colmap", indexed_release, tmp_path, *USUAL, "--points", "5")
-    again = run("export", "colmap", indexed_release, tmp_path, *USUAL, "--points", "5")
-
-    assert first.stdout == again.stdout == f"{tmp_path}: 3 folders\n"
 
 
 @pytest.mark.parametrize(

@@ -79,13 +79,6 @@ def test_completion_knows_commands():
     assert completed("stereogenbench s") == ["synth", "show", "stats"]
 
 
-def test_a_completion_script_can_be_had():
-    environment = os.environ | {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
-    ended = run("--show-completion", "bash", env=environment)
-
-    assert "_STEREOGENBENCH_COMPLETE=complete_bash" in ended.stdout
-
-
 def test_help_imports_neither_torch_nor_numpy():
     code = (
         "import sys; from stereogenbench_data.cli.commands import app\n"

@@ -102,13 +102,6 @@ def test_filters_are_named_and_texts_are_gathered():
     }  # fmt: skip
 
 
-def test_the_card_of_shards_names_the_repository(small_shards):
-    shown = invoke("publish", "card", small_shards, "my-lab/stereo.scenes")
-
-    assert shown.exit_code == 0
-    assert "my-lab/stereo.scenes" in shown.stdout
-
-
 def test_synth_takes_one_number_for_width_and_height(tmp_path):
     words = ("synth", tmp_path, "--frames", 1, "--plan-only", "--workers", 1, "--size")
 

@@ -126,24 +126,17 @@ def test_a_part_that_is_whole_folders_of_one_key_is_that_scene(small_release, tm
     assert "'niform' is a part of 2 keys: " in part.stderr
 
 
-def test_reports_as_json_are_one_document(small_release, tmp_path):
-    data = tmp_path / "data"
-    shutil.copytree(small_release, data)
-    indexed = invoke("index", data, "--json")
+def test_an_index_as_json_is_one_document_and_a_broken_scene_gives_exit_status_1(
+    small_release, tmp_path
+):
+    data = shutil.copytree(small_release, tmp_path / "data")
+    whole = invoke("index", data, "--json")
+    (data / SCENE / "baseline.json").write_text("{}")
+    broken = invoke("index", data, "--json")
 
-    assert json.loads(indexed.stdout) == {
+    assert json.loads(whole.stdout) == {
         "index": str(data / "index.parquet"), "scenes": 4, "incomplete": {}, "broken": {},
         "notes": [],
     }  # fmt: skip
-
-
-def test_an_index_without_a_broken_scene_says_so_as_json_with_exit_status_1(
-    small_release, tmp_path
-):
-    data = tmp_path / "data"
-    shutil.copytree(small_release, data)
-    (data / SCENE / "baseline.json").write_text("{}")
-    indexed = invoke("index", data, "--json")
-
-    assert indexed.exit_code == 1
-    assert list(json.loads(indexed.stdout)["broken"]) == [SCENE]
+    assert broken.exit_code == 1
+    assert list(json.loads(broken.stdout)["broken"]) == [SCENE]

@@ -48,7 +48,6 @@ def test_only_an_error_of_writing_that_names_no_file_gets_the_place():
         ("show", "-o", "sheet.png"),
         ("show", "-o", "clip.mp4"),
         ("show", "-o", "clip.gif"),
-        ("stats", "-o", "stats.md"),
         ("stats", "-o", "plots"),
         ("audit", "--per-scene", "1", "--workers", "1", "-o", "audit.md"),
     ],
@@ -121,12 +120,12 @@ def test_an_index_does_not_replace_a_device_or_a_pipe(small_release, tmp_path):
     assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 
-def test_what_the_terminal_lacks_is_printed_as_a_question_mark(small_shards, tmp_path):
-    environment = os.environ | {"PYTHONIOENCODING": "latin-1"}
-    ended = run("show", small_shards, "-o", "\u0105.png", cwd=tmp_path, env=environment)
+def test_what_the_terminal_lacks_is_printed_as_a_question_mark(tmp_path):
+    words = ("publish", "croissant", "--template", "-o", "\u0105.json")
+    ended = run(*words, cwd=tmp_path, env=os.environ | {"PYTHONIOENCODING": "latin-1"})
 
     assert (ended.returncode, ended.stderr) == (0, "")
-    assert ended.stdout.startswith("?.png: ")
+    assert ended.stdout.startswith("?.json: ")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
@@ -137,11 +136,15 @@ def test_the_exit_status_is_right_where_no_message_can_be_printed():
     assert ended.returncode == 2
 
 
-def test_a_command_whose_stdout_was_closed_does_its_work(small_shards):
-    words = ["sh", "-c", '"$@" >&-', "sh", *COMMAND, "stats", str(small_shards)]
-    ended = subprocess.run(words, stderr=subprocess.PIPE, text=True, check=False)
+def test_a_command_whose_stdout_was_closed_does_its_work(tmp_path):
+    written = tmp_path / "about.json"
+    words = ("publish", "croissant", "--template", "-o", written)
+    ended = subprocess.run(
+        ["sh", "-c", '"$@" >&-', "sh", *COMMAND, *words],
+        stderr=subprocess.PIPE, text=True, check=False,
+    )  # fmt: skip
 
-    assert (ended.returncode, ended.stderr) == (0, "")
+    assert (ended.returncode, ended.stderr, written.exists()) == (0, "", True)
 
 
 @pytest.fixture
