@@ -285,7 +285,7 @@ def find_scenes(
     there = sorted({key.rpartition("/")[0] for key in folders.keys})
     more = f" and {len(there) - _NAMED} folders more" if len(there) > _NAMED else ""
     raise StorageError(
-        f"{shown(root)}: none of its {counted(len(folders.keys), 'scene')} is asked for; there are "
+        f"{shown(root)}: none of its {counted(len(folders.keys), 'scene')} matches; there are "
         f"scenes in {', '.join(there[:_NAMED])}{more}. Check the filters' spelling."
     )
 

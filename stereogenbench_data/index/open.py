@@ -333,7 +333,7 @@ def _of_report(report: "TreeReport") -> Opened:
     """Return the scenes that a walk found.
 
     Raises:
-        StorageError: If there is none, or more than a few are broken.
+        StorageError: If no scene is whole, or more than a few are broken.
     """
     from stereogenbench_data.index.build import FORMAT_CURE
 
@@ -399,7 +399,7 @@ def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:
     if any((beside / file["path"]).exists() for file in table.column("members")[0].as_py()):
         return str(beside)
     folder = None
-    with suppress(OSError, ValueError, RuntimeError):  # of a path that is none
+    with suppress(OSError, ValueError, RuntimeError):  # not a path
         is_url = recorded[:5].lower() == "file:"
         place = local_path(recorded) if is_url else Path(recorded)
         folder = None if is_remote(recorded) else (beside / place).resolve()

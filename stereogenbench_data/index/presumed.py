@@ -114,7 +114,7 @@ class ListedTree:
 
     Attributes:
         root: The folder, or the URL.
-        folders: The keys of the scenes, and folders that are none.
+        folders: The keys of the scenes, and folders that hold none.
         files: Key to files, or to why they cannot be listed.
         is_part: Whether the user chose only some of the scenes.
         stamp: A digest that changes when a file is added, removed or changed.
@@ -618,7 +618,7 @@ def _with_presumed(found: Scene, presumed: Scene, opened: frozenset[str]) -> Sce
 def _differences(presumed: Scene, found: Scene, *, baselines: Baselines) -> Iterator[str]:
     """Yield how a scene contradicts what selection, order and checks took from its row.
 
-    A picture of another size is none: it is read at its own size, and scaled where that is wanted.
+    Another picture size is no contradiction: it is read as it is, and scaled where that is wanted.
     """
     before, now = _format_of(presumed), _format_of(found)
     for what, value in before.items():

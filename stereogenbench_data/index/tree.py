@@ -18,8 +18,7 @@ What was found out about trees without an index is kept in the user's cache:
 
 The listing is the path, size and modification time of every file, so what is kept is used only for
 unchanged files. Any number of processes, of several machines too, may read and write: files are
-renamed into place, whole or not at all, and one that is damaged or cannot be written is as good as
-none.
+renamed into place, whole or not at all, and a damaged one counts as missing.
 """
 
 import hashlib
@@ -163,7 +162,7 @@ FILES: Final = frozenset(
 
 _AT_A_TIME: Final = 12
 _READ_WHOLE: Final = 4 * FIRST_BLOCK
-"""Videos of so many bytes are fetched whole when a scene is described, of larger ones both ends."""
+"""Videos up to this size are fetched whole when a scene is described, of larger ones both ends."""
 
 
 def in_parallel(read: Callable[[_Item], _T], items: Iterable[_Item]) -> Iterator[_T]:
@@ -209,7 +208,7 @@ class SceneFolder:
         return {name: (found[name].st_size, found[name].st_mtime_ns) for name in sorted(found)}
 
     def other_json(self) -> list[str]:
-        """Return the names of JSON files that are none of a release; behind a URL, of none."""
+        """Return the names of JSON files that a release does not have; none behind a URL."""
         return sorted({path.name for path in Path(self._root, self.key).glob("*.json")} - FILES)
 
     def fetch(self, names: Iterable[str]) -> None:
