@@ -71,7 +71,7 @@ def test_tables_that_take_much_memory_are_refused_by_the_footer(file, tmp_path):
 
 def test_seek_tables_that_take_more_than_the_file_allows_are_as_good_as_none(file):
     table = pq.read_table(file)
-    rewritten(file, table.append_column("seek_tables", pa.array([b"x" * 2**28] * 3)))
+    rewritten(file, table.append_column("seek_tables", pa.array([b"x" * 2**27] * 3)))
 
     told = run_bounded(
         "import sys\n"
@@ -80,7 +80,7 @@ def test_seek_tables_that_take_more_than_the_file_allows_are_as_good_as_none(fil
         "# bounded\n"
         "print(read_seek_tables(Path(sys.argv[1])))",
         file,
-        memory_mb=400,
+        memory_mb=300,
     )
 
     assert told == "None\n"

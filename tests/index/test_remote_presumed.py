@@ -188,7 +188,7 @@ def write_records(release, name, record_of):
 
 @pytest.mark.parametrize(
     ("name", "record_of"),
-    [("scenes.jsonl", as_path), ("all.jsonl", as_parts), ("m.json", lambda key, record: record)],
+    [("all.jsonl", as_parts), ("scenes.json", lambda key, record: record)],
 )
 def test_one_file_of_all_scenes_stands_for_each_baseline_json(hub, release, name, record_of):
     write_records(release, name, record_of)
@@ -205,11 +205,7 @@ def scaled(key, record):
     return as_path(key, record)
 
 
-def of_another_scene(key, record):
-    return as_path(KEYS[0], record)
-
-
-@pytest.mark.parametrize("record_of", [scaled, of_another_scene, lambda key, record: {"a": key}])
+@pytest.mark.parametrize("record_of", [scaled, lambda key, record: {"a": key}])
 def test_a_file_that_other_files_contradict_is_not_used(hub, release, record_of):
     write_records(release, "scenes.jsonl", record_of)
     (release / "metadata" / "notes.json").write_text("{")
