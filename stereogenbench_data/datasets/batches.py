@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Final, Literal, TypedDict, Unpack
+from typing import Any, Final, Literal, Protocol, TypedDict, Unpack
 
 import numpy as np
 import torch.distributed
@@ -108,7 +108,6 @@ class EpochBatch(list[int]):
         numbers: Iterable[int],
         *,
         epoch: int,
-        is_padding: list[bool] | None = None,
         ends_of_runs: Collection[int] = (),
         number: int | None = None,
         group: int = 0,
@@ -116,7 +115,7 @@ class EpochBatch(list[int]):
         """Hold the numbers."""
         super().__init__(numbers)
         self.epoch = epoch
-        self.is_padding = is_padding
+        self.is_padding: list[bool] | None = None
         self.ends_of_runs = ends_of_runs
         self.number = number
         self.group = group
@@ -293,6 +292,14 @@ class KnownOrder:
         return self.__dict__ | {"_order": None}
 
 
+class OrderedSamples(Protocol):
+    """What `EpochBatches` asks of a dataset: its samples by number, and the epoch that it is at."""
+
+    plan: Plan
+    index: SceneIndex
+    shared_epoch: SharedEpoch
+
+
 class EpochBatches(Sampler[list[int]]):
     """A batch sampler: the samples of each batch of an epoch, for one rank.
 
@@ -321,7 +328,12 @@ class EpochBatches(Sampler[list[int]]):
         passes: Where its passes are: the position.
     """
 
-    def __init__(self, dataset: Any, batch_size: int, **options: Unpack[EpochOptions]) -> None:
+    def __init__(
+        self,
+        dataset: OrderedSamples,
+        batch_size: int,
+        **options: Unpack[EpochOptions],
+    ) -> None:
         """Order the samples of a dataset; nothing is computed before the first batch.
 
         Args:

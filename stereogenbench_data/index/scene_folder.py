@@ -40,7 +40,7 @@ from stereogenbench_data.media.depth import (
     ANY_DEPTH,
     grey_format,
     measured,
-    open_depth,
+    open_video,
     read_depth_units,
     require_depth_stream,
     resolve_encoding,
@@ -487,7 +487,7 @@ class _Description:
             if name not in self.files:
                 continue
             where = self.where(name)
-            with open_depth(self.folder.video(name), name=where, frames=frames) as reader:
+            with open_video(self.folder.video(name), name=where, frames=frames) as reader:
                 stored = reader.facts.pixel_format
                 for frame in sorted({0, frames // 2, frames - 1}):
                     units = read_depth_units(reader, frame, encoding=ANY_DEPTH)

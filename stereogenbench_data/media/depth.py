@@ -167,8 +167,8 @@ def require_depth_stream(
     return layout
 
 
-def open_depth(file: VideoFile, *, name: str, frames: int) -> VideoReader | DepthFrames:
-    """Open depth that must have so many frames: a video or, by its name, blosc2's frames of one.
+def open_video(file: VideoFile, *, name: str, frames: int) -> VideoReader | DepthFrames:
+    """Open a video that must have so many frames; by its name it may be depth packed by blosc2.
 
     Raises:
         StorageError: If the file cannot be read.

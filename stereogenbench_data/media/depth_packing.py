@@ -26,7 +26,7 @@ from stereogenbench_data.media.container import (
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
     grey_format,
-    open_depth,
+    open_video,
     read_depth_units,
     require_depth_stream,
     resized_nearest,
@@ -71,7 +71,7 @@ def packed_depth(
             packed does not read back as it was.
     """
     chunks, pts = [], []
-    with open_depth(video, name=name, frames=frames) as reader:
+    with open_video(video, name=name, frames=frames) as reader:
         facts = reader.facts
         accepted = _ANY_BITS
         if size is not None and encoding is not None:

@@ -12,6 +12,7 @@ import json
 import struct
 import zlib
 from bisect import bisect_right
+from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -113,9 +114,10 @@ class Position:
     request later.
     """
 
-    def __init__(self, table: SeekTable) -> None:
-        """Begin with a video that is not open."""
+    def __init__(self, table: SeekTable, *, kept_frames: int = 1) -> None:
+        """Begin with a video that is not open, and of which so many frames will be kept."""
         self._table = table
+        self._kept: deque[int] = deque(maxlen=kept_frames)
         self._is_open = False
         self._next = self._end = 0
         self._knows_key_frames = table.blind_jump == 0
@@ -123,8 +125,9 @@ class Position:
     def needed(self, frame: int) -> list[tuple[int, int]]:
         """Return the ranges of bytes that reading a frame needs, and go on behind it."""
         table = self._table
-        if not 0 <= frame < table.packets or (self._is_open and frame == self._next - 1):
+        if not 0 <= frame < table.packets or frame in self._kept:
             return []
+        self._kept.append(frame)
         opened = 0 if self._is_open else table.opening
         self._end = max(self._end, opened)
         start, stop = self._end, min(frame + table.delay + 1, table.packets)

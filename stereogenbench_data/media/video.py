@@ -391,23 +391,12 @@ def read_rgb(
         uint8 (3, h, w), C-contiguous where ``out`` is; ``out`` itself if given.
 
     Raises:
-        MediaError: If the frame cannot be decoded or is not what it must be, or size or ``out``
-            does not fit.
+        MediaError: If the frame cannot be decoded or is not what it must be.
     """
     frame = reader.colour_frame(index) if content == "colour" else reader.frame(index)
     height, width = size or (frame.height, frame.width)
-    if height < 1 or width < 1:
-        raise MediaError(
-            f"{reader.name}: a picture of {height}x{width} pixels (height x width) cannot be made: "
-            f"ask for a size of at least 1x1."
-        )
     if out is None:
         out = np.empty((3, height, width), dtype=np.uint8)
-    elif out.shape != (3, height, width) or out.dtype != np.uint8:
-        raise MediaError(
-            f"{reader.name}: frame {index} needs an array of uint8 (3, {height}, {width}), got "
-            f"{out.dtype} {out.shape}: pass a fitting array or none."
-        )
     try:
         picture = _converted(reader, frame, size=(height, width))
     except av.FFmpegError as error:

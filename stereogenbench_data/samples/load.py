@@ -1,19 +1,12 @@
-"""One sample: decoded, transformed, written; read and decoded only as far as the fields need.
-
-Which bytes the coming samples need follows from the order in which they will be read. A `Position`
-for each open video follows what the decoder will do, so that each byte is fetched once as long as
-its video stays open. Where the order turns out to be another one, planning starts anew.
-"""
+"""One sample: decoded, transformed, written; read and decoded only as far as the fields need."""
 
 import copy
-import os
-import threading
 import warnings
-from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Final, Literal, NamedTuple, Self
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 
@@ -29,8 +22,8 @@ from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import depth_frame_index
-from stereogenbench_data.media.seek_table import Position
 from stereogenbench_data.samples.checks import OddSceneWarning
+from stereogenbench_data.samples.coming import ComingSamples, DescribedAhead, NeededFiles
 from stereogenbench_data.samples.derive import SceneFacts
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.request import Clip, Request
@@ -47,7 +40,7 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.selection.plan import Address, Step
 from stereogenbench_data.sources.cache import ShardCache
-from stereogenbench_data.sources.fetch_ahead import FetchAhead, Wanted
+from stereogenbench_data.sources.fetch_ahead import FetchAhead
 from stereogenbench_data.sources.members import MemberSource
 
 KEPT_POSES: Final = 32
@@ -55,219 +48,6 @@ KEPT_POSES: Final = 32
 
 KEPT_SCENES: Final = 256
 """Of how many scenes what the index says is kept."""
-
-SCENES_AHEAD: Final = 8
-"""How many presumed scenes behind a URL are planned ahead of the one that is read, and how many are
-described ahead of these."""
-
-STEPS_AHEAD: Final = 2048
-"""How many steps are looked ahead for such scenes."""
-
-
-_AT_ONCE: Final = 32
-"""So many samples are planned at most before the next one is read."""
-
-_SOON: Final = 16
-"""What so many samples after this one need is fetched at once."""
-
-_REFILLED_AT: Final = 0.5
-"""The share of the limit below which more is planned: many samples together need fewer requests."""
-
-_FIRST_BYTES: Final = 32_000_000
-"""So many bytes are requested at first, and two more for each that was read: the first batch does
-not wait for what is needed much later."""
-
-
-class NeededFiles(NamedTuple):
-    """What a sample is read from.
-
-    Attributes:
-        scene: Its scene.
-        frames: Name of each video to the frames of it, in their order.
-        texts: Names of files that are read whole, once a scene.
-    """
-
-    scene: Scene
-    frames: dict[str, list[int]]
-    texts: tuple[str, ...]
-
-
-class _Planned(NamedTuple):
-    """A planned sample, by its number, and the bytes planned for the order up to it."""
-
-    number: int
-    address: Address
-    up_to_bytes: int
-
-
-FilesOf = Callable[[Address], NeededFiles]
-
-
-class ComingSamples:
-    """Plans the bytes of coming samples, and of the one that is read now."""
-
-    def __init__(self, source: MemberSource, ahead: FetchAhead, streams: Streams) -> None:
-        """Plan nothing yet.
-
-        Args:
-            source: Where the files are.
-            ahead: What fetches them.
-            streams: Says how many videos stay open, and how many frames of each are kept.
-        """
-        self._source = source
-        self._ahead = ahead
-        self._streams = streams
-        self._steps: Iterator[Step] = iter(())
-        self._due: deque[_Planned] = deque()
-        self._waiting: deque[_Planned] = deque()  # for their requests
-        self._number = self._begun = 0
-        self._planned_bytes = self._read_bytes = 0
-        # Of each open video, and which of its frames are kept.
-        self._positions: OrderedDict[tuple[str, int, int], tuple[Position | None, deque[int]]] = (
-            OrderedDict()
-        )
-        self._read_texts: set[str] = set()
-        self._is_filling = True
-        self._has_order = False
-        self._pid, self._lock = os.getpid(), threading.RLock()
-
-    @property
-    def has_order(self) -> bool:
-        """Whether samples were read as they were expected, in this process."""
-        return self._has_order and self._pid == os.getpid()
-
-    def expect(self, steps: Iterable[Step]) -> None:
-        """Take the samples that will be read next; they replace those expected before."""
-        with self._own_lock():
-            if self._due:
-                self._begin_anew()
-            self._steps, self._has_order = iter(steps), True
-
-    def begin(self, address: Address, files: FilesOf) -> None:
-        """Plan a sample that is read now, unless it is planned, and some of those after it.
-
-        Args:
-            address: The sample.
-            files: Returns what a sample is read from.
-        """
-        with self._own_lock():
-            if not self._due:
-                self._plan_next(files)
-            if self._due and self._due[0].address != address:
-                self._begin_anew()
-            if not self._due:
-                self._plan(Step(address, ends_run=False), files(address))
-            first = self._due[0].number
-            self._begun = max(self._begun, first)
-            self._ahead.begin(self._begun)
-            if not self._is_filling:
-                low = _REFILLED_AT * self._ahead.limit_bytes
-                self._is_filling = self._ahead.planned_bytes < low
-            for _ in range(_AT_ONCE if self._is_filling else 0):
-                self._is_filling = self._ahead.planned_bytes < self._ahead.limit_bytes
-                self._is_filling = self._is_filling and self._plan_next(files)
-                if not self._is_filling:
-                    break
-            # While more is planned, requests for later samples wait: they may grow.
-            last = first + _SOON if self._is_filling else self._number
-            up_to_bytes = _FIRST_BYTES + 2 * self._read_bytes
-            while self._waiting and (
-                self._waiting[0].number <= first
-                or (self._waiting[0].number <= last and self._waiting[0].up_to_bytes <= up_to_bytes)
-            ):
-                self._begun = self._waiting.popleft().number
-            self._ahead.begin(self._begun)
-
-    def end(self, address: Address) -> None:
-        """Forget what a sample that was read needed alone."""
-        with self._own_lock():
-            if self._due and self._due[0].address == address:
-                read = self._due.popleft()
-                self._read_bytes = read.up_to_bytes
-                self._ahead.release(read.number)
-
-    def close(self) -> None:
-        """End all requests, and expect no sample."""
-        with self._own_lock():
-            self._begin_anew()
-            self._ahead.close()
-
-    def _own_lock(self) -> threading.RLock:
-        """Return the lock of this process: a fork begins anew."""
-        if self._pid != os.getpid():
-            self._pid, self._lock = os.getpid(), threading.RLock()
-            self._due.clear()
-            self._begin_anew()
-        return self._lock
-
-    def _begin_anew(self) -> None:
-        for planned in self._due:
-            self._ahead.release(planned.number)
-        self._due.clear()
-        self._waiting.clear()
-        self._planned_bytes = self._read_bytes = 0
-        self._steps = iter(())
-        self._positions.clear()
-        self._read_texts.clear()
-        self._is_filling = True
-        self._has_order = False
-
-    def _plan_next(self, files: FilesOf) -> bool:
-        step = next(self._steps, None)
-        if step is not None:
-            self._plan(step, files(step.address))
-        return step is not None
-
-    def _plan(self, step: Step, needed: NeededFiles) -> None:
-        self._number += 1
-        scene, wanted = needed.scene, list[Wanted]()
-        for name in needed.texts:
-            member = scene.members.get(name)
-            if member is not None and scene.id.key not in self._read_texts:
-                wanted += self._source.wanted(scene, name)
-                self._read_texts.add(scene.id.key)
-        for name, frames in needed.frames.items():
-            if scene.held_name(name) in scene.members:
-                wanted += self._of_video(scene, name, frames, run=step.address.run)
-        if step.ends_run:
-            for member in scene.members.values():
-                self._positions.pop((member.path, member.offset, step.address.run), None)
-        before_bytes = self._ahead.planned_bytes
-        self._ahead.plan(self._number, wanted)
-        self._planned_bytes += self._ahead.planned_bytes - before_bytes
-        planned = _Planned(self._number, step.address, self._planned_bytes)
-        self._due.append(planned)
-        self._waiting.append(planned)
-
-    def _of_video(self, scene: Scene, name: str, frames: list[int], *, run: int) -> list[Wanted]:
-        member = scene.member(name)
-        place = (member.path, member.offset, run)
-        if place not in self._positions:
-            while len(self._positions) >= self._streams.limit > 0:
-                self._positions.popitem(last=False)
-            kept_frames: deque[int] = deque(maxlen=self._streams.kept_frames)
-            self._positions[place] = (self._source.position(scene, name), kept_frames)
-            if self._source.is_cached:
-                return self._source.wanted(scene, name)
-        self._positions.move_to_end(place)
-        position, kept = self._positions[place]
-        ranges: list[tuple[int, int]] = []
-        for frame in frames:
-            if position is not None and frame not in kept:
-                ranges += position.needed(frame)
-                kept.append(frame)
-        return self._source.wanted(scene, name, _joined(ranges)) if ranges else []
-
-
-def _joined(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the same bytes in as few ranges, ascending."""
-    joined: list[tuple[int, int]] = []
-    for start, stop in sorted(ranges):
-        if joined and start <= joined[-1][1]:
-            joined[-1] = (joined[-1][0], max(joined[-1][1], stop))
-        else:
-            joined.append((start, stop))
-    return joined
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -285,47 +65,6 @@ class _KnownScene:
     intrinsics: Intrinsics
     encodings: dict[int, DepthEncoding]
     videos: frozenset[str]
-
-
-class _DescribedAhead:
-    """The steps of an order over presumed scenes behind a URL, which are described ahead of them.
-
-    It ends for now where too many scenes are given that were not begun: describing costs requests.
-    """
-
-    def __init__(self, steps: Iterable[Step], describe: Callable[[Address], None]) -> None:
-        self._steps, self._describe = iter(steps), describe
-        self._waiting: deque[Step] = deque()
-        self._soon: set[int] = set()
-        self._given: set[int] = set()
-        self._ahead: set[int] = set()
-
-    def begin(self, row: int) -> None:
-        """Take a scene as begun."""
-        self._given.add(row)
-        self._ahead.discard(row)
-
-    def __iter__(self) -> Self:
-        return self
-
-    def __next__(self) -> Step:
-        while len(self._soon) < SCENES_AHEAD and len(self._waiting) < STEPS_AHEAD:
-            step = next(self._steps, None)
-            if step is None:
-                break
-            self._waiting.append(step)
-            row = step.address.row
-            if row not in self._given and row not in self._soon:
-                self._soon.add(row)
-                self._describe(step.address)
-        row = self._waiting[0].address.row if self._waiting else -1
-        if row < 0 or (row not in self._given and len(self._ahead) >= SCENES_AHEAD):
-            raise StopIteration
-        if row not in self._given:
-            self._given.add(row)
-            self._ahead.add(row)
-        self._soon.discard(row)
-        return self._waiting.popleft()
 
 
 class SampleLoader:
@@ -383,7 +122,7 @@ class SampleLoader:
         self._coming = None
         if self._ahead is not None:
             self._coming = ComingSamples(self._source, self._ahead, streams)
-        self._described: _DescribedAhead | None = None
+        self._described: DescribedAhead | None = None
         self._scenes: OrderedDict[int, _KnownScene] = OrderedDict()
         self._poses: OrderedDict[str, CameraPoses] = OrderedDict()
 
@@ -414,7 +153,7 @@ class SampleLoader:
         """Take the samples that will be decoded next, so that their bytes are fetched ahead."""
         if self._coming is not None:
             if self._index.presumption is not None:
-                self._described = steps = _DescribedAhead(steps, self._describe_soon)
+                self._described = steps = DescribedAhead(steps, self._describe_soon)
             self._coming.expect(steps)
 
     def begin(self, address: Address) -> None:

@@ -19,11 +19,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stereogenbench_data.errors import MediaError, StorageError
-from stereogenbench_data.media.depth import measured, open_depth, read_depth_units, resized_nearest
-from stereogenbench_data.media.video import VideoReader, read_rgb, require_indexed_picture
+from stereogenbench_data.media.depth import measured, open_video, read_depth_units, resized_nearest
+from stereogenbench_data.media.video import read_rgb, require_indexed_picture
 from stereogenbench_data.samples.views import StoredDepth
 from stereogenbench_data.schema.records import DepthEncoding, Scene
-from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
 from stereogenbench_data.sources.members import MemberSource
 from stereogenbench_data.sources.ranged_file import MemberFile, RangedFile
 
@@ -244,8 +243,7 @@ class Streams:
                 file = self._source.open(scene, name)
                 with _cause_raised(file):
                     label = self._source.label(scene, name)
-                    kind = open_depth if name in PACKED_DEPTH_NAMES.values() else VideoReader
-                    reader = kind(file, name=label, frames=scene.frames)
+                    reader = open_video(file, name=label, frames=scene.frames)
                     try:
                         require_indexed_picture(reader, scene.rig)
                     except MediaError:

@@ -23,7 +23,7 @@ from stereogenbench_data.media.clock import MOST_EXTRA_FRAMES
 from stereogenbench_data.media.container import StreamFacts, depth_coding
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
-    open_depth,
+    open_video,
     read_depth_units,
     resolve_encoding,
 )
@@ -325,7 +325,7 @@ def _decode(task: _SceneTask, name: str) -> None:
             for index in range(scene.frames):
                 pictures.colour_frame(index)
         return
-    with open_depth(file, name=name, frames=scene.frames) as depth:
+    with open_video(file, name=name, frames=scene.frames) as depth:
         for index in range(scene.frames):
             read_depth_units(depth, index, encoding=ANY_DEPTH)
 

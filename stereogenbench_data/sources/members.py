@@ -124,7 +124,7 @@ class MemberSource:
         """Whether whole files are fetched, and kept on disk."""
         return self._cache is not None
 
-    def position(self, scene: Scene, name: str) -> Position | None:
+    def position(self, scene: Scene, name: str, *, kept_frames: int) -> Position | None:
         """Return where a reader of one of a scene's videos stands that is not open.
 
         None if it is not known which bytes a frame needs, or all of them are fetched.
@@ -132,7 +132,7 @@ class MemberSource:
         if self._cache is not None:
             return None
         table = self._table(scene, scene.held_name(name))
-        return None if table is None else Position(table)
+        return None if table is None else Position(table, kept_frames=kept_frames)
 
     def wanted(
         self, scene: Scene, name: str, ranges: Iterable[tuple[int, int]] | None = None

@@ -1,6 +1,5 @@
 """Videos with several key frames: what lies between two of them is shuffled by itself."""
 
-import re
 import shutil
 from collections import defaultdict
 from fractions import Fraction
@@ -10,8 +9,7 @@ import pytest
 import torch
 
 from stereogenbench_data import SceneIndex, StereoPairs
-from stereogenbench_data.index.rows import ADDED
-from stereogenbench_data.samples import streams
+from stereogenbench_data.media import depth
 from stereogenbench_data.selection import plan
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
@@ -97,12 +95,12 @@ def test_runs_are_shuffled_by_themselves_and_hold_the_right_frames(whole, keyed_
 def test_a_run_begins_decoding_at_its_key_frame(keyed_release, monkeypatch):
     first = {}
 
-    class Counting(streams.VideoReader):
+    class Counting(depth.VideoReader):
         def frame(self, index):
             first.setdefault(id(self), (self, index))
             return super().frame(index)
 
-    monkeypatch.setattr(streams, "VideoReader", Counting)
+    monkeypatch.setattr(depth, "VideoReader", Counting)
     loader = StereoPairs(keyed_release, frames="all", fields=("left",)).loader(
         4, drop_last=False, shuffle_groups=1
     )
@@ -116,12 +114,12 @@ def test_a_run_begins_decoding_at_its_key_frame(keyed_release, monkeypatch):
 def test_interleaved_frames_of_all_pairs_are_decoded_once(keyed_release, monkeypatch, open_frames):
     read = defaultdict(list)
 
-    class Counting(streams.VideoReader):
+    class Counting(depth.VideoReader):
         def frame(self, index):
             read[self.name].append(index)
             return super().frame(index)
 
-    monkeypatch.setattr(streams, "VideoReader", Counting)
+    monkeypatch.setattr(depth, "VideoReader", Counting)
     pairs = StereoPairs(keyed_release, frames="all", pairs="all", fields=("left", "right"))
     loader = pairs.loader(4, drop_last=False, shuffle_groups=1, open_frames=open_frames)
     for _ in loader:
@@ -131,8 +129,9 @@ def test_interleaved_frames_of_all_pairs_are_decoded_once(keyed_release, monkeyp
     assert all(sorted(frames) == list(range(len(frames))) for frames in read.values())
 
 
-@pytest.mark.parametrize("selection", [{}, {"pairs": "all"}, {"frames": ("clips", 3)}], ids=str)
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize(
+    ("selection", "workers"), [({"pairs": "all"}, 0), ({"frames": ("clips", 3)}, 2)], ids=str
+)
 def test_every_sample_comes_once_and_as_by_number(keyed_release, selection, workers):
     options = {"frames": "all", "fields": FIELDS} | selection
     pairs = StereoPairs(keyed_release, **options)
@@ -151,29 +150,3 @@ def test_frames_drawn_at_random_are_dealt_to_as_many_runs(keyed_release):
 
     assert pairs.plan.runs.lengths.tolist() == [2, 3] * 3
     assert len(epoch_of(pairs.loader(4, drop_last=False))) == 15
-
-
-def test_an_index_without_key_frames_opens_with_the_digest_it_had(whole, tmp_path):
-    """As earlier versions wrote it."""
-    import pyarrow.parquet as pq
-
-    index = SceneIndex.open(whole)
-    place = tmp_path / "index.parquet"
-    index.write(place)
-    table = pq.read_table(place)
-    metadata = table.schema.metadata
-    older = table.drop_columns([*ADDED])
-    pq.write_table(older.replace_schema_metadata(metadata), place)
-    opened = SceneIndex.open(place, root=whole)
-
-    assert opened.digest == index.digest
-    assert opened.scene(0).key_frames == (0,)
-
-
-def test_a_loader_says_in_a_line_what_its_batches_show(keyed_release):
-    loader = StereoPairs(keyed_release, frames="all", pairs="all", fields=FIELDS).loader(4)
-
-    assert re.fullmatch(
-        r"a batch of 4 shows [1-4]\.\d scenes and [1-4]\.\d moments \(.*fully shuffled\)",
-        loader.stats().mixing,
-    )
