@@ -1,6 +1,5 @@
 """What measures, run once on tiny data; what came out is written, tabled and drawn."""
 
-import json
 import time
 from dataclasses import replace
 
@@ -8,19 +7,16 @@ import numpy as np
 import pytest
 
 from benchmarks import (
-    __main__,
     accuracy,
     clock,
     race,
     tables,
     training,
 )
-from benchmarks.__main__ import chosen, parse
 from benchmarks.contestants import limit
 from benchmarks.material import facts
 from benchmarks.plots import plot_all
 from benchmarks.results import Results, Spread, ratios
-from benchmarks.ways import WAYS
 from benchmarks.workloads import WORKLOADS, Job, tiny
 from stereogenbench_data import StereoPairs
 
@@ -80,13 +76,6 @@ def test_a_contestant_that_hangs_is_stopped():
         clock.in_a_fork(lambda: time.sleep(60), longest_s=0.05)
 
 
-def test_every_way_has_an_error_and_a_speed(results):
-    ways = results.sections["accuracy"]["ways"]
-
-    assert [way["name"] for way in ways] == [way.name for way in WAYS]
-    assert all(way["ns_a_pixel"]["median"] > 0 for way in ways)
-
-
 def test_the_default_is_within_an_ulp_and_the_quantum_and_float16_is_not(results):
     ways = {way["name"]: way for way in results.sections["accuracy"]["ways"]}
     (default,) = [way for way in ways.values() if way["offered"] == "default"]
@@ -95,13 +84,6 @@ def test_the_default_is_within_an_ulp_and_the_quantum_and_float16_is_not(results
     assert default["worst_of_bound"] <= 1
     assert ways["closed form stored as float16"]["worst_ulps"] > 100
     assert ways["pose chain, all float32 (textbook)"]["worst_on_screen_px"] > 0.01
-
-
-def test_depth_that_is_averaged_belongs_to_no_surface(results):
-    shares = {way["name"]: way["invented_share"] for way in results.sections["accuracy"]["resized"]}
-
-    assert shares["nearest-exact, depth"] == 0
-    assert shares["bilinear, depth"] > 0
 
 
 def test_training_shards_are_compared_with_bare_loops_over_the_same_samples(material, monkeypatch):
@@ -139,12 +121,6 @@ def test_the_tables_and_the_plots_are_made_of_the_results(results, tmp_path):
     assert all(path.stat().st_size > 10_000 for path in made)
 
 
-def test_results_outlive_the_process(results):
-    again = Results(results.path)
-
-    assert again.sections == json.loads(json.dumps(results.sections))
-
-
 def test_a_ratio_is_taken_within_each_round():
     rounds = [
         {"a/2": {"samples": 10, "seconds": 1}, "b/2": {"samples": 10, "seconds": 2}},
@@ -153,44 +129,3 @@ def test_a_ratio_is_taken_within_each_round():
     ]
 
     assert ratios(rounds, "a/2", to="b/2") == Spread(3.0, 2.5, 3.5, 2)
-
-
-def test_the_slice_of_those_that_start_anew_is_spread_over_the_places_in_a_video(material):
-    workload = replace(TINY["all-frames"], few=4)
-
-    job = Job(workload, material, reading="anywhere")
-
-    assert sorted(wanted.frames[0] for wanted in job.wanted) == [0, 1, 2, 3]
-    assert [wanted.frames[0] for wanted in job.wanted] == [0, 1, 3, 2]
-
-
-def test_a_step_that_fails_is_reported_and_the_others_are_measured(material, tmp_path, monkeypatch):
-    def fail(*_, **__):
-        raise ValueError("no such thing")
-
-    monkeypatch.setattr(__main__, "measure_accuracy", fail)
-    monkeypatch.setattr(__main__, "measure_training", lambda *_, **__: {"all": 1})
-    results, reported = Results(tmp_path / "results.json"), []
-
-    failed = __main__.measure_others(
-        ["accuracy", "training"],
-        material,
-        results,
-        options=parse(["--rounds", "1"]),
-        report=reported.append,
-    )
-
-    assert failed == ["accuracy: ValueError: no such thing"]
-    assert Results(results.path).sections["training"] == {"all": 1}
-
-
-def test_options_choose_workloads_and_workers():
-    workloads, others = chosen(parse(["--only", "clips", "--only", "training", "--workers", "4,1"]))
-
-    assert [(workload.name, workload.workers) for workload in workloads] == [("clips", (4, 1))]
-    assert others == ["training"]
-
-
-def test_the_spread_of_nothing_is_none():
-    assert Spread.of([]) is None
-    assert np.isclose(Spread.of([1, 2, 3, 4]).median, 2.5)

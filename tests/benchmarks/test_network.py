@@ -12,8 +12,6 @@ from benchmarks.network import WORKLOADS as NETWORK_WORKLOADS
 from benchmarks.plots import plot_all
 from benchmarks.results import Results
 from benchmarks.server import Network, serving
-from stereogenbench_data.sources.remote import RemoteObject
-from tests.sources.policies import retry_policy
 
 DATA = bytes(range(256)) * 4000
 
@@ -33,15 +31,6 @@ def started(folder):
         return serving(folder, network=Network(**how))
 
     return start
-
-
-def test_the_delayed_server_counts_what_it_sends(started):
-    with started(delay_s=0.05) as server:
-        remote = RemoteObject(f"{server.url}/x.tar")
-        assert remote.read(0, 100) + remote.read(500, 900) == DATA[:100] + DATA[500:900]
-        counts = server.counts()
-
-    assert (counts.requests, counts.sent_bytes, counts.connections) == (2, 500, 1)
 
 
 def test_the_delayed_server_answers_as_web_servers_do(started):
@@ -103,17 +92,6 @@ def test_the_delayed_server_limits_the_bandwidth(folder, waits_s, line):
     assert sum(waits_s) == pytest.approx(2 * len(DATA) / 4e6)
 
 
-def test_a_server_that_fails_costs_no_byte(started):
-    with started(refused=0.1, lost=0.1) as server:
-        remote = RemoteObject(f"{server.url}/x.tar", retry=retry_policy(first_wait_s=0.001))
-        for start in range(0, 200_000, 2000):
-            assert remote.read(start, start + 2000) == DATA[start : start + 2000]
-        counts = server.counts()
-
-    assert counts.failures > 5
-    assert counts.requests > 100
-
-
 @pytest.fixture(scope="module")
 def results(material, tmp_path_factory):
     """Return the results of one round of a race over two networks."""
@@ -157,19 +135,6 @@ def test_the_races_are_tabled_and_drawn(results, tmp_path):
     assert "| 1 ms, 20 MB/s a connection | ours |" in text
     assert "| 1 ms, 5% of requests refused | ours |" in text
     assert [path.name for path in made] == ["network.png"]
-
-
-def test_races_that_are_there_are_not_run_again_when_resumed(results, material):
-    before = list(results.sections["network"]["races"])
-    plan = Plan(
-        rounds=1, workers=1, delays_ms=(1.0,), bandwidths_mb_s=(20.0,), faults=(), scenes=10,
-        workloads=("first",), resume=True,
-    )  # fmt: skip
-    reported = []
-    run_network(material, results, plan=plan, report=reported.append)
-
-    assert reported == []
-    assert results.sections["network"]["races"] == before
 
 
 def test_ours_gives_every_sample_where_requests_fail(material):

@@ -39,11 +39,3 @@ def test_a_sequential_order_shows_how_little_it_mixes(pairs):
     assert sequential.frame_spread_ratio < 0.5
     assert shuffled.frame_spread_ratio > 0.7
     assert sequential.shuffled == shuffled.shuffled
-
-
-def test_one_frame_a_scene_has_no_spread_to_compare(small_release):
-    first = StereoPairs(small_release, fields=("__key__",))
-    found = order_quality(EpochBatches(first, 2).order(0), first.plan)
-
-    assert found.frame_spread_ratio == 1
-    assert "a batch of 2 shows 2.0 scenes and 2.0 moments" in str(found)

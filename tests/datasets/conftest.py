@@ -3,6 +3,7 @@
 import itertools
 
 import pytest
+import torch
 
 from stereogenbench_data import SceneIndex, StereoPairs
 
@@ -32,3 +33,26 @@ def in_turn(shares):
     """Return the batches of all ranks in the order of the training steps."""
     rows = itertools.zip_longest(*shares)
     return [batch for row in rows for batch in row if batch is not None]
+
+
+def same(one, other):
+    """Return whether two samples or batches with the same fields are equal, bit for bit."""
+    assert one.keys() == other.keys()
+    return all(
+        torch.equal(value, other[name]) if isinstance(value, torch.Tensor) else value == other[name]
+        for name, value in one.items()
+    )
+
+
+class RefuseFrame:
+    """A transform that fails at a frame."""
+
+    swaps_views = False
+
+    def __init__(self, number):
+        self.number = number
+
+    def __call__(self, views, generator):
+        if self.number in views.frames:
+            raise ArithmeticError(f"frame {self.number}")
+        return views

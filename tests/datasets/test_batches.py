@@ -7,7 +7,6 @@ import pickle
 
 import pytest
 import torch
-from torch.utils.data import DataLoader
 from torchdata.stateful_dataloader import StatefulDataLoader
 
 from stereogenbench_data import EpochBatches, SelectionError, StateError, StereoPairs
@@ -39,37 +38,12 @@ def test_an_epoch_of_which_all_would_be_dropped_is_refused(keyed):
         EpochBatches(keyed, 64, rank=0, world_size=3)
 
 
-def test_wrapped_ranks_are_even_and_know_their_padding(keyed):
-    shares = [EpochBatches(keyed, 9, rank=r, world_size=3, drop_last="pad") for r in range(3)]
-    batches = in_turn([list(share) for share in shares])
-    padding = flat(shares[0].is_padding(number).tolist() for number in range(18))
-
-    assert [len(batch) for batch in batches] == [9] * 18
-    numbers = flat(batches)
-    assert padding == [False] * 140 + [True] * 22
-    assert sorted(numbers[:140]) == list(range(140))
-    assert numbers[140:] == numbers[:22]
-
-
 def test_the_seed_is_the_datasets_unless_another_is_given(small_index):
     pairs = StereoPairs(small_index, fields=("__key__",), frames="all", seed=5)
     others = StereoPairs(small_index, fields=("__key__",), frames="all")
 
     assert list(EpochBatches(pairs, 4)) == list(EpochBatches(others, 4, seed=5))
     assert list(EpochBatches(pairs, 4)) != list(EpochBatches(others, 4))
-
-
-def test_the_epoch_is_the_datasets(keyed):
-    batches = EpochBatches(keyed, 4)
-    first = list(batches)
-    batches.set_epoch(1)
-    second = list(batches)
-
-    assert keyed.epoch == 1
-    assert first != second
-    assert sorted(flat(first)) == sorted(flat(second))
-    keyed.set_epoch(0)
-    assert list(batches) == first
 
 
 def test_a_position_is_flat_json_and_says_what_it_belongs_to(keyed):
@@ -111,9 +85,7 @@ def test_what_is_loaded_goes_on_once_and_then_epochs_are_whole(keyed):
         ({"batch_size": 5}, "batch_size is 5 here and 4 there"),
         ({"seed": 1}, "seed is 1 here and 0 there"),
         ({"batch_size": 1, "shuffle_groups": 2}, "shuffle_groups is 2 here and 4 there"),
-        ({"batch_size": 1, "open_scenes": 1}, "open_scenes is 1 here and 4 there"),
         ({"shuffle": False}, "shuffle is False here and True there"),
-        ({"drop_last": "pad"}, "drop_last is 'pad' here and True there"),
         ({"drop_last": "pad", "seed": 2}, "seed is 2 here.*; drop_last is 'pad' here"),
     ],
     ids=str,
@@ -203,16 +175,11 @@ def test_a_damaged_position_is_refused(keyed, change, message):
         batches.load_state_dict(batches.state_dict() | change)
 
 
-@pytest.mark.parametrize("state", [None, [], "state", 3], ids=repr)
+@pytest.mark.parametrize("state", [None, "state"], ids=repr)
 def test_what_is_no_dict_is_refused(keyed, state):
     for target in (EpochBatches(keyed, 4), keyed.loader(4)):
         with pytest.raises(StateError, match=r"a state is a dict as .* returns it, got"):
             target.load_state_dict(state)
-
-
-def test_something_else_than_a_position_is_refused(keyed):
-    with pytest.raises(StateError, match=r"has no batch_size, .* \(it has model\)"):
-        EpochBatches(keyed, 4).load_state_dict({"model": 1})
 
 
 @pytest.mark.parametrize(
@@ -220,7 +187,6 @@ def test_something_else_than_a_position_is_refused(keyed):
     [
         ({"rank": 2, "world_size": 2}, "got rank=2, world_size=2"),
         ({"rank": 1}, "got rank=1, world_size=None"),
-        ({"drop_last": "keep"}, "drop_last must be True, False or 'pad', got 'keep'"),
         ({"drop": True}, "EpochBatches has no option 'drop'; did you mean 'drop_last'"),
         ({"drop_last": 1}, "drop_last must be True, False or 'pad', got 1"),
         ({"shuffle": "yes"}, "shuffle must be True or False, got 'yes'"),
@@ -232,7 +198,7 @@ def test_options_that_no_epoch_has_are_refused(keyed, options, message):
         EpochBatches(keyed, 4, **options)
 
 
-@pytest.mark.parametrize("size", ["4", None, 2.0, True])
+@pytest.mark.parametrize("size", ["4", True])
 def test_a_batch_size_that_is_no_whole_number_is_refused(keyed, size):
     with pytest.raises(SelectionError, match="batch_size must be a whole number from 1, got"):
         EpochBatches(keyed, size)
@@ -253,27 +219,7 @@ def test_batches_made_before_the_process_group_are_refused_in_it(keyed, tmp_path
         torch.distributed.destroy_process_group()
 
 
-def test_a_pass_that_was_left_is_not_the_position_after_later_ones(keyed):
-    batches = EpochBatches(keyed, 9, drop_last=False)
-    loader = DataLoader(keyed, batch_sampler=batches)
-    for _ in range(2):
-        for number, _ in enumerate(loader):
-            if number == 3:
-                break
-    assert batches.state_dict()["batches_consumed"] == 4
-    list(loader)
-
-    assert batches.state_dict()["batches_consumed"] == 16
-
-
-def test_ranks_whose_passes_are_over_are_all_at_the_end(keyed):
-    ranks = [EpochBatches(keyed, 9, rank=r, world_size=3, drop_last=False) for r in range(3)]
-
-    assert [len(list(rank)) for rank in ranks] == [6, 5, 5]
-    assert [rank.state_dict()["batches_consumed"] for rank in ranks] == [16, 16, 16]
-
-
-@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
+@pytest.mark.parametrize("copied", [copy.deepcopy, pickle.dumps])
 def test_a_pass_over_batches_is_not_copied_and_goes_on(keyed, copied):
     numbers = iter(EpochBatches(keyed, 9, drop_last=False))
     next(numbers)
@@ -283,18 +229,8 @@ def test_a_pass_over_batches_is_not_copied_and_goes_on(keyed, copied):
     assert len(list(numbers)) == 15
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_it_serves_torchs_own_loader(keyed, workers):
-    batches = EpochBatches(keyed, 16, drop_last=False)
-    loader = DataLoader(keyed, batch_sampler=batches, num_workers=workers)
-
-    assert len(loader) == 9
-    assert [len(batch["__key__"]) for batch in loader] == [16] * 8 + [12]
-
-
 @pytest.mark.filterwarnings("ignore:'set_vital' is deprecated")
-@pytest.mark.parametrize("workers", [0, 2])
-@pytest.mark.parametrize("stop", [0, 1, 4, 9])
+@pytest.mark.parametrize(("workers", "stop"), [(0, 0), (0, 4), (2, 4), (2, 9)])
 def test_torchdatas_loader_saves_and_loads_its_position(keyed, workers, stop):
     keyed.set_epoch(2)
 
@@ -316,35 +252,3 @@ def test_torchdatas_loader_saves_and_loads_its_position(keyed, workers, stop):
     assert keys_of(resumed) == unbroken
     resumed.batch_sampler.set_epoch(3)
     assert sorted(flat(keys_of(resumed))) == sorted(flat(unbroken))
-
-
-@pytest.mark.filterwarnings("ignore:'set_vital' is deprecated")
-def test_a_state_of_torchdatas_loader_that_holds_the_position_twice_is_resumed(keyed):
-    """Passes over the batches had a state of their own before, the same as the sampler's."""
-
-    def loader():
-        batches = EpochBatches(keyed, 16, drop_last=False)
-        return StatefulDataLoader(keyed, batch_sampler=batches)
-
-    unbroken, broken, resumed = keys_of(loader()), loader(), loader()
-    before = keys_of(itertools.islice(broken, 4))
-    state = broken.state_dict()
-    assert state["_sampler_iter_state"] is None
-    resumed.load_state_dict(state | {"_sampler_iter_state": state["_index_sampler_state"]})
-
-    assert before + keys_of(resumed) == unbroken
-
-
-@pytest.mark.filterwarnings("ignore:'set_vital' is deprecated")
-@pytest.mark.parametrize("workers", [0, 1])
-def test_torchdatas_loader_begins_a_whole_epoch_after_a_finished_one(keyed, workers):
-    def loader():
-        batches = EpochBatches(keyed, 16, drop_last=False)
-        return StatefulDataLoader(keyed, batch_sampler=batches, num_workers=workers)
-
-    finished = loader()
-    whole = keys_of(finished)
-    resumed = loader()
-    resumed.load_state_dict(finished.state_dict())
-
-    assert keys_of(resumed) == whole

@@ -12,19 +12,16 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-import torch
 
 from stereogenbench_data import SceneIndex, StereoPairs, StereoPairStream
 from stereogenbench_data.datasets.mapped import SeekTableWarning
 from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.media.seek_table import packed_tables, parse_tables
-from stereogenbench_data.samples import load
 from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources.cache import ShardCache
-from stereogenbench_data.sources.fetch_ahead import FetchAhead
 from stereogenbench_data.sources.retry import RetryPolicy
+from tests.datasets.conftest import same
 from tests.servers.failing_server import Answer, serving
-from tests.servers.gate import Gate
 from tests.sources.policies import LONGEST_S, ended
 
 FIELDS = ("left", "right", "disparity", "frame_index", "__key__")
@@ -80,15 +77,6 @@ def parts_asked(server):
     return [each for each in server.asked if each.path.endswith(".tar") and each.stop > 1]
 
 
-def same(one, other):
-    return all(
-        torch.equal(one[name], other[name])
-        if isinstance(one[name], torch.Tensor)
-        else one[name] == other[name]
-        for name in one
-    )
-
-
 def needed_bytes(folder, frame):
     """The bytes of the packets of a primary pair with depth that a frame decodes from."""
     index = SceneIndex.open(folder)
@@ -116,8 +104,9 @@ def test_the_first_frame_of_a_pair_takes_a_request_a_stream(served, large_shards
     assert sum(each.sent for each in asked) <= 1.05 * needed_bytes(large_shards, 0)
 
 
-@pytest.mark.parametrize("frames", ["all", ("random", 3), ("clips", 3)], ids=str)
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize(
+    ("frames", "workers"), [("all", 2), (("random", 3), 0), (("clips", 3), 2)], ids=str
+)
 def test_a_pass_gives_what_local_shards_give_in_few_requests(
     frames, workers, served, large_shards, alone
 ):
@@ -144,70 +133,9 @@ def test_a_stream_of_samples_is_fetched_ahead_too(served, large_shards, alone):
     stream.close()
 
 
-def test_the_streams_of_a_sample_are_fetched_at_the_same_time(served, alone):
-    """No stream is answered before all three are asked for."""
-    with Gate(served.url) as gate:
-        pairs = StereoPairs(gate.url, fields=FIELDS, frames="all")
-        pairs[6]
-        gate.hold_until(3)
-        pairs[0]
-        pairs.close()
-
-    assert gate.came_together
-
-
-def test_what_is_planned_stays_within_the_bound(served, monkeypatch, alone):
-    bound = 100_000
-    pairs = StereoPairs(served.url, fields=("left",), frames="all", fetch_ahead_bytes=bound)
-    loader = pairs.loader(1, drop_last=False)
-    planned, add = [], FetchAhead.plan
-
-    def noted(ahead, sample, wanted):
-        add(ahead, sample, wanted)
-        planned.append(ahead.planned_bytes)
-
-    monkeypatch.setattr(FetchAhead, "plan", noted)
-    assert len([*loader]) == len(pairs)
-    largest = max(planned)
-    loader.close()
-
-    of_one_sample = pairs.index.scene(0).members[rgb_name(0)].size
-    assert bound < largest <= bound + of_one_sample
-
-
-def test_what_is_requested_grows_with_what_was_read(served, large_shards, monkeypatch, alone):
-    monkeypatch.setattr(load, "_FIRST_BYTES", 1)
-    options = {"fields": ("left",), "frames": "all"}
-    loader = StereoPairs(served.url, **options).loader(1, shuffle=False)
-    expected = [*StereoPairs(large_shards, **options).loader(1, shuffle=False)]
-    served.asked.clear()
-    batches = iter(loader)
-    first = next(batches)
-    time.sleep(0.1)
-    asked = len(parts_asked(served))
-    whole = [first, *batches]
-    loader.close()
-
-    assert asked == 1
-    assert all(same(*each) for each in zip(whole, expected, strict=True))
-
-
-def test_nothing_is_planned_ahead_with_a_bound_of_0(served, alone):
-    loader = StereoPairs(served.url, fields=("left",), fetch_ahead_bytes=0).loader(1)
-    served.asked.clear()
-    batches = iter(loader)
-    next(batches)
-    time.sleep(0.1)
-
-    assert len(parts_asked(served)) == 1
-    batches.close()
-    loader.close()
-
-
-@pytest.mark.parametrize("workers", [0, 1])
-def test_a_broken_pass_leaves_nothing(workers, served, alone):
+def test_a_broken_pass_leaves_nothing(served, alone):
     pairs = StereoPairs(served.url, fields=FIELDS, frames="all")
-    for _ in pairs.loader(1, num_workers=workers):
+    for _ in pairs.loader(1):
         break
     deadline = time.monotonic() + 60
     while fetching() and time.monotonic() < deadline:
@@ -220,15 +148,6 @@ def test_a_dropped_dataset_leaves_nothing(served, alone):
     pairs = StereoPairs(served.url, fields=FIELDS)
     pairs[0]
     del pairs
-
-
-def test_ctrl_c_within_the_loop_leaves_nothing(served, alone):
-    def train():
-        for _ in StereoPairs(served.url, fields=FIELDS, frames="all").loader(1):
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train()
 
 
 def test_a_fork_in_the_middle_of_a_pass_reads_for_itself(served, large_shards, alone):
@@ -320,8 +239,8 @@ def swapped(packed):
 
 @pytest.mark.parametrize(
     "change",
-    [shifted, swapped, lambda packed: packed[:-3], lambda packed: b"", lambda packed: None],
-    ids=["shifted", "swapped", "cut", "empty", "null"],
+    [shifted, swapped, lambda packed: packed[:-3]],
+    ids=["shifted", "swapped", "cut"],
 )
 @pytest.mark.filterwarnings("ignore::stereogenbench_data.datasets.mapped.SeekTableWarning")
 def test_a_wrong_seek_table_gives_the_right_frames(change, large_shards, tmp_path, alone):

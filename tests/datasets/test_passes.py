@@ -19,7 +19,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from stereogenbench_data import PassError, StereoPairs, StereoPairStream, WorkerError
-from tests.datasets.conftest import keys_of
+from tests.datasets.conftest import RefuseFrame, keys_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
 
@@ -46,8 +46,9 @@ def wrong(batch, truth):
     return sum(not torch.equal(left, truth[key]) for key, left in samples)
 
 
-@pytest.mark.parametrize("workers", [0, 1, 2])
-@pytest.mark.parametrize("inner", ["six batches", "one batch", "all"])
+@pytest.mark.parametrize(
+    ("workers", "inner"), [(0, "six batches"), (1, "all"), (2, "one batch")], ids=str
+)
 def test_a_pass_within_a_pass_takes_nothing_from_it(pairs, truth, workers, inner):
     loader = pairs.loader(9, num_workers=workers)
     expected = keys_of(pairs.loader(9))
@@ -65,9 +66,8 @@ def test_a_pass_within_a_pass_takes_nothing_from_it(pairs, truth, workers, inner
     assert sum(wrong(batch, truth) for batch in held) == 0
 
 
-@pytest.mark.parametrize("workers", [0, 1])
-def test_two_passes_by_turns_are_each_whole(pairs, truth, workers):
-    loader = pairs.loader(9, num_workers=workers)
+def test_two_passes_by_turns_are_each_whole(pairs, truth):
+    loader = pairs.loader(9, num_workers=1)
     expected = keys_of(pairs.loader(9))
     found = [], []
     for batches in zip(loader, loader, strict=True):
@@ -76,14 +76,6 @@ def test_two_passes_by_turns_are_each_whole(pairs, truth, workers):
             assert wrong(batch, truth) == 0
 
     assert list(found) == [expected, expected]
-
-
-def test_a_look_at_one_batch_does_not_move_the_position_of_the_loop(pairs):
-    loader = pairs.loader(9, num_workers=1)
-    for number, _ in enumerate(loader):
-        next(iter(loader))
-        if number < 14:
-            assert loader.state_dict()["batches_consumed"] == number + 1
 
 
 def test_workers_that_persist_tell_the_older_of_two_passes_that_it_is_over(pairs):
@@ -118,9 +110,7 @@ def test_epochs_set_during_a_pass_are_those_of_the_next_one(small_index):
         assert keys_of(loader) == expected[1]
 
 
-@pytest.mark.parametrize(
-    "copied", [copy.copy, copy.deepcopy, lambda loader: pickle.loads(pickle.dumps(loader))]
-)
+@pytest.mark.parametrize("copied", [copy.copy, lambda loader: pickle.loads(pickle.dumps(loader))])
 def test_a_copy_of_a_loader_has_passes_of_its_own(pairs, truth, copied):
     loader = pairs.loader(9, num_workers=1, persistent_workers=True)
     batches = iter(loader)
@@ -135,13 +125,11 @@ def test_a_copy_of_a_loader_has_passes_of_its_own(pairs, truth, copied):
     other.close()
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-@pytest.mark.parametrize("begun", [False, True])
-@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
+@pytest.mark.parametrize(("workers", "copied"), [(0, copy.deepcopy), (2, pickle.dumps)], ids=str)
 @pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
-def test_a_pass_is_not_copied(pairs, workers, begun, copied):
+def test_a_pass_is_not_copied(pairs, workers, copied):
     batches = iter(pairs.loader(9, num_workers=workers))
-    taken = [next(batches)] if begun else []
+    taken = [next(batches)]
     with pytest.raises(PassError, match="a pass over a loader cannot be copied"):
         copied(batches)
     gc.collect()
@@ -164,7 +152,7 @@ def fork_and(act):
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-@pytest.mark.parametrize("kind", ["loader", "persistent loader", "stream"])
+@pytest.mark.parametrize("kind", ["persistent loader", "stream"])
 def test_a_fork_that_lets_go_of_a_batch_leaves_it_to_its_parent(pairs, small_index, truth, kind):
     if kind == "stream":
         stream = StereoPairStream(small_index, 9, fields=FIELDS, pairs="adjacent", frames="all")
@@ -205,22 +193,6 @@ def test_a_fork_keeps_its_batches_while_the_parent_goes_on(pairs, truth):
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
-def test_batches_in_cycles_and_workers_forked_in_mid_epoch_change_no_batch(pairs, truth):
-    validation = pairs.loader(9, num_workers=2)
-    held = []
-    for number, batch in enumerate(pairs.loader(9, num_workers=1)):
-        cycle = {"batch": batch}
-        cycle["itself"] = cycle
-        held.append(batch)
-        if number % 5 == 2:
-            assert sum(wrong(other, truth) for other in validation) == 0
-        if number % 4 == 3:
-            assert sum(wrong(each, truth) for each in held) == 0
-            held.clear()
-
-    assert sum(wrong(each, truth) for each in held) == 0
-
-
 def test_a_pass_is_refused_in_a_fork_of_its_process(pairs):
     batches = iter(pairs.loader(9, num_workers=1))
     next(batches)
@@ -233,20 +205,18 @@ def test_a_pass_is_refused_in_a_fork_of_its_process(pairs):
     assert len(list(batches)) == 14
 
 
-@pytest.mark.parametrize("size", [None, (40, 56)])
-def test_reading_starts_no_thread_that_a_fork_would_wait_for(small_index, size):
+def test_reading_starts_no_thread_that_a_fork_would_wait_for(small_index):
     """FFmpeg waits for the threads of what it frees, and a fork has none of them."""
     threads = {thread.name for thread in THREADS.iterdir()}
-    held = [StereoPairs(small_index, fields=("left", "right", "disparity"), size=size)]
-    assert held[0][0]["left"].shape[-2:] == (size or (64, 64))
+    held = [StereoPairs(small_index, fields=("left", "right", "disparity"), size=(40, 56))]
+    assert held[0][0]["left"].shape[-2:] == (40, 56)
 
     assert {thread.name for thread in THREADS.iterdir()} <= threads
     assert fork_and(lambda: [held.clear(), gc.collect()]) == 0
 
 
-@pytest.mark.parametrize("persistent", [False, True])
-def test_a_fork_may_begin_a_pass_of_its_own(pairs, truth, persistent):
-    loader = pairs.loader(9, num_workers=1, persistent_workers=persistent)
+def test_a_fork_may_begin_a_pass_of_its_own(pairs, truth):
+    loader = pairs.loader(9, num_workers=1, persistent_workers=True)
     found = []
     for number, batch in enumerate(loader):
         found.append(batch)
@@ -257,9 +227,8 @@ def test_a_fork_may_begin_a_pass_of_its_own(pairs, truth, persistent):
     loader.close()
 
 
-@pytest.mark.parametrize("workers", [0, 1])
-def test_threads_that_share_a_pass_take_turns(pairs, workers):
-    batches = iter(pairs.loader(9, num_workers=workers))
+def test_threads_that_share_a_pass_take_turns(pairs):
+    batches = iter(pairs.loader(9, num_workers=1))
     found, errors = [], []
 
     def take():
@@ -348,15 +317,14 @@ class DieAt:
         return views
 
 
-@pytest.mark.parametrize("method", ["forkserver", "spawn"])
-def test_a_script_without_a_main_guard_is_told_to_have_one(small_index, tmp_path, method):
+def test_a_script_without_a_main_guard_is_told_to_have_one(small_index, tmp_path):
     small_index.write(tmp_path / "index.parquet")
     script = tmp_path / "script.py"
     script.write_text(
         "from stereogenbench_data import SceneIndex, StereoPairs\n"
         f"index = SceneIndex.open({str(tmp_path / 'index.parquet')!r}, root={small_index.root!r})\n"
         f"pairs = StereoPairs(index, fields={FIELDS!r})\n"
-        f"list(pairs.loader(2, num_workers=1, multiprocessing_context={method!r}))\n"
+        f"list(pairs.loader(2, num_workers=1, multiprocessing_context='spawn'))\n"
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
 
@@ -369,13 +337,9 @@ def test_a_script_without_a_main_guard_is_told_to_have_one(small_index, tmp_path
     ("how", "persistent", "pin_memory"),
     [
         ("nothing", False, False),
-        ("nothing", True, True),
         ("queue's lock", False, True),
-        ("queue's lock", True, False),
-        ("half a message", False, True),
-        ("half a message", True, False),
-        ("index queue's lock", False, False),
-        ("index queue's lock", True, True),
+        ("half a message", True, True),
+        ("index queue's lock", True, False),
     ],
 )
 @pytest.mark.filterwarnings("ignore:'pin_memory' argument is set as true but no accelerator")
@@ -402,7 +366,7 @@ def test_a_worker_that_dies_ends_the_pass_whatever_it_held(
 
 
 def test_an_error_ends_its_pass_and_says_so_to_who_asks_on(small_index):
-    pairs = StereoPairs(small_index, fields=FIELDS, frames="all", transform=Refuse())
+    pairs = StereoPairs(small_index, fields=FIELDS, frames="all", transform=RefuseFrame(3))
     batches = iter(pairs.loader(2, num_workers=1, shuffle=False))
     next(batches)
     with pytest.raises(ArithmeticError, match="frame 3"):
@@ -410,15 +374,6 @@ def test_an_error_ends_its_pass_and_says_so_to_who_asks_on(small_index):
 
     with pytest.raises(PassError, match="epoch 0 ended after 1 of 14 batches with an error"):
         next(batches)
-
-
-class Refuse:
-    swaps_views = False
-
-    def __call__(self, views, generator):
-        if 3 in views.frames:
-            raise ArithmeticError("frame 3")
-        return views
 
 
 HANGING = """
@@ -444,7 +399,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-@pytest.mark.parametrize("hanging", [1, 2, 9])
+@pytest.mark.parametrize("hanging", [2, 9])
 def test_a_worker_that_hangs_in_its_fork_is_forked_again(small_release, tmp_path, hanging):
     (tmp_path / "script.py").write_text(HANGING)
     done = subprocess.run(

@@ -4,15 +4,15 @@ import shutil
 from pathlib import Path
 
 import pytest
-import torch
 from torch.utils.data import DataLoader
 
-from stereogenbench_data import PAIR_FIELDS, SceneIndex, SceneViews, StereoPairs
-from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data import PAIR_FIELDS, SceneIndex, StereoPairs
+from stereogenbench_data.errors import StorageError
 from stereogenbench_data.media.seek_table import parse_tables
 from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.retry import RetryPolicy
+from tests.datasets.conftest import same
 from tests.servers.failing_server import Answer, serving
 from tests.servers.hub import REPOSITORY
 from tests.servers.nginx import nginx_serving
@@ -55,14 +55,6 @@ def root(request, root_of):
     return root_of(request.param)
 
 
-def same(one, other):
-    assert one.keys() == other.keys()
-    return all(
-        torch.equal(value, other[name]) if isinstance(value, torch.Tensor) else value == other[name]
-        for name, value in one.items()
-    )
-
-
 def bytes_of_primary_pair(folder):
     index = SceneIndex.open(folder)
     scene = index.scene(0)
@@ -87,51 +79,21 @@ def test_a_sample_names_the_shard_that_it_comes_from(root):
     assert pairs[0]["__url__"] == f"{root}/train-IPD_Gaussian-000000.tar"
 
 
-def test_views_come_from_a_url_too(shards_served, indexed_release):
-    expected = SceneViews(indexed_release, cameras=(0, 5), frames=2)[1]
-    views = SceneViews(shards_served.url, cameras=(0, 5), frames=2)
-
-    assert same(views[1], expected)
-    views.close()
-
-
-@pytest.mark.parametrize("server", ["counting", "nginx"])
-def test_a_pass_over_a_pair_transfers_little_more_than_its_three_members(
-    server, large_shards, tmp_path
-):
+def test_a_pass_over_a_pair_transfers_little_more_than_its_three_members(large_shards, tmp_path):
     needed = bytes_of_primary_pair(large_shards)
-    if server == "counting":
-        with serving(large_shards) as web:
-            pairs = StereoPairs(web.url, frames="all")
-            web.asked.clear()
-            assert all("disparity" in pairs[number] for number in range(len(pairs)))
-            sent = web.sent
-    else:
-        program = require_tool("nginx")
-        with nginx_serving(large_shards, home=tmp_path / "nginx", program=program) as nginx:
-            pairs = StereoPairs(nginx.url, frames="all")
-            before = nginx.sent(requests=2)
-            assert all("disparity" in pairs[number] for number in range(len(pairs)))
-            sent = nginx.sent(requests=6) - before
+    program = require_tool("nginx")
+    with nginx_serving(large_shards, home=tmp_path / "nginx", program=program) as nginx:
+        pairs = StereoPairs(nginx.url, frames="all")
+        before = nginx.sent(requests=2)
+        assert all("disparity" in pairs[number] for number in range(len(pairs)))
+        sent = nginx.sent(requests=6) - before
     pairs.close()
 
     # The index has the headers.
     assert 0.99 * needed <= sent <= 1.05 * needed
 
 
-def test_the_first_frame_alone_transfers_a_part(large_shards):
-    with serving(large_shards) as web:
-        pairs = StereoPairs(web.url, frames="first")
-        web.asked.clear()
-        assert "disparity" in pairs[0]
-        pairs.close()
-
-        assert web.sent < 0.5 * bytes_of_primary_pair(large_shards)
-
-
-@pytest.mark.parametrize(
-    ("context", "place"), [("fork", "web"), ("spawn", "web"), ("fork", "hub"), ("fork", "s3")]
-)
+@pytest.mark.parametrize(("context", "place"), [("spawn", "web"), ("fork", "hub"), ("fork", "s3")])
 def test_workers_read_over_connections_of_their_own(context, place, root_of, indexed_release):
     expected = StereoPairs(indexed_release, fields=FIELDS, frames=[0, 1])
     pairs = StereoPairs(root_of(place), fields=FIELDS, frames=[0, 1])
@@ -206,27 +168,6 @@ def test_bytes_that_never_come_are_no_damaged_video(video, shards_served, impati
     pairs.close()
 
 
-def test_an_index_of_another_pack_is_reported(shards_served):
-    shard = shards_served.folder / "train-IPD_Gaussian-000000.tar"
-    with shard.open("ab") as file:
-        file.write(bytes(512))
-    pairs = StereoPairs(shards_served.url, family="IPD_Gaussian")
-
-    with pytest.raises(
-        ShardError,
-        match=r"scene_000000, frames \(0,\): .*000000.tar : has \d+ bytes, and the index",
-    ):
-        pairs[0]
-
-
-def test_a_shard_that_is_missing_is_reported(shards_served):
-    (shards_served.folder / "train-IPD_Gaussian-000000.tar").unlink()
-    pairs = StereoPairs(shards_served.url, family="IPD_Gaussian")
-
-    with pytest.raises(StorageError, match=r"000000.tar : the server answers 404 Not Found. Check"):
-        pairs[0]
-
-
 def test_a_second_pass_comes_from_the_cache(shards_served, indexed_release, tmp_path):
     cache = ShardCache(tmp_path / "cache", limit_bytes=10**8)
     expected = StereoPairs(indexed_release, fields=FIELDS, frames="first")
@@ -238,16 +179,6 @@ def test_a_second_pass_comes_from_the_cache(shards_served, indexed_release, tmp_
         shards_served.asked.clear()
 
     assert sent == ["index.parquet", "index.parquet"]
-    expected.close()
-
-
-def test_workers_share_a_cache(shards_served, indexed_release, tmp_path):
-    cache = ShardCache(tmp_path / "cache", limit_bytes=10**8)
-    expected = StereoPairs(indexed_release, frames="first")
-    pairs = StereoPairs(shards_served.url, frames="first", cache=cache)
-    loader = DataLoader(pairs, batch_size=None, num_workers=2, timeout=60)
-
-    assert all(same(one, other) for one, other in zip(loader, expected, strict=True))
     expected.close()
 
 
@@ -273,16 +204,6 @@ def test_a_cache_that_was_damaged_on_disk_is_filled_again(shards_served, indexed
     expected.close()
 
 
-def test_a_shard_that_is_damaged_itself_is_reported_with_its_checksum(shards_served, tmp_path):
-    cache = ShardCache(tmp_path / "cache", limit_bytes=10**8)
-    pairs = StereoPairs(shards_served.url, family="IPD_Gaussian", cache=cache)
-    shard = shards_served.folder / "train-IPD_Gaussian-000000.tar"
-    shard.write_bytes(bytes(shard.stat().st_size))
-
-    with pytest.raises(ShardError, match=r"have crc32 [0-9a-f]{8}, and the index says [0-9a-f]{8}"):
-        pairs[0]
-
-
 def test_patience_is_set_where_data_are_opened_and_goes_to_the_workers(shards_served):
     index = SceneIndex.open(shards_served.url, retry=RetryPolicy(timeout_s=0.2))
     pairs = StereoPairs(index, fields=("left",), family="IPD_Gaussian")
@@ -292,28 +213,3 @@ def test_patience_is_set_where_data_are_opened_and_goes_to_the_workers(shards_se
         pairs[0]
     with pytest.raises(StorageError, match=r"cannot be read, .* slower than timeout_s=0.2"):
         list(DataLoader(pairs, num_workers=1))
-
-
-def test_a_shard_that_is_replaced_between_two_frames_is_reported(shards_served):
-    name = "train-IPD_Gaussian-000000.tar"
-    shards_served.validators = {"ETag": '"a"'}
-    pairs = StereoPairs(
-        shards_served.url, fields=("left",), family="IPD_Gaussian", frames="all", check="metadata"
-    )
-    pairs[0]
-    whole = (shards_served.folder / name).read_bytes()
-    (shards_served.folder / name).write_bytes(whole[::-1])
-    shards_served.validators = {"ETag": '"b"'}
-    pairs.close()
-
-    with pytest.raises(ShardError, match=rf'{name} : was replaced .*its ETag was "a" and is "b"'):
-        pairs[1]
-
-
-def test_no_login_is_in_what_a_dataset_shows(shards_served):
-    pairs = StereoPairs(shards_served.url.replace("http://", "http://me:word@"), fields=("left",))
-
-    assert "word" not in repr(pairs)
-    assert repr(pairs).endswith(f"{shards_served.url}>")
-    assert "authorization" in shards_served.asked[-1].headers
-    pairs.close()

@@ -3,15 +3,14 @@
 import copy
 import itertools
 import json
-import pickle
 
 import pytest
 import torch
-from torch.utils.data import DataLoader, IterableDataset
+from torch.utils.data import DataLoader
 from torchdata.stateful_dataloader import StatefulDataLoader
 
-from stereogenbench_data import PAIR_FIELDS, StateError, StereoPairs, StereoPairStream, collate
-from tests.datasets.conftest import flat, keys_of
+from stereogenbench_data import StateError, StereoPairs, StereoPairStream
+from tests.datasets.conftest import flat, keys_of, same
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:This DataLoader will create"),
@@ -36,8 +35,9 @@ def loaded(stream, workers=0, **options):
     )
 
 
-@pytest.mark.parametrize("drop_last", [True, "pad", False])
-@pytest.mark.parametrize(("world", "workers"), [(1, 0), (1, 3), (2, 2), (3, 1)])
+@pytest.mark.parametrize(
+    ("world", "workers", "drop_last"), [(1, 3, True), (2, 2, "pad"), (3, 0, False)], ids=str
+)
 def test_its_batches_are_those_of_the_loader(keyed, stream_of, world, workers, drop_last):
     for rank in range(world):
         options = {"rank": rank, "world_size": world, "drop_last": drop_last}
@@ -54,8 +54,9 @@ def test_its_batches_are_those_of_the_loader(keyed, stream_of, world, workers, d
                 assert torch.equal(one["is_padding"], other["is_padding"])
 
 
-@pytest.mark.parametrize("loader", [DataLoader, StatefulDataLoader])
-@pytest.mark.parametrize("context", ["fork", "spawn"])
+@pytest.mark.parametrize(
+    ("loader", "context"), [(DataLoader, "spawn"), (StatefulDataLoader, "fork")], ids=str
+)
 def test_batches_made_in_place_are_those_of_the_loader_and_stay_while_held(
     small_index, loader, context
 ):
@@ -92,44 +93,7 @@ def test_streams_used_side_by_side_and_their_copies_send_their_own_batches(small
     assert numbers == len(expected[0]) - 1
 
 
-def same(one, other):
-    return all(
-        torch.equal(one[name], other[name]) if torch.is_tensor(one[name]) else one[name] == value
-        for name, value in other.items()
-    )
-
-
-def test_more_workers_than_batches_or_scenes_lose_and_repeat_nothing(small_index):
-    options = {"fields": ("__key__",), "drop_last": False}
-    for size in (1, 2, 3):
-        stream = StereoPairStream(small_index, size, **options)
-        keys = flat(keys_of(loaded(stream, 6)))
-
-        assert len(keys) == len(set(keys)) == 4
-
-
-def test_it_is_an_iterable_dataset_with_every_field(small_release):
-    stream = StereoPairStream(
-        small_release, 2, fields=tuple(PAIR_FIELDS), size=(32, 48), family="Uniform", seed=3
-    )
-    pairs = StereoPairs(
-        small_release, fields=tuple(PAIR_FIELDS), size=(32, 48), family="Uniform", seed=3
-    )
-    assert isinstance(stream, IterableDataset)
-    for one, other in zip(loaded(stream, collate_fn=collate), pairs.loader(2), strict=True):
-        assert one.keys() == other.keys()
-        assert all(
-            torch.equal(one[name], other[name])
-            if isinstance(one[name], torch.Tensor)
-            else one[name] == other[name]
-            for name in one
-        )
-    stream.close()
-    pairs.close()
-
-
-@pytest.mark.parametrize("workers", [0, 2])
-@pytest.mark.parametrize("persistent", [False, True])
+@pytest.mark.parametrize(("workers", "persistent"), [(0, False), (2, True)])
 def test_a_position_goes_on_under_other_ranks_and_workers_once(stream_of, workers, persistent):
     unbroken = keys_of(loaded(stream_of()))
     first = stream_of(rank=0, world_size=2)
@@ -140,7 +104,7 @@ def test_a_position_goes_on_under_other_ranks_and_workers_once(stream_of, worker
 
     stream = stream_of()
     stream.load_state_dict(state)
-    loader = loaded(stream, workers, persistent_workers=persistent and workers > 0)
+    loader = loaded(stream, workers, persistent_workers=persistent)
 
     assert keys_of(loader) == unbroken[6:]
     assert keys_of(loader) == unbroken
@@ -148,8 +112,7 @@ def test_a_position_goes_on_under_other_ranks_and_workers_once(stream_of, worker
     assert sorted(flat(keys_of(loader))) == sorted(flat(unbroken))
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_workers_go_on_once_with_a_position_that_was_reached_without_them(stream_of, workers):
+def test_workers_go_on_once_with_a_position_that_was_reached_without_them(stream_of):
     unbroken = keys_of(loaded(stream_of()))
     first = stream_of()
     samples = iter(first)
@@ -157,7 +120,7 @@ def test_workers_go_on_once_with_a_position_that_was_reached_without_them(stream
         next(samples)
     stream = stream_of()
     stream.load_state_dict(first.state_dict())
-    loader = loaded(stream, workers)
+    loader = loaded(stream, 2)
 
     assert keys_of(loader) == unbroken[2:]
     assert keys_of(loader) == unbroken
@@ -173,15 +136,6 @@ def test_a_stream_iterated_in_this_process_counts_by_itself(stream_of, keyed):
     loader = keyed.loader(9, drop_last=False)
     loader.load_state_dict(stream.state_dict())
     assert keys_of(loader) == keys_of(batches)
-
-
-def test_after_a_short_last_batch_the_next_epoch_begins(stream_of, keyed):
-    stream = stream_of()
-    assert len(list(loaded(stream))) == 16
-    loader = keyed.loader(9, drop_last=False)
-    loader.load_state_dict(stream.state_dict())
-
-    assert loader.epoch == 1
 
 
 def test_a_stream_iterated_by_workers_asks_how_far_the_loop_is(stream_of):
@@ -201,19 +155,17 @@ def test_a_position_of_other_samples_is_refused(stream_of):
         stream_of().load_state_dict(state)
 
 
-@pytest.mark.parametrize("context", ["spawn", "forkserver"])
-def test_workers_of_every_kind_begin_where_a_loaded_position_says(stream_of, context):
+def test_workers_of_every_kind_begin_where_a_loaded_position_says(stream_of):
     unbroken = keys_of(loaded(stream_of()))
     stream = stream_of()
     stream.load_state_dict(stream.batches.state_at(0, 5))
-    loader = loaded(stream, 2, multiprocessing_context=context)
+    loader = loaded(stream, 2, multiprocessing_context="spawn")
 
     assert keys_of(loader) == unbroken[5:]
     assert keys_of(loader) == unbroken
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-@pytest.mark.parametrize("stop", [0, 1, 4, 15])
+@pytest.mark.parametrize(("workers", "stop"), [(0, 4), (2, 0), (2, 4), (2, 15)])
 def test_torchdatas_loader_saves_and_loads_its_position(stream_of, workers, stop):
     def loader():
         return StatefulDataLoader(stream_of(), batch_size=9, num_workers=workers)
@@ -228,7 +180,7 @@ def test_torchdatas_loader_saves_and_loads_its_position(stream_of, workers, stop
     assert keys_of(resumed) == unbroken
 
 
-@pytest.mark.parametrize("taken", [1, 13, 69, 70])
+@pytest.mark.parametrize("taken", [13, 70])
 def test_a_stream_goes_on_after_its_last_sample_and_other_ranks_after_its_last_batch(
     stream_of, taken
 ):
@@ -275,16 +227,6 @@ def test_a_workers_damaged_position_is_refused(stream_of, change, message):
 
     with pytest.raises(StateError, match=message):
         stream.load_state_dict(stream.state_dict() | change)
-
-
-@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
-def test_a_pass_over_a_stream_is_not_copied_and_goes_on(stream_of, copied):
-    samples = iter(stream_of())
-    next(samples)
-
-    with pytest.raises(TypeError, match="generator"):
-        copied(samples)
-    assert len(list(samples)) == 139
 
 
 def test_the_shares_of_many_ranks_and_workers_are_the_selection(stream_of):

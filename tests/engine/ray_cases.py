@@ -174,15 +174,6 @@ def test_both_nodes_work_and_all_is_counted(tmp_path):
 
 
 @pytest.mark.usefixtures("ray")
-def test_one_worker_does_one_item_at_a_time():
-    began = time.monotonic()
-
-    list(RayCluster().map(pid, [1, 2, 3], name=called, workers=1))
-
-    assert time.monotonic() - began >= 0.9
-
-
-@pytest.mark.usefixtures("ray")
 def test_the_error_of_a_task_comes_as_it_is_with_the_name_of_its_item():
     with pytest.raises(ShardError, match=r"^three is refused\n.*item 3"):
         list(RayCluster().map(refuse_three, range(5), name=called))
@@ -206,12 +197,6 @@ def test_closing_the_results_interrupts_tasks_that_run(tmp_path):
         list(RayCluster().map(begin, [mark], name=called, advance=stop))
 
     assert not mark.exists()
-
-
-@pytest.mark.usefixtures("ray")
-def test_a_task_that_needs_a_gpu_is_refused_where_there_is_none():
-    with pytest.raises(StorageError, match=r"has 0 GPUs, and each task needs 1.* device cpu"):
-        list(RayCluster(gpus=1).map(pid, [1], name=called))
 
 
 def test_the_command_works_on_a_cluster_by_its_address_with_relative_paths(

@@ -4,12 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from stereogenbench_data.geometry.arrays import (
-    scatter,
-    take_flat,
-    values_where,
-    whole_where,
-)
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import (
     depth_from_disparity,
@@ -91,41 +85,3 @@ def test_results_stay_on_the_device_of_the_input(inputs):
     made = maps(*(torch.from_numpy(values).to("meta") for values in inputs))
 
     assert {str(values.device) for values in made.values()} == {"meta"}
-
-
-def test_values_outside_the_mask_may_be_anything(library):
-    values = np.array([[2.9, -2.9, 0.0, np.nan, np.inf, -1e30]], dtype=np.float32)
-    mask = np.array([[True, True, True, False, False, False]])
-
-    whole = whole_where(library.array(mask), library.array(values))
-
-    assert library.numpy(whole).dtype == np.int64
-    assert library.numpy(whole).tolist() == [[2, -2, 0, 0, 0, 0]]
-
-
-@pytest.mark.parametrize("mask", [[True, True], [True, False], [False, False]])
-def test_values_where_does_not_change_its_input(library, mask):
-    values = library.array(np.array([1.5, 2.5], dtype=np.float32))
-
-    chosen = values_where(library.array(np.array(mask)), values, otherwise=-np.inf)
-
-    assert library.numpy(chosen).dtype == np.float32
-    assert library.numpy(chosen).tolist() == np.where(mask, [1.5, 2.5], -np.inf).tolist()
-    assert library.numpy(values).tolist() == [1.5, 2.5]
-
-
-def test_take_flat_reads_views_in_row_major_order(library):
-    values = library.array(np.arange(12.0).reshape(3, 4)[:, 1:3])
-
-    taken = take_flat(values, library.array(np.array([[0, 5], [3, 0]])))
-
-    assert library.numpy(taken).tolist() == [[1.0, 10.0], [6.0, 1.0]]
-
-
-def test_scatter_keeps_the_smallest_value_of_a_cell(library):
-    values = library.array(np.array([[3.0, 2.0, 4.0], [np.inf, 7.0, 6.0]], dtype=np.float32))
-    index = library.array(np.array([[1, 1, 1], [3, 0, 0]]))
-
-    cells = scatter(values, index, size=4, reduce="amin", empty=np.inf)
-
-    assert library.numpy(cells).tolist() == [6.0, 2.0, np.inf, np.inf]

@@ -28,14 +28,6 @@ def test_a_sensor_that_is_not_square_gives_each_axis_its_own_focal_length():
     assert intrinsics == Intrinsics(1000.0, 1500.0, 300.0, 400.0, 720, 720)
 
 
-def test_a_principal_point_in_the_corner_is_not_taken_for_none():
-    intrinsics = Intrinsics.from_mm(
-        focal_mm=50.0, sensor_mm=(36.0, 24.0), size_px=(720, 720), principal_point_px=(0.0, 0.0)
-    )
-
-    assert (intrinsics.cx_px, intrinsics.cy_px) == (0.0, 0.0)
-
-
 def test_the_cameras_of_a_rig_share_the_recorded_intrinsics(recorded_rig):
     intrinsics = rig_intrinsics(recorded_rig(np.arange(6.0)))
 
@@ -99,8 +91,3 @@ def test_intrinsics_out_of_range_are_refused(intrinsics, changes):
 
     with pytest.raises(GeometryError, match=f"{name}={value}"):
         replace(intrinsics, **changes)
-
-
-def test_a_sensor_without_width_is_refused():
-    with pytest.raises(GeometryError, match=r"sensor.* got \(0\.0, 24\.0\) mm"):
-        Intrinsics.from_mm(focal_mm=50.0, sensor_mm=(0.0, 24.0), size_px=(720, 720))

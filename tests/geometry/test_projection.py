@@ -32,9 +32,7 @@ class Case(NamedTuple):
 
 HARD_RIGS = {
     "1 cm baseline, 1e6 cm from the origin": Case(1.0, offset_cm=(1e6, -1e6, 1e6)),
-    "750 cm baseline, 1e6 cm from the origin": Case(750.0, offset_cm=(-1e6, 1e6, 1e6)),
     "looking straight up": Case(rotator_deg=(90.0, 30.0, 20.0)),
-    "looking straight down": Case(rotator_deg=(-90.0, 30.0, 20.0)),
     "upside down": Case(rotator_deg=(3.0, -170.0, 180.0)),
     "right to left": Case(target=0, source=1),
 }
@@ -95,7 +93,6 @@ def test_the_pose_chain_is_the_closed_form_on_a_lateral_rig(make_rig, case):
         pytest.param(
             WIDE.cropped(left_px=1240, top_px=0, width_px=40, height_px=30), id="at the border"
         ),
-        pytest.param(WIDE.cropped(left_px=-8, top_px=-5, width_px=40, height_px=30), id="padded"),
         pytest.param(
             WIDE.cropped(left_px=300, top_px=7, width_px=40, height_px=30).flipped(),
             id="cropped off the middle, then flipped",
@@ -212,18 +209,6 @@ def test_a_point_that_the_target_cannot_see_lands_nowhere(library, depth_m):
     assert not library.numpy(lands_inside(projection, height_px=1, width_px=3)).any()
 
 
-def test_a_rectified_pixel_lands_d_to_the_left_in_its_row_at_its_depth(library):
-    depth_m = library.array(np.array([[4.0, 2.0, 1.0]], dtype=np.float32))
-    disparity_px = library.array(np.array([[0.25, -0.5, 2.0]], dtype=np.float32))
-
-    projection = project_rectified(depth_m, disparity_px)
-
-    np.testing.assert_array_equal(library.numpy(projection.u_px), [[0.25, 2.0, 0.5]])
-    assert library.numpy(projection.u_px).dtype == np.float32
-    assert projection.v_px is None
-    assert projection.depth_m is depth_m
-
-
 @pytest.mark.parametrize(
     ("disparity_px", "column"),
     [
@@ -243,13 +228,6 @@ def test_where_the_leftmost_of_three_pixels_lands(library, disparity_px, column)
 
     assert library.numpy(inside)[0, 0] == (column is not None)
     assert column is None or library.numpy(pixel)[0, 0] == column
-
-
-def test_a_rectified_projection_cannot_change_the_number_of_rows():
-    projection = project_rectified(np.ones((4, 6)), np.ones((4, 6)))
-
-    with pytest.raises(GeometryError, match="of 4 rows cannot land in an image of 3 rows"):
-        landing_pixels(projection, height_px=3, width_px=6)
 
 
 def test_depth_of_an_image_of_another_size_is_refused(intrinsics):

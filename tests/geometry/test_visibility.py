@@ -53,21 +53,6 @@ def test_a_target_sees_points_that_agree_with_its_own_depth(library, source_m, t
     assert library.numpy(visible).tolist() == [[expected]]
 
 
-def test_a_pixel_that_leaves_the_image_is_not_visible(library):
-    """B f = 2 px m: at 1 m a pixel moves by two columns, at 0.002 m by a thousand."""
-    projection, measured = pair(library, [1.0, 0.002, 1.0, 1.0], shift_px_m=2.0)
-
-    visible = visible_in_target(
-        projection,
-        measured=measured,
-        target_depth_m=row(library, 1.0, 1.0, 1.0, 1.0),
-        target_measured=row(library, *[1] * 4, dtype=bool),
-        quantum_m=0.001,
-    )
-
-    assert library.numpy(visible).tolist() == [[False, False, True, True]]
-
-
 def test_only_the_target_depth_shows_an_occluder_outside_the_source_view(library):
     """A wall at 2 m moves by one column; the target sees a pole at 0.5 m that the source cannot.
 
@@ -97,15 +82,6 @@ def test_of_two_source_pixels_on_one_target_pixel_the_farther_is_hidden(library)
     visible = visible_from_source(projection, measured=measured, quantum_m=0.001)
 
     assert library.numpy(visible).tolist() == [[False, True, False, True, True]]
-
-
-def test_an_unmeasured_pixel_hides_nothing(library):
-    projection, _ = pair(library, [2.0, 2.0, 2.0, 1.0, 2.0], shift_px_m=2.0)
-    measured = row(library, 1, 1, 1, 0, 1, dtype=bool)
-
-    visible = visible_from_source(projection, measured=measured, quantum_m=0.001)
-
-    assert library.numpy(visible).tolist() == [[False, True, True, False, True]]
 
 
 def brute_force(projection: Projection, measured, target_m, target_measured, tolerance, quantum_m):
@@ -190,39 +166,3 @@ def test_a_pixel_is_hidden_where_a_nearer_one_lands_beside_it(library, seed, row
 
     expected = landed & (nearest_m >= depth_m * 0.97 - 0.02)
     np.testing.assert_array_equal(library.numpy(visible), expected)
-
-
-@pytest.mark.parametrize("rows", ["kept", "moved"])
-def test_a_batch_is_decided_image_by_image(library, rows):
-    rng = np.random.default_rng(5)
-    shape = (2, 3, 5, 7)
-    depth_m, target_m = rng.uniform(1.0, 1.1, (2, *shape))
-    u_px, v_px = rng.uniform(0, 7, shape), rng.uniform(0, 5, shape)
-    measured = rng.random(shape) < 0.9
-    lands = Projection(
-        library.array(u_px),
-        None if rows == "kept" else library.array(v_px),
-        library.array(depth_m),
-    )
-
-    together = visible_in_target(
-        lands,
-        measured=library.array(measured),
-        target_depth_m=library.array(target_m),
-        target_measured=library.array(measured),
-        quantum_m=0.001,
-    )
-    hidden = visible_from_source(lands, measured=library.array(measured), quantum_m=0.001)
-
-    for image in np.ndindex(2, 3):
-        alone = Projection(u_px[image], None if rows == "kept" else v_px[image], depth_m[image])
-        own = {"measured": measured[image], "quantum_m": 0.001}
-        np.testing.assert_array_equal(
-            library.numpy(together)[image],
-            visible_in_target(
-                alone, target_depth_m=target_m[image], target_measured=measured[image], **own
-            ),
-        )
-        np.testing.assert_array_equal(
-            library.numpy(hidden)[image], visible_from_source(alone, **own)
-        )

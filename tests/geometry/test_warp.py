@@ -127,34 +127,6 @@ def test_a_backward_warp_is_scipys_interpolation_between_pixel_centres(library, 
         np.testing.assert_allclose(library.numpy(warped)[item, channel], expected, atol=1e-4)
 
 
-def test_a_warp_by_disparity_samples_to_the_left_by_as_much(library):
-    image = library.array(np.array([[[0, 100, 200, 250]]], dtype=np.uint8))
-    disparity_px = library.array(np.array([[0.0, 0.25, 1.0, 9.0]], dtype=np.float32))
-    depth_m = library.array(np.ones((1, 4), dtype=np.float32))
-
-    warped, inside = backward_warp(image, project_rectified(depth_m, disparity_px))
-
-    assert library.numpy(warped).tolist() == [[[0.0, 75.0, 100.0, 0.0]]]
-    assert library.numpy(inside).tolist() == [[True, True, True, False]]
-
-
-def test_a_splat_can_be_sampled_back_where_nothing_occludes_it(library):
-    """A slanted plane: whole-pixel disparities, so that both warps are exact."""
-    rng = np.random.default_rng(1)
-    disparity = np.broadcast_to(np.array([3, 3, 2, 2, 1, 1, 0, 0], np.float32), (4, 8)).copy()
-    image = rng.integers(1, 255, (3, 4, 8)).astype(np.uint8)
-    projection = project_rectified(library.array(6 / (disparity + 1)), library.array(disparity))
-
-    warped, _ = splat(
-        library.array(image), projection, measured=library.array(np.ones((4, 8), bool))
-    )
-    back, inside = backward_warp(warped, projection)
-
-    inside = library.numpy(inside)
-    assert inside.sum() == 4 * 6
-    np.testing.assert_array_equal(library.numpy(back)[:, inside], image[:, inside])
-
-
 def test_a_rectified_warp_of_an_image_with_other_rows_is_refused():
     projection = project_rectified(np.ones((4, 6)), np.ones((4, 6)))
 

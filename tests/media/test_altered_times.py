@@ -80,7 +80,7 @@ def test_no_flipped_bit_of_a_depth_videos_times_brings_another_frame(depth):
     rng = random.Random(4)
     wrong, places = [], matroska_times(depth)
     for place in places:
-        for bit in range(8):
+        for bit in (0, 3, 7):
             altered = flipped(depth, place, bit)
             order = (range(FRAMES), rng.sample(range(FRAMES), FRAMES))[(place + bit) % 2]
             found = depth_numbers(altered, order)
@@ -94,17 +94,7 @@ def test_no_flipped_bit_of_a_depth_videos_times_brings_another_frame(depth):
     assert wrong == []
 
 
-def test_an_altered_time_is_reported_with_frame_and_ticks(depth):
-    block = matroska_times(depth)[-1]
-
-    with (
-        VideoReader(io.BytesIO(flipped(depth, block, 4)), name="clip", frames=FRAMES) as reader,
-        pytest.raises(MediaError, match=r"clip: its frame number \d+ as stored is shown at \d+ t"),
-    ):
-        reader.frame(FRAMES - 1)
-
-
-@pytest.mark.parametrize("codec", [("-g", "6"), ("-g", "1"), ("-bf", "0")])
+@pytest.mark.parametrize("codec", [("-g", "6"), ("-bf", "0")])
 def test_no_flipped_bit_of_an_mp4s_tables_of_times_brings_another_frame(clips, codec):
     path = clips.rgb(
         f"times {codec}.mp4", "-c:v", "libx264", "-preset", "ultrafast", "-pix_fmt", "yuv420p",

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stereogenbench_data.media.clock import SteadyClock, TableClock
+from stereogenbench_data.media.clock import SteadyClock
 
 MATROSKA_15_HZ = SteadyClock(start=0, step=Fraction(1000, 15))
 
@@ -36,9 +36,3 @@ def test_a_clock_of_one_tick_a_frame_lets_no_frame_be_another():
     clock = SteadyClock(start=3, step=Fraction(1))
 
     assert [clock.index(pts) for pts in (3, 4, 5)] == [clock.latest(i) - 3 for i in range(3)]
-
-
-def test_a_table_knows_its_times_and_no_others():
-    clock = TableClock([0, 67, 140, 900])
-
-    assert [clock.index(pts) for pts in (0, 140, 900, 66, 901)] == [0, 2, 3, None, None]

@@ -13,17 +13,15 @@ import pytest
 
 from stereogenbench_data.errors import ExtraError, MediaError
 from stereogenbench_data.media import depth_frames
-from stereogenbench_data.media.depth import open_depth, read_depth_units, resolve_encoding
+from stereogenbench_data.media.depth import resolve_encoding
 from stereogenbench_data.media.depth_frames import (
     LAYER,
     DepthFrames,
     compressed_chunk,
-    frame_file,
     require_chunk,
 )
 from stereogenbench_data.media.depth_packing import packed_depth, write_depth_video
 from stereogenbench_data.media.video import VideoReader, probe
-from stereogenbench_data.schema.records import DepthEncoding
 from tests.servers.tools import require_module
 
 SHAPE = (40, 56)
@@ -106,60 +104,12 @@ def test_blosc2_itself_reads_the_file_and_its_description(blosc2, packed):
     assert clip["tags"]["DEPTH_SCALE"] == "0.001"
 
 
-def test_a_video_packs_to_the_same_bytes_each_time(packed, video):
-    assert packed_depth(video, name="again", frames=6) == packed
-
-
 def test_its_facts_are_those_of_the_video(packed, video):
     found, told = opened(packed).facts, probe(video, name="cam_00_depth.mkv")
 
     assert found == replace(told, codec="blosc2")
     assert probe(io.BytesIO(packed), name="cam_00_depth.b2frame") == found
     assert resolve_encoding(found, name="it").unit_m == 0.001
-
-
-def test_depth_is_opened_by_its_name(packed, video):
-    encoding = DepthEncoding(unit_m=0.001)
-    with (
-        open_depth(io.BytesIO(packed), name="cam_00_depth.b2frame", frames=6) as one,
-        open_depth(video, name="cam_00_depth.mkv", frames=6) as other,
-    ):
-        for index in range(6):
-            np.testing.assert_array_equal(
-                read_depth_units(one, index, encoding=encoding),
-                read_depth_units(other, index, encoding=encoding),
-            )
-
-
-class Counting(io.BytesIO):
-    """A file that notes what is read of it."""
-
-    def __init__(self, content):
-        super().__init__(content)
-        self.ranges = []
-
-    def read(self, size=-1, /):
-        start = self.tell()
-        data = super().read(size)
-        self.ranges.append((start, len(data)))
-        return data
-
-
-@pytest.mark.usefixtures("blosc2")
-def test_one_frame_costs_the_header_and_its_own_chunk():
-    noise = np.random.default_rng(1)
-    clip = opened_clip()
-    maps = [noise.integers(0, 65536, (200, 200)).astype(np.uint16) for _ in range(4)]
-    clip = replace(clip, width_px=200, height_px=200, pts=(0, 1, 2, 3))
-    file = Counting(frame_file(clip, [compressed_chunk(units.tobytes()) for units in maps]))
-
-    with DepthFrames(file, name="x.b2frame", frames=4) as depth:
-        np.testing.assert_array_equal(depth.units(2), maps[2])
-        chunk = depth.chunk(2)
-
-    assert file.ranges[0] == (0, 4096)
-    assert file.ranges[1] == file.ranges[2]
-    assert file.ranges[1][1] == len(chunk) <= 200 * 200 * 2 + 32
 
 
 def opened_clip():
@@ -202,20 +152,10 @@ def test_a_flipped_byte_of_the_header_is_refused_or_changes_nothing(packed):
     assert {line[:22] for line in told} == {"cam_00_depth.b2frame: "}
 
 
-@pytest.mark.parametrize("left", [0, 5, 100, 400, 3000])
+@pytest.mark.parametrize("left", [0, 100, 3000])
 def test_a_file_that_was_cut_short_is_refused(packed, left):
     with pytest.raises(MediaError, match=r"cam_00_depth\.b2frame: is (not depth|cut short)"):
         opened(packed[:left])
-
-
-def test_a_video_under_its_name_is_refused(video):
-    with pytest.raises(MediaError, match=r"its first bytes are .* not those of a blosc2 frame"):
-        opened(video.read_bytes())
-
-
-def test_another_number_of_frames_is_refused(packed):
-    with pytest.raises(MediaError, match="holds 6 frames where 7 are expected"):
-        opened(packed, frames=7)
 
 
 @pytest.mark.parametrize("index", [-1, 6])
@@ -245,13 +185,9 @@ def changed(chunk, at, value):
         (12, (10**6).to_bytes(4, "little"), "in 1000000, in blocks"),
         (8, bytes(4), "in blocks of 0"),
         (2, b"\xc5", "asks for another codec"),
-        (16, b"\xa0", "asks for another codec"),
-        (22, b"\x25", "asks for another codec"),
         (31, b"\x08", "asks for another codec"),
-        (3, b"\x04", "asks for another codec"),
     ],
-    ids=["a bomb", "a size", "no blocks", "a codec", "a filter of the user's", "a plugin's codec",
-         "a lazy chunk", "wide units"],
+    ids=["a bomb", "a size", "no blocks", "a codec", "a lazy chunk"],
 )  # fmt: skip
 def test_a_chunk_that_blosc2_would_take_otherwise_is_refused_before_it_does(at, value, found):
     clip = opened_clip()
@@ -261,21 +197,6 @@ def test_a_chunk_that_blosc2_would_take_otherwise_is_refused_before_it_does(at, 
         require_chunk(chunk, clip=clip, crc32=zlib.crc32(chunk), name="frame 3")
 
 
-def test_a_chunk_shorter_than_its_header_is_refused():
-    with pytest.raises(MediaError, match="it has 3 bytes, which is less than a chunk's header"):
-        require_chunk(b"abc", clip=opened_clip(), crc32=zlib.crc32(b"abc"), name="frame 3")
-
-
-def test_a_chunk_that_does_not_decompress_is_reported(packed, monkeypatch):
-    with opened(packed) as depth:
-        whole = depth.chunk(4)
-    monkeypatch.setattr(depth_frames, "require_chunk", lambda chunk, **how: None)
-    content = packed.replace(whole, changed(whole, 32, b"\xff" * (len(whole) - 32)))
-
-    with pytest.raises(MediaError, match="frame 4 does not decompress"):
-        opened(content).units(4)
-
-
 def parse_text(content):
     start = content.index(b'{"format":1')
     end = content.index(b"]}", content.index(b'"crc32s"', start)) + 2
@@ -283,9 +204,7 @@ def parse_text(content):
 
 
 @pytest.mark.usefixtures("blosc2")
-@pytest.mark.parametrize(
-    ("pixel_format", "largest"), [("gray16le", 65535), ("gray12le", 4095), ("gray", 255)]
-)
+@pytest.mark.parametrize(("pixel_format", "largest"), [("gray16le", 65535), ("gray", 255)])
 def test_packed_depth_becomes_the_same_video_again(tmp_path, pixel_format, largest):
     first = write_depth(
         tmp_path / "first.mkv", pictures(largest), pixel_format=pixel_format, step=2
@@ -330,33 +249,11 @@ def test_what_cannot_come_back_whole_is_not_packed(tmp_path, codec, pixel_format
         packed_depth(path, name="x.mkv", frames=2)
 
 
-def test_what_blosc2_does_not_give_back_is_an_error(blosc2, video, monkeypatch):
-    def forgetful(chunk, dst, **how):
-        dst[...] = 1
-
-    monkeypatch.setattr(blosc2, "decompress2", forgetful)
-
-    with pytest.raises(MediaError, match="frame 0 does not come back from blosc2 as it was"):
-        packed_depth(video, name="x.mkv", frames=6)
-
-
 def test_without_blosc2_the_extra_is_named(packed, monkeypatch):
     monkeypatch.setitem(sys.modules, "blosc2", None)
 
     with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[blosc2\]'"):
         opened(packed)
-
-
-def test_a_header_of_another_version_is_refused(packed):
-    content = packed.replace(b'{"format":1', b'{"format":2')
-    text = parse_text(packed).replace(b'{"format":1', b'{"format":2')
-    content = content.replace(
-        zlib.crc32(parse_text(packed)).to_bytes(4, "big") + text,
-        zlib.crc32(text).to_bytes(4, "big") + text,
-    )
-
-    with pytest.raises(MediaError, match="its description of itself is of another version"):
-        opened(content)
 
 
 @pytest.mark.parametrize(
@@ -365,9 +262,7 @@ def test_a_header_of_another_version_is_refused(packed):
         (b'"codec":"ffv1"', b'"codec":"h264"', "h264, gray16le"),
         (b'"gray16le"', b'"rgb48lex"', "ffv1, rgb48lex"),
         (b'"width_px":56', b'"width_px":{}', "malformed or incomplete"),
-        (b'"rate":[15,1]', b'"rate":[0,15]', "malformed or incomplete"),
         (b'"rate":[15,1]', b'"rate":[1e99]', "malformed or incomplete"),
-        (b"[1,1000]", b"[1e99,1]", "malformed or incomplete"),
         (b'"tags":{', b'"tagz":{', "malformed or incomplete"),
         (b'"pts":[0,67', b'"pts":[99,0', "times of frames that do not ascend"),
     ],
@@ -382,3 +277,18 @@ def test_a_header_that_describes_no_packed_depth_is_refused(packed, old, new, fo
 
     with pytest.raises(MediaError, match=found):
         opened(content)
+
+
+def test_another_number_of_frames_is_refused(packed):
+    with pytest.raises(MediaError, match="holds 6 frames where 7 are expected"):
+        opened(packed, frames=7)
+
+
+def test_what_blosc2_does_not_give_back_is_an_error(blosc2, video, monkeypatch):
+    def forgetful(chunk, dst, **how):
+        dst[...] = 1
+
+    monkeypatch.setattr(blosc2, "decompress2", forgetful)
+
+    with pytest.raises(MediaError, match="frame 0 does not come back from blosc2 as it was"):
+        packed_depth(video, name="x.mkv", frames=6)

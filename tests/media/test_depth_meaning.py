@@ -77,14 +77,6 @@ def test_zero_and_the_formats_largest_number_are_not_measured(pixel_format, larg
     np.testing.assert_array_equal(found, [[False, True, True, False]])
 
 
-def test_numbers_that_are_not_measured_can_be_named():
-    units = np.array([[0, 7, 65535]], dtype=np.uint16)
-
-    found = measured(units, encoding=DepthEncoding(no_depth=(7,)), pixel_format="gray16le")
-
-    np.testing.assert_array_equal(found, [[True, False, True]])
-
-
 @settings(max_examples=50, deadline=None)
 @given(unit_m=st.floats(1e-5, 10))
 def test_metres_are_the_exact_product_rounded_once(unit_m):

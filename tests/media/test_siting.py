@@ -15,14 +15,10 @@ FILES = {
     "tagged left": ("left.mp4", (*X264, "-bsf:v", "h264_metadata=chroma_sample_loc_type=0")),
     "tagged center": ("center.mp4", (*X264, "-chroma_sample_location", "center")),
     "tagged topleft": ("topleft.mp4", (*X264, "-chroma_sample_location", "topleft")),
-    "tagged bottom": ("bottom.mp4", (*X264, "-chroma_sample_location", "bottom")),
     "hevc untagged": ("hevc.mp4", (*HEVC, "log-level=0")),
     "hevc tagged left": ("hevcl.mp4", (*HEVC, "log-level=0:chromaloc=0")),
     "mpeg4": ("mpeg4.mp4", ("-c:v", "mpeg4", "-q:v", "1", "-pix_fmt", "yuv420p")),
     "ffv1 untagged": ("un.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuv420p")),
-    "ffv1 tagged left": (
-        "left.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuv420p", "-chroma_sample_location", "left"),
-    ),
     "ten bits": ("ten.mp4", ("-c:v", "libx264", "-crf", "5", "-pix_fmt", "yuv420p10le")),
     "odd": ("odd.mkv", ("-vf", "crop=159:255:0:0", "-c:v", "ffv1", "-pix_fmt", "yuv420p")),
 }  # fmt: skip
@@ -31,12 +27,10 @@ PLACES = {
     "tagged center": (0.0, 0.0),
     "tagged left": (-0.5, 0.0),
     "tagged topleft": (-0.5, -0.5),
-    "tagged bottom": (0.0, 0.5),
     "hevc untagged": (0.0, 0.0),
     "hevc tagged left": (-0.5, 0.0),
     "mpeg4": (0.0, 0.0),
     "ffv1 untagged": (0.0, 0.0),
-    "ffv1 tagged left": (-0.5, 0.0),
     "ten bits": (0.0, 0.0),
 }
 
@@ -68,7 +62,7 @@ def shifts_px(picture, reference):
     return np.array(found)
 
 
-@pytest.mark.parametrize("size", [(128, 128), (255, 257), (480, 832), (90, 147), (301, 77)])
+@pytest.mark.parametrize("size", [(480, 832), (90, 147)])
 @pytest.mark.parametrize("name", FILES)
 def test_colour_is_where_brightness_is_at_any_size(clips, name, size):
     stored = torch.from_numpy(read(clips, name))[None]

@@ -1,11 +1,8 @@
 """What is derived from decoded views, against hand-worked numbers and the long way round."""
 
-import json
-
 import numpy as np
 import pytest
 
-from stereogenbench_data import StereoPairs
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.samples.derive import PairGeometry, PairSample, SceneFacts
@@ -19,8 +16,6 @@ from stereogenbench_data.schema.records import (
     Trajectory,
 )
 from stereogenbench_data.schema.release import CAMERA_PAIRS
-from stereogenbench_data.synthesis.produce import synthesise
-from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
 GAP_CM = 20.0
 INTRINSICS = Intrinsics(100.0, 100.0, 20.0, 10.0, 40, 20)
@@ -192,45 +187,6 @@ def test_the_error_bound_holds_for_every_depth_that_rounds_to_the_stored_one(enc
         assert (np.abs(pair.disparity - truth) <= pair.disparity_error)[measured].all()
     assert pair.disparity_error[0, 3, 4] == 0
     assert pair.disparity_error.dtype == np.float32
-
-
-@pytest.mark.parametrize(
-    ("rotation", "change", "primary_pair"),
-    [
-        ("rotator", {}, (0, 1)),
-        ("quaternion_wxyz", {"primary_stereo_pair": [1, 4]}, (1, 4)),
-        ("matrix", {"principal_point_px": {"x": 40.0, "y": 27.5}}, (0, 1)),
-    ],
-    ids=["rotator", "quaternion, pair by indices", "matrix, principal point"],
-)
-def test_spellings_of_the_metadata_give_the_same_pictures_depth(
-    tmp_path, rotation, change, primary_pair
-):
-    """However a scene's files are spelt, warping the right view by disparity gives the left."""
-    contract = ExportContract(rotation=rotation)
-    request = SynthRequest(size_px=96, height_px=64, frames=1, seed=3, contract=contract)
-    synthesise(tmp_path, request, workers=1)
-    for path in (*tmp_path.rglob("baseline.json"), *tmp_path.rglob("trajectory.json")):
-        document = json.loads(path.read_text())
-        for name, value in change.items():
-            place = document if name in document else document.get("camera_intrinsics", {})
-            place[name] = value
-        path.write_text(json.dumps(document))
-    sample = StereoPairs(
-        tmp_path, fields=("left", "right", "disparity", "visible", "pair", "intrinsics")
-    )[0]
-    left, right = (sample[name].numpy().astype(float) for name in ("left", "right"))
-    disparity, visible = sample["disparity"][0].numpy(), sample["visible"][0].numpy()
-    rows, columns = np.indices(disparity.shape)
-    place = np.clip(columns - disparity, 0, 95)
-    near = np.minimum(place.astype(int), 94)
-    warped = right[:, rows, near] * (1 - place + near) + right[:, rows, near + 1] * (place - near)
-
-    assert tuple(sample["pair"].tolist()) == primary_pair
-    assert visible.mean() > 0.3
-    error = np.mean((warped - left)[:, visible] ** 2)
-    unmoved = np.mean((right - left)[:, visible] ** 2)
-    assert 10 * np.log10(unmoved / error) > 5
 
 
 @pytest.mark.parametrize("residual_px", [0.0, 1.0], ids=["rectified", "through poses"])

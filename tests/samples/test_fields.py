@@ -3,7 +3,6 @@
 import pytest
 
 from stereogenbench_data import PAIR_FIELDS, VIEW_FIELDS, FieldError
-from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS, DEFAULT_VIEW_FIELDS
 from stereogenbench_data.samples.request import parse_request
 from stereogenbench_data.samples.transforms import HorizontalFlip
 
@@ -18,11 +17,6 @@ def test_a_row_names_its_field_and_says_how_it_is_made(name, field):
     assert (field.dtype == "str") == (field.shape == "")
     assert name in repr(field)
     assert "lambda" not in repr(field)
-
-
-def test_what_is_given_by_default_is_in_the_table():
-    assert set(DEFAULT_PAIR_FIELDS) <= PAIR_FIELDS.keys()
-    assert set(DEFAULT_VIEW_FIELDS) <= VIEW_FIELDS.keys()
 
 
 def test_a_picture_field_needs_its_own_video_alone():

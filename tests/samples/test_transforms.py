@@ -20,7 +20,6 @@ from stereogenbench_data import (
     RandomCrop,
     RandomScale,
     Resize,
-    SceneViews,
     StereoPairs,
 )
 from stereogenbench_data.geometry.camera import Intrinsics
@@ -60,12 +59,10 @@ def plain(detailed_release):
         Resize(96, 160),
         Resize(200, 240),
         Letterbox(100, 200),
-        Letterbox(200, 100),
         Crop(20, 31, 64, 80),
         RandomCrop(97, 101),
         RandomScale(-0.2, 0.4, stretch_probability=1.0),
         HorizontalFlip(1.0),
-        Compose([HorizontalFlip(1.0), HorizontalFlip(1.0)]),
         Compose([RandomScale(at_least=(128, 128)), HorizontalFlip(1.0), RandomCrop(128, 128)]),
     ],
     ids=str,
@@ -77,8 +74,8 @@ def test_a_moved_pair_still_warps_onto_itself(detailed_release, plain, transform
 
 
 @pytest.mark.filterwarnings("ignore::stereogenbench_data.samples.request.SwappedSizeWarning")
-@pytest.mark.parametrize("size", [(96, 160), (120, 64), (200, 200)])
-def test_scaling_in_the_decoder_is_a_resize(detailed_release, plain, size):
+def test_scaling_in_the_decoder_is_a_resize(detailed_release, plain):
+    size = (120, 64)
     decoded = StereoPairs(detailed_release, fields=FIELDS, size=size)[0]
     resized = StereoPairs(detailed_release, fields=FIELDS, transform=Resize(*size))[0]
 
@@ -117,14 +114,6 @@ def test_a_flipped_pairs_poses_are_those_of_a_rig_seen_in_a_mirror(detailed_rele
     np.testing.assert_allclose(step[:3, 3], [-float(plain["baseline_m"]), 0, 0], atol=1e-9)
     np.testing.assert_allclose(step[:3, :3], np.eye(3), atol=1e-12)
     assert np.linalg.det(flipped["world_from_left"].numpy()[:3, :3]) == pytest.approx(1)
-
-
-def test_a_flip_reads_what_its_mirror_image_needs_though_no_field_names_it(detailed_release):
-    flipped = StereoPairs(
-        detailed_release, fields=("left", "disparity"), transform=HorizontalFlip(1.0)
-    )[0]
-
-    assert sorted(flipped) == ["disparity", "left"]
 
 
 def test_letterbox_adds_black_that_is_not_measured(detailed_release):
@@ -253,18 +242,6 @@ def test_no_more_is_padded_after_a_resize_than_what_padding_went_into(box, size)
 MAPS = tuple(name for name, field in PAIR_FIELDS.items() if "H,W" in field.shape)
 
 
-@pytest.mark.parametrize("name", MAPS)
-def test_a_letterbox_that_scales_nothing_pads_every_field(detailed_release, name):
-    frames = ("clips", 2)
-    whole = StereoPairs(detailed_release, fields=[name], frames=frames)[0][name]
-    boxed = StereoPairs(
-        detailed_release, fields=[name], frames=frames, transform=Letterbox(160, 220)
-    )[0][name]
-
-    padded = torch.nn.functional.pad(whole, (30, 30), value=name == "hole")
-    assert torch.equal(boxed, padded)
-
-
 def padded_columns(before_px, after_px, *, content):
     """Return which columns of a resized picture have padding beside the content in them."""
     return torch.from_numpy(~clean_range(content, before_px=before_px, after_px=after_px)[1])
@@ -300,22 +277,7 @@ def test_what_a_resize_mixed_with_black_is_neither_valid_nor_visible(
         assert not outside[landed].any(), name
 
 
-def test_a_view_by_itself_is_not_valid_where_a_resize_mixed_it_with_black(detailed_release):
-    views = SceneViews(
-        detailed_release,
-        cameras=(0, 2),
-        fields=("image", "depth", "valid"),
-        transform=Compose([Letterbox(220, 160), Resize(101, 73)]),
-    )[0]
-
-    outside = padded_columns(220, 101, content=(30, 190))
-    assert views["image"][:, :, 14].any()
-    for name in ("valid", "depth"):
-        assert not views[name][:, :, outside].any(), name
-        assert views[name][:, :, ~outside].any(), name
-
-
-@pytest.mark.parametrize("last", [Resize(160, 160), Resize(60, 75), Resize(200, 190)], ids=str)
+@pytest.mark.parametrize("last", [Resize(160, 160), Resize(60, 75)], ids=str)
 def test_what_the_eraser_painted_is_not_visible_though_it_is_valid(detailed_release, last):
     fields = (*FIELDS, "visible_from_left")
     eraser = Eraser(1.0, most_boxes=1, low=40, high=60)
@@ -356,14 +318,6 @@ def test_colours_do_not_depend_on_padding(other):
         own = ~after.padded
     assert own.any()
     np.testing.assert_array_equal(after.pictures[1][..., own], before.pictures[1][..., own])
-
-
-def test_a_view_that_is_padding_alone_still_has_colours():
-    views = replace(made_views(), padded=np.ones((40, 60), dtype=bool))
-
-    jittered = ColorJitter()(views, np.random.default_rng(0))
-
-    assert jittered.pictures[0].any()
 
 
 @pytest.mark.parametrize("first", [Letterbox(40, 90), Eraser(1.0)], ids=["padded", "erased"])
@@ -411,20 +365,6 @@ def test_symmetric_jitter_changes_both_views_alike_and_asymmetric_apart():
         assert not np.array_equal(jittered.pictures[0], views.pictures[0])
 
 
-def test_jitter_of_nothing_changes_nothing():
-    views = made_views()
-
-    jittered = ColorJitter(0, 0, 0, 0)(views, np.random.default_rng(0))
-
-    assert np.array_equal(jittered.pictures[0], views.pictures[0])
-
-
-def test_a_third_of_a_turn_of_hue_takes_red_to_green():
-    from stereogenbench_data.samples.transforms import hue_rotation
-
-    np.testing.assert_allclose(hue_rotation(1 / 3) @ [1, 0, 0], [0, 1, 0], atol=1e-6)
-
-
 def test_the_eraser_paints_on_the_second_view_alone():
     views = made_views()
     erased = Eraser(1.0, low=10, high=20)(views, np.random.default_rng(0))
@@ -439,28 +379,20 @@ def test_the_eraser_paints_on_the_second_view_alone():
     ("make", "message"),
     [
         (lambda: Compose([Eraser(), HorizontalFlip()]), "put Eraser last"),
-        (lambda: Compose([Compose([Eraser()]), HorizontalFlip()]), "put Eraser last"),
         (lambda: Resize(0, 5), "whole numbers of pixels from 1, got"),
-        (lambda: Letterbox(5, 0), "whole numbers of pixels from 1, got"),
-        (lambda: Crop(0, 0, 0, 5), "whole numbers of pixels from 1, got"),
-        (lambda: RandomCrop(-1, 5), "whole numbers of pixels from 1, got"),
         (lambda: Crop(30, 0, 20, 5)(made_views(), None), "reaches beyond a picture of 60 x 40"),
         (lambda: Crop(-1, 0, 20, 5), "whole numbers of pixels from 1, got"),
         (lambda: Resize(1.5, 5), "whole numbers of pixels from 1, got 5 x 1.5"),
         (lambda: HorizontalFlip(1.5), "probability of HorizontalFlip must be 0 to 1, got 1.5"),
-        (lambda: HorizontalFlip("x"), "must be 0 to 1, got 'x'"),
         (lambda: RandomScale(2, 1), "low, high of RandomScale must be -8 to inf, ascending"),
         (lambda: ColorJitter(hue=3), "hue of ColorJitter must be 0 to 1, got 3"),
         (lambda: Eraser(1.0, 2, 100, 50), "low, high of Eraser must be 1 to inf, ascending"),
         (lambda: Resize(64), r"write Resize\(64, 64\)"),
         (lambda: RandomCrop((1, 2, 3)), r"is \(height, width\) in pixels, got \(1, 2, 3\)"),
-        (lambda: RandomCrop("64x64"), "is .height, width. in pixels, got '64x64'"),
-        (lambda: RandomCrop(6.4), "whole numbers of pixels from 1, got 6.4 x 6.4"),
         (
             lambda: Compose(HorizontalFlip(1.0), RandomCrop(8)),
             r"write Compose\(\[HorizontalFlip\(.*\), RandomCrop\(height=8, width=8\)\]\)",
         ),
-        (lambda: Compose(Eraser()), r"write Compose\(\[Eraser\("),
         (lambda: Compose([1]), "Compose takes transforms, got 1"),
         (lambda: Compose([HorizontalFlip]), "Compose takes transforms"),
         (lambda: RandomCrop(41, 5)(made_views(), None), "larger than a picture of 60 x 40"),

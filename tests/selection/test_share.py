@@ -41,14 +41,6 @@ def test_families_take_turns_and_in_each_its_maps(index):
     }  # fmt: skip
 
 
-def test_where_a_family_has_no_more_the_others_go_on(index):
-    chosen = share(index, scenes=40)
-
-    assert places(index, chosen)["Uniform", "Town"] == 12
-    assert len(chosen) == len(set(chosen)) == 40
-    assert chosen == sorted(chosen)
-
-
 def test_a_share_of_more_scenes_holds_that_of_fewer(index):
     assert set(share(index, scenes=7)) < set(share(index, scenes=8)) < set(share(index, scenes=60))
 

@@ -67,15 +67,6 @@ def test_key_frames_are_regular_windows_apart_or_count_as_unknown(spec, key_fram
     assert key_distance(parse_frames(spec), key_frames=key_frames) == expected
 
 
-@given(st.integers(1, 40), st.integers(0, 2**31), st.integers(0, 5))
-def test_random_frames_are_different_ascending_and_within_the_scene(n, seed, epoch):
-    found = [frame for (frame,) in windows(("random", n), 40, (seed, epoch, 99))]
-
-    assert found == sorted(set(found))
-    assert len(found) == n
-    assert 0 <= found[0] <= found[-1] < 40
-
-
 def test_random_frames_change_with_epoch_seed_and_scene_and_else_stay():
     draws = [(0, 0, 1), (0, 1, 1), (1, 0, 1), (0, 0, 2)]
     found = [tuple(windows(("random", 8), draw=draw)) for draw in draws]
@@ -105,31 +96,18 @@ def test_starts_of_random_clips_cover_a_scene_evenly():
     assert max(counts) < 660
 
 
-def test_random_frames_cover_a_scene_evenly():
-    counts = [0] * 10
-    for epoch in range(2000):
-        for (frame,) in windows(("random", 3), 10, (0, epoch, 0)):
-            counts[frame] += 1
-
-    assert min(counts) > 510
-    assert max(counts) < 690
-
-
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
         ("last", "is not understood"),
         (-1, "at least 0, got -1"),
-        (True, "got True"),
         ([], "is not understood"),
         ([1, 1], "names a frame twice"),
         ([1.5], "got 1.5"),
         (("every", 0), "at least 1, got 0"),
         (("random", 2, 3), "is not understood"),
-        (("clips",), "is not understood"),
         (("random clips", 1), "is not understood"),
         (("random clips", 0, 16), "at least 1, got 0"),
-        (("clips", 1, 1, 1, 1), "is not understood"),
         (None, "is not understood"),
     ],
     ids=str,

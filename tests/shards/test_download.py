@@ -6,7 +6,6 @@ import subprocess
 import sys
 import time
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -45,16 +44,6 @@ def test_only_the_files_of_the_cameras_are_fetched_and_are_the_released_ones(
     sent = sum(asked.sent for asked in web.asked if asked.path.endswith(".tar"))
     members = [member for row in range(2) for member in index.scene(row).members.values()]
     assert sent == sum(member.size for member in members)
-
-
-def test_what_was_fetched_opens_as_a_dataset(shards_on_the_web, small_release, tmp_path):
-    fetched(shards_on_the_web, tmp_path / "part", rows=(0, 1, 2, 3))
-
-    part = StereoPairs(tmp_path / "part", pairs=[(0, 1)], frames="all")
-
-    whole = StereoPairs(small_release, pairs=[(0, 1)], frames="all")
-    assert len(part) == len(whole) == 28
-    np.testing.assert_array_equal(part[9]["disparity"], whole[9]["disparity"])
 
 
 def test_a_camera_that_was_not_fetched_is_named(shards_on_the_web, tmp_path):
@@ -111,13 +100,6 @@ def test_the_folder_of_the_data_is_refused(small_release):
         download(index, wanted, small_release)
 
 
-def test_a_part_cannot_give_what_it_lacks(shards_on_the_web, tmp_path):
-    part = fetched(shards_on_the_web, tmp_path / "part")
-
-    with pytest.raises(StorageError, match=r"has no cam_05_rgb, cam_05_depth: .* Download from"):
-        plan_download(part, [0], cameras=[5], streams=["rgb", "depth"])
-
-
 def test_the_command_says_the_size_first_and_reports(small_release, tmp_path):
     dest = tmp_path / "part"
     arguments = ["download", str(small_release), "-o", str(dest), "--split", "eval"]
@@ -159,15 +141,6 @@ def test_a_share_passes_over_scenes_without_the_wanted_videos(small_release, tmp
     assert sizes[1] == plan_download(index, [1], cameras=[5], streams=["rgb"]).size_bytes
 
 
-def test_a_camera_that_does_not_exist_is_refused(small_release, tmp_path):
-    done = CliRunner().invoke(
-        app, ["download", str(small_release), "-o", str(tmp_path / "x"), "--cameras", "0,6"]
-    )
-
-    assert done.exit_code == 2
-    assert "write numbers from 0 to 5" in done.output
-
-
 def test_a_metadata_file_of_another_revision_is_fetched_again(shards_on_the_web, tmp_path):
     dest = tmp_path / "part"
     fetched(shards_on_the_web, dest)
@@ -178,16 +151,6 @@ def test_a_metadata_file_of_another_revision_is_fetched_again(shards_on_the_web,
     fetched(shards_on_the_web, dest)
 
     assert changed.read_bytes() == text
-
-
-def test_commands_that_need_all_cameras_name_what_a_part_lacks(shards_on_the_web, tmp_path):
-    dest = tmp_path / "part"
-    fetched(shards_on_the_web, dest)
-
-    shown = CliRunner().invoke(app, ["show", str(dest), "--out", str(tmp_path / "sheet.png")])
-
-    assert shown.exit_code == 2
-    assert "cam_02_rgb.mp4 is not in the data; the scene has cam_00_rgb.mp4" in shown.stderr
 
 
 def test_a_killed_download_goes_on_and_leaves_no_file_that_is_not_whole(

@@ -3,13 +3,9 @@
 import json
 import math
 import shutil
-import subprocess
-import sys
 import tarfile
 from dataclasses import replace
 from fractions import Fraction
-from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -39,7 +35,6 @@ from stereogenbench_data.media.picture_encoding import (
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.schema.release import TRAINING_JSON
 from stereogenbench_data.schema.training import parse_training
-from stereogenbench_data.shards.download import download, plan_download
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.training import TrainingSettings
 from stereogenbench_data.shards.unpack import unpack
@@ -149,17 +144,6 @@ def test_pictures_have_the_psnr_that_the_index_states(release, packed):
         assert scene.training.worst_psnr_db[1] == pytest.approx(min(decibels), abs=0.0011)
         assert scene.training.psnr_db[1] <= np.mean(decibels)
         assert scene.training.worst_psnr_db[1] <= min(decibels)
-
-
-def test_better_qualities_cost_bytes_and_save_error(of_quality):
-    found = []
-    for quality in QUALITIES:
-        scene = SceneIndex.open(of_quality[quality]).scene(0)
-        found.append((scene.members["cam_00_rgb.mp4"].size, min(scene.training.psnr_db)))
-
-    assert list(QUALITIES) == ["small", "balanced", "high"]
-    assert all(one < other for one, other in pairwise(found))
-    assert all(one[1] < other[1] for one, other in pairwise(found))
 
 
 def test_the_index_says_from_what_and_how_scenes_were_derived(release, packed):
@@ -301,23 +285,6 @@ def test_derived_files_that_were_damaged_before_the_shard_are_made_again(packed,
     assert bytes_of(tmp_path) == bytes_of(packed)
 
 
-def test_a_process_that_is_killed_goes_on_where_it_was(packed, release, tmp_path):
-    script = (
-        "import os, sys\n"
-        "from stereogenbench_data.shards.pack import pack\n"
-        "from stereogenbench_data.shards.training import TrainingSettings\n"
-        "def progress(done, total):\n"
-        "    if done > total / 2: os.kill(os.getpid(), 9)\n"
-        "pack(sys.argv[1], sys.argv[2], training=TrainingSettings((24, 32)), workers=1,\n"
-        "     progress=progress)\n"
-    )
-    run = subprocess.run([sys.executable, "-c", script, str(release), str(tmp_path)], check=False)
-    pack(release, tmp_path, training=SETTINGS, workers=1)
-
-    assert run.returncode == -9
-    assert bytes_of(tmp_path) == bytes_of(packed)
-
-
 def test_other_settings_or_another_source_are_another_plan(shards, release, tmp_path):
     with pytest.raises(ShardError, match=r"plan\.json: .* \(plan, training differ\)"):
         pack(release, shards, training=TrainingSettings(SIZE, "small"), workers=1)
@@ -327,10 +294,8 @@ def test_other_settings_or_another_source_are_another_plan(shards, release, tmp_
         pack(release, shards, workers=1)
 
 
-@pytest.mark.parametrize("form", ["shards", "packed depth"])
-def test_shards_are_a_source_as_their_release_is(packed, release, tmp_path, form):
-    codec = "blosc2" if form == "packed depth" else "released"
-    pack(release, tmp_path / "source", depth_codec=codec, workers=1)
+def test_shards_are_a_source_as_their_release_is(packed, release, tmp_path):
+    pack(release, tmp_path / "source", depth_codec="blosc2", workers=1)
     pack(tmp_path / "source", tmp_path / "out", training=SETTINGS, workers=1)
 
     one, other = document_of(tmp_path / "out", KEY), document_of(packed, KEY)
@@ -397,7 +362,6 @@ def test_a_scene_that_lacks_a_camera_is_derived_without_it(release, tmp_path):
     ("request_", "size", "key_frames"),
     [
         (SynthRequest(family="Uniform", scenes=1, size_px=40, frames=1), (17, 23), (0,)),
-        (SynthRequest(family="Uniform", scenes=1, size_px=40, frames=8), (40, 40), (0,)),
         (SynthRequest(family="Uniform", scenes=1, size_px=36, frames=17), (18, 34), (0, 8, 16)),
     ],
 )
@@ -442,11 +406,6 @@ def test_larger_pictures_than_released_are_refused(release, tmp_path):
 def test_settings_that_cannot_be_are_refused(settings, found):
     with pytest.raises(ShardError, match=found):
         TrainingSettings(SIZE, **settings)
-
-
-def test_no_scene_is_refused(release, tmp_path):
-    with pytest.raises(ShardError, match="no scene is selected"):
-        pack(release, tmp_path, training=SETTINGS, rows=[], workers=1)
 
 
 # What reads them, and what refuses them.
@@ -498,19 +457,6 @@ def test_unpacked_training_shards_are_a_folder_of_derived_scenes(packed, tmp_pat
     )
 
 
-def test_a_download_of_a_part_is_a_folder_of_derived_scenes(packed, tmp_path):
-    index = SceneIndex.open(packed)
-    part = plan_download(index, [0], cameras=[0, 1], streams=["rgb", "depth"])
-    download(index, part, tmp_path, workers=1)
-
-    assert repr(SceneIndex.open(tmp_path).scene(0).training) == repr(index.scene(0).training)
-    folder = StereoPairs(tmp_path)
-    one, other = folder[0], StereoPairs(packed)[0]
-    folder.close()
-    assert torch.equal(one["left"], other["left"])
-    assert torch.equal(one["disparity"], other["disparity"])
-
-
 # Damage and alteration.
 
 
@@ -520,12 +466,6 @@ def test_every_frame_decodes(packed):
     assert report.problems == ()
     assert report.videos_decoded == 36
     assert "32x24" in report.derived
-
-
-def test_a_flipped_byte_is_found(shards):
-    flip_byte(shards / "train-Uniform-000000.tar")
-
-    assert verify(shards, workers=1).problems
 
 
 def test_an_altered_psnr_contradicts_the_shard(shards):
@@ -548,11 +488,8 @@ def test_an_altered_psnr_contradicts_the_shard(shards):
     ("facts", "found"),
     [
         ({"quality": "[small](http://x)"}, "training_quality"),
-        ({"source_digest": "none"}, "training_source"),
         ({"settings": "[" * 9999}, "training_settings"),
-        ({"settings": "{"}, "training_settings"),
         ({"psnr_db": (400.0,) * 6}, "psnr_db"),
-        ({"psnr_db": (40.0,) * 5}, "psnr_db"),
         ({"worst_psnr_db": (-math.inf,) * 6}, "worst_psnr_db"),
     ],
 )
@@ -568,7 +505,6 @@ def test_an_index_cannot_say_other_things_of_training_shards(packed, facts, foun
     ("alter", "found"),
     [
         (lambda text: text[:-40], "not valid JSON"),
-        (lambda text: text.replace(b'"format": 1', b'"format": 2'), "its keys"),
         (lambda text: text.replace(b'"psnr_db": ', b'"psnr_db": 1'), "psnr_db"),
         (lambda text: text.replace(b"cam_00_rgb.mp4", b"../../etc"), "files"),
         (
@@ -576,8 +512,6 @@ def test_an_index_cannot_say_other_things_of_training_shards(packed, facts, foun
             "key_frames",
         ),
         (lambda text: text.replace(b'"width_px": 32', b'"width_px": -1'), "width_px"),
-        (lambda text: text.replace(b'"versions"', b'"version"'), "versions"),
-        (lambda text: text.replace(b'"bytes": ', b'"bytes": -'), "bytes"),
         (lambda text: text.replace(b'"crc32": "', b'"crc32": "x'), "invalid literal"),
     ],
 )
@@ -586,17 +520,6 @@ def test_an_altered_description_is_refused_with_its_place(packed, alter, found):
 
     with pytest.raises(SchemaError, match=rf"shard/training\.json: .*{found}"):
         parse_training(text, where="shard/training.json")
-
-
-def test_a_source_that_is_not_the_one_of_its_index_is_refused(release, tmp_path):
-    source = shutil.copytree(release, tmp_path / "source")
-    index = SceneIndex.open(source)
-    place = source / KEY / "cam_02_rgb.mp4"
-    place.write_bytes(place.read_bytes()[:-50])
-
-    with pytest.raises(ShardError, match=rf"{KEY}.*cam_02_rgb\.mp4"):
-        pack(index, tmp_path / "out", training=SETTINGS, workers=1)
-    assert not list((tmp_path / "out").glob("train-Uniform*.tar"))
 
 
 def moving(count, *, size=(32, 48)):
@@ -611,8 +534,10 @@ def moving(count, *, size=(32, 48)):
     )
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
-@pytest.mark.parametrize("rate_hz", [Fraction(15), Fraction(24), Fraction(30000, 1001)])
+@pytest.mark.parametrize(
+    ("quality", "rate_hz"),
+    [("small", Fraction(15)), ("balanced", Fraction(24)), ("high", Fraction(30000, 1001))],
+)
 def test_a_video_is_written_the_same_each_time_and_read_back(tmp_path, quality, rate_hz):
     pictures = moving(19)
     one, other = tmp_path / "one.mp4", tmp_path / "other.mp4"
@@ -629,8 +554,7 @@ def test_a_video_is_written_the_same_each_time_and_read_back(tmp_path, quality, 
     assert facts.key_frames == tuple(range(0, 19, distance))
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
-@pytest.mark.parametrize("shift", [-1, 1])
+@pytest.mark.parametrize(("quality", "shift"), [("balanced", -1), ("high", 1)])
 def test_a_neighbouring_frame_in_the_place_of_one_is_found(tmp_path, quality, shift):
     pictures = moving(10)
     write_pictures(pictures, tmp_path / "a.mp4", quality=quality, rate_hz=Fraction(15))
@@ -672,21 +596,3 @@ def test_the_command_derives_and_verifies(release, tmp_path):
     assert "2 scenes" in packed.stdout
     assert "derived at 32x24 (quality small, h264)" in verified.stdout
     assert "8 videos decoded; 0 problems" in verified.stdout
-
-
-@pytest.mark.parametrize(
-    ("options", "found"),
-    [
-        (["--quality", "small"], "--size"),
-        (["--cameras", "0"], "--size"),
-        (["--size", "32x24", "--cameras", "0,7"], "0 to 5"),
-        (["--size", "32"], "WIDTHxHEIGHT"),
-        (["--size", "32x24", "--depth-codec", "blosc2"], "--depth-codec"),
-    ],
-)
-def test_options_that_do_not_go_together_are_refused(release, tmp_path, options, found):
-    run = command("pack", release, tmp_path / "out", *options)
-
-    assert run.exit_code == 2
-    assert found in run.output
-    assert not Path(tmp_path / "out").exists()

@@ -5,8 +5,6 @@ import json
 import os
 import re
 import shutil
-import subprocess
-import sys
 import tarfile
 import zlib
 from dataclasses import replace
@@ -22,7 +20,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Member, ShardFacts
 from stereogenbench_data.shards.pack import pack
-from stereogenbench_data.shards.verify import Problem, verify
+from stereogenbench_data.shards.verify import verify
 from tests.servers.scene_fixtures import write_video
 from tests.shards.shard_files import flip_byte, scenes_of, tar_of
 
@@ -80,18 +78,14 @@ def test_decoding_counts_every_video_and_progress_ends_at_the_end(small_shards):
     assert seen == sorted(seen)
 
 
-@pytest.mark.parametrize(
-    "where", ["in a header", "at a header", "in a payload", "before the end", "in the end"]
-)
+@pytest.mark.parametrize("where", ["in a header", "in a payload", "before the end"])
 def test_a_cut_shard_is_reported_with_its_size_and_what_is_lost(shards, place, where):
     member = place(SCENES[1], "cam_02_rgb.mp4")
     size = (shards / PAIR).stat().st_size
     cut = {
         "in a header": member.offset - 412,
-        "at a header": member.offset - 512,
         "in a payload": member.offset + 10,
         "before the end": size - 1024,
-        "in the end": size - 512,
     }[where]
     os.truncate(shards / PAIR, cut)
 
@@ -113,27 +107,12 @@ def test_a_flipped_payload_byte_is_reported_with_its_member(shards, place):
     assert reported.endswith(f", and the index says {member.crc32:08x}. {FETCH}")
 
 
-def test_a_flipped_header_byte_is_reported_with_its_member(shards, place):
-    flip_byte(shards / PAIR, place(SCENES[0], "cam_00_rgb.mp4").offset - 512 + 5)
-
-    (reported,) = lines(shards)
-
-    assert reported.startswith(f"{PAIR}: {SCENES[0]}: cam_00_rgb.mp4: its header ")
-
-
 def test_a_byte_between_members_is_reported(shards, place):
     member = place(SCENES[0], "_scene_complete.json")
     assert member.size % 512
     flip_byte(shards / PAIR, member.offset + member.size)
 
     assert_lines(lines(shards), (f"{PAIR}: has sha256 ", "though its files are sound", FETCH))
-
-
-def test_bytes_after_the_end_are_reported(shards):
-    with (shards / PAIR).open("ab") as file:
-        file.write(bytes(512))
-
-    assert_lines(lines(shards), (f"{PAIR}: has ", "something was added", FETCH))
 
 
 KEY = "train/Uniform/Town/scene_000001"
@@ -200,14 +179,6 @@ def test_exchanged_payloads_are_both_reported(toy):
     assert all("its bytes have crc32" in line for line in reported)
 
 
-def test_exchanged_names_are_reported(toy):
-    exchanged = [FILES[0], (FILES[2][0], FILES[1][1]), (FILES[1][0], FILES[2][1])]
-
-    reported = toy(tar_of(exchanged))
-
-    assert_lines(reported, (f"x.tar: {KEY}: cam_0", "_rgb.mp4: its header ", FETCH))
-
-
 def test_a_missing_member_is_reported_and_so_is_what_moved(toy):
     reported = toy(tar_of([FILES[0], FILES[2]]))
 
@@ -217,18 +188,6 @@ def test_a_missing_member_is_reported_and_so_is_what_moved(toy):
         (f"x.tar: {KEY}: cam_00_rgb.mp4: its bytes ", FETCH),
         (f"x.tar: {KEY}: cam_01_rgb.mp4: its bytes ", FETCH),
     )
-
-
-def test_a_member_too_many_is_reported(toy):
-    reported = toy(tar_of([*FILES, (f"{KEY}.cam_09_rgb.mp4", b"more")]))
-
-    assert_lines(reported, ("x.tar: has 5120 bytes", "4096: something was added", FETCH))
-
-
-def test_a_renamed_scene_is_of_another_pack(toy):
-    reported = toy(tar_of([(name.replace("0001", "0002"), content) for name, content in FILES]))
-
-    assert_lines(reported, ("x.tar: ", FILES[0][0].partition(".")[2], "its header", FETCH))
 
 
 @pytest.mark.parametrize("at", [0, 3, 156, 600, 2 * 512, 3000, -1, -600])
@@ -265,21 +224,6 @@ def test_shards_that_the_index_does_not_know_are_reported(shards):
         lines(shards),
         ("train-Uniform-000001.tar: is not in the index", "Put the index beside the shards"),
         ("train-Uniform-000002.tar.tmp: is an unfinished shard", "`stereogenbench pack`"),
-    )
-
-
-def test_an_index_of_another_pack_is_reported_for_every_shard_that_differs(
-    shards, small_release, tmp_path
-):
-    pack(small_release, tmp_path / "other", target_bytes=250_000, workers=1)
-    shutil.copy(tmp_path / "other" / "index.parquet", shards / "index.parquet")
-
-    reported = lines(shards, mode="decode")
-
-    assert_lines(
-        reported,
-        (f"{PAIR}: has ", "something was added", FETCH),
-        ("train-Uniform-000001.tar: is missing", "1 scene"),
     )
 
 
@@ -327,16 +271,6 @@ def test_a_video_with_fewer_frames_is_reported_by_decoding(repacked, tmp_path):
     )
 
 
-def test_a_damaged_video_is_reported_by_decoding(repacked, small_release):
-    content = bytearray((small_release / SCENES[0] / "cam_02_depth.mkv").read_bytes())
-    content[len(content) // 2] ^= 0x55
-
-    (reported,) = repacked("cam_02_depth.mkv", bytes(content))
-
-    assert reported.startswith(f"{PAIR}: {SCENES[0]}: cam_02_depth.mkv: ")
-    assert "frame" in reported
-
-
 def test_depth_of_another_unit_than_the_index_says_is_reported_by_decoding(repacked, tmp_path):
     other = write_video(
         tmp_path / "o_depth.mkv", frames=7, size=(64, 64), tags={"DEPTH_SCALE": "0.5"}
@@ -357,18 +291,6 @@ def test_a_folder_that_was_not_finished_is_refused(shards):
         verify(shards)
 
 
-def test_a_folder_without_index_is_refused(tmp_path):
-    with pytest.raises(ShardError, match=r"holds no index\.parquet\. Pass a folder that"):
-        verify(tmp_path)
-
-
-def test_a_released_folder_is_not_shards(small_release, tmp_path):
-    SceneIndex.open(small_release).write(tmp_path / "index.parquet")
-
-    with pytest.raises(ShardError, match="is the index of a released folder, not of shards"):
-        verify(tmp_path, root=small_release)
-
-
 def test_remote_shards_must_be_downloaded_first(tmp_path):
     with pytest.raises(ShardError, match=r"shards : is remote\. Download the shards"):
         verify("https://example.org/shards")
@@ -382,14 +304,9 @@ def test_remote_shards_must_be_downloaded_first(tmp_path):
         ("baseline.json",
          lambda scene: {"rig": replace(scene.rig, baselines_cm=(7.0,) * 15)},
          "tells baselines_cm ("),
-        ("baseline.json", lambda scene: {"rig": replace(scene.rig, primary_pair=(2, 4))},
-         "tells primary_pair (0, 1), and by the index it is (2, 4)"),
-        ("trajectory.json", lambda scene: {"frames": 6},
-         "tells frames 7, and by the index it is 6"),
         ("trajectory.json", lambda scene: {"frames": 8},
          "tells frames 7, and by the index it is 8"),
         ("trajectory.json", lambda scene: {"lateral_m": (0.0,) * 6}, "tells lateral_m (0.0, "),
-        ("trajectory.json", lambda scene: {"rig_residual_px": 5.0}, "tells rig_residual_px "),
         ("scene_description_qwen_dataset_level.json", lambda scene: {"caption": "Snow."},
          "and by the index it is 'Snow.'"),
         ("baseline.json", lambda scene: {"labels": replace(scene.labels, character="Nobody")},
@@ -440,12 +357,6 @@ def test_an_index_that_contradicts_itself_is_refused(shards):
         verify(shards)
 
 
-def test_a_problem_is_one_line():
-    problem = Problem("x.tar", "", "", "is\nodd", "Do this.")
-
-    assert str(problem) == "x.tar: is odd. Do this."
-
-
 def command(*words):
     return CliRunner().invoke(app, ["verify", *map(str, words), "--workers", "1"])
 
@@ -456,27 +367,6 @@ def test_the_command_ends_with_0_where_all_is_well(small_shards):
     assert result.exit_code == 0
     assert result.stdout.startswith(f"{small_shards}: 3 shards, 4 scenes, 68 members, ")
     assert result.stdout.endswith(" MB, 48 videos decoded; 0 problems\n")
-
-
-def test_the_command_ends_with_1_and_a_line_for_each_problem(shards):
-    (shards / PAIR).unlink()
-    (shards / SINGLE).unlink()
-
-    result = command(shards)
-
-    assert result.exit_code == 1
-    assert [line.split(": ")[0] for line in result.stdout.splitlines()] == [
-        SINGLE,
-        PAIR,
-        str(shards),
-    ]
-    assert result.stdout.splitlines()[-1].endswith("; 2 problems")
-
-
-def test_one_problem_is_reported_in_the_singular(shards):
-    (shards / PAIR).unlink()
-
-    assert command(shards).stdout.endswith("; 1 problem\n")
 
 
 def test_the_command_reports_as_json(shards):
@@ -498,21 +388,8 @@ def test_the_command_reports_as_json(shards):
     ]
 
 
-def test_the_command_ends_with_2_where_there_is_nothing_to_verify(tmp_path):
-    ended = subprocess.run(
-        [sys.executable, "-m", "stereogenbench_data.cli.main", "verify", tmp_path],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+def test_a_released_folder_is_not_shards(small_release, tmp_path):
+    SceneIndex.open(small_release).write(tmp_path / "index.parquet")
 
-    assert ended.returncode == 2
-    assert "ShardError" in ended.stderr
-
-
-def test_a_link_to_nowhere_is_no_shard(shards):
-    shard = sorted(shards.glob("*.tar"))[0]
-    shard.unlink()
-    shard.symlink_to("/nonexistent")
-
-    [line] = lines(shards)
-
-    assert line.startswith(f"{shard.name}: is not a file, with ")
+    with pytest.raises(ShardError, match="is the index of a released folder, not of shards"):
+        verify(tmp_path, root=small_release)

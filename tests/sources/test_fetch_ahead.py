@@ -1,7 +1,6 @@
 """Ranges fetched ahead: exactly the bytes that are needed, in few requests, within a bound."""
 
 import threading
-import time
 
 import pytest
 from hypothesis import example, given, settings
@@ -65,17 +64,6 @@ def test_every_byte_that_is_needed_is_fetched_once_and_no_other(samples):
     ahead.close()
 
 
-def test_ranges_beside_each_other_take_one_request():
-    ahead, log = FetchAhead(), Log()
-    for number in range(5):
-        ahead.plan(number, log.wanted((100 * number, 100 * (number + 1))))
-    ahead.begin()
-
-    assert read(ahead, 0, 500) == CONTENT[:500]
-    assert log.asked == [(0, 500)]
-    ahead.close()
-
-
 def test_ranges_of_later_samples_wait_and_grow():
     ahead, log = FetchAhead(), Log()
     ahead.plan(1, log.wanted((0, 10)))
@@ -124,17 +112,4 @@ def test_an_error_is_raised_where_the_bytes_are_read_and_not_before():
         ahead.read("place", 3)
 
     assert ahead.read("place", 3) is None
-    ahead.close()
-
-
-def test_threads_end_when_there_is_nothing_to_fetch():
-    ahead, log = FetchAhead(), Log()
-    ahead.plan(1, log.wanted((0, 10)))
-    ahead.begin()
-    assert read(ahead, 0, 10) == CONTENT[:10]
-    deadline = time.monotonic() + 60
-    while "fetch-ahead" in {each.name for each in threading.enumerate()}:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
     ahead.close()

@@ -117,17 +117,6 @@ def test_the_login_goes_to_the_hub_and_not_to_its_content_network(hub, monkeypat
     assert all("authorization" not in asked.headers for asked in hub.asked)
 
 
-def test_the_login_and_the_hub_are_those_of_the_environment(hub, monkeypatch):
-    constants = require_module("huggingface_hub.constants")
-    monkeypatch.setitem(fsspec.config.conf, "hf", {})
-    monkeypatch.setattr(constants, "ENDPOINT", hub.url)
-    monkeypatch.setenv("HF_TOKEN", "hf_environment")
-
-    assert RemoteObject(PINNED).read(0, 9) == DATA[:9]
-    ((_, _, headers),) = hub.facts["resolved"]
-    assert headers["authorization"] == "Bearer hf_environment"
-
-
 def test_nothing_that_is_logged_shown_or_sent_to_a_process_holds_a_signature(
     hub, caplog, monkeypatch
 ):
@@ -200,12 +189,6 @@ def test_a_file_in_the_hubs_own_cache_is_read_from_there(hub, own_cache):
         RemoteObject(PINNED).read(100, 109)
 
 
-def test_a_cache_of_another_commit_is_not_that_of_the_branch(hub, own_cache):
-    keep_in_cache(own_cache, commit="f" * 40, content=DATA[::-1])
-
-    assert RemoteObject(BRANCH).read(5, 9) == DATA[5:9]
-
-
 def test_offline_the_cache_is_read_and_nothing_is_requested(hub, own_cache, monkeypatch):
     keep_in_cache(own_cache)
     monkeypatch.setattr(hub_transport, "is_offline", lambda: True)
@@ -220,16 +203,6 @@ def test_offline_the_cache_is_read_and_nothing_is_requested(hub, own_cache, monk
     assert resolved(hub) == []
 
 
-def test_the_switch_of_offline_mode_is_huggingface_hubs(monkeypatch):
-    constants = require_module("huggingface_hub.constants")
-    assert not hub_transport.is_offline()
-    if hasattr(constants, "is_offline_mode"):
-        monkeypatch.setattr(constants, "is_offline_mode", lambda: True)
-    else:
-        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
-    assert hub_transport.is_offline()
-
-
 def test_a_path_out_of_the_repository_is_refused(hub):
     with pytest.raises(StorageError, match=r"not a file of a repository: correct the URL"):
         RemoteObject(f"hf://datasets/{REPOSITORY}@{COMMIT}/../x.tar").read(0, 9)
@@ -240,7 +213,6 @@ def test_a_path_out_of_the_repository_is_refused(hub):
     [
         ("hf://datasets/a/b/c/d.tar", ("datasets", "a/b", "main", "c/d.tar")),
         ("hf://datasets/a/b@refs%2Fpr%2F1/d", ("datasets", "a/b", "refs/pr/1", "d")),
-        ("hf://datasets/a/b@refs/convert/x/d", ("datasets", "a/b", "refs/convert/x", "d")),
         ("hf://a/b@v1/d", ("models", "a/b", "v1", "d")),
         ("hf://datasets/a/b", ("datasets", "a/b", "main", "")),
     ],

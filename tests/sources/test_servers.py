@@ -3,7 +3,6 @@
 import os
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import fsspec
 import pytest
@@ -27,16 +26,6 @@ def same_index(root, folder):
     return index.root == root and index.digest == SceneIndex.open(folder).digest
 
 
-def test_nginx_sends_the_range_requested(nginx, small_shards):
-    shard = shard_of(small_shards)
-    url = f"{nginx.url}/{shard.name}"
-
-    assert size_of(url) == shard.stat().st_size
-    assert read_range(url, 1000, 3000) == shard.read_bytes()[1000:3000]
-    assert nginx.sent(requests=2) == 2001
-    assert same_index(nginx.url, small_shards)
-
-
 def test_nginx_redirects(nginx, small_shards):
     shard = shard_of(small_shards)
 
@@ -52,13 +41,6 @@ def test_what_nginx_refuses_is_reported(nginx, small_shards):
         read_range(f"{nginx.url}/forbidden/x.tar", 0, 9)
     with pytest.raises(StorageError, match=rf"has {size} bytes, and byte {size + 8} is asked for"):
         read_range(f"{nginx.url}/{shard_of(small_shards).name}", size, size + 9)
-
-
-def test_an_index_behind_a_url_may_be_named_itself(nginx, small_shards):
-    index = SceneIndex.open(f"{nginx.url}/index.parquet")
-
-    assert index.root == nginx.url
-    assert index.digest == SceneIndex.open(small_shards).digest
 
 
 def test_the_hub_sends_the_range_requested(hub, small_shards):
@@ -152,29 +134,6 @@ def test_a_file_system_that_fails_is_requested_again(monkeypatch):
     files.rm("/shard.tar")
 
 
-def test_a_wait_that_a_store_asks_for_holds_for_all_its_objects(monkeypatch):
-    files = fsspec.filesystem("memory")
-    files.pipe_file("/busy/shard.tar", b"0123456789")
-
-    class BusyError(OSError):
-        response = SimpleNamespace(status_code=503, headers={"retry-after": "2"})
-
-    failures = [BusyError()]
-
-    def fetched(*args, **how):
-        if failures:
-            raise failures.pop()
-        return type(files).cat_file(files, *args, **how)
-
-    monkeypatch.setattr(files, "cat_file", fetched)
-    for _ in range(2):
-        waits = waits_noted(monkeypatch)
-        remote = RemoteObject("memory://busy/shard.tar")
-        assert remote.read(2, 6) == b"2345"
-        assert waits == [pytest.approx(2.0, abs=1.1)]
-    files.rm("/busy", recursive=True)
-
-
 def test_a_url_that_no_file_system_opens_is_reported():
     with pytest.raises(StorageError, match=r"nope://a/b : not a URL that fsspec can open. Correct"):
         read_range("nope://a/b", 0, 9)
@@ -186,11 +145,6 @@ def test_an_ftp_server_is_refused_before_anything_is_asked_of_it(url, monkeypatc
 
     with pytest.raises(StorageError, match=r"(?i)ftps?://127\S* : FTP servers are not read"):
         SceneIndex.open(url)
-
-
-def test_a_file_system_that_needs_more_than_a_url_is_reported():
-    with pytest.raises(StorageError, match=r"github://a/b : not a URL that fsspec can open"):
-        read_range("github://a/b", 0, 9)
 
 
 def test_a_file_system_that_is_not_installed_is_named(monkeypatch):

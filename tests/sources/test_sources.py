@@ -7,7 +7,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.sources.cache import ShardCache
 from tests.servers.failing_server import Answer, serving
 from tests.servers.hub import COMMIT, REPOSITORY
-from tests.sources.source_kit import BASELINE_JSON, SourceTests, read_range
+from tests.sources.source_kit import BASELINE_JSON, SourceTests
 
 
 class TestReleasedFolder(SourceTests):
@@ -57,12 +57,6 @@ class TestReleasedFolderOverHttp(TestReleasedFolder):
     test_the_index_can_be_opened_where_the_data_are = None
 
 
-class TestHttpWithLogin(TestHttp):
-    @pytest.fixture
-    def root(self, server):
-        return server.url.replace("http://", "http://me:word@")
-
-
 class TestNginx(SourceTests):
     @pytest.fixture
     def root(self, nginx):
@@ -70,9 +64,9 @@ class TestNginx(SourceTests):
 
 
 class TestHub(SourceTests):
-    @pytest.fixture(params=["", f"@{COMMIT}"])
-    def root(self, hub, request):
-        return f"hf://datasets/{REPOSITORY}{request.param}"
+    @pytest.fixture
+    def root(self, hub):
+        return f"hf://datasets/{REPOSITORY}@{COMMIT}"
 
 
 class TestS3(SourceTests):
@@ -111,10 +105,3 @@ class TestCached(TestHttp):
         server.answers = [Answer(), Answer(change=lambda data: data[::-1])]
 
         assert make_source().read(scene, BASELINE_JSON) == released(BASELINE_JSON)
-
-
-def test_a_login_is_sent(small_shards):
-    with serving(small_shards) as server:
-        read_range(f"{server.url.replace('http://', 'http://me:word@')}/index.parquet", 0, 4)
-
-        assert "authorization" in server.asked[0].headers
