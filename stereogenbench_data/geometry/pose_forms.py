@@ -34,7 +34,7 @@ _LOCATION: Final = {
 }  # fmt: skip
 _ROTATION: Final = {
     "rotation", "rotator", "orientation", "euler", "quaternion", "quat", "rot", "q", "r",
-    "angles", "rotmat", "matrix", "rotvec", "rvec", "qvec", "pyr", "rpy",
+    "angle", "angles", "rotmat", "matrix", "rotvec", "rvec", "qvec", "pyr", "rpy",
 }  # fmt: skip
 _NO_POSE: Final = {
     "scale", "scale3d", "velocity", "forward", "up", "right", "target", "lookat", "color",

@@ -22,6 +22,7 @@ from stereogenbench_data.geometry.pose import OPENCV_FROM_UNREAL, CameraPoses
 from stereogenbench_data.geometry.pose_forms import Reading, readings
 from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
 from stereogenbench_data.schema.conventions import PosesAs
+from stereogenbench_data.schema.parse import contradiction
 from stereogenbench_data.schema.quantities import UNITS_M
 from stereogenbench_data.schema.records import Rig
 from stereogenbench_data.schema.release import BASELINE_JSON, CAMERA_PAIRS
@@ -59,7 +60,7 @@ class Understood:
         names: The readings that pass and move the cameras differently in the world, the one that
             was taken first.
         is_named: Whether the file itself names that one.
-        other_pair: Where the file states another primary pair than the rig has; "" if nowhere.
+        others: Where the file states another lens, baseline or primary pair than the rig has.
         first_frame: The number of the first frame that has poses.
         form: What the index keeps of it, for `poses_as`: None for the first form that the file
             itself names, if it is the only one to pass.
@@ -69,7 +70,7 @@ class Understood:
     names: tuple[str, ...]
     is_named: bool
     form: str | None
-    other_pair: str = ""
+    others: str = ""
     first_frame: int = 0
 
 
@@ -111,14 +112,10 @@ def understood_poses(
             f"{where}: {recorded.lens}, and a scene of {BASELINE_JSON} has one lens. Leave this "
             f"scene out, or remove the key."
         )
-    other = "; ".join(
-        f"{where}: {path} states cameras {pair[0]} and {pair[1]}"
-        for path, pair in recorded.primary_pairs
-        if rig.primary_pair not in (pair, (pair[0] - 1, pair[1] - 1))
-    )
+    other = contradiction(recorded.head, rig, where=where)
     if named is None:
         plain = _fitting(readings(recorded), rig, where=where)
-        return replace(plain, other_pair=other, first_frame=recorded.first_frame)
+        return replace(plain, others=other, first_frame=recorded.first_frame)
     found, own, reason = None, None, ""
     try:
         found = _fitting(_readings_as(recorded, named), rig, where=where)
@@ -129,7 +126,7 @@ def understood_poses(
     own_poses = own.poses if own is not None and own.is_named else None
     if found is not None and (own_poses is None or same_poses(found.poses, own_poses)):
         form, first_frame = "|".join(found.names), recorded.first_frame
-        return replace(found, form=form, other_pair=other, first_frame=first_frame)
+        return replace(found, form=form, others=other, first_frame=first_frame)
     reason = reason or "the file names another form, which fits as well and differs"
     fits = "" if own is None else f" What fits is: {shortened(own.names[0], 300)}."
     stated = ((name, getattr(named, name)) for name in ("rotation", "form", "axes", "unit"))

@@ -494,7 +494,8 @@ def restated(
 _PHRASES: Final = {
     "size": "the videos' picture size counts, where baseline.json has another",
     "baselines": "baselines that are not recorded are sums of their neighbours",
-    "pair": "the primary pair of baseline.json counts, where trajectory.json has another",
+    "pair": "lens, baselines and primary pair of baseline.json count, where another file has "
+    "others",
     "frames": "the frames that all videos have are used",
     "lens": "a pinhole lens is assumed, where baseline.json states another model",
     "marker": "no scene has _scene_complete.json, so it is not known which were finished",

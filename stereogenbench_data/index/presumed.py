@@ -55,6 +55,7 @@ from stereogenbench_data.index.scene_folder import (
     unfinished,
 )
 from stereogenbench_data.index.tree import (
+    FILES,
     Files,
     FoundScenes,
     RemoteFolder,
@@ -447,7 +448,11 @@ def _presumed(each: _Metadata, models: Sequence[Scene], stated: Shape | None) ->
         valid_depth_ratio=None,
         remarks=as_kept(remarks),
         pose_form=None,
-        members={name: Member(f"{key}/{name}", 0, size) for name, (size, _) in each.files.items()},
+        members={
+            name: Member(f"{key}/{name}", 0, size)
+            for name, (size, _) in each.files.items()
+            if name in FILES
+        },
         seek_tables=None,
     )
 

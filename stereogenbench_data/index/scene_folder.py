@@ -33,7 +33,7 @@ from stereogenbench_data.index.evidence import (
     shape_of,
     understood_poses,
 )
-from stereogenbench_data.index.tree import SceneFolder, folder_of
+from stereogenbench_data.index.tree import FILES, SceneFolder, folder_of
 from stereogenbench_data.media.clock import MOST_EXTRA_FRAMES
 from stereogenbench_data.media.container import StreamFacts, depth_coding
 from stereogenbench_data.media.depth import (
@@ -63,6 +63,7 @@ from stereogenbench_data.schema.document import (
     parse_text,
 )
 from stereogenbench_data.schema.parse import (
+    contradiction,
     parse_complete,
     parse_description,
     parse_rig,
@@ -184,6 +185,11 @@ class _Description:
         """Note what is odd."""
         self.remarks.append(Remark(about, text))
 
+    def contradicted(self, told: str) -> None:
+        """Note that another file states a lens, baselines or a primary pair that do not count."""
+        if told:
+            self.remark("pair", f"{told.rstrip('.')}. What {BASELINE_JSON} says counts")
+
     def scene(self, conventions: Conventions | None, *, videos: Collection[str] | None) -> Scene:
         """Return the row; `describe_scene` says more."""
         problems: list[StereoGenBenchError] = []
@@ -201,6 +207,10 @@ class _Description:
             text = self.folder.read(COMPLETE_JSON)
             marked, odd = parse_complete(text, where=self.where(COMPLETE_JSON))
         self.remarks += odd
+        if rig is not None and COMPLETE_JSON in self.files:
+            with suppress(SchemaError):
+                head = parse_object(text, where=COMPLETE_JSON)
+                self.contradicted(contradiction(head, rig, where=self.where(COMPLETE_JSON)))
         texts: dict[str, bytes] = {
             name: self.folder.read(name) for name in DESCRIPTIONS if name in self.files
         }
@@ -262,7 +272,7 @@ class _Description:
             members={
                 name: Member(self.where(name), 0, size)
                 for name, (size, _) in self.files.items()
-                if name not in self.unread
+                if name in FILES and name not in self.unread
             },
             seek_tables=packed_tables(self.tables),
         )
@@ -400,12 +410,7 @@ class _Description:
             count > frames and not any(each.about == "frames" for each in self.remarks)
         ):
             self.remark("frames", f"{told}. The first {min(count, frames)} are used")
-        if found.other_pair:
-            left, right = rig.primary_pair
-            told = (
-                f"{found.other_pair}, and {BASELINE_JSON} cameras {left} and {right}, which count"
-            )
-            self.remark("pair", told)
+        self.contradicted(found.others)
         if len(found.names) > 1:
             listed = ", ".join(name.partition(" @ ")[0] for name in found.names)
             self.remark(
@@ -445,9 +450,8 @@ class _Description:
             SchemaError: If conventions state another unit than a tag.
         """
         stated: list[Statement] = []
-        own = [name for name in (BASELINE_JSON, TRAJECTORY_JSON, COMPLETE_JSON)
-               if name in self.files]  # fmt: skip
-        for name in (*own, *self.folder.other_json()):
+        own = BASELINE_JSON, TRAJECTORY_JSON, COMPLETE_JSON
+        for name in (name for name in self.files if name in own or name not in FILES):
             with suppress(SchemaError):
                 text = self.folder.read(name)
                 if b"depth" in text.lower():

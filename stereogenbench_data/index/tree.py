@@ -158,7 +158,13 @@ Files = Mapping[str, tuple[int, int]]
 FILES: Final = frozenset(
     {*METADATA_FILES, TRAINING_JSON, *VIDEO_FILES, *PACKED_DEPTH_NAMES.values()}
 )
-"""Files of a release; others in a scene's folder are ignored."""
+"""Files of a release; of others in a scene's folder, JSON files alone may speak of its depth."""
+
+
+def is_read(name: str) -> bool:
+    """Return whether a file of a scene is read: one of a release, or other JSON."""
+    return name in FILES or (name.endswith(".json") and name[0] != ".")
+
 
 _AT_A_TIME: Final = 12
 _READ_WHOLE: Final = 4 * FIRST_BLOCK
@@ -204,12 +210,8 @@ class SceneFolder:
             explain_os_errors(f"{folder}: cannot be read", "Fetch the scene again."),
             os.scandir(folder) as entries,
         ):
-            found = {entry.name: entry.stat() for entry in entries if entry.name in FILES}
+            found = {entry.name: entry.stat() for entry in entries if is_read(entry.name)}
         return {name: (found[name].st_size, found[name].st_mtime_ns) for name in sorted(found)}
-
-    def other_json(self) -> list[str]:
-        """Return the names of JSON files that a release does not have; none behind a URL."""
-        return sorted({path.name for path in Path(self._root, self.key).glob("*.json")} - FILES)
 
     def fetch(self, names: Iterable[str]) -> None:
         """Fetch files at a time, if they are behind a URL."""
@@ -250,7 +252,7 @@ class RemoteFolder(SceneFolder):
     def _files(self) -> Files:
         if self._listed is None:
             found = RemoteObject(joined(str(self._root), self.key)).entries()
-            sizes = {name: found[name] for name in sorted(found) if name in FILES}
+            sizes = {name: found[name] for name in sorted(found) if is_read(name)}
             self._listed = {name: (size, 0) for name, size in sizes.items() if size is not None}
         return self._listed
 
@@ -555,7 +557,7 @@ class RemoteTree:
         for folder, listed in zip(folders, in_parallel(self._listed, folders), strict=True):
             for path, (size, stamp) in listed.items():
                 key, _, name = f"{folder}/{path}".rpartition("/")
-                if key in found and name in FILES:
+                if key in found and is_read(name):
                     found[key][sys.intern(name)] = size, stamp
         return {key: dict(sorted(files.items())) for key, files in found.items()}
 

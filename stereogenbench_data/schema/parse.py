@@ -47,6 +47,7 @@ from stereogenbench_data.schema.records import Description, Remark, Rig, SceneId
 from stereogenbench_data.schema.release import (
     ADJACENT_CM,
     ADJACENT_PAIRS,
+    BASELINE_JSON,
     CAMERA_COUNT,
     CAMERA_PAIRS,
     IMAGE_SIZE_PX,
@@ -251,6 +252,39 @@ def parse_rig(
     return rig, labels, tuple(file.remarks)
 
 
+def contradiction(head: dict[str, Any], rig: Rig, *, where: str) -> str:
+    """Return what another file of a scene states of its lens, baselines and primary pair.
+
+    Args:
+        head: That file's JSON object; of lists of objects, such as frames, the first is enough.
+        rig: What ``baseline.json`` says.
+        where: The other file's path, for messages.
+
+    Returns:
+        Each value that is not the rig's, with its place; "" if there is none.
+    """
+    own = {
+        "focal_length_mm": rig.focal_mm,
+        "sensor_width_mm": rig.sensor_width_mm,
+        "sensor_height_mm": rig.sensor_height_mm,
+        "pairs": [[*pair, cm] for pair, cm in zip(CAMERA_PAIRS, rig.baselines_cm, strict=True)],
+        "unit": "cm",
+    }
+    pairs = {key: value for key, value in head.items() if "pair" in words(key)}
+    other = {key: value for key, value in head.items() if "primary" not in words(key)}
+    file = _RigFile(json.dumps({"rig": own, "other": other}).encode(), where=where)
+    file.rig(rig.recorded_size_px or (rig.image_width_px, rig.image_height_px))
+    found = [_OWN.sub(BASELINE_JSON, each).replace("$.other", "$") for each in file.problems]
+    for each in Values(pairs).stated("primary_pair"):
+        left, right = named_pair(each.value) or rig.primary_pair
+        if rig.primary_pair not in ((left, right), (left - 1, right - 1)):
+            found.append(f"{each.path}: states cameras {left} and {right} as the primary pair")
+    return "; ".join(f"{where}: {each}" for each in found)
+
+
+_OWN: Final = re.compile(r"\$\.rig(?:\.\w+)+(?:\[\d+\])*")
+
+
 def require_unit(rig: Rig, *, family: str, where: str) -> tuple[Remark, ...]:
     """Return a remark on baselines that the paper's family does not have.
 
@@ -287,6 +321,7 @@ _LENS_MODELS: Final = re.compile(
     r"distort|camera_model|lens_model|projection_type|overscan|squeeze|anamorph|\Ak[123]\Z"
 )
 _ODD_LENS: Final = re.compile(r"fisheye|ortho|equi|brown|spheri|panoram|kannala|distort|anamorph")
+_SIZE_SHARE: Final = 0.05
 _RATIO: Final = 1e-3
 """How far a field of view may be from focal length over sensor width: it is often rounded."""
 
@@ -397,8 +432,9 @@ class _RigFile(MetadataFile):
         where both are there. Where neither is recorded, the sensor is that of the release.
         """
         focal_mm, sensor_mm = self._length_mm("focal"), self._length_mm("sensor_width")
+        is_odd = bool(self.problems)
         ratios = list(self._focal_ratios(width_px, aspect))
-        if ratios and not self.problems:
+        if ratios and not is_odd:
             if not (focal_mm or sensor_mm):
                 sensor_mm = SENSOR_MM
                 told = f"has no sensor width; that of the release is assumed, {SENSOR_MM} mm"
@@ -437,9 +473,22 @@ class _RigFile(MetadataFile):
                 angle = each.value if is_rad else math.radians(each.value)
                 if 0 < angle < math.pi:
                     yield each, 0.5 / math.tan(angle / 2) / scale
+        sides = (("principal_x", 1.0), ("principal_y", aspect))
+        centre = [each.value * scale / (width_px or 1) for name, scale in sides
+                  for each in self.values.numbers(name)[:1] if each.value > 1]  # fmt: skip
+        # Off the centre by the same share on both sides, it is that of pictures of another size.
+        is_other_size = len(centre) == 2 and all(
+            abs(share - centre[0]) < _SIZE_SHARE < abs(share - 0.5) for share in centre
+        )
         for each in self.values.positive("focal_px") if width_px else ():
             if each.unit.startswith("p") or each.path.lower().endswith("x"):
                 yield each, each.value / (width_px or 1)
+                if is_other_size:
+                    self.problems.append(
+                        f"{each.path}: is of pictures about {2 * centre[0] * (width_px or 1):.0f} "
+                        f"px wide by its principal point, and these have {width_px}: state that "
+                        f"size as image_width and image_height"
+                    )
 
     def _principal_point(self, *size_px: int) -> tuple[float, float] | None:
         """Return the principal point in pixels; None where it is the centre or not known."""
@@ -578,11 +627,13 @@ class _RigFile(MetadataFile):
         for key in sorted(self.document, key=lambda key: key != "pairwise_pairs"):
             self._look_below(self.document[key], words(key), child_path("$", key), unit_m)
         for node in () if self._found else self.values.nodes:
-            places = node.value  # of the cameras along the rig
-            if _PLACES.search(node.plain) and _are_numbers(places, CAMERA_COUNT):
+            places = node.value  # of the cameras along the rig, or in space
+            is_line = _are_numbers(places, CAMERA_COUNT)
+            if _PLACES.search(node.plain) and (is_line or _are_points(places)):
                 own_m = UNITS_M.get(node.unit, unit_m)
                 for a, b in CAMERA_PAIRS:
-                    length = abs(places[b] - places[a])
+                    ends = ([places[a]], [places[b]]) if is_line else (places[a], places[b])
+                    length = math.dist(*ends)
                     self._add((a, b), length, own_m, node.path, is_by_place=True)
                 break
         return self._found
@@ -749,6 +800,11 @@ def named_pair(value: Any) -> Pair | None:
     """Return the left and the right camera that a value names, None where it names no two."""
     if isinstance(value, str):
         return _pair_of(value)
+    for side in ("left", "right") if isinstance(value, dict) else ():
+        sided = (inner for key, inner in value.items() if side in words(key).split("_"))
+        named = [camera for camera in map(_camera, sided) if camera is not None]
+        if named and max(named) - min(named) > 1:  # names may count from 0 beside numbers from 1
+            return None
     ends = _ends(value)
     if isinstance(value, dict) and ends == [None, None]:
         return _cameras_of(value)
@@ -806,6 +862,11 @@ def _are_columns(table: dict[str, Any]) -> bool:
 
 def _are_numbers(value: Any, count: int) -> bool:
     return isinstance(value, list) and len(value) == count and all(map(is_number, value))
+
+
+def _are_points(value: Any) -> bool:
+    is_list = isinstance(value, list) and len(value) == CAMERA_COUNT
+    return is_list and all(_are_numbers(each, 3) for each in value)
 
 
 def _is_row(value: Any, *, of: dict[str, Any] | list[Any]) -> bool:

@@ -31,9 +31,9 @@ NAMES: Final[dict[str, str]] = {
     "fov_y": "vfov fov_y vertical_fov vertical_field_of_view fov_vertical angle_y camera_angle_y",
     "focal_y_px": "fy focal_length_y fl_y",
     "image_width": "image_width image_size_x resolution_x resolution_width width_px render_width "
-    "frame_width image_size_width",
+    "frame_width image_size_width camera_intrinsics_width intrinsics_width",
     "image_height": "image_height image_size_y resolution_y resolution_height height_px "
-    "render_height frame_height image_size_height",
+    "render_height frame_height image_size_height camera_intrinsics_height intrinsics_height",
     "principal_x": "cx c_x principal_point_x principal_x optical_center_x optical_centre_x",
     "principal_y": "cy c_y principal_point_y principal_y optical_center_y optical_centre_y",
     "sensor_fit": "sensor_fit",
@@ -313,7 +313,7 @@ def _parts(node: Node) -> Iterator[tuple[int, str, Stated]]:
     if node.plain in MATRICES and isinstance(value, list):
         if len(value) in (3, 4) and all(isinstance(row, list) for row in value):
             value = [number for row in value[:3] for number in row[:3]]
-        if len(value) == 9 and value[8] == 1:
+        if len(value) == 9 and value[8] == 1 and not value[1]:  # pixels are not skewed
             places = _MATRIX_PLACES
     if node.plain == "params" and isinstance(value, list) and node.up is not None:
         model = next(

@@ -90,7 +90,7 @@ REMARKS: Final = {
     "principal point": "the intrinsics; the image's centre is assumed",
     "left": "disparity, and all that needs poses: the rig is stated in two ways",
     "primary pair": "nothing: cameras are taken to be numbered from left to right",
-    "pair": "nothing: the primary pair of baseline.json counts",
+    "pair": "nothing: lens, baselines and primary pair of baseline.json count",
     "sensor": "the focal length in mm: the release's sensor is assumed",
     "videos": "pairs of cameras whose videos are missing",
     "frames": "nothing: frames that all files have are used",

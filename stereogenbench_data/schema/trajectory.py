@@ -22,7 +22,6 @@ from stereogenbench_data.schema.document import (
     listed_keys,
     parse_document,
 )
-from stereogenbench_data.schema.parse import named_pair
 from stereogenbench_data.schema.quantities import NAMES, Values, without_unit, words
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
@@ -88,7 +87,7 @@ class RecordedPoses:
         blocks: The numbers that may be part of poses.
         hints: The words of the texts in which a file says how they are to be read.
         unit_m: Metres in the unit that the file names for lengths, None without one.
-        primary_pairs: The places where it names the primary pair, and the cameras there.
+        head: The file with one element of each list of objects: what it states beside poses.
         lens: The key of a focal length or a field of view that is not the same everywhere, and its
             least and greatest number; "" where there is none.
         first_frame: The least number that frames have, 0 where they have none.
@@ -97,7 +96,7 @@ class RecordedPoses:
     blocks: tuple[Block, ...]
     hints: frozenset[str]
     unit_m: float | None
-    primary_pairs: tuple[tuple[str, tuple[int, int]], ...] = ()
+    head: dict[str, Any]
     lens: str = ""
     first_frame: int = 0
 
@@ -138,12 +137,9 @@ def record_poses(text: bytes, *, where: str) -> RecordedPoses:
             f"{listed_keys(document)}"
         )
         raise SchemaError(f"{where}: {reason}.")
-    head = Values({key: value for key, value in document.items() if "pair" in words(key)})
-    pairs = [(each.path, named_pair(each.value)) for each in head.stated("primary_pair")]
-    known = tuple((path, pair) for path, pair in pairs if pair is not None)
-    unit_m = _unit_m(document, where)
-    lens, first_frame = _changing_lens(columns), _first_frame(columns)
-    return RecordedPoses(tuple(blocks), _hints(document), unit_m, known, lens, first_frame)
+    head = _head_of(document)
+    unit_m, lens, first_frame = _unit_m(head, where), _changing_lens(columns), _first_frame(columns)
+    return RecordedPoses(tuple(blocks), _hints(document), unit_m, head, lens, first_frame)
 
 
 def _first_frame(columns: Columns) -> int:
@@ -170,18 +166,19 @@ _LENS_KEYS: Final = {
 _SAME_LENS: Final = 1e-3
 
 
-def _first_of_lists(node: Any) -> Any:
-    """Return a document with the first element alone of each list, and of each long object."""
+def _head_of(node: Any) -> Any:
+    """Return a document with one element of each list of objects, and of each long object."""
     if isinstance(node, list):
-        return [_first_of_lists(each) for each in node[:1]]
+        is_short = len(node) <= _MOST_HINTS and not any(isinstance(each, dict) for each in node)
+        return [_head_of(each) for each in (node if is_short else node[:1])]
     if isinstance(node, dict):
         items = itertools.islice(node.items(), 1 if len(node) > _MOST_HINTS else None)
-        return {key: _first_of_lists(value) for key, value in items}
+        return {key: _head_of(value) for key, value in items}
     return node
 
 
-def _unit_m(document: dict[str, Any], where: str) -> float | None:
-    values = Values(_first_of_lists(document))
+def _unit_m(head: dict[str, Any], where: str) -> float | None:
+    values = Values(head)
     unit_m = values.length_unit_m
     for each in values.stated("unit"):
         if unit_m is None and isinstance(each.value, str):

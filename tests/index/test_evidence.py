@@ -1,6 +1,7 @@
 """Poses in every form that the reader knows: read as the same poses, or refused."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from stereogenbench_data.index.evidence import (
     shape_of,
     understood_poses,
 )
+from stereogenbench_data.schema.parse import contradiction
 from stereogenbench_data.schema.records import Rig
 
 PLACES_CM = np.array([0.0, 6.5, 19.0, 26.5, 60.0, 66.0])
@@ -292,7 +294,27 @@ def test_lengths_that_differ_by_a_unit_are_stated_in_two_ways(unit):
 def test_another_primary_pair_than_that_of_the_rig_is_told_with_its_place(pair, is_other):
     found = understood(written("rotator", *TURNED, primary_stereo_pair=pair))
 
-    assert ("trajectory.json: $.primary_stereo_pair states cameras" in found.other_pair) == is_other
+    assert ("trajectory.json: $.primary_stereo_pair: states cameras" in found.others) == is_other
+
+
+@pytest.mark.parametrize(
+    ("stated", "told"),
+    [
+        ({"focal_length_mm": 40}, r"\$\.focal_length_mm: states another focal \(40 mm\)"),
+        ({"lens": {"K": [[80, 0, 32], [0, 80, 32], [0, 0, 1]]}}, r"\$\.lens\.K: .* 1\.25 focal"),
+        ({"fov_deg": 90.0}, r"\$\.fov_deg: .* 0\.5 focal lengths"),
+        ({"sensor_width_mm": 36.0}, r"\$\.sensor_width_mm: .*36\.0 mm.*23\.76 mm"),
+        ({"adjacent_baselines": [0.13, 0.25, 0.15, 0.67, 0.12], "unit": "m"},
+         r"cameras 0 and 1 is 13 cm here and 6\.5 cm at baseline\.json"),
+        ({"focal_length_mm": 32.5, "fov": 40.16, "adjacent_baselines_m": [0.065, 0.125]},
+         r"\A\Z"),
+    ],
+    ids=["focal length", "matrix", "angle", "sensor", "baselines", "the same"],
+)  # fmt: skip
+def test_another_lens_or_baseline_beside_the_poses_is_told_with_both_values(stated, told):
+    found = contradiction(stated, RIG, where="scene/trajectory.json")
+
+    assert re.search(told, found)
 
 
 def test_the_poses_of_another_rig_are_refused():

@@ -1,5 +1,8 @@
 """A tree in the released layout behind a URL: found, indexed and read like one on this machine."""
 
+import os
+import shutil
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -8,7 +11,8 @@ from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import build
-from stereogenbench_data.index.tree import find_remote_scenes
+from stereogenbench_data.index.scene_folder import describe_scene
+from stereogenbench_data.index.tree import find_remote_scenes, folder_of, stamp_of
 from tests.servers.hub import REPOSITORY, hub_serving
 
 HUB = f"hf://datasets/{REPOSITORY}@main"
@@ -83,6 +87,23 @@ def test_a_part_is_indexed_under_a_name_of_its_own(small_release):
 def test_a_repository_without_a_scene_says_what_was_looked_for():
     with pytest.raises(StorageError, match=r"holds no scene and no index\.parquet; looked for"):
         find_remote_scenes(HUB)
+
+
+def test_a_unit_of_depth_in_a_file_of_its_own_counts_as_in_a_folder(
+    small_release, tmp_path, monkeypatch
+):
+    (drawn,) = small_release.glob("eval/*/*/*/*")
+    key = drawn.relative_to(small_release).as_posix()
+    shutil.copytree(drawn, tmp_path / key, copy_function=os.link)
+    before = stamp_of(folder_of(tmp_path, key).stamps())
+    (tmp_path / key / "depth_meta.json").write_text('{"depth_unit": "cm"}')
+
+    with hub_serving(tmp_path, monkeypatch):
+        found = [describe_scene(root, key) for root in (tmp_path, HUB)]
+
+    assert all("depth_meta.json: $.depth_unit is" in scene.remark("depth") for scene in found)
+    assert all("depth_meta.json" not in scene.members for scene in found)
+    assert stamp_of(folder_of(tmp_path, key).stamps()) != before
 
 
 def test_a_plain_web_server_cannot_be_listed(web):

@@ -92,6 +92,10 @@ def test_both_forms_of_the_primary_pair_are_read(rig_document, dumped, pair, exp
         ([0, 1, 2], "$.primary_stereo_pair: must be {left_camera, right_camera} or a list"),
         ({"left_camera": "Cam_left", "right_camera": 1}, "$.primary_stereo_pair: must be {left"),
         ({"left_camera": 0}, "$.primary_stereo_pair: must be {left_camera, right_camera}"),
+        (
+            {"left_camera": "Cam_00", "left_index": 2, "right_camera": "Cam_01", "right_index": 3},
+            "$.primary_stereo_pair: must be {left_camera, right_camera}",
+        ),
     ],
 )
 def test_a_wrong_primary_pair_is_refused(rig_document, dumped, pair, problem):
@@ -114,6 +118,33 @@ def test_without_a_sensor_that_of_the_release_is_assumed(rig_document, dumped, i
     assert (rig.sensor_width_mm, rig.sensor_height_mm) == pytest.approx((23.76, 17.82))
     assert rig.focal_mm == pytest.approx(32.5, rel=1e-5)
     assert remark.about == "sensor"
+
+
+@pytest.mark.parametrize(
+    ("matrix", "told"),
+    [
+        ([[1750.84, 0, 640], [0, 1750.84, 480], [0, 0, 1]], "pictures about 1280 px wide"),
+        ([[437.71, 0, 160], [0, 437.71, 120], [0, 0, 1]], "pictures about 320 px wide"),
+        ([[875.42, 3, 320], [0, 875.42, 240], [0, 0, 1]], "focal_length_mm is missing"),
+    ],
+    ids=["larger pictures", "smaller pictures", "skewed pixels"],
+)
+def test_a_camera_matrix_of_other_pictures_is_refused(rig_document, dumped, matrix, told):
+    rig_document["camera_intrinsics"] = {"K": matrix}
+    del rig_document["image_width"], rig_document["image_height"]
+
+    with pytest.raises(SchemaError, match=told):
+        parse_rig(dumped(rig_document), where="baseline.json", size_px=(640, 480))
+
+
+def test_a_camera_matrix_with_the_size_of_its_pictures_is_read(rig_document, dumped):
+    matrix = [[1750.8417508, 0, 640], [0, 1750.8417508, 480], [0, 0, 1]]
+    rig_document["camera_intrinsics"] = {"K": matrix, "width": 1280, "height": 960}
+    del rig_document["image_width"], rig_document["image_height"]
+
+    rig, _, _ = parse_rig(dumped(rig_document), where="baseline.json", size_px=(640, 480))
+
+    assert rig.focal_mm == pytest.approx(32.5)
 
 
 @pytest.mark.parametrize(
