@@ -6,7 +6,7 @@ A text here would take hours if the work grew with its square.
 import pytest
 
 from stereogenbench_data.errors import SchemaError, StereoGenBenchError, url_without_secrets
-from stereogenbench_data.schema.parse import parse_description, parse_scene_key
+from stereogenbench_data.schema.parse import parse_caption, parse_scene_key
 from tests.hostile import run_bounded
 
 MANY = 500_000
@@ -101,8 +101,8 @@ def test_a_scene_with_a_long_name_is_refused_in_few_words():
 def test_a_long_text_of_a_metadata_file_is_left_out_with_a_remark():
     text = b'{"short_caption": "' + b"x" * 70_000 + b'"}'
 
-    description, (remark,) = parse_description(text, where="a.json")
+    caption, (remark,) = parse_caption(text, where="a.json")
 
-    assert description.short_caption == ""
+    assert caption == ""
     assert "short_caption" in remark.text
     assert len(remark.text) < 300

@@ -494,8 +494,7 @@ def restated(
 _PHRASES: Final = {
     "size": "the videos' picture size counts, where baseline.json has another",
     "baselines": "baselines that are not recorded are sums of their neighbours",
-    "pair": "lens, baselines and primary pair of baseline.json count, where another file has "
-    "others",
+    "pair": "the primary pair of baseline.json counts, where another file has another",
     "frames": "the frames that all videos have are used",
     "lens": "a pinhole lens is assumed, where baseline.json states another model",
     "marker": "no scene has _scene_complete.json, so it is not known which were finished",

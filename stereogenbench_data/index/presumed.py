@@ -48,6 +48,7 @@ from stereogenbench_data.index.scene_folder import (
     caption_of,
     describe_scene,
     held_name,
+    members_of,
     merged_labels,
     missing_video,
     require_finished,
@@ -55,7 +56,6 @@ from stereogenbench_data.index.scene_folder import (
     unfinished,
 )
 from stereogenbench_data.index.tree import (
-    FILES,
     Files,
     FoundScenes,
     RemoteFolder,
@@ -73,7 +73,6 @@ from stereogenbench_data.schema.parse import (
     require_unit,
 )
 from stereogenbench_data.schema.records import (
-    Member,
     Remark,
     Rig,
     Scene,
@@ -448,11 +447,7 @@ def _presumed(each: _Metadata, models: Sequence[Scene], stated: Shape | None) ->
         valid_depth_ratio=None,
         remarks=as_kept(remarks),
         pose_form=None,
-        members={
-            name: Member(f"{key}/{name}", 0, size)
-            for name, (size, _) in each.files.items()
-            if name in FILES
-        },
+        members=members_of(key, each.files),
         seek_tables=None,
     )
 

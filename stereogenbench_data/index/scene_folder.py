@@ -33,7 +33,7 @@ from stereogenbench_data.index.evidence import (
     shape_of,
     understood_poses,
 )
-from stereogenbench_data.index.tree import FILES, SceneFolder, folder_of
+from stereogenbench_data.index.tree import FILES, Files, SceneFolder, folder_of
 from stereogenbench_data.media.clock import MOST_EXTRA_FRAMES
 from stereogenbench_data.media.container import StreamFacts, depth_coding
 from stereogenbench_data.media.depth import (
@@ -63,9 +63,9 @@ from stereogenbench_data.schema.document import (
     parse_text,
 )
 from stereogenbench_data.schema.parse import (
-    contradiction,
+    contradictions,
+    parse_caption,
     parse_complete,
-    parse_description,
     parse_rig,
     parse_scene_key,
     require_unit,
@@ -185,10 +185,12 @@ class _Description:
         """Note what is odd."""
         self.remarks.append(Remark(about, text))
 
-    def contradicted(self, told: str) -> None:
-        """Note that another file states a lens, baselines or a primary pair that do not count."""
-        if told:
-            self.remark("pair", f"{told.rstrip('.')}. What {BASELINE_JSON} says counts")
+    def told(self, contradiction: str, other_pair: str) -> None:
+        """Note what another file says otherwise than ``baseline.json``: see `contradictions`."""
+        if contradiction:
+            self.remark("left", contradiction)
+        if other_pair:
+            self.remark("pair", f"{other_pair}. The primary pair of {BASELINE_JSON} counts")
 
     def scene(self, conventions: Conventions | None, *, videos: Collection[str] | None) -> Scene:
         """Return the row; `describe_scene` says more."""
@@ -209,8 +211,8 @@ class _Description:
         self.remarks += odd
         if rig is not None and COMPLETE_JSON in self.files:
             with suppress(SchemaError):
-                head = parse_object(text, where=COMPLETE_JSON)
-                self.contradicted(contradiction(head, rig, where=self.where(COMPLETE_JSON)))
+                head, where = parse_object(text, where=COMPLETE_JSON), self.where(COMPLETE_JSON)
+                self.told(*contradictions(head, rig, where=where))
         texts: dict[str, bytes] = {
             name: self.folder.read(name) for name in DESCRIPTIONS if name in self.files
         }
@@ -269,11 +271,7 @@ class _Description:
             remarks=as_kept(self.remarks),
             pose_form=pose_form,
             conventions=None if self.shape is None else self.shape.text(),
-            members={
-                name: Member(self.where(name), 0, size)
-                for name, (size, _) in self.files.items()
-                if name in FILES and name not in self.unread
-            },
+            members=members_of(self.key, self.files, without=self.unread),
             seek_tables=packed_tables(self.tables),
         )
         return self.derived(scene)
@@ -410,7 +408,7 @@ class _Description:
             count > frames and not any(each.about == "frames" for each in self.remarks)
         ):
             self.remark("frames", f"{told}. The first {min(count, frames)} are used")
-        self.contradicted(found.others)
+        self.told("", found.other_pair)
         if len(found.names) > 1:
             listed = ", ".join(name.partition(" @ ")[0] for name in found.names)
             self.remark(
@@ -589,6 +587,15 @@ def assumed_places_m(rig: Rig) -> tuple[float, ...]:
     return tuple(sign * (place_cm - along_cm[0]) / 100 for place_cm in along_cm)
 
 
+def members_of(key: str, files: Files, *, without: Collection[str] = ()) -> dict[str, Member]:
+    """Return where a release's files of a scene's folder are."""
+    return {
+        name: Member(f"{key}/{name}", 0, size)
+        for name, (size, _) in files.items()
+        if name in FILES and name not in without
+    }
+
+
 def held_name(files: Mapping[str, object], name: str) -> str:
     """Return the name under which a folder holds a released file: depth may be packed."""
     return name if name in files else PACKED_DEPTH_NAMES.get(name, name)
@@ -626,8 +633,7 @@ def caption_of(texts: Mapping[str, bytes], *, key: str) -> tuple[str, tuple[Rema
         if name not in texts or written:
             continue
         if name == DESCRIPTION_JSON:
-            description, odd = parse_description(texts[name], where=where)
-            written = description.detailed_caption or description.short_caption
+            written, odd = parse_caption(texts[name], where=where)
             remarks += odd
             continue
         try:

@@ -80,7 +80,8 @@ _OTHER_MEANING: Final = re.compile(
 _KINDS: Final = frozenset({"kind", "type", "definition", "projection", "annotator"})
 """Words of keys whose texts say what depth is."""
 _PLANAR: Final = re.compile(
-    r"planar|plane|axi|ortho|perpendicular|linear|metric|depth|\bz\b|\d|float|int|half|video|none"
+    r"planar|plane|axi|ortho|perpendicular|linear|metric|depth|\bz\b|\d|float|int|half|video|none|"
+    r"normali[sz]"
 )
 """Texts under such a key that are of depth along the optical axis, or of how it is stored."""
 _SUM: Final = re.compile(r"[\w)\]] \+ [\w.(\[]|[*/][^,;\n]*[\w)\]] - \d")
@@ -117,6 +118,8 @@ _EXPRESSION: Final = re.compile(
     rf"(?:(?P<left>{_VARIABLE})\s*=\s*)?(?:(?P<first>{_RATIO})\s*\*\s*(?P<scaled>{_VARIABLE})|"
     rf"(?P<right>{_VARIABLE})(?P<factors>(?:\s*[*/]\s*(?:{_NUMBER}))+))(?P<more>\s*[-+*/]\s*\w)?"
 )
+_BYTES: Final = re.compile(r"=?\s*\w+\s*(?:\*\s*256|<<\s*8)\s*[+|]\s*\w+\s*\Z")
+"""How 16 bits follow from a high and a low byte."""
 _RANGE_FORMULA: Final = re.compile(r"[^;,]*\(\s*z?far\s*-\s*z?near\s*\)[^;,]*")
 _CLAUSES: Final = re.compile(r"[;\n]|\.(?=\s|$)|,(?!\d)")
 _TYPES: Final = re.compile(r"\b[a-z]+\d\w*|\b\d+[ -]?bits?\b|\b\d+x\d+\b")
@@ -452,7 +455,7 @@ class _Source:
     def _sentence(self, text: str, *, is_about_unit: bool) -> Iterator[Statement]:
         """Return what a text says of the unit, the range and the meaning of depth."""
         plain = text.replace("\u00d7", "*").replace("\u00f7", "/").replace("_", " ").strip()
-        plain = re.sub(r" x (?=[\d.])|(?<=\d) x ", " * ", plain)
+        plain = re.sub(r" x (?=[\d.])|(?<=\d) x ", " * ", _BYTES.sub(" ", plain))
         if _METRES.fullmatch(plain):
             yield self.make("length unit", (UNITS_M[words(plain)],), text)
             return

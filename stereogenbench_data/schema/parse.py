@@ -43,7 +43,7 @@ from stereogenbench_data.schema.quantities import (
     without_unit,
     words,
 )
-from stereogenbench_data.schema.records import Description, Remark, Rig, SceneId, SceneLabels
+from stereogenbench_data.schema.records import Remark, Rig, SceneId, SceneLabels
 from stereogenbench_data.schema.release import (
     ADJACENT_CM,
     ADJACENT_PAIRS,
@@ -70,6 +70,8 @@ _CENTRE_PX: Final = 1.0
 """How far a principal point may be from the image's centre to be that centre: conventions of pixels
 differ by a half, and centres are written as whole pixels."""
 
+_SHARE: Final = 0.05
+"""A point further off the centre by one share of both sides is the centre of another size."""
 _NAMES_A_CAMERA: Final = re.compile(
     r"cam|left|right|index|\A[abij]\Z|_[abij12]\Z|src|dst|from|to\Z"
 )
@@ -192,8 +194,8 @@ def parse_complete(text: bytes, *, where: str) -> tuple[SceneLabels, tuple[Remar
     return file.labels(), tuple(file.remarks)
 
 
-def parse_description(text: bytes, *, where: str) -> tuple[Description, tuple[Remark, ...]]:
-    """Return a scene's machine-written description; absent texts are empty.
+def parse_caption(text: bytes, *, where: str) -> tuple[str, tuple[Remark, ...]]:
+    """Return the caption in a scene's description: the detailed one, else the short one, else "".
 
     What is not understood is left out with a remark: no picture depends on it.
 
@@ -202,18 +204,10 @@ def parse_description(text: bytes, *, where: str) -> tuple[Description, tuple[Re
     try:
         file = MetadataFile(text, where=where)
     except SchemaError as error:
-        return Description(), (Remark("caption", str(error)),)
-    short, detailed, scene_type, setting = (
-        file.text(quantity, about="caption") or ""
-        for quantity in ("short_caption", "detailed_caption", "scene_type", "setting")
-    )
-    tags: tuple[str, ...] = ()
-    for each in file.values.stated("tags"):
-        listed = each.value.split(",") if isinstance(each.value, str) else each.value
-        if isinstance(listed, list):
-            tags = tuple(tag.strip() for tag in listed if isinstance(tag, str))
-            break
-    return Description(short, detailed, scene_type, setting, tags), tuple(file.remarks)
+        return "", (Remark("caption", str(error)),)
+    names = ("detailed_caption", "short_caption")
+    written = [file.text(name, about="caption") for name in names]
+    return next(filter(None, written), ""), tuple(file.remarks)
 
 
 def parse_rig(
@@ -252,16 +246,17 @@ def parse_rig(
     return rig, labels, tuple(file.remarks)
 
 
-def contradiction(head: dict[str, Any], rig: Rig, *, where: str) -> str:
+def contradictions(head: dict[str, Any], rig: Rig, *, where: str) -> tuple[str, str]:
     """Return what another file of a scene states of its lens, baselines and primary pair.
 
     Args:
-        head: That file's JSON object; of lists of objects, such as frames, the first is enough.
+        head: That file's JSON object; of long lists, such as frames, some elements are enough.
         rig: What ``baseline.json`` says.
         where: The other file's path, for messages.
 
     Returns:
-        Each value that is not the rig's, with its place; "" if there is none.
+        Lengths and angles that are not the rig's, and another primary pair, with their places; ""
+        where there are none.
     """
     own = {
         "focal_length_mm": rig.focal_mm,
@@ -270,18 +265,22 @@ def contradiction(head: dict[str, Any], rig: Rig, *, where: str) -> str:
         "pairs": [[*pair, cm] for pair, cm in zip(CAMERA_PAIRS, rig.baselines_cm, strict=True)],
         "unit": "cm",
     }
-    pairs = {key: value for key, value in head.items() if "pair" in words(key)}
     other = {key: value for key, value in head.items() if "primary" not in words(key)}
     file = _RigFile(json.dumps({"rig": own, "other": other}).encode(), where=where)
     file.rig(rig.recorded_size_px or (rig.image_width_px, rig.image_height_px))
     found = [_OWN.sub(BASELINE_JSON, each).replace("$.other", "$") for each in file.problems]
-    for each in Values(pairs).stated("primary_pair"):
+    told = f"{where}: {'; '.join(found[:_MOST_TOLD])}. Or {_UNREAD}." if found else ""
+    pairs = []
+    named = Values({key: value for key, value in head.items() if "pair" in words(key)})
+    for each in named.stated("primary_pair"):
         left, right = named_pair(each.value) or rig.primary_pair
         if rig.primary_pair not in ((left, right), (left - 1, right - 1)):
-            found.append(f"{each.path}: states cameras {left} and {right} as the primary pair")
-    return "; ".join(f"{where}: {each}" for each in found)
+            pairs.append(f"{where}: {each.path} states cameras {left} and {right}")
+    return told, "; ".join(pairs)
 
 
+_MOST_TOLD: Final = 3
+_UNREAD: Final = 'leave the file\'s poses unread: form = "unknown" below [poses] in conventions'
 _OWN: Final = re.compile(r"\$\.rig(?:\.\w+)+(?:\[\d+\])*")
 
 
@@ -321,7 +320,6 @@ _LENS_MODELS: Final = re.compile(
     r"distort|camera_model|lens_model|projection_type|overscan|squeeze|anamorph|\Ak[123]\Z"
 )
 _ODD_LENS: Final = re.compile(r"fisheye|ortho|equi|brown|spheri|panoram|kannala|distort|anamorph")
-_SIZE_SHARE: Final = 0.05
 _RATIO: Final = 1e-3
 """How far a field of view may be from focal length over sensor width: it is often rounded."""
 
@@ -432,9 +430,8 @@ class _RigFile(MetadataFile):
         where both are there. Where neither is recorded, the sensor is that of the release.
         """
         focal_mm, sensor_mm = self._length_mm("focal"), self._length_mm("sensor_width")
-        is_odd = bool(self.problems)
         ratios = list(self._focal_ratios(width_px, aspect))
-        if ratios and not is_odd:
+        if ratios and not self.problems:
             if not (focal_mm or sensor_mm):
                 sensor_mm = SENSOR_MM
                 told = f"has no sensor width; that of the release is assumed, {SENSOR_MM} mm"
@@ -473,22 +470,9 @@ class _RigFile(MetadataFile):
                 angle = each.value if is_rad else math.radians(each.value)
                 if 0 < angle < math.pi:
                     yield each, 0.5 / math.tan(angle / 2) / scale
-        sides = (("principal_x", 1.0), ("principal_y", aspect))
-        centre = [each.value * scale / (width_px or 1) for name, scale in sides
-                  for each in self.values.numbers(name)[:1] if each.value > 1]  # fmt: skip
-        # Off the centre by the same share on both sides, it is that of pictures of another size.
-        is_other_size = len(centre) == 2 and all(
-            abs(share - centre[0]) < _SIZE_SHARE < abs(share - 0.5) for share in centre
-        )
         for each in self.values.positive("focal_px") if width_px else ():
             if each.unit.startswith("p") or each.path.lower().endswith("x"):
                 yield each, each.value / (width_px or 1)
-                if is_other_size:
-                    self.problems.append(
-                        f"{each.path}: is of pictures about {2 * centre[0] * (width_px or 1):.0f} "
-                        f"px wide by its principal point, and these have {width_px}: state that "
-                        f"size as image_width and image_height"
-                    )
 
     def _principal_point(self, *size_px: int) -> tuple[float, float] | None:
         """Return the principal point in pixels; None where it is the centre or not known."""
@@ -506,6 +490,15 @@ class _RigFile(MetadataFile):
             self.remark("principal point", f"a principal point is not understood: {odd[0]}")
         if not any(points):
             return None
+        x, y = (
+            next((each.value / side_px for each in found if is_number(each.value)), 0.5)
+            for found, side_px in zip(points, size_px, strict=True)
+        )
+        if self.values.positive("focal_px") and x > 0.01 and abs(x - y) < _SHARE < abs(x - 0.5):
+            self.problems.append(
+                f"{points[0][0].path}: by its principal point it is of other pictures than these, "
+                f"of {size_px[0]}x{size_px[1]}. State their size as image_width and image_height"
+            )
         place_px: list[float] = []
         for found, side_px in zip(points, size_px, strict=True):
             usable = [each for each in found if is_number(each.value)]
@@ -627,13 +620,11 @@ class _RigFile(MetadataFile):
         for key in sorted(self.document, key=lambda key: key != "pairwise_pairs"):
             self._look_below(self.document[key], words(key), child_path("$", key), unit_m)
         for node in () if self._found else self.values.nodes:
-            places = node.value  # of the cameras along the rig, or in space
-            is_line = _are_numbers(places, CAMERA_COUNT)
-            if _PLACES.search(node.plain) and (is_line or _are_points(places)):
+            places = _places_of(node.value) if _PLACES.search(node.plain) else None
+            if places is not None:
                 own_m = UNITS_M.get(node.unit, unit_m)
                 for a, b in CAMERA_PAIRS:
-                    ends = ([places[a]], [places[b]]) if is_line else (places[a], places[b])
-                    length = math.dist(*ends)
+                    length = math.dist(places[a], places[b])
                     self._add((a, b), length, own_m, node.path, is_by_place=True)
                 break
         return self._found
@@ -664,8 +655,8 @@ class _RigFile(MetadataFile):
             if cameras is not None:
                 length = node if isinstance(node, dict) else node[2]
                 self._add_pair(cameras, length, own_m, place)
-            elif self._are_neighbours(node, words_):
-                for number, (ends, each) in enumerate(zip(ADJACENT_PAIRS, node, strict=True)):
+            elif (ends_of := self._ends_of(node, words_)) is not None:
+                for number, (ends, each) in enumerate(zip(ends_of, node, strict=True)):
                     self._add(ends, each, own_m, (place, number), is_by_place=True)
             elif is_of_pairs or isinstance(node, dict):
                 for key, inner in node.items() if isinstance(node, dict) else enumerate(node):
@@ -682,10 +673,13 @@ class _RigFile(MetadataFile):
                     longer = words_ if isinstance(key, int) or is_row else f"{words_}_{own}"
                     waiting.append((inner, longer, at, camera if is_row else None, inner_m))
 
-    def _are_neighbours(self, value: Any, name: str) -> bool:
-        """Return whether a value lists the baselines of neighbours, which may be all that is."""
+    def _ends_of(self, value: Any, name: str) -> tuple[Pair, ...] | None:
+        """Return whose baselines a list of numbers has: of neighbours, or of all pairs."""
         is_spacing = "spacing" in name and not self._found and not _FIGURES.search(name)
-        return ("adjacent" in name or is_spacing) and _are_numbers(value, len(ADJACENT_PAIRS))
+        if ("adjacent" in name or is_spacing) and _are_numbers(value, len(ADJACENT_PAIRS)):
+            return ADJACENT_PAIRS
+        is_of_all = "baseline" in name and _are_numbers(value, len(CAMERA_PAIRS))
+        return CAMERA_PAIRS if is_of_all and not _FIGURES.search(name) else None
 
     def _add_pair(self, cameras: Pair, value: Any, unit_m: float, path: str) -> None:
         """Add the baseline that a value is, or those of an entry, in one unit or in several."""
@@ -728,7 +722,7 @@ class _RigFile(MetadataFile):
             self.problems.append(told)
 
 
-_PLACES: Final = re.compile(r"offset|lateral|along|(?:camera|rig)_(?:position|place)")
+_PLACES: Final = re.compile(r"offset|lateral|along|(?:camera|rig)_(?:position|place|cent[er])")
 _FIGURES: Final = re.compile(
     r"target|request|nominal|desired|min|max|mean|std|range|count|error|focal|times"
 )
@@ -864,9 +858,16 @@ def _are_numbers(value: Any, count: int) -> bool:
     return isinstance(value, list) and len(value) == count and all(map(is_number, value))
 
 
-def _are_points(value: Any) -> bool:
-    is_list = isinstance(value, list) and len(value) == CAMERA_COUNT
-    return is_list and all(_are_numbers(each, 3) for each in value)
+def _places_of(value: Any) -> list[list[float]] | None:
+    """Return where six cameras stand on a line or in space, None where a value does not tell it."""
+    if isinstance(value, dict) and [*map(camera_of, value)] == [*range(CAMERA_COUNT)]:
+        value = [*value.values()]
+    listed = value if isinstance(value, list) and len(value) == CAMERA_COUNT else []
+    points = [each if isinstance(each, list) else [each] for each in listed]
+    for axes in (1, 3):
+        if points and all(_are_numbers(each, axes) for each in points):
+            return points
+    return None
 
 
 def _is_row(value: Any, *, of: dict[str, Any] | list[Any]) -> bool:

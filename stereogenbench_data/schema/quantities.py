@@ -50,9 +50,6 @@ NAMES: Final[dict[str, str]] = {
     "short_caption": "short_caption caption summary short_description",
     "detailed_caption": "detailed_caption long_caption description detailed_description "
     "dense_caption",
-    "scene_type": "scene_type",
-    "setting": "setting",
-    "tags": "tags keywords",
 }
 """The words of the keys under which a quantity may stand, the likeliest first."""
 

@@ -90,7 +90,7 @@ REMARKS: Final = {
     "principal point": "the intrinsics; the image's centre is assumed",
     "left": "disparity, and all that needs poses: the rig is stated in two ways",
     "primary pair": "nothing: cameras are taken to be numbered from left to right",
-    "pair": "nothing: lens, baselines and primary pair of baseline.json count",
+    "pair": "nothing: the primary pair of baseline.json counts",
     "sensor": "the focal length in mm: the release's sensor is assumed",
     "videos": "pairs of cameras whose videos are missing",
     "frames": "nothing: frames that all files have are used",
@@ -118,17 +118,6 @@ class SceneLabels:
     character: str | None = None
     animation: str | None = None
     aperture_fstop: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Description:
-    """A scene's machine-written description, not verified by people; absent texts are empty."""
-
-    short_caption: str = ""
-    detailed_caption: str = ""
-    scene_type: str = ""
-    setting: str = ""
-    tags: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

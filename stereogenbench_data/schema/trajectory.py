@@ -7,8 +7,8 @@ and an axis of frames; what they mean as poses is for `geometry.pose_forms` to s
 `index.evidence` to confirm.
 """
 
-import itertools
 import re
+from collections.abc import Sized
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -22,7 +22,7 @@ from stereogenbench_data.schema.document import (
     listed_keys,
     parse_document,
 )
-from stereogenbench_data.schema.quantities import NAMES, Values, without_unit, words
+from stereogenbench_data.schema.quantities import Values, without_unit, words
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
 _COUNTING: Final = re.compile(r"(.*?)(\d+)\Z")
@@ -87,9 +87,7 @@ class RecordedPoses:
         blocks: The numbers that may be part of poses.
         hints: The words of the texts in which a file says how they are to be read.
         unit_m: Metres in the unit that the file names for lengths, None without one.
-        head: The file with one element of each list of objects: what it states beside poses.
-        lens: The key of a focal length or a field of view that is not the same everywhere, and its
-            least and greatest number; "" where there is none.
+        head: The file with three elements of each long list: what it states beside poses.
         first_frame: The least number that frames have, 0 where they have none.
     """
 
@@ -97,7 +95,6 @@ class RecordedPoses:
     hints: frozenset[str]
     unit_m: float | None
     head: dict[str, Any]
-    lens: str = ""
     first_frame: int = 0
 
 
@@ -138,8 +135,8 @@ def record_poses(text: bytes, *, where: str) -> RecordedPoses:
         )
         raise SchemaError(f"{where}: {reason}.")
     head = _head_of(document)
-    unit_m, lens, first_frame = _unit_m(head, where), _changing_lens(columns), _first_frame(columns)
-    return RecordedPoses(tuple(blocks), _hints(document), unit_m, head, lens, first_frame)
+    unit_m, first_frame = _unit_m(head, where), _first_frame(columns)
+    return RecordedPoses(tuple(blocks), _hints(document), unit_m, head, first_frame)
 
 
 def _first_frame(columns: Columns) -> int:
@@ -150,31 +147,17 @@ def _first_frame(columns: Columns) -> int:
     return min((number for number in numbers if number is not None), default=0)
 
 
-def _changing_lens(columns: Columns) -> str:
-    for place, (_, values) in columns.items():
-        name = without_unit(place[-1])[0] if place else ""
-        if name in _LENS_KEYS and all(map(is_number, values)):
-            least, most = min(values), max(values)
-            if most - least > _SAME_LENS * most:
-                return f"{'.'.join(place)} is {least:.6g} to {most:.6g}".replace(".*", "[]")
-    return ""
-
-
-_LENS_KEYS: Final = {
-    key for quantity in ("focal", "focal_px", "fov", "fov_y") for key in NAMES[quantity].split()
-}
-_SAME_LENS: Final = 1e-3
-
-
 def _head_of(node: Any) -> Any:
-    """Return a document with one element of each list of objects, and of each long object."""
+    """Return a document with the first, a middle and the last element of what has many elements."""
     if isinstance(node, list):
-        is_short = len(node) <= _MOST_HINTS and not any(isinstance(each, dict) for each in node)
-        return [_head_of(each) for each in (node if is_short else node[:1])]
+        return [_head_of(each) for each in node[:: _step(node)]]
     if isinstance(node, dict):
-        items = itertools.islice(node.items(), 1 if len(node) > _MOST_HINTS else None)
-        return {key: _head_of(value) for key, value in items}
+        return {key: _head_of(node[key]) for key in [*node][:: _step(node)]}
     return node
+
+
+def _step(node: Sized) -> int:
+    return 1 if len(node) <= _MOST_HINTS else (len(node) - 1) // 2
 
 
 def _unit_m(head: dict[str, Any], where: str) -> float | None:

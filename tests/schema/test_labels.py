@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.parse import parse_complete, parse_description, parse_scene_key
-from stereogenbench_data.schema.records import Description, SceneId, SceneLabels
+from stereogenbench_data.schema.parse import parse_caption, parse_complete, parse_scene_key
+from stereogenbench_data.schema.records import SceneId, SceneLabels
 
 
 @pytest.mark.parametrize(
@@ -86,28 +86,23 @@ def test_the_number_of_a_scene_may_be_a_text(written, number):
     assert labels.scene_index == number
 
 
-def test_a_description_is_read():
-    text = b"""{"scene_type": "outdoor", "setting": "yard", "short_caption": "A yard.",
-               "detailed_caption": "A yard with a wall.", "tags": ["yard", "wall"], "other": 1}"""
-
-    assert parse_description(text, where="d.json") == (
-        Description("A yard.", "A yard with a wall.", "outdoor", "yard", ("yard", "wall")),
-        (),
-    )
-
-
-def test_a_caption_is_found_under_likely_keys():
-    text = b'{"caption": "A yard.", "output": {"detailedCaption": "A long yard."}, "tags": "a, b"}'
-
-    description, remarks = parse_description(text, where="d.json")
-
-    assert description == Description("A yard.", "A long yard.", tags=("a", "b"))
-    assert remarks == ()
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"""{"scene_type": "outdoor", "short_caption": "A yard.", "tags": ["yard", "wall"],
+             "detailed_caption": "A yard with a wall."}""",
+        b'{"caption": "A yard.", "output": {"detailedCaption": "A yard with a wall."}}',
+        b'{"summary": "A yard with a wall."}',
+    ],
+    ids=["as printed", "likely keys", "the short one alone"],
+)
+def test_a_caption_is_the_detailed_one(text):
+    assert parse_caption(text, where="d.json") == ("A yard with a wall.", ())
 
 
 @pytest.mark.parametrize("text", [b"{}", b'{"short_caption": true}', b'{"tags": [3]}', b"[]", b""])
-def test_a_description_without_texts_is_empty_and_stops_nothing(text):
-    description, remarks = parse_description(text, where="d.json")
+def test_a_description_without_texts_has_no_caption_and_stops_nothing(text):
+    caption, remarks = parse_caption(text, where="d.json")
 
-    assert description == Description()
+    assert caption == ""
     assert {remark.about for remark in remarks} <= {"caption"}

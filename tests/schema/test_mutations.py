@@ -10,7 +10,7 @@ import pytest
 
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.index.evidence import poses_as, understood_poses
-from stereogenbench_data.schema.parse import parse_complete, parse_description, parse_rig
+from stereogenbench_data.schema.parse import parse_caption, parse_complete, parse_rig
 
 VALUES = (
     None, True, 0, -1, 1.5, "x", "Cam_07", [], {}, [1], {"a": 1}, [[1, 2, 3]] * 3, [0, 0, 0, 1],
@@ -54,7 +54,7 @@ def parsers(rig_document, trajectory_document):
         (partial(poses_as, form=None), trajectory_document),
         (partial(understood_poses, rig=rig), trajectory_document),
         (parse_complete, labels),
-        (parse_description, description),
+        (parse_caption, description),
     )
 
 

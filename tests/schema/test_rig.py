@@ -123,8 +123,11 @@ def test_without_a_sensor_that_of_the_release_is_assumed(rig_document, dumped, i
 @pytest.mark.parametrize(
     ("matrix", "told"),
     [
-        ([[1750.84, 0, 640], [0, 1750.84, 480], [0, 0, 1]], "pictures about 1280 px wide"),
-        ([[437.71, 0, 160], [0, 437.71, 120], [0, 0, 1]], "pictures about 320 px wide"),
+        (
+            [[1750.84, 0, 640], [0, 1750.84, 480], [0, 0, 1]],
+            "of other pictures than these, of 640x480",
+        ),
+        ([[437.71, 0, 160], [0, 437.71, 120], [0, 0, 1]], "of other pictures than these"),
         ([[875.42, 3, 320], [0, 875.42, 240], [0, 0, 1]], "focal_length_mm is missing"),
     ],
     ids=["larger pictures", "smaller pictures", "skewed pixels"],
@@ -462,6 +465,13 @@ def pairs_as(document, write):
         pytest.param(
             lambda pairs: {"adjacent_baselines_cm": [cm for a, b, cm in pairs if b == a + 1]},
             id="neighbours alone"),
+        pytest.param(
+            lambda pairs: {"pairwise_baselines_cm": [cm for a, b, cm in pairs]},
+            id="all pairs in order"),
+        pytest.param(
+            lambda pairs: {"camera_positions_m": {
+                f"Cam_{b:02d}": [1.0, cm / 100, -2.0]
+                for a, b, cm in [(0, 0, 0.0), *pairs] if a == 0}}, id="places in space"),
         pytest.param(
             lambda pairs: {"rig": {"spacings": [cm for a, b, cm in pairs if b == a + 1],
                                    "unit": "cm"}}, id="spacings alone"),
