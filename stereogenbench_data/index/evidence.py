@@ -24,7 +24,7 @@ from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_re
 from stereogenbench_data.schema.conventions import PosesAs
 from stereogenbench_data.schema.parse import contradictions
 from stereogenbench_data.schema.quantities import UNITS_M
-from stereogenbench_data.schema.records import Rig
+from stereogenbench_data.schema.records import Remark, Rig
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.schema.trajectory import RecordedPoses, record_poses
@@ -60,7 +60,7 @@ class Understood:
         names: The readings that pass and move the cameras differently in the world, the one that
             was taken first.
         is_named: Whether the file itself names that one.
-        other_pair: Where the file states another primary pair than the rig has; "" if nowhere.
+        told: What the file states otherwise than the rig, beside poses.
         first_frame: The number of the first frame that has poses.
         form: What the index keeps of it, for `poses_as`: None for the first form that the file
             itself names, if it is the only one to pass.
@@ -70,7 +70,7 @@ class Understood:
     names: tuple[str, ...]
     is_named: bool
     form: str | None
-    other_pair: str = ""
+    told: tuple[Remark, ...] = ()
     first_frame: int = 0
 
 
@@ -104,15 +104,13 @@ def understood_poses(
         SchemaError: If no reading of its numbers passes, or several pass and disagree about where
             the cameras stand to each other, or not as conventions say; it says what was tried.
         SidesError: If its own form fits but for the side of the primary pair's left camera or one
-            factor of all baselines, or if it states another lens or other baselines.
+            factor of all baselines.
     """
     recorded = record_poses(text, where=where)
-    told, other = contradictions(recorded.head, rig, where=where)
-    if told:
-        raise SidesError(told)
+    told = contradictions(recorded.head, rig, where=where)
     if named is None:
         plain = _fitting(readings(recorded), rig, where=where)
-        return replace(plain, other_pair=other, first_frame=recorded.first_frame)
+        return replace(plain, told=told, first_frame=recorded.first_frame)
     found, own, reason = None, None, ""
     try:
         found = _fitting(_readings_as(recorded, named), rig, where=where)
@@ -123,7 +121,7 @@ def understood_poses(
     own_poses = own.poses if own is not None and own.is_named else None
     if found is not None and (own_poses is None or same_poses(found.poses, own_poses)):
         form, first_frame = "|".join(found.names), recorded.first_frame
-        return replace(found, form=form, other_pair=other, first_frame=first_frame)
+        return replace(found, form=form, told=told, first_frame=first_frame)
     reason = reason or "the file names another form, which fits as well and differs"
     fits = "" if own is None else f" What fits is: {shortened(own.names[0], 300)}."
     stated = ((name, getattr(named, name)) for name in ("rotation", "form", "axes", "unit"))

@@ -185,13 +185,6 @@ class _Description:
         """Note what is odd."""
         self.remarks.append(Remark(about, text))
 
-    def told(self, contradiction: str, other_pair: str) -> None:
-        """Note what another file says otherwise than ``baseline.json``: see `contradictions`."""
-        if contradiction:
-            self.remark("left", contradiction)
-        if other_pair:
-            self.remark("pair", f"{other_pair}. The primary pair of {BASELINE_JSON} counts")
-
     def scene(self, conventions: Conventions | None, *, videos: Collection[str] | None) -> Scene:
         """Return the row; `describe_scene` says more."""
         problems: list[StereoGenBenchError] = []
@@ -206,13 +199,12 @@ class _Description:
         marked = SceneLabels()
         odd: tuple[Remark, ...] = (Remark("marker", f"{self.key}: has no {COMPLETE_JSON}"),)
         if COMPLETE_JSON in self.files:
-            text = self.folder.read(COMPLETE_JSON)
-            marked, odd = parse_complete(text, where=self.where(COMPLETE_JSON))
+            text, where = self.folder.read(COMPLETE_JSON), self.where(COMPLETE_JSON)
+            marked, odd = parse_complete(text, where=where)
         self.remarks += odd
         if rig is not None and COMPLETE_JSON in self.files:
             with suppress(SchemaError):
-                head, where = parse_object(text, where=COMPLETE_JSON), self.where(COMPLETE_JSON)
-                self.told(*contradictions(head, rig, where=where))
+                self.remarks += contradictions(parse_object(text, where=where), rig, where=where)
         texts: dict[str, bytes] = {
             name: self.folder.read(name) for name in DESCRIPTIONS if name in self.files
         }
@@ -408,7 +400,7 @@ class _Description:
             count > frames and not any(each.about == "frames" for each in self.remarks)
         ):
             self.remark("frames", f"{told}. The first {min(count, frames)} are used")
-        self.told("", found.other_pair)
+        self.remarks += found.told
         if len(found.names) > 1:
             listed = ", ".join(name.partition(" @ ")[0] for name in found.names)
             self.remark(

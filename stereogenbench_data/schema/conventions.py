@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, Final, get_args
 
 from stereogenbench_data.errors import SchemaError, explain_os_errors
-from stereogenbench_data.schema.document import is_number, listed_keys
+from stereogenbench_data.schema.document import is_number, listed_keys, parse_object
 from stereogenbench_data.schema.quantities import (
     OTHER_UNITS,
     UNITS_M,
@@ -316,13 +316,7 @@ def shape_of_text(text: str) -> Shape:
         SchemaError: If it is none.
     """
     where = "the conventions of a scene"
-    try:
-        table = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise SchemaError(f"{where}: not JSON: {error}.") from error
-    if not isinstance(table, dict):
-        raise SchemaError(f"{where}: not an object.")
-    return _shape(table, where=where)
+    return _shape(parse_object(text.encode(errors="surrogatepass"), where=where), where=where)
 
 
 def parse_conventions(text: bytes, *, where: str) -> Conventions:

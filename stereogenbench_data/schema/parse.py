@@ -246,17 +246,13 @@ def parse_rig(
     return rig, labels, tuple(file.remarks)
 
 
-def contradictions(head: dict[str, Any], rig: Rig, *, where: str) -> tuple[str, str]:
-    """Return what another file of a scene states of its lens, baselines and primary pair.
+def contradictions(head: dict[str, Any], rig: Rig, *, where: str) -> tuple[Remark, ...]:
+    """Return what another file of a scene states of lens, baselines and primary pair otherwise.
 
     Args:
         head: That file's JSON object; of long lists, such as frames, some elements are enough.
         rig: What ``baseline.json`` says.
         where: The other file's path, for messages.
-
-    Returns:
-        Lengths and angles that are not the rig's, and another primary pair, with their places; ""
-        where there are none.
     """
     own = {
         "focal_length_mm": rig.focal_mm,
@@ -269,18 +265,17 @@ def contradictions(head: dict[str, Any], rig: Rig, *, where: str) -> tuple[str, 
     file = _RigFile(json.dumps({"rig": own, "other": other}).encode(), where=where)
     file.rig(rig.recorded_size_px or (rig.image_width_px, rig.image_height_px))
     found = [_OWN.sub(BASELINE_JSON, each).replace("$.other", "$") for each in file.problems]
-    told = f"{where}: {'; '.join(found[:_MOST_TOLD])}. Or {_UNREAD}." if found else ""
-    pairs = []
+    told = [Remark("left", f"{where}: {'; '.join(found)}. {_UNREAD}")] if found else []
     named = Values({key: value for key, value in head.items() if "pair" in words(key)})
     for each in named.stated("primary_pair"):
         left, right = named_pair(each.value) or rig.primary_pair
         if rig.primary_pair not in ((left, right), (left - 1, right - 1)):
-            pairs.append(f"{where}: {each.path} states cameras {left} and {right}")
-    return told, "; ".join(pairs)
+            states = f"{where}: {each.path} states cameras {left} and {right}"
+            told.append(Remark("pair", f"{states}. The primary pair of {BASELINE_JSON} counts"))
+    return tuple(told)
 
 
-_MOST_TOLD: Final = 3
-_UNREAD: Final = 'leave the file\'s poses unread: form = "unknown" below [poses] in conventions'
+_UNREAD: Final = 'Or read no poses: form = "unknown" below [poses] in a file of conventions.'
 _OWN: Final = re.compile(r"\$\.rig(?:\.\w+)+(?:\[\d+\])*")
 
 
@@ -864,10 +859,8 @@ def _places_of(value: Any) -> list[list[float]] | None:
         value = [*value.values()]
     listed = value if isinstance(value, list) and len(value) == CAMERA_COUNT else []
     points = [each if isinstance(each, list) else [each] for each in listed]
-    for axes in (1, 3):
-        if points and all(_are_numbers(each, axes) for each in points):
-            return points
-    return None
+    are_known = points and len(points[0]) in (1, 3)
+    return points if are_known and all(_are_numbers(p, len(points[0])) for p in points) else None
 
 
 def _is_row(value: Any, *, of: dict[str, Any] | list[Any]) -> bool:

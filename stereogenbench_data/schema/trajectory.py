@@ -8,7 +8,6 @@ and an axis of frames; what they mean as poses is for `geometry.pose_forms` to s
 """
 
 import re
-from collections.abc import Sized
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -149,15 +148,12 @@ def _first_frame(columns: Columns) -> int:
 
 def _head_of(node: Any) -> Any:
     """Return a document with the first, a middle and the last element of what has many elements."""
+    if not isinstance(node, dict | list):
+        return node
+    step = 1 if len(node) <= _MOST_HINTS else (len(node) - 1) // 2
     if isinstance(node, list):
-        return [_head_of(each) for each in node[:: _step(node)]]
-    if isinstance(node, dict):
-        return {key: _head_of(node[key]) for key in [*node][:: _step(node)]}
-    return node
-
-
-def _step(node: Sized) -> int:
-    return 1 if len(node) <= _MOST_HINTS else (len(node) - 1) // 2
+        return [_head_of(each) for each in node[::step]]
+    return {key: _head_of(node[key]) for key in [*node][::step]}
 
 
 def _unit_m(head: dict[str, Any], where: str) -> float | None:
