@@ -205,8 +205,7 @@ def parse_caption(text: bytes, *, where: str) -> tuple[str, tuple[Remark, ...]]:
         file = MetadataFile(text, where=where)
     except SchemaError as error:
         return "", (Remark("caption", str(error)),)
-    names = ("detailed_caption", "short_caption")
-    written = [file.text(name, about="caption") for name in names]
+    written = [file.text(name, about="caption") for name in ("detailed_caption", "short_caption")]
     return next(filter(None, written), ""), tuple(file.remarks)
 
 
@@ -264,7 +263,8 @@ def contradictions(head: dict[str, Any], rig: Rig, *, where: str) -> tuple[Remar
     other = {key: value for key, value in head.items() if "primary" not in words(key)}
     file = _RigFile(json.dumps({"rig": own, "other": other}).encode(), where=where)
     file.rig(rig.recorded_size_px or (rig.image_width_px, rig.image_height_px))
-    found = [_OWN.sub(BASELINE_JSON, each).replace("$.other", "$") for each in file.problems]
+    found = [_OWN.sub(BASELINE_JSON, each).replace("$.other", "$") for each in file.problems
+             if _OWN.search(each) or "in mm mean" in each]  # fmt: skip
     told = [Remark("left", f"{where}: {'; '.join(found)}. {_UNREAD}")] if found else []
     named = Values({key: value for key, value in head.items() if "pair" in words(key)})
     for each in named.stated("primary_pair"):

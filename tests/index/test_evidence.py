@@ -309,8 +309,9 @@ def test_another_primary_pair_than_that_of_the_rig_is_told_with_its_place(pair, 
          r"cameras 0 and 1 is 13 cm here and 6\.5 cm at baseline\.json"),
         ({"focal_length_mm": 32.5, "fov": 40.16, "adjacent_baselines_m": [0.065, 0.125]},
          r"\A\Z"),
+        ({"pair_offsets_cm": {"0-1": -6.5}, "focal_length_mm": None}, r"\A\Z"),
     ],
-    ids=["focal length", "matrix", "angle", "sensor", "baselines", "the same"],
+    ids=["focal length", "matrix", "angle", "sensor", "baselines", "the same", "no lengths"],
 )  # fmt: skip
 def test_another_lens_or_baseline_beside_the_poses_is_told_with_both_values(stated, told):
     found = contradictions(stated, RIG, where="scene/trajectory.json")
