@@ -525,9 +525,16 @@ def six_equal_views(folder):
 
 @pytest.mark.parametrize(
     ("corrupt", "note"),
-    [(without_texture, "no texture"), (six_equal_views, "too little parallax")],
+    [
+        (without_texture, "no texture"),
+        (six_equal_views, "too little parallax"),
+        (lambda folder: rewrite_depth(folder, lambda units: units * 0), "no depth"),
+    ],
+    ids=["no texture", "no parallax", "no depth"],
 )
-def test_pictures_that_show_no_disparity_decide_nothing(verdict_on, corrupt, note):
+def test_pictures_that_show_no_disparity_and_files_without_depth_decide_nothing(
+    verdict_on, corrupt, note
+):
     verdict = verdict_on(corrupt)
 
     assert not verdict.is_wrong

@@ -94,3 +94,4 @@ def test_what_hides_a_border_is_reported_with_its_share_and_side(where, share, s
     found, on = border_occluder(depth_m, measured, far_m=10.0)
 
     assert (found, on) == (pytest.approx(share), side)
+    assert border_occluder(depth_m, measured, far_m=math.nan) == (0.0, "")

@@ -50,7 +50,7 @@ def tile(sheet, *, line, column, width_px):
     return sheet[top : top + width_px, left : left + width_px]
 
 
-@pytest.mark.parametrize("size_px", [64, 333])
+@pytest.mark.parametrize("size_px", [None, 333])
 def test_the_views_of_a_sheet_are_the_six_cameras_pictures(reader, row, size_px):
     sheet = scene_sheet(reader, row, pair=(0, 2), frame=1, tile_px=size_px)
     width = tile_width(reader.index.scene(row), size_px)
