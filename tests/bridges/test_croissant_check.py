@@ -42,6 +42,10 @@ MUTATIONS = {
         lambda d: node(d, "pairs/scene_id").update(references={"field": {"@id": "scenes/key"}}),
         "scenes/key",
     ),
+    "reference of the specification's form": (
+        lambda d: node(d, "pairs/scene_id").update(references={"@id": "scenes/scene_id"}),
+        "data.json: mlcroissant cannot read it",
+    ),
     "misspelt responsible-AI name": (
         lambda d: d.update({"rai:dataBias": ["none"]}), "rai:dataBias: is not a property of RAI",
     ),
