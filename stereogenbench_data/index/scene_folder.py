@@ -443,9 +443,11 @@ class _Description:
         own = BASELINE_JSON, TRAJECTORY_JSON, COMPLETE_JSON
         for name in (name for name in self.files if name in own or name not in FILES):
             with suppress(SchemaError):
-                text = self.folder.read(name)
-                if b"depth" in text.lower():
-                    stated += stated_in_json(parse_object(text, where=name), name=self.where(name))
+                text, stem = self.folder.read(name), name.rpartition(".")[0]
+                if b"depth" in (stem.encode() + text).lower():
+                    document = parse_object(text, where=name)
+                    about = "" if name in own else stem
+                    stated += stated_in_json(document, name=self.where(name), about=about)
         found: list[DepthEncoding | None] = []
         problems: list[str] = []
         for name, facts in depths:
@@ -454,11 +456,14 @@ class _Description:
             except MediaError as error:
                 found.append(None)
                 problems.append(str(error))
-        known = [each for each in found if each is not None and each.source != "default"]
+        known = [each for each in found if each is not None]
         units_m = [each.known_unit_m for each in known]
         if units_m and max(units_m) > _SCALE_OF_A_RIG * min(units_m):
             found = [None] * len(found)
-            listed = ", ".join(f"{each:g}" for each in units_m)
+            listed = ", ".join(
+                f"{each.known_unit_m:g}{' by default' if each.source == 'default' else ''}"
+                for each in known
+            )
             problems.append(
                 f"{self.key}: its cameras' units of depth differ by a scale: {listed} m"
             )

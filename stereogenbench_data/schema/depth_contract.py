@@ -213,11 +213,11 @@ _JOINED: Final = re.compile(
 _ONLY_JOINED: Final = re.compile(rf"(?:{_JOINED.pattern})+")
 
 
-def stated_in_json(document: dict[str, Any], *, name: str) -> list[Statement]:
-    """Return what a metadata file says under keys that name depth."""
+def stated_in_json(document: dict[str, Any], *, name: str, about: str = "") -> list[Statement]:
+    """Return what a metadata file says under keys that name depth, or in a file ``about`` it."""
     found: list[Statement] = []
     for node in nodes_of(document):
-        place = words(node.path)
+        place = words(f"{about} {node.path}")
         if "depth" not in place.split("_") or _OTHER_DEPTHS.search(place):
             continue
         value = node.value

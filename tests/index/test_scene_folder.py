@@ -52,12 +52,14 @@ def test_the_scene_rendered_elsewhere_is_described(shared_scenes):
 
 
 def test_depth_without_a_tag_has_the_releases_unit(make_scene, root, video):
-    shutil.copy(video("depth.mkv", tags={}), make_scene() / "cam_02_depth.mkv")
+    folder = make_scene()
+    for camera in range(6):
+        shutil.copy(video("depth.mkv", tags={}), folder / f"cam_{camera:02d}_depth.mkv")
 
     scene = describe_scene(root, KEY)
 
-    assert scene.depth_unit_m[1:4] == (0.001, 0.1, 0.001)
-    assert scene.depth_unit_source[1:4] == ("tag", "default", "tag")
+    assert scene.depth_unit_m == (0.1,) * 6
+    assert scene.depth_unit_source == ("default",) * 6
 
 
 def test_any_common_number_of_frames_is_recorded(make_scene, root):
@@ -206,10 +208,14 @@ def test_depth_in_a_form_that_nothing_reads_stops_no_pictures(make_scene, root):
         scene.member("cam_00_depth.mkv")
 
 
-def test_a_unit_of_depth_in_a_file_of_its_own_is_read(make_scene, root, video):
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("notes.json", '{"depth_unit": "mm"}'), ("depth_meta.json", '{"unit": "mm"}')],
+)
+def test_a_unit_of_depth_in_a_file_of_its_own_is_read(make_scene, root, video, name, text):
     folder = make_scene()
     shutil.copy(video("depth.mkv", tags={}), folder / "cam_00_depth.mkv")
-    (folder / "depth_meta.json").write_text('{"depth_unit": "mm"}')
+    (folder / name).write_text(text)
 
     assert describe_scene(root, KEY).depth_unit_m[0] == 0.001
 
@@ -245,14 +251,19 @@ def test_objects_beside_the_cameras_are_no_poses(make_scene, root, rewrite):
     assert describe_scene(root, KEY).remark("poses") == ""
 
 
-def test_units_of_depth_that_differ_by_a_scale_within_a_rig_are_not_used(make_scene, root, video):
-    other = video("depth.mkv", tags={"DEPTH_SCALE": "0.01"})
-    shutil.copy(other, make_scene() / "cam_00_depth.mkv")
+@pytest.mark.parametrize(
+    ("tags", "told"),
+    [({"DEPTH_SCALE": "0.01"}, "0.01, 0.001"), ({}, "0.1 by default, 0.001")],
+)
+def test_units_of_depth_that_differ_by_a_scale_within_a_rig_are_not_used(
+    make_scene, root, video, tags, told
+):
+    shutil.copy(video("depth.mkv", tags=tags), make_scene() / "cam_00_depth.mkv")
 
     scene = describe_scene(root, KEY)
 
     assert scene.depth_unit_source == ("unreadable",) * 6
-    assert "0.01, 0.001" in scene.remark("depth")
+    assert told in scene.remark("depth")
 
 
 def test_a_video_of_another_size_is_named(make_scene, root, video):
