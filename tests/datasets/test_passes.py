@@ -125,7 +125,7 @@ def test_a_copy_of_a_loader_has_passes_of_its_own(pairs, truth, copied):
     other.close()
 
 
-@pytest.mark.parametrize(("workers", "copied"), [(0, copy.deepcopy), (2, pickle.dumps)], ids=str)
+@pytest.mark.parametrize(("workers", "copied"), [(0, copy.deepcopy), (2, pickle.dumps)])
 @pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
 def test_a_pass_is_not_copied(pairs, workers, copied):
     batches = iter(pairs.loader(9, num_workers=workers))
