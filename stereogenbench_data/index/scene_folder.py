@@ -38,6 +38,7 @@ from stereogenbench_data.media.clock import MOST_EXTRA_FRAMES
 from stereogenbench_data.media.container import StreamFacts, depth_coding
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
+    DEPTH_CURES,
     grey_format,
     measured,
     open_video,
@@ -465,7 +466,8 @@ class _Description:
                 for each in known
             )
             problems.append(
-                f"{self.key}: its cameras' units of depth differ by a scale: {listed} m"
+                f"{self.key}: its cameras' units of depth differ by a scale: {listed} m. "
+                f"{DEPTH_CURES}"
             )
         depth = None if self.shape is None else self.shape.depth
         if depth is not None and depth.encoding.unit_m is not None:

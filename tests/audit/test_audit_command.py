@@ -108,7 +108,7 @@ def test_an_option_that_is_off_is_a_usage_error(small_shards, run, words, told):
 
 def test_a_filter_that_no_folder_matches_says_what_folders_there_are(small_release, run):
     there = (
-        "none of its 4 scenes is asked for; there are scenes in eval/MapSeenInTrain/Uniform/"
+        "none of its 4 scenes matches; there are scenes in eval/MapSeenInTrain/Uniform/"
         "SynthStage, train/IPD_Gaussian/SynthStage, train/Uniform/SynthStage. Check the filters"
     )
     refused = run(small_release, "--workers", "1", "--where", "family=uniform")

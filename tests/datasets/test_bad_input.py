@@ -248,15 +248,14 @@ def test_a_tag_that_is_no_number_needs_the_users_unit(scene):
     assert 1 < float(meant["depth_right"].median()) < 100
 
 
-def test_a_tag_that_one_camera_lacks_is_warned_of(scene):
+def test_depth_is_not_guessed_where_one_camera_of_a_rig_lacks_its_tag(scene):
     retagged(scene, 1)
 
-    with pytest.warns(OddSceneWarning) as warned:
+    told = r"differ by a scale: 0\.001, 0\.1 by default.*pass DepthEncoding\(unit_m="
+    with pytest.raises(MediaError, match=told):
         StereoPairs(root_of(scene))
 
-    told = [str(each.message) for each in warned]
-    assert any("1 selected scenes state other units of depth" in text for text in told)
-    assert any("stereogenbench doctor" in text for text in told)
+    assert StereoPairs(root_of(scene), fields=("left",))[0]["left"].any()
 
 
 def turn(scene, camera, **angles_deg):

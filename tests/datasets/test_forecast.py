@@ -139,7 +139,8 @@ def test_a_forecast_of_small_scenes_measures_and_adds_up(small_shards):
     assert found.scales[1].requests_s * found.scales[1].share <= 3000 * (1 + 1e-9)
 
 
-def test_the_command_prints_a_table_or_json(small_shards):
+def test_the_command_prints_a_table_or_json(small_shards, monkeypatch):
+    monkeypatch.setattr(forecasting, "_decoding_s", lambda *_, **__: 0.01)  # it takes seconds
     words = (
         "forecast", small_shards, "--samples-s", "20", "--delay-ms", "60", "--total-mb-s", "0.001",
         "--batch-size", "2", "--frames", "random:2",

@@ -22,7 +22,7 @@ def accelerate_steps(data, folder):
         if resume:
             accelerator.load_state(folder / "accelerate")
         steps, ends = [], 0
-        for _ in range(loader.epoch, 2):
+        for _ in range(loader.epoch, runs.EPOCHS):
             for batch in loader:
                 steps.append(batch["__key__"])
                 ends += accelerator.gradient_state.end_of_dataloader
@@ -36,7 +36,7 @@ def accelerate_steps(data, folder):
         return steps, ends
 
     whole, ends = train()
-    assert ends == 2
+    assert ends == runs.EPOCHS
     return whole, train(stop_at=9)[0], train(resume=True)[0]
 
 

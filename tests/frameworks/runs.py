@@ -13,7 +13,7 @@ from lightning import Trainer as LightningTrainer
 
 from stereogenbench_data import StereoPairs, collate
 
-EPOCHS = 3
+EPOCHS = 2
 
 
 def random_frames(data):

@@ -48,13 +48,12 @@ def of_epochs(steps, *, epochs):
 
 @pytest.mark.parametrize("name", ["accelerate", "hugging face loader", "lightning"])
 def test_two_ranks_get_each_sample_once_and_other_frames_each_epoch(ranks, name):
-    epochs = 2 if name == "accelerate" else runs.EPOCHS
-    shares = [of_epochs(rank[name][0], epochs=epochs) for rank in ranks]
+    shares = [of_epochs(rank[name][0], epochs=runs.EPOCHS) for rank in ranks]
     together = [flat(of_ranks) for of_ranks in zip(*shares, strict=True)]
 
     for keys in together:
         assert len(keys) == len(set(keys)) == 56
-    assert len({tuple(sorted(keys)) for keys in together}) == epochs
+    assert len({tuple(sorted(keys)) for keys in together}) == runs.EPOCHS
     assert not set(shares[0][0]) & set(shares[1][0])
 
 
@@ -63,8 +62,8 @@ def test_two_ranks_get_other_frames_each_epoch_where_the_trainer_makes_the_loade
     together = [frozenset(flat(of_ranks)) for of_ranks in zip(*shares, strict=True)]
 
     # The trainer fills up the last batches.
-    assert [len(keys) for keys in together] == [60] * 3
-    assert len(set(together)) == 3
+    assert [len(keys) for keys in together] == [60] * runs.EPOCHS
+    assert len(set(together)) == runs.EPOCHS
 
 
 @pytest.mark.parametrize(
@@ -112,7 +111,9 @@ def test_lightning_goes_on_as_if_it_had_not_stopped(whole_runs, indexed_release,
     before = runs.lightning(loader(), tmp_path, stop_at=stop)
     after = runs.lightning(loader(), tmp_path, resume=True)
 
-    assert len({tuple(sorted(keys)) for keys in of_epochs(whole, epochs=3)}) == 3
+    assert (
+        len({tuple(sorted(keys)) for keys in of_epochs(whole, epochs=runs.EPOCHS)}) == runs.EPOCHS
+    )
     assert len(before) == stop
     assert before + after == whole
 
@@ -130,7 +131,9 @@ def test_hugging_faces_trainer_goes_on_as_if_it_had_not_stopped(
     before = run(stop_at=stop)
     after = run(resume=True)
 
-    assert len({tuple(sorted(keys)) for keys in of_epochs(whole, epochs=3)}) == 3
+    assert (
+        len({tuple(sorted(keys)) for keys in of_epochs(whole, epochs=runs.EPOCHS)}) == runs.EPOCHS
+    )
     assert len(before) == stop
     assert before + after == whole
 
@@ -146,7 +149,9 @@ def test_lightning_overfits_the_first_batches_in_order(indexed_release, tmp_path
 def test_lightning_sees_other_samples_in_each_of_some_short_epochs(indexed_release, tmp_path):
     pairs = StereoPairs(indexed_release, fields=("left", "__key__"), frames="all")
     steps = runs.lightning(pairs.loader(4), tmp_path, limit_train_batches=2)
-    expected = [pairs.set_epoch(epoch) or keys_of(pairs.loader(4))[:2] for epoch in range(3)]
+    expected = [
+        pairs.set_epoch(epoch) or keys_of(pairs.loader(4))[:2] for epoch in range(runs.EPOCHS)
+    ]
 
     assert steps == flat(expected)
 

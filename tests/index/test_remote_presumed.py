@@ -46,6 +46,12 @@ def release(whole_release, tmp_path):
     return shutil.copytree(whole_release, tmp_path / "release", copy_function=os.link)
 
 
+@pytest.fixture(scope="module")
+def local(whole_release):
+    """The index of the release as it is on the disk, each scene read."""
+    return SceneIndex.open(whole_release, rows="read")
+
+
 @pytest.fixture
 def hub(release, tmp_path, monkeypatch):
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
@@ -64,9 +70,8 @@ def read_names(server, key):
     return {name.rpartition("/")[2] for _, name, _ in server.facts["resolved"] if key in name}
 
 
-def test_rows_come_from_the_listing_and_a_few_scenes(hub, release):
+def test_rows_come_from_the_listing_and_a_few_scenes(hub, local):
     index = SceneIndex.open(HUB)
-    local = SceneIndex.open(release, rows="read")
 
     assert index.presumption is not None
     assert not read_names(hub, ODD)
@@ -75,9 +80,9 @@ def test_rows_come_from_the_listing_and_a_few_scenes(hub, release):
     assert requests(hub) < 300
 
 
-def test_baselines_are_read_where_a_selection_needs_them_and_the_digest_stays(hub, release):
+def test_baselines_are_read_where_a_selection_needs_them_and_the_digest_stays(hub, local):
     index = SceneIndex.open(HUB)
-    digest, local = index.digest, SceneIndex.open(release, rows="read")
+    digest = index.digest
 
     np.testing.assert_array_equal(index.column("scene_label"), local.column("scene_label"))
     np.testing.assert_array_equal(index.column("baselines_cm"), local.column("baselines_cm"))
@@ -190,9 +195,9 @@ def write_records(release, name, record_of):
     ("name", "record_of"),
     [("all.jsonl", as_parts), ("scenes.json", lambda key, record: record)],
 )
-def test_one_file_of_all_scenes_stands_for_each_baseline_json(hub, release, name, record_of):
+def test_one_file_of_all_scenes_stands_for_each_baseline_json(hub, release, local, name, record_of):
     write_records(release, name, record_of)
-    index, local = SceneIndex.open(HUB), SceneIndex.open(release, rows="read")
+    index = SceneIndex.open(HUB)
 
     np.testing.assert_array_equal(index.column("scene_label"), local.column("scene_label"))
     np.testing.assert_array_equal(index.column("baselines_cm"), local.column("baselines_cm"))
@@ -206,20 +211,20 @@ def scaled(key, record):
 
 
 @pytest.mark.parametrize("record_of", [scaled, lambda key, record: {"a": key}])
-def test_a_file_that_other_files_contradict_is_not_used(hub, release, record_of):
+def test_a_file_that_other_files_contradict_is_not_used(hub, release, local, record_of):
     write_records(release, "scenes.jsonl", record_of)
     (release / "metadata" / "notes.json").write_text("{")
-    index, local = SceneIndex.open(HUB), SceneIndex.open(release, rows="read")
+    index = SceneIndex.open(HUB)
 
     np.testing.assert_array_equal(index.column("baselines_cm"), local.column("baselines_cm"))
     assert read_names(hub, UNREAD) == {"baseline.json"}
 
 
-def test_captions_come_from_one_file_of_all_scenes(hub, release):
+def test_captions_come_from_one_file_of_all_scenes(hub, release, local):
     (drawn,) = {(release / key / "scene_description_qwen_dataset_level.json").read_bytes()
                 for key in KEYS}  # fmt: skip
     write_records(release, "captions.jsonl", lambda key, _: as_path(key, json.loads(drawn)))
     captions = SceneIndex.open(HUB).column("caption")
 
-    assert captions.tolist() == SceneIndex.open(release, rows="read").column("caption").tolist()
+    assert captions.tolist() == local.column("caption").tolist()
     assert not read_names(hub, UNREAD)
