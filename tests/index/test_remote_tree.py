@@ -3,6 +3,7 @@
 import os
 import shutil
 
+import fsspec
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -13,6 +14,7 @@ from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import build
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.index.tree import find_remote_scenes, folder_of, stamp_of
+from tests.servers.fixtures import BUCKET
 from tests.servers.hub import REPOSITORY, hub_serving
 
 HUB = f"hf://datasets/{REPOSITORY}@main"
@@ -45,6 +47,18 @@ def test_the_index_of_a_repository_is_that_of_the_folder(hub_tree, small_release
     sizes = sum(path.stat().st_size for path in small_release.rglob("*.mkv"))
     sent = sum(asked.sent for asked in hub_tree.asked if asked.path.endswith(".mkv"))
     assert sent <= sizes
+
+
+@pytest.mark.usefixtures("s3")
+def test_a_tree_in_an_s3_store_opens_like_the_folder(small_release):
+    fsspec.filesystem("s3").put(f"{small_release}/", f"{BUCKET}/tree/", recursive=True)
+    local = StereoPairs(small_release, pairs="all", frames=[6])
+    remote = StereoPairs(f"s3://{BUCKET}/tree", pairs="all", frames=[6])
+
+    assert remote.index.digest == local.index.digest
+    a, b = local[31], remote[31]
+    assert a["__key__"] == b["__key__"]
+    np.testing.assert_array_equal(a["disparity"], b["disparity"])
 
 
 @pytest.mark.usefixtures("hub_tree")

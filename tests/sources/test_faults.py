@@ -6,11 +6,13 @@ import threading
 import time
 from contextlib import contextmanager
 
+import fsspec
 import pytest
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.sources.remote import RemoteObject
 from tests.servers.failing_server import Answer, serving
+from tests.servers.hub import COMMIT, REPOSITORY
 from tests.servers.raw import raw_serving
 from tests.sources.policies import LONGEST_S, ended, retry_policy, waits_noted
 
@@ -85,6 +87,23 @@ def test_a_dead_server_is_a_named_error_within_the_longest_outage(dead):
 
     assert f"{dead}/x.tar : cannot be read, at byte" in text
     assert "slower than timeout_s=0.2" in text
+
+
+@pytest.mark.parametrize("how", ["refusing", "never answering"])
+@pytest.mark.parametrize("scheme", ["hf", "s3"])
+def test_a_dead_store_is_a_named_error_within_the_longest_outage(monkeypatch, scheme, how):
+    policy = retry_policy(attempts=999, timeout_s=0.2, longest_outage_s=0.4)
+    with DEAD[how]() as dead:
+        conf = {
+            "hf": {"endpoint": dead, "token": False},
+            "s3": {"key": "key", "secret": "word", "endpoint_url": dead},
+        }
+        monkeypatch.setitem(fsspec.config.conf, scheme, conf[scheme])
+        root = {"hf": f"hf://datasets/{REPOSITORY}@{COMMIT}", "s3": "s3://bucket/shards"}[scheme]
+
+        text = ended(lambda: reason_of(root, policy))
+
+    assert f"{root}/x.tar : cannot be read, at byte 0 of 65536" in text
 
 
 def test_a_dead_server_is_a_named_error_in_a_forked_worker_too(served):
