@@ -103,7 +103,7 @@ class _Work:
 
     @contextmanager
     def noting(self, item: Any) -> Iterator[None]:
-        """Add the name of an item to whatever error its task raises."""
+        """Add the name of an item to any error that its task raises."""
         try:
             yield
         except BrokenProcessPool:
@@ -122,7 +122,7 @@ def engine_of(text: str, *, device: str = "cpu") -> Engine:
         device: Where tasks compute. On Ray each task has its own GPU, unless this is "cpu".
 
     Raises:
-        StorageError: If it is none of these.
+        StorageError: If the name is another one.
     """
     if text == "local":
         return LOCAL

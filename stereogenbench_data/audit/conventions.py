@@ -238,7 +238,7 @@ class _ExamineTask:
 
 
 def _spread(scenes: Sequence[Scene], count: int) -> list[Scene]:
-    """Return so many scenes or fewer, evenly spread."""
+    """Return at most this number of scenes, evenly spread."""
     return list(scenes[:: max(1, -(-len(scenes) // count))])
 
 

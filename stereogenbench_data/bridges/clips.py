@@ -195,7 +195,7 @@ class ClipOptions(WorkOptions, SceneFilters, PairOptions, total=False):
 
     Attributes:
         length: Its frames; the longest that every scene has and the layout takes unless given.
-        stride: Every so many frames of the video is one of the clip.
+        stride: Frames of the video from one frame of the clip to the next.
         step: Frames of the video from one clip's first to the next one's; no overlap unless given.
         size: (height, width) in pixels, or a text "WIDTHxHEIGHT"; None for the stored size.
         captions: "plain", or "with baseline" for captions that tell it.

@@ -88,7 +88,7 @@ def _placed(
 def sampled_pixels(
     image: PosedImage, points: int | None
 ) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
-    """Return rows and columns of measured pixels, row by row: all, or so many drawn at random.
+    """Return rows and columns of measured pixels, row by row: all, or ``points`` drawn at random.
 
     The same picture gives the same pixels each time.
     """

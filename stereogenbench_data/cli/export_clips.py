@@ -33,10 +33,8 @@ class ClipOptions:
         int | None,
         typer.Option(help="Frames of a clip [the most that fit]."),
     ] = None
-    stride: Annotated[int, typer.Option(help="Take every so many frames.")] = 1
-    step: Annotated[
-        int | None, typer.Option(help="Start a clip every so many frames [no overlap].")
-    ] = None
+    stride: Annotated[int, typer.Option(help="Take one of this many frames.")] = 1
+    step: Annotated[int | None, typer.Option(help="Frames from clip to clip [no overlap].")] = None
     size: SizeOption = None
     baseline_in_caption: Annotated[
         bool, flag("--baseline-in-caption", "Tell the baseline in the captions.")

@@ -53,14 +53,14 @@ _WORKERS, _SENT, _RETIRED = 0, 1, 2
 
 
 class BatchArrays:
-    """The fields of so many samples of one shape: one tensor each, of which a sample is a slice.
+    """The fields of samples of one shape: one tensor each, of which a sample is a slice.
 
     Attributes:
         count: How many samples there are.
     """
 
     def __init__(self, count: int, take: Callable[[str, int], torch.Tensor]) -> None:
-        """Begin without fields; ``take`` returns so many bytes for a field, by its name."""
+        """Begin without fields; ``take`` returns memory for a field, by its name and size."""
         self.count = count
         self._arrays: dict[str, np.ndarray] = {}
         self._slices: dict[str, tuple[torch.Tensor, ...]] = {}
@@ -117,7 +117,7 @@ class BatchBuffers:
         self._slots: _WorkerSlots | None = None
 
     def allocate(self, count: int) -> BatchArrays:
-        """Return the arrays for a batch of so many samples."""
+        """Return the arrays for a batch of ``count`` samples."""
         if self.kind == "fresh":
             return BatchArrays(count, fresh_bytes)
         if self._slots is not None:
@@ -263,7 +263,7 @@ class _WorkerSlots:
         )
 
     def _free_slot(self) -> int | None:
-        """Return a slot that nobody holds, None where there is none."""
+        """Return a slot that nobody holds, None where all are held."""
         for slot in range(SLOTS):
             status = int(self._status[slot])
             if status == _SENT or self._views[slot]() is not None:

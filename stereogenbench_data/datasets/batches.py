@@ -66,14 +66,14 @@ class EpochOptions(TypedDict, total=False):
             marked in the field ``is_padding`` (batch,) bool.
         shuffle_groups: How many groups of scenes are shuffled separately; batch n belongs to group
             n mod shuffle_groups. By default 4, but 2 where scenes are so large that a group has
-            fewer than 16 open; selections too small for so many groups have fewer. Each video is
+            fewer than 16 open; small selections have fewer groups. Each video is
             decoded by one process, once an epoch, if world_size * num_workers divides
             ``shuffle_groups``: make it that product or a multiple of it.
         open_scenes: The shuffle buffer, counted in scenes: how many each group interleaves. If left
             out 16, or the batch size where that is more, but of large pictures no more than about
             0.9 GB of decoders hold: of 1280x1280 pixels 16 with one pair a scene, and 4 with all
-            pairs. Fewer take less memory and shuffle less well. A process has so many of each group
-            that it reads.
+            pairs. Fewer take less memory and shuffle less well. A process has them of each
+            group that it reads.
         open_frames: How many neighbouring frames of each open scene are interleaved, where several
             samples show a frame (all pairs). A batch then shows more moments, and their pictures
             and depth stay in memory. If left out, as many as a batch has samples of an open scene,
@@ -95,11 +95,11 @@ class EpochBatch(list[int]):
     """The numbers of a batch's samples, with the epoch that they are drawn for.
 
     Attributes:
-        epoch: The epoch: of random frames and transforms, too, whatever epoch the dataset is at.
+        epoch: The epoch, of random frames and transforms, too; that of the dataset does not matter.
         is_padding: For each sample whether it fills up after the epoch's end; None where no sample
             ever does (without ``drop_last="pad"``).
         ends_of_runs: The samples after which their videos are wanted no more for now.
-        number: Its number among the batches of all ranks; None where it is none of an epoch's.
+        number: Its number among the batches of all ranks; None for a batch outside of an epoch.
         group: The shuffle group that it is of.
     """
 
@@ -489,7 +489,7 @@ class EpochBatches(Sampler[list[int]]):
         return rank_share(start, self.end(start), rank=self.rank, world_size=self.world_size)
 
     def require_group(self, rank: int, world_size: int) -> None:
-        """Require that the batches were made for a rank of so many, unless the user chose another.
+        """Require that the batches were made for this rank and world, unless the user chose others.
 
         Raises:
             SelectionError: If they were made for another one before the processes were known.
@@ -549,7 +549,7 @@ class EpochBatches(Sampler[list[int]]):
         return self.known_order.order(self.dataset.plan.runs, epoch)
 
     def state_at(self, epoch: int, batches: int) -> State:
-        """Return the state after so many global batches of an epoch."""
+        """Return the state after a number of global batches of an epoch."""
         return {
             "version": ORDER_VERSION,
             "epoch": epoch,
@@ -591,7 +591,7 @@ class EpochBatches(Sampler[list[int]]):
 
     @property
     def batches_of_all(self) -> int:
-        """How many batches hold all samples of an epoch, whatever ranks there are."""
+        """How many batches hold all samples of an epoch, those of all ranks."""
         return -(-len(self.dataset.plan) // self.rule.batch_size)
 
     @cached_property
@@ -636,7 +636,7 @@ def require_count(state: Mapping[str, Any], name: str, *, most: int | None = Non
     """Return a whole number from 0 of a state.
 
     Raises:
-        StateError: If it is none, or more than there can be.
+        StateError: If it is not a whole number, or more than there can be.
     """
     value = state.get(name)
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
@@ -698,10 +698,10 @@ class RepeatedDecodingWarning(UserWarning):
 def videos_to_keep(
     plan: Plan, rule: OrderRule, *, streams: frozenset[Stream], processes: int
 ) -> int:
-    """Return how many videos one of so many processes keeps open for its share of an epoch.
+    """Return how many videos one of several processes keeps open for its share of an epoch.
 
     A process reads every shuffle group of which it gets batches, each with its open scenes. A
-    warning says what to do if the process may not open so many files, or if several processes
+    warning says what to do if the process may not open that many files, or if several processes
     decode the same videos and more groups would avoid it.
     """
     from stereogenbench_data.samples.streams import OPEN_STREAMS  # slow to import: decoders

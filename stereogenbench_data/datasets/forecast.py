@@ -40,7 +40,7 @@ _MOST_PLANNED: Final = 16_384
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """What so many accelerators need, and what they get.
+    """What a number of accelerators needs, and what it gets.
 
     Attributes:
         accelerators: How many.

@@ -40,7 +40,7 @@ from stereogenbench_data.selection.plan import Plan
 
 _DESCRIBED_SAMPLES: Final = 100_000
 _DESCRIBED_BATCHES: Final = 200
-"""`LoaderStats.mixing` is computed for so many samples at most, from so many batches."""
+"""`LoaderStats.mixing` is computed for at most this number of samples and of batches."""
 
 
 class LoaderOptions(EpochOptions, total=False):
@@ -116,8 +116,8 @@ class PairsLoader(DataLoader[Any]):
     numbers of ranks and workers.
 
     Each pass is of the next epoch, unless an epoch was set since: after a whole pass, and after one
-    whose loop was left. So training loops need not call `set_epoch`, and a loop of so many steps an
-    epoch sees other samples in each. Only `load_state_dict` goes on inside an epoch. To repeat a
+    whose loop was left. So training loops need not call `set_epoch`, and a loop that stops
+    after some steps sees other samples in each epoch. Only `load_state_dict` goes on inside an epoch. To repeat a
     pass, as for validation on random frames, call ``set_epoch(0)`` before it.
 
     A pass owns its workers and their memory, so several passes over one loader can run at a time;

@@ -374,7 +374,7 @@ class _MappedScenes(Dataset[Sample]):
         return twin
 
     def keep_open(self, batches: EpochBatches, *, processes: int) -> None:
-        """Read by these batches, in one of so many processes: each video is opened once.
+        """Read by these batches, in one of several processes: each video is opened once.
 
         Videos are kept open for as many runs as the batches interleave, and closed after a run's
         last sample.
@@ -559,7 +559,7 @@ def _check_of(check: Check, plan: Plan) -> Literal["opened", "metadata"]:
     """Return when videos are compared with their checksums.
 
     Raises:
-        SelectionError: If the check is none of those.
+        SelectionError: If there is no such check.
     """
     if check not in get_args(Check):
         known = ", ".join(map(repr, get_args(Check)))

@@ -171,7 +171,7 @@ def _finite(
 def _parted(
     values: np.ndarray, names: list[str], place: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rotations and the translations of matrices, in whatever shape they are written."""
+    """Return the rotations and the translations of matrices, written in any shape."""
     sides = {16: (4, 4), 12: (3, 4), 9: (3, 3)}.get(values.shape[-1])
     if values.ndim == 3 and sides is not None:
         values = values.reshape(*values.shape[:-1], *sides)

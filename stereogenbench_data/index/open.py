@@ -1,4 +1,4 @@
-"""Opening an index: from a place, whatever it is, to a checked table of scenes.
+"""Opening an index: from a file, a folder or a URL to a checked table of scenes.
 
     a file ─────────────────────┬─ read ── root of its data ── digest ── is it stale?
     a folder with an index file ┘

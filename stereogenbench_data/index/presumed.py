@@ -198,7 +198,7 @@ class ListedTree:
 
     @property
     def has_one_shape(self) -> bool:
-        """Whether the conventions concern all scenes alike, whatever keys their files have."""
+        """Whether the conventions hold for all scenes, not only for files with certain keys."""
         return self.conventions is None or not self.conventions.shapes[0].has
 
     @property

@@ -661,7 +661,7 @@ def sized_as_videos(
     remarks: list[Remark],
     shape: Shape | None,
 ) -> Rig:
-    """Return the rig for pictures of the videos' size, which counts whatever baseline.json says.
+    """Return the rig for pictures of the videos' size; that in baseline.json does not count.
 
     A principal point, in pixels of the recorded image, moves with the size.
     """

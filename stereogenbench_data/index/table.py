@@ -104,7 +104,7 @@ class SceneIndex:
 
         Args:
             data: An index file; a folder with an ``index.parquet``, such as one of shards; the URL
-                of either (``https://``, ``hf://datasets/``, ``s3://`` or whatever fsspec opens),
+                of either (``https://``, ``hf://datasets/``, ``s3://``, or others of fsspec),
                 of which only the index is fetched; or a folder in the released layout.
             root: Where the data of an index file are, whatever the file says: any folder or URL
                 that you trust.
@@ -364,7 +364,7 @@ class SceneIndex:
 
     @property
     def digest(self) -> str:
-        """A sha256 of the rows: the same wherever, and by whatever version, they were written."""
+        """A sha256 of the rows: the same on every machine and in every version."""
         if not self._digest:
             presumption = self.presumption
             if presumption is not None and presumption.is_remote:

@@ -26,7 +26,7 @@ class BinaryFile(Protocol):
     """An open binary file that can be sought in, such as `open(path, "rb")` or `io.BytesIO`."""
 
     def read(self, size: int = -1, /) -> bytes:
-        """Return at most so many bytes."""
+        """Return at most ``size`` bytes."""
 
     def seek(self, offset: int, whence: int = 0, /) -> int:
         """Move to an offset; return it."""
@@ -36,7 +36,7 @@ class BinaryFile(Protocol):
 
 
 class SeekableFile(io.RawIOBase):
-    """A read-only file of so many bytes, whose subclasses read them.
+    """A read-only file of known size, whose subclasses read its bytes.
 
     Attributes:
         opens_by_header: Whether a video is opened by its header, so that no packet is fetched.
@@ -167,7 +167,7 @@ class Codec:
     """What reading has to know of a codec.
 
     Attributes:
-        is_lossless: Whether it returns what it was given, whatever its settings.
+        is_lossless: Whether it always returns what it was given.
         is_intra_only: Whether it stores each picture by itself, so that pictures are shown in the
             order of the file.
         skips_exactly: Whether its decoder drops, on NONREF, only pictures that no other is

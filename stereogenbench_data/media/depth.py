@@ -30,7 +30,7 @@ from stereogenbench_data.schema.records import DepthEncoding, DepthRisk
 from stereogenbench_data.schema.release import DEFAULT_DEPTH_UNIT_M
 
 ANY_DEPTH: Final = DepthEncoding(accept=frozenset(get_args(DepthRisk)))
-"""A contract that takes whatever holds one number a pixel."""
+"""A contract that takes any stream with one number a pixel."""
 
 NO_DEPTH_UNIT: Final = "its files do not tell how many metres a stored unit of depth has"
 DEPTH_CURES: Final = (
@@ -297,7 +297,7 @@ def resolve_encoding(
     Args:
         facts: What `probe` found.
         name: What messages call the file.
-        override: The user's contract, which holds whatever files say if it has a unit.
+        override: The user's contract, which counts instead of the files if it has a unit.
         stated: What the scene's JSON says.
 
     Raises:

@@ -231,7 +231,7 @@ class DepthFrames(FrameReader):
     """
 
     def __init__(self, file: VideoFile, *, name: str, frames: int | Literal["any"]) -> None:
-        """Open a file that must hold so many frames.
+        """Open a file that must hold ``frames`` frames.
 
         Args:
             file: A path, or a seekable binary file; the latter stays the caller's to close.

@@ -96,13 +96,13 @@ class SeekTable:
         return self.bounds[min(bisect_right(self.bounds, byte), self.packets)]
 
     def header_bytes(self, start: int, size: int | None) -> bytes:
-        """Return so many bytes of the header from a place on, none where packets lie."""
+        """Return bytes of the header from a place on, none where packets lie."""
         size = LARGEST_HEADER if size is None or size < 0 else size
         after = start - self.bounds[-1]
         return self.head[start : start + size] if after < 0 else self.tail[after : after + size]
 
     def fits(self, *, file_bytes: int) -> bool:
-        """Return whether it can be the table of a file of so many bytes."""
+        """Return whether it can be the table of a file of this size in bytes."""
         end = self.bounds[-1]
         return end + len(self.tail) == file_bytes if self.tail else end <= file_bytes
 

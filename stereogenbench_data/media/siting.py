@@ -240,7 +240,7 @@ class _Bits:
         self._left = len(content) * 8
 
     def take(self, count: int = 1) -> int:
-        """Return so many bits as a number."""
+        """Return the next bits as a number."""
         self._left -= count
         if self._left < 0:
             raise EOFError
@@ -259,7 +259,7 @@ class _Bits:
         return (number + 1) // 2 if number % 2 else -(number // 2)
 
     def skip(self, *counts: int) -> None:
-        """Pass over numbers: so many bits, or an Exp-Golomb number where it is 0."""
+        """Pass over numbers by their widths in bits; a width of 0 is an Exp-Golomb number."""
         for count in counts:
             _ = self.take(count) if count else self.golomb()
 

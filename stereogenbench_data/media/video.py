@@ -134,7 +134,7 @@ class VideoReader(FrameReader):
     """
 
     def __init__(self, file: VideoFile, *, name: str, frames: int) -> None:
-        """Open a video that must hold so many frames.
+        """Open a video that must hold ``frames`` frames.
 
         Args:
             file: A path, or a seekable binary file; the latter stays the caller's to close.

@@ -30,7 +30,7 @@ _AT_ONCE: Final = 32
 """So many samples are planned at most before the next one is read."""
 
 _SOON: Final = 16
-"""What so many samples after this one need is fetched at once."""
+"""What this many samples after this one need is fetched at once."""
 
 _REFILLED_AT: Final = 0.5
 """The share of the limit below which more is planned: many samples together need fewer requests."""

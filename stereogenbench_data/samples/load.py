@@ -141,7 +141,7 @@ class SampleLoader:
         return twin
 
     def keep_open(self, videos: int, *, frames: int = 1) -> None:
-        """Keep up to so many videos open, and so many frames of each, in each process."""
+        """Set how many videos, and how many frames of each, every process keeps open."""
         self._streams.limit, self._streams.kept_frames = videos, frames
 
     @property

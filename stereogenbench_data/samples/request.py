@@ -144,7 +144,7 @@ def parse_size(text: str) -> tuple[int, int]:
     """Return the (height, width) in pixels of a text WIDTHxHEIGHT.
 
     Raises:
-        FieldError: If the text is none, or a side is not 1 to 16384 pixels.
+        FieldError: If the text is not a size, or a side is not 1 to 16384 pixels.
 
     >>> parse_size("832x480")
     (480, 832)

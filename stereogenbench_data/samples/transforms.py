@@ -1,7 +1,7 @@
 """Transforms that move pictures, stored depth and cameras together.
 
 Each maps `Views` to `Views` with the random numbers of one sample, so the same seed gives the same
-sample in whatever process it is made. Pictures are averaged when they shrink; stored depth takes
+sample in every process. Pictures are averaged when they shrink; stored depth takes
 the nearest pixel centre, never a mixture of two depths. A pixel that was averaged with padding is
 no more measured than the padding. Every frame and camera of a sample is treated alike, unless a
 docstring says otherwise.

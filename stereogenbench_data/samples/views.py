@@ -44,7 +44,7 @@ class Views:
         intrinsics: Of every camera, after what was done to the pictures.
         world: "as recorded", or "mirrored" (x negated) after a horizontal flip.
         padded: (h, w) bool, pixels of every view that are padding or were averaged with padding.
-            They are never `measured`. None where there are none.
+            They are never `measured`. None where no pixel is padding.
         erased: (h, w) bool for each camera whose picture was painted over: where.
 
     Raises:

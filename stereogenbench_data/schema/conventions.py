@@ -252,7 +252,7 @@ class Conventions:
             where: The scene, for messages.
 
         Raises:
-            SchemaError: If there is none.
+            SchemaError: If no shape has these keys.
         """
         there: Collection[str] = () if not self.shapes[0].has else keys()
         for shape in self.shapes:
@@ -313,7 +313,7 @@ def shape_of_text(text: str) -> Shape:
     """Return the shape that an index keeps beside a scene.
 
     Raises:
-        SchemaError: If it is none.
+        SchemaError: If the text is not a shape.
     """
     where = "the conventions of a scene"
     return _shape(parse_object(text.encode(errors="surrogatepass"), where=where), where=where)

@@ -11,7 +11,7 @@ first batches would show first frames alone, and all streams would stay in step.
 
 Within a run moments ascend: a process that gets every batch of a group decodes each run once, but
 for what is skipped to reach the moment at which a stream starts. Where several samples show a
-moment (all pairs), so many neighbouring moments are interleaved as the rule has open frames.
+moment (all pairs), as many neighbouring moments are interleaved as the rule has open frames.
 A cut between groups may part a run: groups - 1 runs at the most.
 
 No more than a few thousand samples are ordered at a time, so memory and time until the first batch
@@ -44,7 +44,7 @@ DRIFT: Final = 0.1
 """How far a stream's pace may differ from the mean, so that streams do not run in step."""
 
 _CHUNK: Final = 1 << 15
-"""About so many samples of a group are ordered at a time."""
+"""About this many samples of a group are ordered at a time."""
 
 _MANY_RUNS: Final = 32
 """So many runs a stream are dealt out in their order; fewer so that streams are equally long."""
@@ -116,7 +116,7 @@ class OrderRule:
             raise SelectionError(f"shuffle must be True or False, got {self.shuffle!r}.")
 
     def groups_of(self, lengths: Numbers) -> int:
-        """Return into how many groups runs of so many samples are parted.
+        """Return into how many groups runs of this many samples are parted.
 
         So few that the longest run need not come twice in a batch, but two at least, of two
         runs each, so that two processes need not decode the same; and a divisor of
@@ -434,7 +434,7 @@ def last_batch(
         start: The batch from which these ranks go on.
 
     Raises:
-        SelectionError: If it is none of these.
+        SelectionError: If it is another word.
     """
     whole, all_of_them = samples // batch_size, -(-samples // batch_size)
     if drop_last is True:

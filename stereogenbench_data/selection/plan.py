@@ -190,7 +190,7 @@ def parse_frames(spec: Any) -> Windows:
             anywhere. Or any `Windows`.
 
     Raises:
-        SelectionError: If it is none of these, or a number in it is out of range.
+        SelectionError: If it is another form, or a number in it is out of range.
     """
     if isinstance(spec, Windows):
         return spec

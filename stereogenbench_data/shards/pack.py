@@ -81,7 +81,7 @@ def pack(  # noqa: PLR0913 - each is an option of the command
     """Pack a release into tar shards, or one part of it.
 
     Finished shards are kept, so a run that was stopped continues when it is run again. The same
-    release and target size give the same bytes, whatever the parts and the workers.
+    release and target size give the same bytes, for any number of parts and workers.
 
     Args:
         data: The release: its folder or index.

@@ -218,7 +218,7 @@ def _uncovered(state: _State, wanted: Wanted, sample: int) -> list[tuple[int, in
 
 
 def _touching(state: _State, place: Hashable, start: int, stop: int) -> list[_Part]:
-    """Return the parts that share a byte with a range; parts share none with each other."""
+    """Return the parts that share a byte with a range; parts do not overlap."""
     parts = state.parts.get(place, [])
     first = bisect_right(parts, start, key=_START)
     first -= first > 0 and parts[first - 1].stop > start

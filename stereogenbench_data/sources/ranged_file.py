@@ -33,7 +33,7 @@ class MemberFile(SeekableFile):
     """
 
     def __init__(self, size: int) -> None:
-        """Begin at the start of so many bytes."""
+        """Begin at the start of a file of ``size`` bytes."""
         super().__init__(size)
         self.failure: StorageError | None = None
 

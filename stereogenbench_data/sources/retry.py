@@ -15,7 +15,7 @@ MISSING: Final = "Check the URL, and that the index and its shards lie in one fo
 """The cure where an object does not exist."""
 
 CHUNK_BYTES: Final = 64 * 1024
-"""A read that received so many more bytes has its whole time and all its attempts again."""
+"""A read that received this many more bytes has its whole time and all its attempts again."""
 
 PASSING: Final = (408, 425, 429, 500, 502, 503, 504)
 """Status codes of failures that may pass."""
@@ -130,7 +130,7 @@ class Attempts:
         """Wait before the next attempt.
 
         Raises:
-            StorageError: If there is none.
+            StorageError: If no attempt is left.
         """
         policy = self._policy
         self._tries += 1
