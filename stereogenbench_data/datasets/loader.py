@@ -116,9 +116,9 @@ class PairsLoader(DataLoader[Any]):
     numbers of ranks and workers.
 
     Each pass is of the next epoch, unless an epoch was set since: after a whole pass, and after one
-    whose loop was left. So training loops need not call `set_epoch`, and a loop that stops
-    after some steps sees other samples in each epoch. Only `load_state_dict` goes on inside an epoch. To repeat a
-    pass, as for validation on random frames, call ``set_epoch(0)`` before it.
+    whose loop was left. So training loops need not call `set_epoch`, and a loop that stops after
+    some steps sees other samples in each epoch. Only `load_state_dict` goes on inside an epoch. To
+    repeat a pass, as for validation on random frames, call ``set_epoch(0)`` before it.
 
     A pass owns its workers and their memory, so several passes over one loader can run at a time;
     one that begins while another runs is of the same epoch. Workers that persist serve one pass at
