@@ -70,7 +70,7 @@ from stereogenbench_data.sources.remote import RemoteObject
 CACHE_VARIABLE: Final = "STEREOGENBENCH_CACHE"
 """The environment variable that names another folder for the cache, or is "off"."""
 
-_FORMAT: Final = 2
+_FORMAT: Final = 3
 _MOST_TABLES: Final = 8
 """So many selections of a tree are kept: each has a table of its own."""
 
@@ -269,8 +269,8 @@ class RemoteFolder(SceneFolder):
         parts: list[tuple[str, int, int]] = []
         for name in names:
             is_video = name.startswith("cam_")
-            is_read = is_video or self._files.get(name, (0, 0))[0] <= MAX_TEXT_BYTES
-            if name in self._files and name not in self._objects and is_read:
+            is_small = self._files.get(name, (0, 0))[0] <= MAX_TEXT_BYTES
+            if name in self._files and name not in self._objects and (is_video or is_small):
                 size, _ = self._files[name]
                 url = joined(str(self._root), f"{self.key}/{name}")
                 self._objects[name] = RemoteObject(url, expected_size=size)
