@@ -213,9 +213,15 @@ def turned(folder):
     edit_trajectory(folder, turn)
 
 
+def other_lens(folder):
+    document = json.loads((folder / "trajectory.json").read_text())
+    (folder / "trajectory.json").write_text(json.dumps(document | {"focal_length_mm": 99}))
+
+
 @pytest.mark.parametrize(
     ("change", "where", "check", "found"),
     [
+        (other_lens, "trajectory.json", "unreadable", "states another focal (99 mm) than baseline"),
         (pictures(2, lambda seen: (seen * 0.05).astype(np.uint8)), "cam_02_rgb.mp4", "too dark",
          "95th percentile of luma, of 255 is "),
         (flat, "cam_04_rgb.mp4", "flat", "of 255 is 0, frame 0 "),

@@ -224,6 +224,8 @@ class _SceneCheck:
         figures += self.alignment.figures()
         for camera in range(CAMERA_COUNT):
             figures += self._of_camera(camera)
+        if stated_twice := self.scene.remark("left"):
+            self.files.problems.setdefault(TRAJECTORY_JSON, stated_twice)
         return SceneAudit(
             key=self.scene.id.key,
             frames=self.scene.frames,
