@@ -6,7 +6,6 @@ among its values. A file counts only if it has one record of every scene, and wh
 some scenes with their own files first.
 """
 
-import csv
 import json
 import re
 from collections.abc import Iterator, Sequence
@@ -20,9 +19,8 @@ from stereogenbench_data.sources.retry import MissingObject
 FOLDER: Final = "metadata"
 
 _LARGEST_BYTES: Final = 64 * 2**20
-_KINDS: Final = (".jsonl", ".json", ".csv")
+_KINDS: Final = (".jsonl", ".json")
 _PATH: Final = re.compile(r"(?:^|/)((?:train/[^/]+|eval/[^/]+/[^/]+)/[^/]+/[^/]+)(?:/|$)")
-_NUMBER: Final = re.compile(r"[+-]?[0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?")
 
 
 def merged_records(root: str, keys: Sequence[str]) -> Iterator[dict[str, bytes]]:
@@ -52,16 +50,12 @@ def merged_records(root: str, keys: Sequence[str]) -> Iterator[dict[str, bytes]]
             else:
                 if len(found) == len(keys):
                     yield found
-        except (ValueError, RecursionError, csv.Error):
+        except (ValueError, RecursionError):
             continue  # not a file of records: each scene's own files are read
 
 
 def _records(text: str, name: str) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the objects of a file, each with the name it stands under, if any."""
-    if name.endswith(".csv"):
-        for row in csv.DictReader(text.splitlines()):
-            yield "", {column: _value(value) for column, value in row.items() if column}
-        return
     if name.endswith(".jsonl"):
         document: Any = [json.loads(line) for line in text.splitlines() if line.strip()]
     else:
@@ -71,13 +65,6 @@ def _records(text: str, name: str) -> Iterator[tuple[str, dict[str, Any]]]:
         named = [*node.items()] if isinstance(node, dict) else listed
         if all(isinstance(record, dict) for _, record in named):
             yield from named
-
-
-def _value(text: Any) -> Any:
-    """Return a cell of a table: a number, null or a text."""
-    if not isinstance(text, str) or not text:
-        return None
-    return json.loads(text) if _NUMBER.fullmatch(text) else text
 
 
 class _Scenes:
