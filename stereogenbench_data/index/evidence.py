@@ -10,9 +10,9 @@ fields on which they differ are refused. Pictures tell more: see `audit.contract
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -22,9 +22,8 @@ from stereogenbench_data.geometry.pose import OPENCV_FROM_UNREAL, CameraPoses
 from stereogenbench_data.geometry.pose_forms import Reading, readings
 from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
 from stereogenbench_data.schema.conventions import PosesAs
-from stereogenbench_data.schema.parse import contradictions
 from stereogenbench_data.schema.quantities import UNITS_M
-from stereogenbench_data.schema.records import Remark, Rig
+from stereogenbench_data.schema.records import Rig
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.schema.trajectory import RecordedPoses, record_poses
@@ -60,7 +59,7 @@ class Understood:
         names: The readings that pass and move the cameras differently in the world, the one that
             was taken first.
         is_named: Whether the file itself names that one.
-        told: What the file states otherwise than the rig, beside poses.
+        head: The file's JSON object, with some elements of long lists.
         first_frame: The number of the first frame that has poses.
         form: What the index keeps of it, for `poses_as`: None for the first form that the file
             itself names, if it is the only one to pass.
@@ -70,7 +69,7 @@ class Understood:
     names: tuple[str, ...]
     is_named: bool
     form: str | None
-    told: tuple[Remark, ...] = ()
+    head: dict[str, Any] = field(default_factory=dict)
     first_frame: int = 0
 
 
@@ -107,10 +106,9 @@ def understood_poses(
             factor of all baselines.
     """
     recorded = record_poses(text, where=where)
-    told = contradictions(recorded.head, rig, where=where)
     if named is None:
         plain = _fitting(readings(recorded), rig, where=where)
-        return replace(plain, told=told, first_frame=recorded.first_frame)
+        return replace(plain, head=recorded.head, first_frame=recorded.first_frame)
     found, own, reason = None, None, ""
     try:
         found = _fitting(_readings_as(recorded, named), rig, where=where)
@@ -121,7 +119,7 @@ def understood_poses(
     own_poses = own.poses if own is not None and own.is_named else None
     if found is not None and (own_poses is None or same_poses(found.poses, own_poses)):
         form, first_frame = "|".join(found.names), recorded.first_frame
-        return replace(found, form=form, told=told, first_frame=first_frame)
+        return replace(found, form=form, head=recorded.head, first_frame=first_frame)
     reason = reason or "the file names another form, which fits as well and differs"
     fits = "" if own is None else f" What fits is: {shortened(own.names[0], 300)}."
     stated = ((name, getattr(named, name)) for name in ("rotation", "form", "axes", "unit"))

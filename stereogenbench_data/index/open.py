@@ -493,6 +493,7 @@ def restated(
 
 _PHRASES: Final = {
     "size": "the videos' picture size counts, where baseline.json has another",
+    "stated": "the videos and baseline.json count, where files state otherwise",
     "baselines": "baselines that are not recorded are sums of their neighbours",
     "pair": "the primary pair of baseline.json counts, where another file has another",
     "frames": "the frames that all videos have are used",
@@ -511,10 +512,15 @@ class AssumptionWarning(UserWarning):
 def assumptions(scenes: Iterable[Scene], *, where: str) -> str:
     """Return what was taken for granted about scenes and what was measured; "" if nothing."""
     counts: Counter[str] = Counter()
+    firsts: dict[str, str] = {}
     for scene in scenes:
         if scene.conventions is not None:
             continue
-        counts.update({_PHRASES[each.about] for each in scene.remarks if each.about in _PHRASES})
+        found = {_PHRASES[each.about]: each for each in scene.remarks if each.about in _PHRASES}
+        counts.update(found.keys())
+        for phrase, each in found.items():
+            if each.about in ("size", "pair", "stated"):
+                firsts.setdefault(phrase, f", such as {each.text}")
         pixels = scene.remark("pixels").partition(": ")[2]
         counts.update([f"{pixels}; disparity follows from the sensor's width"] if pixels else [])
         form = (scene.pose_form or "").split("|")[0].partition(" @ ")[0]
@@ -523,7 +529,10 @@ def assumptions(scenes: Iterable[Scene], *, where: str) -> str:
                    "are the baselines"] += 1  # fmt: skip
     if not counts:
         return ""
-    told = "; ".join(f"{phrase} ({counted(count, 'scene')})" for phrase, count in counts.items())
+    told = "; ".join(
+        f"{phrase} ({counted(count, 'scene')}{firsts.get(phrase, '')})"
+        for phrase, count in counts.items()
+    )
     return (
         f"{where}: {told}. `stereogenbench conventions {where} -o conventions.toml` writes down "
         f"how its files are read, for conventions=."

@@ -65,12 +65,14 @@ from stereogenbench_data.schema.document import (
 )
 from stereogenbench_data.schema.parse import (
     contradictions,
+    counted_otherwise,
     parse_caption,
     parse_complete,
     parse_rig,
     parse_scene_key,
     require_unit,
 )
+from stereogenbench_data.schema.quantities import Values
 from stereogenbench_data.schema.records import (
     DepthEncoding,
     Member,
@@ -203,9 +205,6 @@ class _Description:
             text, where = self.folder.read(COMPLETE_JSON), self.where(COMPLETE_JSON)
             marked, odd = parse_complete(text, where=where)
         self.remarks += odd
-        if rig is not None and COMPLETE_JSON in self.files:
-            with suppress(SchemaError):
-                self.remarks += contradictions(parse_object(text, where=where), rig, where=where)
         texts: dict[str, bytes] = {
             name: self.folder.read(name) for name in DESCRIPTIONS if name in self.files
         }
@@ -231,7 +230,10 @@ class _Description:
             raise problems[0]
         if self.unread:
             self.remark("videos", "; ".join(self.unread.values()))
-        poses, pose_form = self.poses(rig, frames)
+        found = self.poses(rig, frames)
+        known = frames if self.document is None else None
+        self.contradicted(rig, labels, known, found)
+        poses, pose_form = (None, None) if found is None else (found.poses, found.form)
         frames = frames if poses is None else min(frames, poses.frame_count)
         own = {name: facts for name, facts in self.facts.items() if name in _DEPTHS}
         some = next(iter(own.items()), (depth_name(0), _NO_DEPTH))
@@ -268,6 +270,24 @@ class _Description:
             seek_tables=packed_tables(self.tables),
         )
         return self.derived(scene)
+
+    def contradicted(
+        self, rig: Rig, labels: SceneLabels, frames: int | None, poses: Understood | None
+    ) -> None:
+        """Note what the JSON files state otherwise than the videos and ``baseline.json``."""
+        where, ignores = self.where(BASELINE_JSON), self.shape.ignores if self.shape else None
+        own = Values(parse_object(self.folder.read(BASELINE_JSON), where=where), ignores=ignores)
+        self.remarks += counted_otherwise(
+            own, {"cameras": CAMERA_COUNT, "frames": frames}, where=where
+        )
+        others = {} if poses is None else {TRAJECTORY_JSON: poses.head}
+        if COMPLETE_JSON in self.files:
+            with suppress(SchemaError):
+                text = self.folder.read(COMPLETE_JSON)
+                others[COMPLETE_JSON] = parse_object(text, where=self.where(COMPLETE_JSON))
+        for name, head in others.items():
+            where = self.where(name)
+            self.remarks += contradictions(head, rig, labels, where=where, frames=frames)
 
     def probe(self, opened: Collection[str] | None) -> None:
         """Find what videos are, where their packets lie, and why others cannot be opened.
@@ -374,8 +394,8 @@ class _Description:
                     f"scene. Another video stands under this name: fetch it again."
                 )
 
-    def poses(self, rig: Rig, frames: int) -> tuple[CameraPoses | None, str | None]:
-        """Return the poses that fit the rig and the names of their readings, or neither.
+    def poses(self, rig: Rig, frames: int) -> Understood | None:
+        """Return the poses that fit the rig.
 
         Raises:
             SchemaError: If conventions state how poses are read, and they do not fit the rig.
@@ -396,12 +416,11 @@ class _Description:
                     f"file."
                 )
             self.remark("poses", reason)
-            return None, None
+            return None
         if count < frames or (
             count > frames and not any(each.about == "frames" for each in self.remarks)
         ):
             self.remark("frames", f"{told}. The first {min(count, frames)} are used")
-        self.remarks += found.told
         if len(found.names) > 1:
             listed = ", ".join(name.partition(" @ ")[0] for name in found.names)
             self.remark(
@@ -409,7 +428,7 @@ class _Description:
                 f"{where}: several readings of its poses fit the rig: {listed}; `stereogenbench "
                 f"doctor` tells by depth which is right",
             )
-        return found.poses, found.form
+        return found
 
     def understood(self, rig: Rig, where: str) -> tuple[Understood | None, str]:
         """Return poses that fit the rig, or why there are none."""
@@ -442,13 +461,16 @@ class _Description:
         """
         stated: list[Statement] = []
         own = BASELINE_JSON, TRAJECTORY_JSON, COMPLETE_JSON
-        for name in (name for name in self.files if name in own or name not in FILES):
+        read = (*own, DESCRIPTION_JSON)
+        for name in (name for name in self.files if name in read or name not in FILES):
             with suppress(SchemaError):
                 text, stem = self.folder.read(name), name.rpartition(".")[0]
                 if b"depth" in (stem.encode() + text).lower():
                     document = parse_object(text, where=name)
-                    about = "" if name in own else stem
-                    stated += stated_in_json(document, name=self.where(name), about=about)
+                    stated += stated_in_json(
+                        document, name=self.where(name), about="" if name in read else stem,
+                        is_prose=name == DESCRIPTION_JSON,
+                    )  # fmt: skip
         found: list[DepthEncoding | None] = []
         problems: list[str] = []
         for name, facts in depths:

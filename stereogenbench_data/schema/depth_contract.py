@@ -213,23 +213,30 @@ _JOINED: Final = re.compile(
 _ONLY_JOINED: Final = re.compile(rf"(?:{_JOINED.pattern})+")
 
 
-def stated_in_json(document: dict[str, Any], *, name: str, about: str = "") -> list[Statement]:
-    """Return what a metadata file says under keys that name depth, or in a file ``about`` it."""
+def stated_in_json(
+    document: dict[str, Any], *, name: str, about: str = "", is_prose: bool = False
+) -> list[Statement]:
+    """Return what a metadata file says under keys that name depth, or in a file ``about`` it.
+
+    Of ``is_prose``, such as the description of a scene, only units count: "depth" may be a caption.
+    """
     found: list[Statement] = []
     for node in nodes_of(document):
         place = words(f"{about} {node.path}")
         if "depth" not in place.split("_") or _OTHER_DEPTHS.search(place):
             continue
-        value = node.value
+        value, is_scale = node.value, not _SCALES.isdisjoint(node.name.split("_"))
+        if is_prose and isinstance(value, str) and not is_scale:
+            continue
         source = _Source(f"{name}: {node.path} is", "metadata", path=place)
         if isinstance(value, list) and value[:1] * CAMERA_COUNT == value:
             value = value[0]
         if isinstance(value, list) and len(value) != 2:
-            if not _SCALES.isdisjoint(node.name.split("_")):
+            if is_scale:
                 found.append(source.make("unclear", (), json.dumps(value)))
         elif not isinstance(value, dict):
             found += source.read(node.name, value)
-    return found
+    return [each for each in found if each.about in ("unit", "length unit")] if is_prose else found
 
 
 def agreed(statements: Sequence[Statement], *, largest: int) -> StatedDepth:

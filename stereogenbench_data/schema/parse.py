@@ -36,6 +36,7 @@ from stereogenbench_data.schema.quantities import (
     NAMES,
     SPEAKS_OF_PAIRS,
     UNITS_M,
+    Node,
     Stated,
     Values,
     as_stated,
@@ -245,13 +246,33 @@ def parse_rig(
     return rig, labels, tuple(file.remarks)
 
 
-def contradictions(head: dict[str, Any], rig: Rig, *, where: str) -> tuple[Remark, ...]:
-    """Return what another file of a scene states of lens, baselines and primary pair otherwise.
+def counted_otherwise(
+    values: Values, known: dict[str, int | None], *, where: str
+) -> tuple[Remark, ...]:
+    """Return which numbers of frames, cameras or pixels a file states that are not the known ones.
+
+    An animation's number of frames is its own.
+    """
+    odd = [
+        f"{each.path} states {quantity.replace('_', ' ')} {brief(each.value)}, not {count}"
+        for quantity, count in known.items()
+        for each in values.numbers(quantity)
+        if count not in (None, each.value) and "anim" not in each.path.lower()
+    ]
+    return (Remark("stated", f"{where}: {'; '.join(odd)}"),) if odd else ()
+
+
+def contradictions(
+    head: dict[str, Any], rig: Rig, labels: SceneLabels, *, where: str, frames: int | None = None
+) -> tuple[Remark, ...]:
+    """Return what another file of a scene states otherwise of lens, baselines, pair and labels.
 
     Args:
         head: That file's JSON object; of long lists, such as frames, some elements are enough.
-        rig: What ``baseline.json`` says.
+        rig: What ``baseline.json`` and the videos say.
+        labels: What ``baseline.json`` says.
         where: The other file's path, for messages.
+        frames: The number of frames of the videos, None where another may be right.
     """
     own = {
         "focal_length_mm": rig.focal_mm,
@@ -262,7 +283,8 @@ def contradictions(head: dict[str, Any], rig: Rig, *, where: str) -> tuple[Remar
     }
     other = {key: value for key, value in head.items() if "primary" not in words(key)}
     file = _RigFile(json.dumps({"rig": own, "other": other}).encode(), where=where)
-    file.rig(rig.recorded_size_px or (rig.image_width_px, rig.image_height_px))
+    width, height = rig.recorded_size_px or (rig.image_width_px, rig.image_height_px)
+    file.rig((width, height))
     found = [_OWN.sub(BASELINE_JSON, each).replace("$.other", "$") for each in file.problems
              if _OWN.search(each) or "in mm mean" in each]  # fmt: skip
     told = [Remark("left", f"{where}: {'; '.join(found)}. {_UNREAD}")] if found else []
@@ -272,6 +294,21 @@ def contradictions(head: dict[str, Any], rig: Rig, *, where: str) -> tuple[Remar
         if rig.primary_pair not in ((left, right), (left - 1, right - 1)):
             states = f"{where}: {each.path} states cameras {left} and {right}"
             told.append(Remark("pair", f"{states}. The primary pair of {BASELINE_JSON} counts"))
+    values = Values(head)
+    known = {
+        "cameras": CAMERA_COUNT,
+        "frames": frames,
+        "image_width": width,
+        "image_height": height,
+    }
+    told += counted_otherwise(values, known, where=where)
+    for name in ("scene_label", "scene_index", "map_name", "map_path", "character", "animation"):
+        label = getattr(labels, name)
+        for each in values.stated(name):
+            is_named = isinstance(each.at, Node) and each.at.plain == name
+            if is_named and label is not None and each.value not in (label, str(label)):
+                states = f"{where}: {each.path} states {brief(each.value)}, and {BASELINE_JSON}"
+                told.append(Remark("stated", f"{states} {brief(label)}"))
     return tuple(told)
 
 

@@ -34,6 +34,8 @@ NAMES: Final[dict[str, str]] = {
     "frame_width image_size_width camera_intrinsics_width intrinsics_width",
     "image_height": "image_height image_size_y resolution_y resolution_height height_px "
     "render_height frame_height image_size_height camera_intrinsics_height intrinsics_height",
+    "frames": "frame_count num_frames n_frames number_of_frames total_frames frames",
+    "cameras": "camera_count num_cameras n_cameras number_of_cameras",
     "principal_x": "cx c_x principal_point_x principal_x optical_center_x optical_centre_x",
     "principal_y": "cy c_y principal_point_y principal_y optical_center_y optical_centre_y",
     "sensor_fit": "sensor_fit",

@@ -96,6 +96,7 @@ REMARKS: Final = {
     "frames": "nothing: frames that all files have are used",
     "depth": "depth, unless you pass a DepthEncoding with its unit_m",
     "size": "nothing: the videos' size is used",
+    "stated": "nothing: the videos and baseline.json count",
     "lens": "nothing: models of lenses are not applied",
     "pixels": "nothing: disparity follows from the sensor's width",
     "marker": "nothing: no scene of the tree has its completion mark",

@@ -215,14 +215,13 @@ def test_a_journal_that_cannot_be_read_is_named(tmp_path):
 def test_an_eval_subset_is_reported_by_its_folder_else_by_its_map(
     make_scene, root, rewrite, folder, map_name, subset, notes
 ):
-    rewrite(
-        make_scene("train/Uniform/OnlyHere/scene_000000") / "baseline.json",
-        lambda document: document.update(map_name="OnlyHere"),
-    )
-    rewrite(
-        make_scene(f"eval/{folder}/Uniform/{map_name}/scene_000000") / "baseline.json",
-        lambda document: document.update(map_name=map_name),
-    )
+    for path, name in (
+        ("train/Uniform/OnlyHere/scene_000000", "OnlyHere"),
+        (f"eval/{folder}/Uniform/{map_name}/scene_000000", map_name),
+    ):
+        scene = make_scene(path)
+        for file in ("baseline.json", "_scene_complete.json"):
+            rewrite(scene / file, lambda document, name=name: document.update(map_name=name))
 
     report = walk(root)
 

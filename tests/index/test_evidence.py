@@ -21,7 +21,7 @@ from stereogenbench_data.index.evidence import (
     understood_poses,
 )
 from stereogenbench_data.schema.parse import contradictions
-from stereogenbench_data.schema.records import Rig
+from stereogenbench_data.schema.records import Rig, SceneLabels
 
 PLACES_CM = np.array([0.0, 6.5, 19.0, 26.5, 60.0, 66.0])
 RIG = Rig(
@@ -294,7 +294,8 @@ def test_lengths_that_differ_by_a_unit_are_stated_in_two_ways(unit):
 def test_another_primary_pair_than_that_of_the_rig_is_told_with_its_place(pair, is_other):
     found = understood(written("rotator", *TURNED, primary_stereo_pair=pair))
 
-    told = "".join(remark.text for remark in found.told if remark.about == "pair")
+    remarks = contradictions(found.head, RIG, SceneLabels(), where="trajectory.json")
+    told = "".join(remark.text for remark in remarks if remark.about == "pair")
     assert ("trajectory.json: $.primary_stereo_pair states cameras" in told) == is_other
 
 
@@ -314,7 +315,7 @@ def test_another_primary_pair_than_that_of_the_rig_is_told_with_its_place(pair, 
     ids=["focal length", "matrix", "angle", "sensor", "baselines", "the same", "no lengths"],
 )  # fmt: skip
 def test_another_lens_or_baseline_beside_the_poses_is_told_with_both_values(stated, told):
-    found = contradictions(stated, RIG, where="scene/trajectory.json")
+    found = contradictions(stated, RIG, SceneLabels(), where="scene/trajectory.json")
 
     assert re.search(told, "".join(remark.text for remark in found))
     assert {remark.about for remark in found} <= {"left"}
@@ -341,7 +342,8 @@ def test_a_focal_length_that_changes_over_frames_is_refused():
         for camera in frame["cameras"]:
             camera["focal_length_mm"] = 32.5 + number
 
-    (remark,) = understood(json.dumps(document).encode()).told
+    head = understood(json.dumps(document).encode()).head
+    (remark,) = contradictions(head, RIG, SceneLabels(), where="trajectory.json")
 
     assert remark.about == "left"
     assert re.search(r"frames\[1\]\.\S+focal_length_mm: states another focal", remark.text)

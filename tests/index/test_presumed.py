@@ -54,6 +54,7 @@ def whole_tree(tmp_path_factory, video):
     for number, key in enumerate(KEYS):
         (root / key).mkdir(parents=True)
         own = {"baseline.json": baseline_of(number), "trajectory.json": trajectory_of(number)}
+        own["_scene_complete.json"] = {"scene_label": own["baseline.json"]["scene_label"]}
         for name, document in (documents() | own).items():
             (root / key / name).write_text(json.dumps(document))
         for camera in range(6):

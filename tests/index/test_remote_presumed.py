@@ -32,11 +32,12 @@ def whole_release(small_release, tmp_path_factory):
     for number, key in enumerate(KEYS):
         (root / key).mkdir(parents=True)
         for file in drawn.iterdir():
-            if file.name != "baseline.json":
+            if file.suffix != ".json" or "scene_description" in file.name:
                 os.link(file, root / key / file.name)
-        baseline = json.loads((drawn / "baseline.json").read_text())
-        baseline["scene_label"] = f"Scene {number}"
-        (root / key / "baseline.json").write_text(json.dumps(baseline))
+        for name in ("baseline.json", "trajectory.json", "_scene_complete.json"):
+            document = json.loads((drawn / name).read_text())
+            document["scene_label"] = f"Scene {number}"
+            (root / key / name).write_text(json.dumps(document))
     return root
 
 

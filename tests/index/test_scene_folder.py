@@ -210,7 +210,14 @@ def test_depth_in_a_form_that_nothing_reads_stops_no_pictures(make_scene, root):
 
 @pytest.mark.parametrize(
     ("name", "text"),
-    [("notes.json", '{"depth_unit": "mm"}'), ("depth_meta.json", '{"unit": "mm"}')],
+    [
+        ("notes.json", '{"depth_unit": "mm"}'),
+        ("depth_meta.json", '{"unit": "mm"}'),
+        (
+            "scene_description_qwen_dataset_level.json",
+            '{"depth": "deep, some 9 metres", "max_depth_m": 30, "depth_scale": 0.001}',
+        ),
+    ],
 )
 def test_a_unit_of_depth_in_a_file_of_its_own_is_read(make_scene, root, video, name, text):
     folder = make_scene()
@@ -379,6 +386,28 @@ def test_a_damaged_file_is_remarked(make_scene, root, name, content, about, told
     (make_scene() / name).write_bytes(content)
 
     assert told in describe_scene(root, KEY).remark(about)
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "value", "told"),
+    [
+        ("baseline.json", "frame_count", 99, r"\$.frame_count states frames 99, not \d+$"),
+        ("baseline.json", "camera_count", 5, r"\$.camera_count states cameras 5, not 6$"),
+        ("trajectory.json", "num_frames", 99, r"\$.num_frames states frames 99, not \d+$"),
+        ("trajectory.json", "image_width", 9, r"\$.image_width states image width 9, not 32$"),
+        ("_scene_complete.json", "map_name", "Egypt", "map_name states 'Egypt', and baseline.json"),
+        ("baseline.json", "animations", {"frame_count": 99}, r"\A\Z"),
+    ],
+)
+def test_what_a_file_states_otherwise_is_told_with_its_place_and_does_not_count(
+    make_scene, root, rewrite, name, key, value, told
+):
+    rewrite(make_scene() / name, lambda document: document.update({key: value}))
+
+    scene = describe_scene(root, KEY)
+
+    assert re.search(told, scene.remark("stated"))
+    assert (scene.frames, scene.rig.image_width_px) == (4, 32)
 
 
 def test_all_problems_of_a_scene_are_told_at_once(make_scene, root, video):
