@@ -1,9 +1,9 @@
-"""Runs an example as it is, notes the samples that it takes, and kills it after some batches.
+"""Runs an example under torchrun, notes the samples that it takes, and kills a first attempt.
 
-python watched.py NOTES BATCHES EXAMPLE [ARGUMENTS]
+python watched.py NOTES BATCHES EXAMPLE
 
-Each batch of training samples that a torch DataLoader gives becomes a line of NOTES.RANK, its
-samples' names. After so many batches the process kills itself; 0 is never.
+The batches of training samples that a torch DataLoader gives become NOTES.ATTEMPT.RANK, a list of
+the names of each one's samples. After so many batches a process of the first attempt kills itself.
 """
 
 import json
@@ -22,20 +22,17 @@ def names_of(batch):
 
 
 def main():
-    notes, batches, example = sys.argv[1:4]
-    sys.argv[:] = sys.argv[3:]
+    notes, batches, example = sys.argv[1:]
+    sys.argv[:] = [example]
+    attempt, rank = os.environ["TORCHELASTIC_RESTART_COUNT"], os.environ["RANK"]
     take = dataloader._BaseDataLoaderIter.__next__
-    taken = 0
+    taken = []
 
     def noted(self):
-        nonlocal taken
         batch = take(self)
-        names = names_of(batch)
-        if names[0].startswith("train/"):
-            taken += 1
-            with Path(f"{notes}.{os.environ.get('RANK', '0')}").open("a") as file:
-                file.write(json.dumps(names) + "\n")
-        if taken == int(batches):
+        taken.append(names_of(batch))
+        Path(f"{notes}.{attempt}.{rank}").write_text(json.dumps(taken))
+        if attempt == "0" and len(taken) == int(batches):
             os.kill(os.getpid(), signal.SIGKILL)
         return batch
 
