@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 
 import pytest
 import torch
@@ -15,6 +14,7 @@ from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.trajectory import record_poses
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
+from tests.audit.corruption import copied
 from tests.cli.command import invoke
 
 RIGHT, WRONG = "opencv", "opengl"
@@ -95,17 +95,17 @@ def test_conventions_of_poses_that_depth_does_not_tell_stay_open_and_say_what_is
 
 
 def moved(root, **options):
-    """The motion of camera 0 from the first frame to frame 40."""
-    views = SceneViews(root, cameras=(0,), fields=("world_from_cam",), frames=(0, 40), **options)
+    """The motion of camera 0 from the first frame to the last."""
+    views = SceneViews(root, cameras=(0,), fields=("world_from_cam",), frames=(0, 6), **options)
     first, later = (views[row]["world_from_cam"] for row in (0, 1))
     return torch.linalg.inv(first) @ later
 
 
 def test_conventions_take_the_reading_that_depth_confirms_and_refuse_another(
-    shared_scenes, tmp_path
+    small_release, tmp_path
 ):
     root, file, edited = (tmp_path / name for name in ("tree", "c.toml", "edited.toml"))
-    shutil.copytree(shared_scenes, root, copy_function=shutil.copyfile)
+    copied(small_release / "train/Uniform/SynthStage/scene_000000", root)
     plain = moved(root)
     write_matrices(root)
     options = ("--pictures", 1, "--workers", 1)
@@ -115,7 +115,7 @@ def test_conventions_take_the_reading_that_depth_confirms_and_refuse_another(
     checked = invoke("conventions", root, "--check", edited, *options)
 
     assert learned.exit_code == 0, learned.stderr
-    assert re.search(r"# .*78%.*opencv axes.*\n\[poses\]", file.read_text())
+    assert re.search(r"# .*97%.*opencv axes.*\n\[poses\]", file.read_text())
     torch.testing.assert_close(moved(root, conventions=file), plain)
     assert checked.exit_code == 1
-    assert re.search(r"78%.*opencv.*WRONG.*opengl", checked.stderr)
+    assert re.search(r"97%.*opencv.*WRONG.*opengl", checked.stderr)
