@@ -14,7 +14,6 @@ from stereogenbench_data.cli.options import (
     size_of,
 )
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.writing import write_report
 from stereogenbench_data.schema.release import (
     FAMILIES,
     FRAME_COUNT,
@@ -70,16 +69,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
         ),
     ] = None,
     part: PartOption = "1/1",
-    plan_only: Annotated[bool, flag("--plan-only", "Propose and filter, render nothing.")] = False,
-    report: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            metavar="DIR",
-            help="Folder for a report on the proposals, and a picture of each scene.",
-        ),
-    ] = None,
+    plan_only: Annotated[bool, flag("--plan-only", "Report on proposals, render nothing.")] = False,
     work: WorkOptions,
 ) -> None:
     """Generate scenes with exact depth, poses and intrinsics, in the released layout.
@@ -93,10 +83,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.synthesis.planning import acceptance_markdown
     from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
     from stereogenbench_data.synthesis.render import RAY_CASTING
-    from stereogenbench_data.synthesis.review import write_sheets
 
-    if report is not None:
-        report.mkdir(parents=True, exist_ok=True)  # an error comes before the work
     if map_name is not None and "all" in map_name and len(map_name) > 1:
         raise typer.BadParameter(
             "'all' is all maps: give it alone, or name maps without it.", param_hint="--map"
@@ -121,23 +108,14 @@ def synth(  # noqa: PLR0913 - one parameter an option
         contract=ExportContract(depth_unit_m=depth_unit_m),
     )
     how: Any = {"renderer": chosen, "part": part, **work.options()}
-    with progress_bar("proposing", unit="scenes") as progress:
-        planned = plan_scenes(out, request, progress=progress, **how)
-    keys: list[str] = []
-    if not plan_only:
-        with progress_bar("drawing", unit="frames") as progress:
-            keys = synthesise(out, request, progress=progress, planned=planned, **how)
-    found = acceptance_markdown(planned.values())
-    if report is not None:
-        write_report(report / "report.md", found)
-    if report is not None and keys:
-        with progress_bar("pictures", unit="scenes") as progress:
-            how = {"unit_m": depth_unit_m, "progress": progress, **work.options()}
-            write_sheets(out, keys, folder=report, **how)
     if plan_only:
-        typer.echo(found.rstrip())
+        with progress_bar("proposing", unit="scenes") as progress:
+            planned = plan_scenes(out, request, progress=progress, **how)
+        typer.echo(acceptance_markdown(planned.values()).rstrip())
         return
+    with progress_bar("drawing", unit="frames") as progress:
+        keys = synthesise(out, request, progress=progress, **how)
     folders = sorted({key.rpartition("/")[0] for key in keys})
-    none = f" (part {part[0]}/{part[1]} of {scenes} has none, or all are held out)"
+    none = f" (part {part[0]}/{part[1]} of {scenes} has none)"
     where = f" in {', '.join(folders)}" if folders else none
     typer.echo(f"{out}: {counted(len(keys), 'scene')}{where}")

@@ -83,13 +83,11 @@ class Refusal:
         reason: The filter that refused it, such as "collision"; ``docs/generation.md`` has them.
         value: What was measured.
         limit: What the filter allows.
-        text: The same in words.
     """
 
     reason: str
     value: float
     limit: float
-    text: str
 
 
 # Where the subject stands.
@@ -126,19 +124,11 @@ def find_spawn(proposal: Proposal, *, world: World) -> Spawn | Refusal:
             floors.append(z)
         z -= _STEP_DOWN_M
     if not floors:
-        return Refusal(
-            "spawn_support",
-            0,
-            1,
-            f"no floor at ({x:.2f}, {y:.2f}) between {low[2]:g} and {high[2]:g} m",
-        )
+        return Refusal("spawn_support", 0, 1)
     rooms = [_cast_one(world, (x, y, floor + 0.05), (0.0, 0.0, 1.0)) + 0.05 for floor in floors]
     high_enough = [z for z, room in zip(floors, rooms, strict=True) if room >= LIMITS.headroom_m]
     if not high_enough:
-        return Refusal(
-            "spawn_space", max(rooms), LIMITS.headroom_m,
-            f"{max(rooms):.2f} m of headroom at ({x:.2f}, {y:.2f})",
-        )  # fmt: skip
+        return Refusal("spawn_space", max(rooms), LIMITS.headroom_m)
     floor = high_enough[int(pick * len(high_enough))]
     return Spawn(np.round(np.array([x, y, floor]), 6), yaw_deg)
 
@@ -170,20 +160,12 @@ def check_spawn(body_m: Float64[np.ndarray, "frames p 3"], *, world: World) -> R
     space = world.cast(origins.reshape(-1, 3), directions.reshape(-1, 3)).reshape(frames, -1)
     least = space.min(axis=1)
     if least.min() < LIMITS.body_space_m:
-        return Refusal(
-            "spawn_space", float(least.min()), LIMITS.body_space_m,
-            f"the map is {least.min():.2f} m from the subject at frame {int(least.argmin())}",
-        )  # fmt: skip
+        return Refusal("spawn_space", float(least.min()), LIMITS.body_space_m)
     # The soles may sink as far as the filter of support allows.
     low = body_m[..., 2] <= lowest[:, None] + LIMITS.support_gap_m
     seen = _sight(world, middle[:, None], body_m) | low
     if not seen.all():
-        share = float(seen.mean(axis=1).min())
-        return Refusal(
-            "spawn_space", share, 1.0,
-            f"{1 - share:.0%} of the subject is inside the map at frame "
-            f"{int(seen.mean(axis=1).argmin())}",
-        )  # fmt: skip
+        return Refusal("spawn_space", float(seen.mean(axis=1).min()), 1.0)
     # Ground beneath the sole that is lowest at a frame, and beneath the middle of the body.
     sole = body_m[np.arange(frames), body_m[..., 2].argmin(axis=1)]
     above = np.concatenate([sole, np.column_stack([middle[:, :2], lowest])])
@@ -191,16 +173,10 @@ def check_spawn(body_m: Float64[np.ndarray, "frames p 3"], *, world: World) -> R
     fall = world.cast(above, np.tile([0.0, 0.0, -1.0], (len(above), 1)))
     gap = np.where(np.isfinite(fall), np.abs(fall - _REACH_M), np.inf)
     if gap.max() > LIMITS.support_gap_m:
-        return Refusal(
-            "spawn_support", float(gap.max()), LIMITS.support_gap_m,
-            f"the ground is {gap.max():.2f} m from the soles at frame {int(gap.argmax()) % frames}",
-        )  # fmt: skip
+        return Refusal("spawn_support", float(gap.max()), LIMITS.support_gap_m)
     way_m = np.linalg.norm(np.diff(middle, axis=0), axis=1)
     if way_m.max(initial=0) > LIMITS.subject_step_m:
-        return Refusal(
-            "subject_motion", float(way_m.max()), LIMITS.subject_step_m,
-            f"the subject moves {way_m.max():.2f} m from frame {int(way_m.argmax())} to the next",
-        )  # fmt: skip
+        return Refusal("subject_motion", float(way_m.max()), LIMITS.subject_step_m)
     return None
 
 
@@ -247,11 +223,8 @@ class PoseChecks:
 
     def refusal(self, frame: int) -> Refusal:
         """Return why the pose of a frame is refused."""
-        reason = str(self.reasons[frame])
         value, limit = float(self.values[frame]), float(self.limits[frame])
-        return Refusal(
-            reason, value, limit, f"frame {frame}: {reason} {value:.3g}, limit {limit:.3g}"
-        )
+        return Refusal(str(self.reasons[frame]), value, limit)
 
 
 def check_poses(

@@ -93,30 +93,28 @@ def plan_scene(
         refused.append((proposal, result))
     reasons = Counter(refusal.reason for _, refusal in refused)
     raise SynthesisError(
-        f"scene {index} of {request.stream}: all of {MOST_PROPOSALS} proposals are refused ("
-        + ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
-        + "). Choose wider maps, another family or a shorter focal length."
+        f"scene {index} of {request.stream}: all of {MOST_PROPOSALS} proposals are refused "
+        f"({_counts(reasons)}). Choose wider maps, another family or a shorter focal length."
     )
 
 
 def acceptance_markdown(planned: Iterable[Planned]) -> str:
     """Return what became of proposals as a table in Markdown, by map and over all maps."""
-    groups: dict[str, list[Refusal | None]] = defaultdict(list)
+    accepted: Counter[str] = Counter()
+    refused: dict[str, Counter[str]] = defaultdict(Counter)
     for scene in planned:
-        for proposal, refusal in (*scene.refused, (scene.plan.proposal, None)):
-            for name in (_ALL_MAPS, proposal.map_name):
-                groups[name].append(refusal)
+        accepted.update((scene.plan.proposal.map_name, _ALL_MAPS))
+        for proposal, refusal in scene.refused:
+            for name in (proposal.map_name, _ALL_MAPS):
+                refused[name][refusal.reason] += 1
     rows = [("map", "proposals", "accepted", "refused for")]
-    for name in sorted(groups, key=lambda each: (each == _ALL_MAPS, each)):
-        found = groups[name]
-        reasons = Counter(refusal.reason for refusal in found if refusal)
-        accepted = len(found) - reasons.total()
-        rows.append(
-            (
-                name,
-                f"{len(found):,}",
-                f"{accepted:,} ({accepted / len(found):.1%})",
-                ", ".join(f"{reason} {count:,}" for reason, count in reasons.most_common()),
-            )
-        )
+    for name in sorted({*accepted, *refused}, key=lambda each: (each == _ALL_MAPS, each)):
+        reasons = refused[name]
+        count = accepted[name] + reasons.total()
+        found = f"{accepted[name]:,} ({accepted[name] / count:.1%})"
+        rows.append((name, f"{count:,}", found, _counts(reasons)))
     return "".join(f"{line}\n" for line in markdown_table(*rows))
+
+
+def _counts(reasons: Counter[str]) -> str:
+    return ", ".join(f"{reason} {count:,}" for reason, count in reasons.most_common())

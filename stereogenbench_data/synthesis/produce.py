@@ -8,27 +8,21 @@ and the next run of the same request goes on with what is missing.
 import hashlib
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager, suppress
-from dataclasses import replace
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, Unpack
 
+import numpy as np
 import torch
+from jaxtyping import Float64
 
-from stereogenbench_data.engine import (
-    LOCAL,
-    Advance,
-    Engine,
-    Progress,
-    advance_of,
-)
-from stereogenbench_data.errors import (
-    SynthesisError,
-    explain_os_errors,
-)
-from stereogenbench_data.jobs import do_items
+from stereogenbench_data.engine import Advance
+from stereogenbench_data.errors import SynthesisError, explain_os_errors
+from stereogenbench_data.jobs import WorkOptions, do_items
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.sources.files import try_locked
 from stereogenbench_data.synthesis.filters import Refusal
 from stereogenbench_data.synthesis.planning import Planned, plan_scene, propose
@@ -36,7 +30,6 @@ from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.render import RAY_CASTING
 from stereogenbench_data.synthesis.renderer import Renderer, ScenePlan
 from stereogenbench_data.synthesis.request import SynthRequest
-from stereogenbench_data.synthesis.review import HOLDOUT
 from stereogenbench_data.synthesis.scene_files import (
     check_pictures,
     completion_text,
@@ -44,7 +37,6 @@ from stereogenbench_data.synthesis.scene_files import (
     write_cameras,
 )
 
-_FEW: Final = 4
 _MOST_RENDERED: Final = 8
 """How many rendered proposals of one scene may fail their checks."""
 _CURE: Final = (
@@ -52,129 +44,132 @@ _CURE: Final = (
     "complete scenes are kept."
 )
 
-SearchTask = tuple[SynthRequest, Renderer, int, Sequence[tuple[Proposal, Refusal]]]
-"""A request, what draws it, a scene's number, and its proposals that were refused already."""
-RenderTask = tuple[ScenePlan, Renderer, tuple[int, ...], Path]
-"""A scene, what draws it, some of its cameras, and the folder for their videos."""
-
 FOLDER: Final = ".generation"
 """Where unfinished scenes are drawn, below the root."""
 
 
-def synthesise(  # noqa: PLR0913 - each names one thing that a user chooses
+def synthesise(
     out: str | Path,
     request: SynthRequest,
     *,
     renderer: Renderer = RAY_CASTING,
     part: tuple[int, int] = (1, 1),
-    workers: int | None = 1,
-    engine: Engine = LOCAL,
-    progress: Progress | None = None,
-    planned: dict[int, Planned] | None = None,
+    **options: Unpack[WorkOptions],
 ) -> list[str]:
     """Write scenes in the released layout; keep scenes that the same request wrote before.
 
     Args:
         out: Root of the tree; created if it does not exist.
-        request: The scenes. Scene i does not depend on the number of scenes or on ``workers``.
+        request: The scenes. Scene i does not depend on the number of scenes or of workers.
         renderer: What draws them.
         part: (i, n) writes the i-th of n parts of the scenes, with i from 1. All parts together
             are the same scenes as without parts.
-        workers: The number of processes; each renders one camera of one scene at a time. With 1,
-            this process renders; None is one a core. More are spawned, so a script must call
-            this function below ``if __name__ == "__main__"``.
-        engine: Where the processes run: `engine.LOCAL`, or an `engine.RayCluster`.
-        progress: Called repeatedly with the numbers of camera frames rendered so far and in total.
-        planned: What `plan_scenes` found, so that it is not searched for again. Scenes that fail
-            after rendering get another plan there.
+        **options: How it is done; progress is in frames of cameras. Each worker renders one scene
+            at a time. There is one unless ``workers`` is given, and this process renders; more
+            are spawned, so a script must call this function below ``if __name__ == "__main__"``.
 
     Returns:
-        The scenes' keys, by number. Scenes in the holdout are left out.
+        The scenes' keys, by number.
 
     Raises:
         SynthesisError: If there is no such part or map, another process draws this part now, a
             scene's folder has other content, a file cannot be written, or all proposals of a scene
             are refused.
+        SelectionError: If an option is unknown.
         StorageError: If ``workers`` is below 1 or a worker process dies.
     """
-    run = _Run(Path(out), request, renderer, workers, engine)
+    require_options(synthesise, options)
+    tree = _Tree(Path(out), request, renderer)
     indices = _of_part(request, part)
-    with _disk_errors(run.out):
-        there = run.existing(indices)
+    per_scene = CAMERA_COUNT * request.frames
+    with _disk_errors(tree.out):
+        there = tree.existing(indices)
         missing = [index for index in indices if index not in there]
         if missing:
-            planned = {} if planned is None else planned
-            planned |= run.search({index: () for index in missing if index not in planned})
-            due = {index: planned[index] for index in missing}
-            with run.held(part) as unfinished:
-                planned |= run.draw(due, unfinished=unfinished, progress=progress, done=len(there))
-            there = run.existing(indices)
-    return [key for _, key in sorted(there.items()) if key is not None]
+            with tree.held(part) as unfinished:
+                do_items(
+                    _draw,
+                    [(tree, index, unfinished) for index in missing],
+                    name=lambda task: f"scene {task[1]} of {request.stream}",
+                    options={"workers": 1, **options},
+                    done=len(there) * per_scene,
+                    total=len(indices) * per_scene,
+                )
+            there = tree.existing(indices)
+    return [key for _, key in sorted(there.items())]
 
 
-def plan_scenes(  # noqa: PLR0913 - the choices of `synthesise`
+def plan_scenes(
     out: str | Path,
     request: SynthRequest,
     *,
     renderer: Renderer = RAY_CASTING,
     part: tuple[int, int] = (1, 1),
-    workers: int | None = 1,
-    engine: Engine = LOCAL,
-    progress: Progress | None = None,
+    **options: Unpack[WorkOptions],
 ) -> dict[int, Planned]:
     """Search for the plans of the scenes that a tree does not have, without rendering them.
 
-    The arguments are those of `synthesise`; ``progress`` is called with the numbers of scenes.
+    The arguments are those of `synthesise`; progress is in scenes.
 
     Returns:
         What was found, by the scenes' numbers.
 
     Raises:
-        SynthesisError, StorageError: As `synthesise`.
+        SynthesisError, SelectionError, StorageError: As `synthesise`.
     """
-    run = _Run(Path(out), request, renderer, workers, engine)
+    require_options(plan_scenes, options)
+    tree = _Tree(Path(out), request, renderer)
     indices = _of_part(request, part)
-    with _disk_errors(run.out):
-        there = run.existing(indices)
-        missing = (index for index in indices if index not in there)
-        return run.search(dict.fromkeys(missing, ()), progress=progress, done=len(there))
+    found: list[Planned] = []
+    with _disk_errors(tree.out):
+        there = tree.existing(indices)
+        do_items(
+            _plan,
+            [(tree, index) for index in indices if index not in there],
+            name=lambda task: f"scene {task[1]} of {request.stream}",
+            keep=found.append,
+            options={"workers": 1, **options},
+            done=len(there),
+            total=len(indices),
+        )
+    return {each.plan.proposal.index: each for each in found}
 
 
-class _Run:
-    """One run of a request in a tree."""
+@dataclass(frozen=True, slots=True)
+class _Tree:
+    """The scenes of a request in a tree; it is pickled into worker processes."""
 
-    def __init__(
-        self,
-        out: Path,
-        request: SynthRequest,
-        renderer: Renderer,
-        workers: int | None,
-        engine: Engine,
-    ) -> None:
-        for name in set(request.maps) - set(renderer.maps):
+    out: Path
+    request: SynthRequest
+    renderer: Renderer
+
+    def __post_init__(self) -> None:
+        """Refuse maps that the renderer does not have."""
+        for name in set(self.request.maps) - set(self.renderer.maps):
             # The renderer has others, or says what it has.
-            alone = replace(request, map_name=name)
-            renderer.world(propose(alone, index=0, number=0, renderer=renderer))
-        self.out, self.request, self.renderer = out, request, renderer
-        self.workers, self.engine = workers, engine
-        self.drawn_by = f"{renderer.name} {renderer.fingerprint}"
+            alone = replace(self.request, map_name=name)
+            self.renderer.world(propose(alone, index=0, number=0, renderer=self.renderer))
 
-    def existing(self, indices: list[int]) -> dict[int, str | None]:
-        """Return the keys of the scenes that the tree has; None for those in the holdout.
+    @property
+    def drawn_by(self) -> str:
+        """What the completion marker says of the renderer."""
+        return f"{self.renderer.name} {self.renderer.fingerprint}"
+
+    def existing(self, indices: list[int]) -> dict[int, str]:
+        """Return the keys of the scenes that the tree has.
 
         Raises:
             SynthesisError: If another request wrote one of them.
         """
-        found: dict[int, str | None] = {}
-        for root in (self.out / HOLDOUT, self.out):
-            for name in self.request.maps:
-                folder = root / self.request.folder(name)
-                there = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-                for index in indices:
-                    key = self.request.key(index, map_name=name)
-                    if key.rpartition("/")[2] in there:
-                        self._require_own(root / key, index)
-                        found[index] = key if root == self.out else None
+        found: dict[int, str] = {}
+        for name in self.request.maps:
+            folder = self.out / self.request.folder(name)
+            there = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+            for index in indices:
+                key = self.request.key(index, map_name=name)
+                if key.rpartition("/")[2] in there:
+                    self._require_own(self.out / key, index)
+                    found[index] = key
         return found
 
     def _require_own(self, folder: Path, index: int) -> None:
@@ -189,109 +184,6 @@ class _Run:
             f"{folder}: another request wrote this scene (its {COMPLETE_JSON} differs or is "
             f"missing). Choose another output or another map, or move the folder away."
         )
-
-    def search(
-        self,
-        before: Mapping[int, Sequence[tuple[Proposal, Refusal]]],
-        *,
-        progress: Progress | None = None,
-        done: int = 0,
-    ) -> dict[int, Planned]:
-        """Return a plan of each scene, given its proposals that were refused before."""
-        found: list[Planned] = []
-        # To start processes takes longer than a few searches.
-        few = len(before) <= _FEW
-        do_items(
-            _search,
-            [(self.request, self.renderer, *each) for each in before.items()],
-            name=lambda task: f"scene {task[2]} of {self.request.stream}",
-            keep=found.append,
-            options={
-                "engine": LOCAL if few else self.engine,
-                "workers": 1 if few else self.workers,
-                "progress": progress,
-            },
-            done=done,
-            total=done + len(before),
-        )
-        return {each.plan.proposal.index: each for each in found}
-
-    def draw(
-        self,
-        due: dict[int, Planned],
-        *,
-        unfinished: Path,
-        progress: Progress | None,
-        done: int,
-    ) -> dict[int, Planned]:
-        """Render scenes until each passes its checks, given how many there are already.
-
-        Returns:
-            What was found for those whose first plan failed its checks.
-        """
-        per_scene = CAMERA_COUNT * self.request.frames
-        total = (done + len(due)) * per_scene
-        advance = advance_of(progress, done=done * per_scene, total=total)
-        advance(0)
-        refused: dict[int, Refusal] = {}
-        others: dict[int, Planned] = {}
-        for _ in range(_MOST_RENDERED):
-            refused = self._rendered(due, unfinished=unfinished, advance=advance)
-            if not refused:
-                return others
-            # A scene that failed its checks goes on with its next proposal.
-            due = self.search(
-                {
-                    index: [*due[index].refused, (due[index].plan.proposal, refusal)]
-                    for index, refusal in refused.items()
-                }
-            )
-            others |= due
-        index, last = next(iter(refused.items()))
-        raise SynthesisError(
-            f"{self.request.stream}: {_MOST_RENDERED} rendered proposals of scene {index} fail "
-            f"their checks, the last one with {last.reason} ({last.text}). Check the renderer's "
-            f"maps and lights, and the depth's unit."
-        )
-
-    def _rendered(
-        self,
-        planned: Mapping[int, Planned],
-        *,
-        unfinished: Path,
-        advance: Advance,
-    ) -> dict[int, Refusal]:
-        """Render scenes, move those that pass to their places, and return why others do not."""
-        together = self.renderer.cameras_per_task
-        tasks: list[RenderTask] = []
-        for plan in (planned[index].plan for index in sorted(planned)):
-            folder = unfinished / plan.key
-            folder.mkdir(parents=True)
-            for first in range(0, CAMERA_COUNT, together):
-                cameras = tuple(range(first, first + together))
-                tasks.append((plan, self.renderer, cameras, folder))
-        measured: dict[int, dict[int, Any]] = {index: {} for index in planned}
-        refused: dict[int, Refusal] = {}
-        rendered = self.engine.map(
-            _render,
-            tasks,
-            name=lambda task: f"{task[0].key}, camera {', '.join(map(str, task[2]))}",
-            workers=self.workers,
-            advance=advance,
-        )
-        with closing(rendered):
-            for plan, rows in rendered:
-                index = plan.proposal.index
-                measured[index] |= rows
-                if len(measured[index]) < CAMERA_COUNT:
-                    continue
-                refusal = check_pictures(measured[index])
-                if refusal is None:
-                    self._finish(plan, unfinished)
-                    continue
-                refused[index] = refusal
-                shutil.rmtree(unfinished / plan.key)
-        return refused
 
     @contextmanager
     def held(self, part: tuple[int, int]) -> Iterator[Path]:
@@ -316,12 +208,51 @@ class _Run:
             finally:
                 shutil.rmtree(unfinished, ignore_errors=True)
 
-    def _finish(self, plan: ScenePlan, unfinished: Path) -> None:
+    def draw(self, index: int, unfinished: Path, after_frames: Advance) -> None:
+        """Render proposals of a scene until one passes its checks, and move it to its place."""
+        refused: list[tuple[Proposal, Refusal]] = []
+        for _ in range(_MOST_RENDERED):
+            plan, before = plan_scene(
+                self.request, index=index, renderer=self.renderer, before=refused
+            )
+            folder = unfinished / plan.key
+            folder.mkdir(parents=True)
+            refusal = check_pictures(self._rendered(plan, folder, after_frames))
+            if refusal is None:
+                self._finish(plan, folder)
+                return
+            shutil.rmtree(folder)
+            # The scene goes on with its next proposal.
+            refused = [*before, (plan.proposal, refusal)]
+        _, last = refused[-1]
+        raise SynthesisError(
+            f"{self.request.stream}: {_MOST_RENDERED} rendered proposals of scene {index} fail "
+            f"their checks, the last one with {last.reason} ({last.value:.3g}, limit "
+            f"{last.limit:.3g}). Check the renderer's maps and lights, and the depth's unit."
+        )
+
+    def _rendered(
+        self, plan: ScenePlan, folder: Path, after_frames: Advance
+    ) -> dict[int, Float64[np.ndarray, "frames 4"]]:
+        """Write the videos of all cameras, and return what they show (`write_cameras`)."""
+        measured: dict[int, Float64[np.ndarray, "frames 4"]] = {}
+        together = self.renderer.cameras_per_task
+        for first in range(0, CAMERA_COUNT, together):
+            measured |= write_cameras(
+                plan,
+                renderer=self.renderer,
+                cameras=tuple(range(first, first + together)),
+                folder=folder,
+                after_frame=lambda: after_frames(1),
+            )
+        return measured
+
+    def _finish(self, plan: ScenePlan, folder: Path) -> None:
         """Complete a rendered scene and move it to its place.
 
         The completion marker is written last, and the scene appears whole, by one renaming.
         """
-        folder, target = unfinished / plan.key, self.out / plan.key
+        target = self.out / plan.key
         description = self.renderer.description(plan)
         texts = metadata_texts(plan, renderer=self.drawn_by, description=description)
         for name, text in texts.items():
@@ -333,28 +264,22 @@ class _Run:
             folder.rename(target)
 
 
-def _search(task: SearchTask, after_scene: Advance) -> Planned:
+def _plan(task: tuple[_Tree, int], after_scene: Advance) -> Planned:
     """Search for a scene's plan; a worker process calls this."""
-    request, renderer, index, before = task
-    planned = plan_scene(request, index=index, renderer=renderer, before=before)
+    tree, index = task
+    planned = plan_scene(tree.request, index=index, renderer=tree.renderer)
     after_scene(1)
     return planned
 
 
-def _render(task: RenderTask, after_frames: Advance) -> tuple[ScenePlan, dict[int, Any]]:
-    """Write the videos of cameras; a worker process calls this."""
-    plan, renderer, cameras, folder = task
+def _draw(task: tuple[_Tree, int, Path], after_frames: Advance) -> None:
+    """Draw a scene; a worker process calls this."""
+    tree, index, unfinished = task
     # Torch renders with one thread, because its rounding depends on the number of threads.
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return plan, write_cameras(
-            plan,
-            renderer=renderer,
-            cameras=cameras,
-            folder=folder,
-            after_frame=lambda: after_frames(1),
-        )
+        tree.draw(index, unfinished, after_frames)
     finally:
         torch.set_num_threads(threads)
 

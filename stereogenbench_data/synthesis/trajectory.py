@@ -142,11 +142,8 @@ class _Search:
             refused.update(checks.reasons[~checks.passed].tolist())
             pool = pool[checks.passed]
             if len(pool) < LIMITS.viewpoints:
-                ((reason, most),) = refused.most_common(1)
-                return Refusal(
-                    reason, len(pool), LIMITS.viewpoints,
-                    f"{len(pool)} of {_CANDIDATES} viewpoints hold, {most} fail {reason}",
-                )  # fmt: skip
+                ((reason, _),) = refused.most_common(1)
+                return Refusal(reason, len(pool), LIMITS.viewpoints)
         return pool
 
     def checks(self, centres_m: Array, rotators_deg: Array, *, frames: Any) -> PoseChecks:
@@ -199,10 +196,7 @@ class _Search:
             tried.append(self._targets(pool, viewpoints[-1]))
         if knots[-1].frame == self.frames - 1:
             return np.round(path, _DIGITS)
-        return Refusal(
-            "transition", reached, self.frames,
-            f"the path breaks off after {reached} of {self.frames} frames",
-        )  # fmt: skip
+        return Refusal("transition", reached, self.frames)
 
     def _targets(self, pool: Array, viewpoint: Array) -> Iterator[Array]:
         """Return viewpoints to go to from one, in random order; the last is to stay there."""
@@ -228,16 +222,13 @@ class _Search:
 def _check_motion(plan: ScenePlan) -> Refusal | None:
     """Refuse a path with a jump."""
     step_m, turn_deg = plan.steps()
-    for name, values, limit in (
-        ("m a frame", step_m, LIMITS.step_m),
-        ("degrees a frame", turn_deg, LIMITS.turn_deg),
-        ("degrees a frame more or less", np.abs(np.diff(turn_deg)), LIMITS.jerk_deg),
+    for values, limit in (
+        (step_m, LIMITS.step_m),
+        (turn_deg, LIMITS.turn_deg),
+        (np.abs(np.diff(turn_deg)), LIMITS.jerk_deg),
     ):
         if values.max(initial=0) > limit:
-            return Refusal(
-                "motion", float(values.max()), limit,
-                f"{values.max():.3g} {name} at frame {int(values.argmax()) + 1}",
-            )  # fmt: skip
+            return Refusal("motion", float(values.max()), limit)
     return None
 
 

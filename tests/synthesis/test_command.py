@@ -81,14 +81,3 @@ def test_a_part_without_scenes_says_so(tmp_path):
 
     assert result.exit_code == 0
     assert "0 scenes (part 2/2 of 1 has none" in result.stdout
-
-
-def test_where_nothing_can_be_written_is_told_before_the_work(tmp_path):
-    (tmp_path / "file").touch()
-    place = f"{tmp_path}/file/report"
-
-    with pytest.raises(NotADirectoryError) as told:
-        CliRunner().invoke(app, [f"{tmp_path}/out", *SMALL, "-o", place], catch_exceptions=False)
-
-    assert told.value.filename == place
-    assert not (tmp_path / "out").exists()

@@ -61,7 +61,6 @@ def test_a_pit_refuses_the_subject_that_walks_over_it():
     assert refusal.reason == "spawn_support"
     assert refusal.value == pytest.approx(3.0)
     assert refusal.limit == LIMITS.support_gap_m
-    assert "3.00 m" in refusal.text
 
 
 def test_nothing_below_the_subject_refuses_it():
@@ -257,7 +256,6 @@ def test_a_subject_that_jumps_from_one_frame_to_the_next_is_refused():
 
     assert (refusal.reason, refusal.limit) == ("subject_motion", LIMITS.subject_step_m)
     assert refusal.value == pytest.approx(1.0 + 1 / 80)
-    assert "1.01 m from frame 3 to the next" in refusal.text
 
 
 def test_a_subject_may_run():
@@ -289,7 +287,7 @@ def test_a_cell_around_the_subject_refuses_all_viewpoints():
     assert isinstance(refusal, Refusal)
     assert refusal.reason == "visibility"
     assert refusal.limit == LIMITS.viewpoints
-    assert "of 96 viewpoints hold" in refusal.text
+    assert refusal.value < LIMITS.viewpoints
 
 
 def test_a_yard_that_walls_cut_has_a_path_all_of_which_passes():

@@ -1,7 +1,6 @@
-"""Generation as a whole: parts, resuming, what is refused after rendering, reports, the holdout."""
+"""Generation as a whole: parts, resuming, what is refused after rendering, reports."""
 
 import json
-import os
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,7 +20,7 @@ from stereogenbench_data.synthesis.produce import FOLDER, plan_scenes, synthesis
 from stereogenbench_data.synthesis.render import RAY_CASTING, RayCasting
 from stereogenbench_data.synthesis.renderer import RenderedView
 from stereogenbench_data.synthesis.request import SynthRequest
-from stereogenbench_data.synthesis.review import hold_out, write_sheets
+from stereogenbench_data.synthesis.scene_files import check_pictures, write_cameras
 
 app = typer.Typer()
 app.command()(synth)
@@ -101,17 +100,6 @@ def test_parts_together_are_the_same_scenes_as_one_run(tmp_path):
     assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
 
 
-def test_what_a_plan_found_is_drawn_without_another_search(tmp_path, monkeypatch):
-    request = SynthRequest(scenes=2, family="Uniform", map_name=MIXED, **SMALL)
-    planned = plan_scenes(tmp_path / "planned", request)
-    whole = synthesise(tmp_path / "whole", request)
-    monkeypatch.setattr(RayCasting, "world", None)
-
-    assert synthesise(tmp_path / "planned", request, planned=planned) == whole
-    assert contents(tmp_path / "planned") == contents(tmp_path / "whole")
-    assert plan_scenes(tmp_path / "planned", request) == {}
-
-
 @pytest.mark.parametrize("part", [(0, 2), (3, 2)])
 def test_a_part_that_is_none_is_refused(tmp_path, part):
     with pytest.raises(SynthesisError, match=r"part ./.: .* from 1 to the second"):
@@ -174,14 +162,16 @@ def test_a_scene_that_fails_after_rendering_is_replaced_by_its_next_proposal(
     first = plan_scene(request, index=0)[0].proposal.number
 
     renderer = Spoilt(number=first, **spoilt)
-    planned = plan_scenes(tmp_path, request, renderer=renderer)
+    measured = write_cameras(
+        plan_scene(request, index=0).plan,
+        renderer=renderer, cameras=(0,), folder=tmp_path, after_frame=int,
+    )  # fmt: skip
+    assert check_pictures(measured).reason == reason
 
-    (key,) = synthesise(tmp_path, request, renderer=renderer, planned=planned)
+    (key,) = synthesise(tmp_path / "tree", request, renderer=renderer)
 
-    proposal, refusal = planned[0].refused[first]
-    assert (proposal.number, refusal.reason) == (first, reason)
-    marker = json.loads((tmp_path / key / "_scene_complete.json").read_text())
-    assert marker["synthesis"]["proposal"] == planned[0].plan.proposal.number > first
+    marker = json.loads((tmp_path / "tree" / key / "_scene_complete.json").read_text())
+    assert marker["synthesis"]["proposal"] > first
 
 
 def test_a_renderer_that_always_fails_its_checks_ends_with_the_reason(tmp_path, monkeypatch):
@@ -211,7 +201,7 @@ def test_a_request_that_does_not_fit_the_tree_decides_nothing(tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-# Reports, sheets and the holdout.
+# Reports.
 
 
 def test_the_report_counts_acceptance_by_map_and_reason_and_wide_rigs_are_refused_more(tmp_path):
@@ -239,55 +229,16 @@ def test_the_report_counts_acceptance_by_map_and_reason_and_wide_rigs_are_refuse
     assert realised_cm < proposed_cm - 5
 
 
-def test_contact_sheets_show_every_scene_once(tmp_path):
-    keys = synthesise(tmp_path, SynthRequest(**SMALL))
-
-    def sheets():
-        return write_sheets(tmp_path, keys, folder=tmp_path / "sheets", unit_m=0.001)
-
-    (path,) = sheets()
-
-    assert path.name == "train__IPD_Gaussian__SynthStage__scene_000000.png"
-    before = path.stat().st_mtime_ns
-    assert sheets() == [path]
-    assert path.stat().st_mtime_ns == before
-    os.utime(path, ns=(0, 0))  # As of a scene that was there before this one.
-    sheets()
-    assert path.stat().st_mtime_ns >= before
-
-
-def test_held_out_scenes_leave_the_tree_and_do_not_come_back(tmp_path):
-    request = SynthRequest(scenes=2, **SMALL)
-    first, second = synthesise(tmp_path, request)
-
-    assert hold_out(tmp_path, [first]) == [first]
-    assert hold_out(tmp_path, [first]) == []
-    assert not (tmp_path / first).exists()
-    assert synthesise(tmp_path, request) == [second]
-    assert not (tmp_path / first).exists()
-
-
-@pytest.mark.parametrize("key", ["train/Uniform/Elsewhere/scene_000000", "../outside"])
-def test_a_holdout_of_what_is_no_scene_moves_nothing(tmp_path, key):
-    (there,) = synthesise(tmp_path, SynthRequest(**SMALL))
-
-    with pytest.raises(SynthesisError, match=r"there is no scene .* to hold out"):
-        hold_out(tmp_path, [there, key])
-    assert (tmp_path / there).is_dir()
-
-
 # The command.
 
 
-def test_the_command_plans_and_reports(tmp_path):
-    out, report = tmp_path / "out", tmp_path / "report"
+def test_the_command_plans_and_draws(tmp_path):
+    out = tmp_path / "out"
     mixed = [str(out), "--size", "32", "--frames", "1", "--workers", "1", "--family", "Uniform"]
-    mixed += ["--map", "SynthYard", "--map", "SynthHall", "--scenes", "2", "-o", str(report)]
+    mixed += ["--map", "SynthYard", "--map", "SynthHall", "--scenes", "2"]
 
     planned = CliRunner().invoke(app, [*mixed, "--plan-only"], catch_exceptions=False)
     drawn = CliRunner().invoke(app, [*mixed, "--part", "1/2"], catch_exceptions=False)
 
     assert "all maps" in planned.stdout
     assert drawn.stdout.startswith(f"{out}: 1 scene in ")
-    assert len(list(report.glob("*.png"))) == 1
-    assert "all maps" in (report / "report.md").read_text()
