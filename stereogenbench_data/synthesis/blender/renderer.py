@@ -34,7 +34,7 @@ from stereogenbench_data.synthesis.renderer import (
 )
 from stereogenbench_data.synthesis.request import SENSOR_MM
 
-_VERSION: Final = 1
+_VERSION: Final = 2
 """Goes up when the same assets give other scenes."""
 
 

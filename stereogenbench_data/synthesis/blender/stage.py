@@ -3,17 +3,15 @@
 A process of its own imports it (`process.py`), because Blender is a global of its process.
 
 Axes here are Blender's: right-handed, x and y level, z up, in units of the map's file; `Mirror`
-turns map axes into them. Blender evaluates a scene anew for each render, and otherwise than for its
-windows. So triangles for depth are taken from the evaluation that Cycles renders.
+turns map axes into them. Depth is Cycles' own, of a render of one ray through the centre of each
+pixel. Blender evaluates a scene anew for each render, and otherwise than for its windows. So the
+triangles that filters ask are taken from the evaluation that Cycles renders.
 """
 
-import contextlib
 import math
 import os
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,13 +28,12 @@ from stereogenbench_data.synthesis.blender.assets import (
     RenderSettings,
     Shot,
 )
-from stereogenbench_data.synthesis.renderer import View
 
 Array = Any
 
 _RATE_HZ: Final = 15.0
 _MESHES: Final = frozenset({"MESH", "CURVE", "SURFACE", "FONT", "META"})
-_WITHOUT_MESH: Final = frozenset({"CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL"})
+_WITHOUT_DEPTH: Final = frozenset({"VOLUME", "GREASEPENCIL"})
 _OPEN_SKY_M: Final = 20.0
 """How far above its highest point cameras may be in a map without a ceiling."""
 _OPEN_SHARE: Final = 0.3
@@ -56,6 +53,8 @@ _STILL_M: Final = 0.02
 _BONE_PATH: Final = re.compile(r'pose\.bones\["((?:[^"\\]|\\.)*)"\]\.(\w+)')
 _NOTHING: Final = 1e9
 """Depth of Cycles' pass from which on nothing is seen."""
+_NARROWEST_PX: Final = 0.01
+"""Cycles' narrowest filter: rays pass within half of it of the centre of their pixel."""
 _MOST_LAYERS: Final = 64
 _GPU_KINDS: Final = ("OPTIX", "CUDA", "HIP", "ONEAPI", "METAL")
 
@@ -80,212 +79,71 @@ class Mirror:
         return points_m * self.flip / self.unit_m
 
 
-# What is in front of the camera: triangles of the evaluated scene.
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Mesh:
-    """An evaluated mesh in Blender's world axes.
-
-    Attributes:
-        name: A name that stays over the frames.
-        is_subject: Whether it belongs to the subject.
-        vertices: (n, 3) float64.
-        corners: (m, 3) the vertices of its triangles.
-        is_cut: (m,) whether the material of a triangle lets rays through somewhere.
-    """
-
-    name: str
-    is_subject: bool
-    vertices: Array
-    corners: Array
-    is_cut: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Hits:
-    """What rays meet first.
-
-    Attributes:
-        distance: (n,) how many directions away; infinity where they meet nothing.
-        normals: (n, 3) of the triangles, 0 where they meet nothing.
-        is_cut: (n,) whether the material there lets rays through somewhere.
-    """
-
-    distance: Array
-    normals: Array
-    is_cut: Array
+# What rays of the filters meet: triangles of the evaluated map.
 
 
 class Triangles:
-    """Triangles in Blender's world axes, with a tree that finds the first that a ray meets."""
+    """What cameras see of an evaluated scene, with a tree that finds the first that a ray meets.
 
-    def __init__(self, meshes: list[Mesh]) -> None:
-        starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-        self.vertices = np.concatenate([np.empty((0, 3)), *(mesh.vertices for mesh in meshes)])
-        self.corners = np.concatenate(
-            [
-                np.empty((0, 3), np.int64),
-                *(mesh.corners + start for mesh, start in zip(meshes, starts, strict=False)),
-            ]
-        )
-        self.is_cut = np.concatenate([np.empty(0, bool), *(mesh.is_cut for mesh in meshes)])
+    Attributes:
+        vertices: (n, 3) in Blender's world axes, with modifiers applied.
+    """
+
+    def __init__(self, depsgraph: Any) -> None:
+        vertices, corners, count = [np.empty((0, 3))], [np.empty((0, 3), int)], 0
+        for instance in depsgraph.object_instances:
+            shown = instance.object
+            if shown.type in _MESHES and instance.show_self and shown.visible_camera:
+                points, triangles = _mesh_of(shown)
+                matrix = np.array(instance.matrix_world)
+                vertices.append(points @ matrix[:3, :3].T + matrix[:3, 3])
+                corners.append(triangles + count)
+                count += len(points)
+        self.vertices = np.concatenate(vertices)
         self._tree = BVHTree.FromPolygons(
-            self.vertices.tolist(), self.corners.tolist(), all_triangles=True, epsilon=0.0
+            self.vertices.tolist(), np.concatenate(corners).tolist(), all_triangles=True
         )
 
-    def first_hits(self, origins: Array, directions: Array) -> Hits:
-        """Return what rays meet, from origins (n, 3) or from one (3,).
+    def first_hits(self, origins: Array, directions: Array) -> tuple[Array, Array]:
+        """Return how far rays (n, 3) of unit direction go, and how much upwards the faces look.
 
-        The tree, in float32, tells which triangle; where the ray meets its plane is computed in
-        float64.
+        Both are (n,): infinity and nan where a ray meets nothing.
         """
-        cast = self._tree.ray_cast
-        starts = origins.tolist() if origins.ndim == 2 else repeat(origins.tolist())
-        found = np.fromiter(
-            (
-                -1 if (hit := cast(start, way)[2]) is None else hit
-                for start, way in zip(starts, directions.tolist(), strict=False)
-            ),
-            np.int64,
-            len(directions),
-        )
-        distance = np.full(len(directions), np.inf)
-        normals = np.zeros((len(directions), 3))
-        is_cut = np.zeros(len(directions), bool)
-        met = np.flatnonzero(found >= 0)
-        if met.size:
-            first, second, third = np.moveaxis(self.vertices[self.corners[found[met]]], 1, 0)
-            normals[met] = np.cross(second - first, third - first)
-            start = origins[met] if origins.ndim == 2 else origins
-            towards = np.einsum("ni,ni->n", normals[met], directions[met])
-            away = np.einsum("ni,ni->n", normals[met], first - start)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                ahead = away / towards
-            distance[met] = np.where(np.isfinite(ahead) & (ahead > 0), ahead, np.inf)
-            is_cut[met] = self.is_cut[found[met]]
-        return Hits(distance, normals, is_cut)
+        found = []
+        for origin, direction in zip(origins.tolist(), directions.tolist(), strict=True):
+            _, normal, _, distance = self._tree.ray_cast(origin, direction)
+            found.append((np.inf, np.nan) if normal is None else (distance, normal.z))
+        distances, upwards = np.array(found).reshape(-1, 2).T
+        return distances, upwards
 
 
-def triangles_of(depsgraph: Any, *, subject: frozenset[str]) -> list[Mesh]:
-    """Return every mesh that the cameras see in an evaluated scene, with its modifiers applied."""
-    found: list[Mesh] = []
-    meshes: dict[int, tuple[Array, Array, Array]] = {}
-    for instance in depsgraph.object_instances:
-        shown = instance.object
-        if shown.type not in _MESHES or not instance.show_self or not shown.visible_camera:
-            continue
-        source = shown.data.as_pointer() if shown.type == "MESH" else 0
-        mesh = meshes.get(source) if source else None
-        if mesh is None:
-            mesh = _mesh_of(shown)
-            if source:
-                meshes[source] = mesh
-        vertices, corners, materials = mesh
-        if not len(corners):
-            continue
-        matrix = np.array(instance.matrix_world)
-        owner = (instance.parent or shown).original.name
-        slots = [slot.material for slot in shown.material_slots] or [None]
-        cut = [each is not None and _lets_through(each.node_tree) for each in slots]
-        found.append(
-            Mesh(
-                name=f"{owner}/{shown.name}/{tuple(instance.persistent_id)}",
-                is_subject=owner in subject,
-                vertices=vertices @ matrix[:3, :3].T + matrix[:3, 3],
-                corners=corners,
-                is_cut=np.array(cut)[np.minimum(materials, len(cut) - 1)],
-            )
-        )
-    return found
-
-
-def _mesh_of(shown: Any) -> tuple[Array, Array, Array]:
-    """Return vertices, triangles and their slots of materials of an evaluated object."""
+def _mesh_of(shown: Any) -> tuple[Array, Array]:
+    """Return vertices (n, 3) and triangles (m, 3) of an evaluated object, in its own axes."""
     mesh = shown.to_mesh()
     if mesh is None:
-        return np.empty((0, 3)), np.empty((0, 3), np.int64), np.empty(0, np.int64)
+        return np.empty((0, 3)), np.empty((0, 3), int)
     mesh.calc_loop_triangles()
     vertices = np.empty(3 * len(mesh.vertices), np.float32)
     mesh.vertices.foreach_get("co", vertices)
     corners = np.empty(3 * len(mesh.loop_triangles), np.int32)
     mesh.loop_triangles.foreach_get("vertices", corners)
-    materials = np.empty(len(mesh.loop_triangles), np.int32)
-    mesh.loop_triangles.foreach_get("material_index", materials)
     shown.to_mesh_clear()
-    return vertices.reshape(-1, 3).astype(np.float64), corners.reshape(-1, 3).astype(int), materials
+    return vertices.reshape(-1, 3).astype(np.float64), corners.reshape(-1, 3).astype(int)
 
 
-def _lets_through(tree: Any) -> bool:
-    """Return whether nodes of a material are transparent; refraction is not transparency."""
-    for node in tree.nodes if tree is not None else ():
-        if node.bl_idname == "ShaderNodeBsdfTransparent":
-            return True
-        if node.bl_idname == "ShaderNodeGroup" and _lets_through(node.node_tree):
-            return True
-        if node.bl_idname == "ShaderNodeBsdfPrincipled":
-            alpha = node.inputs["Alpha"]
-            if alpha.is_linked or alpha.default_value < 1:
-                return True
-    return False
-
-
-class Surfaces:
-    """The triangles of a map over its frames; the tree of what stands still is built once."""
-
-    def __init__(self) -> None:
-        self._first: dict[str, Array] = {}
-        self._names: set[str] = set()
-        self._still = Triangles([])
-
-    def at_frame(self, meshes: list[Mesh]) -> list[Triangles]:
-        """Return what is to be searched: what stands still, and what moves."""
-        map_meshes = [mesh for mesh in meshes if not mesh.is_subject]
-        self._first = self._first or {mesh.name: mesh.vertices for mesh in map_meshes}
-        still = [
-            mesh
-            for mesh in map_meshes
-            if np.array_equal(mesh.vertices, self._first.get(mesh.name, ()))
-        ]
-        names = {mesh.name for mesh in still}
-        if names != self._names:
-            self._names, self._still = names, Triangles(still)
-        moving = [mesh for mesh in meshes if mesh.is_subject or mesh.name not in names]
-        return [self._still, *([Triangles(moving)] if moving else [])]
-
-
-def first_hits(searched: list[Triangles], origins: Array, directions: Array) -> Hits:
-    """Return what rays meet first among several trees."""
-    best = searched[0].first_hits(origins, directions)
-    for other in searched[1:]:
-        hits = other.first_hits(origins, directions)
-        closer = hits.distance < best.distance
-        best = Hits(
-            np.where(closer, hits.distance, best.distance),
-            np.where(closer[:, None], hits.normals, best.normals),
-            np.where(closer, hits.is_cut, best.is_cut),
-        )
-    return best
-
-
-@contextlib.contextmanager
-def _around_cycles(
-    before: Callable[[Any], None] | None = None, after: Callable[[Any], None] | None = None
-) -> Iterator[None]:
-    """Hand over the scene as evaluated for Cycles before it renders, and its engine afterwards."""
+def _render(before: Callable[[Any], object] = id, after: Callable[[Any], object] = id) -> None:
+    """Let Cycles render; hand over the scene as evaluated for it before, and its engine after."""
     from cycles import CyclesRender, engine
 
     def render(self: Any, depsgraph: Any) -> None:
-        if before is not None:
-            before(depsgraph)
+        before(depsgraph)
         engine.render(self, depsgraph)
-        if after is not None:
-            after(self)
+        after(self)
 
     own = CyclesRender.render
     CyclesRender.render = render
     try:
-        yield
+        bpy.ops.render.render()
     finally:
         CyclesRender.render = own
 
@@ -429,7 +287,6 @@ class Subject:
         self.start, end = map(float, action.frame_range)
         self.frames = max(end - self.start, 1e-6)
         self.strip = self._animate(action, where=animation.where)
-        self.names = frozenset(item.name for item in self.objects)
         self.unit_m = unit_m
         self.empty = bpy.data.objects.new("StereoGenBench subject", None)
         bpy.context.scene.collection.objects.link(self.empty)
@@ -692,13 +549,12 @@ class Stage:
         self.subject: Subject | None = None
         self._own: set[Any] = set()
         self._subject_assets: tuple[CharacterAsset, AnimationAsset] | None = None
-        self.surfaces = Surfaces()
-        self.still = self._gather()
+        self.triangles = self._gather()
         self.bounds_m, self.spawn_bounds_m = self._bounds()
         self._own = {*bpy.data.objects, *bpy.data.actions}
 
     def _prepare(self) -> None:
-        """Switch off what this program does not render alike in picture and depth."""
+        """Switch off what has no depth, or would differ between picture and depth."""
         scene = self.scene
         render = scene.render
         render.use_compositing = render.use_sequencer = False
@@ -707,29 +563,18 @@ class Stage:
         render.resolution_percentage = 100
         render.dither_intensity = 0.0
         for item in scene.objects:
-            if item.type in _WITHOUT_MESH and not item.hide_render:
+            if item.type in _WITHOUT_DEPTH and not item.hide_render:
                 item.hide_render = True
                 self.notes.append(f"object {item.name!r} ({item.type.lower()}), hidden: no depth")
-            for modifier in item.modifiers:
-                if modifier.type == "PARTICLE_SYSTEM" and modifier.show_render:
-                    settings = modifier.particle_system.settings
-                    if settings.render_type in ("PATH", "HALO", "LINE"):
-                        modifier.show_render = False
-                        self.notes.append(f"hair of {item.name!r}, hidden: no depth")
-                if modifier.type == "SUBSURF":
-                    modifier.use_adaptive_subdivision = False
-        for material in bpy.data.materials:
-            # Displacement that only Cycles sees would not be in the depth.
-            material.displacement_method = "BUMP"
         for layer in scene.view_layers:
             layer.use = layer == bpy.context.view_layer
         scene.frame_set(self.start)
         if bpy.app.autoexec_fail:
             self.notes.append(bpy.app.autoexec_fail_message)
 
-    def _gather(self) -> list[Triangles]:
+    def _gather(self) -> Triangles:
         """Return the map's triangles at its first frame, without the subject."""
-        found: list[Mesh] = []
+        found: list[Triangles] = []
         self.scene.render.engine = "CYCLES"
         self.scene.render.use_multiview = False
         self.scene.render.resolution_x = self.scene.render.resolution_y = 1
@@ -738,16 +583,13 @@ class Stage:
             camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
             self.scene.collection.objects.link(camera)
             self.scene.camera = camera
-        with _around_cycles(
-            lambda depsgraph: found.extend(triangles_of(depsgraph, subject=frozenset()))
-        ):
-            bpy.ops.render.render()
-        return self.surfaces.at_frame(found)
+        _render(before=lambda depsgraph: found.append(Triangles(depsgraph)))
+        return found[-1]
 
     def _bounds(self) -> tuple[Array, Array]:
         """Return two corners of where cameras may be, and of where subjects are spawned."""
         asset = self.asset
-        points = np.concatenate([each.vertices for each in self.still])
+        points = self.triangles.vertices
         if not len(points):
             raise AssetError(
                 f"{asset.where}: the map is empty: no mesh of its scene is rendered. Show its "
@@ -779,13 +621,13 @@ class Stage:
         upwards = np.broadcast_to([0.0, 0.0, 1.0], at.shape)
         floors, ceilings = np.full((2, len(at)), np.inf)
         for _ in range(_MOST_LAYERS):
-            hits = first_hits(self.still, at, upwards)
-            is_met = np.isfinite(hits.distance)
+            distances, turned = self.triangles.first_hits(at, upwards)
+            is_met = np.isfinite(distances)
             if not is_met.any():
                 break
-            at[is_met, 2] += hits.distance[is_met]
-            is_floor = (hits.normals[:, 2] > 0) & np.isinf(floors)
-            is_ceiling = (hits.normals[:, 2] < 0) & np.isfinite(floors) & np.isinf(ceilings)
+            at[is_met, 2] += distances[is_met]
+            is_floor = (turned > 0) & np.isinf(floors)
+            is_ceiling = (turned < 0) & np.isfinite(floors) & np.isinf(ceilings)
             floors[is_floor], ceilings[is_ceiling] = at[is_floor, 2], at[is_ceiling, 2]
             at[:, 2] += 1e-5 / self.mirror.unit_m
         found = ceilings[np.isfinite(floors)]
@@ -797,8 +639,8 @@ class Stage:
     def cast(self, origins_m: Array, directions: Array) -> Array:
         """Return how many metres each ray goes until it meets the map."""
         ways = directions * self.mirror.flip
-        hits = first_hits(self.still, self.mirror.to_blender(origins_m), ways)
-        return hits.distance * self.mirror.unit_m
+        distances, _ = self.triangles.first_hits(self.mirror.to_blender(origins_m), ways)
+        return distances * self.mirror.unit_m
 
     def set_subject(self, character: CharacterAsset, animation: AnimationAsset) -> Subject:
         """Put a character with an animation into the scene, in place of the one before."""
@@ -813,10 +655,7 @@ class Stage:
         return self.subject
 
     def render(self, subject: Subject, shot: Shot) -> Array:
-        """Write the pictures of several cameras at a frame; return their depths in metres.
-
-        Pictures and depths come from one evaluation of the scene.
-        """
+        """Write the pictures of several cameras at a frame; return their depths in metres."""
         time_frames, times = subject.time_of(shot.frame)
         exact = self.start + shot.frame / _RATE_HZ * self.rate_hz
         self.scene.frame_set(int(exact), subframe=exact - int(exact))
@@ -828,30 +667,15 @@ class Stage:
         width_px, height_px = shot.views[0].size_px
         self._set_render(shot)
         self._set_cameras(shot, eyes=eyes, axes=turned)
-        searched: list[Triangles] = []
-
-        def gather(depsgraph: Any) -> None:
-            searched.extend(self.surfaces.at_frame(triangles_of(depsgraph, subject=subject.names)))
-
-        with _around_cycles(gather):
-            bpy.ops.render.render(write_still=True)
-        if not searched:
-            raise RuntimeError("Cycles ended before it rendered")
-        ways = [_pixel_ways(view, axes=axes) for view, axes in zip(shot.views, turned, strict=True)]
-        hits = [first_hits(searched, eye, way) for eye, way in zip(eyes, ways, strict=True)]
-        depths = np.stack([each.distance for each in hits])
-        is_cut = np.stack([each.is_cut for each in hits])
-        if is_cut.any():
-            # Where a material has holes, Cycles tells how far the surface is that is seen.
-            seen = self._depth_passes(width_px, height_px)
-            depths = np.where(is_cut, np.where(seen < _NOTHING, seen, np.inf), depths)
-        depths_m: Array = depths.reshape(-1, height_px, width_px) * self.mirror.unit_m
+        bpy.ops.render.render(write_still=True)
+        depths = self._depths(width_px, height_px)
+        depths_m: Array = np.where(depths < _NOTHING, depths * self.mirror.unit_m, np.inf)
         return depths_m
 
-    def _depth_passes(self, width_px: int, height_px: int) -> Array:
-        """Return Cycles' own depth (cameras, pixels) through (nearly) the centres of pixels."""
+    def _depths(self, width_px: int, height_px: int) -> Array:
+        """Return Cycles' depth along the axis (cameras, h, w), of the frame that is set."""
         cycles, layer = self.scene.cycles, bpy.context.view_layer
-        cycles.samples, cycles.use_denoising, cycles.filter_width = 1, False, 0.01
+        cycles.samples, cycles.use_denoising, cycles.filter_width = 1, False, _NARROWEST_PX
         layer.use_pass_z, layer.pass_alpha_threshold = True, 0.5
         found: dict[int, Array] = {}
 
@@ -861,12 +685,11 @@ class Stage:
                     found[each.view_id] = np.empty(width_px * height_px, np.float32)
                     each.rect.foreach_get(found[each.view_id])
 
-        with _around_cycles(after=read):
-            bpy.ops.render.render()
+        _render(after=read)
         layer.use_pass_z = False
         passes = np.stack([found[view] for view in sorted(found)]).astype(np.float64)
         # Blender's first row is the lowest.
-        return passes.reshape(-1, height_px, width_px)[:, ::-1].reshape(len(passes), -1)
+        return passes.reshape(-1, height_px, width_px)[:, ::-1]
 
     def _set_render(self, shot: Shot) -> None:
         settings = shot.settings
@@ -925,16 +748,6 @@ class Stage:
             view.camera_suffix, view.use = f"_{number}", True
             if number == 0:
                 scene.camera = item
-
-
-def _pixel_ways(view: View, *, axes: Array) -> Array:
-    """Return the directions (n, 3) through pixel centres; their part along the axis is 1."""
-    width_px, height_px = view.size_px
-    across = view.right_of_axis(np.arange(width_px) + 0.5)
-    down = view.below_axis(np.arange(height_px) + 0.5)
-    forward, right, up = axes.T
-    ways: Array = forward + across[None, :, None] * right - down[:, None, None] * up
-    return ways.reshape(-1, 3)
 
 
 def _device(settings: RenderSettings) -> str:
