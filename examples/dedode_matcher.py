@@ -6,7 +6,7 @@
 
 WEIGHTS holds the two files of https://github.com/Parskatt/DeDoDe/releases (licence: MIT):
 dedode_detector_L.pth and dedode_descriptor_B.pth. A plug-in has the members of its kind in
-`stereogenbench_data.evaluation.models.interfaces`.
+`stereogenbench_data.evaluation.models.loading`.
 """
 
 from pathlib import Path
@@ -16,8 +16,7 @@ import numpy as np
 import torch
 
 from stereogenbench_data.evaluation.metrics.matching import KEYPOINTS, RATIO, mutual_matches
-from stereogenbench_data.evaluation.models.interfaces import Keypoints
-from stereogenbench_data.evaluation.models.weights import fingerprint, load_into, read_weights
+from stereogenbench_data.evaluation.models.loading import Keypoints, load_file
 
 
 class DeDoDe:
@@ -35,8 +34,7 @@ class DeDoDe:
         }  # fmt: skip
         for part, name in (("detector", "detector_L"), ("descriptor", "descriptor_B")):
             path = weights / f"dedode_{name}.pth"
-            load_into(getattr(network, part), read_weights(path, what=f"DeDoDe {name}"), path=path)
-            self.settings[f"{part}_sha256"] = fingerprint(path)
+            self.settings[f"{part}_sha256"] = load_file(getattr(network, part), path)
         self.network, self.device = network.to(device), device
 
     def detect(self, picture) -> Keypoints:

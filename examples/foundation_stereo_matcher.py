@@ -7,7 +7,7 @@
 
 Its code and weights (model_best_bp2.pth and cfg.yaml, linked in its README) are for non-commercial
 research. A plug-in has the members of its kind in
-`stereogenbench_data.evaluation.models.interfaces`.
+`stereogenbench_data.evaluation.models.loading`.
 """
 
 from contextlib import nullcontext
@@ -18,7 +18,7 @@ import torch
 from core.foundation_stereo import FoundationStereo as Network
 from omegaconf import OmegaConf
 
-from stereogenbench_data.evaluation.models.weights import fingerprint, load_into, read_weights
+from stereogenbench_data.evaluation.models.loading import load_file
 
 ITERATIONS, MULTIPLE = 32, 32
 
@@ -29,13 +29,13 @@ class FoundationStereo:
     def __init__(self, *, weights: Path, device: str = "cpu") -> None:
         options, path = OmegaConf.load(weights / "cfg.yaml"), weights / "model_best_bp2.pth"
         options.setdefault("vit_size", "vitl")
-        network, tensors = Network(options), read_weights(path, what="FoundationStereo")
-        load_into(network, tensors.get("model", tensors), path=path)
+        network = Network(options)
+        sha256 = load_file(network, path, select=lambda file: file.get("model", file))
         self.network, self.device = network.to(device), device
         self.on_cuda = device.startswith("cuda")
         self.name = f"FoundationStereo ({weights.name})"
         self.settings = {
-            "weights": path.name, "weights_sha256": fingerprint(path), "iterations": ITERATIONS,
+            "weights": path.name, "weights_sha256": sha256, "iterations": ITERATIONS,
             "padding": f"replicated to a multiple of {MULTIPLE}",
             "precision": "autocast" if self.on_cuda else "float32",
         }  # fmt: skip

@@ -39,7 +39,6 @@ from stereogenbench_data.errors import WorkerError as WorkerError
 from stereogenbench_data.evaluation.controls import score_controls as score_controls
 from stereogenbench_data.evaluation.evaluate import evaluate as evaluate
 from stereogenbench_data.evaluation.inputs import export_inputs as export_inputs
-from stereogenbench_data.evaluation.models.registry import ModelOptions as ModelOptions
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol as EvaluationProtocol
 from stereogenbench_data.evaluation.report import write_report as write_report
 from stereogenbench_data.evaluation.tables import tables_of as tables_of

@@ -13,7 +13,7 @@ one tree from many requests, so each part of a request has a lock of its own the
 import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypedDict, TypeVar
@@ -172,13 +172,6 @@ def read_json(path: Path, *, cure: str = "Remove it.") -> dict[str, Any]:
     if not isinstance(found, dict):
         raise StorageError(f"{path}: is not a JSON object. {cure}")
     return found
-
-
-def read_item(path: Path) -> dict[str, Any] | None:
-    """Return the object in a JSON file of an item; None where it is missing or was cut short."""
-    with suppress(FileNotFoundError, StorageError):
-        return read_json(path)
-    return None
 
 
 class WorkOptions(TypedDict, total=False):

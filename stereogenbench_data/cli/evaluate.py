@@ -32,17 +32,6 @@ if TYPE_CHECKING:
     from stereogenbench_data.evaluation.tables import Table
 
 
-def _stratum_of(text: str) -> tuple[str, tuple[float, ...]]:
-    """Return the column of ``--by`` with its edges."""
-    column, _, edges = text.partition(":")
-    try:
-        return column, tuple(float(edge) for edge in edges.split(",")) if edges else ()
-    except ValueError:
-        raise typer.BadParameter(
-            f"{text!r}: the edges {edges!r} are not numbers such as 18,35."
-        ) from None
-
-
 _METRICS = "How metrics are computed"
 """Panel of the help for the options of metrics."""
 TierOption = Annotated[
@@ -113,7 +102,6 @@ class ProtocolOptions:
         Raises:
             EvaluationError: If a metric is unknown.
         """
-        from stereogenbench_data.evaluation.models.registry import ModelOptions
         from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 
         return EvaluationProtocol(
@@ -121,7 +109,8 @@ class ProtocolOptions:
             size=self.size,
             keypoint_matcher=self.keypoint_matcher,
             stereo_matcher=self.stereo_matcher,
-            models=ModelOptions(device=self.device, weights=self.weights),
+            device=self.device,
+            weights=self.weights,
         )
 
 
@@ -232,11 +221,9 @@ def score(  # noqa: PLR0913 - one parameter an option
     chosen: ScoredOptions,
     scoring: ProtocolOptions,
     by: Annotated[
-        list[Any] | None,
+        list[str] | None,
         typer.Option(
-            parser=_stratum_of,
-            metavar="COLUMN[:EDGES]",
-            help="Also score by map_name or focal_mm:18,35,85. May be repeated.",
+            metavar="COLUMN", help="Also score by map_name, focal_mm, ... May be repeated."
         ),
     ] = None,
     allow_missing: Annotated[
@@ -259,11 +246,10 @@ def score(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.evaluation.tables import tables_of
 
     protocol, selection = scoring.protocol(), chosen.selection()
-    strata: dict[str, tuple[float, ...]] = dict(by or ())
     called = name or predictions.resolve().name
     folder = report.out or Path("evaluation") / f"{called}-{tier}"
     index = source.open()
-    for column in strata:
+    for column in by or ():
         index.column(column)  # refuses an unknown one before the work
     with progress_bar("scoring", unit="frames") as progress:
         scores = evaluate(
@@ -278,7 +264,7 @@ def score(  # noqa: PLR0913 - one parameter an option
             progress=progress,
             **selection,
         )
-    report.write(folder, [scores], tables_of([scores], by=strata))
+    report.write(folder, [scores], tables_of([scores], by=by or ()))
 
 
 @grouped

@@ -164,47 +164,36 @@ def group_by(
     return groups
 
 
-def strata(values: Sequence[Any], *, name: str, edges: Sequence[float] = ()) -> list[str]:
+def strata(values: Sequence[Any], *, name: str) -> list[str]:
     """Return the stratum of each value of a column.
 
-    Texts and up to 6 different numbers are strata themselves. Other numbers are sorted into the
-    intervals between the edges, all but the last half-open; without edges, into quarters.
+    Texts and up to 6 different numbers are strata themselves; other numbers fall into quarters.
 
     Raises:
-        EvaluationError: If no value is known, or edges do not ascend.
+        EvaluationError: If no value is known.
 
-    >>> strata([18.0, 50.0, 85.0], name="focal_mm", edges=(18, 35, 85))
-    ['[18,35)', '[35,85]', '[35,85]']
+    >>> strata([18.0, 50.0, 18.0], name="focal_mm")
+    ['18', '50', '18']
     """
     if not all(isinstance(value, int | float) for value in values):
         return [str(value) or "not recorded" for value in values]
-    known = sorted(number for number in values if math.isfinite(number))
+    known = [number for number in values if math.isfinite(number)]
     if not known:
         raise EvaluationError(
             f"{name} is not known for any scene: make the index anew (for valid_depth_ratio with "
             f"`stereogenbench index ROOT --valid-depth`), or stratify by another column."
         )
-    if list(edges) != sorted(set(edges)) or len(edges) == 1:
-        raise EvaluationError(
-            f"edges of {name} must be at least two ascending numbers, got {edges}."
-        )
-    if not edges and len(set(known)) <= _DISTINCT_VALUES:
+    if len(set(known)) <= _DISTINCT_VALUES:
         return [f"{number:g}" if math.isfinite(number) else "not known" for number in values]
-    if not edges:
-        inner = {float(f"{each:.4g}") for each in np.quantile(known, (0.25, 0.5, 0.75))}
-        edges = sorted(inner | {known[0], known[-1]})
+    inner = {float(f"{each:.4g}") for each in np.quantile(known, (0.25, 0.5, 0.75))}
+    edges = sorted(inner | {min(known), max(known)})
     names = [f"[{low:g},{high:g})" for low, high in pairwise(edges)]
-    names = [
-        f"(-inf,{edges[0]:g})",
-        *names[:-1],
-        f"{names[-1][:-1]}]",
-        f"({edges[-1]:g},inf)",
-        "not known",
+    names[-1] = f"{names[-1][:-1]}]"
+    places = np.searchsorted(edges[1:-1], values, side="right")
+    return [
+        names[place] if math.isfinite(number) else "not known"
+        for place, number in zip(places, values, strict=True)
     ]
-    places = np.searchsorted(edges, values, side="right")
-    places[np.asarray(values) == edges[-1]] -= 1
-    places[~np.isfinite(values)] = len(names) - 1
-    return [names[place] for place in places]
 
 
 Labels = tuple[str, ...]

@@ -14,70 +14,53 @@ class Column:
         label: What tables call it.
         better: Which way is better; "neither" for what only explains another column.
         digits: Decimals in tables.
-        meaning: What it is, with its unit.
         backend: Which of a protocol's backends it was measured with, "" for none.
     """
 
     label: str
     better: Literal["higher", "lower", "neither"]
     digits: int
-    meaning: str
     backend: Literal["", "keypoint_matcher", "stereo_matcher"] = ""
 
 
 _SD_FITS: Final = {"filtered": "filtered", "least_squares": "least squares"}
 """The fits of SD and what tables call them; the first is the one beside the paper's numbers."""
 
-
 EXPLAIN_A_FIT: Final = {
-    "slope": ("a", 4, "slope of true on found disparity"),
-    "offset_px": ("b", 2, "px; offset of the fit"),
-    "valid": ("fit pixels", 3, "share of pixels in the fit"),
-    "outliers": ("outliers", 3, "share of answered pixels left out of the fit"),
-    "residual_px": ("residual", 2, "px; standard deviation of the residuals"),
-    "r2": ("R2", 3, "share of variance explained"),
+    "slope": ("a", 4),
+    "offset_px": ("b", 2),
+    "valid": ("fit pixels", 3),
+    "outliers": ("outliers", 3),
+    "residual_px": ("residual", 2),
+    "r2": ("R2", 3),
 }
-"""What explains a fit of SD: the attribute of a `ScaleFit`, its label, decimals and meaning."""
+"""What explains a fit of SD: the attribute of a `ScaleFit`, its label and decimals."""
 
 COLUMNS: Final[dict[str, Column]] = {
-    "psnr": Column("PSNR", "higher", 2, "dB; identical pictures are counted, not averaged"),
-    "ssim": Column("SSIM", "higher", 4, "structural similarity"),
-    "lpips": Column("LPIPS", "lower", 4, "learned perceptual distance"),
-    "e_match": Column(
-        "E_match", "lower", 2, "%; change of the set of matched keypoints", "keypoint_matcher"
-    ),
-    "p_psnr": Column("P-PSNR", "higher", 2, "dB; mean over patches of the best match's"),
+    "psnr": Column("PSNR", "higher", 2),
+    "ssim": Column("SSIM", "higher", 4),
+    "lpips": Column("LPIPS", "lower", 4),
+    "e_match": Column("E_match", "lower", 2, "keypoint_matcher"),
+    "p_psnr": Column("P-PSNR", "higher", 2),
     **{
-        f"sd_{fit}": Column(
-            f"SD {words}",
-            "lower",
-            4,
-            "|slope - 1| of disparity, true on found",
-            "stereo_matcher",
-        )
+        f"sd_{fit}": Column(f"SD {words}", "lower", 4, "stereo_matcher")
         for fit, words in _SD_FITS.items()
     },
-    "p_psnr_pooled": Column("P-PSNR pooled", "neither", 2, "dB of the best matches' mean MSE"),
-    "p_psnr_ceiling": Column("P-PSNR of target", "neither", 2, "dB; what the rendered view gets"),
-    "p_psnr_outside": Column(
-        "outside window", "neither", 3, "share of measured pixels whose disparity is not searched"
-    ),
-    "keypoints": Column("keypoints", "neither", 0, "of the left view", "keypoint_matcher"),
-    "target_matches": Column("M_gt", "neither", 0, "matches of the target", "keypoint_matcher"),
-    "predicted_matches": Column(
-        "M_pred", "neither", 0, "matches of the prediction", "keypoint_matcher"
-    ),
-    "common_matches": Column("M_both", "neither", 0, "matches of both", "keypoint_matcher"),
-    "sd_answered": Column(
-        "answered", "neither", 3, "share of visible pixels with a found disparity", "stereo_matcher"
-    ),
+    "p_psnr_pooled": Column("P-PSNR pooled", "neither", 2),
+    "p_psnr_ceiling": Column("P-PSNR of target", "neither", 2),
+    "p_psnr_outside": Column("outside window", "neither", 3),
+    "keypoints": Column("keypoints", "neither", 0, "keypoint_matcher"),
+    "target_matches": Column("M_gt", "neither", 0, "keypoint_matcher"),
+    "predicted_matches": Column("M_pred", "neither", 0, "keypoint_matcher"),
+    "common_matches": Column("M_both", "neither", 0, "keypoint_matcher"),
+    "sd_answered": Column("answered", "neither", 3, "stereo_matcher"),
     **{
-        f"sd_{fit}_{name}": Column(f"{label} {words}", "neither", digits, meaning, "stereo_matcher")
+        f"sd_{fit}_{name}": Column(f"{label} {words}", "neither", digits, "stereo_matcher")
         for fit, words in _SD_FITS.items()
-        for name, (label, digits, meaning) in EXPLAIN_A_FIT.items()
+        for name, (label, digits) in EXPLAIN_A_FIT.items()
     },
 }
-"""Columns of frames, headline columns first."""
+"""Columns of frames, headline columns first; `frame_metrics` says how each is computed."""
 
 FRAME_METRICS: Final[dict[str, tuple[str, ...]]] = {
     "psnr": ("psnr",),
@@ -98,17 +81,13 @@ the paper leaves outliers out, though it does not state by which rule.
 HEAVY_TAILED: Final = frozenset(f"sd_{fit}" for fit in _SD_FITS)
 """Columns whose mean a few scenes can dominate: their median is shown and judged."""
 
-LEARNED: Final[dict[str, tuple[str, str]]] = {
-    "lpips": ("pair metric", "lpips"),
-    "fid": ("image features", "inception"),
-    "fvd": ("video features", "i3d"),
-}
-"""The learned metrics, with the kind and the name of the model that computes each.
+LEARNED: Final = ("lpips", "fid", "fvd")
+"""The metrics that are computed with learned weights.
 
-Features make distances between sets: of frames, or of clips, one clip a pair.
+FID and FVD are distances between sets: of the features of frames, or of clips, one clip a pair.
 """
 
-METRICS: Final = (*FRAME_METRICS, *(name for name in LEARNED if name not in FRAME_METRICS))
+METRICS: Final = (*FRAME_METRICS, "fid", "fvd")
 OFFLINE_METRICS: Final = ("psnr", "ssim", "e_match", "p_psnr", "sd")
 """What is computed by default: nothing that needs weights."""
 

@@ -8,7 +8,7 @@ Source: the StereoGenBench paper, appendix on metric definitions and calibration
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Unpack
 
@@ -40,48 +40,30 @@ CONTROLS: Final = (TARGET, COPIED_LEFT, WRONG_BASELINE, RANDOM_RIGHT)
 
 
 @dataclass(frozen=True, slots=True)
-class SameFrame:
-    """A control that is a view of the sample itself.
+class Control:
+    """A source of right views that are frames of another place.
 
     Attributes:
-        name: What tables call it.
-        inputs: The view, "right" or "left".
-    """
-
-    name: str
-    inputs: tuple[str, ...]
-
-    def stamp(self, wanted: PairFrames) -> str:
-        """Return what it is."""
-        return f"its {self.inputs[0]} view"
-
-    @contextmanager
-    def open(self, index: SceneIndex) -> Iterator[Read]:
-        """Yield a function that returns the view of each sample."""
-        yield lambda wanted, samples: [sample[self.inputs[0]] for sample in samples]
-
-
-@dataclass(frozen=True, slots=True)
-class OtherView:
-    """A control that is the same frame of another camera, or of another scene's right camera.
-
-    Attributes:
-        name: What tables call it.
+        name: Which control it is.
         size: (height, width) that is scored.
-        donors: For each scene, the scene that its views are taken from; none for the same one.
-        inputs: Nothing of a sample.
+        donors: For each scene, another one that stands in for it.
+        inputs: Nothing of a sample but both views, which every sample has.
     """
 
     name: str
     size: tuple[int, int]
-    donors: Mapping[str, str] = field(default_factory=dict)
+    donors: Mapping[str, str]
     inputs: tuple[str, ...] = ()
 
     def origin(self, wanted: PairFrames) -> tuple[str, int]:
         """Return the scene and the camera that the view of a pair is taken from."""
-        if self.donors:
-            return self.donors[wanted.scene], wanted.pair[1]
-        return wanted.scene, wrong_camera(*wanted.pair)
+        left, right = wanted.pair
+        return {
+            TARGET: (wanted.scene, right),
+            COPIED_LEFT: (wanted.scene, left),
+            WRONG_BASELINE: (wanted.scene, wrong_camera(left, right)),
+            RANDOM_RIGHT: (self.donors[wanted.scene], right),
+        }[self.name]
 
     def stamp(self, wanted: PairFrames) -> str:
         """Return where its views are taken from."""
@@ -90,12 +72,15 @@ class OtherView:
 
     @contextmanager
     def open(self, index: SceneIndex) -> Iterator[Read]:
-        """Yield a function that loads the other view; a shorter scene's last frame is repeated."""
+        """Yield a function that returns the views; a shorter scene's last frame is repeated."""
         rows = {str(key): row for row, key in enumerate(index.column("key"))}
         with open_frames(index, ("right",), size=self.size) as load:
 
             def read(wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
                 scene, camera = self.origin(wanted)
+                if scene == wanted.scene and camera in wanted.pair:  # The sample has it.
+                    view = ("left", "right")[wanted.pair.index(camera)]
+                    return [sample[view] for sample in samples]
                 row = rows[scene]
                 last = int(index.column("frames")[row]) - 1
                 frames = (min(int(sample["frame_index"]), last) for sample in samples)
@@ -160,15 +145,10 @@ def score_controls(
     require_options(score_controls, options)
     protocol = protocol or EvaluationProtocol()
     workload = select_workload(data, protocol, inputs=(), options=options, conventions=conventions)
-    donors = derangement([pairs[0].scene for pairs in workload.pairs], seed=seed)
+    donors = derangement(sorted({pair.scene for pair in workload.pairs}), seed=seed)
     run = Run(
         protocol=protocol,
-        sources=(
-            SameFrame(TARGET, ("right",)),
-            SameFrame(COPIED_LEFT, ("left",)),
-            OtherView(WRONG_BASELINE, protocol.size),
-            OtherView(RANDOM_RIGHT, protocol.size, donors=donors),
-        ),
+        sources=tuple(Control(name, protocol.size, donors) for name in CONTROLS),
         tier=CONTROL,
         donors=donors,
         settings={"seed": seed},

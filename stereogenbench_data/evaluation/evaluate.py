@@ -1,20 +1,34 @@
 """Score a method by the paper's protocol, from the views it wrote or by calling it.
 
-Scenes are scored in parallel processes, and each is kept on disk as soon as it is scored.
+Scenes are scored in parallel processes. Each is kept on disk as soon as it is scored, so that a
+stopped evaluation goes on:
+
+    OUT/evaluation.json     all that scores depend on (`jobs`); other settings are refused
+    OUT/scenes/<digest>.pt  a scene's scores, with what identified its right views
 """
 
+import hashlib
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, Final, Unpack
+
+import torch
 
 from stereogenbench_data.datasets.mapped import Data, StereoPairs, opened
 from stereogenbench_data.engine import LOCAL
-from stereogenbench_data.errors import EvaluationError, PredictionError, StorageError
+from stereogenbench_data.errors import (
+    EvaluationError,
+    PredictionError,
+    StorageError,
+    explain_os_errors,
+)
 from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, tally
-from stereogenbench_data.evaluation.frame_metrics import fields_of, models_of
+from stereogenbench_data.evaluation.frame_metrics import fields_of, model_of, settings_of
 from stereogenbench_data.evaluation.metrics.frechet import (
     FeatureStatistics,
     FrechetDistance,
@@ -23,28 +37,31 @@ from stereogenbench_data.evaluation.metrics.frechet import (
 from stereogenbench_data.evaluation.predictions import (
     CalledMethod,
     Method,
+    Pair,
     PairFrames,
     PredictionFolder,
     PredictionSource,
 )
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, require_tier
 from stereogenbench_data.evaluation.scene_scores import (
-    EVALUATION,
-    FORMAT,
-    PartialResults,
+    PairScores,
     SceneScores,
     SceneWork,
     score_scene,
 )
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.jobs import WorkOptions, do_items, job_folder
+from stereogenbench_data.jobs import JobKind, WorkOptions, do_items, job_folder
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import may_pass
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import Random, Selection
+from stereogenbench_data.sources.files import write_atomic
 
+EVALUATION: Final = JobKind("scores", "evaluation.json", ".evaluation.lock", EvaluationError)
+FORMAT: Final = 5
+"""Of the files of scenes; other formats are refused."""
 _PROBLEMS_SHOWN: Final = 2
 
 
@@ -128,18 +145,21 @@ class Workload:
 
     Attributes:
         index: The index.
-        rows: The scenes' rows, ascending.
-        pairs: For each scene, what is scored of its pairs.
+        scenes: What is scored of the pairs of each scene, by its row, ascending.
     """
 
     index: SceneIndex
-    rows: tuple[int, ...]
-    pairs: tuple[tuple[PairFrames, ...], ...]
+    scenes: Mapping[int, Sequence[PairFrames]]
+
+    @property
+    def pairs(self) -> list[PairFrames]:
+        """The pairs of all scenes."""
+        return [pair for pairs in self.scenes.values() for pair in pairs]
 
     @property
     def frames(self) -> int:
         """How many frames of pairs there are."""
-        return sum(len(pair.frames) for pairs in self.pairs for pair in pairs)
+        return sum(len(pair.frames) for pair in self.pairs)
 
 
 def select_workload(
@@ -200,13 +220,12 @@ def select_workload(
             f"{selection.get('direction', 'left to right')!r}: choose pairs='primary', 'adjacent', "
             f"'all' or (left, right) numbers."
         )
-    rows = tuple(int(row) for row in plan.scene_rows)
-    pairs: dict[int, list[PairFrames]] = {row: [] for row in rows}
+    scenes: dict[int, list[PairFrames]] = {int(row): [] for row in plan.scene_rows}
     for row, left, right in zip(
         chosen.row.tolist(), chosen.source.tolist(), chosen.targets[:, 0].tolist(), strict=True
     ):
         scene = index.scene(row)
-        pairs[row].append(
+        scenes[row].append(
             PairFrames(
                 scene=scene.id.key,
                 pair=(left, right),
@@ -219,7 +238,7 @@ def select_workload(
                 stored_size=(scene.rig.image_height_px, scene.rig.image_width_px),
             )
         )
-    return Workload(index=index, rows=rows, pairs=tuple(map(tuple, pairs.values())))
+    return Workload(index=index, scenes=scenes)
 
 
 def _require_whole(index: SceneIndex, lost: int, why: str = "") -> None:
@@ -265,47 +284,42 @@ def score_workload(
     """
     folders = [str(each.root) for each in run.sources if isinstance(each, PredictionFolder)]
     try:
-        settings = models_of(run.protocol).settings()
+        settings = settings_of(run.protocol)
         state = {
             "format": FORMAT,
             "tier": run.tier,
             "methods": [source.name for source in run.sources],
             "data": workload.index.digest,
-            "frames": sorted({pair.frames for pairs in workload.pairs for pair in pairs}),
-            "pairs": sorted({pair.pair for pairs in workload.pairs for pair in pairs}),
+            "frames": sorted({pair.frames for pair in workload.pairs}),
+            "pairs": sorted({pair.pair for pair in workload.pairs}),
             "settings": settings,
             **({"predictions": folders} if folders else {}),
             **run.settings,
         }
         with ExitStack() as stack:
-            out = options.get("out")
-            if out is None:
-                out = stack.enter_context(tempfile.TemporaryDirectory(prefix="stereogenbench-"))
-            stack.enter_context(job_folder(Path(out), state, kind=EVALUATION))
-            partial = PartialResults(Path(out))
-            _score_missing_scenes(workload, run, partial, options)
-            return [
-                _scores(workload, run, partial, source.name, settings) for source in run.sources
-            ]
+            given = options.get("out") or stack.enter_context(
+                tempfile.TemporaryDirectory(prefix="stereogenbench-")
+            )
+            out = Path(given)
+            stack.enter_context(job_folder(out, state, kind=EVALUATION))
+            _score_missing_scenes(workload, run, out, options)
+            return [_scores(workload, run, out, source.name, settings) for source in run.sources]
     finally:
-        models_of.cache_clear()
+        model_of.cache_clear()
 
 
 def _score_missing_scenes(
-    workload: Workload,
-    run: Run,
-    partial: PartialResults,
-    options: RunOptions | EvaluationOptions,
+    workload: Workload, run: Run, out: Path, options: RunOptions | EvaluationOptions
 ) -> None:
     """Score what is not scored yet, and keep each scene's scores as soon as it is done."""
     allowed = options.get("allow_missing", 0)
-    stamps: dict[str, dict[tuple[str, tuple[int, int]], str]] = {}
+    stamps: dict[str, dict[tuple[str, Pair], str]] = {}
     works: list[SceneWork] = []
     missing: list[str] = []
     problems: list[str] = []
     done_frames = 0
     rows = {str(key): row for row, key in enumerate(workload.index.column("key"))}
-    for row, pairs in zip(workload.rows, workload.pairs, strict=True):
+    for row, pairs in workload.scenes.items():
         scene = pairs[0].scene
         stamps[scene] = {}
         for source in run.sources:
@@ -316,19 +330,13 @@ def _score_missing_scenes(
                     stamp = ""
                     missing.append(str(problem))
                 stamps[scene][source.name, pair.pair] = stamp
-        known = partial.problems(scene, stamps=stamps[scene])
-        if known is not None:
+        known = _read_scene(out, scene)
+        if {place: found.stamp for place, found in known.items()} == stamps[scene]:
             done_frames += sum(len(pair.frames) for pair in pairs)
-            problems.extend(known)
+            problems.extend(found.problem for found in known.values() if found.problem)
             continue
-        works.append(
-            SceneWork(
-                index=workload.index.only({row, rows[run.donors.get(scene, scene)]}),
-                pairs=pairs,
-                protocol=run.protocol,
-                sources=run.sources,
-            )
-        )
+        index = workload.index.only({row, rows[run.donors.get(scene, scene)]})
+        works.append(SceneWork(index, tuple(pairs), run.protocol, run.sources))
     _require_few(missing, allowed=allowed)
     _require_few(problems, allowed=allowed)
 
@@ -336,7 +344,9 @@ def _score_missing_scenes(
         scene, scores = result
         problems.extend(found.problem for found in scores.values() if found.problem)
         _require_few(problems, allowed=allowed)
-        partial.write(scene, scores, stamps=stamps[scene])
+        for place, found in scores.items():
+            found.stamp = stamps[scene][place]
+        _write_scene(out, scene, scores)
 
     do_items(
         score_scene,
@@ -358,16 +368,65 @@ def _require_few(problems: Sequence[str], *, allowed: int) -> None:
         )
 
 
+def _scene_path(out: Path, scene: str) -> Path:
+    return out / "scenes" / f"{hashlib.sha256(scene.encode()).hexdigest()[:24]}.pt"
+
+
+def _write_scene(out: Path, scene: str, scores: SceneScores) -> None:
+    """Keep the scores of a scene, whole or not at all."""
+    content = {
+        place: {
+            "columns": found.columns,
+            "problem": found.problem,
+            "views_sha256": found.views_sha256,
+            "stamp": found.stamp,
+            "predicted": _tensors(found.predicted),
+            "target": _tensors(found.target),
+        }
+        for place, found in scores.items()
+    }
+    packed, path = BytesIO(), _scene_path(out, scene)
+    torch.save(content, packed)
+    what = f"{path}: the scores of {scene} cannot be written"
+    with explain_os_errors(what, "Choose another folder with --out."):
+        path.parent.mkdir(exist_ok=True)
+        write_atomic(path, packed.getvalue())
+
+
+def _tensors(sides: Mapping[str, FeatureStatistics]) -> dict[str, tuple[Any, ...]]:
+    return {
+        metric: (each.count, torch.from_numpy(each.mean), torch.from_numpy(each.root))
+        for metric, each in sides.items()
+    }
+
+
+def _read_scene(out: Path, scene: str) -> SceneScores:
+    """Return the scores of a scene; none if it was not scored or its file was cut short."""
+    try:
+        content = torch.load(_scene_path(out, scene), weights_only=True)
+    except (FileNotFoundError, UnpicklingError, RuntimeError, EOFError, ValueError):
+        return {}
+    scores = {}
+    for place, entry in content.items():
+        for side in ("predicted", "target"):
+            entry[side] = {
+                metric: FeatureStatistics(count, mean.numpy(), root.numpy())
+                for metric, (count, mean, root) in entry[side].items()
+            }
+        scores[place] = PairScores(**entry)
+    return scores
+
+
 def _scores(
-    workload: Workload, run: Run, partial: PartialResults, name: str, settings: Mapping[str, Any]
+    workload: Workload, run: Run, out: Path, name: str, settings: Mapping[str, Any]
 ) -> Scores:
     """Return what a source scored; one scene's frames and features are in memory at a time."""
     index, means = workload.index, []
     gathered: dict[tuple[Labels, str], tuple[FeatureStatistics, FeatureStatistics]] = {}
-    for row, pairs in zip(workload.rows, workload.pairs, strict=True):
+    for row, pairs in workload.scenes.items():
         scene = index.scene(row)
         branch: Labels = (scene.id.subset or "", scene.id.family)
-        found = partial.read(scene.id.key, [(name, each.pair) for each in pairs])
+        found = _read_scene(out, scene.id.key)
         for each in pairs:
             scores = found[name, each.pair]
             is_primary = each.pair == scene.rig.primary_pair
@@ -386,12 +445,10 @@ def _scores(
             )
             for metric in scores.predicted if is_primary else ():
                 sides = scores.predicted[metric], scores.target[metric]
-                before = gathered.get((branch, metric))
-                gathered[branch, metric] = (
-                    sides
-                    if before is None
-                    else (before[0].merged(sides[0]), before[1].merged(sides[1]))
-                )
+                if (branch, metric) in gathered:
+                    before = gathered[branch, metric]
+                    sides = before[0].merged(sides[0]), before[1].merged(sides[1])
+                gathered[branch, metric] = sides
     distances: dict[Labels, dict[str, FrechetDistance]] = {}
     for (branch, metric), sides in gathered.items():
         distances.setdefault(branch, {})[metric] = frechet_distance(*sides)

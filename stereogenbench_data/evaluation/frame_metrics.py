@@ -4,11 +4,10 @@ A new metric is a new row of `FRAME_METRIC_ROWS`, and its columns in `columns`. 
 stands what its rows are computed from: the models of a protocol, and a frame of the target.
 """
 
-from collections import ChainMap
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final
 
@@ -16,8 +15,13 @@ from av.video.reformatter import VideoReformatter
 
 from stereogenbench_data.evaluation.columns import EXPLAIN_A_FIT, LEARNED
 from stereogenbench_data.evaluation.metrics import matching, pixels, scale
-from stereogenbench_data.evaluation.models import interfaces
-from stereogenbench_data.evaluation.models.registry import load_model
+from stereogenbench_data.evaluation.models.loading import (
+    KeypointMatcher,
+    Keypoints,
+    Picture,
+    Settings,
+    load_model,
+)
 from stereogenbench_data.evaluation.predictions import scaled_rgb
 from stereogenbench_data.evaluation.protocol import PROTOCOL_VERSION, EvaluationProtocol
 from stereogenbench_data.samples.fields import Sample
@@ -32,82 +36,63 @@ RESIZE: Final = (
 _VERSIONS: Final = ("stereogenbench-data", "numpy", "opencv-python-headless", "opencv-python", "av")
 
 
-class MetricModels:
-    """The models that a protocol's metrics are computed with, loaded when first used.
+@cache
+def model_of(protocol: EvaluationProtocol, kind: str) -> Any:
+    """Return a model of a protocol, kept for the next scene that this process scores.
 
-    Attributes:
-        protocol: The protocol.
+    Args:
+        protocol: Which, where it runs and where its weights are.
+        kind: "keypoint_matcher", "stereo_matcher", or one of the `LEARNED` metrics.
+
+    Raises:
+        EvaluationError: If there is no such model.
+        ExtraError: If a package or weights that it needs are missing.
     """
-
-    def __init__(self, protocol: EvaluationProtocol) -> None:
-        """Take the protocol; nothing is loaded yet."""
-        self.protocol = protocol
-
-    @cached_property
-    def keypoint_matcher(self) -> Any:
-        """What finds the matches of E_match, a `KeypointMatcher`."""
-        return load_model("keypoint matcher", self.protocol.keypoint_matcher, self.protocol.models)
-
-    @cached_property
-    def stereo_matcher(self) -> Any:
-        """What finds the disparity of SD, a `StereoMatcher`."""
-        return load_model("stereo matcher", self.protocol.stereo_matcher, self.protocol.models)
-
-    @cached_property
-    def learned(self) -> dict[str, dict[str, Any]]:
-        """The models of the learned metrics, by kind and metric."""
-        found: dict[str, dict[str, Any]] = {kind: {} for kind, _ in LEARNED.values()}
-        for metric, (kind, name) in LEARNED.items():
-            if metric in self.protocol.metrics:
-                found[kind][metric] = load_model(kind, name, self.protocol.models)
-        return found
-
-    def settings(self) -> dict[str, Any]:
-        """Return every choice that the scores depend on, as plain values.
-
-        Raises:
-            ExtraError: If a package or weights that a metric needs are not there.
-        """
-        protocol = self.protocol
-        height, width = protocol.size
-        settings: dict[str, Any] = {
-            "protocol": PROTOCOL_VERSION,
-            "size": f"{width}x{height}",
-            "resize": RESIZE,
-            "depth": "as the files state" if protocol.depth is None else repr(protocol.depth),
-            "metrics": list(protocol.metrics),
-            "averages": "frames first, then scenes; intervals are Student's over scenes",
-            "versions": {},
-        }
-        for package in _VERSIONS:
-            with suppress(PackageNotFoundError):
-                settings["versions"][package] = version(package)
-        learned = ChainMap(*self.learned.values())
-        for name in protocol.metrics:
-            row = FRAME_METRIC_ROWS.get(name)
-            settings[name] = dict(row.settings(self) if row else learned[name].settings)
-        return settings
+    options: dict[str, Any] = {"device": protocol.device, "weights": protocol.weights}
+    if kind in LEARNED:
+        return load_model("learned metric", kind, **options)
+    return load_model(kind.replace("_", " "), getattr(protocol, kind), **options)
 
 
-@lru_cache(maxsize=1)
-def models_of(protocol: EvaluationProtocol) -> MetricModels:
-    """Return the models of a protocol, kept for the next scene that this process scores.
+def settings_of(protocol: EvaluationProtocol) -> dict[str, Any]:
+    """Return every choice that the scores depend on, as plain values.
 
-    ``models_of.cache_clear()`` drops them.
+    Raises:
+        ExtraError: If a package or weights that a metric needs are not there.
     """
-    return MetricModels(protocol)
+    height, width = protocol.size
+    settings: dict[str, Any] = {
+        "protocol": PROTOCOL_VERSION,
+        "size": f"{width}x{height}",
+        "resize": RESIZE,
+        "depth": "as the files state" if protocol.depth is None else repr(protocol.depth),
+        "metrics": list(protocol.metrics),
+        "averages": "frames first, then scenes; intervals are Student's over scenes",
+        "versions": {},
+    }
+    for package in _VERSIONS:
+        with suppress(PackageNotFoundError):
+            settings["versions"][package] = version(package)
+    for name in protocol.metrics:
+        learned = name in LEARNED
+        settings[name] = dict(
+            model_of(protocol, name).settings
+            if learned
+            else FRAME_METRIC_ROWS[name].settings(protocol)
+        )
+    return settings
 
 
 class CachedKeypoints:
     """A keypoint matcher that detects the keypoints of one and the same array once."""
 
-    def __init__(self, matcher: interfaces.KeypointMatcher) -> None:
+    def __init__(self, matcher: KeypointMatcher) -> None:
         """Take the matcher."""
         self.name, self.settings, self.match = matcher.name, matcher.settings, matcher.match
         self._detect = matcher.detect
-        self._found: dict[int, tuple[Any, interfaces.Keypoints]] = {}
+        self._found: dict[int, tuple[Any, Keypoints]] = {}
 
-    def detect(self, picture: interfaces.Picture) -> interfaces.Keypoints:
+    def detect(self, picture: Picture) -> Keypoints:
         """Return the keypoints of a picture."""
         if id(picture) not in self._found:
             # The picture is kept too, so that no other takes its identity.
@@ -159,7 +144,7 @@ class TargetFrame:
         return matching.target_matches(self.left, self.right, matcher=self.matcher)
 
 
-def _p_psnr(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:
+def _p_psnr(picture: Any, target: TargetFrame, protocol: EvaluationProtocol) -> dict[str, float]:
     score = pixels.patch_psnr(target.left, picture)
     return {
         "p_psnr": score.mean_db,
@@ -169,13 +154,13 @@ def _p_psnr(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str
     }
 
 
-def _e_match(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:
+def _e_match(picture: Any, target: TargetFrame, protocol: EvaluationProtocol) -> dict[str, float]:
     return asdict(matching.match_error(picture, against=target.matches, matcher=target.matcher))
 
 
-def _sd(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:
+def _sd(picture: Any, target: TargetFrame, protocol: EvaluationProtocol) -> dict[str, float]:
     """Return SD by each fit of the protocol, all of one disparity map."""
-    estimated_px = models.stereo_matcher(target.left, picture)
+    estimated_px = model_of(protocol, "stereo_matcher")(target.left, picture)
     found: dict[str, float] = {}
     for method in scale.FITS:
         fit = scale.fit_scale(
@@ -194,36 +179,36 @@ class FrameMetric:
     """How a metric is computed frame by frame.
 
     Attributes:
-        score: Takes the right view, the target and the models; returns a number for each column.
+        score: Takes the right view, the target and the protocol; returns a number for each column.
         settings: Returns every choice that the scores depend on.
         fields: The fields of a sample that it needs besides both views.
     """
 
-    score: Callable[[interfaces.Picture, TargetFrame, MetricModels], Mapping[str, float]]
-    settings: Callable[[MetricModels], interfaces.Settings]
+    score: Callable[[Picture, TargetFrame, EvaluationProtocol], Mapping[str, float]]
+    settings: Callable[[EvaluationProtocol], Settings]
     fields: tuple[str, ...] = ()
 
 
 FRAME_METRIC_ROWS: Final[dict[str, FrameMetric]] = {
     "psnr": FrameMetric(
-        lambda picture, target, models: {"psnr": pixels.psnr_db(picture, target.right)},
-        lambda models: pixels.PSNR_SETTINGS,
+        lambda picture, target, protocol: {"psnr": pixels.psnr_db(picture, target.right)},
+        lambda protocol: pixels.PSNR_SETTINGS,
     ),
     "ssim": FrameMetric(
-        lambda picture, target, models: {"ssim": pixels.ssim(picture, target.right)},
-        lambda models: pixels.SSIM_SETTINGS,
+        lambda picture, target, protocol: {"ssim": pixels.ssim(picture, target.right)},
+        lambda protocol: pixels.SSIM_SETTINGS,
     ),
     "e_match": FrameMetric(
-        _e_match, lambda models: matching.match_settings(models.keypoint_matcher)
+        _e_match, lambda protocol: matching.match_settings(model_of(protocol, "keypoint_matcher"))
     ),
-    "p_psnr": FrameMetric(_p_psnr, lambda models: pixels.PATCH_SETTINGS, ("disparity", "valid")),
+    "p_psnr": FrameMetric(_p_psnr, lambda protocol: pixels.PATCH_SETTINGS, ("disparity", "valid")),
     "sd": FrameMetric(
         _sd,
-        lambda models: scale.scale_settings(models.stereo_matcher),
+        lambda protocol: scale.scale_settings(model_of(protocol, "stereo_matcher")),
         ("disparity", "visible"),
     ),
 }
-"""Every metric of a frame but the learned (`MetricModels.learned`), by name."""
+"""Every metric of a frame but the learned, by name."""
 
 
 def fields_of(protocol: EvaluationProtocol) -> tuple[str, ...]:

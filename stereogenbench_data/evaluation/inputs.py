@@ -97,7 +97,7 @@ def export_inputs(
     workload = select_workload(
         data, protocol, inputs=known.inputs, options=options, conventions=conventions
     )
-    wanted = [pair for pairs in workload.pairs for pair in pairs]
+    wanted = workload.pairs
     settings = {
         "tier": known.name,
         "size": f"{size[1]}x{size[0]}",
@@ -107,7 +107,7 @@ def export_inputs(
     with job_folder(root, settings, kind=INPUTS):
         works = [
             _ItemWork(workload.index.only([row]), pair, known, depth, root / pair.item)
-            for row, pairs in zip(workload.rows, workload.pairs, strict=True)
+            for row, pairs in workload.scenes.items()
             for pair in pairs
             if not (root / pair.item).is_dir()
         ]

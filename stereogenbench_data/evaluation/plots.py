@@ -15,7 +15,6 @@ from stereogenbench_data.evaluation.aggregate import (
     Scores,
     cell,
     group_by,
-    require_comparable,
 )
 from stereogenbench_data.evaluation.columns import COLUMNS, HEAVY_TAILED
 from stereogenbench_data.schema.release import BASELINE_BINS, baseline_bin
@@ -30,11 +29,9 @@ def write_plots(folder: Path, results: Sequence[Scores]) -> list[Path]:
     """Write one PNG for each headline metric, and return the files.
 
     Raises:
-        EvaluationError: If the methods are of different tiers or were scored in different ways.
         ExtraError: If matplotlib is not installed.
         StorageError: If a file cannot be written.
     """
-    require_comparable(results)
     try:
         from matplotlib.figure import Figure
     except ImportError as error:

@@ -7,7 +7,8 @@ conditions.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, Literal
 
 from stereogenbench_data.errors import EvaluationError
@@ -17,7 +18,6 @@ from stereogenbench_data.evaluation.columns import (
     OFFLINE_METRICS,
     require_metrics,
 )
-from stereogenbench_data.evaluation.models.registry import ModelOptions
 from stereogenbench_data.samples.request import require_size
 from stereogenbench_data.schema.records import DepthEncoding
 
@@ -85,10 +85,11 @@ class EvaluationProtocol:
         metrics: Names of `METRICS`.
         size: (height, width) in pixels at which everything is scored.
         keypoint_matcher: What finds the matches of E_match: "sift", or a model of your own
-            (`models.registry`).
+            (`models.loading`).
         stereo_matcher: What finds the disparity of SD: "sgbm", or a model of your own.
         depth: A depth contract instead of the one that files and release state.
-        models: Where learned models run and where their weights are.
+        device: Where learned models run, as torch names it.
+        weights: The folder of their weights; None for that of torch.hub's checkpoints.
         batch_frames: How many frames are held, and given to learned parts, at a time.
     """
 
@@ -97,7 +98,8 @@ class EvaluationProtocol:
     keypoint_matcher: str = "sift"
     stereo_matcher: str = "sgbm"
     depth: DepthEncoding | None = None
-    models: ModelOptions = field(default_factory=ModelOptions)
+    device: str = "cpu"
+    weights: Path | None = None
     batch_frames: int = 8
 
     def __post_init__(self) -> None:

@@ -192,15 +192,12 @@ class Table:
     notes: tuple[str, ...] = ()
 
 
-def tables_of(
-    results: Sequence[Scores], *, by: Mapping[str, Sequence[float]] | None = None
-) -> list[Table]:
+def tables_of(results: Sequence[Scores], *, by: Sequence[str] = ()) -> list[Table]:
     """Return all tables of methods of one tier.
 
     Args:
         results: Each method's scores.
-        by: Columns of the index to stratify by, besides branches and baselines; with the edges
-            of numbers, or () to choose them.
+        by: Columns of the index to stratify by, besides branches and baselines.
 
     Raises:
         EvaluationError: If the methods are of different tiers or were scored in different ways.
@@ -210,12 +207,12 @@ def tables_of(
     names = ["branches", "bins_primary", *(["bins_all"] if has_others else [])]
     return [
         *(table_of(results, name) for name in names),
-        *(stratum_table(results, column, edges=edges) for column, edges in (by or {}).items()),
+        *(stratum_table(results, column) for column in by),
         table_of(results, "explanations"),
     ]
 
 
-def stratum_table(results: Sequence[Scores], column: str, *, edges: Sequence[float] = ()) -> Table:
+def stratum_table(results: Sequence[Scores], column: str) -> Table:
     """Return primary pairs by a column of the index.
 
     Raises:
@@ -229,7 +226,7 @@ def stratum_table(results: Sequence[Scores], column: str, *, edges: Sequence[flo
         )
     used = sorted({pair.row for one in results for pair in one.pairs})
     plain = ["" if value is None else value for value in values[used].tolist()]
-    strata_of = dict(zip(used, strata(plain, name=column, edges=edges), strict=True))
+    strata_of = dict(zip(used, strata(plain, name=column), strict=True))
     form = TableForm(f"By {column}, primary pairs", (*_BRANCH, column))
     return table_of(results, f"by_{column}", form=form, strata_of=strata_of)
 

@@ -73,7 +73,6 @@ def refused(*words):
         (["eval", "controls", "d"], "--size", "480", "WIDTHxHEIGHT"),
         (["eval", "controls", "d"], "--pairs", "0:1", "0-1,0-5"),
         (["eval", "controls", "d"], "--frames", "some", "every:K"),
-        (["eval", "score", "d", "p", "--tier", "G1"], "--by", "focal_mm:wide", "18,35"),
         (["audit", "d"], "--per-scene", "0", "'all'"),
         (["audit", "d"], "--where", "wide", "NAME=VALUE"),
         (["stats", "d"], "--where", "focal_mm=wide", "18:35"),

@@ -74,12 +74,6 @@ def test_every_frame_is_counted_once(numbers):
     assert found.finite + found.infinite + found.undefined == len(numbers)
 
 
-def test_edges_are_half_open_but_for_the_last():
-    assert strata([18, 35, 50, 85, 10, 90], name="focal_mm", edges=(18, 35, 85)) == [
-        "[18,35)", "[35,85]", "[35,85]", "[35,85]", "(-inf,18)", "(85,inf)",
-    ]  # fmt: skip
-
-
 def test_texts_and_few_numbers_are_strata_themselves():
     assert strata(["Town", "", "Egypt"], name="map_name") == ["Town", "not recorded", "Egypt"]
     assert strata([24, 50.5, 24], name="focal_mm") == ["24", "50.5", "24"]
@@ -104,11 +98,3 @@ def test_every_number_has_a_stratum(numbers):
 def test_a_column_that_is_not_known_is_refused():
     with pytest.raises(EvaluationError, match="valid_depth_ratio is not known for any scene"):
         strata([math.nan, math.nan], name="valid_depth_ratio")
-
-
-@pytest.mark.parametrize("edges", [(3, 2), (1,)])
-def test_edges_that_do_not_ascend_are_refused(edges):
-    with pytest.raises(
-        EvaluationError, match="edges of focal_mm must be at least two ascending numbers"
-    ):
-        strata([1.0], name="focal_mm", edges=edges)

@@ -220,7 +220,7 @@ index = SceneIndex.open({scored_index.root!r})
 evaluate(index, lefts, tier="G1", protocol=protocol, out={str(out)!r})
 """
     killed = subprocess.run([sys.executable, "-c", script], check=False, timeout=120)
-    (kept,) = scenes.glob("*.json")
+    (kept,) = scenes.glob("*.pt")
     before = kept.stat().st_mtime_ns
     calls = []
 
@@ -259,14 +259,15 @@ def test_partial_results_that_are_cut_are_made_again_and_of_another_format_refus
     scored_index, right_views, protocol, tmp_path
 ):
     whole = scored(scored_index, right_views, protocol, out=tmp_path)
-    damaged = sorted((tmp_path / "scenes").glob("*.json"))[0]
-    damaged.write_bytes(damaged.read_bytes()[:100])
+    damaged = sorted((tmp_path / "scenes").glob("*.pt"))[0]
+    content = damaged.read_bytes()
+    damaged.write_bytes(content[:100])
 
     assert numbers(scored(scored_index, right_views, protocol, out=tmp_path)) == numbers(whole)
-    json.loads(damaged.read_text())
+    assert len(damaged.read_bytes()) == len(content)
     state = tmp_path / "evaluation.json"
-    state.write_text(json.dumps(json.loads(state.read_text()) | {"format": 3}))
-    with pytest.raises(EvaluationError, match="holds scores of other format: 3, where 4"):
+    state.write_text(json.dumps(json.loads(state.read_text()) | {"format": 4}))
+    with pytest.raises(EvaluationError, match="holds scores of other format: 4, where 5"):
         scored(scored_index, right_views, protocol, out=tmp_path)
 
 
@@ -381,16 +382,16 @@ def test_what_metrics_are_computed_with_is_loaded_once_for_all_scenes(
     loaded = []
     load = frame_metrics.load_model
 
-    def counted(*arguments):
+    def counted(*arguments, **options):
         loaded.append(arguments)
-        return load(*arguments)
+        return load(*arguments, **options)
 
     monkeypatch.setattr(frame_metrics, "load_model", counted)
     matches = EvaluationProtocol(metrics=("e_match",), size=SIZE)
     scored(scored_index, right_views, matches, frames=[0])
 
     assert len(loaded) == 1
-    assert frame_metrics.models_of.cache_info().currsize == 0
+    assert frame_metrics.model_of.cache_info().currsize == 0
 
 
 def test_progress_counts_frames_of_pairs_up_to_all(scored_index, right_views, protocol):

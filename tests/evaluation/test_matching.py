@@ -11,7 +11,7 @@ from stereogenbench_data.evaluation.metrics.matching import (
     mutual_matches,
     target_matches,
 )
-from stereogenbench_data.evaluation.models.interfaces import Keypoints
+from stereogenbench_data.evaluation.models.loading import Keypoints
 from stereogenbench_data.evaluation.models.opencv import Sift
 from tests.evaluation.conftest import photograph
 

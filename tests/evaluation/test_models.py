@@ -11,8 +11,9 @@ import torch
 from stereogenbench_data.errors import EvaluationError, ExtraError
 from stereogenbench_data.evaluation.models.i3d import I3D
 from stereogenbench_data.evaluation.models.inception import INCEPTION
-from stereogenbench_data.evaluation.models.registry import MODELS, ModelOptions, load_model
-from stereogenbench_data.evaluation.models.weights import read_weights, weights_path
+from stereogenbench_data.evaluation.models.loading import MODELS, load_file, load_model
+from stereogenbench_data.evaluation.models.lpips import TRUNK, PerceptualDistance
+from tests.evaluation.known_weights import known_state
 
 
 def test_an_unknown_name_is_answered_with_the_known_ones():
@@ -24,10 +25,10 @@ def test_a_model_of_ones_own_is_named_by_its_file_and_class(tmp_path):
     file = tmp_path / "mine.py"
     file.write_text("class Grey:\n    def __init__(self, *, device):\n        self.name = device\n")
 
-    assert load_model("pair metric", f"{file}:Grey", ModelOptions(device="meta")).name == "meta"
+    assert load_model("stereo matcher", f"{file}:Grey", device="meta").name == "meta"
     for name in (f"{file}:Blue", f"{tmp_path}/other.py:Grey", "no_such_module:Grey"):
-        with pytest.raises(ExtraError, match=f"pair metric {name}: cannot be imported"):
-            load_model("pair metric", name)
+        with pytest.raises(ExtraError, match=f"stereo matcher {name}: cannot be imported"):
+            load_model("stereo matcher", name)
 
 
 @pytest.mark.parametrize("path", [path for models in MODELS.values() for path in models.values()])
@@ -37,36 +38,27 @@ def test_every_model_of_the_registry_can_be_imported(path):
     assert getattr(import_module(module), name).__doc__
 
 
-@pytest.mark.parametrize(
-    ("kind", "name", "weights"),
-    [
-        ("image features", "inception", INCEPTION),
-        ("video features", "i3d", I3D),
-    ],
-)
-def test_missing_weights_are_named_with_source_licence_and_place(
-    kind, name, weights, tmp_path, monkeypatch
+@pytest.mark.parametrize(("name", "weights"), [("lpips", TRUNK), ("fid", INCEPTION), ("fvd", I3D)])
+def test_missing_weights_are_named_with_source_licence_place_and_extra(
+    name, weights, tmp_path, monkeypatch
 ):
     with pytest.raises(ExtraError, match=re.escape(str(tmp_path / weights.file))) as caught:
-        load_model(kind, name, ModelOptions(weights=tmp_path))
+        load_model("learned metric", name, weights=tmp_path)
 
     assert weights.source in str(caught.value)
     assert f"licence: {weights.licence}" in str(caught.value)
-    assert "pip install 'stereogenbench-data[evaluation]'" in str(caught.value)
+    assert f"pip install 'stereogenbench-data[{weights.extra}]'" in str(caught.value)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     with pytest.raises(ExtraError, match=re.escape(str(tmp_path / "torch" / "hub"))):
-        weights_path(weights, folder=None)
+        load_model("learned metric", name)
 
 
-def test_a_missing_package_is_named_with_its_extra_and_its_weights(monkeypatch, tmp_path):
+def test_without_the_package_lpips_its_extra_is_named(monkeypatch, tmp_path):
+    torch.save(known_state(PerceptualDistance().alexnet), tmp_path / TRUNK.file)
     monkeypatch.setattr("stereogenbench_data.evaluation.models.lpips.find_spec", lambda _: None)
 
-    with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[lpips\]'") as caught:
-        load_model("pair metric", "lpips", ModelOptions(weights=tmp_path))
-
-    assert "https://" in str(caught.value)
-    assert "licence: " in str(caught.value)
-    assert f"put it at {tmp_path}/" in str(caught.value)
+    with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[lpips\]'"):
+        load_model("learned metric", "lpips", weights=tmp_path)
 
 
 @pytest.mark.parametrize("name", ["sift", "sgbm"])
@@ -83,7 +75,7 @@ def test_a_file_that_holds_more_than_tensors_is_not_run(tmp_path):
     torch.save({"run": Path("/")}, path)
 
     with pytest.raises(EvaluationError, match="cannot be read as tensors only"):
-        read_weights(path, what="a network")
+        load_file(torch.nn.Linear(1, 1), path)
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut short"])
@@ -92,18 +84,18 @@ def test_a_damaged_file_is_named(tmp_path, content):
     path.write_bytes(content)
 
     with pytest.raises(EvaluationError, match=f"{re.escape(str(path))}: .* Fetch the file again"):
-        read_weights(path, what="a network")
+        load_file(torch.nn.Linear(1, 1), path)
 
 
 def test_a_file_of_something_else_is_named(tmp_path):
     torch.save(torch.zeros(3), tmp_path / I3D.file)
 
     with pytest.raises(EvaluationError, match="are a Tensor, not a table of tensors"):
-        load_model("video features", "i3d", ModelOptions(weights=tmp_path))
+        load_model("learned metric", "fvd", weights=tmp_path)
 
 
 def test_weights_of_another_network_are_named(tmp_path):
     torch.save({"conv.weight": torch.zeros(3)}, tmp_path / I3D.file)
 
-    with pytest.raises(EvaluationError, match="not the weights of InflatedInception: Missing key"):
-        load_model("video features", "i3d", ModelOptions(weights=tmp_path))
+    with pytest.raises(EvaluationError, match="not the weights of this network: Missing key"):
+        load_model("learned metric", "fvd", weights=tmp_path)

@@ -48,12 +48,12 @@ def i3d(i3d_folder):
 def lpips(tmp_path_factory):
     """LPIPS from a folder for AlexNet and a package of which only the file of numbers is read."""
     root = tmp_path_factory.mktemp("lpips")
-    state = known_state(PerceptualDistance())
-    trunk = {name: value for name, value in state.items() if name.startswith("features.")}
-    torch.save(trunk | {"classifier.1.bias": torch.zeros(3)}, root / TRUNK.file)
+    network = PerceptualDistance()
+    classifier = {"classifier.1.bias": torch.zeros(3)}
+    torch.save(known_state(network.alexnet) | classifier, root / TRUNK.file)
     heads = root / "site" / "lpips" / "weights" / "v0.1" / "alex.pth"
     heads.parent.mkdir(parents=True)
-    torch.save({name: state[name] for name in state.keys() - trunk.keys()}, heads)
+    torch.save(known_state(network.heads), heads)
     (root / "site" / "lpips" / "__init__.py").write_text("raise ImportError('not to be imported')")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(root / "site")

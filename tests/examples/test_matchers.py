@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from stereogenbench_data.evaluation.models.registry import ModelOptions, load_model
+from stereogenbench_data.evaluation.models.loading import load_model
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -87,7 +87,7 @@ def test_dedode_is_given_its_weights_and_the_picture_as_kornia_wants_it(site):
     picture = np.zeros((3, 6, 8), dtype=np.uint8)
     picture[:, 2, 5] = 255
 
-    matcher = load_model("keypoint matcher", DEDODE, ModelOptions(weights=site))
+    matcher = load_model("keypoint matcher", DEDODE, weights=site)
     found = matcher.detect(picture)
 
     assert matcher.name == "DeDoDe (kornia 0.test)"
@@ -106,7 +106,7 @@ def test_foundation_stereo_is_padded_for_and_its_answer_cut_to_the_picture(site)
     left, right = (rng.integers(10, 256, (3, 37, 50)).astype(np.uint8) for _ in range(2))
     right[0, 3, 4] = 9
 
-    matcher = load_model("stereo matcher", FOUNDATION, ModelOptions(weights=weights))
+    matcher = load_model("stereo matcher", FOUNDATION, weights=weights)
     disparity = matcher(left, right)
 
     expected = left[0] * np.float32(0.5)

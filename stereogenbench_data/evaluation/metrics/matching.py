@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Int64
 
-from stereogenbench_data.evaluation.models.interfaces import (
+from stereogenbench_data.evaluation.models.loading import (
     KeypointMatcher,
     Keypoints,
     Picture,

@@ -4,14 +4,14 @@ P-PSNR asks how well each patch of the left picture is found again along its row
 """
 
 import math
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 from numpy.lib.stride_tricks import as_strided
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.models.interfaces import Picture, Settings
+from stereogenbench_data.evaluation.models.loading import Picture, Settings
 from stereogenbench_data.evaluation.models.opencv import require_opencv
 
 _PEAK: Final = 255.0
@@ -19,8 +19,6 @@ _WINDOW_PX: Final = 11
 _SIGMA_PX: Final = 1.5
 _K1: Final = 0.01
 _K2: Final = 0.03
-_BAND_ROWS: Final = 64
-"""How many rows of windows are worked on at once, so that they stay in the cache."""
 
 PSNR_SETTINGS: Final[Settings] = {
     "data_range": _PEAK,
@@ -49,12 +47,9 @@ def psnr_db(predicted: Picture, target: Picture) -> float:
     Returns:
         Infinity where the two are identical: count these, since an average of them says nothing.
     """
-    error = predicted.astype(np.int32)
-    error -= target
-    flat = error.reshape(-1)
-    np.multiply(flat, flat, out=flat)
-    squared = int(flat.sum(dtype=np.int64))
-    return 10 * math.log10(_PEAK * _PEAK * flat.size / squared) if squared else math.inf
+    error = predicted.astype(np.int32) - target
+    squared = int(np.sum(error**2, dtype=np.int64))
+    return 10 * math.log10(_PEAK * _PEAK * error.size / squared) if squared else math.inf
 
 
 def ssim(predicted: Picture, target: Picture) -> float:
@@ -76,50 +71,21 @@ def ssim(predicted: Picture, target: Picture) -> float:
             f"SSIM needs pictures of at least {_WINDOW_PX}x{_WINDOW_PX} pixels, "
             f"got {width}x{height}."
         )
-    cv2 = require_opencv()
-    rows, columns = int(height) - _WINDOW_PX + 1, int(width) - _WINDOW_PX + 1
-    bands = [
-        slice(top, min(top + _BAND_ROWS, rows) + _WINDOW_PX - 1)
-        for top in range(0, rows, _BAND_ROWS)
-    ]
-    sums = (
-        _summed_ssim(cv2, x[band], y[band])
-        for x, y in zip(predicted, target, strict=True)
-        for band in bands
-    )
-    return math.fsum(sums) / (len(predicted) * rows * columns)
+    cv2, inside = require_opencv(), slice(_WINDOW_PX // 2, -(_WINDOW_PX // 2))
 
+    def means(values: Float64[np.ndarray, "h w 3"]) -> Float64[np.ndarray, "inner_h inner_w 3"]:
+        """Return the Gaussian means of the windows that lie wholly inside."""
+        filtered = cv2.sepFilter2D(values, -1, _KERNEL, _KERNEL)
+        return np.asarray(filtered[inside, inside])
 
-def _summed_ssim(cv2: Any, x8: Any, y8: Any) -> float:
-    """Return the sum of the SSIM of all windows inside a part of one channel.
-
-    The variances are only needed as their sum, so four filters do: of x, y, xx + yy and xy.
-    """
-    x, y = x8.astype(np.float64), y8.astype(np.float64)
-    mean_x, mean_y = _filtered(cv2, x), _filtered(cv2, y)
-    products = x * y
-    x *= x
-    y *= y
-    x += y
-    means = mean_x * mean_y
-    covariance = _filtered(cv2, products)
-    covariance -= means
-    mean_x *= mean_x
-    mean_y *= mean_y
-    mean_x += mean_y
-    variances = _filtered(cv2, x)
-    variances -= mean_x
+    x, y = (view.transpose(1, 2, 0).astype(np.float64, order="C") for view in (predicted, target))
+    mean_x, mean_y = means(x), means(y)
+    powers, product = mean_x**2 + mean_y**2, mean_x * mean_y
+    # The variances are only needed as their sum, so four filters do.
+    variances, covariance = means(x**2 + y**2) - powers, means(x * y) - product
     c1, c2 = (_K1 * _PEAK) ** 2, (_K2 * _PEAK) ** 2
-    similar = (2 * means + c1) * (2 * covariance + c2)
-    similar /= (mean_x + c1) * (variances + c2)
-    return float(similar.sum())
-
-
-def _filtered(cv2: Any, values: Float64[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
-    """Return the Gaussian means of the windows that lie wholly inside."""
-    inside = slice(_WINDOW_PX // 2, -(_WINDOW_PX // 2))
-    filtered = cv2.sepFilter2D(values, -1, _KERNEL, _KERNEL)
-    return np.asarray(filtered[inside, inside])
+    similar = (2 * product + c1) * (2 * covariance + c2) / ((powers + c1) * (variances + c2))
+    return float(similar.mean())
 
 
 _OFFSETS_PX: Final = np.arange(_WINDOW_PX) - _WINDOW_PX // 2

@@ -7,7 +7,7 @@ from typing import Final, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from stereogenbench_data.evaluation.models.interfaces import Settings, StereoMatcher
+from stereogenbench_data.evaluation.models.loading import Settings, StereoMatcher
 
 FitMethod = Literal["filtered", "least_squares"]
 
@@ -50,7 +50,6 @@ class ScaleFit:
         drift: SD, |slope - 1|.
         slope: Below 1 where the predicted pair's disparity is too large.
         offset_px: True disparity where none is estimated.
-        pixels: How many pixels the line was fitted to.
         outliers: The share of the answered pixels that were left out of the fit.
         valid: The share of the picture's pixels that the line was fitted to.
         answered: The share of the scored pixels for which the matcher had an answer.
@@ -61,7 +60,6 @@ class ScaleFit:
     drift: float = math.nan
     slope: float = math.nan
     offset_px: float = math.nan
-    pixels: int = 0
     outliers: float = math.nan
     valid: float = 0.0
     answered: float = math.nan
@@ -116,7 +114,6 @@ def fit_scale(
         drift=abs(slope - 1),
         slope=slope,
         offset_px=offset,
-        pixels=pixels,
         outliers=(estimated.size - pixels) / estimated.size,
         valid=pixels / scored.size,
         answered=share,

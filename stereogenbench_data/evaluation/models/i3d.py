@@ -12,8 +12,13 @@ from jaxtyping import Float64
 from torch import nn
 from torch.nn import functional
 
-from stereogenbench_data.evaluation.models.interfaces import Clips, Settings
-from stereogenbench_data.evaluation.models.weights import Weights, in_batches, load_weights
+from stereogenbench_data.evaluation.models.loading import (
+    Clips,
+    Settings,
+    Weights,
+    in_batches,
+    load_weights,
+)
 
 I3D: Final = Weights(
     what="FVD's I3D",
@@ -34,7 +39,7 @@ class I3dFeatures:
     min_frames = 10
 
     def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
-        """Load the network; the arguments are those of `ModelOptions`.
+        """Load the network; the arguments are those of `load_model`.
 
         Raises:
             ExtraError: If the file of weights is missing.

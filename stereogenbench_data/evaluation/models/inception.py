@@ -5,8 +5,7 @@ the maximum, and it resizes pictures as TensorFlow 1 does, bilinearly from pixel
 without smoothing. Layers are named as in the file of its weights.
 
 The network of torch-fidelity 0.4 gives the same features bit for bit. It is not used because it
-imports torchvision, each release of which fits one release of torch only, and because it unpickles
-the file of weights without restriction.
+imports torchvision, each release of which fits one release and one build of torch only.
 """
 
 from collections import OrderedDict
@@ -20,8 +19,13 @@ from jaxtyping import Float64
 from torch import nn
 from torch.nn import functional
 
-from stereogenbench_data.evaluation.models.interfaces import Pictures, Settings
-from stereogenbench_data.evaluation.models.weights import Weights, in_batches, load_weights
+from stereogenbench_data.evaluation.models.loading import (
+    Pictures,
+    Settings,
+    Weights,
+    in_batches,
+    load_weights,
+)
 
 INCEPTION: Final = Weights(
     what="FID's Inception",
@@ -42,7 +46,7 @@ class InceptionFeatures:
     name = "Inception-v3 (TensorFlow, 2015-12-05)"
 
     def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
-        """Load the network; the arguments are those of `ModelOptions`.
+        """Load the network; the arguments are those of `load_model`.
 
         Raises:
             ExtraError: If the file of weights is missing.

@@ -1,8 +1,8 @@
 """LPIPS, version 0.1 on AlexNet: a weighted distance of two pictures' normalised activations.
 
 The network of the package lpips gives the same distances to 1e-8. It is not used because it imports
-torchvision, each release of which fits one release of torch only. The package is needed for its
-file of weights, and is not imported.
+torchvision, each release of which fits one release and one build of torch only. The package is
+needed for its file of weights, and is not imported.
 """
 
 from importlib.util import find_spec
@@ -15,15 +15,15 @@ from jaxtyping import Float64
 from torch import nn
 from torch.nn import functional
 
-from stereogenbench_data.errors import ExtraError, missing_extra
-from stereogenbench_data.evaluation.models.interfaces import Pictures, Settings
-from stereogenbench_data.evaluation.models.weights import (
+from stereogenbench_data.errors import missing_extra
+from stereogenbench_data.evaluation.models.loading import (
+    Pictures,
+    Settings,
+    Tensors,
     Weights,
-    fingerprint,
     in_batches,
-    load_into,
-    read_weights,
-    weights_path,
+    load_file,
+    load_weights,
 )
 
 TRUNK: Final = Weights(
@@ -46,7 +46,7 @@ class Lpips:
     name = "LPIPS"
 
     def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
-        """Load the network; the arguments are those of `ModelOptions`.
+        """Load the network; the arguments are those of `load_model`.
 
         AlexNet's file is in the folder of weights; the few numbers on top of it come from the
         installed package lpips.
@@ -55,32 +55,20 @@ class Lpips:
             ExtraError: If the package or the file is missing.
             EvaluationError: If a file does not hold this network's weights.
         """
-        package = find_spec("lpips")
-        if package is None or package.origin is None:
-            raise ExtraError(
-                f"{missing_extra('LPIPS', TRUNK.extra, 'No module named lpips')} The weights of "
-                f"AlexNet: {TRUNK.how_to_fetch(weights)}, or name the folder that it is in "
-                f"(--weights)."
-            )
-        path = weights_path(TRUNK, folder=weights)
-        heads = read_weights(Path(package.origin).parent / HEADS, what="LPIPS")
-        trunk = {
-            name: value
-            for name, value in read_weights(path, what=TRUNK.what).items()
-            if name.startswith("features.")
-        }
         network = PerceptualDistance()
-        load_into(network, trunk | dict(heads), path=path)
-        self._network = network.to(device)
-        self._device = device
         self.settings: Settings = {
             "network": "AlexNet",
             "version": "0.1",
             "size": "as scored",
-            "weights": path.name,
-            "weights_sha256": fingerprint(path),
+            **load_weights(network.alexnet, TRUNK, folder=weights, select=_of_features),
             "precision": "float32",
         }
+        package = find_spec("lpips")
+        if package is None or package.origin is None:
+            raise missing_extra("LPIPS", TRUNK.extra, "No module named lpips")
+        load_file(network.heads, Path(package.origin).parent / HEADS)
+        self._network = network.to(device)
+        self._device = device
 
     def __call__(self, predicted: Pictures, target: Pictures) -> Float64[np.ndarray, " n"]:
         """Return the distance of each picture from its target."""
@@ -88,6 +76,11 @@ class Lpips:
             self._network, predicted, target, device=self._device, rows=_BATCH
         )
         return distances
+
+
+def _of_features(tensors: Tensors) -> Tensors:
+    """Leave out the layers of AlexNet that classify."""
+    return {name: each for name, each in tensors.items() if name.startswith("features.")}
 
 
 class PerceptualDistance(nn.Module):
@@ -98,7 +91,7 @@ class PerceptualDistance(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.features = nn.Sequential(
+        features = nn.Sequential(
             nn.Conv2d(3, 64, 11, stride=4, padding=2),
             nn.ReLU(),
             nn.MaxPool2d(3, stride=2),
@@ -112,17 +105,18 @@ class PerceptualDistance(nn.Module):
             nn.Conv2d(256, 256, 3, padding=1),
             nn.ReLU(),
         )
+        self.alexnet = nn.ModuleDict({"features": features})
+        self.heads = nn.ModuleDict()
         for layer, channels in enumerate(_CHANNELS):
             head = nn.Sequential(nn.Dropout(), nn.Conv2d(channels, 1, 1, bias=False))
-            self.add_module(f"lin{layer}", nn.ModuleDict({"model": head}))
+            self.heads[f"lin{layer}"] = nn.ModuleDict({"model": head})
 
     def forward(self, one: torch.Tensor, two: torch.Tensor) -> torch.Tensor:
         """Return distances (n,)."""
         total = one.new_zeros(len(one))
-        for layer, (here, there) in enumerate(
-            zip(self._activations(one), self._activations(two), strict=True)
-        ):
-            head = self.get_submodule(f"lin{layer}.model")
+        activations = zip(self._activations(one), self._activations(two), strict=True)
+        for layer, (here, there) in enumerate(activations):
+            head = self.heads.get_submodule(f"lin{layer}.model")
             total += head((here - there) ** 2).mean(dim=(1, 2, 3))
         return total
 
@@ -134,7 +128,7 @@ class PerceptualDistance(nn.Module):
         )
         x = (pictures / 127.5 - 1 - shift) / scale
         found = []
-        for step in self.features:
+        for step in self.alexnet.get_submodule("features").children():
             x = step(x)
             if isinstance(step, nn.ReLU):
                 found.append(functional.normalize(x, dim=1, eps=1e-10))

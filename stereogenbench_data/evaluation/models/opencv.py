@@ -8,11 +8,7 @@ from jaxtyping import Float32, Int64
 
 from stereogenbench_data.errors import EvaluationError, missing_extra
 from stereogenbench_data.evaluation.metrics.matching import KEYPOINTS, RATIO, mutual_matches
-from stereogenbench_data.evaluation.models.interfaces import (
-    Keypoints,
-    Picture,
-    Settings,
-)
+from stereogenbench_data.evaluation.models.loading import Keypoints, Picture, Settings
 
 _DESCRIPTOR_DIM: Final = 128
 
