@@ -32,6 +32,7 @@ from stereogenbench_data.index.scene_folder import (
 )
 from stereogenbench_data.index.tree import (
     FoundScenes,
+    SceneFolder,
     find_remote_scenes,
     find_scene_folders,
     folder_of,
@@ -52,6 +53,8 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.location import is_remote, shown
+from stereogenbench_data.sources.remote import RemoteObject
+from stereogenbench_data.sources.retry import RetryPolicy
 
 _JOURNAL_FORMAT: Final = 2
 
@@ -204,6 +207,7 @@ def walk(  # noqa: PLR0913 - each is an option of the command
     wanted: Callable[[SceneId], bool] | None = None,
     if_none: Literal["refuse", "all"] = "refuse",
     conventions: Conventions | None = None,
+    retry: RetryPolicy | None = None,
 ) -> TreeReport:
     """Return every scene of a tree in the released layout, and what is wrong with the others.
 
@@ -220,14 +224,16 @@ def walk(  # noqa: PLR0913 - each is an option of the command
         wanted: Returns whether to describe the scene of a path; None is all.
         if_none: What to do where no scene is wanted: refuse, or describe all of them.
         conventions: Where quantities stand in the files and how they are read.
+        retry: How slow a server may be.
 
     Raises:
         StorageError: If there is no such scene below the root, or a worker process died; or if the
             first `ALIKE` scenes are broken for one reason, so that it is the format of the files.
     """
     require_workers(workers)
-    folders, is_part = find_scenes(root, wanted=wanted, if_none=if_none)
-    outcomes = _reused(root, folders.keys, journal)
+    folders, is_part = find_scenes(root, wanted=wanted, if_none=if_none, retry=retry)
+    task = DescribeTask(str(root), valid_depth, conventions, retry)
+    outcomes = _reused(task, folders.keys, journal)
     total = len(folders.keys)
     if progress is not None:
         progress(len(outcomes), total)
@@ -236,7 +242,6 @@ def walk(  # noqa: PLR0913 - each is an option of the command
         workers = 1
     if is_remote(root):
         tell_requests(root, len(pending), each=_REQUESTS, what="all files")
-    task = DescribeTask(str(root), valid_depth, conventions)
     for outcome in engine.map(task, pending, name=str, workers=workers):
         outcomes[outcome.key] = outcome
         if len(outcomes) == ALIKE:
@@ -271,10 +276,13 @@ def find_scenes(
     wanted: Callable[[SceneId], bool] | None,
     if_none: Literal["refuse", "all"] = "refuse",
     folders: FoundScenes | None = None,
+    retry: RetryPolicy | None = None,
 ) -> tuple[FoundScenes, bool]:
     """Return the wanted scenes of a tree, and whether they are a part of it; see `walk`."""
-    if folders is None:
-        folders = find_remote_scenes(str(root)) if is_remote(root) else find_scene_folders(root)
+    if folders is None and is_remote(root):
+        folders = find_remote_scenes(RemoteObject(str(root), retry=retry))
+    elif folders is None:
+        folders = find_scene_folders(root)
     if wanted is None:
         return folders, False
     keys = tuple(key for key in folders.keys if wanted(parse_scene_key(key)))
@@ -313,11 +321,16 @@ class DescribeTask:
     root: str
     valid_depth: ValidDepth = "skip"
     conventions: Conventions | None = None
+    retry: RetryPolicy | None = None
+
+    def folder(self, key: str) -> SceneFolder:
+        """Return a scene's folder; nothing is read yet."""
+        return folder_of(self.root, key, retry=self.retry)
 
     def __call__(self, key: str, advance: Advance = no_advance) -> Outcome:
         """Return what the scene is."""
         advance(0)
-        folder = folder_of(self.root, key)
+        folder = self.folder(key)
         files: dict[str, tuple[int, int]] = {}
         try:
             files = folder.stamps()
@@ -330,14 +343,14 @@ class DescribeTask:
         return Outcome(key, scene, stamp_of(files), has_mark=COMPLETE_JSON in files)
 
 
-def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> dict[str, Outcome]:
+def _reused(task: DescribeTask, keys: Iterable[str], journal: Journal | None) -> dict[str, Outcome]:
     """Return the scenes that a journal holds and whose files have not changed."""
     outcomes: dict[str, Outcome] = {}
     for key in keys if journal is not None and len(journal) else ():
         with suppress(
             StorageError, ValueError, KeyError, TypeError, IndexError, AttributeError
         ):  # of the folder, or of a damaged row: the scene is described again
-            stamp = stamp_of(folder_of(root, key).stamps())
+            stamp = stamp_of(task.folder(key).stamps())
             row = None if journal is None else journal.value(key, stamp=stamp)
             if row is not None:
                 scene = scene_of_json(row)

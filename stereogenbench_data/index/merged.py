@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import PurePosixPath
 from typing import Any, Final
 
-from stereogenbench_data.sources.location import joined
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import MissingObject
 
@@ -23,21 +22,21 @@ _KINDS: Final = (".jsonl", ".json")
 _PATH: Final = re.compile(r"(?:^|/)((?:train/[^/]+|eval/[^/]+/[^/]+)/[^/]+/[^/]+)(?:/|$)")
 
 
-def merged_records(root: str, keys: Sequence[str]) -> Iterator[dict[str, bytes]]:
+def merged_records(root: RemoteObject, keys: Sequence[str]) -> Iterator[dict[str, bytes]]:
     """Yield the records of each file that has one of every scene: key to a JSON object.
 
     Raises:
         StorageError: If the folder is there, and a file of it cannot be fetched.
     """
-    folder = joined(root, FOLDER)
+    folder = root.below(FOLDER)
     try:
-        sizes = RemoteObject(folder).entries()
+        sizes = folder.entries()
     except MissingObject:
         return
     for name, size in sorted(sizes.items()):
         if size is None or size > _LARGEST_BYTES or PurePosixPath(name).suffix not in _KINDS:
             continue
-        text = RemoteObject(joined(folder, name), expected_size=size).read(0, size)
+        text = folder.below(name, expected_size=size).read(0, size)
         found: dict[str, bytes] = {}
         scenes = _Scenes(keys)
         try:

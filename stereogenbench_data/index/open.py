@@ -131,7 +131,9 @@ def open_table(
     at the caller's caller.
     """
     named_root = None if root is None else _require_root(root)
-    open_tree = functools.partial(_open_tree, wanted=wanted, conventions=conventions, rows=rows)
+    open_tree = functools.partial(
+        _open_tree, wanted=wanted, conventions=conventions, rows=rows, retry=retry
+    )
     if is_remote(data):
         where = shown(data)
         opened = _open_url(str(data), root=named_root, retry=retry, open_tree=open_tree)
@@ -218,6 +220,7 @@ def _open_tree(
     wanted: Callable[[SceneId], bool] | None,
     rows: Rows,
     conventions: Conventions | None,
+    retry: RetryPolicy | None,
 ) -> Opened:
     """Return the scenes of a folder or URL in the released layout, without a few broken ones.
 
@@ -228,19 +231,19 @@ def _open_tree(
     from stereogenbench_data.index.presumed import list_tree
 
     with _no_collection():
-        tree = list_tree(root if is_remote(root) else Path(root), wanted, conventions)
+        place = root if is_remote(root) else Path(root)
+        tree = list_tree(place, wanted, conventions, retry=retry)
     if tree is not None and rows == "presumed" and tree.has_one_shape:
-        opened = _open_presumed(tree, "when needed" if tree.is_remote else "read")
+        opened = _open_presumed(tree, "read" if tree.remote is None else "when needed")
         if opened is not None:
             return opened
     opened = None if tree is None else _kept(tree, "read")
     if opened is None:
-        if tree is not None and tree.is_remote:
+        if tree is not None and tree.remote is not None:
             _require_few(tree)
         # In this process: a script without `if __name__ == "__main__"` could start no others.
-        opened = _of_report(
-            walk(root, workers=1, wanted=wanted, if_none="all", conventions=conventions)
-        )
+        how: Any = {"wanted": wanted, "conventions": conventions, "retry": retry}
+        opened = _of_report(walk(root, workers=1, if_none="all", **how))
         if tree is not None:
             _keep(tree, "read", opened)
     return opened

@@ -91,6 +91,8 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.sources.fetch_ahead import FetchAhead, Wanted
 from stereogenbench_data.sources.location import shown
+from stereogenbench_data.sources.remote import RemoteObject
+from stereogenbench_data.sources.retry import RetryPolicy
 
 _LOOKED_AT: Final = 20
 """How many scenes are described in full when a tree is opened, over all groups."""
@@ -119,6 +121,7 @@ class ListedTree:
         is_part: Whether the user chose only some of the scenes.
         stamp: A digest that changes when a file is added, removed or changed.
         conventions: How the files are read.
+        remote: The folder behind the URL; None on this machine.
         described: The outcomes of scenes that were described in full.
     """
 
@@ -128,12 +131,8 @@ class ListedTree:
     is_part: bool
     stamp: str
     conventions: Conventions | None
+    remote: RemoteObject | None
     described: dict[str, Outcome] = field(default_factory=dict)
-
-    @property
-    def is_remote(self) -> bool:
-        """Whether it is behind a URL."""
-        return isinstance(self.root, str)
 
     @property
     def cache(self) -> TreeCache:
@@ -145,8 +144,8 @@ class ListedTree:
         files = self.files.get(key)
         if isinstance(files, StorageError):
             raise files
-        if isinstance(self.root, str) and files is not None:
-            return RemoteFolder(self.root, key, files, self.cache)
+        if self.remote is not None and files is not None:
+            return RemoteFolder(self.remote, key, files, self.cache)
         return SceneFolder(self.root, key)
 
     def finished(self, key: str) -> Files:
@@ -165,7 +164,7 @@ class ListedTree:
 
     def of_each(self, read: Callable[[str], Any], keys: Sequence[str]) -> Iterator[Any]:
         """Yield what is read of each scene, in order; several wait at a time."""
-        return in_parallel(read, keys) if self.is_remote else _of_each(read, keys)
+        return _of_each(read, keys) if self.remote is None else in_parallel(read, keys)
 
     def describe(self, key: str, videos: Collection[str] | None = None) -> Scene:
         """Return a scene as its files say, or as the user's cache holds it; see `describe_scene`.
@@ -217,9 +216,12 @@ def list_tree(
     root: Path | str,
     wanted: Callable[[SceneId], bool] | None,
     conventions: Conventions | None = None,
+    *,
+    retry: RetryPolicy | None = None,
 ) -> ListedTree | None:
     """List the wanted scenes of a tree; None where they are few, which are better read whole."""
-    tree = RemoteTree(root) if isinstance(root, str) else None
+    remote = RemoteObject(root, retry=retry) if isinstance(root, str) else None
+    tree = None if remote is None else RemoteTree(remote)
     all_folders = None if tree is None else tree.scenes()
     folders, is_part = find_scenes(root, wanted=wanted, if_none="all", folders=all_folders)
     if len(folders.keys) < (POOL_FROM if tree is None else FEW_REMOTE):
@@ -242,7 +244,7 @@ def list_tree(
     digest = hashlib.sha256(repr((is_part, folders.is_marked, folders.refused)).encode())
     for key, found in files.items():
         digest.update(repr((key, found)).encode())
-    return ListedTree(root, folders, files, is_part, digest.hexdigest()[:32], conventions)
+    return ListedTree(root, folders, files, is_part, digest.hexdigest()[:32], conventions, remote)
 
 
 def _of_each(read: Callable[[str], Any], keys: Sequence[str]) -> Iterator[Any]:
@@ -294,7 +296,7 @@ def presumed_report(tree: ListedTree, baselines: Baselines) -> TreeReport | None
         groups.setdefault((found.id.split, found.id.family, videos), []).append(found)
     for group in groups.values():
         count = _LEAST_OF_A_GROUP
-        if not tree.is_remote:
+        if tree.remote is None:
             count = max(count, _LOOKED_AT // len(groups))
         places = np.unique(np.linspace(0, len(group) - 1, count).astype(int)).tolist()
         keys = [group[place].id.key for place in places]
@@ -322,7 +324,7 @@ def _metadata(
 ) -> Iterator[tuple[str, _Metadata | StereoGenBenchError]]:
     """Yield what is known of each scene before it is described, or why it cannot be used."""
     rigs, keys = RigReader(tree.stated), tree.folders.keys
-    merged = _merged(tree) if baselines == "read" and tree.is_remote else {}
+    merged = _merged(tree, tree.remote) if baselines == "read" and tree.remote else {}
 
     def read(key: str) -> tuple[Files, bytes] | StereoGenBenchError:
         try:
@@ -333,7 +335,7 @@ def _metadata(
         except StereoGenBenchError as error:
             return error
 
-    if baselines == "read" and tree.is_remote and not merged:
+    if baselines == "read" and tree.remote and not merged:
         tell_requests(tree.root, len(keys), each=1, what=BASELINE_JSON)
     for key, found in zip(keys, tree.of_each(read, keys), strict=True):
         if isinstance(found, StereoGenBenchError):
@@ -370,7 +372,7 @@ def _with_marked(labels: SceneLabels, folder: SceneFolder, files: Files) -> Scen
     return merged_labels(labels, marked)
 
 
-def _merged(tree: ListedTree) -> Mapping[str, bytes]:
+def _merged(tree: ListedTree, root: RemoteObject) -> Mapping[str, bytes]:
     """Return a record of each scene that says what some scenes' own files say, if there is one."""
     keys = tree.folders.keys
     places = np.unique(np.linspace(0, len(keys) - 1, _LOOKED_AT).astype(int)).tolist()
@@ -381,7 +383,7 @@ def _merged(tree: ListedTree) -> Mapping[str, bytes]:
         rig, labels, _ = parse_rig(folder.read(BASELINE_JSON), where=key, shape=tree.stated)
         return rig, _with_marked(labels, folder, tree.finished(key))
 
-    for records in merged_records(str(tree.root), keys):
+    for records in merged_records(root, keys):
         with suppress(SchemaError, StorageError):  # of a record, or of the files of one of these
             stated = (parse_rig(records[key], where=key, shape=tree.stated) for key in some)
             both = zip(stated, in_parallel(own, some), strict=True)
@@ -473,10 +475,10 @@ class Presumption:
     ) -> None:
         """Name the tree, and how the poses are read of the scenes that were read."""
         self.was_told = False
-        self.is_remote = tree.is_remote
+        self.is_remote = tree.remote is not None
         self.baselines = baselines
         # On a disk files are listed anew when a scene is needed, so they need not be kept.
-        self.tree = tree if tree.is_remote else replace(tree, files={}, described={})
+        self.tree = tree if self.is_remote else replace(tree, files={}, described={})
         self._agreed = agreed_forms(forms)
         self._ahead = FetchAhead()
         self._planned: dict[str, int] = {}
@@ -570,7 +572,8 @@ class Presumption:
             return caption_of(texts, key=key)[0]
 
         keys = [*keys]
-        for merged in merged_records(str(self.tree.root), keys) if self.is_remote else ():
+        remote = self.tree.remote
+        for merged in () if remote is None else merged_records(remote, keys):
             found = [caption_of({DESCRIPTION_JSON: merged[key]}, key=key)[0] for key in keys]
             if any(found) and all(map(eq, found, map(caption, keys[:_LEAST_OF_A_GROUP]))):
                 return found

@@ -62,10 +62,11 @@ from stereogenbench_data.schema.release import (
     VIDEO_FILES,
 )
 from stereogenbench_data.sources.files import write_atomic
-from stereogenbench_data.sources.location import is_remote, joined, shown
+from stereogenbench_data.sources.location import is_remote
 from stereogenbench_data.sources.members import read_text_file
 from stereogenbench_data.sources.ranged_file import FIRST_BLOCK, MemberFile, RangedFile
 from stereogenbench_data.sources.remote import RemoteObject
+from stereogenbench_data.sources.retry import RetryPolicy
 
 CACHE_VARIABLE: Final = "STEREOGENBENCH_CACHE"
 """The environment variable that names another folder for the cache, or is "off"."""
@@ -177,9 +178,11 @@ def in_parallel(read: Callable[[_Item], _T], items: Iterable[_Item]) -> Iterator
         yield from pool.map(read, items)
 
 
-def folder_of(root: str | Path, key: str) -> "SceneFolder":
+def folder_of(root: str | Path, key: str, *, retry: RetryPolicy | None = None) -> "SceneFolder":
     """Return a scene's folder on this machine or behind a URL; nothing is read yet."""
-    return RemoteFolder(str(root), key) if is_remote(root) else SceneFolder(root, key)
+    if is_remote(root):
+        return RemoteFolder(RemoteObject(str(root), retry=retry), key)
+    return SceneFolder(root, key)
 
 
 def stamp_of(files: Files) -> str:
@@ -239,10 +242,15 @@ class RemoteFolder(SceneFolder):
     """A scene's folder behind a URL."""
 
     def __init__(
-        self, root: str, key: str, files: Files | None = None, kept: TreeCache | None = None
+        self,
+        root: RemoteObject,
+        key: str,
+        files: Files | None = None,
+        kept: TreeCache | None = None,
     ) -> None:
         """Name the folder, its files if they are listed already, and where small ones are kept."""
-        super().__init__(root, key)
+        self.key = key
+        self._folder = root.below(key)
         self._listed = files
         self._kept = kept
         self._objects: dict[str, RemoteObject] = {}
@@ -251,7 +259,7 @@ class RemoteFolder(SceneFolder):
     @property
     def _files(self) -> Files:
         if self._listed is None:
-            found = RemoteObject(joined(str(self._root), self.key)).entries()
+            found = self._folder.entries()
             sizes = {name: found[name] for name in sorted(found) if is_read(name)}
             self._listed = {name: (size, 0) for name, size in sizes.items() if size is not None}
         return self._listed
@@ -272,8 +280,7 @@ class RemoteFolder(SceneFolder):
             is_small = self._files.get(name, (0, 0))[0] <= MAX_TEXT_BYTES
             if name in self._files and name not in self._objects and (is_video or is_small):
                 size, _ = self._files[name]
-                url = joined(str(self._root), f"{self.key}/{name}")
-                self._objects[name] = RemoteObject(url, expected_size=size)
+                self._objects[name] = self._folder.below(name, expected_size=size)
                 if is_video and size > _READ_WHOLE:
                     parts += (name, 0, FIRST_BLOCK), (name, size - FIRST_BLOCK, size)
                 else:
@@ -452,7 +459,7 @@ def _nothing_found(root: Path, refused: dict[str, str]) -> str:
     return f"{looked}, and found {', '.join(there) or 'nothing'} in it. Point at another folder."
 
 
-def find_remote_scenes(url: str) -> FoundScenes:
+def find_remote_scenes(root: RemoteObject) -> FoundScenes:
     """Return the keys of all scenes behind a URL, sorted; scenes' own folders are not listed.
 
     Raises:
@@ -461,13 +468,13 @@ def find_remote_scenes(url: str) -> FoundScenes:
     """
 
     def folders(path: str) -> list[str]:
-        entries = RemoteObject(joined(url, path) if path else url).entries()
+        entries = (root.below(path) if path else root).entries()
         return [name for name, size in entries.items() if size is None and name[0] != "."]
 
     keys = _keys_below([name for name in folders("") if name in _SCENE_DEPTH], folders)
     if not keys:
         raise StorageError(
-            f"{shown(url)}: holds no scene and no index.parquet; looked for folders {_LAYOUT}. "
+            f"{root.where}: holds no scene and no index.parquet; looked for folders {_LAYOUT}. "
             "Point at the folder that holds train/ or eval/, or at one of shards."
         )
     return FoundScenes(tuple(sorted(parse_scene_key(key).key for key in keys)), {})
@@ -522,14 +529,14 @@ class PlacedFolders:
 class RemoteTree:
     """The scenes of a tree behind a URL, and their files."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, root: RemoteObject) -> None:
         """Ask for the commit of a tree of the Hub; nothing else is requested yet.
 
         Raises:
             StorageError: If the server cannot be asked.
         """
-        self.url = url
-        pinned = RemoteObject(url).pinned()
+        self._root = root
+        pinned = root.pinned()
         self._kept = TreeCache(pinned) if pinned else None
 
     def scenes(self) -> FoundScenes:
@@ -538,7 +545,7 @@ class RemoteTree:
         Raises:
             StorageError: If the tree cannot be listed, or no scene is where it belongs.
         """
-        keys = self._once("scenes", lambda: find_remote_scenes(self.url).keys)
+        keys = self._once("scenes", lambda: find_remote_scenes(self._root).keys)
         return FoundScenes(tuple(keys), {})
 
     def files(self, keys: Sequence[str]) -> dict[str, Files]:
@@ -563,7 +570,7 @@ class RemoteTree:
 
     def _listed(self, folder: str) -> dict[str, tuple[int, int]]:
         def listed() -> dict[str, tuple[int, int]]:
-            files = RemoteObject(joined(self.url, folder)).files()
+            files = self._root.below(folder).files()
             return {path: (size, _number(version)) for path, (size, version) in files.items()}
 
         return {path: (size, number) for path, (size, number) in self._once(folder, listed).items()}

@@ -11,7 +11,7 @@ from contextlib import closing
 from typing import TYPE_CHECKING, TypeVar
 
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.sources.location import is_web, shown
+from stereogenbench_data.sources.location import is_web, joined, shown
 from stereogenbench_data.sources.retry import Attempts, RetryPolicy, TransientError
 
 if TYPE_CHECKING:
@@ -57,12 +57,18 @@ class RemoteObject:
             StorageError: If it is not a URL.
         """
         self.where = shown(url)
+        self._url = url
         self._policy = retry or RetryPolicy()
         self._transport = _transport(url, expected_size=expected_size)
 
     def __repr__(self) -> str:
         """Return the URL, without login and query."""
         return f"RemoteObject({self.where!r})"
+
+    def below(self, path: str, *, expected_size: int | None = None) -> "RemoteObject":
+        """Return a file or folder below this folder; reading it waits as long."""
+        url = joined(self._url, path)
+        return RemoteObject(url, expected_size=expected_size, retry=self._policy)
 
     def size(self) -> int:
         """Return the size of the file in bytes.
