@@ -67,11 +67,11 @@ sample: $(READY)
 	cp -r $(SAMPLE)/shards/* shards/
 	$(BIN)/stereogenbench verify --deep shards
 
-# croissant/, from the sample and the paper. The day is that of the sample.
+# croissant/, from the sample, what shards/about.json says of it, and the paper.
 descriptors: $(READY)
 	rm -rf croissant
 	$(BIN)/stereogenbench publish croissant shards -o croissant/sample.json \
-		--name "StereoGenBench sample" --published 2026-11-21
+		--about shards/about.json
 	$(BIN)/stereogenbench publish croissant -o croissant/release.json
 	$(BIN)/stereogenbench publish croissant --template -o croissant/template.json
 

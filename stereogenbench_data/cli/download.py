@@ -7,9 +7,9 @@ import typer
 
 from stereogenbench_data.cli.options import (
     CamerasOption,
-    DataOptions,
     SceneOptions,
     ShareOptions,
+    SourceOptions,
     flag,
     grouped,
 )
@@ -20,7 +20,7 @@ from stereogenbench_data.schema.text import counted
 
 @grouped
 def download(  # noqa: PLR0913 - one parameter an option
-    source: DataOptions,
+    source: SourceOptions,
     *,
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write into.")],
     cameras: CamerasOption = None,
@@ -29,7 +29,6 @@ def download(  # noqa: PLR0913 - one parameter an option
     ] = "both",
     chosen: SceneOptions,
     share: ShareOptions,
-    workers: Annotated[int, typer.Option(min=1, help="Files to fetch at a time.")] = 8,
     dry_run: Annotated[bool, flag("--dry-run", "Print the size and fetch nothing.")] = False,
 ) -> None:
     """Fetch only what a selection needs, in the released layout.
@@ -59,5 +58,5 @@ def download(  # noqa: PLR0913 - one parameter an option
     typer.echo(f"{scenes}, {files}, {size:,.1f} MB", err=True)
     if not dry_run:
         with progress_bar("downloading", unit="MB") as progress:
-            fetched(index, wanted, out, workers=workers, progress=progress)
+            fetched(index, wanted, out, progress=progress)
         typer.echo(f"{out}: {scenes}, {size:,.1f} MB")

@@ -1,8 +1,7 @@
 """``stereogenbench forecast``: what will limit a training."""
 
-import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import typer
@@ -10,7 +9,6 @@ import typer
 from stereogenbench_data.cli.options import (
     SCENES,
     DataOptions,
-    JsonOption,
     SampleOptions,
     SizeOption,
     frames_of,
@@ -59,7 +57,7 @@ class MachineOptions:
 
 
 @grouped
-def forecast(  # noqa: PLR0913 - one parameter an option
+def forecast(
     source: DataOptions,
     *,
     trains: MachineOptions,
@@ -69,12 +67,11 @@ def forecast(  # noqa: PLR0913 - one parameter an option
     ] = None,
     batch_size: Annotated[int, typer.Option(min=1, help="Samples of a batch.")] = 8,
     chosen: TrainedOptions,
-    as_json: JsonOption = False,
 ) -> None:
     """Forecast what will limit a training: processors, network, requests.
 
     Bytes and requests of a sample follow from the index. Decoding is measured on this machine, for
-    seconds. The documentation has the formula.
+    seconds. The documentation has the formula; `stereogenbench_data.forecast` returns the numbers.
 
     Example: `stereogenbench forecast shards/ --samples-s 100 --delay-ms 60`
     """
@@ -86,7 +83,7 @@ def forecast(  # noqa: PLR0913 - one parameter an option
     if size is not None:
         options["size"] = size
     found = forecast_by(source.open(), batch_size=batch_size, **options)
-    typer.echo(json.dumps(asdict(found), indent=1) if as_json else _table(found))
+    typer.echo(_table(found))
 
 
 def _table(found: Any) -> str:

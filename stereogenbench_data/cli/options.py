@@ -211,8 +211,8 @@ ConventionsOption = Annotated[
 
 
 @dataclass(frozen=True, kw_only=True)
-class DataOptions:
-    """The data that a command reads."""
+class SourceOptions:
+    """The data whose index a command reads."""
 
     data: Annotated[str, typer.Argument(help="Folder of scenes or shards, an index file, or URL.")]
     data_root: Annotated[
@@ -220,6 +220,22 @@ class DataOptions:
         typer.Option("--root", help="Where the data of an index file are, if not beside."),
     ] = None
     conventions: ConventionsOption = None
+
+    def stated(self) -> "Conventions | None":
+        """Return the conventions."""
+        from stereogenbench_data.schema.conventions import Conventions
+
+        return None if self.conventions is None else Conventions.read(self.conventions)
+
+    def open(self) -> "SceneIndex":
+        """Return the index of the data as `open_data` does."""
+        return open_data(self.data, root=self.data_root, conventions=self.stated())
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataOptions(SourceOptions):
+    """The data whose videos a command decodes."""
+
     accept: Annotated[
         list[str] | None,
         typer.Option(
@@ -234,7 +250,7 @@ class DataOptions:
         from stereogenbench_data.schema.records import DepthEncoding
 
         accepted: Any = {*(self.accept or ())}
-        stated = None if self.conventions is None else Conventions.read(self.conventions)
+        stated = super().stated()
         if not accepted:
             return stated
         shapes = []
@@ -244,10 +260,6 @@ class DataOptions:
             depth = replace(depth, encoding=replace(depth.encoding, accept=accept))
             shapes.append(replace(shape, depth=depth))
         return Conventions(tuple(shapes), "--accept" if stated is None else stated.where)
-
-    def open(self) -> "SceneIndex":
-        """Return the index of the data as `open_data` does."""
-        return open_data(self.data, root=self.data_root, conventions=self.stated())
 
 
 @dataclass(frozen=True, kw_only=True)

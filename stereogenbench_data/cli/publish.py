@@ -1,6 +1,5 @@
 """``stereogenbench publish croissant``, ``card``, ``upload``: describe shards and upload them."""
 
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,7 +22,7 @@ AboutOption = Annotated[
     typer.Option(
         "--about",
         metavar="FILE|release",
-        help="Authors, licence, provenance: answers to `publish croissant --template`, or "
+        help="Name, version, licence, provenance: answers to `publish croissant --template`, or "
         "release for the paper's scenes.",
     ),
 ]
@@ -39,7 +38,7 @@ RepositoryArgument = Annotated[
 ]
 
 
-def croissant(  # noqa: PLR0913 - one parameter an option
+def croissant(
     data: Annotated[
         str | None,
         typer.Argument(
@@ -55,18 +54,6 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     base_url: Annotated[
         str | None,
         typer.Option(help="URL of the data, pinned to a revision [paths from the descriptor]."),
-    ] = None,
-    name: Annotated[
-        str | None, typer.Option(help="The dataset's name [as its maker states].")
-    ] = None,
-    release: Annotated[
-        str | None, typer.Option(metavar="VERSION", help="Version of the data [1.0.0].")
-    ] = None,
-    published: Annotated[
-        datetime | None,
-        typer.Option(
-            formats=["%Y-%m-%d"], metavar="YYYY-MM-DD", help="Day of publication [today]."
-        ),
     ] = None,
     about: AboutOption = None,
     template: Annotated[
@@ -107,9 +94,6 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         return
     index = None if data is None else SceneIndex.open(data, rows="read")
     publication = Publication(
-        name=name,
-        version=release,
-        published=None if published is None else published.date(),
         data_url=None if base_url is None else base_url.rstrip("/"),
         about=_stated(about),
     )
@@ -155,7 +139,6 @@ def upload(
     shards: ShardsArgument,
     repository: RepositoryArgument,
     *,
-    branch: Annotated[str, typer.Option(help="Branch to commit to.")] = "main",
     about: AboutOption = None,
 ) -> None:
     """Upload shards with card and descriptor to the Hub.
@@ -169,7 +152,5 @@ def upload(
 
     # The Hub's client has progress bars of its own.
     with progress_bar("picturing", unit="scenes") as progress:
-        report = uploaded(
-            Path(shards), repository, branch=branch, about=_stated(about), progress=progress
-        )
+        report = uploaded(Path(shards), repository, about=_stated(about), progress=progress)
     typer.echo(f"{counted(report.files, 'file')}: StereoPairs({report.url!r})")

@@ -33,10 +33,6 @@ def show(
         ),
     ] = None,
     frame: Annotated[int, typer.Option(min=0, help="Number of the frame.")] = 0,
-    width: Annotated[
-        int | None,
-        typer.Option(min=1, max=2048, help="Width of each drawn picture, px [320]."),
-    ] = None,
 ) -> None:
     """Draw one scene with the disparity of a pair.
 
@@ -59,26 +55,22 @@ def show(
     index = source.open()
     row = 0 if scene is None else find_scene(index, scene)
     recorded = index.scene(row)
-    key, rig = recorded.id.key, recorded.rig
+    key = recorded.id.key
     target = out or Path(key.replace("/", "_") + ".png")
     with writing(target):
         if ending == ".png":
-            sheet = scene_pictures.scene_sheet(
-                SceneReader(index), row, pair=pair, frame=frame, tile_px=width
-            )
+            sheet = scene_pictures.scene_sheet(SceneReader(index), row, pair=pair, frame=frame)
             write_png(target, sheet)
         elif ending == ".rrd":
             from stereogenbench_data.bridges.rerun import write_recording
 
-            height = rig.image_height_px * (width or 0) / rig.image_width_px
-            size = None if width is None else (max(1, round(height)), width)
             with progress_bar("logging", unit="frames") as progress:
-                write_recording(target, index, key, pair=pair, size=size, progress=progress)
+                write_recording(target, index, key, pair=pair, progress=progress)
         else:
             with progress_bar("drawing", unit="frames") as progress:
                 scene_pictures.write_clip(
                     target,
-                    scene_pictures.clip_pages(SceneReader(index), row, pair=pair, tile_px=width),
+                    scene_pictures.clip_pages(SceneReader(index), row, pair=pair),
                     frames=recorded.frames,
                     rate_hz=recorded.frame_rate_hz,
                     progress=progress,

@@ -6,10 +6,10 @@ from dataclasses import asdict
 import typer
 
 from stereogenbench_data.cli.options import (
-    DataOptions,
     JsonOption,
     OutOption,
     SceneOptions,
+    SourceOptions,
     grouped,
 )
 from stereogenbench_data.cli.writing import write_report
@@ -17,7 +17,7 @@ from stereogenbench_data.cli.writing import write_report
 
 @grouped
 def stats(
-    source: DataOptions,
+    source: SourceOptions,
     *,
     chosen: SceneOptions,
     out: OutOption = None,

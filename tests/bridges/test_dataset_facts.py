@@ -16,7 +16,7 @@ from stereogenbench_data.errors import DescriptorError
 from stereogenbench_data.schema.release import COMPLETE_JSON
 from stereogenbench_data.shards.pack import pack
 from tests.audit.release_counts import paper_scenes
-from tests.cli.command import invoke
+from tests.cli.command import invoke, one_line
 
 
 @pytest.fixture(scope="module", params=["no program", "assets of the user"])
@@ -124,6 +124,20 @@ def test_a_maker_may_state_only_what_differs(small_shards, tmp_path):
     assert facts == DRAWN | {"name": "Mine", "license": "https://example.org/licence"}
     assert "license: other" in text
     assert "license_link: https://example.org/licence" in text
+
+
+def test_a_maker_states_name_version_and_day_of_a_descriptor(small_shards, tmp_path):
+    stated, path = tmp_path / "about.json", tmp_path / "data.json"
+    facts = {"name": "Mine", "version": "2.1.0", "datePublished": "2026-11-21"}
+
+    def written(change):
+        stated.write_text(json.dumps(facts | change))
+        return invoke("publish", "croissant", small_shards, "-o", path, "--about", stated)
+
+    assert written({}).exit_code == 0
+    assert facts.items() <= json.loads(path.read_text()).items()
+    assert "'two' is not a version" in one_line(written({"version": "two"}).stderr)
+    assert "datePublished is 'May', not a day" in one_line(written({"datePublished": "May"}).stderr)
 
 
 def test_the_bibliography_is_that_of_the_descriptors():

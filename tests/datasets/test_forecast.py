@@ -1,6 +1,5 @@
 """What limits a training: the formula by hand, its properties, and the command."""
 
-import json
 import math
 
 import pytest
@@ -139,19 +138,16 @@ def test_a_forecast_of_small_scenes_measures_and_adds_up(small_shards):
     assert found.scales[1].requests_s * found.scales[1].share <= 3000 * (1 + 1e-9)
 
 
-def test_the_command_prints_a_table_or_json(small_shards, monkeypatch):
+def test_the_command_prints_a_table(small_shards, monkeypatch):
     monkeypatch.setattr(forecasting, "_decoding_s", lambda *_, **__: 0.01)  # it takes seconds
     words = (
         "forecast", small_shards, "--samples-s", "20", "--delay-ms", "60", "--total-mb-s", "0.001",
         "--batch-size", "2", "--frames", "random:2",
     )  # fmt: skip
-    text, document = invoke(*words), invoke(*words, "--json")
+    text = invoke(*words)
 
     assert text.exit_code == 0, text.output
     assert "each 60 ms until its first byte" in text.stdout
     lines = text.stdout.splitlines()
     assert lines[-1].split()[:2] == ["10,000", "1,250"]
     assert lines[-1].endswith("total bandwidth")
-    found = json.loads(document.stdout)
-    assert found["scales"][1]["limit"] == "total bandwidth"
-    assert found["delay_ms"] == 60

@@ -158,7 +158,7 @@ def test_a_killed_download_goes_on_and_leaves_no_file_that_is_not_whole(
 ):
     """The process is killed while a server that answers slowly has sent some files."""
     dest = tmp_path / "part"
-    command = ["download", shards_on_the_web, "-o", str(dest), "--workers", "1"]
+    command = ["download", shards_on_the_web, "-o", str(dest)]
     for name in sorted(path.relative_to(web.folder) for path in web.folder.rglob("*.tar")):
         web.always[str(name)] = Answer(delay_s=0.1)
     killed = subprocess.Popen(

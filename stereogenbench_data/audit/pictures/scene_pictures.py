@@ -177,7 +177,11 @@ _SCALED_ON: Final = 5
 
 
 def clip_pages(
-    reader: SceneReader, row: int, *, pair: tuple[int, int] | None = None, tile_px: int | None
+    reader: SceneReader,
+    row: int,
+    *,
+    pair: tuple[int, int] | None = None,
+    tile_px: int | None = None,
 ) -> Iterator[Picture]:
     """Yield a page for each frame of a scene, all of one size with even sides.
 

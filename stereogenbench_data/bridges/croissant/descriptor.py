@@ -169,6 +169,7 @@ Node = dict[str, Any]
 _HUB_FILE: Final = re.compile(r"(https?://[^/]+/datasets/[^/]+/[^/]+)/(?:resolve|tree|blob|raw)/")
 """A URL of files of a dataset on the Hub; the group is the dataset's page."""
 _VERSION: Final = re.compile(r"\d+\.\d+\.\d+")
+_DAY: Final = re.compile(r"\d{4}-\d{2}(-\d{2})?")
 _MEDIA_TYPES: Final = {"mp4": "video/mp4", "mkv": "video/x-matroska"}
 """By suffix. Depth packed by blosc2 has no media type of its own."""
 _TAR: Final = "application/x-tar"
@@ -229,8 +230,8 @@ def write_descriptor(
             the data are not shards, or who made the scenes is not known.
     """
     publication = publication or Publication()
-    _require_valid(publication)
     facts = dataset_facts.facts_of(index, about=publication.about)
+    _require_valid(publication, facts)
     if index is None:
         data_url = publication.data_url or facts["url"]
         files = template("release", repository=data_url)
@@ -264,12 +265,14 @@ def write_node(node: Mapping[str, Any], path: Path) -> None:
         write_atomic(path, (json.dumps(node, indent=1, ensure_ascii=False) + "\n").encode())
 
 
-def _require_valid(publication: Publication) -> None:
-    version = publication.version
-    if version is not None and not _VERSION.fullmatch(version):
+def _require_valid(publication: Publication, facts: Mapping[str, Any]) -> None:
+    version = publication.version or facts.get("version", "1.0.0")
+    if not _VERSION.fullmatch(str(version)):
         raise DescriptorError(
             f"{version!r} is not a version: it must be MAJOR.MINOR.PATCH, such as 1.0.0."
         )
+    if not _DAY.fullmatch(str(day := facts.get("datePublished", "2026-01"))):
+        raise DescriptorError(f"datePublished is {day!r}, not a day: write it as 2026-11-21.")
     url = publication.data_url
     if url is not None and (not is_remote(url) or shown(url) != url):
         raise DescriptorError(
