@@ -5,23 +5,20 @@ import json
 import pytest
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.document import parse_object, require_text_size
+from stereogenbench_data.schema.document import parse_object
 
 
 @pytest.mark.parametrize(
     ("text", "match"),
     [
         pytest.param(b"", r"a\.json: the file is empty. Copy it", id="empty"),
-        pytest.param(b" \n", r"a\.json: the file is empty", id="blank"),
         pytest.param(b'{"a": 1, "b"', r"looks truncated: copy it", id="truncated"),
         pytest.param(b'{"a": "unfinish', r"looks truncated: copy it", id="truncated in a text"),
         pytest.param(b'{"a": 1]', r"line 1, column 8 .*Copy it", id="not JSON"),
         pytest.param(b"\xff\xfe{}", r"not UTF-8: byte 0 is 0xff", id="UTF-16"),
         pytest.param(b"[1, 2]", r"\$ must be an object, found a list of 2", id="a list"),
-        pytest.param(b"null", r"\$ must be an object, found null", id="null"),
         pytest.param(b'{"a": ' + b"9" * 5000 + b"}", "not valid JSON", id="long number"),
         pytest.param(b"[" * 100_000, "nested hundreds of levels deep", id="nesting bomb"),
-        pytest.param(b'{"a":' * 100_000, "nested hundreds of levels deep", id="nested objects"),
     ],
 )
 def test_a_text_that_is_not_a_json_object_is_refused(text, match):
@@ -41,11 +38,6 @@ def test_a_text_above_the_limit_is_refused_before_it_is_parsed():
 
     with pytest.raises(SchemaError, match=r"may have 33,554,432 bytes, this one has 33,554,441"):
         parse_object(text, where="a.json")
-
-
-def test_a_size_is_refused_without_the_text():
-    with pytest.raises(SchemaError, match=r"a\.json: .*200,000,000.*was not read"):
-        require_text_size(200_000_000, where="a.json")
 
 
 def test_a_byte_order_mark_is_accepted():

@@ -18,7 +18,6 @@ from stereogenbench_data.schema.records import SceneId, SceneLabels
         ("train/Uniform/Car_Dealer/scene_000001", "train", None),
         ("eval/MapSeenInTrain/Uniform/Car_Dealer/scene_000001", "eval", "seen_map"),
         ("eval/MapUnseenInTrain/Uniform/Car_Dealer/scene_000001", "eval", "unseen_map"),
-        ("eval/MapNotSeenInTrain/Uniform/Car_Dealer/scene_000001", "eval", "unseen_map"),
         ("eval/Other/Uniform/Car_Dealer/scene_000001", "eval", None),
     ],
 )
@@ -32,13 +31,9 @@ def test_a_key_tells_split_subset_family_and_map(key, split, subset):
         ("train/Uniform/Map/scene_1.5", "is not a valid folder.*Rename the folder"),
         ("train/Uniform/../scene_1", "is not a valid folder"),
         ("train/Uniform/Mäp/scene_1", "'Mäp' is not a valid folder"),
-        ("train/Uniform//scene_1", "'' is not a valid folder"),
-        ("train/Uniform/a\\b/scene_1", "is not a valid folder"),
-        ("train/Uniform/a\n/scene_1", "is not a valid folder"),
         ("train/Uniform/scene_1", "train/<family>/<map>/<scene>.*found 3 folders"),
         ("eval/Uniform/Map/scene_1", "eval/<subset>/<family>/<map>/<scene>.*found 4 folders"),
         ("test/Uniform/Map/scene_1", "start with 'test'"),
-        ("", "'' is not a valid folder"),
     ],
 )
 def test_a_path_of_another_form_is_refused(key, match):

@@ -4,18 +4,19 @@ import dataclasses
 import itertools
 import json
 import math
+import re
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.parse import parse_rig, require_unit, see_rig
+from stereogenbench_data.schema.parse import parse_rig, require_unit
 from stereogenbench_data.schema.records import Rig
 
 BASELINES_CM = (6.5, 13.25, 19.0, 26.0, 32.5, 6.75, 12.5, 19.5, 26.0, 5.75, 12.75, 19.25)
 BASELINES_CM += (7.0, 13.5, 6.5)
-PAIRS = tuple(itertools.combinations(range(6), 2))
+PLACES_CM = (0.0, 6.5, 13.25, 19.0, 26.0, 32.5)
 
 
 def problems_of(document, dumped):
@@ -35,14 +36,75 @@ def test_a_rig_is_read_as_it_is_recorded(rig_document, dumped):
     )
 
 
-def test_the_scene_rendered_elsewhere_is_read(shared_scenes):
-    path = next(shared_scenes.rglob("baseline.json"))
+def baseline(place, value):
+    """A change of the length of one recorded pair."""
+    return lambda document: document["pairwise_pairs"][place].update(baseline_cm=value)
 
-    rig, labels, _ = parse_rig(path.read_bytes(), where="baseline.json")
 
-    assert rig.focal_mm == 45.0
-    assert rig.baselines_cm[:5] == (18.5, 51.5, 61.25000000000001, 122.50000000000001, 163.0)
-    assert (labels.character, labels.animation) == ("SK_Ch13_nonPBR", "AN_Pontera")
+def lens(**values):
+    """A change of the recorded intrinsics."""
+    return lambda document: document["camera_intrinsics"].update(values)
+
+
+def keys(**values):
+    """A change of keys of the whole document."""
+    return lambda document: document.update(values)
+
+
+PAIR = r"\$\.primary_stereo_pair: must be \{left_camera, right_camera\}"
+TWICE = {"camera_index_a": 2, "camera_index_b": 0, "baseline_cm": 13.5}
+ADJACENT = {"camera_index_a": 1, "camera_index_b": 2, "baseline_cm": 6.9}
+LENGTH = r"pairwise_pairs\[3\]\.baseline_cm: must be a number above zero, found "
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (keys(primary_stereo_pair=[0, 6]), PAIR),
+        (keys(primary_stereo_pair=[2, 2]), PAIR),
+        (keys(primary_stereo_pair=[0, True]), PAIR),
+        (keys(primary_stereo_pair=[0, 1, 2]), PAIR),
+        (keys(primary_stereo_pair={"left_camera": "Cam_left", "right_camera": 1}), PAIR),
+        (keys(primary_stereo_pair={"left_camera": 0}), PAIR),
+        (keys(primary_stereo_pair={"left_camera": "Cam_00", "left_index": 2,
+                                   "right_camera": "Cam_01", "right_index": 3}), PAIR),
+        (baseline(3, math.nan), f"{LENGTH}nan"),
+        (baseline(3, "6.5"), f"{LENGTH}'6.5'"),
+        (baseline(3, 10**400), f"{LENGTH}1000000"),
+        (baseline(3, -6.5), f"{LENGTH}-6.5"),
+        (lambda document: document["pairwise_pairs"][4].update(camera_index_b=7),
+         r"pairwise_pairs\[4\].*: is of cameras 0 and 7, and the rig has cameras 0 to 5"),
+        (lambda document: document["pairwise_pairs"].__setitem__(7, TWICE),
+         r"pairwise_pairs\[7\].*0 and 2 is 13.5 cm here and 13.25 cm at \$\.pairwise_pairs\[1\]"),
+        (keys(adjacent_pairs=[ADJACENT]),
+         r"adjacent_pairs\[0\].*1 and 2 is 6.9 cm here and 6.75 cm at \$\.pairwise_pairs\[5\]"),
+        (keys(baselines_adjacent_cm=[6.5, 6.9, 5.75, 7.0, 6.5]),
+         r"adjacent_cm\[1\]: .*1 and 2 is 6.9 cm here and 6.75 cm at \$\.pairwise_pairs\[5\]"),
+        (keys(pairwise_pairs={}), "each of the 15 camera pairs, and lacks 0-1"),
+        (keys(pairwise_pairs=[[0, 0, 6.5]]), "each of the 15 camera pairs, and lacks 0-1"),
+        (lens(focal_length_mm=0.0325), r"0\.0325 mm.*0\.00137 widths"),
+        (lens(sensor_width_mm=0.02376), r"0\.02376 mm.*e\+03 widths"),
+        (lens(fov_deg=45.0), r"fov_deg: 45\.0 means 1\.20711 focal lengths"),
+        (keys(camera_intrinsics={"focal_length": 875.42, "sensor_width_mm": 23.76}),
+         "focal_length"),
+        (keys(camera_intrinsics={"zoom": 32.5, "sensor_width_mm": 23.76}),
+         r"\$\.camera_intrinsics\.focal_length_mm is missing; the keys are: .*intrinsics\.zoom"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_a_rig_is_told_with_its_place(rig_document, dumped, change, told):
+    change(rig_document)
+
+    assert re.search(told, "\n".join(problems_of(rig_document, dumped)))
+
+
+def test_all_problems_of_a_file_are_reported_at_once(rig_document, dumped):
+    lens(focal_length_mm="far", sensor_width_mm=0)(rig_document)
+    baseline(0, None)(rig_document)
+
+    problems = problems_of(rig_document, dumped)
+
+    for place in ("baseline_cm", "focal_length_mm", "sensor_width_mm"):
+        assert any(place in problem for problem in problems)
 
 
 def test_without_an_image_size_the_releases_size_is_assumed(rig_document, dumped):
@@ -67,11 +129,9 @@ def test_without_a_sensor_height_pixels_are_square(rig_document, dumped):
     [
         ({"left_camera": "Town_Cam_02", "right_camera": "Town_cam4"}, (2, 4)),
         ({"left_camera": 3, "right_camera": 5}, (3, 5)),
-        ([1, 2], (1, 2)),
         ({"L": "Cam_01", "R": "Cam_02"}, (1, 2)),
         (["Cam_00", "Cam_05"], (0, 5)),
         ("1-3", (1, 3)),
-        ({"camera_index_a": 2, "camera_index_b": 3, "baseline_cm": 5.75}, (2, 3)),
         ({"left_camera": "cam_00_rgb.mp4", "right_camera": "cam_04_rgb.mp4"}, (0, 4)),
     ],
 )
@@ -81,30 +141,6 @@ def test_both_forms_of_the_primary_pair_are_read(rig_document, dumped, pair, exp
     rig, _, _ = parse_rig(dumped(rig_document), where="baseline.json")
 
     assert rig.primary_pair == expected
-
-
-@pytest.mark.parametrize(
-    ("pair", "problem"),
-    [
-        ([0, 6], "$.primary_stereo_pair: must be {left_camera, right_camera} or a list of two of"),
-        ([2, 2], "$.primary_stereo_pair: must be {left_camera, right_camera} or a list of two of"),
-        ([0, True], "$.primary_stereo_pair: must be {left_camera, right_camera} or a list"),
-        ([0, 1, 2], "$.primary_stereo_pair: must be {left_camera, right_camera} or a list"),
-        ({"left_camera": "Cam_left", "right_camera": 1}, "$.primary_stereo_pair: must be {left"),
-        ({"left_camera": 0}, "$.primary_stereo_pair: must be {left_camera, right_camera}"),
-        (
-            {"left_camera": "Cam_00", "left_index": 2, "right_camera": "Cam_01", "right_index": 3},
-            "$.primary_stereo_pair: must be {left_camera, right_camera}",
-        ),
-    ],
-)
-def test_a_wrong_primary_pair_is_refused(rig_document, dumped, pair, problem):
-    rig_document["primary_stereo_pair"] = pair
-
-    found = problems_of(rig_document, dumped)
-
-    assert len(found) == 1
-    assert found[0].startswith(problem)
 
 
 @pytest.mark.parametrize(
@@ -138,63 +174,6 @@ def test_a_camera_matrix_of_other_pictures_is_refused(rig_document, dumped, matr
 
     with pytest.raises(SchemaError, match=told):
         parse_rig(dumped(rig_document), where="baseline.json", size_px=(640, 480))
-
-
-def test_a_camera_matrix_with_the_size_of_its_pictures_is_read(rig_document, dumped):
-    matrix = [[1750.8417508, 0, 640], [0, 1750.8417508, 480], [0, 0, 1]]
-    rig_document["camera_intrinsics"] = {"K": matrix, "width": 1280, "height": 960}
-    del rig_document["image_width"], rig_document["image_height"]
-
-    rig, _, _ = parse_rig(dumped(rig_document), where="baseline.json", size_px=(640, 480))
-
-    assert rig.focal_mm == pytest.approx(32.5)
-
-
-@pytest.mark.parametrize(
-    "intrinsics",
-    [{"focal_length": 875.42, "sensor_width_mm": 23.76}, {"fx": 875.42, "sensor_width_mm": 23.76}],
-)
-def test_a_focal_length_that_could_be_anything_is_refused(rig_document, dumped, intrinsics):
-    rig_document["camera_intrinsics"] = intrinsics
-    del rig_document["image_width"]
-
-    (problem,) = problems_of(rig_document, dumped)
-
-    assert "focal_length" in problem
-
-
-def without_pairs(document):
-    return {key: value for key, value in document.items() if key != "pairwise_pairs"}
-
-
-def table(names):
-    """Baselines of the fixture as rows of a table."""
-    places = dict(enumerate((0.0, 6.5, 13.25, 19.0, 26.0, 32.5)))
-    return {names(a): {names(b): places[b] - places[a] for b in range(a + 1, 6)} for a in range(5)}
-
-
-@pytest.mark.parametrize(
-    "written",
-    [
-        {"pairwise_baselines_cm": table(str)},
-        {"baseline_matrix_cm": [
-            [abs(a - b) for b in (0.0, 6.5, 13.25, 19.0, 26.0, 32.5)]
-            for a in (0.0, 6.5, 13.25, 19.0, 26.0, 32.5)
-        ]},
-        {"pairwise_pairs": {
-            f"Town_7_Cam_{a:02d}__Town_7_Cam_{b:02d}": {"baseline_cm": length}
-            for (a, b), length in zip(PAIRS, BASELINES_CM, strict=True)
-        }},
-        {"pairs": [
-            {"pair": f"{a}-{b}", "baseline_mm": 10 * length, "target_baseline_cm": round(length)}
-            for (a, b), length in zip(PAIRS, BASELINES_CM, strict=True)
-        ]},
-    ],
-)  # fmt: skip
-def test_tables_and_names_of_pairs_are_read(rig_document, dumped, written):
-    rig, _, _ = parse_rig(dumped(without_pairs(rig_document) | written), where="baseline.json")
-
-    assert rig.baselines_cm == pytest.approx(BASELINES_CM)
 
 
 def test_of_baselines_that_agree_the_most_precise_counts(rig_document, dumped):
@@ -246,25 +225,11 @@ def test_baselines_below_a_unit_that_is_not_known_are_refused(rig_document, dump
         parse_rig(dumped(rig_document | {"baseline": {"unit": "ell", "pairs": rows}}), where="rig")
 
 
-def test_a_principal_point_is_read(rig_document, dumped):
-    rig_document["camera_intrinsics"]["principal_point_px"] = {"x": 300.5, "y": 250}
-
-    rig, _, _ = parse_rig(dumped(rig_document), where="baseline.json")
-
-    assert rig.principal_point_px == (300.5, 250.0)
-
-
-def test_a_principal_point_that_is_null_is_none(rig_document, dumped):
-    rig, _, _ = parse_rig(dumped(rig_document | {"principal_point": None}), where="baseline.json")
-
-    assert rig.principal_point_px is None
-
-
 @pytest.mark.parametrize(
     "written",
     [
+        {"principal_point_px": {"x": 300.5, "y": 250}},
         {"principal_point": [300.5, 250.0]},
-        {"principalPoint": {"x": 300.5, "y": 250.0}},
         {"cx": 300.5, "cy": 250.0},
         {"optical_center_x_px": 300.5, "optical_center_y_px": 250.0},
     ],
@@ -280,12 +245,7 @@ def test_a_principal_point_is_found_under_likely_keys(rig_document, dumped, writ
 
 @pytest.mark.parametrize(
     "written",
-    [
-        {"cx": 320.0, "cy": 240.0},
-        {"cx": 0.5, "cy": 0.5},
-        {"cx": 319.5, "cy": 239.5},
-        {"principal_point": "image_center"},
-    ],
+    [{"principal_point": None}, {"cx": 0.5, "cy": 0.5}, {"principal_point": "image_center"}],
 )
 def test_a_principal_point_at_the_centre_is_none(rig_document, dumped, written):
     rig, _, remarks = parse_rig(dumped(rig_document | written), where="baseline.json")
@@ -299,7 +259,6 @@ def test_a_principal_point_at_the_centre_is_none(rig_document, dumped, written):
     [
         {"cx": 300.5}, {"principal_point": "left"}, {"cx": 1e9, "cy": 1}, {"shift_x": 0.05},
         {"principal_point_normalized": [0.53, 0.5]}, {"principal_point_offset_px": [4, 0]},
-        {"principal_point_shift_px": {"x": 5, "y": 0}}, {"cx_norm": 0.55, "cy_norm": 0.5},
     ],
 )  # fmt: skip
 def test_a_principal_point_that_is_not_understood_stops_no_disparity(rig_document, dumped, written):
@@ -312,7 +271,6 @@ def test_a_principal_point_that_is_not_understood_stops_no_disparity(rig_documen
 @pytest.mark.parametrize(
     ("intrinsics", "size"),
     [
-        ({"focalLength": 32.5, "sensorWidth": 23.76, "sensorHeight": 17.82}, {}),
         ({"focal_length_mm": "32.5 mm", "sensor_width_cm": 2.376, "sensor_height_cm": 1.782}, {}),
         ({"focal_length_mm": 32.5, "sensor_size_mm": [23.76, 17.82]}, {}),
         ({"focal_length_mm": 32.5, "sensor": {"width_mm": 23.76, "height_mm": 17.82}}, {}),
@@ -330,12 +288,9 @@ def test_a_principal_point_that_is_not_understood_stops_no_disparity(rig_documen
             {},
         ),
         ({"lens": 32.5, "Filmback": {"SensorWidth": 23.76, "SensorHeight": 17.82}}, {}),
-        ({"f_mm": 32.5, "horizontal_aperture": 23.76, "vertical_aperture": 17.82}, {}),
         ({"focal_length_mm": [32.5] * 6, "sensor_width_mm": 23.76}, {}),
         ({"FOVAngle": 40.15832, "sensor_width_mm": 23.76}, {}),
-        ({"horizontal_fov": 0.70089489, "sensor_width_mm": 23.76}, {}),
         ({"camera_angle_x": 0.70089489, "sensor_width_mm": 23.76}, {}),
-        ({"f_mm": 32.5, "sw_mm": 23.76, "sh_mm": 17.82}, {}),
         ({"camera.focal_length_mm": 32.5, "sensor_mm": [23.76, 17.82], "fov": 40.2}, {}),
         ({"camera_matrix": {"rows": 3, "data": [875.4208754, 0, 320, 0, 875.4208754, 240, 0, 0, 1]},
           "sensor_width_mm": 23.76}, {}),
@@ -363,21 +318,6 @@ def test_a_lens_is_found_under_likely_keys(rig_document, dumped, intrinsics, siz
     assert (rig.image_width_px, rig.image_height_px) == (640, 480)
 
 
-@pytest.mark.parametrize(
-    ("name", "metres", "widths"),
-    [("focal_length_mm", 0.0325, "0.00137 widths"), ("sensor_width_mm", 0.02376, "e+03 widths")],
-)
-def test_a_lens_that_no_camera_has_is_refused_with_its_ratio(
-    rig_document, dumped, name, metres, widths
-):
-    rig_document["camera_intrinsics"][name] = metres
-
-    (problem,) = problems_of(rig_document, dumped)
-
-    assert f"{metres:g} mm" in problem
-    assert widths in problem
-
-
 def test_the_side_that_a_sensor_is_fitted_to_counts(rig_document, dumped):
     rig_document["camera_intrinsics"] |= {"sensor_width_mm": 36.0, "sensor_height_mm": 24.0}
 
@@ -396,34 +336,10 @@ def test_a_model_of_the_lens_is_told(rig_document, dumped, written):
     assert remark.about == "lens"
 
 
-def test_a_lens_that_is_stated_twice_must_agree(rig_document, dumped):
-    rig_document["camera_intrinsics"]["fov_deg"] = 40.16
-    parse_rig(dumped(rig_document), where="baseline.json")
+def test_a_lens_may_be_stated_twice_within_its_rounding(rig_document, dumped):
+    lens(fov_deg=40.16)(rig_document)
 
-    rig_document["camera_intrinsics"]["fov_deg"] = 45.0
-    (problem,) = problems_of(rig_document, dumped)
-    assert problem.startswith("$.camera_intrinsics.fov_deg: 45.0 means 1.20711 focal lengths")
-
-
-@pytest.mark.parametrize(
-    ("value", "found"),
-    [
-        (math.nan, "must be a number above zero, found nan"),
-        (math.inf, "must be a number above zero, found inf"),
-        (True, "must be a number above zero, found True"),
-        ("6.5", "must be a number above zero, found '6.5'"),
-        (10**400, "must be a number above zero, found 1000000"),
-        (0, "must be a number above zero, found 0"),
-        (-6.5, "must be a number above zero, found -6.5"),
-    ],
-)
-def test_a_baseline_that_is_not_a_length_is_named_with_its_path(rig_document, dumped, value, found):
-    rig_document["pairwise_pairs"][3]["baseline_cm"] = value
-
-    problems = problems_of(rig_document, dumped)
-
-    assert len(problems) == 1
-    assert problems[0].startswith(f"$.pairwise_pairs[3].baseline_cm: {found}")
+    assert parse_rig(dumped(rig_document), where="baseline.json")[0].focal_mm == 32.5
 
 
 def pairs_as(document, write):
@@ -498,11 +414,6 @@ def pairs_as(document, write):
             ]}, id="inches"),
         pytest.param(
             lambda pairs: {"pairwise_pairs": [
-                {"camera_index_a": a, "camera_index_b": b, "baseline": cm / 2.54, "unit": "inch"}
-                for a, b, cm in pairs
-            ]}, id="a unit beside the number"),
-        pytest.param(
-            lambda pairs: {"pairwise_pairs": [
                 {"camera_index_a": a, "camera_index_b": b, "baseline_cm": cm, "fx_px": 875.4,
                  "baseline_bin": "[1,10)", "focal_length_mm": 32.5, "baseline_error_cm": 3e-12,
                  "target_baseline_cm": 7.0, "fx_times_baseline": 9.0}
@@ -512,20 +423,20 @@ def pairs_as(document, write):
             lambda pairs: {"baselines": {f"{a}-{b}": f"{cm / 100!r} m" for a, b, cm in pairs}},
             id="a unit behind the number"),
         pytest.param(
-            lambda pairs: {"pairwise_pairs": [
-                {"camera_index_a": a + 1, "camera_index_b": b + 1, "baseline_cm": cm}
-                for a, b, cm in pairs
-            ]}, id="cameras from 1 and names from 0"),
+            lambda pairs: {"baseline_matrix_cm": [[abs(a - b) for b in PLACES_CM]
+                                                  for a in PLACES_CM]}, id="a matrix"),
+        pytest.param(
+            lambda pairs: {"pairwise_pairs": {
+                f"Town_7_Cam_{a:02d}__Town_7_Cam_{b:02d}": {"baseline_cm": cm}
+                for a, b, cm in pairs}}, id="names of pairs"),
+        pytest.param(
+            lambda pairs: {"pairs": [{"pair": f"{a}-{b}", "baseline_mm": 10 * cm}
+                                     for a, b, cm in pairs]}, id="pairs by a key"),
         pytest.param(
             lambda pairs: {"baselines_cm": {
                 f"cam_{a:02d}": {f"cam_{b:02d}": cm for c, b, cm in pairs if c == a}
                 for a in range(5)
             }}, id="names below names"),
-        pytest.param(
-            lambda pairs: {"pairwise_pairs": [
-                {"camera_index_a": a, "camera_index_b": b, "baseline_cm": cm, "index_delta": b - a}
-                for a, b, cm in pairs
-            ]}, id="a difference of numbers"),
     ],
 )  # fmt: skip
 def test_baselines_are_found_in_likely_forms(rig_document, dumped, write):
@@ -535,17 +446,6 @@ def test_baselines_are_found_in_likely_forms(rig_document, dumped, write):
     assert rig.primary_pair == (0, 1)
 
 
-def test_conventions_state_the_unit_that_baselines_were_read_in(rig_document, dumped):
-    for pair in rig_document["pairwise_pairs"]:
-        pair["baseline_in"] = pair.pop("baseline_cm") / 2.54
-
-    shape = see_rig(dumped(rig_document), where="baseline.json").shape
-
-    assert shape.at["baselines"].unit == "inch"
-    rig, _, _ = parse_rig(dumped(rig_document), where="baseline.json", shape=shape)
-    assert rig.baselines_cm == pytest.approx(BASELINES_CM, rel=1e-12)
-
-
 def test_a_pair_that_is_not_recorded_follows_from_the_others(rig_document, dumped):
     del rig_document["pairwise_pairs"][3]
 
@@ -553,89 +453,6 @@ def test_a_pair_that_is_not_recorded_follows_from_the_others(rig_document, dumpe
 
     assert rig.baselines_cm == pytest.approx(BASELINES_CM)
     assert "0-4" in remark.text
-
-
-def test_a_pair_given_twice_with_other_lengths_names_both_places(rig_document, dumped):
-    rig_document["pairwise_pairs"][7] = {
-        "camera_index_a": 2,
-        "camera_index_b": 0,
-        "baseline_cm": 13.5,
-    }
-
-    assert problems_of(rig_document, dumped)[0] == (
-        "$.pairwise_pairs[7].baseline_cm: the baseline of cameras 0 and 2 is 13.5 cm here and "
-        "13.25 cm at $.pairwise_pairs[1].baseline_cm. Remove the wrong one."
-    )
-
-
-def test_a_camera_outside_the_rig_is_named(rig_document, dumped):
-    rig_document["pairwise_pairs"][4]["camera_index_b"] = 7
-
-    assert problems_of(rig_document, dumped)[0].startswith(
-        "$.pairwise_pairs[4].baseline_cm: is of cameras 0 and 7, and the rig has cameras 0 to 5"
-    )
-
-
-@pytest.mark.parametrize("pairs", [{}, [1], [], "x", None, [[0, 0, 6.5]]])
-def test_pairs_that_are_not_understood_are_listed_as_missing(rig_document, dumped, pairs):
-    rig_document["pairwise_pairs"] = pairs
-
-    assert any(
-        "must have the baseline of each of the 15 camera pairs, and lacks 0-1" in problem
-        for problem in problems_of(rig_document, dumped)
-    )
-
-
-@pytest.mark.parametrize(
-    ("record", "path"),
-    [
-        (
-            {"adjacent_pairs": [{"camera_index_a": 1, "camera_index_b": 2, "baseline_cm": 6.9}]},
-            "$.adjacent_pairs[0].baseline_cm",
-        ),
-        ({"baselines_adjacent_cm": [6.5, 6.9, 5.75, 7.0, 6.5]}, "$.baselines_adjacent_cm[1]"),
-    ],
-)
-def test_adjacent_baselines_must_agree_with_the_pairwise_ones(rig_document, dumped, record, path):
-    assert problems_of(rig_document | record, dumped) == [
-        f"{path}: the baseline of cameras 1 and 2 is 6.9 cm here and 6.75 cm at "
-        "$.pairwise_pairs[5].baseline_cm. Remove the wrong one."
-    ]
-
-
-@pytest.mark.parametrize(
-    "rounded",
-    [[6.500000476837158, 6.75, 5.75, 7.0, 6.5], [6.5, 6.8, 5.8, 7.0, 6.5], [7, 7, 6, 7, 7]],
-)
-def test_values_that_agree_within_their_own_digits_are_the_same(rig_document, dumped, rounded):
-    document = rig_document | {"baselines_adjacent_cm": rounded}
-
-    rig, _, remarks = parse_rig(dumped(document), where="b")
-
-    assert rig.baselines_cm == BASELINES_CM
-    assert remarks == ()
-
-
-def test_a_missing_quantity_is_named_with_its_place_and_the_keys_found(rig_document, dumped):
-    intrinsics = rig_document["camera_intrinsics"]
-    intrinsics["zoom"] = intrinsics.pop("focal_length_mm")
-
-    (problem,) = problems_of(rig_document, dumped)
-
-    assert problem.startswith("$.camera_intrinsics.focal_length_mm is missing; the keys are: ")
-    assert "camera_intrinsics.zoom" in problem
-
-
-def test_all_problems_of_a_file_are_reported_at_once(rig_document, dumped):
-    rig_document["camera_intrinsics"]["focal_length_mm"] = "far"
-    rig_document["camera_intrinsics"]["sensor_width_mm"] = 0
-    rig_document["pairwise_pairs"][0]["baseline_cm"] = None
-    rig_document["primary_stereo_pair"] = "left"
-
-    problems = problems_of(rig_document, dumped)
-
-    for place in ("baseline_cm", "focal_length_mm", "sensor_width_mm", "primary_stereo_pair"):
-        assert any(place in problem for problem in problems)
 
 
 def test_sizes_and_labels_that_are_odd_stop_nothing(rig_document, dumped):

