@@ -100,22 +100,6 @@ def test_a_worker_that_dies_is_an_error_and_no_hang(linked_scenes, root, monkeyp
         walk(root, workers=2, progress=kill)
 
 
-def test_progress_is_reported_after_each_scene(linked_scenes, root):
-    linked_scenes(3)
-    told = []
-
-    walk(root, progress=lambda done, total: told.append((done, total)))
-
-    assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
-
-
-def test_a_number_of_workers_below_one_is_refused(linked_scenes, root):
-    linked_scenes(1)
-
-    with pytest.raises(StorageError, match="workers must be at least 1, got 0"):
-        walk(root, workers=0)
-
-
 def stopped_walk(root, journal_path, *, after):
     def stop(done, total):
         if done == after:
@@ -197,11 +181,6 @@ def test_a_journal_that_cannot_be_written_is_named(linked_scenes, root, tmp_path
         walk(root, journal=journal)
 
 
-def test_a_journal_that_cannot_be_read_is_named(tmp_path):
-    with pytest.raises(StorageError, match="the journal of an earlier run cannot be read"):
-        scene_journal(tmp_path, walk="w")
-
-
 @pytest.mark.parametrize(
     ("folder", "map_name", "subset", "notes"),
     [
@@ -228,13 +207,3 @@ def test_an_eval_subset_is_reported_by_its_folder_else_by_its_map(
     assert [scene.id.subset for scene in report.scenes] == [subset, None]
     assert len(report.notes) == notes
     assert all("eval/Other names no subset" in note for note in report.notes)
-
-
-def test_a_map_that_the_files_call_otherwise_is_noted(make_scene, root):
-    make_scene("train/Uniform/Downtown_West/scene_000000")
-
-    report = walk(root)
-
-    assert report.scenes[0].id.map_name == "Downtown_West"
-    (note,) = report.notes
-    assert note.endswith("such as train/Uniform/Downtown_West/scene_000000: 'Car_Dealer'")

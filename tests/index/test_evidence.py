@@ -167,7 +167,7 @@ def understood(text, rig=RIG):
 TURNED = path([(-12.0, 33.0, 2.0), (-14.0, 37.0, 1.0), (-15.0, 44.0, -3.0)])
 
 
-@pytest.mark.parametrize("unit", ["cm", "m", "mm"])
+@pytest.mark.parametrize("unit", ["cm", "m"])
 @pytest.mark.parametrize("form", FORMS)
 def test_each_form_is_read_in_each_unit(form, unit):
     found = understood(written(form, *TURNED, unit=unit, coordinate_system="Unreal"))
@@ -275,15 +275,8 @@ def test_poses_beside_others_of_the_rig_alone_are_those_of_the_world():
 def test_a_unit_that_the_distances_contradict_is_refused(unit):
     document = json.loads(written("rotator", *TURNED)) | {"unit": unit}
 
-    with pytest.raises(SchemaError, match=r"trajectory\.json: .* 66 cm apart, and by the poses"):
-        understood(json.dumps(document).encode())
-
-
-@pytest.mark.parametrize("unit", ["m", "mm"])
-def test_lengths_that_differ_by_a_unit_are_stated_in_two_ways(unit):
-    document = json.loads(written("rotator", *TURNED)) | {"unit": unit}
-
-    with pytest.raises(SidesError, match="as if one of the two were in another unit"):
+    told = r"(?s)trajectory\.json: .* 66 cm apart, and by the poses.*in another unit"
+    with pytest.raises(SidesError, match=told):
         understood(json.dumps(document).encode())
 
 
@@ -363,9 +356,6 @@ def test_scenes_of_one_shape_decide_together():
     agreed = agreed_forms([both, one, both, other])
 
     assert agreed == {"a": ("a: x @ 1.0",), "b": ("b: z @ 1.0",)}
-
-
-def test_scenes_of_one_shape_that_disagree_decide_nothing():
     assert agreed_forms(["a: x @ 1.0", "a: y @ 1.0"]) == {"a": ()}
 
 

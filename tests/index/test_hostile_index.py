@@ -1,6 +1,5 @@
 """Index files that somebody made to take time or memory."""
 
-import dataclasses
 import json
 import shutil
 
@@ -10,7 +9,6 @@ import pytest
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.records import Member
 from tests.hostile import run_bounded
 from tests.index.test_table import METADATA, scene_of
 
@@ -86,29 +84,15 @@ def test_seek_tables_that_take_more_than_the_file_allows_are_as_good_as_none(fil
     assert told == "None\n"
 
 
-@pytest.mark.parametrize(
-    ("name", "letters", "most"),
-    [("map_name", 65_537, "65,536"), ("caption", 65_537, "65,536")],
-)
-def test_a_long_text_is_refused_with_its_length_alone(file, name, letters, most):
+def test_a_long_text_is_refused_with_its_length_alone(file):
     table = pq.read_table(file)
-    rewritten(file, with_texts(table, name, ["x" * letters, "b", "c"]))
+    rewritten(file, with_texts(table, "caption", ["x" * 65_537, "b", "c"]))
 
-    match = rf"{name} of a scene has {letters:,} letters, and it may have {most}"
+    match = "caption of a scene has 65,537 letters, and it may have 65,536"
     with pytest.raises(StorageError, match=match) as refused:
         SceneIndex.open(file)
 
     assert len(str(refused.value)) < 500
-
-
-def test_more_frames_than_a_video_can_have_are_refused(file):
-    table = pq.read_table(file)
-    place = table.schema.get_field_index("frames")
-    frames = pa.array([2**31, 5, 5])
-    rewritten(file, table.set_column(place, table.schema.field("frames"), frames))
-
-    with pytest.raises(StorageError, match="frames is 2147483648, not 1 to 131072"):
-        SceneIndex.open(file)
 
 
 def test_reasons_of_any_length_are_listed_by_their_start(file):
@@ -121,11 +105,3 @@ def test_reasons_of_any_length_are_listed_by_their_start(file):
         SceneIndex.open(file)
 
     assert len(str(told[0].message)) < 60_000
-
-
-def test_a_size_above_the_bound_is_shown_beside_the_bound_in_full(tmp_path):
-    scene = scene_of(0)
-    members = {"a.mp4": Member("a.mp4", 0, 2**61 + 1)}
-
-    with pytest.raises(StorageError, match="size is 2305843009213693953, not 0 to 230584300921369"):
-        SceneIndex.from_scenes([dataclasses.replace(scene, members=members)], tmp_path)

@@ -106,21 +106,7 @@ def test_presumed_rows_are_those_that_reading_gives(whole_tree, read_index):
     ):  # fmt: skip
         np.testing.assert_array_equal(presumed.column(name), read.column(name), err_msg=name)
     np.testing.assert_allclose(presumed.column("lateral_m"), read.column("lateral_m"), atol=1e-9)
-
-
-def test_a_scene_of_a_presumed_row_is_what_its_files_say(whole_tree, read_index):
-    presumed = SceneIndex.open(whole_tree)
-
-    row = row_of(presumed, ODD)
-
-    assert presumed.scene(row) == read_index.scene(row)
-    assert presumed.scene(row).caption == "Cars behind glass."
-
-
-def test_few_scenes_are_read_whole(make_scene, root):
-    make_scene()
-
-    assert SceneIndex.open(root).presumption is None
+    assert presumed.scene(row_of(presumed, ODD)) == read.scene(row_of(read, ODD))
 
 
 @pytest.mark.parametrize(
@@ -159,16 +145,6 @@ def test_a_scene_that_contradicts_what_was_presumed_is_named(tree, video, how, f
     index = SceneIndex.open(tree)
 
     with pytest.raises(StorageError, match=rf"{ODD} is not as was presumed of it: .*{found}"):
-        index.scene(row_of(index, ODD))
-
-
-def test_cameras_that_stand_the_other_way_round_contradict(tree):
-    baseline = baseline_of(4)
-    baseline["primary_stereo_pair"] = {"left_camera": "Cam_01", "right_camera": "Cam_00"}
-    put(tree / ODD / "baseline.json", baseline)
-    index = SceneIndex.open(tree)
-
-    with pytest.raises(StorageError, match=rf"{ODD}.*camera 1 is to the right of camera 0"):
         index.scene(row_of(index, ODD))
 
 
@@ -211,25 +187,6 @@ def test_what_the_listing_and_baseline_json_show_is_told_at_opening(tree):
     assert "cam_05_rgb.mp4" in index.indexed_scene(row_of(index, KEYS[3])).remark("videos")
 
 
-def test_where_no_scene_has_its_mark_all_are_presumed_and_that_is_told(tree):
-    for key in KEYS:
-        (tree / key / "_scene_complete.json").unlink()
-
-    with pytest.warns(AssumptionWarning, match="_scene_complete"):
-        index = SceneIndex.open(tree)
-
-    assert index.presumption is not None
-    assert len(index) == len(KEYS)
-
-
-def test_more_than_a_few_broken_scenes_are_refused(tree):
-    for key in KEYS[:10]:
-        put(tree / key / "baseline.json", b"{")
-
-    with pytest.raises(StorageError, match="10 scenes cannot be used"):
-        SceneIndex.open(tree)
-
-
 def test_a_table_that_is_presumed_is_not_written_as_an_index(whole_tree, tmp_path):
     with pytest.raises(StorageError, match="rows are presumed"):
         SceneIndex.open(whole_tree).write(tmp_path / "index.parquet")
@@ -255,13 +212,6 @@ def test_a_damaged_cache_is_ignored_and_written_anew(whole_tree, cache):
 
     assert SceneIndex.open(whole_tree).digest == digest
     assert kept.stat().st_size == size
-
-
-def test_a_cache_that_cannot_be_written_is_none(whole_tree, tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file" / "cache"))
-
-    assert len(SceneIndex.open(whole_tree)) == len(KEYS)
 
 
 def test_a_changed_file_is_seen_at_the_next_opening(tree, cache):
@@ -331,18 +281,8 @@ def in_metres(document):
     return document | {"unit": "m"}
 
 
-def negative(document):
-    document["camera_intrinsics"]["focal_length_mm"] = -3.5
-    return document
-
-
 def other_camera(document):
     document["primary_stereo_pair"]["right_camera"] = "Town_scene_90_Cam_03"
-    return document
-
-
-def stated_twice(document):
-    document["pairwise_pairs"].append(document["pairwise_pairs"][0] | {"baseline_cm": 99.5})
     return document
 
 
@@ -355,13 +295,9 @@ def other_map(document):
     return document | {"map_name": "Another_Map"}
 
 
-def odd_label(document):
-    return document | {"scene_label": ["a", "list"]}
-
-
 @pytest.mark.parametrize(
     "edit",
-    [unchanged, in_metres, negative, other_camera, stated_twice, as_text, other_map, odd_label],
+    [unchanged, in_metres, other_camera, as_text, other_map],
 )
 def test_many_alike_files_are_read_as_one_by_one(edit):
     reader = RigReader()

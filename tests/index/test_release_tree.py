@@ -1,6 +1,7 @@
 """The search for scenes: which folders are scenes, and what is said of the others."""
 
 import os
+import re
 
 import pytest
 
@@ -29,13 +30,6 @@ def add(root, key):
     (root / key / "baseline.json").write_text("{}")
 
 
-def test_scenes_are_found_by_their_place_and_sorted(tree):
-    folders = find_scene_folders(tree)
-
-    assert folders.keys == KEYS
-    assert folders.refused == {}
-
-
 def test_other_folders_and_hidden_ones_are_passed_over(tree):
     (tree / "metadata").mkdir()
     (tree / "metadata" / "manifest.jsonl").write_text("{}")
@@ -44,50 +38,29 @@ def test_other_folders_and_hidden_ones_are_passed_over(tree):
     assert find_scene_folders(tree).keys == KEYS
 
 
-def test_an_empty_folder_where_a_scene_should_be_is_one(tree):
-    (tree / "train/Uniform/Car_Dealer/scene_000002").mkdir()
-
-    assert "train/Uniform/Car_Dealer/scene_000002" in find_scene_folders(tree).keys
-
-
-def test_a_misplaced_scene_is_listed_with_the_root_to_point_at(tree):
-    add(tree, "copy/train/Uniform/Car_Dealer/scene_000000")
+@pytest.mark.parametrize(
+    ("key", "told"),
+    [
+        ("copy/train/Uniform/Car_Dealer/scene_000000", "Move it, or point at .*/copy instead"),
+        ("train/more/Uniform/Car_Dealer/scene_000000", "found 5 folders"),
+        ("train/Uniform/Car_Dealer/scene_1.5", "not a valid folder"),
+    ],
+)
+def test_a_misplaced_scene_is_listed_with_the_cure(tree, key, told):
+    add(tree, key)
 
     folders = find_scene_folders(tree)
 
     assert folders.keys == KEYS
-    assert list(folders.refused) == ["copy/train/Uniform/Car_Dealer/scene_000000"]
-    assert folders.refused.popitem()[1].endswith(f"Move it, or point at {tree / 'copy'} instead.")
+    ((found, reason),) = folders.refused.items()
+    assert found == key
+    assert re.search(told, reason)
 
 
-def test_a_scene_too_deep_is_listed(tree):
-    add(tree, "train/more/Uniform/Car_Dealer/scene_000000")
-
-    refused = find_scene_folders(tree).refused
-
-    assert list(refused) == ["train/more/Uniform/Car_Dealer/scene_000000"]
-    assert "found 5 folders" in refused.popitem()[1]
-
-
-def test_a_dot_in_a_folders_name_is_listed(tree):
-    add(tree, "train/Uniform/Car_Dealer/scene_1.5")
-
-    refused = find_scene_folders(tree).refused
-
-    assert "not a valid folder" in refused["train/Uniform/Car_Dealer/scene_1.5"]
-
-
-@pytest.mark.parametrize(
-    "below", ["train", "train/Uniform", "eval/MapSeenInTrain", KEYS[0], KEYS[3]]
-)
-def test_a_root_inside_the_release_is_reported_the_right_one(tree, below):
-    with pytest.raises(StorageError, match=f"holds no scene; .* Point at {tree} instead"):
-        find_scene_folders(tree / below)
-
-
-def test_a_root_above_the_release_is_reported_the_right_one(tree):
+@pytest.mark.parametrize("place", ["train", "eval/MapSeenInTrain", KEYS[3], ".."])
+def test_a_root_inside_the_release_or_above_it_is_answered_with_the_right_one(tree, place):
     with pytest.raises(StorageError, match=f"Point at {tree} instead"):
-        find_scene_folders(tree.parent)
+        find_scene_folders((tree / place).resolve())
 
 
 def test_a_folder_without_scenes_says_what_was_looked_for(tmp_path):
@@ -98,22 +71,6 @@ def test_a_folder_without_scenes_says_what_was_looked_for(tmp_path):
         match=r"looked for folders train/<family>/<map>/<scene> or eval/.*found pictures in it",
     ):
         find_scene_folders(tmp_path)
-
-
-def test_scenes_of_no_release_are_reported_with_an_example(tmp_path):
-    add(tmp_path, "mine/scene_000000")
-
-    with pytest.raises(StorageError, match="found 1 elsewhere, such as mine/scene_000000: "):
-        find_scene_folders(tmp_path)
-
-
-def test_a_root_that_is_not_there_or_a_file_is_refused(tmp_path):
-    (tmp_path / "file").write_text("")
-
-    with pytest.raises(StorageError, match="nowhere: does not exist; expected a folder"):
-        find_scene_folders(tmp_path / "nowhere")
-    with pytest.raises(StorageError, match="file: is a file; expected a folder"):
-        find_scene_folders(tmp_path / "file")
 
 
 def test_links_to_folders_are_followed(tree, tmp_path_factory):
@@ -133,14 +90,6 @@ def test_a_link_to_a_folder_above_itself_is_listed_and_not_followed(tree):
     assert folders.refused == {
         "train/Uniform/loop": "is a link to a folder above itself. Remove the link."
     }
-
-
-def test_a_link_to_itself_is_listed(tree):
-    (tree / "train/Uniform/self").symlink_to(tree / "train/Uniform/self")
-
-    refused = find_scene_folders(tree).refused
-
-    assert refused["train/Uniform/self"].startswith("cannot be searched (Too many levels")
 
 
 def test_a_folder_that_may_not_be_read_is_listed(tree, monkeypatch):

@@ -10,7 +10,6 @@ import pytest
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import open as open_module
-from stereogenbench_data.index.presumed import Presumption
 from stereogenbench_data.index.tree import CACHE_VARIABLE
 from tests.servers.hub import REPOSITORY, hub_serving
 
@@ -149,17 +148,6 @@ def test_a_scene_that_contradicts_what_was_presumed_is_named(hub, release, how):
 
     with pytest.raises(StorageError, match=rf"{ODD} is not as was presumed.*stereogenbench index"):
         pairs[number]
-
-
-def test_another_pair_of_a_scene_opens_more_of_its_videos(hub):
-    cameras = {"pairs": [(0, 1), (0, 2)], "fields": ["right"]}
-    pairs = StereoPairs(HUB, scenes=KEYS[10:20], frames=[0], **cameras)
-    assert isinstance(pairs.index.presumption, Presumption)
-
-    pairs[0], pairs[1]
-
-    key = str(pairs.index.column("key")[0])
-    assert "cam_02_rgb.mp4" in read_names(hub, key)
 
 
 @pytest.mark.usefixtures("hub")

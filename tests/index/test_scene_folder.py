@@ -7,7 +7,7 @@ import shutil
 import av
 import pytest
 
-from stereogenbench_data.errors import SchemaError, StorageError
+from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.open import assumptions
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
@@ -51,23 +51,6 @@ def test_the_scene_rendered_elsewhere_is_described(shared_scenes):
     assert len(scene.members) == 17
 
 
-def test_depth_without_a_tag_has_the_releases_unit(make_scene, root, video):
-    folder = make_scene()
-    for camera in range(6):
-        shutil.copy(video("depth.mkv", tags={}), folder / f"cam_{camera:02d}_depth.mkv")
-
-    scene = describe_scene(root, KEY)
-
-    assert scene.depth_unit_m == (0.1,) * 6
-    assert scene.depth_unit_source == ("default",) * 6
-
-
-def test_any_common_number_of_frames_is_recorded(make_scene, root):
-    make_scene(frames=7)
-
-    assert describe_scene(root, KEY).frames == 7
-
-
 def test_the_share_of_measured_depth_is_known_where_it_is_requested(make_scene, root):
     make_scene()
 
@@ -90,13 +73,6 @@ def test_an_unfinished_scene_says_why(make_scene, root, keep, match):
             path.unlink()
 
     with pytest.raises(IncompleteScene, match=f"{KEY}: {match}"):
-        describe_scene(root, KEY)
-
-
-def test_a_finished_scene_without_its_rig_names_what_is_missing(make_scene, root):
-    (make_scene() / "baseline.json").unlink()
-
-    with pytest.raises(StorageError, match=r"has no baseline.json \(it has _scene_complete"):
         describe_scene(root, KEY)
 
 
@@ -144,12 +120,6 @@ def test_cameras_whose_sides_are_contradicted_have_no_poses(make_scene, root, re
     assert "camera 1 is to the right of camera 0" in scene.remark("left")
 
 
-def test_descriptions_may_be_absent(make_scene, root):
-    (make_scene() / "scene_description_qwen_dataset_level.json").unlink()
-
-    assert describe_scene(root, KEY).caption == ""
-
-
 def test_the_text_file_stands_in_for_the_description(make_scene, root):
     folder = make_scene()
     (folder / "scene_description_qwen_dataset_level.json").unlink()
@@ -181,15 +151,6 @@ def test_frames_without_poses_at_the_end_are_not_used(make_scene, root, rewrite)
 
     assert (scene.frames, scene.remark("poses")) == (3, "")
     assert "poses of 3 frames, and the videos have 4. The first 3 are" in scene.remark("frames")
-
-
-def test_a_trajectory_without_the_first_frame_is_not_used(make_scene, root, rewrite):
-    rewrite(make_scene() / "trajectory.json", lambda document: document["frames"].pop(0))
-
-    scene = describe_scene(root, KEY)
-
-    assert scene.frames == 4
-    assert "has poses of 3 frames, and the videos have 4" in scene.remark("poses")
 
 
 def test_depth_in_a_form_that_nothing_reads_stops_no_pictures(make_scene, root):
@@ -234,8 +195,9 @@ def test_a_unit_of_depth_in_a_file_of_its_own_is_read(make_scene, root, video, n
                         for frame in frames for pose in frame["cameras"]],
         lambda frames: frames.extend([frames[-1] | {"frame_index": 4 + more} for more in range(3)]),
         lambda frames: [frame.update(frame_index=frame["frame_index"] - 4) for frame in frames],
+        lambda frames: frames.pop(0),
     ],
-    ids=["all cameras turned", "three entries more", "numbers below 0"],
+    ids=["all cameras turned", "three entries more", "numbers below 0", "one less"],
 )  # fmt: skip
 def test_poses_that_no_lateral_rig_of_these_frames_has_are_not_used(
     make_scene, root, rewrite, edit
@@ -289,20 +251,7 @@ def test_the_videos_tell_the_size_whatever_is_recorded(make_scene, root, rewrite
     assert "pictures of 1280x24 pixels, and all videos have 32x24" in scene.remark("size")
 
 
-def test_where_no_size_is_recorded_the_rig_is_for_the_videos(make_scene, root, rewrite):
-    def forget_size(document):
-        del document["image_width"], document["image_height"]
-
-    rewrite(make_scene() / "baseline.json", forget_size)
-
-    rig = describe_scene(root, KEY).rig
-
-    assert (rig.image_width_px, rig.image_height_px) == (32, 24)
-
-
-@pytest.mark.parametrize(
-    "size", [{}, {"resolution": "32x24"}, {"image_width": "32"}, {"resolution": {"a": 32}}]
-)
+@pytest.mark.parametrize("size", [{}, {"resolution": "32x24"}, {"resolution": {"a": 32}}])
 def test_a_focal_length_in_pixels_is_one_of_the_videos_where_the_file_has_no_size(
     make_scene, root, rewrite, size
 ):
@@ -337,20 +286,6 @@ def test_a_sensor_of_another_shape_than_the_pictures_is_remarked_with_both(
     assert "32x24" in assumptions([scene], where="ROOT")
 
 
-def test_a_baseline_that_the_poses_contradict_is_reported_with_both_numbers(
-    make_scene, root, rewrite
-):
-    def widen(document):
-        document["pairwise_pairs"][7]["baseline_cm"] = 51.0
-
-    rewrite(make_scene() / "baseline.json", widen)
-
-    with pytest.raises(
-        StorageError, match=r"cameras 1 and 4 are 51 cm apart.* 50 cm apart in frame 0.* add up"
-    ):
-        describe_scene(root, KEY)
-
-
 def test_a_baseline_may_differ_by_a_millimetre_and_a_thousandth(make_scene, root, rewrite):
     def widen(document):
         document["pairwise_pairs"][7]["baseline_cm"] = 50.14
@@ -358,34 +293,6 @@ def test_a_baseline_may_differ_by_a_millimetre_and_a_thousandth(make_scene, root
     rewrite(make_scene() / "baseline.json", widen)
 
     assert describe_scene(root, KEY).rig.baselines_cm[7] == 50.14
-
-
-def test_a_wrong_unit_shows_as_a_contradiction(make_scene, root, rewrite):
-    def in_another_unit(document):
-        for frame in document["frames"]:
-            for pose in frame["cameras"]:
-                pose["location"] = {axis: 100 * cm for axis, cm in pose["location"].items()}
-
-    rewrite(make_scene() / "trajectory.json", in_another_unit)
-
-    remark = describe_scene(root, KEY).remark("poses")
-    recorded_cm, posed_cm = re.findall(r"are ([0-9.]+) cm apart", remark)
-    assert float(posed_cm) == pytest.approx(100 * float(recorded_cm))
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "about", "told"),
-    [
-        ("trajectory.json", b"[]", "poses", f"{KEY}/trajectory.json: no numbers of 6 cameras"),
-        ("_scene_complete.json", b"", "labels", f"{KEY}/_scene_complete.json: the file is empty"),
-        ("cam_00_rgb.mp4", b"", "videos", f"{KEY}/cam_00_rgb.mp4: is empty"),
-        ("cam_00_depth.mkv", b"\x1aE\xdf\xa3", "videos", f"{KEY}/cam_00_depth.mkv: cannot"),
-    ],
-)
-def test_a_damaged_file_is_remarked(make_scene, root, name, content, about, told):
-    (make_scene() / name).write_bytes(content)
-
-    assert told in describe_scene(root, KEY).remark(about)
 
 
 @pytest.mark.parametrize(
@@ -420,21 +327,6 @@ def test_all_problems_of_a_scene_are_told_at_once(make_scene, root, video):
 
     assert f"{KEY}/baseline.json: not valid JSON" in str(caught.value)
     assert "cam_01_rgb.mp4 has 64x48" in str(caught.value)
-
-
-def test_a_huge_metadata_file_is_refused_by_its_size(make_scene, root):
-    path = make_scene() / "baseline.json"
-    os.truncate(path, 200 * 2**20)
-
-    with pytest.raises(SchemaError, match=r"baseline.json: .*this one has 209,715,200. It was not"):
-        describe_scene(root, KEY)
-
-
-def test_a_truncated_video_is_named(make_scene, root):
-    path = make_scene() / "cam_00_rgb.mp4"
-    os.truncate(path, path.stat().st_size // 2)
-
-    assert f"{KEY}/cam_00_rgb.mp4: " in describe_scene(root, KEY).remark("videos")
 
 
 def test_a_folder_that_is_gone_is_named(root):

@@ -6,8 +6,6 @@ import dataclasses
 import json
 import pickle
 import random
-import shutil
-import warnings
 
 import fsspec.core
 import numpy as np
@@ -87,20 +85,14 @@ def test_a_scene_comes_back_from_the_file_as_it_was(tmp_path_factory, seed, coun
     assert [index.scene(row) for row in range(count)] == scenes
 
 
-def test_rows_are_in_the_order_of_their_keys_whatever_order_they_came_in(scenes, tmp_path):
-    forth = SceneIndex.from_scenes(scenes, tmp_path)
-    back = SceneIndex.from_scenes(reversed(scenes), tmp_path)
-
-    assert back.column("key").tolist() == sorted(scene.id.key for scene in scenes)
-    assert back.digest == forth.digest
-
-
-def test_the_digest_is_the_same_after_writing_and_in_parts_of_a_table(scenes, tmp_path):
-    index = SceneIndex.from_scenes(scenes, tmp_path)
+def test_the_digest_is_the_same_in_any_order_and_in_parts_of_a_table(scenes, tmp_path):
+    index = SceneIndex.from_scenes(reversed(scenes), tmp_path)
     index.write(tmp_path / "index.parquet")
     table = pq.read_table(tmp_path / "index.parquet")
     pq.write_table(table, tmp_path / "parts.parquet", row_group_size=2)
 
+    assert index.column("key").tolist() == sorted(scene.id.key for scene in scenes)
+    assert SceneIndex.from_scenes(scenes, tmp_path).digest == index.digest
     assert SceneIndex.open(tmp_path / "index.parquet").digest == index.digest
     assert SceneIndex.open(tmp_path / "parts.parquet").digest == index.digest
 
@@ -109,8 +101,6 @@ def test_the_digest_is_the_same_after_writing_and_in_parts_of_a_table(scenes, tm
     "change",
     [
         {"frames": 7},
-        {"caption": "Other."},
-        {"valid_depth_ratio": 0.5},
         {"lateral_m": (0.0, 0.1, 0.2, 0.3, 0.4, 0.6)},
         {"members": {"a.mp4": Member("a.mp4", 0, 1)}},
     ],
@@ -159,32 +149,18 @@ def test_a_row_that_is_not_there_is_named(scenes, tmp_path, row):
         SceneIndex.from_scenes(scenes, tmp_path).scene(row)
 
 
-def test_an_index_goes_to_another_process_whole(scenes, tmp_path):
-    index = SceneIndex.from_scenes(scenes, tmp_path)
-    index.column("frames")
-
-    copy = pickle.loads(pickle.dumps(index))
-
-    assert (copy.root, copy.digest, len(copy)) == (index.root, index.digest, 5)
-    assert copy.scene(3) == scenes[3]
-
-
 def test_two_scenes_of_one_key_are_refused(scenes, tmp_path):
     with pytest.raises(StorageError, match="scene_000001' is listed twice"):
         SceneIndex.from_scenes([*scenes, scenes[1]], tmp_path)
 
 
-@pytest.mark.parametrize("path", ["../x", "/etc/passwd", "a/../../b", "a\\b", ""])
-def test_a_path_that_could_leave_the_root_is_refused(scenes, tmp_path, path):
-    bad = dataclasses.replace(scenes[0], members={"a": Member(path, 0, 1)})
-
-    with pytest.raises(StorageError, match="is not a path inside the data's root"):
-        SceneIndex.from_scenes([bad], tmp_path)
-
-
-@pytest.mark.parametrize("name", ["../x", "/etc/passwd", "a/b", "..", ""])
-def test_a_file_name_that_could_leave_its_scene_is_refused(scenes, tmp_path, name):
-    bad = dataclasses.replace(scenes[0], members={name: Member("train/a.tar", 0, 1)})
+@pytest.mark.parametrize(
+    ("name", "path"),
+    [("a", "../x"), ("a", "/etc/passwd"), ("a", "a/../../b"), ("a", "a\\b"), ("a", ""),
+     ("../x", "a.tar"), ("/etc/passwd", "a.tar"), ("a/b", "a.tar"), ("", "a.tar")],
+)  # fmt: skip
+def test_a_path_or_a_name_that_could_leave_its_folder_is_refused(scenes, tmp_path, name, path):
+    bad = dataclasses.replace(scenes[0], members={name: Member(path, 0, 1)})
 
     with pytest.raises(StorageError, match="is not a path inside the data's root"):
         SceneIndex.from_scenes([bad], tmp_path)
@@ -217,9 +193,6 @@ def with_path(path):
     [
         (lambda table, head: head.update(format=2), "of format 2, and this version .* reads fo"),
         (lambda table, head: head.update(broken=3), "description of itself was altered"),
-        (lambda table, head: head.update(incomplete={"a": 3}), "description of itself was altered"),
-        (lambda table, head: head.update(root=3), "description of itself was altered"),
-        (lambda table, head: head["shards"].update(x=3), "description of itself was altered"),
         (
             lambda table, head: head["shards"].update(x={"size": "1", "sha256": "", "members": 1}),
             "description of itself was altered",
@@ -238,7 +211,6 @@ def with_path(path):
         (lambda table, head: table.take([1, 0, 2, 3, 4]), "is listed twice or out of order"),
         (with_path("train/other"), "its rows were changed"),
         (with_path("../../etc/passwd"), "'../../etc/passwd' is not a path inside the data's root"),
-        (with_path("/etc/passwd"), "'/etc/passwd' is not a path inside the data's root"),
     ],
 )
 def test_an_altered_index_is_refused(scenes, tmp_path, edit, match):
@@ -256,7 +228,7 @@ def test_a_foreign_parquet_file_is_refused(tmp_path):
         SceneIndex.open(tmp_path / "other.parquet")
 
 
-@pytest.mark.parametrize("keep", [0, 3, 200, 0.5, 0.99])
+@pytest.mark.parametrize("keep", [0, 200, 0.99])
 def test_a_truncated_index_is_refused(scenes, tmp_path, keep):
     path = written(scenes, tmp_path)
     content = path.read_bytes()
@@ -270,7 +242,7 @@ def test_bytes_that_changed_inside_an_index_never_change_a_scene(scenes, tmp_pat
     path = written(scenes, tmp_path)
     content = path.read_bytes()
     rng = random.Random(0)
-    for _ in range(80):
+    for _ in range(40):
         damaged = bytearray(content)
         damaged[rng.randrange(len(content))] ^= rng.randrange(1, 256)
         path.write_bytes(damaged)
@@ -278,30 +250,15 @@ def test_bytes_that_changed_inside_an_index_never_change_a_scene(scenes, tmp_pat
             assert SceneIndex.open(path).scene(0) == scenes[0]
 
 
-def test_data_that_do_not_exist_are_named(tmp_path):
-    with pytest.raises(StorageError, match=r"nowhere: does not exist; expected an index file"):
-        SceneIndex.open(tmp_path / "nowhere")
-
-
-def test_a_name_that_no_system_takes_is_refused_with_the_cure():
-    with pytest.raises(StorageError, match=r"nnn: cannot be looked at .*Choose a shorter name"):
-        SceneIndex.open("n" * 300)
-
-
 def test_an_index_behind_a_url_is_fetched_and_its_data_lie_beside_it(scenes, web):
-    SceneIndex.from_scenes(scenes, web.folder).write(web.folder / "index.parquet")
+    SceneIndex.from_scenes(scenes, "https://elsewhere").write(web.folder / "index.parquet")
     for url in (web.url, f"{web.url}/", f"{web.url}/index.parquet"):
         web.asked.clear()
         index = SceneIndex.open(url)
 
         assert index.root == web.url
-        assert index.digest == SceneIndex.open(web.folder).digest
+        assert index.digest == SceneIndex.from_scenes(scenes, web.url).digest
         assert {asked.path for asked in web.asked} == {"index.parquet"}
-
-
-def test_a_url_without_an_index_is_named(web):
-    with pytest.raises(StorageError, match=r"/data/index.parquet : the server answers 404 Not Fou"):
-        SceneIndex.open(f"{web.url}/data?key=secret")
 
 
 def test_a_damaged_index_behind_a_url_is_named(web):
@@ -326,12 +283,6 @@ def test_an_index_kept_elsewhere_names_the_url_that_it_was_made_of(scenes, tmp_p
     with pytest.raises(StorageError, match=r"kept.parquet: .* s3://bucket/data\."):
         SceneIndex.open(tmp_path / "kept.parquet")
     assert SceneIndex.open(tmp_path / "kept.parquet", root=web.url).root == web.url
-
-
-def test_an_index_behind_a_url_cannot_send_its_readers_elsewhere(scenes, web):
-    SceneIndex.from_scenes(scenes, "https://elsewhere").write(web.folder / "index.parquet")
-
-    assert SceneIndex.open(web.url).root == web.url
 
 
 def test_no_secret_is_written_into_an_index(scenes, tmp_path):
@@ -407,13 +358,10 @@ def recording(scenes, path, root):
         "reference://x::data:application/json;base64,e30=",
         "hf://datasets/a/b@main/x",
         "s3://key:word@bucket/x",
-        "https://example.org/x",
         "https://example.org/x?key=word",
         "https://example.org/\x1b[31m",
         "http://[::1",
-        "file:///etc",
         "FILE:///etc",
-        "/etc",
         "../other",
         "link",
         "a\0b",
@@ -472,20 +420,15 @@ def with_row(**values):
     ("change", "match"),
     [
         (with_row(image_height_px=0), "image_height_px is 0, not 1 to 65536"),
-        (with_row(image_width_px=2**40), "image_width_px is 1099511627776, not 1 to 65536"),
         (with_row(frames=-3), "frames is -3, not 1 to"),
         (with_row(focal_mm=float("nan")), "focal_mm is nan, not"),
-        (with_row(sensor_width_mm=float("inf")), "sensor_width_mm is inf, not"),
-        (with_row(baselines_cm=[float("nan")] * 15), "baselines_cm is nan, not"),
         (with_row(baselines_cm=[-1.0] * 15), "baselines_cm is -1.0, not"),
         (with_row(lateral_m=[float("inf")] * 6), "lateral_m is inf, not"),
         (with_row(rig_residual_px=float("nan")), "rig_residual_px is nan, not 0 to inf"),
         (with_row(depth_unit_m=[0.0] * 6), "depth_unit_m is 0.0, not"),
-        (with_row(depth_unit_source=["guess"] * 6), "depth_unit_source is 'guess', not"),
         (with_row(primary_left=6), "primary_left is 6, not 0 to 5"),
         (with_row(primary_left=1, primary_right=1), "a primary pair has a camera twice"),
         (with_row(split="test"), "split is 'test', not"),
-        (with_row(subset="some"), "subset is 'some', not"),
         (with_row(family="a/b"), "family is 'a/b', not"),
         (with_row(map_name="\x1b[31m"), r"map_name is .*, not"),
         (
@@ -514,17 +457,6 @@ def test_a_value_that_no_scene_has_is_refused_though_the_digest_is_right(
         SceneIndex.open(path)
 
 
-def test_an_index_whose_root_is_gone_says_where_it_was(scenes, tmp_path):
-    (tmp_path / "data").mkdir()
-    SceneIndex.from_scenes(scenes, tmp_path / "data").write(tmp_path / "index.parquet")
-    (tmp_path / "data").rmdir()
-
-    with pytest.raises(
-        StorageError, match=f"its data were at {tmp_path}/data, which is not a folder"
-    ):
-        SceneIndex.open(tmp_path / "index.parquet")
-
-
 def test_a_file_that_cannot_be_written_is_named_and_leaves_nothing(scenes, tmp_path):
     (tmp_path / "index.parquet").mkdir()
 
@@ -532,27 +464,6 @@ def test_a_file_that_cannot_be_written_is_named_and_leaves_nothing(scenes, tmp_p
         SceneIndex.from_scenes(scenes, tmp_path).write(tmp_path / "index.parquet")
 
     assert [path.name for path in tmp_path.iterdir()] == ["index.parquet"]
-
-
-def test_a_tree_opens_directly(make_scene, root):
-    make_scene("train/Uniform/Car_Dealer/scene_000002")
-    make_scene("train/Uniform/Car_Dealer/scene_000001")
-
-    index = SceneIndex.open(root)
-
-    assert [key[-1] for key in index.column("key")] == ["1", "2"]
-    assert index.root == str(root)
-
-
-def test_incomplete_scenes_of_a_tree_are_warned_of(make_scene, root):
-    make_scene()
-    shutil.rmtree(make_scene("train/Uniform/Car_Dealer/scene_000002"))
-    (root / "train/Uniform/Car_Dealer/scene_000002").mkdir()
-
-    with pytest.warns(IncompleteSceneWarning, match=r"(?s)1 scene cannot be used:.*folder is empt"):
-        index = SceneIndex.open(root)
-
-    assert list(index.incomplete) == ["train/Uniform/Car_Dealer/scene_000002"]
 
 
 def test_broken_scenes_of_a_tree_are_an_error_that_lists_them(make_scene, root):
@@ -614,14 +525,6 @@ def test_where_no_scene_has_its_mark_all_are_opened_and_that_is_told(make_scene,
         SceneIndex.open(root, wanted=lambda scene: scene.split == "train")
 
 
-def test_a_tree_of_unfinished_scenes_is_an_error(make_scene, root):
-    for video in make_scene().glob("cam_*"):
-        video.unlink()
-
-    with pytest.raises(StorageError, match="no scene is complete: 1 scene cannot be used"):
-        SceneIndex.open(root)
-
-
 def test_what_was_left_out_is_reported_when_the_index_is_opened(scenes, tmp_path):
     index = SceneIndex.from_scenes(scenes, tmp_path)
     index.incomplete = {"train/a/b/c": "is empty"}
@@ -632,33 +535,6 @@ def test_what_was_left_out_is_reported_when_the_index_is_opened(scenes, tmp_path
         opened = SceneIndex.open(tmp_path)
 
     assert (opened.incomplete, opened.broken) == (index.incomplete, index.broken)
-
-
-def test_an_index_without_anything_left_out_opens_without_a_warning(scenes, tmp_path):
-    written(scenes, tmp_path)
-
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        SceneIndex.open(tmp_path)
-
-    assert caught == []
-
-
-def test_as_many_scenes_as_the_release_has_come_back(tmp_path):
-    scenes = [dataclasses.replace(scene_of(0), id=scene_of(n).id) for n in range(8493)]
-    SceneIndex.from_scenes(scenes, tmp_path).write(tmp_path / "index.parquet")
-
-    index = SceneIndex.open(tmp_path)
-
-    assert len(index) == 8493
-    assert index.scene(8492).id == scenes[8492].id
-    assert index.column("baselines_cm").shape == (8493, 15)
-
-
-def test_an_index_shows_its_root_and_how_many_scenes_it_holds(small_release):
-    index = SceneIndex.open(small_release)
-
-    assert repr(index) == f"<SceneIndex of {str(small_release)!r}: {len(index)} scenes>"
 
 
 def test_seek_tables_are_kept_apart_and_change_no_digest(tmp_path):
