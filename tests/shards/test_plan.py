@@ -121,9 +121,8 @@ def test_data_behind_a_url_are_not_packed(index_of):
 
 @pytest.mark.parametrize(
     ("text", "size"),
-    [("500MB", 500_000_000), ("2GiB", 2**31), ("1.5 kb", 1500), ("12", 12), ("3k", 3000),
-     ("1TB", 10**12)],
-)  # fmt: skip
+    [("500MB", 500_000_000), ("2GiB", 2**31), ("1.5 kb", 1500), ("12", 12), ("3k", 3000)],
+)
 def test_a_size_is_read_as_it_is_written(text, size):
     assert parse_bytes(text) == size
 

@@ -5,8 +5,6 @@ import subprocess
 import tarfile
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from stereogenbench_data.errors import ShardError
 from stereogenbench_data.shards.tar import (
@@ -51,31 +49,12 @@ def test_a_tar_is_the_one_that_gnu_tar_writes(tmp_path):
     assert (tmp_path / "x.tar").read_bytes() == tar_of(TWO).ljust(10240, b"\0")
 
 
-parts = st.text("abcXYZ019_-", min_size=1, max_size=50)
-names = st.tuples(parts, parts, parts, st.sampled_from(["json", "cam_00_rgb.mp4", "txt"])).map(
-    lambda found: f"{found[0]}/{found[1]}/{found[2]}.{found[3]}"
-)
-contents = st.binary(max_size=1500)
-
-
-@given(st.dictionaries(names, contents, max_size=6))
-@settings(max_examples=30, deadline=None)
-def test_any_members_come_back_by_tarfile(files):
-    with tarfile.open(fileobj=io.BytesIO(tar_of(files.items())), mode="r:") as tar:
-        found = {info.name: tar.extractfile(info).read() for info in tar}
-
-    assert list(found) == list(files)
-    assert found == files
-
-
 @pytest.mark.parametrize(
     ("name", "match"),
     [
         ("/etc/passwd", "not a relative path"),
         ("../x.json", "not a relative path"),
-        ("a\\x.json", "not a relative path"),
         ("a/ä.json", "not a relative path in ASCII"),
-        ("a/x\n.json", "not a relative path"),
         ("", "not a relative path"),
         (f"a/{'x' * 101}", "has 103 characters, and ustar holds 100"),
         (f"{'f' * 80}/{'g' * 120}/x", "Shorten its folders' names"),

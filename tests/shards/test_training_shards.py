@@ -42,6 +42,7 @@ from stereogenbench_data.shards.verify import verify
 from stereogenbench_data.sources.files import try_locked
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
+from tests.datasets.conftest import same
 from tests.servers.tools import require_module
 from tests.shards.shard_files import bytes_of, flip_byte
 
@@ -77,17 +78,6 @@ def packed(release, tmp_path_factory):
     return out
 
 
-@pytest.fixture(scope="module")
-def of_quality(release, packed, tmp_path_factory):
-    """Its training shards by quality, one scene but for the default; not to be changed."""
-    folders = {"balanced": packed}
-    for quality in set(QUALITIES) - set(folders):
-        folders[quality] = tmp_path_factory.mktemp("of_quality") / quality
-        settings = TrainingSettings(SIZE, quality)
-        pack(release, folders[quality], training=settings, rows=[0], workers=1)
-    return folders
-
-
 @pytest.fixture
 def shards(packed, tmp_path):
     """A copy that a test may change."""
@@ -111,20 +101,12 @@ def document_of(folder, key):
         return parse_training(file.read(member.size), where="test")
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
-def test_all_but_pictures_is_bit_for_bit_what_size_gives(release, of_quality, quality):
-    derived = StereoPairs(of_quality[quality], pairs="all", frames="all", fields=FIELDS)
+def test_all_but_pictures_is_bit_for_bit_what_size_gives(release, packed):
+    derived = StereoPairs(packed, pairs="all", frames="all", fields=FIELDS)
     on_the_fly = StereoPairs(release, pairs="all", frames="all", fields=FIELDS, size=SIZE)
 
-    assert len(on_the_fly) == 3 * 15 * 18
-    assert len(derived) == len(SceneIndex.open(of_quality[quality])) * 15 * 18
-    for number in range(0, len(derived), 53):
-        one, other = derived[number], on_the_fly[number]
-        for name in FIELDS:
-            if isinstance(one[name], torch.Tensor):
-                assert torch.equal(one[name], other[name]), name
-            else:
-                assert one[name] == other[name], name
+    assert len(derived) == len(on_the_fly) == 3 * 15 * 18
+    assert all(same(derived[number], on_the_fly[number]) for number in range(0, 810, 53))
 
 
 def test_pictures_have_the_psnr_that_the_index_states(release, packed):
@@ -201,21 +183,11 @@ def test_the_same_input_gives_the_same_bytes_whatever_the_workers_and_parts(
 
 
 def test_more_processes_than_shards_share_the_scenes(packed, release, tmp_path):
-    seen = []
-    report = pack(
-        release,
-        tmp_path,
-        training=SETTINGS,
-        rows=[1, 2],
-        workers=2,
-        progress=lambda done, total: seen.append((done, total)),
-    )
+    report = pack(release, tmp_path, training=SETTINGS, rows=[1, 2], workers=2)
 
     shard = "train-Uniform-000000.tar"
     assert report.packed == (shard,)
     assert (tmp_path / shard).read_bytes() == (packed / shard).read_bytes()
-    assert seen == sorted(seen)
-    assert seen[-1][0] == seen[-1][1]
     assert not list((tmp_path / ".parts").glob("*.derived"))
 
 
@@ -292,15 +264,6 @@ def test_other_settings_or_another_source_are_another_plan(shards, release, tmp_
         pack(release, shards, training=SETTINGS, rows=[0], workers=1)
     with pytest.raises(ShardError, match="another plan"):
         pack(release, shards, workers=1)
-
-
-def test_shards_are_a_source_as_their_release_is(packed, release, tmp_path):
-    pack(release, tmp_path / "source", depth_codec="blosc2", workers=1)
-    pack(tmp_path / "source", tmp_path / "out", training=SETTINGS, workers=1)
-
-    one, other = document_of(tmp_path / "out", KEY), document_of(packed, KEY)
-    assert repr(one.files) == repr(other.files)  # from Python 3.13 on nan differs from itself
-    assert one.source_digest != other.source_digest
 
 
 def test_a_url_is_a_source_as_its_folder_is(packed, release, tmp_path, web):
@@ -383,10 +346,9 @@ def test_scenes_of_other_lengths_and_sizes(tmp_path, request_, size, key_frames)
     assert (report.problems, report.videos_decoded) == ((), 12)
 
 
-@pytest.mark.parametrize("size", [(24, 31), (23, 32)])
-def test_h264_refuses_odd_sides_by_name(size):
-    with pytest.raises(MediaError, match=rf"{size[1]}x{size[0]}.*even.*quality 'high'"):
-        TrainingSettings(size, "balanced")
+def test_h264_refuses_odd_sides_by_name():
+    with pytest.raises(MediaError, match=r"31x24.*even.*quality 'high'"):
+        TrainingSettings((24, 31), "balanced")
 
 
 def test_larger_pictures_than_released_are_refused(release, tmp_path):
@@ -460,14 +422,6 @@ def test_unpacked_training_shards_are_a_folder_of_derived_scenes(packed, tmp_pat
 # Damage and alteration.
 
 
-def test_every_frame_decodes(packed):
-    report = verify(packed, mode="decode", workers=1)
-
-    assert report.problems == ()
-    assert report.videos_decoded == 36
-    assert "32x24" in report.derived
-
-
 def test_an_altered_psnr_contradicts_the_shard(shards):
     index = SceneIndex.open(shards)
     scenes = [index.scene(row) for row in range(len(index))]
@@ -489,7 +443,6 @@ def test_an_altered_psnr_contradicts_the_shard(shards):
     [
         ({"quality": "[small](http://x)"}, "training_quality"),
         ({"settings": "[" * 9999}, "training_settings"),
-        ({"psnr_db": (400.0,) * 6}, "psnr_db"),
         ({"worst_psnr_db": (-math.inf,) * 6}, "worst_psnr_db"),
     ],
 )
@@ -507,11 +460,7 @@ def test_an_index_cannot_say_other_things_of_training_shards(packed, facts, foun
         (lambda text: text[:-40], "not valid JSON"),
         (lambda text: text.replace(b'"psnr_db": ', b'"psnr_db": 1'), "psnr_db"),
         (lambda text: text.replace(b"cam_00_rgb.mp4", b"../../etc"), "files"),
-        (
-            lambda text: text.replace(b"[0, 4, 8, 12, 16]", b"[0, 8, 4, 12, 16]"),
-            "key_frames",
-        ),
-        (lambda text: text.replace(b'"width_px": 32', b'"width_px": -1'), "width_px"),
+        (lambda text: text.replace(b"[0, 4, 8, 12, 16]", b"[0, 8, 4, 12, 16]"), "key_frames"),
         (lambda text: text.replace(b'"crc32": "', b'"crc32": "x'), "invalid literal"),
     ],
 )
@@ -554,27 +503,15 @@ def test_a_video_is_written_the_same_each_time_and_read_back(tmp_path, quality, 
     assert facts.key_frames == tuple(range(0, 19, distance))
 
 
-@pytest.mark.parametrize(("quality", "shift"), [("balanced", -1), ("high", 1)])
-def test_a_neighbouring_frame_in_the_place_of_one_is_found(tmp_path, quality, shift):
+@pytest.mark.parametrize("quality", ["balanced", "high"])
+def test_a_neighbouring_frame_in_the_place_of_one_and_a_lost_one_are_found(tmp_path, quality):
     pictures = moving(10)
     write_pictures(pictures, tmp_path / "a.mp4", quality=quality, rate_hz=Fraction(15))
 
     with pytest.raises(MediaError, match=r"video: frame \d shows frame \d of its source"):
-        measured_error(np.roll(pictures, shift, axis=0), tmp_path / "a.mp4", name="video")
-
-
-def test_frames_that_do_not_differ_are_not_taken_for_each_other(tmp_path):
-    still = np.repeat(moving(1), 12, axis=0)
-    write_pictures(still, tmp_path / "a.mp4", quality="small", rate_hz=Fraction(15))
-
-    assert measured_error(still, tmp_path / "a.mp4", name="a").psnr_db > 20
-
-
-def test_a_lost_frame_is_found(tmp_path):
-    write_pictures(moving(10), tmp_path / "a.mp4", quality="small", rate_hz=Fraction(15))
-
+        measured_error(np.roll(pictures, 1, axis=0), tmp_path / "a.mp4", name="video")
     with pytest.raises(MediaError, match="holds 10 frames where 11 are expected"):
-        measured_error(moving(11), tmp_path / "a.mp4", name="a")
+        measured_error(moving(11), tmp_path / "a.mp4", name="video")
 
 
 # The command.
