@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from stereogenbench_data.datasets.mapped import SceneViews, StereoPairs
-from stereogenbench_data.errors import StereoGenBenchError, StorageError
+from stereogenbench_data.errors import FieldError, StereoGenBenchError, StorageError
 from stereogenbench_data.index.learning import chosen_scenes, examine, learn, tables_of_notes
 from stereogenbench_data.index.open import AssumptionWarning
 from stereogenbench_data.index.parquet import INDEX_NAME
@@ -223,6 +223,13 @@ def test_an_index_whose_conventions_were_altered_is_refused(make_scene, root, te
 
     with pytest.raises(StorageError, match="conventions"):
         SceneIndex.from_scenes([scene], root)
+
+
+def test_conventions_beside_an_open_index_are_refused(make_scene, root):
+    make_scene()
+
+    with pytest.raises(FieldError, match=r"SceneIndex\.open"):
+        StereoPairs(SceneIndex.open(root), conventions=stated("[depth]\nframe_lag = 1\n"))
 
 
 def test_opening_says_in_a_line_what_it_took_for_granted(make_scene, root, rewrite):

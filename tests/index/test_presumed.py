@@ -187,6 +187,25 @@ def test_what_the_listing_and_baseline_json_show_is_told_at_opening(tree):
     assert "cam_05_rgb.mp4" in index.indexed_scene(row_of(index, KEYS[3])).remark("videos")
 
 
+def test_where_no_scene_has_its_mark_all_are_presumed_and_that_is_told(tree):
+    for key in KEYS:
+        (tree / key / "_scene_complete.json").unlink()
+
+    with pytest.warns(AssumptionWarning, match="_scene_complete"):
+        index = SceneIndex.open(tree)
+
+    assert index.presumption is not None
+    assert len(index) == len(KEYS)
+
+
+def test_more_than_a_few_broken_scenes_are_refused(tree):
+    for key in KEYS[:10]:
+        put(tree / key / "baseline.json", b"{")
+
+    with pytest.raises(StorageError, match="10 scenes cannot be used"):
+        SceneIndex.open(tree)
+
+
 def test_a_table_that_is_presumed_is_not_written_as_an_index(whole_tree, tmp_path):
     with pytest.raises(StorageError, match="rows are presumed"):
         SceneIndex.open(whole_tree).write(tmp_path / "index.parquet")
@@ -281,6 +300,11 @@ def in_metres(document):
     return document | {"unit": "m"}
 
 
+def negative(document):
+    document["camera_intrinsics"]["focal_length_mm"] = -3.5
+    return document
+
+
 def other_camera(document):
     document["primary_stereo_pair"]["right_camera"] = "Town_scene_90_Cam_03"
     return document
@@ -297,7 +321,7 @@ def other_map(document):
 
 @pytest.mark.parametrize(
     "edit",
-    [unchanged, in_metres, other_camera, as_text, other_map],
+    [unchanged, in_metres, negative, other_camera, as_text, other_map],
 )
 def test_many_alike_files_are_read_as_one_by_one(edit):
     reader = RigReader()

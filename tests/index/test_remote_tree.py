@@ -90,6 +90,14 @@ def test_the_command_tells_requests_and_time_before_it_reads_many_scenes(tmp_pat
     assert "reads all files of 4 scenes, in 116 requests: on the Hub without a login" in told
 
 
+def test_a_part_is_indexed_under_a_name_of_its_own(small_release):
+    done = CliRunner().invoke(app, ["index", str(small_release), "--split", "eval"])
+
+    assert done.exit_code == 2
+    assert "--out FILE" in done.output
+    assert not (small_release / "index.parquet").exists()
+
+
 @pytest.mark.usefixtures("hub")
 def test_a_repository_without_a_scene_says_what_was_looked_for():
     with pytest.raises(StorageError, match=r"holds no scene and no index\.parquet; looked for"):

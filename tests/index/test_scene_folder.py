@@ -286,13 +286,20 @@ def test_a_sensor_of_another_shape_than_the_pictures_is_remarked_with_both(
     assert "32x24" in assumptions([scene], where="ROOT")
 
 
-def test_a_baseline_may_differ_by_a_millimetre_and_a_thousandth(make_scene, root, rewrite):
-    def widen(document):
-        document["pairwise_pairs"][7]["baseline_cm"] = 50.14
+def test_a_baseline_may_differ_by_a_millimetre_and_a_thousandth_and_no_more(
+    make_scene, root, rewrite
+):
+    def widened(baseline_cm):
+        return lambda document: document["pairwise_pairs"][7].update(baseline_cm=baseline_cm)
 
-    rewrite(make_scene() / "baseline.json", widen)
-
+    path = make_scene() / "baseline.json"
+    rewrite(path, widened(50.14))
     assert describe_scene(root, KEY).rig.baselines_cm[7] == 50.14
+
+    rewrite(path, widened(51.0))
+    told = "cameras 1 and 4 are 51 cm apart.* 50 cm apart in frame 0.* add up"
+    with pytest.raises(StorageError, match=told):
+        describe_scene(root, KEY)
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,9 @@ def test_the_digest_is_the_same_in_any_order_and_in_parts_of_a_table(scenes, tmp
     assert index.column("key").tolist() == sorted(scene.id.key for scene in scenes)
     assert SceneIndex.from_scenes(scenes, tmp_path).digest == index.digest
     assert SceneIndex.open(tmp_path / "index.parquet").digest == index.digest
-    assert SceneIndex.open(tmp_path / "parts.parquet").digest == index.digest
+    parts = SceneIndex.open(tmp_path / "parts.parquet")
+    assert parts.digest == index.digest
+    assert parts.column("depth_codec").tolist() == index.column("depth_codec").tolist()
 
 
 @pytest.mark.parametrize(
@@ -312,6 +314,9 @@ def test_an_index_above_its_data_remembers_where_they_are(scenes, tmp_path):
     SceneIndex.from_scenes(scenes, tmp_path / "data").write(tmp_path / "index.parquet")
 
     assert SceneIndex.open(tmp_path / "index.parquet").root == str(tmp_path / "data")
+    (tmp_path / "data").rmdir()
+    with pytest.raises(StorageError, match=f"its data were at {tmp_path}/data, which is not a f"):
+        SceneIndex.open(tmp_path / "index.parquet")
 
 
 def test_an_index_elsewhere_opens_once_the_user_says_where_its_data_are(scenes, tmp_path):

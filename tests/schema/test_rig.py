@@ -409,9 +409,9 @@ def pairs_as(document, write):
             ))}, id="columns"),
         pytest.param(
             lambda pairs: {"pairwise_pairs": [
-                {"camera_index_a": a, "camera_index_b": b, "baseline_in": cm / 2.54}
+                {"camera_index_a": a, "camera_index_b": b, "baseline": cm / 2.54, "unit": "inch"}
                 for a, b, cm in pairs
-            ]}, id="inches"),
+            ]}, id="a unit beside the number"),
         pytest.param(
             lambda pairs: {"pairwise_pairs": [
                 {"camera_index_a": a, "camera_index_b": b, "baseline_cm": cm, "fx_px": 875.4,

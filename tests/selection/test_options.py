@@ -6,9 +6,10 @@ from stereogenbench_data import EpochBatches, SceneViews, StereoPairs, StereoPai
 from stereogenbench_data.audit.geometry.audit import audit
 from stereogenbench_data.bridges.clips import export_clips
 from stereogenbench_data.bridges.export_views import export_views
-from stereogenbench_data.errors import FieldError, SelectionError
+from stereogenbench_data.errors import FieldError, SelectionError, SynthesisError
 from stereogenbench_data.evaluation.controls import score_controls
 from stereogenbench_data.evaluation.inputs import export_inputs
+from stereogenbench_data.synthesis.request import SynthRequest
 
 
 def refusal(call, *arguments, **options):
@@ -50,6 +51,11 @@ def test_other_calls_list_their_own_options(small_shards, tmp_path):
     assert refusal(export_views, small_shards, tmp_path, layout="ply", point=2)[0] == "points"
     assert refusal(export_clips, small_shards, tmp_path, layout="musubi", pair=2)[0] == "pairs"
     assert refusal(audit, small_shards, journals=2)[0] == "journal"
+
+
+def test_a_misspelled_family_of_drawn_scenes_is_answered_with_the_nearest_one():
+    with pytest.raises(SynthesisError, match="got 'Unifrom'; did you mean 'Uniform'"):
+        SynthRequest(family="Unifrom")
 
 
 def test_a_misspelled_field_is_answered_with_the_nearest_one(small_shards):

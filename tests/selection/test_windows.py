@@ -103,6 +103,7 @@ def test_starts_of_random_clips_cover_a_scene_evenly():
         ([1.5], "got 1.5"),
         (("every", 0), "at least 1, got 0"),
         (("random", 2, 3), "is not understood"),
+        (None, "is not understood"),
     ],
     ids=str,
 )
