@@ -25,10 +25,7 @@ http {{
     server {{
         listen 127.0.0.1:{port};
         root {folder};
-        location /moved/ {{ return 302 /$uri_rest; }}
-        location /forbidden/ {{ return 403; }}
     }}
-    map $uri $uri_rest {{ ~^/moved/(?<rest>.*)$ $rest; }}
 }}
 """
 
@@ -43,10 +40,6 @@ class Nginx:
     def sent(self, *, requests: int) -> int:
         """Return the bytes of bodies sent, once there were so many requests."""
         return sum(int(line.split()[1]) for line in self._lines(requests))
-
-    def statuses(self, *, requests: int) -> list[int]:
-        """Return the status of every answer, once there were so many requests."""
-        return [int(line.split()[0]) for line in self._lines(requests)]
 
     def _lines(self, count: int) -> list[str]:
         """Return the lines of the log, which nginx writes just after it has answered."""

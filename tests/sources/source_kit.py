@@ -6,7 +6,6 @@ lie in shards it says so with a fixture ``index``. Everything else is held here.
 
 import pickle
 import re
-import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -113,9 +112,6 @@ class SourceTests:
             assert file.read(50) == released(VIDEO)[100:150]
             assert file.read() == released(VIDEO)[150:]
 
-    def test_a_metadata_file_is_read_whole(self, make_source, scene, released):
-        assert make_source().read(scene, BASELINE_JSON) == released(BASELINE_JSON)
-
     def test_a_range_and_the_size_of_a_file_are_those_requested(self, root, scene, released):
         member, url = scene.members[VIDEO], joined(str(root), scene.members[VIDEO].path)
 
@@ -169,21 +165,6 @@ class SourceTests:
         copy = pickle.loads(pickle.dumps(source))
 
         assert bytes_of(copy.open(scene, VIDEO)) == released(VIDEO)
-
-    def test_threads_read_at_the_same_time(self, make_source, scene, released):
-        source, wrong = make_source(), []
-
-        def read(name):
-            if bytes_of(source.open(scene, name)) != released(name):
-                wrong.append(name)
-
-        threads = [threading.Thread(target=read, args=(name,)) for name in scene.members]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-
-        assert wrong == []
 
     def test_messages_name_the_place_and_the_file(self, make_source, scene, root):
         source = make_source()

@@ -200,15 +200,6 @@ def test_files_of_others_are_neither_counted_nor_deleted(cache, shard, tmp_path)
     assert (tmp_path / FOLDER_NAME / "items" / "mine.tar").stat().st_size == 50_000
 
 
-def test_a_folder_that_cannot_be_made_is_reported(tmp_path):
-    (tmp_path / "file").touch()
-
-    with pytest.raises(
-        StorageError, match=r"cannot be read or written \(Not a directory\). Choose"
-    ):
-        ShardCache(tmp_path / "file", limit_bytes=1)
-
-
 @pytest.mark.parametrize("limit", [0, -1, True], ids=repr)
 def test_a_limit_that_is_no_number_of_bytes_is_refused(tmp_path, limit):
     with pytest.raises(StorageError, match=rf"{tmp_path}: .*, got {limit!r}: give a number"):

