@@ -92,6 +92,14 @@ def test_a_full_disk_is_reported_before_anything_is_fetched(
         fetched(shards_on_the_web, tmp_path / "part")
 
 
+def test_the_folder_of_the_data_is_refused(small_release):
+    index = SceneIndex.open(small_release)
+    wanted = plan_download(index, [0], cameras=[0], streams=["rgb"])
+
+    with pytest.raises(StorageError, match=r"is the folder of the data"):
+        download(index, wanted, small_release)
+
+
 def test_the_command_says_the_size_first_and_reports(small_release, tmp_path):
     dest = tmp_path / "part"
     arguments = ["download", str(small_release), "-o", str(dest), "--split", "eval"]

@@ -322,6 +322,18 @@ def command(*words):
     return CliRunner().invoke(app, ["pack", *map(str, words)])
 
 
+def test_the_command_packs_a_share_that_fits(small_release, tmp_path):
+    folder = tmp_path / "share"
+    whole = sum(path.stat().st_size for path in small_release.rglob("scene_*/*"))
+
+    done = command(small_release, folder, "--max-bytes", str(whole * 2 // 3), "--workers", "1")
+
+    assert done.exit_code == 0, done.output
+    packed_bytes = sum(path.stat().st_size for path in folder.glob("*.tar"))
+    assert 1 <= len(SceneIndex.open(folder)) < 4
+    assert packed_bytes <= whole * 2 // 3
+
+
 def test_the_command_packs_and_reports_what_there_is(small_release, tmp_path, packed):
     first = command(small_release, tmp_path, "--shard-size", "250kB", "--part", "1/2")
     second = command(small_release, tmp_path, "--shard-size", "250kB", "--workers", "1")
