@@ -84,7 +84,6 @@ class Cell:
             are infinite.
         median: Of the scenes' means.
         scenes: How many scenes have a finite mean.
-        finite: How many frames are averaged.
         infinite: How many frames are infinite, and not averaged.
         undefined: How many frames have no score.
     """
@@ -93,7 +92,6 @@ class Cell:
     ci95: float | None
     median: float | None
     scenes: int
-    finite: int
     infinite: int
     undefined: int
 
@@ -129,7 +127,6 @@ def cell(pairs: Sequence[PairMeans], column: str) -> Cell:
         ci95=None if infinite else half_interval(means),
         median=median(means) if means else None,
         scenes=len(means),
-        finite=sum(found.finite for found in tallies),
         infinite=infinite,
         undefined=sum(found.undefined for found in tallies),
     )

@@ -28,7 +28,6 @@ from stereogenbench_data.errors import (
     explain_os_errors,
 )
 from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, tally
-from stereogenbench_data.evaluation.frame_metrics import fields_of, model_of, settings_of
 from stereogenbench_data.evaluation.metrics.frechet import (
     FeatureStatistics,
     FrechetDistance,
@@ -47,7 +46,10 @@ from stereogenbench_data.evaluation.scene_scores import (
     PairScores,
     SceneScores,
     SceneWork,
+    fields_of,
+    model_of,
     score_scene,
+    settings_of,
 )
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import JobKind, WorkOptions, do_items, job_folder

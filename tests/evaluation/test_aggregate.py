@@ -27,7 +27,7 @@ def test_frames_are_averaged_before_pairs_and_these_before_scenes():
     found = cell(pairs, "psnr")
 
     assert found.mean == 35
-    assert (found.scenes, found.finite) == (2, 4)
+    assert found.scenes == 2
 
 
 def test_identical_frames_are_counted_and_not_averaged():
@@ -40,7 +40,7 @@ def test_identical_frames_are_counted_and_not_averaged():
 def test_frames_without_a_score_are_counted():
     found = cell([pair("a", [10, math.nan]), pair("b", [math.nan]), pair("c", [20])], "psnr")
 
-    assert (found.mean, found.undefined, found.scenes, found.finite) == (15, 2, 2, 2)
+    assert (found.mean, found.undefined, found.scenes) == (15, 2, 2)
 
 
 def test_where_there_is_no_number_there_is_none_and_not_nan():

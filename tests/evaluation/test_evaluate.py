@@ -377,21 +377,21 @@ def test_each_view_is_decoded_once_for_all_pairs(scored_index, protocol, monkeyp
 def test_what_metrics_are_computed_with_is_loaded_once_for_all_scenes(
     scored_index, right_views, monkeypatch
 ):
-    from stereogenbench_data.evaluation import frame_metrics
+    from stereogenbench_data.evaluation import scene_scores
 
     loaded = []
-    load = frame_metrics.load_model
+    load = scene_scores.load_model
 
     def counted(*arguments, **options):
         loaded.append(arguments)
         return load(*arguments, **options)
 
-    monkeypatch.setattr(frame_metrics, "load_model", counted)
+    monkeypatch.setattr(scene_scores, "load_model", counted)
     matches = EvaluationProtocol(metrics=("e_match",), size=SIZE)
     scored(scored_index, right_views, matches, frames=[0])
 
     assert len(loaded) == 1
-    assert frame_metrics.model_of.cache_info().currsize == 0
+    assert scene_scores.model_of.cache_info().currsize == 0
 
 
 def test_progress_counts_frames_of_pairs_up_to_all(scored_index, right_views, protocol):

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from stereogenbench_data import EvaluationProtocol, score_controls
-from stereogenbench_data.evaluation.plots import write_plots
+from stereogenbench_data.evaluation.report import write_plots
 from tests.evaluation.conftest import SIZE
 
 

@@ -21,25 +21,6 @@ RATIO: Final = 0.9
 KEYPOINTS: Final = 2048
 
 
-@dataclass(frozen=True, slots=True)
-class MatchScore:
-    """E_match of one prediction; its numbers are called as their columns are.
-
-    Attributes:
-        e_match: 100 (1 - common / union), in percent; nan if neither right picture has a match.
-        keypoints: How many keypoints the left picture has.
-        target_matches: How many of them are found again in the target.
-        predicted_matches: How many of them are found again in the prediction.
-        common_matches: How many in both.
-    """
-
-    e_match: float
-    keypoints: int
-    target_matches: int
-    predicted_matches: int
-    common_matches: int
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetMatches:
     """The left keypoints, and which the target shows: the same for all predictions.
@@ -65,18 +46,26 @@ def target_matches(left: Picture, target: Picture, *, matcher: KeypointMatcher) 
 
 def match_error(
     predicted: Picture, *, against: TargetMatches, matcher: KeypointMatcher
-) -> MatchScore:
-    """Return E_match of a predicted right picture, by the matcher that matched the target."""
+) -> dict[str, float]:
+    """Return E_match of a predicted right picture, by the matcher that matched the target.
+
+    Returns:
+        e_match: 100 (1 - common / union), in percent; nan if neither right picture has a match.
+        keypoints: How many keypoints the left picture has.
+        target_matches: How many of them are found again in the target.
+        predicted_matches: How many of them are found again in the prediction.
+        common_matches: How many in both.
+    """
     matched = _matched(against.left, predicted, matcher=matcher)
     common = int(np.count_nonzero(matched & against.matched))
     union = int(np.count_nonzero(matched | against.matched))
-    return MatchScore(
-        e_match=100 * (1 - common / union) if union else math.nan,
-        keypoints=len(matched),
-        target_matches=int(np.count_nonzero(against.matched)),
-        predicted_matches=int(np.count_nonzero(matched)),
-        common_matches=common,
-    )
+    return {
+        "e_match": 100 * (1 - common / union) if union else math.nan,
+        "keypoints": len(matched),
+        "target_matches": int(np.count_nonzero(against.matched)),
+        "predicted_matches": int(np.count_nonzero(matched)),
+        "common_matches": common,
+    }
 
 
 def match_settings(matcher: KeypointMatcher) -> Settings:

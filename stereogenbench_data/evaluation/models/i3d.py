@@ -6,19 +6,11 @@ Tensors are named as in the file of its weights.
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import torch
-from jaxtyping import Float64
 from torch import nn
 from torch.nn import functional
 
-from stereogenbench_data.evaluation.models.loading import (
-    Clips,
-    Settings,
-    Weights,
-    in_batches,
-    load_weights,
-)
+from stereogenbench_data.evaluation.models.loading import Network, Weights, load_weights
 
 I3D: Final = Weights(
     what="FVD's I3D",
@@ -32,10 +24,9 @@ _CLASSES: Final = 400
 Size = tuple[int, int, int]
 
 
-class I3dFeatures:
-    """FVD's features of clips."""
+class I3dFeatures(Network):
+    """FVD's features of clips: from uint8 (n, t, 3, h, w) to (n, 400)."""
 
-    name = "I3D (Kinetics-400)"
     min_frames = 10
 
     def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
@@ -46,32 +37,16 @@ class I3dFeatures:
             EvaluationError: If it does not hold this network's weights.
         """
         network = InflatedInception()
-        self.settings: Settings = {
+        settings = {
             "layer": "logits, mean over time",
             "resize": "bilinear to 224x224, aspect not kept, no smoothing",
             **load_weights(network, I3D, folder=weights),
-            "precision": "float32",
         }
-        self._network = network.to(device)
-        self._device = device
-
-    def __call__(self, clips: Clips) -> Float64[np.ndarray, "n dim"]:
-        """Return the features of each clip."""
-        features: Float64[np.ndarray, "n dim"] = in_batches(
-            self._logits, clips, device=self._device, rows=1
-        )
-        return features
-
-    def _logits(self, clips: torch.Tensor) -> torch.Tensor:
-        small = functional.interpolate(
-            clips[0], size=(_SIDE_PX, _SIDE_PX), mode="bilinear", align_corners=False
-        )
-        logits: torch.Tensor = self._network((2 * small / 255 - 1).transpose(0, 1)[None])
-        return logits
+        super().__init__(network, settings=settings, device=device, rows=1)
 
 
 class InflatedInception(nn.Module):
-    """From clips (n, 3, t, 224, 224) of -1 to 1 to 400 logits each."""
+    """From clips (n, t, 3, h, w) of 0 to 255 to 400 logits each."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -89,8 +64,12 @@ class InflatedInception(nn.Module):
         self.Mixed_5c = _InflatedBlock(832, (384, 192, 384, 48, 128, 128))
         self.logits = nn.ModuleDict({"conv3d": nn.Conv3d(1024, _CLASSES, 1)})
 
-    def forward(self, video: torch.Tensor) -> torch.Tensor:
+    def forward(self, clips: torch.Tensor) -> torch.Tensor:
         """Return logits (n, 400)."""
+        frames = functional.interpolate(
+            clips.flatten(0, 1), size=(_SIDE_PX, _SIDE_PX), mode="bilinear"
+        )
+        video = (2 * frames / 255 - 1).unflatten(0, clips.shape[:2]).transpose(1, 2)
         wide, all_ways = (1, 3, 3), (3, 3, 3)
         x = _max_pool(self.Conv3d_1a_7x7(video), kernel=wide, stride=(1, 2, 2))
         x = self.Conv3d_2c_3x3(self.Conv3d_2b_1x1(x))

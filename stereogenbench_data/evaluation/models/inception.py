@@ -13,19 +13,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
-import numpy as np
 import torch
-from jaxtyping import Float64
 from torch import nn
 from torch.nn import functional
 
-from stereogenbench_data.evaluation.models.loading import (
-    Pictures,
-    Settings,
-    Weights,
-    in_batches,
-    load_weights,
-)
+from stereogenbench_data.evaluation.models.loading import Network, Weights, load_weights
 
 INCEPTION: Final = Weights(
     what="FID's Inception",
@@ -40,10 +32,8 @@ _CLASSES: Final = 1008
 _BATCH: Final = 8
 
 
-class InceptionFeatures:
-    """FID's features of pictures."""
-
-    name = "Inception-v3 (TensorFlow, 2015-12-05)"
+class InceptionFeatures(Network):
+    """FID's features of pictures: from uint8 (n, 3, h, w) to (n, 2048)."""
 
     def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
         """Load the network; the arguments are those of `load_model`.
@@ -53,21 +43,12 @@ class InceptionFeatures:
             EvaluationError: If it does not hold this network's weights.
         """
         network = Inception()
-        self.settings: Settings = {
+        settings = {
             "layer": "pool3, 2048",
             "resize": "TensorFlow 1 bilinear to 299x299, corners not aligned, no smoothing",
             **load_weights(network, INCEPTION, folder=weights),
-            "precision": "float32",
         }
-        self._network = network.to(device)
-        self._device = device
-
-    def __call__(self, pictures: Pictures) -> Float64[np.ndarray, "n dim"]:
-        """Return the features of each picture."""
-        features: Float64[np.ndarray, "n dim"] = in_batches(
-            self._network, pictures, device=self._device, rows=_BATCH
-        )
-        return features
+        super().__init__(network, settings=settings, device=device, rows=_BATCH)
 
 
 class Inception(nn.Module):

@@ -18,13 +18,11 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int64, UInt8
+from jaxtyping import Float32, Float64, Int64, UInt8
 
 from stereogenbench_data.errors import EvaluationError, ExtraError
 
 Picture = UInt8[np.ndarray, "3 h w"]
-Pictures = UInt8[np.ndarray, "n 3 h w"]
-Clips = UInt8[np.ndarray, "n t 3 h w"]
 Settings = Mapping[str, str | int | float | bool | None]
 
 
@@ -207,13 +205,28 @@ def load_file(
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def in_batches(
-    network: Callable[..., torch.Tensor], *arrays: np.ndarray, device: str, rows: int
-) -> Any:
-    """Return what a network makes of arrays, a few rows at a time, as float64."""
-    made = []
-    with torch.inference_mode():
-        for start in range(0, len(arrays[0]), rows):
-            some = (torch.from_numpy(each[start : start + rows].copy()) for each in arrays)
-            made.append(network(*(each.to(device).float() for each in some)).cpu().numpy())
-    return np.concatenate(made).astype(np.float64)
+class Network:
+    """A network that is given pictures or clips, a few at a time, and answers in float64.
+
+    Attributes:
+        settings: Every choice that its answers depend on.
+    """
+
+    def __init__(
+        self, network: torch.nn.Module, *, settings: Settings, device: str, rows: int
+    ) -> None:
+        """Take a network that has its weights, and how many rows it is given at a time."""
+        self.settings: Settings = {**settings, "precision": "float32"}
+        self._network, self._device, self._rows = network.to(device), device, rows
+
+    def __call__(self, *arrays: np.ndarray) -> Float64[np.ndarray, "n *answer"]:
+        """Return what the network makes of arrays that have a row for each picture or clip."""
+        made = []
+        with torch.inference_mode():
+            for start in range(0, len(arrays[0]), self._rows):
+                some = (
+                    torch.from_numpy(each[start : start + self._rows].copy()) for each in arrays
+                )
+                answer = self._network(*(each.to(self._device).float() for each in some))
+                made.append(answer.cpu().numpy())
+        return np.asarray(np.concatenate(made), dtype=np.float64)

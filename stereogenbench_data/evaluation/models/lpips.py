@@ -9,19 +9,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import torch
-from jaxtyping import Float64
 from torch import nn
 from torch.nn import functional
 
 from stereogenbench_data.errors import missing_extra
 from stereogenbench_data.evaluation.models.loading import (
-    Pictures,
-    Settings,
+    Network,
     Tensors,
     Weights,
-    in_batches,
     load_file,
     load_weights,
 )
@@ -40,10 +36,8 @@ _CHANNELS: Final = (64, 192, 384, 256, 256)
 _BATCH: Final = 8
 
 
-class Lpips:
-    """LPIPS of pictures against their targets."""
-
-    name = "LPIPS"
+class Lpips(Network):
+    """LPIPS of pictures against their targets: from two arrays, uint8 (n, 3, h, w), to (n,)."""
 
     def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
         """Load the network; the arguments are those of `load_model`.
@@ -56,26 +50,17 @@ class Lpips:
             EvaluationError: If a file does not hold this network's weights.
         """
         network = PerceptualDistance()
-        self.settings: Settings = {
+        settings = {
             "network": "AlexNet",
             "version": "0.1",
             "size": "as scored",
             **load_weights(network.alexnet, TRUNK, folder=weights, select=_of_features),
-            "precision": "float32",
         }
         package = find_spec("lpips")
         if package is None or package.origin is None:
             raise missing_extra("LPIPS", TRUNK.extra, "No module named lpips")
         load_file(network.heads, Path(package.origin).parent / HEADS)
-        self._network = network.to(device)
-        self._device = device
-
-    def __call__(self, predicted: Pictures, target: Pictures) -> Float64[np.ndarray, " n"]:
-        """Return the distance of each picture from its target."""
-        distances: Float64[np.ndarray, " n"] = in_batches(
-            self._network, predicted, target, device=self._device, rows=_BATCH
-        )
-        return distances
+        super().__init__(network, settings=settings, device=device, rows=_BATCH)
 
 
 def _of_features(tensors: Tensors) -> Tensors:
