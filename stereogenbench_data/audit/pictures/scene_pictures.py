@@ -102,7 +102,8 @@ def _title(
         f"depth unit {encoding.known_unit_m:g} m ({encoding.source}); "
         f"rig residual {scene.rig_residual_px:.2g} px"
     )
-    texts = [text for text in (derived_text(scene), scene.caption) if text]
+    told = derived_text(scene), scene.remark("left"), scene.caption
+    texts = [text for text in told if text]
     return [scene.id.key, facts, *texts]
 
 
