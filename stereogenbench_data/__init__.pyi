@@ -1,7 +1,5 @@
 """The public names and the modules that hold them: the one list, for type checkers and imports."""
 
-from stereogenbench_data.datasets.adapters import to_raft_stereo as to_raft_stereo
-from stereogenbench_data.datasets.adapters import to_torchvision as to_torchvision
 from stereogenbench_data.datasets.batch_buffers import collate as collate
 from stereogenbench_data.datasets.batch_buffers import to_device as to_device
 from stereogenbench_data.datasets.batches import EpochBatches as EpochBatches
@@ -9,6 +7,7 @@ from stereogenbench_data.datasets.batches import OpenVideosWarning as OpenVideos
 from stereogenbench_data.datasets.batches import (
     RepeatedDecodingWarning as RepeatedDecodingWarning,
 )
+from stereogenbench_data.datasets.batches import RepeatedEpochWarning as RepeatedEpochWarning
 from stereogenbench_data.datasets.derive import DERIVE_FIELDS as DERIVE_FIELDS
 from stereogenbench_data.datasets.derive import DERIVED_FIELDS as DERIVED_FIELDS
 from stereogenbench_data.datasets.derive import derive as derive
@@ -18,7 +17,8 @@ from stereogenbench_data.datasets.mapped import MixedSplitsWarning as MixedSplit
 from stereogenbench_data.datasets.mapped import SceneViews as SceneViews
 from stereogenbench_data.datasets.mapped import SeekTableWarning as SeekTableWarning
 from stereogenbench_data.datasets.mapped import StereoPairs as StereoPairs
-from stereogenbench_data.datasets.shared_epoch import RepeatedEpochWarning as RepeatedEpochWarning
+from stereogenbench_data.datasets.mapped import to_raft_stereo as to_raft_stereo
+from stereogenbench_data.datasets.mapped import to_torchvision as to_torchvision
 from stereogenbench_data.datasets.streamed import StereoPairStream as StereoPairStream
 from stereogenbench_data.errors import DescriptorError as DescriptorError
 from stereogenbench_data.errors import EvaluationError as EvaluationError
@@ -42,15 +42,15 @@ from stereogenbench_data.evaluation.inputs import export_inputs as export_inputs
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol as EvaluationProtocol
 from stereogenbench_data.evaluation.report import write_report as write_report
 from stereogenbench_data.evaluation.tables import tables_of as tables_of
-from stereogenbench_data.index.open import AssumptionWarning as AssumptionWarning
-from stereogenbench_data.index.open import IncompleteSceneWarning as IncompleteSceneWarning
 from stereogenbench_data.index.open import StaleIndexWarning as StaleIndexWarning
+from stereogenbench_data.index.open_tree import AssumptionWarning as AssumptionWarning
+from stereogenbench_data.index.open_tree import IncompleteSceneWarning as IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex as SceneIndex
 from stereogenbench_data.samples.checks import OddSceneWarning as OddSceneWarning
 from stereogenbench_data.samples.fields import PAIR_FIELDS as PAIR_FIELDS
 from stereogenbench_data.samples.fields import VIEW_FIELDS as VIEW_FIELDS
-from stereogenbench_data.samples.request import EnlargedSizeWarning as EnlargedSizeWarning
-from stereogenbench_data.samples.request import SwappedSizeWarning as SwappedSizeWarning
+from stereogenbench_data.samples.fields import EnlargedSizeWarning as EnlargedSizeWarning
+from stereogenbench_data.samples.fields import SwappedSizeWarning as SwappedSizeWarning
 from stereogenbench_data.samples.transforms import ColorJitter as ColorJitter
 from stereogenbench_data.samples.transforms import Compose as Compose
 from stereogenbench_data.samples.transforms import Crop as Crop

@@ -20,15 +20,15 @@ StereoGenBenchError
 Warnings, each a `UserWarning`, stand beside the code that gives them:
 
 StaleIndexWarning        index.open           a folder differs from its index
-IncompleteSceneWarning   index.open           some scenes of the data cannot be used
-AssumptionWarning        index.open           files are not as the paper prints them
+IncompleteSceneWarning   index.open_tree      some scenes of the data cannot be used
+AssumptionWarning        index.open_tree      files are not as the paper prints them
 OddSceneWarning          samples.checks       selected scenes differ from what the release promises
-SwappedSizeWarning       samples.request      a size looks like (width, height)
+SwappedSizeWarning       samples.fields       a size looks like (width, height)
 OpenVideosWarning        datasets.batches more videos are needed than may be open
 RepeatedDecodingWarning  datasets.batches several processes decode the same videos
 FewerPairsWarning        selection.pairs      the data hold some cameras alone
 MixedSplitsWarning       datasets.mapped      train and eval scenes come together
-RepeatedEpochWarning     datasets.shared_epoch a pass repeats the random frames of another
+RepeatedEpochWarning     datasets.batches     a pass repeats the random frames of another
 
 Each error takes one message, so the error of a DataLoader worker is raised again as the same class
 in the main process. Messages show URLs without logins and queries.

@@ -38,9 +38,8 @@ from stereogenbench_data.jobs import (
     read_json,
 )
 from stereogenbench_data.media.encoder import Encoding, VideoEncoder
-from stereogenbench_data.samples.fields import Sample
+from stereogenbench_data.samples.fields import Request, Sample
 from stereogenbench_data.samples.load import SampleLoader
-from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.selection.options import require_options

@@ -36,8 +36,8 @@ from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import WorkOptions, atomic_folder, do_items, job_folder, named_errors
+from stereogenbench_data.samples.fields import Request
 from stereogenbench_data.samples.load import SampleLoader
-from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters
 from stereogenbench_data.selection.options import require_options

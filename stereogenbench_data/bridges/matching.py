@@ -19,8 +19,7 @@ import numpy as np
 import torch
 
 from stereogenbench_data.bridges.adapted import AdaptedPairs, Item
-from stereogenbench_data.datasets.adapters import to_raft_stereo
-from stereogenbench_data.datasets.mapped import Data, PairsOptions
+from stereogenbench_data.datasets.mapped import Data, PairsOptions, to_raft_stereo
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.samples.fields import Sample
 

@@ -27,11 +27,8 @@ def open_data(
         StorageError: If the data do not exist, hold no complete scene or too many broken ones, or
             contradict conventions.
     """
-    from stereogenbench_data.index.open import (
-        AssumptionWarning,
-        IncompleteSceneWarning,
-        StaleIndexWarning,
-    )
+    from stereogenbench_data.index.open import StaleIndexWarning
+    from stereogenbench_data.index.open_tree import AssumptionWarning, IncompleteSceneWarning
     from stereogenbench_data.index.table import SceneIndex
 
     with (

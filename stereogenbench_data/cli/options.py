@@ -79,7 +79,7 @@ def out_folder(text: str) -> Path:
 def size_of(text: str) -> tuple[int, int]:
     """Return (height, width) of a size, which is WIDTHxHEIGHT."""
     from stereogenbench_data.errors import FieldError
-    from stereogenbench_data.samples.request import parse_size
+    from stereogenbench_data.samples.fields import parse_size
 
     try:
         return parse_size(text)
@@ -359,7 +359,7 @@ class ShareOptions:
             ShardError: If the size cannot be parsed.
             SelectionError: If there are fewer scenes, or none fits.
         """
-        from stereogenbench_data.selection.balance import balanced_share
+        from stereogenbench_data.selection.plan import balanced_share
         from stereogenbench_data.shards.plan import parse_bytes
 
         limit = None if self.max_bytes is None else parse_bytes(self.max_bytes)

@@ -12,11 +12,12 @@ from stereogenbench_data.datasets.batches import (
     EpochOptions,
     Pass,
     Position,
+    RepeatedEpochWarning,
+    SharedNumbers,
     State,
     require_count,
 )
 from stereogenbench_data.datasets.mapped import Data, PairsOptions, StereoPairs
-from stereogenbench_data.datasets.shared_epoch import RepeatedEpochWarning, SharedNumbers
 from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.selection.options import require_options, split_options

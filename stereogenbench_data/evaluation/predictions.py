@@ -34,9 +34,8 @@ from stereogenbench_data.errors import (
 from stereogenbench_data.evaluation.protocol import Tier
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.video import VideoReader, plane_numbers, probe, read_rgb
-from stereogenbench_data.samples.fields import Sample
+from stereogenbench_data.samples.fields import Request, Sample
 from stereogenbench_data.samples.load import SampleLoader
-from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.plan import Address
 

@@ -18,7 +18,7 @@ from stereogenbench_data.evaluation.columns import (
     OFFLINE_METRICS,
     require_metrics,
 )
-from stereogenbench_data.samples.request import require_size
+from stereogenbench_data.samples.fields import require_size
 from stereogenbench_data.schema.records import DepthEncoding
 
 PROTOCOL_VERSION: Final = 1

@@ -3,24 +3,21 @@
     a file ─────────────────────┬─ read ── root of its data ── digest ── is it stale?
     a folder with an index file ┘
     a URL ──────── fetched ─────── read ────────────────────── digest
-    a folder or URL without one ── its scenes are described
+    a folder or URL without one ── a tree (`open_tree`)
 
 An index file may come from a stranger: it opens data beside itself, and any other root is the
 user's own word. Conventions that are given for an index are compared with its rows (`restated`).
-What was taken for granted about a tree's files is told in one line (`assumptions`). An index is old
-if its folder holds other scenes or shards (`stale_message`): the names of folders tell, as copies
-and unpacked archives change dates; 7 ms for 8,493 scenes.
+An index is old if its folder holds other scenes or shards (`stale_message`): the names of folders
+tell, as copies and unpacked archives change dates; 7 ms for 8,493 scenes.
 """
 
 import functools
-import gc
 import warnings
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -39,12 +36,10 @@ from stereogenbench_data.index.parquet import (
     made_again,
     read_index_file,
     read_seek_tables,
-    seek_tables_of,
-    table_of_scenes,
 )
 from stereogenbench_data.index.rows import SCHEMA, scene_of
 from stereogenbench_data.schema.conventions import Conventions
-from stereogenbench_data.schema.records import Scene, SceneId
+from stereogenbench_data.schema.records import SceneId
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
     CAMERA_COUNT,
@@ -64,56 +59,23 @@ from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import MissingObject, RetryPolicy
 
 if TYPE_CHECKING:
-    from stereogenbench_data.index.build import TreeReport
-    from stereogenbench_data.index.presumed import Baselines, ListedTree, Presumption
+    pass
+
+from stereogenbench_data.index.open_tree import (
+    AssumptionWarning,
+    IncompleteSceneWarning,
+    Opened,
+    Rows,
+    listed,
+    open_tree,
+)
 
 MAX_INDEX_BYTES: Final = 256 * 2**20
+
 """The largest index that is fetched. One of 8,493 scenes has a few megabytes."""
 
-MOST_REMOTE_SCENES: Final = 64
-"""The most scenes behind a URL that are described when a tree without an index is opened."""
-
-MOST_LEFT_OUT: Final = 0.05
-"""The largest share of a tree's scenes that may be broken; one always may."""
 
 _LONGEST_ROOT: Final = 300
-_LONGEST_REASON: Final = 5000
-_SHOWN: Final = 10
-_LOOKED_AT: Final = 64
-"""How many scenes tell what opening a tree takes for granted."""
-
-
-class IncompleteSceneWarning(UserWarning):
-    """Some scenes of the data cannot be used; the message names them and the reasons."""
-
-
-Rows = Literal["presumed", "read"]
-"""Whether the rows of many scenes without an index may be presumed; see `index.presumed`."""
-
-SeekTables: TypeAlias = pa.BinaryArray | Path | None
-"""The packed seek tables of scenes, a row each, or the index file that holds them; None where there
-are none."""
-
-
-class Opened(NamedTuple):
-    """An index that was opened.
-
-    Attributes:
-        table: A checked table with one row per scene.
-        head: What is known besides, with the root where the data are.
-        stale: How the root differs from the index, with the cure; "" if it does not.
-        seek_tables: Where the packets of the videos lie.
-        assumed: What was taken for granted about the files of a tree; "" where nothing was.
-        presumption: What describes the scenes of a table that is presumed; None for one that was
-            read.
-    """
-
-    table: pa.Table
-    head: IndexHead
-    stale: str = ""
-    seek_tables: SeekTables = None
-    assumed: str = ""
-    presumption: "Presumption | None" = None
 
 
 def open_table(
@@ -131,12 +93,12 @@ def open_table(
     at the caller's caller.
     """
     named_root = None if root is None else _require_root(root)
-    open_tree = functools.partial(
-        _open_tree, wanted=wanted, conventions=conventions, rows=rows, retry=retry
+    opening = functools.partial(
+        open_tree, wanted=wanted, conventions=conventions, rows=rows, retry=retry
     )
     if is_remote(data):
         where = shown(data)
-        opened = _open_url(str(data), root=named_root, retry=retry, open_tree=open_tree)
+        opened = _open_url(str(data), root=named_root, retry=retry, open_tree=opening)
     else:
         path = local_path(data)
         where = str(path)
@@ -145,7 +107,7 @@ def open_table(
             is_tree = is_folder and not (path / INDEX_NAME).is_file()
         if is_tree:
             _require_no_root(path, named_root)
-            opened = open_tree(path)
+            opened = opening(path)
         elif is_folder or is_file:
             file = path / INDEX_NAME if is_folder else path
             opened = _open_file(file, root=named_root)
@@ -160,7 +122,7 @@ def open_table(
             head = replace(opened.head, digest=table_digest(stated))
             opened = opened._replace(table=stated, head=head)
     if left_out := opened.head.incomplete | opened.head.broken:
-        message = text_without_secrets(f"{where}: {_listed(left_out)}")
+        message = text_without_secrets(f"{where}: {listed(left_out)}")
         warnings.warn(message, IncompleteSceneWarning, stacklevel=3)
     if opened.stale:
         warnings.warn(opened.stale, StaleIndexWarning, stacklevel=3)
@@ -212,161 +174,6 @@ def _open_url(
     head = replace(head, root=root or beside)
     content.seek(0)
     return Opened(table, head, seek_tables=read_seek_tables(content))
-
-
-def _open_tree(
-    root: str | Path,
-    *,
-    wanted: Callable[[SceneId], bool] | None,
-    rows: Rows,
-    conventions: Conventions | None,
-    retry: RetryPolicy | None,
-) -> Opened:
-    """Return the scenes of a folder or URL in the released layout, without a few broken ones.
-
-    Those of a large folder are kept in the user's cache, and presumed where that is possible.
-    """
-    # What describes files takes long to import, and an index needs none of it.
-    from stereogenbench_data.index.build import walk
-    from stereogenbench_data.index.presumed import list_tree
-
-    with _no_collection():
-        place = root if is_remote(root) else Path(root)
-        tree = list_tree(place, wanted, conventions, retry=retry)
-    if tree is not None and rows == "presumed" and tree.has_one_shape:
-        opened = _open_presumed(tree, "read" if tree.remote is None else "when needed")
-        if opened is not None:
-            return opened
-    opened = None if tree is None else _kept(tree, "read")
-    if opened is None:
-        if tree is not None and tree.remote is not None:
-            _require_few(tree)
-        # In this process: a script without `if __name__ == "__main__"` could start no others.
-        how: Any = {"wanted": wanted, "conventions": conventions, "retry": retry}
-        opened = _of_report(walk(root, workers=1, if_none="all", **how))
-        if tree is not None:
-            _keep(tree, "read", opened)
-    return opened
-
-
-def _open_presumed(tree: "ListedTree", baselines: "Baselines") -> Opened | None:
-    """Return the scenes of a tree, most of them presumed; None where nothing can be presumed."""
-    from stereogenbench_data.index.presumed import Presumption, presumed_report
-
-    name: Literal["presumed", "listed"] = "presumed" if baselines == "read" else "listed"
-    opened = _kept(tree, name)
-    if opened is None:
-        with _no_collection():
-            report = presumed_report(tree, baselines)
-            opened = None if report is None else _keep(tree, name, _of_report(report))
-    if opened is None:
-        return None
-    forms = opened.table.column("pose_form").drop_null().to_pylist()
-    presumption = Presumption(tree, forms=forms, baselines=baselines)
-    return opened._replace(presumption=presumption)
-
-
-def with_baselines(presumption: "Presumption", table: pa.Table) -> "tuple[pa.Table, Presumption]":
-    """Return presumed rows once each ``baseline.json`` was read.
-
-    Raises:
-        StorageError: If one of them cannot be used, or read.
-    """
-    if presumption.baselines == "read":
-        return table, presumption
-    opened = _open_presumed(presumption.tree, "read")
-    if opened is None or opened.presumption is None or opened.table["key"] != table["key"]:
-        why = "" if opened is None else _listed(opened.head.incomplete | opened.head.broken)
-        raise StorageError(
-            f"{shown(presumption.tree.root)}: not all scenes are as was presumed: {why}. "
-            f"{presumption.cures()}"
-        )
-    return opened.table, opened.presumption
-
-
-def _require_few(tree: "ListedTree") -> None:
-    """Refuse to describe many scenes behind a URL each time they are opened."""
-    count, where = len(tree.folders.keys), shown(tree.root)
-    if count > MOST_REMOTE_SCENES:
-        raise StorageError(
-            f"{where}: has no {INDEX_NAME}, its scenes cannot be presumed to be alike, and {count} "
-            f"are too many to fetch their headers each time. Index it once, or the part you need: "
-            f"`stereogenbench index {where} -o index.parquet --split eval`, and open that file "
-            f"with --root {where}, or SceneIndex.open('index.parquet', root=...)."
-        )
-
-
-@contextmanager
-def _no_collection() -> Iterator[None]:
-    """Collect no garbage: beside torch's objects, the rows of thousands of scenes cost a third."""
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
-
-
-def _kept(tree: "ListedTree", rows: Rows | Literal["listed"]) -> Opened | None:
-    """Return the rows of a tree that an earlier opening has kept."""
-    found = tree.cache.table(f"{rows}-{tree.stamp}")
-    if found is None:
-        return None
-    table, head, tables = found
-    # Without a digest: the user has made no index file.
-    return Opened(
-        table,
-        replace(head, root=str(tree.root), digest=""),
-        seek_tables=tables,
-        assumed=_assumed_of(table, where=str(tree.root)),
-    )
-
-
-def _keep(tree: "ListedTree", rows: Rows | Literal["listed"], opened: Opened) -> Opened:
-    """Keep the rows of a tree for later openings, and return them."""
-    if not isinstance(opened.seek_tables, Path):
-        head = replace(opened.head, digest=table_digest(opened.table))
-        name = f"{rows}-{tree.stamp}"
-        tree.cache.keep_table(name, opened.table, head, opened.seek_tables)
-    return opened
-
-
-def _of_report(report: "TreeReport") -> Opened:
-    """Return the scenes that a walk found.
-
-    Raises:
-        StorageError: If no scene is whole, or more than a few are broken.
-    """
-    from stereogenbench_data.index.build import FORMAT_CURE
-
-    where = shown(report.root)
-    if not report.scenes:
-        cure = f"\n{FORMAT_CURE.format(root=where)}" if report.broken else ""
-        raise StorageError(
-            f"{where}: no scene is complete: {_listed(report.broken | report.incomplete)}{cure}"
-        )
-    found = len(report.scenes) + len(report.broken)
-    if len(report.broken) > max(1, found * MOST_LEFT_OUT):
-        raise StorageError(
-            f"{where}: {_listed(report.broken)}\nRepair or remove them; or leave them out on "
-            f"purpose: `stereogenbench index {where}` makes an index without them."
-        )
-    opened = opened_report(report)
-    return opened._replace(assumed=_assumed_of(opened.table, where=where))
-
-
-def opened_report(report: "TreeReport") -> Opened:
-    """Return the scenes that a walk found as an index."""
-    table = table_of_scenes(report.scenes, where=shown(report.root))
-    return Opened(table, report.head, seek_tables=seek_tables_of(report.scenes))
-
-
-def _assumed_of(table: pa.Table, *, where: str) -> str:
-    """Return what was taken for granted, by some of the scenes whose files were all read."""
-    is_odd = pc.or_(pc.is_valid(table.column("pose_form")), pc.is_valid(table.column("remarks")))
-    scenes = table.filter(is_odd).slice(0, _LOOKED_AT).to_pylist()
-    return assumptions(map(scene_of, scenes), where=where)
 
 
 def _require_root(root: str | Path) -> str:
@@ -427,18 +234,11 @@ def _must_be_named(path: Path, recorded: str) -> StorageError:
     )
 
 
-def _listed(left_out: Mapping[str, str]) -> str:
-    lines = [
-        shortened(reason if key in reason else f"{key}: {reason}", _LONGEST_REASON)
-        for key, reason in sorted(left_out.items())[:_SHOWN]
-    ]
-    if len(left_out) > _SHOWN:
-        lines.append(f"and {len(left_out) - _SHOWN} more")
-    return "\n  ".join([f"{counted(len(left_out), 'scene')} cannot be used:", *lines])
-
-
 _OF_DEPTH: Final = ("key", "depth_unit_m", "depth_offset_m", "depth_unit_source")
+
+
 _READ_AGAIN: Final = 3
+
 """How many scenes' files are read again by the conventions."""
 
 
@@ -492,54 +292,6 @@ def restated(
         column = pa.array([value] * table.num_rows, type=SCHEMA.field(name).type)
         table = table.set_column(SCHEMA.get_field_index(name), SCHEMA.field(name), column)
     return table.combine_chunks()
-
-
-_PHRASES: Final = {
-    "size": "the videos' picture size counts, where baseline.json has another",
-    "stated": "the videos and baseline.json count, where files state otherwise",
-    "baselines": "baselines that are not recorded are sums of their neighbours",
-    "pair": "the primary pair of baseline.json counts, where another file has another",
-    "frames": "the frames that all videos have are used",
-    "lens": "a pinhole lens is assumed, where baseline.json states another model",
-    "marker": "no scene has _scene_complete.json, so it is not known which were finished",
-    "world": "several readings of the poses fit the baselines, and fields that depend on the "
-    "reading are refused",
-}
-_PLAIN: Final = "unreal axes"
-
-
-class AssumptionWarning(UserWarning):
-    """Files of a tree are not as the paper prints them, and something was taken for granted."""
-
-
-def assumptions(scenes: Iterable[Scene], *, where: str) -> str:
-    """Return what was taken for granted about scenes and what was measured; "" if nothing."""
-    counts: Counter[str] = Counter()
-    firsts: dict[str, str] = {}
-    for scene in scenes:
-        if scene.conventions is not None:
-            continue
-        found = {_PHRASES[each.about]: each for each in scene.remarks if each.about in _PHRASES}
-        counts.update(found.keys())
-        for phrase, each in found.items():
-            if each.about in ("size", "pair", "stated"):
-                firsts.setdefault(phrase, f", such as {each.text}")
-        pixels = scene.remark("pixels").partition(": ")[2]
-        counts.update([f"{pixels}; disparity follows from the sensor's width"] if pixels else [])
-        form = (scene.pose_form or "").split("|")[0].partition(" @ ")[0]
-        if form and _PLAIN not in form and not scene.remark("world"):
-            counts[f"poses are read as {shortened(form, 200)}: measured, the cameras' distances "
-                   "are the baselines"] += 1  # fmt: skip
-    if not counts:
-        return ""
-    told = "; ".join(
-        f"{phrase} ({counted(count, 'scene')}{firsts.get(phrase, '')})"
-        for phrase, count in counts.items()
-    )
-    return (
-        f"{where}: {told}. `stereogenbench conventions {where} -o conventions.toml` writes down "
-        f"how its files are read, for conventions=."
-    )
 
 
 _NAMED: Final = 3

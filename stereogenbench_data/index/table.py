@@ -15,13 +15,8 @@ import pyarrow as pa
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import compute as pc
 from stereogenbench_data.index.arrow import as_categories, as_numpy, one_array, table_digest
-from stereogenbench_data.index.open import (
-    Opened,
-    Rows,
-    open_table,
-    opened_report,
-    with_baselines,
-)
+from stereogenbench_data.index.open import open_table
+from stereogenbench_data.index.open_tree import Opened, Rows, opened_report, with_baselines
 from stereogenbench_data.index.parquet import (
     IndexHead,
     read_seek_tables,

@@ -8,9 +8,9 @@ import numpy as np
 
 from stereogenbench_data.errors import MediaError, StorageError, text_without_secrets
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
-from stereogenbench_data.index.open import MOST_LEFT_OUT
+from stereogenbench_data.index.open_tree import MOST_LEFT_OUT
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.request import EnlargedSizeWarning, Request, warn_if_swapped
+from stereogenbench_data.samples.fields import EnlargedSizeWarning, Request, warn_if_swapped
 from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT, DEFAULT_DEPTH_UNIT_M, depth_name

@@ -32,7 +32,7 @@ from stereogenbench_data.geometry.projection import (
     visible_in_target,
 )
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
-from stereogenbench_data.samples.views import StoredDepth, Views
+from stereogenbench_data.samples.streams import StoredDepth, Views
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 
 MIRROR_X: Final = np.diag([-1.0, 1.0, 1.0, 1.0])

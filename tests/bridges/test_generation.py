@@ -93,7 +93,7 @@ def test_embedded_coordinates_say_where_a_warped_pixel_came_from(item):
 
 
 @pytest.mark.parametrize("size", [(120, 200), (200, 120)])
-@pytest.mark.filterwarnings("ignore::stereogenbench_data.samples.request.SwappedSizeWarning")
+@pytest.mark.filterwarnings("ignore::stereogenbench_data.samples.fields.SwappedSizeWarning")
 def test_clip_is_given_what_its_own_processor_makes(detailed_release, size):
     transformers = require_module("transformers")
     left = StereoPairs(detailed_release, fields=("left",), size=size)[0]["left"]

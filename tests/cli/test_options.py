@@ -11,7 +11,7 @@ import typer
 from typer.testing import CliRunner
 
 from stereogenbench_data.cli.options import DataOptions, SceneOptions, filter_of, grouped
-from stereogenbench_data.samples.request import SwappedSizeWarning
+from stereogenbench_data.samples.fields import SwappedSizeWarning
 from tests.cli.command import invoke, one_line
 
 

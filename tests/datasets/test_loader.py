@@ -24,7 +24,7 @@ from stereogenbench_data.datasets.batches import (
     videos_per_scene,
 )
 from stereogenbench_data.media import depth
-from stereogenbench_data.samples.request import parse_request
+from stereogenbench_data.samples.fields import parse_request
 from stereogenbench_data.selection.order import OrderRule
 from tests.datasets.conftest import flat, in_turn, keys_of
 

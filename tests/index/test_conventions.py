@@ -9,7 +9,7 @@ import pytest
 from stereogenbench_data.datasets.mapped import SceneViews, StereoPairs
 from stereogenbench_data.errors import FieldError, StereoGenBenchError, StorageError
 from stereogenbench_data.index.learning import chosen_scenes, examine, learn, tables_of_notes
-from stereogenbench_data.index.open import AssumptionWarning
+from stereogenbench_data.index.open_tree import AssumptionWarning
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.scene_folder import metadata_differences
 from stereogenbench_data.index.table import SceneIndex

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.index import build as walk_module
-from stereogenbench_data.index.open import IncompleteSceneWarning
+from stereogenbench_data.index.open_tree import IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex
 from tests.cli.command import invoke
 

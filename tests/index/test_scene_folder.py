@@ -8,7 +8,7 @@ import av
 import pytest
 
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.index.open import assumptions
+from stereogenbench_data.index.open_tree import assumptions
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
     describe_scene,

@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import SelectionError
-from stereogenbench_data.index.open import IncompleteSceneWarning, StaleIndexWarning
+from stereogenbench_data.index.open import StaleIndexWarning
+from stereogenbench_data.index.open_tree import IncompleteSceneWarning
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import COMPLETE_JSON

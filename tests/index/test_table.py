@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import open as index_module
 from stereogenbench_data.index.arrow import table_digest
-from stereogenbench_data.index.open import AssumptionWarning, IncompleteSceneWarning
+from stereogenbench_data.index.open_tree import AssumptionWarning, IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Member, Rig, Scene, SceneId, SceneLabels
 from stereogenbench_data.sources.members import MemberSource

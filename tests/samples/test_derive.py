@@ -6,7 +6,7 @@ import pytest
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.samples.derive import PairGeometry, PairSample, SceneFacts
-from stereogenbench_data.samples.views import StoredDepth, Views
+from stereogenbench_data.samples.streams import StoredDepth, Views
 from stereogenbench_data.schema.records import (
     DepthEncoding,
     Rig,

@@ -3,7 +3,7 @@
 import pytest
 
 from stereogenbench_data import PAIR_FIELDS, VIEW_FIELDS, FieldError
-from stereogenbench_data.samples.request import parse_request
+from stereogenbench_data.samples.fields import parse_request
 from stereogenbench_data.samples.transforms import HorizontalFlip
 
 ROWS = [*PAIR_FIELDS.items(), *VIEW_FIELDS.items()]

@@ -6,7 +6,7 @@ import pytest
 
 from stereogenbench_data import SceneViews, StereoPairs
 from stereogenbench_data.errors import FieldError
-from stereogenbench_data.samples.request import (
+from stereogenbench_data.samples.fields import (
     SwappedSizeWarning,
     parse_size,
     require_size,

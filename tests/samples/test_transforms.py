@@ -25,7 +25,7 @@ from stereogenbench_data import (
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.media.depth import resized_nearest
 from stereogenbench_data.samples.fields import PAIR_FIELDS
-from stereogenbench_data.samples.views import StoredDepth, Views
+from stereogenbench_data.samples.streams import StoredDepth, Views
 
 FIELDS = (
     "left", "right", "disparity", "valid", "visible", "depth", "disparity_right", "valid_right",
@@ -73,7 +73,7 @@ def test_a_moved_pair_still_warps_onto_itself(detailed_release, plain, transform
     assert warped_psnr_db(moved) > min(30, warped_psnr_db(plain)) - 1.5
 
 
-@pytest.mark.filterwarnings("ignore::stereogenbench_data.samples.request.SwappedSizeWarning")
+@pytest.mark.filterwarnings("ignore::stereogenbench_data.samples.fields.SwappedSizeWarning")
 def test_scaling_in_the_decoder_is_a_resize(detailed_release, plain):
     size = (120, 64)
     decoded = StereoPairs(detailed_release, fields=FIELDS, size=size)[0]
@@ -84,7 +84,7 @@ def test_scaling_in_the_decoder_is_a_resize(detailed_release, plain):
     assert warped_psnr_db(decoded) > min(30, warped_psnr_db(plain)) - 1.5
 
 
-@pytest.mark.filterwarnings("ignore::stereogenbench_data.samples.request.SwappedSizeWarning")
+@pytest.mark.filterwarnings("ignore::stereogenbench_data.samples.fields.SwappedSizeWarning")
 def test_disparity_scales_with_the_width_alone(plain, detailed_release):
     half = StereoPairs(detailed_release, fields=FIELDS, size=(160, 80))[0]
 

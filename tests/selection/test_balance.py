@@ -8,7 +8,7 @@ from scipy import stats
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.release import baseline_bin
-from stereogenbench_data.selection.balance import balanced
+from stereogenbench_data.selection.plan import balanced
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.selection.balance import balanced_share
+from stereogenbench_data.selection.plan import balanced_share
 from tests.selection.conftest import made_scene
 
 SCENES = {("IPD", "Town"): 30, ("IPD", "Yard"): 30, ("IPD", "Car"): 2, ("Uniform", "Town"): 12}

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.engine import no_advance
 from stereogenbench_data.errors import ShardError
-from stereogenbench_data.index.open import IncompleteSceneWarning
+from stereogenbench_data.index.open_tree import IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.plan import PlannedMember, PlannedShard, plan_shards

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from stereogenbench_data import PAIR_FIELDS, StereoPairs
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import ExtraError, ShardError, StorageError
-from stereogenbench_data.index.open import IncompleteSceneWarning
+from stereogenbench_data.index.open_tree import IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.video import VideoReader
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES, depth_name, rgb_name

@@ -25,7 +25,7 @@ from stereogenbench_data.audit.scene_access import source_of
 from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
 from stereogenbench_data.index.build import Journal, walk
-from stereogenbench_data.index.open import IncompleteSceneWarning
+from stereogenbench_data.index.open_tree import IncompleteSceneWarning
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.rows import row_of
 from stereogenbench_data.index.table import SceneIndex

@@ -9,9 +9,8 @@ from jaxtyping import UInt8
 from stereogenbench_data.errors import MediaError, SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import DEPTH_CURES, NO_DEPTH_UNIT
-from stereogenbench_data.samples.fields import Sample
+from stereogenbench_data.samples.fields import Request, Sample
 from stereogenbench_data.samples.load import SampleLoader
-from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
