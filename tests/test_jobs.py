@@ -1,7 +1,6 @@
 """A folder belongs to one job: others are refused, also such as begin at the same moment."""
 
-import subprocess
-import sys
+import multiprocessing
 
 import pytest
 
@@ -9,20 +8,6 @@ from stereogenbench_data.bridges.clips import export_clips
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.jobs import job_folder
 from stereogenbench_data.media.encoder import Encoding
-
-ONE_OF_TWO = """
-import sys, time, warnings
-from pathlib import Path
-warnings.simplefilter("ignore")
-data, out, size, started = sys.argv[1], sys.argv[2], int(sys.argv[3]), Path(sys.argv[4])
-from stereogenbench_data.bridges.clips import export_clips
-from stereogenbench_data.media.encoder import Encoding
-(started / str(size)).touch()
-while len([*started.iterdir()]) < 2:
-    time.sleep(0.001)
-form = dict(size=(size, size), encoding=Encoding(preset="ultrafast"))
-export_clips(data, out, layout="diffsynth", **form, workers=1)
-"""
 
 
 def files_of(root):
@@ -33,27 +18,36 @@ def files_of(root):
 
 def test_of_two_jobs_at_once_one_is_whole_and_the_other_refused(indexed_release, tmp_path):
     """Clips stand for all jobs: they take their folder by one function."""
-    both, started = tmp_path / "both", tmp_path / "started"
-    started.mkdir()
-    running = {
-        size: subprocess.Popen(
-            [sys.executable, "-c", ONE_OF_TWO, indexed_release, both, str(size), started],
-            stderr=subprocess.PIPE, text=True,
-        )
-        for size in (16, 32)
-    }  # fmt: skip
-    done = {
-        size: (each.communicate(timeout=100)[1], each.returncode) for size, each in running.items()
-    }
-    (winner,) = (size for size, (_, code) in done.items() if code == 0)
+    forks = multiprocessing.get_context("fork")
+    told, ready = forks.Queue(), forks.Barrier(2)
+
+    def export(size, out):
+        form = {"size": (size, size), "encoding": Encoding(preset="ultrafast")}
+        export_clips(indexed_release, out, layout="diffsynth", **form, workers=1)
+
+    def one_of_two(size):
+        ready.wait(60)
+        try:
+            export(size, tmp_path / "both")
+        except StorageError as error:
+            told.put((size, str(error)))
+        else:
+            told.put((size, ""))
+
+    running = [forks.Process(target=one_of_two, args=(size,)) for size in (16, 32)]
+    for process in running:
+        process.start()
+    done = dict(told.get(timeout=100) for _ in running)
+    for process in running:
+        process.join(60)
+    (winner,) = (size for size, refusal in done.items() if not refusal)
     (loser,) = done.keys() - {winner}
-    form = {"size": (winner, winner), "encoding": Encoding(preset="ultrafast")}
-    export_clips(indexed_release, tmp_path / "alone", layout="diffsynth", **form, workers=1)
+    export(winner, tmp_path / "alone")
 
     # On a busy machine the loser may begin after the winner has ended.
     refusals = ("another process works on this folder", "of other")
-    assert any(refusal in done[loser][0] for refusal in refusals)
-    assert files_of(both) == files_of(tmp_path / "alone")
+    assert any(refusal in done[loser] for refusal in refusals)
+    assert files_of(tmp_path / "both") == files_of(tmp_path / "alone")
 
 
 def refusal(folder):

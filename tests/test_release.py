@@ -56,15 +56,6 @@ def test_a_later_release_is_compared_with_the_one_before(release):
     )
 
 
-def test_nothing_is_dated_twice(release):
-    text = release.dated(ENTRIES, version="0.1.0", day="2026-11-22")
-
-    with pytest.raises(ValueError, match=r"has 0\.1\.0 already. Raise the version"):
-        release.dated(text, version="0.1.0", day="2026-11-23")
-    with pytest.raises(ValueError, match="has no entries under"):
-        release.dated(text, version="0.2.0", day="2026-11-23")
-
-
 def test_the_changelog_can_be_dated_and_its_links_are_those_of_its_headings(release):
     text = (HOME / "CHANGELOG.md").read_text()
     headings = set(re.findall(r"^## \[(.+?)\]", text, re.MULTILINE))
@@ -95,28 +86,6 @@ def test_a_dated_release_with_addresses_may_be_published(release):
     found = release.problems("v0.1.0", project={"version": "0.1.0", "urls": urls}, changelog=text)
 
     assert found == []
-
-
-def test_an_entry_with_two_sections_of_one_kind_is_named(release):
-    entries = ENTRIES.replace("- A thing.\n", "- A thing.\n\n### Added\n- More.\n")
-    text = release.dated(entries, version="0.1.0", day="2026-11-22")
-
-    lines = release.problems("v0.1.0", project={"version": "0.1.0", "urls": {}}, changelog=text)
-
-    assert "CHANGELOG.md: 0.1.0 has several sections 'Added': make them one" in lines
-
-
-def test_the_version_stands_in_one_place():
-    import stereogenbench_data
-
-    files = subprocess.run(
-        [require_tool("git"), "grep", "--files-with-matches", "--fixed-strings", "0.1.0"],
-        cwd=HOME, capture_output=True, text=True, check=False,
-    ).stdout.split()  # fmt: skip
-    named = {path for path in files if path.endswith((".py", ".pyi", ".toml", ".cff"))}
-
-    assert stereogenbench_data.__version__ == PROJECT["project"]["version"]
-    assert {path for path in named if not path.startswith(("tests/", ".ci/"))} <= {"pyproject.toml"}
 
 
 def test_every_python_that_is_named_gets_the_wheel_before_it_is_published():

@@ -185,27 +185,6 @@ def test_filters_count_and_the_copied_selection_gives_the_same_scenes(page):
     assert keys_listed(page)
 
 
-def test_a_baseline_range_dims_the_pairs_outside_and_moves_to_one_inside(page):
-    page.type("baseline-low", "10")
-    page.type("baseline-high", "60")
-    page.until(lambda: "baseline_cm=(10, 60)" in page.text("selection-line"))
-    page.until(lambda: page.script("return document.querySelector('.pair.off') !== null"))
-    page.settle()
-    pairs = run(page.text("selection-line"))["pairs"]
-    row = pairs.index.column("key").tolist().index(page.text("key"))
-    wanted = np.sort(pairs.index.column("baselines_cm")[row])
-    off = page.script(
-        "return [...document.querySelectorAll('.pair')]"
-        ".map((pair) => pair.classList.contains('off'))"
-    )
-
-    assert off == [not 10 <= cm <= 60 for cm in wanted]
-    assert not page.script(
-        "return document.querySelector('.pair[aria-checked=true]').classList.contains('off')"
-    )
-    assert page.text("count").endswith(f"{len(pairs.plan.pairs):,} pairs")
-
-
 def test_the_numbers_under_the_cursor_are_those_of_the_maps(page):
     page.open("key=train/Uniform/SynthStage/scene_000120&pair=0-2&frame=3")
     sample = run(page.text("sample-line"))["sample"]
@@ -287,15 +266,6 @@ def test_the_keyboard_alone_flips_frames_pairs_scenes_and_views(page):
     page.until(lambda: "left" in page.script(caption))
     page.press("/")
     assert page.script("return document.activeElement.id") == "caption"
-
-
-def test_keys_pressed_before_the_last_scene_is_shown_each_go_one_scene_on(page):
-    page.script(
-        "for (const key of 'jjjk') document.body.dispatchEvent("
-        "new KeyboardEvent('keydown', {key, bubbles: true}));"
-    )
-
-    page.until(lambda: page.text("key") == keys_listed(page)[2])
 
 
 def test_the_list_holds_few_rows_and_scrolls_to_any(page):
@@ -388,19 +358,6 @@ def test_the_address_is_a_link_to_filters_sample_and_view(page):
     assert page.hash() == link
 
 
-def test_a_link_that_is_pasted_into_the_open_page_changes_it(page):
-    page.filter("split", "train")
-    page.until(lambda: "split=train" in page.hash())
-    page.script("location.hash = 'key=scene_000133&pair=0-3&frame=4&view=left'")
-    page.until(lambda: "scene_000133" in page.text("key") and page.text("frame-number") == "4 / 6")
-    page.until(lambda: page.text("count") == "160 scenes, 2,400 pairs")
-
-    page.until(lambda: "pairs=[(0, 3)], frames=4" in page.text("sample-line"))
-    assert page.script("return document.querySelectorAll('[data-pane]').length") == 1
-    page.script("location.hash = 'split=eval'")
-    page.until(lambda: page.text("count") == "40 scenes, 600 pairs")
-
-
 def test_a_link_to_a_scene_that_is_not_there_says_so(page):
     page.open("key=train/Uniform/SynthStage/scene_777777")
 
@@ -416,13 +373,6 @@ def test_a_link_to_a_scene_that_is_not_there_says_so(page):
 
     page.press("j")
     page.until(lambda: not visible(page, "#notice")[0])
-
-
-def test_a_link_with_a_filter_that_is_none_says_so_and_can_be_reset(page):
-    page.script("location.hash = 'pairs=sweep'")
-    page.until(lambda: "no choice 'sweep'" in page.text("nothing-reason"))
-
-    reset(page)
 
 
 @pytest.fixture
@@ -487,28 +437,6 @@ def test_a_screen_shows_pictures_first_their_numbers_beside_and_nothing_beyond_t
     else:
         assert readout[3] <= 844
         assert visible(page, "#open-drawer", "#drawer", "#steps") == [False, True, False]
-
-
-def test_on_a_phone_filters_and_list_are_in_a_drawer(screen):
-    page = screen(390, "light")
-    assert page.text("open-drawer") == "☰ 160 scenes"
-    page.script("document.getElementById('open-drawer').click()")
-    page.until(lambda: visible(page, "#drawer", "#backdrop") == [True, True])
-    page.filter("family", "Uniform")
-    page.until(lambda: "scenes, 1 filter" in page.text("open-drawer"))
-    page.script("document.querySelector('.row:nth-child(2)').click()")
-    page.until(lambda: visible(page, "#drawer", "#backdrop") == [False, False])
-    page.until(lambda: page.text("key") in keys_listed(page))
-
-    before = page.text("key")
-    page.script("document.getElementById('after').click()")
-    page.until(lambda: page.text("key") != before)
-    page.script("document.getElementById('before').click()")
-    page.until(lambda: page.text("key") == before)
-    page.script("document.getElementById('open-drawer').click()")
-    page.until(lambda: visible(page, "#drawer") == [True])
-    page.script("document.getElementById('backdrop').click()")
-    page.until(lambda: visible(page, "#drawer") == [False])
 
 
 def test_the_page_runs_without_a_word_on_the_console_and_loads_from_itself_alone(page, address):

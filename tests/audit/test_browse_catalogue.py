@@ -48,28 +48,6 @@ def test_the_line_of_a_choice_selects_what_the_page_counts(catalogue, query):
     ].tolist()
 
 
-def test_the_line_of_a_sample_gives_it(catalogue, indexed_release):
-    line = catalogue.sample_line(SCENE, pair=(1, 4), frame=5)
-    sample = run(line)["sample"]
-
-    assert sample["__key__"] == f"{SCENE}/01-04/005"
-    assert line.startswith("from stereogenbench_data import StereoPairs\n")
-
-
-def test_a_value_counts_what_all_other_filters_leave(catalogue, index):
-    counts = catalogue.summary(parse_choice({"family": ["Uniform"], "split": ["train"]}))["counts"]
-
-    split, family = index.column("split"), index.column("family")
-    assert counts["family"] == {
-        name: int(((split == "train") & (family == name)).sum())
-        for name in ("IPD_Gaussian", "Uniform")
-    }
-    assert counts["split"] == {
-        name: int(((split == name) & (family == "Uniform")).sum()) for name in ("eval", "train")
-    }
-    assert counts["subset"] == {"seen_map": 0}
-
-
 def test_the_edges_of_bins_belong_where_the_paper_puts_them(index):
     scene = index.scene(0)
     edges = (0.5, 1.0, 9.99, 10.0, 30.0, 60.0, 100.0, 149.0, 150.0, 150.1, 2.0, 3.0, 4.0, 5.0, 6.0)
@@ -79,16 +57,6 @@ def test_the_edges_of_bins_belong_where_the_paper_puts_them(index):
     found = [baseline_bin(cm) for cm in edges]
     counts = catalogue.summary({})["counts"]["bin"]
     assert counts == {name: found.count(name) for name in BASELINE_BINS}
-
-
-def test_nothing_left_says_why_and_what_there_is(catalogue):
-    told = catalogue.summary(parse_choice({"caption": ["submarine"]}))
-
-    assert (told["scenes"], told["pairs"]) == (0, 0)
-    assert "caption submarine matches none of 4 scenes" in told["reason"]
-    assert (
-        catalogue.listed(parse_choice({"caption": ["submarine"]}), first=0, count=9)["rows"] == []
-    )
 
 
 def test_a_scenes_pairs_go_from_the_narrowest_to_the_widest(catalogue, index):
@@ -118,10 +86,6 @@ def test_a_long_list_comes_in_parts(index):
     assert (listed["total"], listed["first"], len(listed["rows"])) == (450, 400, 50)
     assert len(catalogue.listed({}, first=0, count=10_000)["rows"]) == 200
     assert catalogue.place({}, "train/scene_000321") == 321
-
-
-def test_a_scene_outside_the_choice_has_no_place_in_the_list(catalogue):
-    assert catalogue.place(parse_choice({"split": ["eval"]}), SCENE) == -1
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ from stereogenbench_data.audit.geometry.records import ToleranceAudit
 from stereogenbench_data.audit.geometry.scene_audit import spread_frames
 from stereogenbench_data.audit.geometry.table import audit_markdown, pooled_px
 from stereogenbench_data.errors import SelectionError
-from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.audit.corruption import (
@@ -126,15 +125,6 @@ def test_a_tree_behind_a_url_is_walked_with_its_broken_scenes(indexed_release):
     assert "cam_04_depth.mkv" in finding.member + finding.found
     assert report.scenes_audited == of_eval.scenes_audited == 1
     assert of_eval.findings == ()
-
-
-def test_packed_shards_behind_a_url_give_the_same_figures(exact, indexed_release, web):
-    pack(indexed_release, web.folder, depth_codec="blosc2", workers=1)
-
-    found = audit(web.url, THREE, workers=1, scenes=SCENE)
-
-    (expected,) = [scene for scene in exact.to_json()["scenes"] if scene["key"] == SCENE]
-    assert found.to_json()["scenes"] == [expected]
 
 
 def test_worker_processes_give_the_same_report(exact, indexed_release):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stereogenbench_data import SceneIndex, SelectionError
+from stereogenbench_data import SceneIndex
 from stereogenbench_data.audit.pictures.scene_pictures import (
     HIDDEN,
     LEFT,
@@ -20,9 +20,7 @@ from stereogenbench_data.samples.picture import (
     COLOUR_STOPS,
     NOT_MEASURED,
     ColourScale,
-    Tile,
     anaglyph,
-    draw_sheet,
     pair_tiles,
 )
 
@@ -90,13 +88,6 @@ def test_the_pairs_cameras_are_framed_in_their_colours(reader, row):
     assert [camera for camera in range(6) if framed[camera] == RIGHT] == [5]
 
 
-def test_a_frame_or_pair_that_is_not_there_is_named(reader, row):
-    with pytest.raises(SelectionError, match="has no frame 7: its 7 are 0 to 6"):
-        scene_sheet(reader, row, frame=7)
-    with pytest.raises(SelectionError, match=r"there is no pair \(4, 1\)"):
-        scene_sheet(reader, row, pair=(4, 1))
-
-
 def test_a_scale_runs_from_dark_to_red_and_a_log_scale_the_other_way():
     values, measured = np.array([[2.0, 20.0]]), np.array([[True, True]])
     linear, log = ColourScale(2.0, 20.0), ColourScale(2.0, 2000.0, "log")
@@ -117,23 +108,6 @@ def test_the_bar_of_disparity_says_depth_in_metres_below_pixels(reader, row):
     assert [pixels(value) for value in (0.0, 20.0)] == ["0", "20"]
     assert metres(0.0) == "inf"
     assert float(metres(60.0)) == pytest.approx(10 * float(sample["baseline_m"]), rel=1e-2)
-
-
-def test_nothing_measured_has_a_scale_too():
-    nothing = np.zeros((2, 2), dtype=bool)
-
-    scale = ColourScale.of(np.zeros((2, 2)), measured=nothing, kind="log")
-    assert (scale.paint(np.zeros((2, 2)), measured=nothing) == NOT_MEASURED).all()
-
-
-def test_a_caption_never_leaves_its_tile():
-    white = np.full((90, 90, 3), 250, np.uint8)
-    tiles = [Tile("disparity and very much more than there is room for", white), Tile("", white)]
-
-    sheet = draw_sheet([], [tiles], width_px=90)
-
-    inked = (sheet[13:29] < 128).any(axis=-1).any(axis=0).nonzero()[0]
-    assert 60 < inked.max() < 13 + 90
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
@@ -163,18 +137,3 @@ def test_the_colours_of_a_clip_mean_the_same_in_every_frame(reader, row):
 
     assert len(bars) == 1
     assert not np.array_equal(pages[0], pages[-1])
-
-
-def test_a_clip_that_fails_leaves_no_file(reader, row, tmp_path):
-    def failing():
-        yield np.zeros((4, 4, 3), dtype=np.uint8)
-        raise SelectionError("the second page is not there")
-
-    with pytest.raises(SelectionError, match="the second page"):
-        write_clip(tmp_path / "clip.gif", failing(), frames=2, rate_hz=15.0)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_clip_of_another_kind_is_refused(tmp_path):
-    with pytest.raises(SelectionError, match=r"clip\.avi: a clip is \.mp4 or \.gif"):
-        write_clip(tmp_path / "clip.avi", iter(()), frames=0, rate_hz=15.0)

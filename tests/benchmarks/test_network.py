@@ -7,8 +7,7 @@ import urllib.request
 import pytest
 
 import benchmarks.server
-from benchmarks.network import LOCAL, OURS, Job, Plan, measured, network_tables, run_network
-from benchmarks.network import WORKLOADS as NETWORK_WORKLOADS
+from benchmarks.network import LOCAL, OURS, Plan, network_tables, run_network
 from benchmarks.plots import plot_all
 from benchmarks.results import Results
 from benchmarks.server import Network, serving
@@ -135,13 +134,3 @@ def test_the_races_are_tabled_and_drawn(results, tmp_path):
     assert "| 1 ms, 20 MB/s a connection | ours |" in text
     assert "| 1 ms, 5% of requests refused | ours |" in text
     assert [path.name for path in made] == ["network.png"]
-
-
-def test_ours_gives_every_sample_where_requests_fail(material):
-    (first,) = [workload for workload in NETWORK_WORKLOADS if workload.name == "first"]
-    job = Job(first, material.root / "network", 10)
-
-    turn = measured(OURS, job, Network(0.001, refused=0.2, lost=0.1), workers=0)
-
-    assert turn.samples == 10
-    assert turn.failures > 0

@@ -17,7 +17,7 @@ from PIL import Image
 
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.card import MARK, card, write_card, write_viewer_rows
-from stereogenbench_data.errors import DescriptorError, StorageError
+from stereogenbench_data.errors import DescriptorError
 from stereogenbench_data.shards.pack import pack
 from tests.servers.failing_server import serving
 from tests.servers.hub import REPOSITORY, HubHandler
@@ -139,17 +139,6 @@ def test_the_rows_of_the_viewer_are_written_once_for_an_index(small_shards, tmp_
     assert len(names) == 4
     assert {picture.format for picture in pictures} == {"JPEG"}
     assert min(np.asarray(picture).std() for picture in pictures) > 10
-
-
-def test_a_scene_that_cannot_be_read_is_named(small_shards, tmp_path):
-    folder = shutil.copytree(small_shards, tmp_path / "shards")
-    index = SceneIndex.open(folder)
-    (shard, *_) = index.shards
-    (folder / shard).unlink()
-
-    with pytest.raises(StorageError, match=re.escape(shard)):
-        write_viewer_rows(index, tmp_path)
-    assert list((tmp_path / "viewer").glob("*.tar*")) == []
 
 
 def test_a_card_is_replaced_but_another_readme_is_not(tmp_path):

@@ -1,7 +1,6 @@
 """Clips as files: what the videos show, what each trainer's manifest says, going on, refusals."""
 
 import csv
-import gc
 import json
 import shutil
 import tomllib
@@ -17,7 +16,7 @@ from stereogenbench_data.bridges.clips import export_clips
 from stereogenbench_data.errors import MediaError, StorageError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.encoder import Encoding
-from tests.servers.tools import kill_at, killed_fork, require_module, small_disk
+from tests.servers.tools import kill_at, killed_fork, small_disk
 
 FIELDS = ("left", "right", "warped_right", "hole", "disparity", "depth", "valid", "baseline_m",
           "frame_rate_hz", "caption", "scene", "split", "pair")  # fmt: skip
@@ -105,21 +104,6 @@ def test_diffsynth_reads_its_table_with_pandas(everything, expected):
         "vace_video": {"warped"}, "vace_video_mask": {"mask"},
     }  # fmt: skip
     assert all((everything / path).is_file() for name in columns for path in table[name])
-
-
-@pytest.mark.filterwarnings(
-    "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
-)
-def test_diffsynth_reads_videos_with_imageio(everything, expected):
-    imageio = require_module("imageio")
-    table = pandas.read_csv(everything / "metadata.csv")
-    reader = imageio.get_reader(everything / table["video"][0])
-
-    assert (reader.count_frames(), reader.get_meta_data()["fps"]) == (5, 15.0)
-    for number, picture in enumerate(expected[0]["right"]):
-        assert difference(reader.get_data(number).transpose(2, 0, 1), picture) < 1.5
-    reader.close()
-    gc.collect()
 
 
 CAPTIONS = ("", "NA", 'Two "quoted" words,\na line\u2028and more')
@@ -239,24 +223,6 @@ def test_clips_may_overlap_and_have_their_own_names(indexed_release, tmp_path):
     assert frames.count([0, 1, 2, 3, 4]) == frames.count([2, 3, 4, 5, 6]) == 2
 
 
-def test_filters_choose_what_is_exported(indexed_release, tmp_path):
-    exported(indexed_release, tmp_path, family="Uniform", pairs="all", baseline_cm=(0, 12))
-
-    found = records(tmp_path)
-    assert found
-    assert all(0 < record["baseline_m"] <= 0.12 for record in found)
-    assert {record["scene"].split("/")[1] for record in found} == {"Uniform"}
-
-
-def test_the_baseline_is_told_in_captions_where_it_is_wanted(indexed_release, tmp_path):
-    exported(indexed_release, tmp_path, "musubi", captions="with baseline")
-
-    for record in records(tmp_path):
-        told = f" Stereo baseline {record['baseline_m'] * 100:.1f} cm."
-        text = (tmp_path / record["videos"]["right"]).with_suffix(".txt").read_text()
-        assert text.endswith(f"{told}\n")
-
-
 # Going on.
 
 
@@ -304,19 +270,6 @@ def test_a_killed_run_goes_on_to_the_bytes_of_an_unbroken_one(indexed_release, t
     found, whole = contents(out), contents(tmp_path / "whole")
     assert found.keys() == whole.keys()
     assert {name for name in found if found[name] != whole[name]} == {"dataset.toml"}
-
-
-def test_progress_tells_frames_and_begins_with_those_that_are_there(indexed_release, tmp_path):
-    told = []
-    progress = {"progress": lambda done, total: told.append((done, total))}
-    names = exported(indexed_release, tmp_path, **progress).written
-    assert (told[0], told[-1]) == ((0, 15), (15, 15))
-
-    told.clear()
-    (tmp_path / "clips" / f"{names[0]}.json").unlink()
-    exported(indexed_release, tmp_path, **progress)
-
-    assert (told[0], told[-1]) == ((10, 15), (15, 15))
 
 
 # Refusals.

@@ -17,7 +17,6 @@ from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.croissant.check import check_descriptor
 from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
 from stereogenbench_data.errors import DescriptorError
-from stereogenbench_data.shards.download import download, plan_download
 from stereogenbench_data.shards.pack import pack
 from tests.cli.command import invoke
 from tests.servers.tools import require_module, require_tool
@@ -201,29 +200,6 @@ def test_shards_of_packed_depth_are_described_by_its_suffix(small_release, tmp_p
     assert records["contents"]["depth_videos"] == depth
     assert records["counts"]["media_files"] == 12 * len(packed)
     assert check_descriptor(path) == []
-
-
-def test_a_partial_download_is_described_by_its_videos(small_shards, tmp_path):
-    whole = SceneIndex.open(small_shards)
-    part = plan_download(whole, [0, 1], cameras=(2, 3), streams=("depth",))
-    download(whole, part, tmp_path / "tree")
-    pack(tmp_path / "tree", tmp_path / "shards", workers=1)
-    path = tmp_path / "data.json"
-    written = write_descriptor(SceneIndex.open(tmp_path / "shards"), path, publication=DAY)
-
-    kinds = [each["@id"] for each in written["recordSet"] if each["@id"].endswith("_videos")]
-    assert kinds == ["depth_videos"]
-    assert check_descriptor(path) == []
-
-
-def test_shards_of_any_folder_are_named_relative_to_the_descriptor(index, tmp_path):
-    path = tmp_path / "deep" / "down" / "data.json"
-
-    written = write_descriptor(index, path, publication=DAY)
-
-    for file in written["distribution"]:
-        if file["@type"] == "cr:FileObject":
-            assert (path.parent / file["contentUrl"]).is_file()
 
 
 def test_many_shards_are_listed_in_a_file(index, tmp_path, monkeypatch):

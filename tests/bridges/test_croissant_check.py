@@ -49,33 +49,9 @@ MUTATIONS = {
     "misspelt responsible-AI name": (
         lambda d: d.update({"rai:dataBias": ["none"]}), "rai:dataBias: is not a property of RAI",
     ),
-    "missing responsible-AI name": (
-        lambda d: d.pop("rai:dataLimitations"),
-        "rai:dataLimitations: is missing",
-    ),
     "context by address": (
         lambda d: d.update({"@context": "https://example.org/context"}),
         "@context: ",
-    ),
-    "no licence": (
-        lambda d: d.pop("license"),
-        "schema.org/license",
-    ),
-    "no version": (
-        lambda d: d.update(version="v1"),
-        "MAJOR.MINOR.PATCH: v1",
-    ),
-    "unknown data type": (
-        lambda d: node(d, "scenes/map").update(dataType="sc:String"),
-        r"Field\(map\)",
-    ),
-    "list as a value": (
-        lambda d: node(d, "scenes/depth_unit_m").pop("isArray"),
-        "scenes/depth_unit_m",
-    ),
-    "date that is none": (
-        lambda d: d.update(datePublished="22.11.2026"),
-        "Got 22",
     ),
     "question without an answer": (
         lambda d: d["creator"][0].update(name="FILL IN: who made it"),
@@ -88,10 +64,6 @@ MUTATIONS = {
     "empty responsible-AI value": (
         lambda d: d.update({"rai:dataBiases": []}),
         "rai:dataBiases: is missing",
-    ),
-    "not shaped as one": (
-        lambda d: d.update(recordSet=[1]),
-        "RecordSet, but got int",
     ),
 }  # fmt: skip
 
@@ -146,14 +118,6 @@ def test_the_command_writes_and_checks(small_shards, tmp_path):
     assert (checked.exit_code, checked.output) == (0, f"{path}: 0 problems\n")
     assert found.exit_code == 1
     assert "rai:dataBiases: is missing" in found.output
-
-
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000])
-def test_deep_nesting_is_refused_by_name(tmp_path, text):
-    (tmp_path / "data.json").write_text(text)
-
-    with pytest.raises(DescriptorError, match=r"data\.json: cannot be read as JSON"):
-        check_descriptor(tmp_path / "data.json")
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from pathlib import Path
 
 import pytest
 
@@ -72,13 +71,6 @@ def test_the_command_takes_the_users_word_for_the_release(elsewhere, tmp_path):
     )
 
 
-def test_without_data_the_release_is_meant():
-    facts = facts_of(None)
-
-    assert facts["creator"] == RELEASE["creator"]
-    assert "the release states no version and no day of publication" in facts["description"]
-
-
 @pytest.mark.parametrize("write", ["descriptor", "card"])
 def test_scenes_of_an_unknown_maker_are_described_as_the_maker_states(
     elsewhere, about, tmp_path, write
@@ -138,9 +130,3 @@ def test_a_maker_states_name_version_and_day_of_a_descriptor(small_shards, tmp_p
     assert facts.items() <= json.loads(path.read_text()).items()
     assert "'two' is not a version" in one_line(written({"version": "two"}).stderr)
     assert "datePublished is 'May', not a day" in one_line(written({"datePublished": "May"}).stderr)
-
-
-def test_the_bibliography_is_that_of_the_descriptors():
-    home = Path(__file__).resolve().parents[2]
-
-    assert (home / "CITATION.bib").read_text() == RELEASE["citeAs"]

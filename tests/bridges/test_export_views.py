@@ -17,7 +17,7 @@ from stereogenbench_data.bridges.multiview import PosedImage
 from stereogenbench_data.errors import FieldError, SelectionError, StorageError
 from stereogenbench_data.geometry.pose import rotation_from_quaternion_xyzw
 from stereogenbench_data.index.table import SceneIndex
-from tests.servers.tools import kill_at, killed_fork, require_module, small_disk
+from tests.servers.tools import kill_at, killed_fork, require_module
 
 CLOSE_PX = 0.01
 
@@ -32,39 +32,6 @@ def files_of(root):
         for path in sorted(root.rglob("*"))
         if path.is_file() and path.name != ".export.lock"
     }
-
-
-def read_colmap(folder):
-    """Read a text model as COLMAP's documentation describes it."""
-    model = folder / "sparse" / "0"
-
-    def lines(name):
-        text = (model / f"{name}.txt").read_text().splitlines()
-        return [line for line in text if not line.startswith("#")]
-
-    (camera,) = (line.split() for line in lines("cameras"))
-    assert camera[:2] == ["1", "PINHOLE"]
-    size, lens = tuple(map(int, camera[2:4])), tuple(map(float, camera[4:]))
-    images = {}
-    for head, observed in zip(lines("images")[::2], lines("images")[1::2], strict=True):
-        number, w, x, y, z, *step, camera_id, name = head.split()
-        assert camera_id == "1"
-        quaternion = np.array([x, y, z, w], dtype=np.float64)
-        triples = np.array(observed.split(), dtype=np.float64).reshape(-1, 3)
-        images[int(number)] = (
-            name,
-            rotation_from_quaternion_xyzw(quaternion),
-            np.array(step, dtype=np.float64),
-            triples,
-        )
-    points = {}
-    for line in lines("points3D"):
-        number, *rest = line.split()
-        track = np.array(rest[7:], dtype=int).reshape(-1, 2)
-        points[int(number)] = (
-            np.array(rest[:3], dtype=np.float64), tuple(map(int, rest[3:6])), track,
-        )  # fmt: skip
-    return size, lens, images, points
 
 
 def read_ply(path):
@@ -97,52 +64,42 @@ def moment(detailed_release):
     return SceneViews(detailed_release)[0]
 
 
-def test_points_of_a_colmap_model_project_onto_their_observations(
+@pytest.mark.skipif(sys.version_info >= (3, 15), reason="pycolmap has no wheel for Python 3.15 yet")
+def test_colmap_reads_poses_and_points_that_project_onto_their_observations(
     detailed_release, moment, tmp_path
 ):
+    pycolmap = require_module("pycolmap")
     (folder,) = exported(detailed_release, tmp_path, layout="colmap", points=200)
-    size, lens, images, points = read_colmap(folder)
+    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
     about = json.loads((folder / "stereogenbench.json").read_text())
     scene_from_export = np.array(about["scene_from_export"])
 
+    (lens,) = model.cameras.values()
     assert (about["scene"], about["frame"]) == ("train/IPD_Gaussian/SynthStage/scene_000000", 0)
-    assert size == (160, 160)
-    np.testing.assert_array_equal(lens, moment["intrinsics"].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]])
-    for name, rotation, step, _ in images.values():
-        cam_from_export = np.eye(4)
-        cam_from_export[:3, :3], cam_from_export[:3, 3] = rotation, step
-        scene_from_cam = scene_from_export @ np.linalg.inv(cam_from_export)
-        expected = moment["world_from_cam"][int(name[4:6])].numpy()
-        np.testing.assert_allclose(scene_from_cam, expected, atol=1e-9)
-    assert len(points) == 6 * 200
-    for position, colour, track in points.values():
-        for image, place in track:
-            name, rotation, step, observed = images[image]
-            landed = pixels_of((rotation @ position + step)[None], lens)[0]
-            assert np.abs(landed - observed[place, :2]).max() < CLOSE_PX
-        # The first is the pixel that the point is made of.
-        name, rotation, step, observed = images[track[0, 0]]
-        camera = int(name[4:6])
-        u, v = observed[track[0, 1], :2]
-        column, row = int(u), int(v)
-        assert (u, v) == (column + 0.5, row + 0.5)
-        assert tuple(moment["image"][camera, :, row, column].tolist()) == colour
-        depth_m = (rotation @ position + step)[2]
-        assert abs(depth_m - moment["depth"][camera, 0, row, column].item()) < 1e-9
-
-
-@pytest.mark.skipif(sys.version_info >= (3, 15), reason="pycolmap has no wheel for Python 3.15 yet")
-def test_colmap_reads_the_model(shared_scenes, tmp_path):
-    pycolmap = require_module("pycolmap")
-    (folder,) = exported(shared_scenes, tmp_path, layout="colmap", points=300)
-    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
-
-    assert (len(model.cameras), len(model.images), len(model.points3D)) == (1, 6, 1800)
+    assert (lens.model.name, lens.width, lens.height) == ("PINHOLE", 160, 160)
+    np.testing.assert_array_equal(
+        lens.params, moment["intrinsics"].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]
+    )
+    assert (len(model.images), len(model.points3D)) == (6, 6 * 200)
     for image in model.images.values():
+        cam_from_export = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+        scene_from_cam = scene_from_export @ np.linalg.inv(cam_from_export)
+        expected = moment["world_from_cam"][int(image.name[4:6])].numpy()
+        np.testing.assert_allclose(scene_from_cam, expected, atol=1e-9)
         assert (folder / "images" / image.name).is_file()
         for observed in image.points2D:
             landed = image.project_point(model.points3D[observed.point3D_id].xyz)
             assert np.abs(landed - observed.xy).max() < CLOSE_PX
+    for point in model.points3D.values():
+        # The first is the pixel that the point is made of.
+        first = point.track.elements[0]
+        image = model.images[first.image_id]
+        camera, (u, v) = int(image.name[4:6]), image.points2D[first.point2D_idx].xy
+        column, row = int(u), int(v)
+        assert (u, v) == (column + 0.5, row + 0.5)
+        assert moment["image"][camera, :, row, column].tolist() == point.color.tolist()
+        depth_m = (image.cam_from_world() * point.xyz)[2]
+        assert abs(depth_m - moment["depth"][camera, 0, row, column].item()) < 1e-9
 
 
 @pytest.fixture(scope="module")
@@ -285,38 +242,6 @@ def test_moges_depth_is_read_back_whatever_its_range(tmp_path, values, close):
     np.testing.assert_allclose(np.nan_to_num(found, nan=0.0), depth_m, rtol=close)
 
 
-def test_the_size_of_an_export_is_that_of_its_pictures_depth_and_cameras(
-    detailed_release, tmp_path
-):
-    size = (48, 80)
-    (folder,) = exported(
-        detailed_release, tmp_path / "t", layout="transforms", size=size, points="all"
-    )
-    about = json.loads((folder / "transforms.json").read_text())
-    sample = SceneViews(detailed_release, size=size)[0]
-    frame = about["frames"][2]
-
-    assert (about["w"], about["h"]) == (80, 48)
-    assert np.load(folder / frame["depth_file_path"]).shape == size
-    with Image.open(folder / frame["file_path"]) as picture:
-        assert picture.size == (80, 48)
-    lens = (about["fl_x"], about["fl_y"], about["cx"], about["cy"])
-    assert lens == tuple(sample["intrinsics"].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]])
-
-
-def test_every_moment_has_a_folder_of_its_own(indexed_release, tmp_path):
-    chosen = {"layout": "colmap", "frames": ("every", 3), "family": "Uniform", "points": 5}
-    moments = exported(indexed_release, tmp_path, **chosen)
-    scene = tmp_path / "train" / "Uniform" / "SynthStage" / "scene_000000"
-
-    assert moments[:3] == [scene / f"frame_{frame:03d}" for frame in (0, 3, 6)]
-    assert len(moments) == 6
-    _, _, images, points = read_colmap(moments[1])
-    assert (len(images), len(points)) == (6, 30)
-    names = {name for name, *_ in images.values()}
-    assert names == {path.name for path in (moments[1] / "images").iterdir()}
-
-
 @pytest.mark.parametrize("layout", ["colmap", "moge"])
 def test_what_was_exported_before_is_kept(indexed_release, tmp_path, layout):
     options = {"layout": layout, "frames": [0, 4], "size": (32, 32)}
@@ -434,24 +359,6 @@ def test_a_missing_video_is_named_and_nothing_half_is_left(indexed_release, tmp_
     with pytest.raises(StorageError, match=r"scene_000001.*cam_04_rgb"):
         exported(index, tmp_path / "out", layout="ply", size=(16, 16))
     assert not [*(tmp_path / "out").rglob("*.unfinished")]
-
-
-def test_a_full_disk_is_named_and_nothing_half_is_left(indexed_release, tmp_path):
-    with small_disk(tmp_path / "disk", size="200k") as disk:
-        with pytest.raises(StorageError, match=r"frame_000.*No space left.*Make room"):
-            exported(indexed_release, disk / "out", layout="transforms", frames="all")
-        folders = [*(disk / "out").rglob("frame_*")]
-        assert all((folder / "transforms.json").is_file() for folder in folders)
-
-
-def test_the_same_comes_out_of_shards_and_folders(indexed_release, small_shards, tmp_path):
-    found = []
-    for name, data in (("folders", indexed_release), ("shards", small_shards)):
-        exported(data, tmp_path / name, layout="transforms", size=(32, 32))
-        found.append(files_of(tmp_path / name))
-        found[-1].pop("export.json")
-
-    assert found[0] == found[1]
 
 
 rotations = st.tuples(*[st.floats(-1, 1) for _ in range(4)]).filter(

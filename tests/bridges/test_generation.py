@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from stereogenbench_data import FieldError, HorizontalFlip, Letterbox, SelectionError, StereoPairs
-from stereogenbench_data.bridges.generation import GenStereo, StereoClips, describe_pair
+from stereogenbench_data.bridges.generation import GenStereo, StereoClips
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.checks import OddSceneWarning
 from tests.servers.tools import require_module
@@ -141,20 +141,6 @@ def test_clips_tell_their_caption_baseline_and_rate(indexed_release):
     assert float(plain["frame_rate_hz"]) == scene.frame_rate_hz / 2 > 0
 
 
-def test_a_batch_of_clips_has_captions_as_a_list(indexed_release):
-    clips = StereoClips(indexed_release, frames=("clips", 3), split="train")
-
-    batch = next(iter(clips.loader(batch_size=3, num_workers=1)))
-
-    assert batch["target"].shape == (3, 3, 3, 64, 64)
-    assert [type(caption) for caption in batch["caption"]] == [str] * 3
-    assert batch["baseline_m"].shape == batch["frame_rate_hz"].shape == (3,)
-
-
-def test_a_pair_without_a_description_is_described_by_its_baseline():
-    assert describe_pair("", baseline_m=0.1) == "Stereo baseline 10.0 cm."
-
-
 def test_what_cannot_be_is_refused(indexed_release):
     with pytest.raises(FieldError, match=r"layout must be one of .*'cthw'.*, got 'thwc'"):
         StereoClips(indexed_release, layout="thwc", frames=("clips", 2))
@@ -164,17 +150,3 @@ def test_what_cannot_be_is_refused(indexed_release):
         StereoClips(indexed_release)
     with pytest.raises(SelectionError, match="GenStereo takes frames"):
         GenStereo(indexed_release, frames=("clips", 2))
-
-
-@pytest.mark.parametrize(
-    ("frames", "stride"), [("all", 1), (("clips", 2, 3), 3), (("clips", 1), 1)]
-)
-def test_the_frame_rate_is_a_field(indexed_release, frames, stride):
-    from stereogenbench_data import SceneViews
-
-    pair = StereoPairs(indexed_release, fields=("frame_rate_hz",), frames=frames)
-    views = SceneViews(indexed_release, fields=("frame_rate_hz",), frames=frames)
-
-    rate = pair.index.scene(0).frame_rate_hz / stride
-    assert pair[0]["frame_rate_hz"].dtype == torch.float64
-    assert float(pair[0]["frame_rate_hz"]) == float(views[0]["frame_rate_hz"]) == rate > 0

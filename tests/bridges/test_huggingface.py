@@ -4,13 +4,10 @@ import sys
 
 import datasets
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import torch
 from datasets.distributed import split_dataset_by_node
 from torch.utils.data import DataLoader
-from torchdata.stateful_dataloader import StatefulDataLoader
 
 from stereogenbench_data import PAIR_FIELDS, Compose, HorizontalFlip, RandomCrop, StereoPairs
 from stereogenbench_data.bridges import huggingface
@@ -79,25 +76,6 @@ def test_a_state_resumes_where_it_was_taken(small_shards, stream, expected):
     assert taken + keys(resumed) == keys(expected)
 
 
-@pytest.mark.filterwarnings("ignore:'set_vital' is deprecated:UserWarning")
-def test_torchdatas_loader_resumes_with_workers(small_shards, stream, expected):
-    loader = StatefulDataLoader(stream, batch_size=2, num_workers=2)
-    taken = []
-    for batch in loader:
-        taken += batch["__key__"]
-        if len(taken) == 10:
-            state = loader.state_dict()
-            break
-    resumed = StatefulDataLoader(
-        huggingface.iterable(small_shards, **SELECTION), batch_size=2, num_workers=2
-    )
-    resumed.load_state_dict(state)
-
-    assert sorted(taken + [key for batch in resumed for key in batch["__key__"]]) == sorted(
-        keys(expected)
-    )
-
-
 def test_an_epoch_has_new_random_frames_and_a_new_order(small_shards):
     stream = huggingface.iterable(
         small_shards, fields=("frame_index", "scene"), frames=("random", 3)
@@ -111,20 +89,6 @@ def test_an_epoch_has_new_random_frames_and_a_new_order(small_shards):
     assert set(drawn(0)) != set(drawn(1))
     orders = {tuple(scene for scene, _ in drawn(epoch)) for epoch in range(4)}
     assert len(orders) > 1
-
-
-def test_running_workers_follow_the_epoch(small_shards):
-    stream = huggingface.iterable(
-        small_shards, fields=("frame_index", "scene"), frames=("random", 3)
-    )
-    loader = DataLoader(stream, batch_size=None, num_workers=1, persistent_workers=True)
-
-    def drawn(epoch):
-        stream.set_epoch(epoch)
-        return {(sample["scene"], int(sample["frame_index"])) for sample in loader}
-
-    assert drawn(0) != drawn(1)
-    assert drawn(0) == drawn(0)
 
 
 EVERY_FIELD = tuple(name for name in PAIR_FIELDS if name not in ("__key__", "__url__"))
@@ -174,25 +138,6 @@ class Odd:
         return views
 
 
-def test_datasets_of_ours_are_interleaved_cast_and_written_with_their_dtypes(stream, tmp_path):
-    cast = stream.cast_column("pair", datasets.List(datasets.Value("int32"), length=2))
-    mixed = datasets.interleave_datasets([stream, stream])
-    joined = datasets.concatenate_datasets([stream, stream])
-
-    cast.to_parquet(tmp_path / "samples.parquet")
-
-    for each in (cast, mixed, joined):
-        sample = next(iter(each))
-        assert sample["left"].dtype == np.uint8
-        assert sample["pair"].shape == (2,)
-        assert each.features["left"] == datasets.Array3D(shape=(3, 64, 64), dtype="uint8")
-    rows = pq.read_table(tmp_path / "samples.parquet")
-    assert rows.schema.field("pair").type.value_type == pa.int32()
-    assert rows["__key__"].to_pylist() == keys(stream)
-    left = np.array(rows["left"][0].as_py(), dtype=np.uint8)
-    assert np.array_equal(left, next(iter(stream))["left"])
-
-
 def raw(urls, **options):
     return datasets.load_dataset(
         "webdataset", data_files={"train": urls}, features=huggingface.features(**options),
@@ -227,14 +172,6 @@ def test_a_scene_of_many_samples_is_mapped_in_batches_of_one(urls):
     assert len(set(keys(mapped))) == 4 * 15 * 2
     with pytest.raises(SelectionError, match=r"gives 30 samples, but map takes one per row"):
         next(iter(rows.map(decoder)))
-
-
-def test_raw_bytes_are_the_released_ones(urls, small_release):
-    row = next(iter(raw(urls)))
-
-    folder = small_release / row["__key__"]
-    assert row["cam_05_depth.mkv"] == (folder / "cam_05_depth.mkv").read_bytes()
-    assert row["baseline.json"]["pairwise_pairs"][14]["camera_index_b"] == 5
 
 
 def test_videos_that_datasets_decoded_are_refused(urls):

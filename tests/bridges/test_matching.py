@@ -191,17 +191,6 @@ def flat(batch):
 
 
 @pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
-def test_a_pass_draws_other_transforms_than_the_one_before(indexed_release, adapter, options):
-    dataset = adapter(indexed_release, transform=RandomCrop(16, 16), **options)
-    loader = dataset.loader(4, shuffle=False, drop_last=False)
-
-    first, second = (flat(next(iter([*loader]))) for _ in range(2))
-
-    name = next(key for key in first if torch.is_tensor(first[key]))
-    assert not torch.equal(first[name], second[name])
-
-
-@pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
 def test_what_the_project_cannot_take_is_refused(indexed_release, adapter, options):
     name = adapter.__name__
 

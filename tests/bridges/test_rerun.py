@@ -9,8 +9,8 @@ from PIL import Image
 
 from stereogenbench_data import SceneViews, StereoPairs
 from stereogenbench_data.bridges import rerun as bridge
-from stereogenbench_data.errors import ExtraError, SelectionError, StorageError
-from tests.servers.tools import require_module, small_disk
+from stereogenbench_data.errors import ExtraError, SelectionError
+from tests.servers.tools import require_module
 
 SCENE = "train/Uniform/SynthStage/scene_000001"
 
@@ -121,21 +121,6 @@ def test_the_time_of_a_frame_follows_from_its_rate(rerun, indexed_release, tmp_p
     assert seconds == pytest.approx(3 / 15)
 
 
-def test_wide_pictures_are_made_smaller_unless_a_size_is_asked_for(
-    rerun, indexed_release, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(bridge, "USUAL_WIDTH_PX", 40)
-    sizes = []
-    for size in (None, (50, 60)):
-        bridge.write_recording(tmp_path / "a.rrd", indexed_release, frames="first", size=size)
-        (resolution,) = read_back(tmp_path / "a.rrd")[
-            "/world/cam_00", "Pinhole:resolution"
-        ].values()
-        sizes.append(list(resolution))
-
-    assert sizes == [[40, 40], [60, 50]]
-
-
 def test_a_recording_of_ones_own_takes_a_scene(rerun, indexed_release, tmp_path):
     recording = rerun.RecordingStream("mine")
     recording.save(tmp_path / "mine.rrd")
@@ -162,15 +147,6 @@ def test_what_a_scene_does_not_have_is_refused_and_the_file_that_was_there_stays
             bridge.write_recording(path, indexed_release, **asked)
     assert [each.name for each in tmp_path.iterdir()] == ["a.rrd"]
     assert path.read_bytes() == b"before"
-
-
-def test_a_full_disk_is_named_and_the_file_that_was_there_stays(rerun, indexed_release, tmp_path):
-    with small_disk(tmp_path / "disk", size="100k") as disk:
-        (disk / "a.rrd").write_bytes(b"before")
-        with pytest.raises(StorageError, match=r"a\.rrd: cannot be written .*Make room"):
-            bridge.write_recording(disk / "a.rrd", indexed_release, frames=[0, 3])
-        assert [each.name for each in disk.iterdir()] == ["a.rrd"]
-        assert (disk / "a.rrd").read_bytes() == b"before"
 
 
 def test_without_rerun_the_extra_is_named(indexed_release, tmp_path, monkeypatch):

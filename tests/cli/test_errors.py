@@ -9,7 +9,6 @@ import warnings
 from pathlib import Path
 
 import pytest
-import typer
 
 from stereogenbench_data.cli.errors import ErrorsReported
 from stereogenbench_data.errors import ExtraError, SelectionError
@@ -73,13 +72,6 @@ def test_an_error_that_nobody_expected_shows_where_it_arose(capsys):
 
     assert ended.value.code == 2
     assert "in broken\n" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("error", [typer.Exit(1), typer.BadParameter("no"), SystemExit(3)])
-def test_exits_and_usage_errors_pass(error, capsys):
-    with pytest.raises(type(error)), ErrorsReported():
-        raise error
-    assert capsys.readouterr().err == ""
 
 
 def test_a_warning_is_one_line_and_afterwards_looks_as_before(capsys):

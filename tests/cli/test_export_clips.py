@@ -3,13 +3,12 @@
 import json
 
 import pytest
-from typer.testing import CliRunner
 
-from stereogenbench_data.cli.commands import app
+from tests.cli.command import invoke, one_line
 
 
 def run(*words):
-    return CliRunner().invoke(app, ["export", "clips", *map(str, words)], env={"COLUMNS": "300"})
+    return invoke("export", "clips", *words, env={"COLUMNS": "300"})
 
 
 def records(out):
@@ -62,6 +61,6 @@ def test_what_cannot_be_is_refused_with_its_cure(indexed_release, tmp_path, word
     shown = run(indexed_release, tmp_path / "out", "--layout", "musubi", "--split", "train", *words)
 
     assert shown.exit_code == 2, shown.output
-    text = " ".join(shown.stderr.replace("│", " ").split())
+    text = one_line(shown.stderr)
     assert all(word in text for word in said), text
     assert not (tmp_path / "out").exists()

@@ -3,15 +3,10 @@
 import json
 
 import pytest
-from typer.testing import CliRunner
 
-from stereogenbench_data.cli.commands import app
+from tests.cli.command import invoke, one_line
 
 USUAL = ("--size", "16x16", "--workers", "1")
-
-
-def run(*arguments):
-    return CliRunner().invoke(app, [str(each) for each in arguments])
 
 
 @pytest.mark.parametrize(
@@ -26,7 +21,7 @@ def run(*arguments):
 def test_training_scenes_are_exported_and_those_left_out_are_counted(
     indexed_release, tmp_path, name, file
 ):
-    done = run("export", name, indexed_release, tmp_path, *USUAL)
+    done = invoke("export", name, indexed_release, tmp_path, *USUAL)
 
     assert done.exit_code == 0, done.output
     assert done.stdout == f"{tmp_path}: 3 folders\n"
@@ -36,7 +31,7 @@ def test_training_scenes_are_exported_and_those_left_out_are_counted(
 
 
 def test_filters_cameras_frames_and_points_are_taken(indexed_release, tmp_path):
-    done = run(
+    done = invoke(
         "export", "ply", indexed_release, tmp_path, *USUAL, "--where", "family=Uniform",
         "--cameras", "0,5", "--frames", "every:3", "--points", "all",
     )  # fmt: skip
@@ -49,7 +44,9 @@ def test_filters_cameras_frames_and_points_are_taken(indexed_release, tmp_path):
 
 
 def test_evaluation_scenes_that_would_not_match_are_not_counted(indexed_release, tmp_path):
-    done = run("export", "ply", indexed_release, tmp_path, *USUAL, "--where", "family=IPD_Gaussian")
+    done = invoke(
+        "export", "ply", indexed_release, tmp_path, *USUAL, "--where", "family=IPD_Gaussian"
+    )
 
     assert done.stdout == f"{tmp_path}: 1 folder\n"
     assert "left out" not in done.stderr
@@ -65,8 +62,8 @@ def test_evaluation_scenes_that_would_not_match_are_not_counted(indexed_release,
     ],
 )
 def test_a_text_that_is_not_understood_is_named(indexed_release, tmp_path, options, message):
-    done = run("export", "ply", indexed_release, tmp_path / "out", *options)
+    done = invoke("export", "ply", indexed_release, tmp_path / "out", *options)
 
     assert done.exit_code == 2
-    assert message in " ".join(done.output.replace("│", " ").split())
+    assert message in one_line(done.output)
     assert not (tmp_path / "out").exists()

@@ -2,59 +2,13 @@
 
 import shutil
 import subprocess
-from dataclasses import dataclass
-from typing import Annotated
 
 import imageio_ffmpeg
 import pytest
-import typer
-from typer.testing import CliRunner
 
-from stereogenbench_data.cli.options import DataOptions, SceneOptions, filter_of, grouped
+from stereogenbench_data.cli.options import DataOptions, SceneOptions, filter_of
 from stereogenbench_data.samples.fields import SwappedSizeWarning
 from tests.cli.command import invoke, one_line
-
-
-@dataclass(frozen=True, kw_only=True)
-class Place:
-    where: Annotated[str, typer.Argument(help="Where.")]
-    floor: Annotated[int, typer.Option(help="Which floor.")] = 0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Attic(Place):
-    floor: Annotated[int, typer.Option(help="Which floor.")] = 9
-
-
-def command_of(place):
-    @grouped
-    def look(here: place, what: Annotated[str, typer.Argument()], *, loud: bool = False) -> None:
-        typer.echo(f"{what} in {here.where} on {here.floor} {type(here).__name__} {loud}")
-
-    alone = typer.Typer()
-    alone.command()(look)
-    return alone
-
-
-@pytest.mark.parametrize(
-    ("place", "words", "printed"),
-    [
-        (Place, ["house", "cat"], "cat in house on 0 Place False"),
-        (Place, ["house", "cat", "--floor", "3", "--loud"], "cat in house on 3 Place True"),
-        (Attic, ["house", "cat"], "cat in house on 9 Attic False"),
-    ],
-)
-def test_a_group_of_options_is_one_parameter_of_the_command(place, words, printed):
-    shown = CliRunner().invoke(command_of(place), words)
-
-    assert (shown.exit_code, shown.stdout.strip()) == (0, printed)
-
-
-def test_what_a_group_requires_is_required_of_the_command():
-    shown = CliRunner().invoke(command_of(Place), [])
-
-    assert shown.exit_code == 2
-    assert "Usage" in shown.stderr
 
 
 def refused(*words):

@@ -84,16 +84,6 @@ def test_a_full_disk_leaves_no_empty_picture_and_keeps_the_one_before(small_shar
     assert "(No space left on device). Make room, or choose another place." in new.stderr
 
 
-def test_a_report_that_cannot_be_written_leaves_the_one_before(tmp_path):
-    report = tmp_path / "new" / "report.md"
-    write_report(report, "first")
-    with files_of_at_most(2), pytest.raises(OSError, match=r"report\.md"):
-        write_report(report, "second")
-
-    assert report.read_text() == "first"
-    assert list(report.parent.iterdir()) == [report]
-
-
 def test_a_report_may_go_through_a_link_or_a_pipe(tmp_path):
     link, target, pipe = tmp_path / "link.md", tmp_path / "target.md", tmp_path / "pipe"
     target.write_text("before")
@@ -167,21 +157,6 @@ def test_a_log_gets_progress_line_by_line_as_time_passes(printed_progress):
 
     assert [line.split("MB")[0].split()[-1] for line in often] == ["1/3", "2/3", "3/3", "3/3"]
     assert len(seldom) == 1
-
-
-def test_a_bar_that_counted_nothing_leaves_no_line(printed_progress):
-    assert printed_progress(width=80, every_s=60, done_mb=()) == []
-    assert printed_progress(width=80, every_s=60, done_mb=(0,)) == []
-
-
-def test_a_bar_that_counted_nothing_is_taken_off_the_terminal(monkeypatch, capsys):
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.setenv("TERM", "xterm")
-    with pytest.raises(KeyError), progress_bar("packing", unit="MB"):
-        raise KeyError
-    up_and_erased = "\x1b[1A\x1b[2K"
-
-    assert capsys.readouterr().err.endswith(up_and_erased)
 
 
 @pytest.mark.parametrize(

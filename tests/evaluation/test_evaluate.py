@@ -2,10 +2,9 @@
 
 import json
 import math
+import os
 import shutil
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import ClassVar
 
@@ -21,10 +20,8 @@ from stereogenbench_data.errors import FieldError, PredictionError, StorageError
 from stereogenbench_data.evaluation.models import i3d, inception
 from stereogenbench_data.evaluation.predictions import frame_name, item_name
 from stereogenbench_data.schema.release import rgb_name
-from stereogenbench_data.shards.pack import pack
 from tests.evaluation.conftest import FRAMES, SIZE, numbers, rendered, scored, write_pngs
-from tests.servers.failing_server import serving
-from tests.servers.tools import require_module
+from tests.servers.tools import killed_fork
 
 
 def keys(index):
@@ -159,17 +156,6 @@ def test_a_png_identical_to_the_rendered_view_scores_infinitely(
     assert [pair.tallies["ssim"].mean for pair in scores.pairs] == [1.0] * 3
 
 
-def test_all_pairs_are_scored_with_one_prediction_each(scored_index, protocol, tmp_path):
-    scores = scored(
-        scored_index, lambda inputs: inputs["left"], protocol, pairs="all", frames=[0],
-        scenes=keys(scored_index)[0],
-    )  # fmt: skip
-
-    assert len(scores.pairs) == 15
-    assert [pair.pair for pair in scores.pairs if pair.is_primary] == [(0, 1)]
-    assert all(pair.tallies["psnr"].finite == 1 for pair in scores.pairs)
-
-
 def test_a_missing_prediction_is_an_error_before_anything_is_scored(scored_index, copied, protocol):
     scene = keys(scored_index)[1]
     shutil.rmtree(copied / item_name(scene, (0, 1)))
@@ -201,26 +187,17 @@ def test_a_prediction_that_is_not_right_is_an_error_or_a_counted_gap(
 
 
 def test_an_evaluation_that_was_killed_goes_on_with_what_it_has(scored_index, protocol, tmp_path):
-    out, scenes = tmp_path / "out", tmp_path / "out" / "scenes"
-    script = f"""
-import os, signal
-from stereogenbench_data import EvaluationProtocol, evaluate
-from stereogenbench_data.index.table import SceneIndex
+    out = tmp_path / "out"
+    batches = []
 
-batches = []
+    def killed(inputs):
+        batches.append(inputs)
+        if len(batches) == 4:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return inputs["left"]
 
-def lefts(inputs):
-    batches.append(inputs)
-    if len(batches) == 4:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return inputs["left"]
-
-protocol = EvaluationProtocol(metrics=("psnr", "ssim", "p_psnr"), size={SIZE}, batch_frames=3)
-index = SceneIndex.open({scored_index.root!r})
-evaluate(index, lefts, tier="G1", protocol=protocol, out={str(out)!r})
-"""
-    killed = subprocess.run([sys.executable, "-c", script], check=False, timeout=120)
-    (kept,) = scenes.glob("*.pt")
+    assert killed_fork(lambda: scored(scored_index, killed, protocol, name="lefts", out=out))
+    (kept,) = (out / "scenes").glob("*.pt")
     before = kept.stat().st_mtime_ns
     calls = []
 
@@ -230,7 +207,6 @@ evaluate(index, lefts, tier="G1", protocol=protocol, out={str(out)!r})
 
     resumed = scored(scored_index, lefts, protocol, out=out)
 
-    assert killed.returncode == -signal.SIGKILL
     assert kept.stat().st_mtime_ns == before
     assert sum(calls) == 2 * FRAMES
     assert numbers(resumed) == numbers(scored(scored_index, lefts, protocol))
@@ -354,46 +330,6 @@ def test_a_folder_that_is_none_is_refused(scored_index, protocol, tmp_path):
         scored(scored_index, tmp_path / "nowhere", protocol)
 
 
-def test_each_view_is_decoded_once_for_all_pairs(scored_index, protocol, monkeypatch):
-    from stereogenbench_data.media.decoder import Decoder
-
-    decoded = []
-    reach = Decoder.reach
-
-    def counted(self, index):
-        decoded.append((id(self), index))
-        return reach(self, index)
-
-    monkeypatch.setattr(Decoder, "reach", counted)
-    scored(
-        scored_index, lambda inputs: inputs["left"], protocol, tier="G2", pairs="all",
-        scenes=keys(scored_index)[0],
-    )  # fmt: skip
-
-    # Six colour videos, and the depth of the five cameras that are left of another.
-    assert len(decoded) == 11 * FRAMES
-
-
-def test_what_metrics_are_computed_with_is_loaded_once_for_all_scenes(
-    scored_index, right_views, monkeypatch
-):
-    from stereogenbench_data.evaluation import scene_scores
-
-    loaded = []
-    load = scene_scores.load_model
-
-    def counted(*arguments, **options):
-        loaded.append(arguments)
-        return load(*arguments, **options)
-
-    monkeypatch.setattr(scene_scores, "load_model", counted)
-    matches = EvaluationProtocol(metrics=("e_match",), size=SIZE)
-    scored(scored_index, right_views, matches, frames=[0])
-
-    assert len(loaded) == 1
-    assert scene_scores.model_of.cache_info().currsize == 0
-
-
 def test_progress_counts_frames_of_pairs_up_to_all(scored_index, right_views, protocol):
     told = []
     scored(scored_index, right_views, protocol, progress=lambda *counts: told.append(counts))
@@ -429,18 +365,6 @@ def test_predictions_of_some_frames_suffice_where_these_are_scored(
     scores = scored(scored_index, folder, protocol, frames=("every", 2))
 
     assert [pair.frames for pair in scores.pairs] == [2, 2, 2]
-
-
-def test_packed_depth_and_a_url_score_as_the_tree(scored_index, right_views, tmp_path):
-    require_module("blosc2")
-    protocol = EvaluationProtocol(metrics=("psnr", "p_psnr"), size=SIZE)
-    shards = tmp_path / "shards"
-    pack(Path(scored_index.root), shards, workers=1, depth_codec="blosc2")
-    with serving(shards) as server:
-        places = [scored_index, shards, server.url]
-        results = [scored(place, right_views, protocol, frames=[0, 3]) for place in places]
-
-    assert numbers(results[0]) == numbers(results[1]) == numbers(results[2])
 
 
 def test_baselines_that_poses_contradict_are_not_scored_by_any_metric(

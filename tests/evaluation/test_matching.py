@@ -92,14 +92,6 @@ def test_where_only_one_side_matches_the_error_is_whole_and_where_none_does_ther
     assert math.isnan(error_of(listed, NOTHING, target=NOTHING)["e_match"])
 
 
-def test_left_keypoints_are_detected_once_for_all_predictions(listed):
-    against = target_matches(view(LEFT), view(TARGET), matcher=listed)
-    for predicted in (TARGET, PREDICTED):
-        match_error(view(predicted), against=against, matcher=listed)
-
-    assert listed.detected == [LEFT, TARGET, TARGET, PREDICTED]
-
-
 def described(*values: float) -> Keypoints:
     return Keypoints(
         xy_px=np.zeros((len(values), 2), dtype=np.float32),

@@ -85,17 +85,6 @@ def test_both_fits_are_those_of_scipy_with_and_without_what_lies_off_the_line(se
     assert plain.drift > 2 * filtered.drift
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_an_unrelated_disparity_drifts_by_about_1(method):
-    rng = np.random.default_rng(2)
-    estimated, truth = (rng.uniform(0, 60, (200, 200)) for _ in range(2))
-
-    fit = fit_scale(estimated, truth, scored=np.ones((200, 200), dtype=bool), method=method)
-
-    assert fit.drift == pytest.approx(1, abs=0.05)
-    assert abs(fit.r2) < 0.01
-
-
 @given(factor=st.floats(0.1, 10), offset=st.floats(-50, 50))
 def test_any_line_is_found(factor, offset):
     estimated = np.random.default_rng(4).uniform(0, 50, SIZE)
@@ -165,15 +154,6 @@ def test_sgbm_on_a_photographed_pair_has_the_true_scale(cloth, sgbm):
     assert fit.answered > 0.7
 
 
-def test_sgbm_tells_a_view_that_is_not_shifted_by_a_huge_scale(cloth, sgbm):
-    left, _, disparity = cloth
-
-    fit = fit_scale(sgbm(left, left), disparity, scored=disparity > 0)
-
-    assert fit.drift > 10
-    assert fit.r2 < 0.05
-
-
 def test_sgbm_gives_a_known_shift_and_nothing_where_its_search_leaves_the_picture(sgbm):
     wide = np.random.default_rng(0).integers(0, 256, (3, 60, 300)).astype(np.uint8)
 
@@ -185,14 +165,6 @@ def test_sgbm_gives_a_known_shift_and_nothing_where_its_search_leaves_the_pictur
     assert np.isnan(disparity[:, -16:]).all()
     assert np.median(disparity[10:-10, 140:250]) == 20
     assert np.isfinite(disparity[10:-10, 140:250]).all()
-
-
-def test_sgbm_also_gives_a_small_negative_shift(sgbm):
-    wide = np.random.default_rng(1).integers(0, 256, (3, 60, 300)).astype(np.uint8)
-
-    disparity = sgbm(wide[..., 8:], wide[..., :-8])
-
-    assert np.nanmedian(disparity) == -8
 
 
 def test_pictures_narrower_than_the_search_are_refused():

@@ -104,14 +104,6 @@ def test_bins_are_in_order_with_the_papers_beside(scores):
     assert table.rows[1].values["psnr"] == "21.69 ± 1.04"
 
 
-def test_all_pairs_have_a_table_of_their_own(scores):
-    names = [table.name for table in tables_of([scores()])]
-    table = table_of([scores()], "bins_all")
-
-    assert names == ["branches", "bins_primary", "bins_all", "explanations"]
-    assert ("ours", "unseen_map", "IPD_Gaussian", "[10,30)") in rows(table)
-
-
 def test_a_column_of_the_index_makes_strata(scores, scored_index):
     by_map = stratum_table([scores()], "map_name")
     by_focal = stratum_table([scores()], "focal_mm")
@@ -174,26 +166,6 @@ def test_identical_and_undefined_frames_are_counted_in_the_cell(scores):
     assert "(2 undefined)" in text
 
 
-def test_every_form_of_a_report_has_sd_by_both_fits_and_says_why(scores, tmp_path):
-    one = scores()
-    files = {path.name: path for path in write_report(tmp_path, [one], tables_of([one]))}
-    texts = {name: path.read_text() for name, path in files.items() if path.suffix != ".png"}
-    told = json.loads(texts["results.json"])
-    head = texts["pairs.csv"].partition("\n")[0].split(",")
-
-    assert {"sd_filtered", "sd_least_squares"} <= set(head)
-    assert "sd" not in head
-    for table in told["tables"][:3]:
-        assert table["columns"]["sd_filtered"] == "SD filtered (sgbm)↓ [median]"
-        assert table["columns"]["sd_least_squares"] == "SD least squares (sgbm)↓ [median]"
-        cells = table["rows"][0]["values"]
-        assert (cells["sd_filtered"]["mean"], cells["sd_least_squares"]["mean"]) == (0.5, 1)
-        assert any("does not state its rule for outliers" in note for note in table["notes"])
-    for words in ("SD filtered", "SD least squares", "does not state its rule for outliers"):
-        assert words in texts["report.md"]
-    assert {"sd_filtered_by_baseline.png", "sd_least_squares_by_baseline.png"} <= set(files)
-
-
 def test_a_gap_is_a_column_of_the_table(scores):
     whole = scores()
     gap = PairMeans(
@@ -239,11 +211,6 @@ def test_no_output_holds_nan_and_json_reads_back(scores, tmp_path):
     assert told["tables"][0]["rows"][0]["values"]["psnr"]["infinite"] == 2
     pairs = list(csv.DictReader(io.StringIO((tmp_path / "pairs.csv").read_text())))
     assert [line["psnr"] for line in pairs] == ["inf", "22.0", "", "8.0"]
-
-
-def test_a_table_needs_a_method():
-    with pytest.raises(EvaluationError, match="at least one method, got none"):
-        tables_of([])
 
 
 def test_latex_has_its_signs_escaped_and_its_columns_counted(scores):

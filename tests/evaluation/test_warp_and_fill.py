@@ -20,10 +20,6 @@ def warp_and_fill():
     return module.warp_and_fill
 
 
-def test_the_example_has_at_most_60_lines():
-    assert len(EXAMPLE.read_text().splitlines()) <= 60
-
-
 def test_holes_take_the_next_pixel_to_the_right_else_to_the_left(warp_and_fill):
     row = torch.tensor([0, 5, 0, 0, 7, 0], dtype=torch.uint8)
     inputs = {

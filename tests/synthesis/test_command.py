@@ -25,22 +25,6 @@ def test_the_command_writes_scenes_and_says_where(tmp_path):
     assert "depth_unit_m=0.1, " in first.read_text()
 
 
-def test_an_impossible_request_ends_the_command(tmp_path):
-    with pytest.raises(SynthesisError, match="Pairwise_Uniform exists only in train"):
-        CliRunner().invoke(
-            app,
-            [str(tmp_path), *SMALL, "--family", "Pairwise_Uniform", "--split", "eval"],
-            catch_exceptions=False,
-        )
-
-
-def test_assets_that_cannot_be_read_end_the_command(tmp_path):
-    options = ["--assets", f"{tmp_path}/absent.toml"]
-
-    with pytest.raises(SynthesisError, match=r"absent\.toml: cannot be read"):
-        CliRunner().invoke(app, [f"{tmp_path}/out", *SMALL, *options], catch_exceptions=False)
-
-
 def test_all_maps_and_a_map_of_its_own_contradict_each_other(tmp_path):
     options = ["--map", "all", "--map", "SynthRoom"]
 
@@ -74,10 +58,3 @@ def test_what_is_no_part_is_told(tmp_path, part):
     assert "--part" in result.stderr
     assert f"{part!r} is not a part: write I/N" in " ".join(result.stderr.split())
     assert not list(tmp_path.iterdir())
-
-
-def test_a_part_without_scenes_says_so(tmp_path):
-    result = CliRunner().invoke(app, [str(tmp_path), *SMALL, "--part", "2/2"])
-
-    assert result.exit_code == 0
-    assert "0 scenes (part 2/2 of 1 has none" in result.stdout

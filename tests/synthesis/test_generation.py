@@ -71,21 +71,6 @@ def test_a_proposal_follows_from_its_numbers_alone(family, seed, index, number):
     assert 18 <= first.focal_mm <= 85
 
 
-def test_realised_baselines_are_those_of_the_accepted_proposal():
-    plan = plan_scene(SynthRequest(family="Uniform", map_name="SynthHall", size_px=64), index=0)[0]
-
-    for frame in (0, 40, 80):
-        gaps_cm = np.linalg.norm(np.diff(plan.world_locations_cm(frame), axis=0), axis=1)
-        np.testing.assert_allclose(gaps_cm, np.diff(plan.proposal.places_cm), rtol=0, atol=1e-9)
-
-
-def test_the_poses_are_rounded_so_that_processors_agree():
-    plan = plan_scene(SynthRequest(map_name="SynthYard", size_px=64, frames=9), index=0)[0]
-
-    for values in (plan.centres_m, plan.rotators_deg, plan.spawn.place_m):
-        np.testing.assert_array_equal(values, np.round(values, 6))
-
-
 # Parts and resuming.
 
 

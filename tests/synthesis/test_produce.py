@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 
-from stereogenbench_data.errors import StorageError, SynthesisError
+from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.media.encoder import VideoWriter
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
@@ -36,17 +36,6 @@ def test_scenes_are_written_to_the_folders_of_the_release(tmp_path, request_, ke
     assert synthesise(tmp_path, request_) == [key]
     assert {path.name for path in tmp_path.iterdir()} == {key.split("/")[0], ".generation"}
     assert len(contents(tmp_path / key)) == 17
-
-
-@pytest.mark.parametrize("other", [{"seed": 10}, {"split": "eval"}, {"map_name": "SynthPark"}])
-def test_another_seed_or_folder_gives_another_scene(tmp_path, other):
-    (first,) = synthesise(tmp_path / "first", SynthRequest(**SMALL))
-    (second,) = synthesise(tmp_path / "second", SynthRequest(**(SMALL | other)))
-
-    name = "cam_00_depth.mkv"
-    assert (tmp_path / "first" / first / name).read_bytes() != (
-        tmp_path / "second" / second / name
-    ).read_bytes()
 
 
 def test_progress_counts_camera_frames_up_to_all(tmp_path):
@@ -147,21 +136,3 @@ def test_two_runs_do_not_draw_the_same_part_at_once(tmp_path):
     first = synthesise(tmp_path, request, part=(1, 2), progress=second_run)
 
     assert [len(contents(tmp_path / key)) for key in first] == [17, 17]
-
-
-def test_parts_that_share_scenes_may_run_side_by_side(tmp_path):
-    request = SynthRequest(scenes=2, **SMALL)
-
-    def second_run(done, total):
-        if done == 6:
-            assert len(synthesise(tmp_path, request)) == 2
-
-    (first,) = synthesise(tmp_path, request, part=(1, 2), progress=second_run)
-
-    assert len(contents(tmp_path / first)) == 17
-    assert not list(tmp_path.glob(".generation/*/"))
-
-
-def test_no_workers_are_refused(tmp_path):
-    with pytest.raises(StorageError, match="workers must be at least 1, got 0"):
-        synthesise(tmp_path, SynthRequest(**SMALL), workers=0)

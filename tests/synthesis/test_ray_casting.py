@@ -82,14 +82,6 @@ def test_a_nearer_shape_hides_a_farther_one_in_either_order():
     assert first[2, 0] == pytest.approx(4.1)
 
 
-def test_a_shape_behind_the_camera_is_not_seen():
-    behind = Shape("box", np.array([-3.0, 0.0, 2.0]), np.eye(3), np.full(3, 1.0), STONE)
-
-    depth_m, _ = depth_of([behind], view_from([0.0, 0.0, 2.0]))
-
-    assert depth_m[2, 2] == np.inf
-
-
 @pytest.mark.parametrize("index", range(2))
 def test_every_hit_lies_on_the_surface_of_its_solid(index):
     """Independent of how it was found: the point at that depth fulfils the solid's equation."""
