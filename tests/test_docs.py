@@ -71,17 +71,6 @@ def test_the_page_of_commands_names_every_command_and_option(built):
             assert option in page or not option.startswith("--"), f"{name} {option}"
 
 
-def test_examples_in_docstrings_are_shown_as_code_that_a_reader_can_type(built):
-    _, site = built
-    page = (site / "api" / "index.html").read_text()
-
-    blocks = re.findall(r'<div class="highlight">.*?</div>', page, flags=re.DOTALL)
-    prompts = sum(block.count("&gt;&gt;&gt; ") for block in blocks)
-    assert prompts == page.count("&gt;&gt;&gt; ") > 5
-    assert "getfixture" not in page
-    assert "doctest:" not in page
-
-
 def test_the_tables_of_fields_in_the_file_are_those_of_the_code():
     """`python docs/generated_pages.py` writes them anew."""
     page = (HOME / "docs" / "samples.md").read_text()

@@ -8,12 +8,7 @@ from stereogenbench_data.bridges.clips import export_clips
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.jobs import job_folder
 from stereogenbench_data.media.encoder import Encoding
-
-
-def files_of(root):
-    return {
-        str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()
-    }
+from tests.servers.tools import files_of
 
 
 def test_of_two_jobs_at_once_one_is_whole_and_the_other_refused(indexed_release, tmp_path):

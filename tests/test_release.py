@@ -42,20 +42,6 @@ def test_the_first_release_is_dated_and_linked(release):
     )
 
 
-def test_a_later_release_is_compared_with_the_one_before(release):
-    first = release.dated(ENTRIES, version="0.1.0", day="2026-11-22")
-    entries = first.replace("## [Unreleased]\n", "## [Unreleased]\n\n### Fixed\n- Another.\n")
-
-    text = release.dated(entries, version="0.2.0", day="2026-12-24")
-
-    assert text.index("## [0.2.0] - 2026-12-24") < text.index("- Another.")
-    assert text.index("- Another.") < text.index("## [0.1.0] - 2026-11-22")
-    assert text.endswith(
-        "[Unreleased]: ../../compare/v0.2.0...HEAD\n"
-        "[0.2.0]: ../../compare/v0.1.0...v0.2.0\n[0.1.0]: ../../releases/tag/v0.1.0\n"
-    )
-
-
 def test_the_changelog_can_be_dated_and_its_links_are_those_of_its_headings(release):
     text = (HOME / "CHANGELOG.md").read_text()
     headings = set(re.findall(r"^## \[(.+?)\]", text, re.MULTILINE))

@@ -1,4 +1,4 @@
-"""An index of 8,493 scenes whose statistics are those that the paper prints, built from nothing.
+"""An index of 8,493 scenes with the statistics that the paper prints, but for those of all pairs.
 
 What the paper tells of a family's baselines (count, least, largest, mean, standard deviation,
 median) fixes a list of numbers up to its shape; that shape is two power laws, found by scipy.
@@ -55,18 +55,16 @@ def paper_scenes():
     adjacent = {
         ("train", "IPD_Gaussian"): spread_out(16445, 4.5278, 8.3867, 6.3813, 0.4998, 6.3813),
         ("train", "Uniform"): spread_out(3870, 1.0113, 149.8906, 52.7908, 38.95, 43.2916),
-        ("train", "Pairwise_Uniform"): _pairwise_adjacent(),
+        ("train", "Pairwise_Uniform"): spread_out(18455, 5.1117, 123.2309, 38.6091, 20.7742, 36.0),
         ("eval", "IPD_Gaussian"): spread_out(1780, 4.7119, 8.3332, 6.3743, 0.5052, 6.3743),
         ("eval", "Uniform"): spread_out(1915, 1.0058, 149.7889, 50.6741, 39.1111, 41.6438),
     }
     scenes = []
     for (split, family), values in adjacent.items():
         places = _places(split, family)
-        rows = _in_rows(values, places, rng=rng)
-        others = _others(rows) if family == "Pairwise_Uniform" else None
+        rows = _in_rows(values, rng=rng)
         scenes += [
-            _scene(split, family, subset, name, number, rows[number],
-                   None if others is None else others[number])
+            _scene(split, family, subset, name, number, rows[number])
             for number, (subset, name) in enumerate(places)
         ]  # fmt: skip
     return scenes
@@ -83,43 +81,8 @@ def _places(split, family):
     ]
 
 
-def _pairwise_adjacent():
-    """Return 18,455 gaps of which 150, which come first, are below 10 cm."""
-    short = np.linspace(5.1117, 9.9, 150)
-    count, mean, std = 18455 - 150, 38.6091, 20.7742
-    rest_mean = (18455 * mean - short.sum()) / count
-    square = (18455 * (std**2 + mean**2) - (short**2).sum()) / count
-    rest = spread_out(count, 10.0, 123.2309, rest_mean, (square - rest_mean**2) ** 0.5, 36.0)
-    return np.concatenate([short, rest])
-
-
-def _others(rows):
-    """Return the ten baselines beside the adjacent ones, so that all 15 are as the paper says."""
-    count, mean, std = 55365, 97.7615, 56.7814
-    others = count - rows.size
-    others_mean = (count * mean - rows.sum()) / others
-    square = (count * (std**2 + mean**2) - (rows**2).sum()) / others
-    others_std = (square - others_mean**2) ** 0.5
-
-    def made(median):
-        return spread_out(others, 12.0, 199.9969, others_mean, others_std, median)
-
-    low, high = 95.0, 170.0
-    for _ in range(60):
-        middle = (low + high) / 2
-        is_low = np.median(np.concatenate([rows.ravel(), made(middle)])) < 93.3603
-        low, high = (middle, high) if is_low else (low, middle)
-    return made(middle).reshape(len(rows), 10)
-
-
-def _in_rows(values, places, *, rng):
-    """Return five gaps a scene, the short ones and those of the paper's bins where they belong."""
-    if len(values) == 18455:
-        rows = np.empty((len(places), 5))
-        short = np.array([name == "UndergroundSciFi" for _, name in places])
-        rows[short] = values[:150].reshape(-1, 5)
-        rows[~short] = rng.permutation(values[150:]).reshape(-1, 5)
-        return rows
+def _in_rows(values, *, rng):
+    """Return five gaps a scene, of the primary pairs those of the paper's bins."""
     values = rng.permutation(values)
     if len(values) != 1915:
         return values.reshape(-1, 5)
@@ -132,12 +95,10 @@ def _in_rows(values, places, *, rng):
     return np.column_stack([values[primary], values[rest[102:]].reshape(-1, 4)])
 
 
-def _scene(split, family, subset, name, number, gaps, others):
+def _scene(split, family, subset, name, number, gaps):
     baselines = np.empty(15)
     baselines[ADJACENT] = gaps
     baselines[OTHERS] = [gaps[a:b].sum() for a in range(5) for b in range(a + 2, 6)]
-    if others is not None:
-        baselines[OTHERS] = others
     folder = {None: "", "seen_map": "MapSeenInTrain/", "unseen_map": "MapUnseen/"}[subset]
     key = f"{split}/{folder}{family}/{name}/scene_{number:06d}"
     focal_mm = 18.0 + 67.0 * (number % 100) / 99

@@ -358,6 +358,19 @@ def test_the_address_is_a_link_to_filters_sample_and_view(page):
     assert page.hash() == link
 
 
+def test_a_link_that_is_pasted_into_the_open_page_changes_it(page):
+    page.filter("split", "train")
+    page.until(lambda: "split=train" in page.hash())
+    page.script("location.hash = 'key=scene_000133&pair=0-3&frame=4&view=left'")
+    page.until(lambda: "scene_000133" in page.text("key") and page.text("frame-number") == "4 / 6")
+    page.until(lambda: page.text("count") == "160 scenes, 2,400 pairs")
+
+    page.until(lambda: "pairs=[(0, 3)], frames=4" in page.text("sample-line"))
+    assert page.script("return document.querySelectorAll('[data-pane]').length") == 1
+    page.script("location.hash = 'split=eval'")
+    page.until(lambda: page.text("count") == "40 scenes, 600 pairs")
+
+
 def test_a_link_to_a_scene_that_is_not_there_says_so(page):
     page.open("key=train/Uniform/SynthStage/scene_777777")
 
@@ -396,23 +409,6 @@ def screen(page):
     tell("Emulation.setEmulatedMedia", {"features": []})
 
 
-LUMINANCE = """
-const linear = (part) => part <= 0.03928 ? part / 12.92 : ((part + 0.055) / 1.055) ** 2.4;
-const of = (colour) => {
-  const [r, g, b] = colour.match(/[0-9.]+/g).map((each) => linear(each / 255));
-  return 0.2126 * r + 0.7152 * g + 0.0722 * b;
-};
-return [...document.querySelectorAll(arguments[0])].map((box) => {
-  let behind = box;
-  while (behind.parentElement && getComputedStyle(behind).backgroundColor === 'rgba(0, 0, 0, 0)') {
-    behind = behind.parentElement;
-  }
-  const [a, b] = [of(getComputedStyle(box).color), of(getComputedStyle(behind).backgroundColor)];
-  return (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
-});
-"""
-
-
 @pytest.mark.parametrize(("width", "scheme"), [(390, "dark"), (800, "light"), (1440, "dark")])
 def test_a_screen_shows_pictures_first_their_numbers_beside_and_nothing_beyond_the_edge(
     screen, width, scheme
@@ -422,13 +418,11 @@ def test_a_screen_shows_pictures_first_their_numbers_beside_and_nothing_beyond_t
     left, right, readout = map(
         page.box, ("[data-pane=left] canvas", "[data-pane=right] canvas", "#readout")
     )
-    contrasts = page.script(LUMINANCE, "#key, #facts, button, #readout dt, .facet b, .code pre")
 
     assert beyond <= 0
     assert left[0] >= 0
     assert right[2] <= width
     assert right[3] <= 844
-    assert min(contrasts) > 4.5
     if width == 390:
         assert left[2] - left[0] > 150
         assert left[3] < page.box("#pairs")[1] < page.box(".heading")[1]

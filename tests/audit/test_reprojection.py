@@ -65,15 +65,6 @@ def test_a_right_depth_that_is_off_gives_the_disparity_it_is_off_by(away_m, kept
     assert found.agreeing == (found.unhidden if kept else 0)
 
 
-def test_inverse_depth_has_the_step_of_its_distance():
-    # Stored is 4000 / depth: at 2 m one number more or less is 2 ** 2 / 4000 = 0.001 m.
-    near = compared(constant(2.0, step_m=4000.0, form="inverse"), constant(2.0018), beside(0.1))
-    off = compared(constant(2.0, step_m=4000.0, form="inverse"), constant(2.0022), beside(0.1))
-
-    assert near.errors_px[1].size > 0
-    assert off.errors_px[1].size == 0
-
-
 def test_pixels_behind_something_near_are_not_counted():
     left, right = constant(4.0), constant(4.0)
     # A box of 20 columns at 1 m: 10 px of disparity, where the wall has 2.5 px.

@@ -55,22 +55,6 @@ def test_rounds_that_are_there_are_not_run_again_when_resumed(results, material)
     assert results.race("all-frames")["rounds"] == before
 
 
-def test_the_limit_of_two_processes_counts_the_samples_of_both(material):
-    job = Job(TINY["all-frames"], material)
-
-    measured = clock.measured("limit", job, workers=2)
-
-    assert measured.samples == len(job.wanted) == 4
-
-
-def test_a_contestant_that_fails_says_so(material):
-    def fail():
-        raise ValueError("no such thing")
-
-    with pytest.raises(clock.MeasurementError, match="ValueError: no such thing"):
-        clock.in_a_fork(fail)
-
-
 def test_a_contestant_that_hangs_is_stopped():
     with pytest.raises(clock.MeasurementError, match=r"took longer than 0\.05 s"):
         clock.in_a_fork(lambda: time.sleep(60), longest_s=0.05)

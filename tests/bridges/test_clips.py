@@ -16,7 +16,7 @@ from stereogenbench_data.bridges.clips import export_clips
 from stereogenbench_data.errors import MediaError, StorageError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.encoder import Encoding
-from tests.servers.tools import kill_at, killed_fork, small_disk
+from tests.servers.tools import files_of, kill_at, killed_fork, small_disk
 
 FIELDS = ("left", "right", "warped_right", "hole", "disparity", "depth", "valid", "baseline_m",
           "frame_rate_hz", "caption", "scene", "split", "pair")  # fmt: skip
@@ -206,12 +206,7 @@ def test_the_same_export_is_the_same_bytes_with_more_processes(indexed_release, 
     second = exported(indexed_release, tmp_path / "two", workers=2)
 
     assert first.written == second.written
-    assert contents(tmp_path / "one") == contents(tmp_path / "two")
-
-
-def contents(out):
-    files = [path for path in out.rglob("*") if path.is_file() and path.name != ".export.lock"]
-    return {str(path.relative_to(out)): path.read_bytes() for path in files}
+    assert files_of(tmp_path / "one") == files_of(tmp_path / "two")
 
 
 def test_clips_may_overlap_and_have_their_own_names(indexed_release, tmp_path):
@@ -228,19 +223,19 @@ def test_clips_may_overlap_and_have_their_own_names(indexed_release, tmp_path):
 
 def test_a_run_that_is_repeated_keeps_what_is_finished(indexed_release, tmp_path):
     first = exported(indexed_release, tmp_path)
-    before = contents(tmp_path)
+    before = files_of(tmp_path)
 
     again = exported(indexed_release, tmp_path)
 
     assert (len(first.written), first.kept) == (3, ())
     assert (again.written, again.kept) == ((), first.written)
-    assert contents(tmp_path) == before
+    assert files_of(tmp_path) == before
 
 
 @pytest.mark.parametrize("damage", ["video cut", "record removed", "mask removed"])
 def test_a_clip_that_is_not_whole_is_written_again(indexed_release, tmp_path, damage):
     names = exported(indexed_release, tmp_path).written
-    before = contents(tmp_path)
+    before = files_of(tmp_path)
     video = tmp_path / "right" / f"{names[1]}.mp4"
     if damage == "video cut":
         video.write_bytes(video.read_bytes()[:-100])
@@ -252,7 +247,7 @@ def test_a_clip_that_is_not_whole_is_written_again(indexed_release, tmp_path, da
     again = exported(indexed_release, tmp_path)
 
     assert again.written == (names if damage == "mask removed" else names[1:2])
-    assert contents(tmp_path) == before
+    assert files_of(tmp_path) == before
 
 
 def test_a_killed_run_goes_on_to_the_bytes_of_an_unbroken_one(indexed_release, tmp_path):
@@ -267,7 +262,7 @@ def test_a_killed_run_goes_on_to_the_bytes_of_an_unbroken_one(indexed_release, t
 
     assert len(report.kept) >= 2
     assert len(report.written) + len(report.kept) == 6
-    found, whole = contents(out), contents(tmp_path / "whole")
+    found, whole = files_of(out), files_of(tmp_path / "whole")
     assert found.keys() == whole.keys()
     assert {name for name in found if found[name] != whole[name]} == {"dataset.toml"}
 
@@ -292,7 +287,7 @@ def test_evaluation_scenes_need_an_explicit_word(indexed_release, tmp_path):
 
 def test_a_folder_of_another_export_is_refused_by_what_differs(indexed_release, tmp_path):
     exported(indexed_release, tmp_path)
-    before = contents(tmp_path)
+    before = files_of(tmp_path)
 
     for change, named in (
         ({"layout": "musubi"}, "layout"),
@@ -303,22 +298,7 @@ def test_a_folder_of_another_export_is_refused_by_what_differs(indexed_release, 
     ):
         with pytest.raises(StorageError, match=rf"an export of other {named}[.\w]*: .*remove"):
             exported(indexed_release, tmp_path, **change)
-    assert contents(tmp_path) == before
-
-
-@pytest.mark.parametrize("layout", ["diffsynth", "finetrainers", "musubi"])
-def test_a_length_that_the_trainer_cuts_is_refused(indexed_release, tmp_path, layout):
-    with pytest.raises(SelectionError, match=rf"length=7: {layout} takes .* 4N\+1 .* 5 or 9"):
-        exported(indexed_release, tmp_path, layout, length=7)
-
-
-@pytest.mark.parametrize("layout", ["diffsynth", "stereocrafter"])
-def test_without_a_length_a_clip_is_as_long_as_scene_and_trainer_allow(
-    indexed_release, tmp_path, layout
-):
-    exported(indexed_release, tmp_path, layout, family="IPD_Gaussian")
-
-    assert len(records(tmp_path)[0]["frames"]) == (7 if layout == "stereocrafter" else 5)
+    assert files_of(tmp_path) == before
 
 
 @pytest.mark.parametrize(

@@ -17,21 +17,12 @@ from stereogenbench_data.bridges.multiview import PosedImage
 from stereogenbench_data.errors import FieldError, SelectionError, StorageError
 from stereogenbench_data.geometry.pose import rotation_from_quaternion_xyzw
 from stereogenbench_data.index.table import SceneIndex
-from tests.servers.tools import kill_at, killed_fork, require_module
+from tests.servers.tools import files_of, kill_at, killed_fork, require_module
 
 CLOSE_PX = 0.01
 
 exported = partial(export_views, workers=1)
 """Processes take seconds to start: one test has several."""
-
-
-def files_of(root):
-    """Return every file of an export but its lock, by relative path."""
-    return {
-        str(path.relative_to(root)): path.read_bytes()
-        for path in sorted(root.rglob("*"))
-        if path.is_file() and path.name != ".export.lock"
-    }
 
 
 def read_ply(path):
@@ -298,15 +289,6 @@ def test_evaluation_scenes_are_exported_only_where_the_split_names_them(indexed_
     assert {folder.relative_to(tmp_path).parts[1] for folder in asked} == {"eval"}
     with pytest.raises(StorageError, match=r"other split: \['eval'\], where \['train'\] is asked"):
         exported(indexed_release, tmp_path / "asked", layout=layout, size=(16, 16))
-
-
-def test_both_splits_and_a_contract_go_on_in_their_folder(indexed_release, tmp_path):
-    contract = DepthEncoding(unit_m=0.05, accept=frozenset({"8-bit", "lossy", "chroma"}))
-    options = {"split": ("train", "eval"), "depth": contract, "size": (16, 16), "layout": "moge"}
-
-    assert len(exported(indexed_release, tmp_path, **options)) == 4
-    assert len(exported(indexed_release, tmp_path, **options)) == 4
-    assert json.loads((tmp_path / "export.json").read_text())["split"] == ["eval", "train"]
 
 
 def test_a_folder_holds_one_kind_of_export_of_the_same_data(

@@ -121,16 +121,6 @@ def test_the_time_of_a_frame_follows_from_its_rate(rerun, indexed_release, tmp_p
     assert seconds == pytest.approx(3 / 15)
 
 
-def test_a_recording_of_ones_own_takes_a_scene(rerun, indexed_release, tmp_path):
-    recording = rerun.RecordingStream("mine")
-    recording.save(tmp_path / "mine.rrd")
-    key = bridge.log_scene(recording, indexed_release, SCENE, frames="first", size=(16, 16))
-    recording.disconnect()
-
-    assert key == SCENE
-    assert ("/pair/disparity", "DepthImage:buffer") in read_back(tmp_path / "mine.rrd")
-
-
 def test_what_a_scene_does_not_have_is_refused_and_the_file_that_was_there_stays(
     rerun, indexed_release, tmp_path
 ):
@@ -160,15 +150,6 @@ def test_without_rerun_the_extra_is_named(indexed_release, tmp_path, monkeypatch
         with pytest.raises(ExtraError, match=r"stereogenbench-data\[rerun\]"):
             call()
     assert not [*tmp_path.iterdir()]
-
-
-def test_a_viewer_that_does_not_start_is_named(rerun, indexed_release, monkeypatch):
-    def refuse(**_options):
-        raise RuntimeError("Failed to find Rerun Viewer executable in PATH.\nInstall it ...")
-
-    monkeypatch.setattr(rerun, "spawn", refuse)
-    with pytest.raises(ExtraError, match=r"viewer does not start \(Failed .*an \.rrd file"):
-        bridge.view_live(indexed_release)
 
 
 def test_the_viewer_is_sent_the_scene(rerun, indexed_release, tmp_path, monkeypatch):

@@ -130,18 +130,6 @@ def test_a_signal_ends_the_browser_at_once_with_130(small_shards):
     assert "Traceback" not in message
 
 
-def test_a_port_in_use_is_reported(small_shards):
-    import socket
-
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        shown = invoke("browse", small_shards, "--no-open", "--port", taken.getsockname()[1])
-
-    assert shown.exit_code == 2
-    assert "(Address already in use). Choose another port." in shown.stderr
-
-
 def test_control_characters_of_a_name_are_escaped(tmp_path):
     odd = tmp_path / "a\x1b]0;title\x07\x1b[31m"
     shown = invoke("stats", odd)
@@ -162,10 +150,3 @@ def test_an_empty_path_is_refused_and_nothing_is_written(words, tmp_path, monkey
     assert ended.exit_code == 2
     assert "the path is empty" in ended.stderr
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_name_of_300_letters_is_refused_with_a_cure(tmp_path):
-    printed = invoke("index", str(tmp_path / ("x" * 300)))
-
-    assert printed.exit_code == 2
-    assert "File name too long). Choose a shorter name." in printed.output

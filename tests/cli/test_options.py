@@ -23,8 +23,6 @@ def refused(*words):
     [
         (["eval", "score", "d", "p", "--tier", "G1"], "--size", "480,832", "WIDTHxHEIGHT"),
         (["eval", "score", "d", "p", "--tier", "G1"], "--size", "832x0", "1 to 16384"),
-        (["eval", "inputs", "d", "o", "--tier", "G1"], "--size", "480,832", "832x480"),
-        (["eval", "controls", "d"], "--size", "480", "WIDTHxHEIGHT"),
         (["eval", "controls", "d"], "--pairs", "0:1", "0-1,0-5"),
         (["eval", "controls", "d"], "--frames", "some", "every:K"),
         (["audit", "d"], "--per-scene", "0", "'all'"),
@@ -32,9 +30,7 @@ def refused(*words):
         (["stats", "d"], "--where", "focal_mm=wide", "18:35"),
         (["index", "d", "-o", "i"], "--where", "caption=red", "family or map"),
         (["stats", "d"], "--where", "min_frames=x", "whole number"),
-        (["show", "d"], "--pair", "left", "0-5"),
         (["show", "d"], "--pair", "5-0", "write it as 0-5"),
-        (["show", "d"], "--pair", "2-2", "two different cameras"),
         (["eval", "controls", "d"], "--pairs", "5-2", "write it as 2-5"),
         (["download", "d", "-o", "o"], "--cameras", "6", "0 to 5"),
         (["pack", "d", "o"], "--part", "first", "I/N"),

@@ -96,21 +96,6 @@ def test_a_tree_with_a_broken_scene_shows_the_others(small_release, tmp_path):
     assert f"{SCENE}/baseline.json: " in good.stderr
 
 
-def test_statistics_count_the_whole_scenes_of_a_tree_and_say_which_they_leave_out(
-    small_release, tmp_path
-):
-    shutil.copytree(small_release, tmp_path / "data")
-    (tmp_path / "data" / SCENE / "baseline.json").write_text("{}")
-    (tmp_path / "data" / SCENE.replace("001", "000") / "_scene_complete.json").unlink()
-
-    counted = invoke("stats", tmp_path / "data", "--json")
-
-    assert counted.exit_code == 0
-    assert json.loads(counted.stdout)["scenes"] == 2
-    assert "baseline.json" in counted.stderr
-    assert "_scene_complete.json" in counted.stderr
-
-
 def test_a_part_that_is_whole_folders_of_one_key_is_that_scene(small_release, tmp_path):
     for family in ("Uniform", "Pairwise_Uniform"):
         folder = tmp_path / "data" / "train" / family / "Stage" / "scene_000000"

@@ -13,7 +13,7 @@ import pytest
 
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import write_report, writing
-from tests.cli.command import COMMAND, invoke, one_line, run
+from tests.cli.command import COMMAND, invoke, one_line
 from tests.servers.tools import small_disk
 
 
@@ -108,22 +108,6 @@ def test_an_index_does_not_replace_a_device_or_a_pipe(small_release, tmp_path):
     assert shown.exit_code == 2
     assert "is not a regular file" in one_line(shown.stderr)
     assert stat.S_ISFIFO(pipe.stat().st_mode)
-
-
-def test_what_the_terminal_lacks_is_printed_as_a_question_mark(tmp_path):
-    words = ("publish", "croissant", "--template", "-o", "\u0105.json")
-    ended = run(*words, cwd=tmp_path, env=os.environ | {"PYTHONIOENCODING": "latin-1"})
-
-    assert (ended.returncode, ended.stderr) == (0, "")
-    assert ended.stdout.startswith("?.json: ")
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_the_exit_status_is_right_where_no_message_can_be_printed():
-    with Path("/dev/full").open("w") as full:
-        ended = run("stats", "nowhere", stderr=full)
-
-    assert ended.returncode == 2
 
 
 def test_a_command_whose_stdout_was_closed_does_its_work(tmp_path):

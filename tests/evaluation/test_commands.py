@@ -79,9 +79,6 @@ def test_an_evaluation_that_scored_nothing_does_not_hinder_another_one(
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
-        ("--size", "832", "WIDTHxHEIGHT"),
-        ("--frames", "some", "is not all, first, every:K"),
-        ("--pairs", "0_1", "is not primary, adjacent, all or pairs"),
         ("--by", "nope", "has no column 'nope'"),
         ("--metrics", "mse", "there is no metric 'mse'"),
         ("--stereo-matcher", "eyes", "'eyes'"),

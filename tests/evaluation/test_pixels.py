@@ -1,7 +1,6 @@
 """PSNR and SSIM against scikit-image, on random, flat and photographed pictures."""
 
 import math
-import sys
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from stereogenbench_data.errors import EvaluationError, ExtraError
+from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.metrics.pixels import (
     psnr_db,
     ssim,
@@ -75,11 +74,3 @@ def test_a_picture_below_the_window_has_no_ssim():
 
     with pytest.raises(EvaluationError, match="at least 11x11 pixels, got 30x10"):
         ssim(small, small)
-
-
-def test_without_opencv_ssim_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    picture = np.zeros((3, 20, 30), dtype=np.uint8)
-
-    with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[evaluation\]'"):
-        ssim(picture, picture)

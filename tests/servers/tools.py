@@ -27,6 +27,15 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
     return folder
 
 
+def files_of(root: Path) -> dict[str, bytes]:
+    """Return the content of every file below a folder but locks, by relative path."""
+    return {
+        str(path.relative_to(root)): path.read_bytes()
+        for path in sorted(root.rglob("*"))
+        if path.is_file() and path.suffix != ".lock"
+    }
+
+
 def require_tool(name: str) -> str:
     """Return the path of a program; without it skip, or fail where CI is set."""
     path = shutil.which(name) or shutil.which(name, path="/usr/sbin:/usr/local/sbin")

@@ -38,18 +38,6 @@ def test_scenes_are_written_to_the_folders_of_the_release(tmp_path, request_, ke
     assert len(contents(tmp_path / key)) == 17
 
 
-def test_progress_counts_camera_frames_up_to_all(tmp_path):
-    seen = []
-
-    synthesise(
-        tmp_path, SynthRequest(scenes=2, **SMALL), progress=lambda *counts: seen.append(counts)
-    )
-
-    assert seen[0] == (0, 24)
-    assert seen[-1] == (24, 24)
-    assert seen == sorted(seen)
-
-
 def test_an_interrupted_run_of_two_processes_goes_on_to_the_same_scenes_as_one_alone(tmp_path):
     small = SMALL | {"frames": 3}
     request = SynthRequest(scenes=2, **small)
@@ -104,14 +92,6 @@ def test_a_scene_that_another_request_wrote_is_neither_kept_nor_overwritten(tmp_
     (tmp_path / key / "_scene_complete.json").unlink()
     with pytest.raises(SynthesisError, match=r"_scene_complete\.json differs or is missing"):
         synthesise(tmp_path, SynthRequest(**SMALL))
-
-
-def test_an_output_that_is_not_a_folder_is_named(tmp_path):
-    taken = tmp_path / "file"
-    taken.write_text("")
-
-    with pytest.raises(SynthesisError, match=r"file: cannot write there "):
-        synthesise(taken, SynthRequest(**SMALL))
 
 
 def test_a_full_disk_is_an_error_that_names_the_cure(tmp_path, monkeypatch):
