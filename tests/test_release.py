@@ -8,7 +8,6 @@ import tomllib
 from pathlib import Path
 
 import pytest
-import yaml
 
 from tests.servers.tools import require_tool
 
@@ -72,22 +71,6 @@ def test_a_dated_release_with_addresses_may_be_published(release):
     found = release.problems("v0.1.0", project={"version": "0.1.0", "urls": urls}, changelog=text)
 
     assert found == []
-
-
-def test_every_python_that_is_named_gets_the_wheel_before_it_is_published():
-    jobs = yaml.safe_load((HOME / ".github" / "workflows" / "build.yml").read_text())["jobs"]
-    tried = jobs["install"]["strategy"]["matrix"]["include"]
-    classified = {
-        line.rpartition(" ")[2]
-        for line in PROJECT["project"]["classifiers"]
-        if line.startswith("Programming Language :: Python :: ")
-    }
-
-    assert {each["python"] for each in tried} == classified
-    assert {"lowest", "newest"} <= {each["versions"] for each in tried}
-    assert all((HOME / "constraints" / f"{each['versions']}.txt").is_file() for each in tried)
-    assert (jobs["publish"]["needs"], jobs["install"]["needs"]) == ("install", "build")
-    assert jobs["publish"]["permissions"] == {"id-token": "write"}
 
 
 @pytest.mark.parametrize("target", ["test", "demo"])

@@ -317,17 +317,3 @@ def test_vggts_base_class_crops_the_views(indexed_release, trained_on_vggt):
                 record[name][number], plain[name][number][:16, :32], rtol=1e-5, atol=1e-5
             )
         assert record["original_sizes"][number].tolist() == [64, 64]
-
-
-def test_vggts_configuration_decides_whether_views_and_sequences_are_drawn_by_chance(
-    indexed_release, trained_on_vggt
-):
-    once = trained_on_vggt(configuration(allow_duplicate_img=False), indexed_release)
-    twice = trained_on_vggt(configuration(inside_random=True), indexed_release)
-    torch.manual_seed(0)
-
-    assert sorted(once[0, 6, 1.0]["ids"].tolist()) == [0, 1, 2, 3, 4, 5]
-    assert len(once[0, 9, 1.0]["ids"]) == 9
-    drawn = [twice[0, 6, 1.0] for _ in range(15)]
-    assert any(len(set(record["ids"].tolist())) < 6 for record in drawn)
-    assert len({record["seq_name"] for record in drawn}) == 3

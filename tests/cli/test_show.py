@@ -66,25 +66,6 @@ def test_what_cannot_be_shown_is_refused(small_shards, tmp_path, monkeypatch, op
     assert list(tmp_path.iterdir()) == []
 
 
-def test_depth_of_an_unknown_unit_is_refused_as_at_opening_and_an_option_cures_it(
-    small_release, tmp_path
-):
-    tree = shutil.copytree(small_release, tmp_path / "tree")
-    place = tree / SCENE / "baseline.json"
-    recorded = json.loads(place.read_text()) | {"depth_scale": 0.5}
-    place.write_text(json.dumps(recorded))
-
-    refused = invoke("show", tree, SCENE, "-o", tmp_path / "sheet.png")
-    stated = tmp_path / "stated.toml"
-    stated.write_text("[depth]\nunit_m = 0.001\n")
-    cured = invoke("show", tree, SCENE, "-o", tmp_path / "sheet.png", "--conventions", stated)
-
-    assert refused.exit_code == 2
-    assert "$.depth_scale is '0.5'" in one_line(refused.stderr)
-    assert "--conventions" in one_line(refused.stderr)
-    assert (cured.exit_code, (tmp_path / "sheet.png").exists()) == (0, True)
-
-
 def test_a_tree_with_a_broken_scene_shows_the_others(small_release, tmp_path):
     shutil.copytree(small_release, tmp_path / "data")
     (tmp_path / "data" / SCENE / "baseline.json").write_text("{}")

@@ -6,7 +6,7 @@ import resource
 import signal
 import stat
 import subprocess
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,7 +14,6 @@ import pytest
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import write_report, writing
 from tests.cli.command import COMMAND, invoke, one_line
-from tests.servers.tools import small_disk
 
 
 @contextmanager
@@ -67,21 +66,6 @@ def test_a_file_that_cannot_be_written_is_named_and_not_left_half(
     assert "(File too large). Choose a place that takes files of this size." in last
     left = [path.name for path in tmp_path.rglob("*") if path.is_file()]
     assert [name for name in left if not name.endswith(".journal")] == []
-
-
-def test_a_full_disk_leaves_no_empty_picture_and_keeps_the_one_before(small_shards, tmp_path):
-    with small_disk(tmp_path, size="16k"):
-        before = tmp_path / "before.png"
-        before.write_bytes(b"a picture")
-        with suppress(OSError), (tmp_path / "full").open("wb", buffering=0) as filling:
-            filling.write(bytes(16 * 1024))
-        new = invoke("show", small_shards, "-o", tmp_path / "sheet.png")
-        again = invoke("show", small_shards, "-o", before)
-
-        assert {path.name for path in tmp_path.iterdir()} == {"before.png", "full"}
-        assert before.read_bytes() == b"a picture"
-    assert [new.exit_code, again.exit_code] == [2, 2]
-    assert "(No space left on device). Make room, or choose another place." in new.stderr
 
 
 def test_a_report_may_go_through_a_link_or_a_pipe(tmp_path):

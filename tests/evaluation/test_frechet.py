@@ -63,19 +63,6 @@ def test_fewer_samples_than_features_are_no_difficulty(samples, others):
     assert (found.samples, found.dim) == ((samples, others), 8)
 
 
-def test_gaussians_along_the_axes_are_as_far_apart_as_their_formula_says():
-    def corners(x: float, y: float, *, at: float) -> np.ndarray:
-        """Return four points of variances 4/3 x^2 and 4/3 y^2."""
-        return np.array([(x, y), (x, -y), (-x, y), (-x, -y)]) + at
-
-    found = frechet_distance(
-        FeatureStatistics.of(corners(3, 1, at=0)), FeatureStatistics.of(corners(1, 2, at=5))
-    )
-
-    assert found.value == pytest.approx(2 * 5**2 + 4 / 3 * ((3 - 1) ** 2 + (1 - 2) ** 2), rel=1e-12)
-    assert not found.underdetermined
-
-
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 999), cuts=st.lists(st.integers(0, 300), max_size=6))
 def test_gathered_in_parts_a_set_spreads_as_it_does_at_once(seed, cuts):

@@ -1,7 +1,6 @@
 """Models by name, and what is said of each whose package or weights are not at hand."""
 
 import re
-import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -59,15 +58,6 @@ def test_without_the_package_lpips_its_extra_is_named(monkeypatch, tmp_path):
 
     with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[lpips\]'"):
         load_model("learned metric", "lpips", weights=tmp_path)
-
-
-@pytest.mark.parametrize("name", ["sift", "sgbm"])
-def test_without_opencv_the_stand_ins_name_the_extra(monkeypatch, name):
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    kind = "keypoint matcher" if name == "sift" else "stereo matcher"
-
-    with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[evaluation\]'"):
-        load_model(kind, name)
 
 
 def test_a_file_that_holds_more_than_tensors_is_not_run(tmp_path):

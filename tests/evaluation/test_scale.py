@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 from scipy.stats import linregress
 
@@ -83,16 +81,6 @@ def test_both_fits_are_those_of_scipy_with_and_without_what_lies_off_the_line(se
     assert filtered.offset_px == pytest.approx(inliers.intercept, rel=1e-9)
     assert filtered.drift < 0.21
     assert plain.drift > 2 * filtered.drift
-
-
-@given(factor=st.floats(0.1, 10), offset=st.floats(-50, 50))
-def test_any_line_is_found(factor, offset):
-    estimated = np.random.default_rng(4).uniform(0, 50, SIZE)
-
-    fit = fit_scale(estimated, factor * estimated + offset, scored=EVERYWHERE)
-
-    assert fit.slope == pytest.approx(factor, rel=1e-9)
-    assert fit.offset_px == pytest.approx(offset, abs=1e-7)
 
 
 def test_only_what_is_scored_and_answered_counts(truth):

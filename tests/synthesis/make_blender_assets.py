@@ -354,23 +354,8 @@ def make_broken(folder):
     lit_floor()
     bpy.context.scene.objects["floor"].scale = (10000.0,) * 3
     save("huge.blend")
-    lit_floor()
-    box("ceiling", (8, 8, 0.2), (0, 0, 2.9), matte("white", (0.8, 0.8, 0.8)))
-    for name in ("floor", "ceiling"):
-        bpy.context.scene.objects[name].scale = (50, 50, 100)
-        bpy.context.scene.objects[name].location.z *= 100
-    save("vast.blend")
     lit_floor(textures=outside)
     save("far_texture.blend")
-
-    lit_floor()
-    bpy.ops.wm.save_as_mainfile(filepath=str(outside / "library.blend"))
-    clear()
-    with bpy.data.libraries.load(str(outside / "library.blend"), link=True) as (there, wanted):
-        wanted.objects = there.objects
-    for linked in wanted.objects:
-        bpy.context.scene.collection.objects.link(linked)
-    save("linked.blend")
 
     lit_floor()
     script = bpy.data.texts.new("harm.py")
