@@ -1,4 +1,4 @@
-"""The sample in the repository: complete, small, made by its README's commands, reproducible."""
+"""The sample in the repository: small, sound, made by its README's commands, reproducible."""
 
 import re
 import subprocess

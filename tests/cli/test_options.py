@@ -1,4 +1,4 @@
-"""Options declared once: groups of them as parameters, and errors that name the option."""
+"""Options declared once, and errors that name the option."""
 
 import shutil
 import subprocess

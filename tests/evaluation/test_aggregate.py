@@ -1,4 +1,4 @@
-"""Averages: frames, then pairs of a scene, then scenes; intervals by hand and by scipy."""
+"""Averages: frames, then pairs of a scene, then scenes; intervals by hand."""
 
 import math
 

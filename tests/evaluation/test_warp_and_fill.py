@@ -1,4 +1,4 @@
-"""The shipped example: short, right in its filling, and worse the wider the baseline."""
+"""The shipped example: right in its filling, and worse the wider the baseline."""
 
 import importlib.util
 from pathlib import Path
