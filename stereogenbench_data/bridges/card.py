@@ -24,6 +24,7 @@ import numpy as np
 from PIL import Image
 
 from stereogenbench_data.bridges import dataset_facts
+from stereogenbench_data.bridges.in_memory import columns
 from stereogenbench_data.datasets.mapped import StereoPairs
 from stereogenbench_data.engine import Advance, Progress, advance_of
 from stereogenbench_data.errors import DescriptorError, explain_os_errors, missing_extra
@@ -34,8 +35,6 @@ from stereogenbench_data.schema.records import Scene, SceneId
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     CAMERA_PAIRS,
-    DESCRIPTION_TXT,
-    METADATA_FILES,
     TRAINING_JSON,
 )
 from stereogenbench_data.schema.text import counted, markdown_text
@@ -290,11 +289,9 @@ def _head(index: SceneIndex, facts: dataset_facts.Facts, configs: _Configs) -> d
 
 
 def _features(index: SceneIndex) -> dict[str, str]:
-    kinds = {name: "string" if name == DESCRIPTION_TXT else "json" for name in METADATA_FILES}
     members = index.scene(0).members
     videos = sorted(name for name in members if name.startswith("cam_"))
-    kinds |= {TRAINING_JSON: "json"} if TRAINING_JSON in members else {}
-    return kinds | dict.fromkeys(videos, "binary") | {"__key__": "string", "__url__": "string"}
+    return columns(videos, of_training=TRAINING_JSON in members)
 
 
 def _configs(index: SceneIndex) -> _Configs:

@@ -23,7 +23,7 @@ from typing import Any, Final, Literal, NamedTuple, Unpack, cast
 
 import numpy as np
 
-from stereogenbench_data.bridges.exports import scene_filters, training_selection
+from stereogenbench_data.bridges.exports import depth_setting, training_filters
 from stereogenbench_data.bridges.generation import Captions, describe_pair
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.engine import Advance
@@ -173,7 +173,7 @@ LAYOUTS: Final[Mapping[LayoutName, ClipLayout]] = {
     "stereocrafter": ClipLayout(lambda root, clips: {}, kinds=("grid", "right"), frames_step=1),
 }
 
-_FORMAT: Final = 3
+_FORMAT: Final = 4
 _CLIPS_JSONL: Final = "clips.jsonl"
 _CLIPS: Final = "clips"
 
@@ -220,14 +220,12 @@ class ClipReport(NamedTuple):
         written: Names of the clips that were written now.
         kept: Names of those that were there before.
         manifests: The manifests that were written.
-        evaluation_scenes: How many scenes of the split eval were left out.
         without_caption: How many clips have an empty caption.
     """
 
     written: tuple[str, ...]
     kept: tuple[str, ...]
     manifests: tuple[Path, ...]
-    evaluation_scenes: int
     without_caption: int
 
 
@@ -249,8 +247,7 @@ def export_clips(
 
     Raises:
         SelectionError: If nothing matches; if there is no such layout or option; if the trainer
-            would cut a clip of this length; or if all that match are evaluation scenes, and
-            ``split`` does not name them.
+            would cut a clip of this length.
         StorageError: If the folder holds something else, another process exports into it, or
             something cannot be read or written.
         MediaError: If a video cannot be decoded, or not be encoded as asked.
@@ -261,10 +258,9 @@ def export_clips(
         raise SelectionError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}.")
     rules = LAYOUTS[layout]
     index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
-    chosen, evaluation_scenes = training_selection(index, options)
-    names = {*SceneFilters.__annotations__, *PairOptions.__annotations__, "seed"}
-    chosen = {name: value for name, value in chosen.items() if name in names}
-    chosen["frames"] = _windows(index, layout, options, selection=chosen)
+    filters, names = training_filters(options), {*PairOptions.__annotations__, "seed"}
+    chosen: dict[str, Any] = {name: value for name, value in options.items() if name in names}
+    chosen |= {**filters, "frames": _windows(index, layout, options, filters=filters)}
     fields = dict.fromkeys(name for kind in rules.kinds for name in _FIELDS[kind])
     pairs = StereoPairs(
         index, fields=fields, size=options.get("size"), depth=options.get("depth"), **chosen
@@ -283,7 +279,7 @@ def export_clips(
         "size": pairs.request.size,
         "captions": options.get("captions", "plain"),
         "encoding": asdict(encoding),
-        "depth": repr(options.get("depth")),
+        "depth": depth_setting(options.get("depth")),
         "data": index.digest,
         "selection": pairs.plan.digest,
     }
@@ -322,20 +318,19 @@ def export_clips(
         written=tuple(work.name for work in due),
         kept=tuple(work.name for work in works if work.name not in written),
         manifests=tuple(root / name for name in texts if "/" not in name),
-        evaluation_scenes=evaluation_scenes,
         without_caption=sum(not clip["caption"] for clip in clips),
     )
 
 
 def _windows(
-    index: SceneIndex, layout: LayoutName, options: ClipOptions, *, selection: Mapping[str, Any]
+    index: SceneIndex, layout: LayoutName, options: ClipOptions, *, filters: SceneFilters
 ) -> FramesSpec:
     """Return the frames of clips, as `StereoPairs` takes them."""
     unit, stride = LAYOUTS[layout].frames_step, options.get("stride", 1)
     length, step = options.get("length"), options.get("step")
     if length is None:
         parse_frames(("clips", 1, stride))
-        rows = filter_scenes(index, scene_filters(selection))
+        rows = filter_scenes(index, filters)
         shortest = int(index.column("frames")[rows].min())
         length = (shortest - 1) // stride // unit * unit + 1
     elif (length - 1) % unit:
@@ -420,14 +415,9 @@ def _clip_name(number: int, facts: Mapping[str, Any]) -> str:
 
 
 def _is_finished(work: _ClipWork) -> bool:
-    """Return whether a clip's videos are there, with the sizes that were noted."""
-    if not work.record.is_file():
-        return False
-    sizes = read_json(work.record).get("bytes", {})
-    paths = {kind: work.root / path for kind, path in work.videos.items()}
-    return all(
-        path.is_file() and path.stat().st_size == sizes.get(kind) for kind, path in paths.items()
-    )
+    """Return whether a clip's videos are there, and its record, which is written after them."""
+    paths = [work.record, *(work.root / path for path in work.videos.values())]
+    return all(path.is_file() for path in paths)
 
 
 def _write_clip(work: _ClipWork, advance: Advance) -> None:
@@ -456,9 +446,6 @@ def _write_clip(work: _ClipWork, advance: Advance) -> None:
     if draws_depth:
         record["depth_m"] = [1 / each if each else None for each in nearness[::-1]]
     record["videos"] = work.videos
-    record["bytes"] = {
-        kind: (work.root / path).stat().st_size for kind, path in work.videos.items()
-    }
     with named_errors(work.record):
         work.record.parent.mkdir(exist_ok=True)
         write_atomic(work.record, json_bytes(record))

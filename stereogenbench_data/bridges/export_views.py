@@ -14,7 +14,7 @@ import json
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, Unpack
 
@@ -23,7 +23,7 @@ from jaxtyping import Float64, Int64
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from stereogenbench_data.bridges.exports import scene_filters, training_selection
+from stereogenbench_data.bridges.exports import depth_setting, training_filters
 from stereogenbench_data.bridges.multiview import (
     CENTRE_PX,
     VIEW_FIELDS,
@@ -353,7 +353,7 @@ def export_views(
         raise SelectionError(f"layout must be one of {known}, got {layout!r}.")
     points, depth = _points(layout, options.get("points")), options.get("depth")
     index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
-    filters = scene_filters(training_selection(index, options)[0])
+    filters = training_filters(options)
     frames = options.get("frames", "first")
     views = SceneViews(
         index,
@@ -385,8 +385,7 @@ def export_views(
         "cameras": cameras,
         "size": views.request.size,
         "points": points,
-        "depth": depth
-        and asdict(depth) | {"no_depth": depth.no_depth, "accept": sorted(depth.accept)},
+        "depth": depth_setting(depth),
         "data": index.digest,
     }
     works = [
@@ -404,7 +403,7 @@ def export_views(
         )
         if layout == "moge":
             with named_errors(root):
-                _list_pictures(root, [*folders], cameras)
+                _list_pictures(root)
     return [*folders]
 
 
@@ -447,14 +446,7 @@ def _export_scene(work: _SceneWork, advance: Advance) -> None:
                 advance(len(images))
 
 
-def _list_pictures(root: Path, folders: Sequence[Path], cameras: Sequence[int]) -> None:
-    """Write MoGe's list of folders: those of this export, and those that it named before."""
-    path = root / INDEX_TXT
-    lines = {
-        f"{folder.relative_to(root).as_posix()}/cam_{camera:02d}"
-        for folder in folders
-        for camera in cameras
-    }
-    if path.is_file():
-        lines.update(path.read_text(encoding="utf-8").splitlines())
-    write_atomic(path, "".join(f"{line}\n" for line in sorted(lines)).encode())
+def _list_pictures(root: Path) -> None:
+    """Write MoGe's list of folders: all that are there."""
+    found = sorted(path.parent.relative_to(root).as_posix() for path in root.rglob("meta.json"))
+    write_atomic(root / INDEX_TXT, "".join(f"{folder}\n" for folder in found).encode())

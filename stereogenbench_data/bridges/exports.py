@@ -1,37 +1,24 @@
-"""Which scenes exports are made of: training scenes, unless evaluation scenes are asked for."""
+"""What all exports share: they are of training scenes, unless the user names another split."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any, cast
 
-from stereogenbench_data.errors import SelectionError
-from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
+from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.selection.filters import SceneFilters
 
 
-def scene_filters(selection: Mapping[str, Any]) -> SceneFilters:
-    """Return the filters on scenes among the options of a selection."""
-    names = SceneFilters.__annotations__
-    return cast("SceneFilters", {name: selection[name] for name in names if name in selection})
+def training_filters(options: Mapping[str, Any]) -> SceneFilters:
+    """Return the filters on scenes among options; without ``split``, training scenes.
 
-
-def training_selection(
-    index: SceneIndex, selection: Mapping[str, Any]
-) -> tuple[dict[str, Any], int]:
-    """Return a selection without evaluation scenes, and how many were left out.
-
-    A selection whose ``split`` is given stays as it is: a model that was trained on evaluation
-    scenes cannot be evaluated on them, so they are taken only if they are asked for.
-
-    Raises:
-        SelectionError: If no scene matches, or only evaluation scenes do.
+    A model that was trained on evaluation scenes cannot be evaluated on them, so these are exported
+    only where they are named.
     """
-    if selection.get("split") is not None:
-        return dict(selection), 0
-    rows = filter_scenes(index, scene_filters(selection))
-    evaluation = int((index.column("split")[rows] == "eval").sum())
-    if evaluation == len(rows):
-        raise SelectionError(
-            f"{index.where}: only evaluation scenes ({evaluation}) match, and training data are "
-            "made of these only if you say so: split='eval', on the command line --split eval."
-        )
-    return {**selection, "split": "train"}, evaluation
+    names = SceneFilters.__annotations__
+    found = {name: options[name] for name in names if options.get(name) is not None}
+    return cast("SceneFilters", {"split": "train", **found})
+
+
+def depth_setting(depth: DepthEncoding | None) -> dict[str, Any] | None:
+    """Return a depth contract as the settings of an export hold it, the same in every process."""
+    return None if depth is None else asdict(depth) | {"accept": sorted(depth.accept)}

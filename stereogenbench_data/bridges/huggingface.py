@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Unpack
 
-from stereogenbench_data.bridges.in_memory import SampleOptions, samples_of, to_arrays
+from stereogenbench_data.bridges.in_memory import SampleOptions, columns, samples_of, to_arrays
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.errors import (
     ExtraError,
@@ -25,8 +25,6 @@ from stereogenbench_data.samples.transforms import (
     Resize,
 )
 from stereogenbench_data.schema.release import (
-    DESCRIPTION_TXT,
-    METADATA_FILES,
     PACKED_DEPTH_NAMES,
     TRAINING_JSON,
     VIDEO_FILES,
@@ -179,14 +177,10 @@ def features(*, depth_suffix: str = "mkv") -> "Features":
         from datasets import Features, Json, Value
     except ImportError as error:
         raise _missing(error) from error
-    kinds: dict[str, Any] = {
-        name: Value("string") if name == DESCRIPTION_TXT else Json() for name in METADATA_FILES
-    }
-    if names:
-        kinds[TRAINING_JSON] = Json()
-    for name in VIDEO_FILES:
-        kinds[names.get(name, name)] = Value("binary")
-    return Features(kinds | {"__key__": Value("string"), "__url__": Value("string")})
+    kinds = columns((names.get(name, name) for name in VIDEO_FILES), of_training=bool(names))
+    return Features(
+        {name: Json() if kind == "json" else Value(kind) for name, kind in kinds.items()}
+    )
 
 
 def decode(

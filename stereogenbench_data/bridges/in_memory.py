@@ -7,7 +7,7 @@ errors and samples are those of `StereoPairs`.
 import json
 import tempfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, TypedDict
 
@@ -18,6 +18,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import (
+    DESCRIPTION_TXT,
     METADATA_FILES,
     PACKED_DEPTH_NAMES,
     TRAINING_JSON,
@@ -28,6 +29,13 @@ from stereogenbench_data.selection.plan import FramesSpec
 
 _VIDEOS: Final = (*VIDEO_FILES, *PACKED_DEPTH_NAMES.values())
 _FILES: Final = (*METADATA_FILES, TRAINING_JSON, *_VIDEOS)
+
+
+def columns(videos: Iterable[str], *, of_training: bool) -> dict[str, str]:
+    """Return the columns of raw shards as `datasets` reads them, each with its kind."""
+    kinds = {name: "string" if name == DESCRIPTION_TXT else "json" for name in METADATA_FILES}
+    kinds |= {TRAINING_JSON: "json"} if of_training else {}
+    return kinds | dict.fromkeys(videos, "binary") | {"__key__": "string", "__url__": "string"}
 
 
 class SampleOptions(TypedDict, total=False):

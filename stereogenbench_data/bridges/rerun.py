@@ -14,7 +14,6 @@ pixel centres at 0.5, which Rerun's pictures have; its cloud of depth lies half 
 Source: rerun-io/rerun, docs/snippets, crates/viewer/re_renderer/shader/depth_cloud.wgsl.
 """
 
-import sys
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
@@ -23,7 +22,6 @@ from stereogenbench_data.bridges.multiview import VIEW_FIELDS, origin_at, posed_
 from stereogenbench_data.datasets.mapped import Data, SceneViews, StereoPairs
 from stereogenbench_data.engine import Progress
 from stereogenbench_data.errors import (
-    ExtraError,
     SelectionError,
     explain_os_errors,
     missing_extra,
@@ -77,34 +75,6 @@ def write_recording(
     with explain_os_errors(cannot, "Choose another place."), open_output(Path(path)) as file:
         file.write(content)
     return key
-
-
-def view_live(
-    data: Data, scene: str | None = None, *, progress: Progress | None = None, **options: Any
-) -> str:
-    """Open Rerun's viewer, or the one that is open, and send it a scene; return the scene's key.
-
-    Args:
-        data: As for `write_recording`.
-        scene: As for `write_recording`.
-        progress: As for `write_recording`.
-        **options: As for `write_recording`.
-
-    Raises:
-        ExtraError: If ``rerun-sdk`` is not installed, or its viewer does not start.
-        StereoGenBenchError: As `write_recording` does.
-    """
-    here = Path(sys.executable).with_name("rerun")
-    viewer = str(here) if here.is_file() else None  # else it is looked for in PATH
-    with _rerun().RecordingStream("stereogenbench") as recording:
-        try:
-            _rerun().spawn(recording=recording, executable_path=viewer)
-        except RuntimeError as error:
-            raise ExtraError(
-                f"Rerun's viewer does not start ({str(error).partition(chr(10))[0]}). Write an "
-                f".rrd file instead, and open it where there is a screen."
-            ) from error
-        return log_scene(recording, data, scene, progress=progress, **options)
 
 
 def log_scene(  # noqa: PLR0913 - each names one thing that a user chooses

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from stereogenbench_data.bridges.card import CARD_NAME, viewer_tars, write_card
-from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
+from stereogenbench_data.bridges.croissant.descriptor import write_descriptor
 from stereogenbench_data.bridges.dataset_facts import About
 from stereogenbench_data.engine import Progress
 from stereogenbench_data.errors import DescriptorError, StorageError
@@ -70,7 +70,7 @@ def upload(
     _require_whole(index, folder)
     write_card(index, folder, repository=repository, about=about, progress=progress)
     descriptor = folder / DESCRIPTOR_NAME
-    name = write_descriptor(index, descriptor, publication=Publication(about=about))["name"]
+    name = write_descriptor(index, descriptor, about=about)["name"]
     from huggingface_hub import HfApi
     from huggingface_hub.errors import HfHubHTTPError
 
@@ -92,8 +92,7 @@ def upload(
         )
         revision = str(api.dataset_info(repository, revision=branch).sha)
         address = f"{api.endpoint}/datasets/{repository}/resolve/{revision}"
-        pinned = Publication(data_url=address, about=about)
-        write_descriptor(index, descriptor, publication=pinned)
+        write_descriptor(index, descriptor, about=about, data_url=address)
         api.upload_file(
             path_or_fileobj=descriptor,
             path_in_repo=DESCRIPTOR_NAME,

@@ -86,9 +86,6 @@ def clips(
             **work.options(),
             **selection,
         )
-    if report.evaluation_scenes:
-        left_out = counted(report.evaluation_scenes, "evaluation scene")
-        typer.echo(f"{left_out} left out: --split eval exports them", err=True)
     if report.without_caption:
         typer.echo(f"{counted(report.without_caption, 'clip')} without a caption", err=True)
     names = [path.name for path in report.manifests]

@@ -120,7 +120,6 @@ def _export(
     source: DataOptions, out: OutArgument, chosen: ViewOptions, work: WorkOptions, *, layout: Any
 ) -> None:
     from stereogenbench_data.bridges.export_views import export_views
-    from stereogenbench_data.bridges.exports import training_selection
 
     index = source.open()
     with progress_bar("writing", unit="pictures") as progress:
@@ -131,11 +130,5 @@ def _export(
             progress=progress,
             **chosen.selection(),
             **work.options(),
-        )
-    _, for_evaluation = training_selection(index, chosen.filters())
-    if for_evaluation:
-        typer.echo(
-            f"{counted(for_evaluation, 'evaluation scene')} left out: --split eval exports them",
-            err=True,
         )
     typer.echo(f"{out}: {counted(len(folders), 'folder')}")

@@ -81,11 +81,7 @@ def croissant(
             "no file for the descriptor: name it with -o FILE.", param_hint="--out"
         )
     from stereogenbench_data.bridges import dataset_facts
-    from stereogenbench_data.bridges.croissant.descriptor import (
-        Publication,
-        write_descriptor,
-        write_node,
-    )
+    from stereogenbench_data.bridges.croissant.descriptor import write_descriptor, write_node
     from stereogenbench_data.index.table import SceneIndex
 
     if template:
@@ -93,11 +89,8 @@ def croissant(
         typer.echo(f"{out}: answer the questions, then add --about {out}")
         return
     index = None if data is None else SceneIndex.open(data, rows="read")
-    publication = Publication(
-        data_url=None if base_url is None else base_url.rstrip("/"),
-        about=_stated(about),
-    )
-    descriptor = write_descriptor(index, out, publication=publication)
+    data_url = None if base_url is None else base_url.rstrip("/")
+    descriptor = write_descriptor(index, out, about=_stated(about), data_url=data_url)
     files, records = len(descriptor["distribution"]), len(descriptor["recordSet"])
     typer.echo(f"{out}: {files} files and sets of files, {counted(records, 'record set')}")
 

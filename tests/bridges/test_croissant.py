@@ -7,7 +7,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-from datetime import date
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -15,7 +14,7 @@ import pytest
 
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.croissant.check import check_descriptor
-from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
+from stereogenbench_data.bridges.croissant.descriptor import write_descriptor
 from stereogenbench_data.errors import DescriptorError
 from stereogenbench_data.shards.pack import pack
 from tests.cli.command import invoke
@@ -24,7 +23,6 @@ from tests.servers.tools import require_module, require_tool
 HOME = Path(__file__).resolve().parents[2]
 SHIPPED = HOME / "croissant"
 LOADER = Path(__file__).with_name("load_records.py")
-DAY = Publication(published=date(2026, 11, 21))
 
 
 def validated(*paths):
@@ -171,8 +169,7 @@ def test_absolute_addresses_pass_the_steps_of_the_conference_checker(web, index,
     """It takes a dict, so paths must be URLs, and reads the first record of every set."""
     shutil.copytree(index.root, web.folder / "rev1" / "shards")
     place = web.folder / "rev1" / "shards" / "metadata.json"
-    publication = Publication(published=date(2026, 11, 21), data_url=f"{web.url}/rev1/shards")
-    write_descriptor(index, place, publication=publication)
+    write_descriptor(index, place, data_url=f"{web.url}/rev1/shards")
 
     (records,) = loaded(tmp_path / "cache", place)
 
@@ -191,7 +188,7 @@ def test_shards_of_packed_depth_are_described_by_its_suffix(small_release, tmp_p
     pack(small_release, tmp_path / "shards", workers=1, depth_codec="blosc2")
     packed = SceneIndex.open(tmp_path / "shards")
     path = tmp_path / "data.json"
-    write_descriptor(packed, path, publication=DAY)
+    write_descriptor(packed, path)
 
     (records,) = loaded(tmp_path / "cache", path)
 
@@ -202,18 +199,20 @@ def test_shards_of_packed_depth_are_described_by_its_suffix(small_release, tmp_p
     assert check_descriptor(path) == []
 
 
-def test_many_shards_are_listed_in_a_file(index, tmp_path, monkeypatch):
-    for limit in ("MOST_SHARD_FILES", "MOST_MEDIA_BYTES"):
-        monkeypatch.setattr(f"stereogenbench_data.bridges.croissant.descriptor.{limit}", 1)
+def test_records_of_many_shards_are_those_of_the_smallest_of_each_family(
+    index, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("stereogenbench_data.bridges.croissant.descriptor.MOST_MEDIA_BYTES", 1)
     path = tmp_path / "many.json"
 
-    written = write_descriptor(index, path, publication=DAY)
+    written = write_descriptor(index, path)
 
     assert check_descriptor(path) == []
-    assert (tmp_path / "many" / "shards.txt").read_text().split() == sorted(index.shards)
-    assert [file["@id"] for file in written["distribution"]][-1] == "shard-files"
+    named = {each["@id"] for each in written["distribution"]}
+    assert set(index.shards) <= named
     (records,) = loaded(tmp_path / "cache", path)
     assert records["counts"]["shards"] == len(index.shards)
+    assert 0 < records["counts"]["media_files"] <= 12 * len(index)
 
 
 def test_shards_behind_a_url_need_an_address_to_name(small_release, web, tmp_path):
@@ -221,35 +220,32 @@ def test_shards_behind_a_url_need_an_address_to_name(small_release, web, tmp_pat
     remote = SceneIndex.open(f"{web.url}/shards")
 
     with pytest.raises(DescriptorError, match=r"are behind a URL.*--base-url"):
-        write_descriptor(remote, tmp_path / "data.json", publication=DAY)
+        write_descriptor(remote, tmp_path / "data.json")
 
 
 def test_a_descriptor_that_cannot_be_written_names_the_place(index, tmp_path):
     (tmp_path / "file").write_text("")
 
     with pytest.raises(DescriptorError, match=r"file/data: tables cannot be written"):
-        write_descriptor(index, tmp_path / "file" / "data.json", publication=DAY)
+        write_descriptor(index, tmp_path / "file" / "data.json")
 
 
 def test_a_tree_is_to_be_packed_first(small_release, tmp_path):
     with pytest.raises(DescriptorError, match="Pack them first"):
-        write_descriptor(SceneIndex.open(small_release), tmp_path / "data.json", publication=DAY)
+        write_descriptor(SceneIndex.open(small_release), tmp_path / "data.json")
 
 
 @pytest.mark.parametrize(
-    ("stated", "message"),
+    ("data_url", "message"),
     [
-        ({"version": "one"}, "'one' is not a version: it must be MAJOR.MINOR.PATCH"),
-        ({"data_url": "packed"}, "'packed' is not a URL"),
+        ("packed", "'packed' is not a URL"),
         (
-            {"data_url": "https://me:word@host/data?key=word"},
+            "https://me:word@host/data?key=word",
             r"^'https://host/data ?' is not .*without a login or a query",
         ),
     ],
 )
-def test_what_the_check_would_refuse_is_not_written(small_shards, tmp_path, stated, message):
+def test_what_the_check_would_refuse_is_not_written(small_shards, tmp_path, data_url, message):
     with pytest.raises(DescriptorError, match=message):
-        write_descriptor(
-            SceneIndex.open(small_shards), tmp_path / "a.json", publication=Publication(**stated)
-        )
+        write_descriptor(SceneIndex.open(small_shards), tmp_path / "a.json", data_url=data_url)
     assert list(tmp_path.iterdir()) == []

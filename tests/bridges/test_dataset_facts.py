@@ -9,7 +9,7 @@ import pytest
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.card import card
 from stereogenbench_data.bridges.croissant.check import check_descriptor
-from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
+from stereogenbench_data.bridges.croissant.descriptor import write_descriptor
 from stereogenbench_data.bridges.dataset_facts import DRAWN, RELEASE, facts_of, template
 from stereogenbench_data.errors import DescriptorError
 from stereogenbench_data.schema.release import COMPLETE_JSON
@@ -80,7 +80,7 @@ def test_scenes_of_an_unknown_maker_are_described_as_the_maker_states(
     def written(stated):
         if write == "card":
             return card(elsewhere, repository="a/b", about=stated)
-        return json.dumps(write_descriptor(elsewhere, path, publication=Publication(about=stated)))
+        return json.dumps(write_descriptor(elsewhere, path, about=stated))
 
     with pytest.raises(DescriptorError, match=r"is not known.*Not stated: name, .*--template"):
         written(None)

@@ -144,19 +144,8 @@ def test_without_rerun_the_extra_is_named(indexed_release, tmp_path, monkeypatch
 
     for call in (
         lambda: bridge.write_recording(tmp_path / "a.rrd", indexed_release),
-        lambda: bridge.view_live(indexed_release),
         lambda: bridge.log_scene(None, indexed_release),
     ):
         with pytest.raises(ExtraError, match=r"stereogenbench-data\[rerun\]"):
             call()
     assert not [*tmp_path.iterdir()]
-
-
-def test_the_viewer_is_sent_the_scene(rerun, indexed_release, tmp_path, monkeypatch):
-    def save_instead(*, recording, executable_path):
-        recording.save(tmp_path / "live.rrd")
-
-    monkeypatch.setattr(rerun, "spawn", save_instead)
-    bridge.view_live(indexed_release, SCENE, frames=[1], size=(16, 16))
-
-    assert 1 in read_back(tmp_path / "live.rrd")["/world/cam_05/depth", "DepthImage:buffer"]

@@ -3,7 +3,6 @@
 import gc
 import json
 import re
-from datetime import date
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ import webdataset
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.bridges.card import card
 from stereogenbench_data.bridges.croissant.check import check_descriptor
-from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
+from stereogenbench_data.bridges.croissant.descriptor import write_descriptor
 from stereogenbench_data.bridges.webdataset import decode
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.training import TrainingSettings
@@ -60,7 +59,7 @@ def test_the_descriptor_says_from_what_how_and_with_what_error(
 ):
     path = tmp_path / "data.json"
     index = SceneIndex.open(packed)
-    written = write_descriptor(index, path, publication=Publication(published=date(2026, 11, 21)))
+    written = write_descriptor(index, path)
 
     assert check_descriptor(path) == []
     assert "derived from other scenes for training" in written["description"]

@@ -18,14 +18,11 @@ USUAL = ("--size", "16x16", "--workers", "1")
         ("moge", "cam_00/depth.png"),
     ],
 )
-def test_training_scenes_are_exported_and_those_left_out_are_counted(
-    indexed_release, tmp_path, name, file
-):
+def test_training_scenes_are_exported(indexed_release, tmp_path, name, file):
     done = invoke("export", name, indexed_release, tmp_path, *USUAL)
 
     assert done.exit_code == 0, done.output
     assert done.stdout == f"{tmp_path}: 3 folders\n"
-    assert "1 evaluation scene left out: --split eval exports them" in done.stderr
     folder = tmp_path / "train" / "Uniform" / "SynthStage" / "scene_000001" / "frame_000"
     assert (folder / file).is_file()
 
@@ -38,18 +35,8 @@ def test_filters_cameras_frames_and_points_are_taken(indexed_release, tmp_path):
     settings = json.loads((tmp_path / "export.json").read_text())
 
     assert done.stdout == f"{tmp_path}: 6 folders\n"
-    assert "1 evaluation scene left out" in done.stderr
     assert settings["cameras"] == [0, 5]
     assert (settings["points"], settings["size"]) == (None, [16, 16])
-
-
-def test_evaluation_scenes_that_would_not_match_are_not_counted(indexed_release, tmp_path):
-    done = invoke(
-        "export", "ply", indexed_release, tmp_path, *USUAL, "--where", "family=IPD_Gaussian"
-    )
-
-    assert done.stdout == f"{tmp_path}: 1 folder\n"
-    assert "left out" not in done.stderr
 
 
 @pytest.mark.parametrize(

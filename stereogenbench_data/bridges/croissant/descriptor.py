@@ -23,8 +23,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -39,9 +38,6 @@ from stereogenbench_data.schema.release import CAMERA_PAIRS, baseline_bin
 from stereogenbench_data.sources.files import open_atomic, write_atomic
 from stereogenbench_data.sources.location import is_remote, shown
 
-SHARD_LIST: Final = "shards.txt"
-MOST_SHARD_FILES: Final = 3000
-"""Above this number, shards are named in a list, with their checksums in a table."""
 MOST_MEDIA_BYTES: Final = 1_000_000_000
 """Above this size of all shards, record sets of files use the smallest shard of each family."""
 
@@ -86,8 +82,7 @@ def write_tables(index: SceneIndex, folder: Path) -> dict[str, bytes]:
     """Write the tables of shards into a folder, and return their bytes by name.
 
     Args:
-        index: The index of shards. If there are too many for a descriptor, their paths are
-            written as ``shards.txt``.
+        index: The index of shards.
         folder: Where to write; created if it does not exist.
 
     Raises:
@@ -98,18 +93,13 @@ def write_tables(index: SceneIndex, folder: Path) -> dict[str, bytes]:
         "pairs.parquet": pairs_table(index),
         "shards.parquet": shards_table(index),
     }
-    names = [*tables]
     cannot = f"{folder}: tables cannot be written"
     with explain_os_errors(cannot, "Choose another place with --out.", kind=DescriptorError):
         folder.mkdir(parents=True, exist_ok=True)
         for name, table in tables.items():
             with open_atomic(folder / name) as file:
                 pq.write_table(table, file, compression="zstd")
-        if len(index.shards) > MOST_SHARD_FILES:
-            listed = "".join(f"{path}\n" for path in sorted(index.shards))
-            write_atomic(folder / SHARD_LIST, listed.encode())
-            names.append(SHARD_LIST)
-        return {name: (folder / name).read_bytes() for name in names}
+        return {name: (folder / name).read_bytes() for name in tables}
 
 
 def scenes_table(index: SceneIndex) -> pa.Table:
@@ -172,33 +162,12 @@ _VERSION: Final = re.compile(r"\d+\.\d+\.\d+")
 _DAY: Final = re.compile(r"\d{4}-\d{2}(-\d{2})?")
 _MEDIA_TYPES: Final = {"mp4": "video/mp4", "mkv": "video/x-matroska"}
 """By suffix. Depth packed by blosc2 has no media type of its own."""
-_TAR: Final = "application/x-tar"
+_TAR, _PARQUET = "application/x-tar", "application/x-parquet"
 _TABLES: Final = {
     "scenes.parquet": "One row a scene.",
     "pairs.parquet": "One row a camera pair, 15 a scene.",
     "shards.parquet": "One row a shard, with its checksum.",
-    SHARD_LIST: "The paths of all shards, one a line.",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Publication:
-    """The name, version and URLs that a descriptor states.
-
-    Attributes:
-        name: The dataset's name; None for what its maker states.
-        version: MAJOR.MINOR.PATCH; None for what its maker states, else 1.0.0.
-        published: The day of publication; None for what its maker states, else today.
-        data_url: URL of the folder of shards, pinned to a revision. With None, shards have paths
-            relative to the descriptor.
-        about: What the user states of the scenes, as for `dataset_facts.facts_of`.
-    """
-
-    name: str | None = None
-    version: str | None = None
-    published: date | None = None
-    data_url: str | None = None
-    about: dataset_facts.About | None = None
 
 
 def template(name: str, **words: str) -> Node:
@@ -211,7 +180,11 @@ def template(name: str, **words: str) -> Node:
 
 
 def write_descriptor(
-    index: SceneIndex | None, path: Path, *, publication: Publication | None = None
+    index: SceneIndex | None,
+    path: Path,
+    *,
+    about: dataset_facts.About | None = None,
+    data_url: str | None = None,
 ) -> Node:
     """Write the descriptor of an index's data, and its tables beside it.
 
@@ -219,25 +192,27 @@ def write_descriptor(
         index: The index of shards; None for the release in its own repository.
         path: The descriptor to write, such as ``croissant/sample.json``; the tables of shards are
             written into the folder of the same name without its suffix.
-        publication: What it states about name, version and URLs.
+        about: What the user states of the scenes, as for `dataset_facts.facts_of`. The version is
+            1.0.0 and the day of publication is today, unless they are stated.
+        data_url: URL of the folder of shards, pinned to a revision. With None, shards have paths
+            relative to the descriptor.
 
     Returns:
         The descriptor as written.
 
     Raises:
-        DescriptorError: If a file cannot be written, the version or a URL is not valid,
-            ``data_url`` is None but shards are behind a URL, a URL contains a login or a query,
-            the data are not shards, or who made the scenes is not known.
+        DescriptorError: If a file cannot be written, ``data_url`` is not valid or contains a login
+            or a query, it is None but shards are behind a URL, the data are not shards, or who
+            made the scenes is not known.
     """
-    publication = publication or Publication()
-    facts = dataset_facts.facts_of(index, about=publication.about)
-    _require_valid(publication, facts)
+    facts = dataset_facts.facts_of(index, about=about)
+    _require_valid(facts, data_url)
     if index is None:
-        data_url = publication.data_url or facts["url"]
+        data_url = data_url or facts["url"]
         files = template("release", repository=data_url)
     elif index.shards:
-        data_url = publication.data_url or _relative(index.root, to=path.parent)
-        tables_url = f"{publication.data_url}/{path.stem}" if publication.data_url else path.stem
+        tables_url = f"{data_url}/{path.stem}" if data_url else path.stem
+        data_url = data_url or _relative(index.root, to=path.parent)
         tables = write_tables(index, path.with_suffix(""))
         files = _shard_nodes(index, tables, data_url=data_url, tables_url=tables_url)
         facts = facts | dataset_facts.packing_facts(index, facts)
@@ -246,7 +221,7 @@ def write_descriptor(
             f"{index.where}: these are folders of scenes. Pack them first: shards are described "
             "where they are."
         )
-    head = _head(facts, publication, url=_page(data_url, beside=path))
+    head = _head(facts, url=_page(data_url, beside=path))
     records = [*_enumerations(index), *files["recordSet"]]
     descriptor = head | {"distribution": files["distribution"], "recordSet": records}
     write_node(descriptor, path)
@@ -265,18 +240,17 @@ def write_node(node: Mapping[str, Any], path: Path) -> None:
         write_atomic(path, (json.dumps(node, indent=1, ensure_ascii=False) + "\n").encode())
 
 
-def _require_valid(publication: Publication, facts: Mapping[str, Any]) -> None:
-    version = publication.version or facts.get("version", "1.0.0")
+def _require_valid(facts: Mapping[str, Any], data_url: str | None) -> None:
+    version, day = facts.get("version", "1.0.0"), facts.get("datePublished", "2026-01")
     if not _VERSION.fullmatch(str(version)):
         raise DescriptorError(
             f"{version!r} is not a version: it must be MAJOR.MINOR.PATCH, such as 1.0.0."
         )
-    if not _DAY.fullmatch(str(day := facts.get("datePublished", "2026-01"))):
+    if not _DAY.fullmatch(str(day)):
         raise DescriptorError(f"datePublished is {day!r}, not a day: write it as 2026-11-21.")
-    url = publication.data_url
-    if url is not None and (not is_remote(url) or shown(url) != url):
+    if data_url is not None and (not is_remote(data_url) or shown(data_url) != data_url):
         raise DescriptorError(
-            f"{shown(url)!r} is not a URL under which others find the data, such as "
+            f"{shown(data_url)!r} is not a URL under which others find the data, such as "
             "https://HOST/PATH, without a login or a query: give one, or leave it out."
         )
 
@@ -308,22 +282,19 @@ def _shard_nodes(
     """Return the files and record sets of shards."""
     nodes = _of_videos(index)
     bound = bound_shards(index)
-    is_listed = SHARD_LIST in tables
     files = []
     for name, content in tables.items():
-        kind = "text/plain" if name == SHARD_LIST else "application/x-parquet"
         sha256, about = hashlib.sha256(content).hexdigest(), {"description": _TABLES[name]}
         place = f"{tables_url}/{name}"
-        files.append(_file(name, place, kind, sha256, len(content), about))
-    for shard in bound if is_listed else sorted(index.shards):
+        files.append(_file(name, place, _PARQUET, sha256, len(content), about))
+    for shard in sorted(index.shards):
         facts = index.shards[shard]
         files.append(_file(shard, f"{data_url}/{shard}", _TAR, facts.sha256, facts.size, {}))
     contained: Any = [{"@id": each} for each in bound]
     for each in nodes["distribution"]:
         if each["containedIn"] == []:
             each["containedIn"] = contained if len(bound) != 1 else contained[0]
-        if each["@id"] != "shard-files" or is_listed:
-            files.append(each)
+        files.append(each)
     return {"distribution": files, "recordSet": nodes["recordSet"]}
 
 
@@ -371,19 +342,18 @@ def _relative(root: str, *, to: Path) -> str:
     return Path(os.path.relpath(root, to)).as_posix()
 
 
-def _head(facts: Mapping[str, Any], publication: Publication, *, url: str) -> Node:
+def _head(facts: Mapping[str, Any], *, url: str) -> Node:
     """Return the properties of the dataset as a whole, in the order in which people read them."""
     head = template("common")
     del head["recordSet"]
-    published = publication.published or facts.get("datePublished", datetime.now(UTC).date())
     head |= {
-        "name": publication.name or facts["name"],
+        "name": facts["name"],
         "description": facts["description"],
         "url": url,
         "license": facts["license"],
         "usageInfo": facts["usageInfo"],
-        "version": publication.version or facts.get("version", "1.0.0"),
-        "datePublished": str(published),
+        "version": facts.get("version", "1.0.0"),
+        "datePublished": facts.get("datePublished", str(datetime.now(UTC).date())),
     }
     rest = {name: value for name, value in facts.items() if name not in head}
     return head | rest | {"inLanguage": facts.get("inLanguage", "en")}

@@ -117,7 +117,7 @@ def _serve(requests: Connection, folder: Path) -> None:
     # The user's own preferences and add-ons stay out of it.
     for name in ("RESOURCES", "CONFIG", "SCRIPTS", "EXTENSIONS", "DATAFILES"):
         os.environ[f"BLENDER_USER_{name}"] = str(folder / name.lower())
-    from stereogenbench_data.synthesis.blender.stage import AssetError, Server
+    from stereogenbench_data.synthesis.blender.stage import Server
 
     server = Server()
     while True:
@@ -127,5 +127,5 @@ def _serve(requests: Connection, folder: Path) -> None:
             os._exit(0)  # Blender's own clean-up takes long and may crash.
         try:
             requests.send((None, getattr(server, name)(*values)))
-        except AssetError as error:
+        except SynthesisError as error:
             requests.send((str(error), None))

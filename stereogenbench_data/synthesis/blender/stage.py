@@ -20,6 +20,7 @@ import numpy as np
 from mathutils import Matrix
 from mathutils.bvhtree import BVHTree
 
+from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.synthesis.blender.assets import (
     AnimationAsset,
     Asked,
@@ -57,10 +58,6 @@ _NARROWEST_PX: Final = 0.01
 """Cycles' narrowest filter: rays pass within half of it of the centre of their pixel."""
 _MOST_LAYERS: Final = 64
 _GPU_KINDS: Final = ("OPTIX", "CUDA", "HIP", "ONEAPI", "METAL")
-
-
-class AssetError(Exception):
-    """An asset that cannot be used; its text is what the user reads."""
 
 
 class Mirror:
@@ -161,7 +158,7 @@ def check_files(where: str, *, root: str) -> None:
     own = bpy.utils.resource_path("LOCAL")
     for path in bpy.utils.blend_paths(absolute=True, packed=False, local=False):
         if Path(path).exists() and not _inside(path, root) and not _inside(path, own):
-            raise AssetError(
+            raise SynthesisError(
                 f"{where}: it refers to {path}, which is outside the asset folder {root}. Copy "
                 f"that file into the folder and point to it there, or pack it into the .blend file."
             )
@@ -174,7 +171,7 @@ def check_files(where: str, *, root: str) -> None:
         if is_needed and not Path(path).exists():
             missing.add(image.filepath or image.name)
     if missing:
-        raise AssetError(
+        raise SynthesisError(
             f"{where}: {len(missing)} of its files are missing: {_few(missing)}. Copy them beside "
             f"it and repair the paths (Blender: File, External Data, Find Missing Files), or pack "
             f"them."
@@ -195,7 +192,7 @@ def _import(path: str, where: str) -> None:
             bpy.ops.wm.fbx_import(filepath=path)
     except RuntimeError as error:
         text = str(error).strip().splitlines()
-        raise AssetError(
+        raise SynthesisError(
             f"{where}: Blender cannot import it ({text[-1] if text else 'no reason given'}). Open "
             f"it in Blender, repair it and save it as a .blend file."
         ) from error
@@ -213,7 +210,7 @@ def _add(path: str, where: str) -> tuple[list[Any], list[Any], float]:
                 wanted.scenes = there.scenes[:1]
                 wanted.actions = there.actions
         except (OSError, RuntimeError) as error:
-            raise AssetError(
+            raise SynthesisError(
                 f"{where}: Blender cannot open it ({error}). Save it again with Blender 5.2."
             ) from error
         rate_hz = 24.0
@@ -308,7 +305,7 @@ class Subject:
         )
         moved = _bones_of(action, own_slot)
         if not moved.keys() & bones.keys():
-            raise AssetError(
+            raise SynthesisError(
                 f"{where}: the take {action.name!r} moves no bone of the armature "
                 f"{self.armature.name!r}: it has {_few(moved)}, the armature has "
                 f"{_few(bones.keys())}. Name an animation of the same skeleton, or retarget it."
@@ -339,7 +336,7 @@ class Subject:
         self.place(None, time_frames=self.start)
         points = self._vertices()
         if not len(points):
-            raise AssetError(
+            raise SynthesisError(
                 f"{character.where}: it has no mesh that is rendered. Export the mesh with "
                 f"the armature, or show it in renders."
             )
@@ -433,7 +430,7 @@ def _armature_of(objects: list[Any], *, where: str) -> Any:
     """
     armatures = [item for item in objects if item.type == "ARMATURE"]
     if not armatures:
-        raise AssetError(
+        raise SynthesisError(
             f"{where}: it has no armature, so it cannot be animated; it has "
             f"{_few({item.type.lower() for item in objects})}. Export the skeleton with the mesh, "
             f"or name another file."
@@ -476,7 +473,7 @@ def _take(actions: list[Any], *, name: str | None, where: str) -> Any:
     matching = [action for full, action in takes.items() if name in (full, *full.split("|"))]
     if len(matching) != 1:
         asked = "" if name is None else f"; take = {name!r} names {len(matching)} of them"
-        raise AssetError(
+        raise SynthesisError(
             f"{where}: it has {len(takes)} takes that move bones ({_few(takes, 12)}){asked}. Name "
             f"one of them by `take`, or export the animation with the armature."
         )
@@ -497,7 +494,7 @@ def _require_size(noun: str, size_m: float, asset: MapAsset | CharacterAsset) ->
         return
     likely = [factor for factor in _UNITS_M if usual_least <= size_m * factor <= usual_most]
     cure = f"Set scale = {asset.scale * likely[0]:g}" if likely else "Set scale to metres in a unit"
-    raise AssetError(
+    raise SynthesisError(
         f"{asset.where}: its {noun} is {size_m:.3g} m, and should be {least:g} to {most:g} m. "
         f"{cure} there. If a map is right, set bounds_m to the part where cameras may be."
     )
@@ -528,7 +525,7 @@ class Stage:
             try:
                 bpy.ops.wm.open_mainfile(filepath=asset.file, load_ui=False, use_scripts=False)
             except RuntimeError as error:
-                raise AssetError(
+                raise SynthesisError(
                     f"{where}: Blender cannot open it ({str(error).strip()}). Save it again with "
                     f"Blender 5.2."
                 ) from error
@@ -591,7 +588,7 @@ class Stage:
         asset = self.asset
         points = self.triangles.vertices
         if not len(points):
-            raise AssetError(
+            raise SynthesisError(
                 f"{asset.where}: the map is empty: no mesh of its scene is rendered. Show its "
                 f"collections in renders, or name another file."
             )
@@ -763,7 +760,7 @@ def _device(settings: RenderSettings) -> str:
             for device in preferences.devices:
                 device.use = device.type == kind
             return "GPU"
-    raise AssetError(
+    raise SynthesisError(
         'device = "GPU": Cycles finds no GPU here. Install the driver of the GPU, or set '
         'device = "CPU" in [render].'
     )
@@ -772,7 +769,7 @@ def _device(settings: RenderSettings) -> str:
 class Server:
     """Answers requests about the one scene. Each names its map, which is opened if it is another.
 
-    Every method raises `AssetError` if an asset cannot be used.
+    Every method raises `SynthesisError` if an asset cannot be used.
     """
 
     def __init__(self) -> None:
