@@ -8,7 +8,7 @@ reference is part of it, and an empty cell for a dash.
 import csv
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -54,13 +54,6 @@ SOURCES: Final[dict[str, str]] = {
 }
 """Where each table stands in the paper: its LaTeX label and what it is."""
 
-SCENES_SCORED: Final[Mapping[tuple[str, str], int]] = {
-    (subset, family): count
-    for (split, subset, family), count in SCENE_COUNTS.items()
-    if split == "eval"
-}
-"""How many scenes the paper's numbers are of, by subset and family: all of the split."""
-
 
 @cache
 def reference_table(name: TableName) -> tuple[ReferenceRow, ...]:
@@ -97,8 +90,9 @@ def release_difference(index: SceneIndex, rows: Collection[int], *, scored: str 
             f"{len(others)} of {len(names)} scenes on maps that the release does not have ({named})"
         )
     branches = Counter(zip(subsets, families, strict=True))
-    for branch in {**branches, **(SCENES_SCORED if scored == "all" else {})}:
-        found, expected = branches[branch], SCENES_SCORED.get(branch, 0)
+    papers = {branch[1:]: count for branch, count in SCENE_COUNTS.items() if branch[0] == "eval"}
+    for branch in {**branches, **(papers if scored == "all" else {})}:
+        found, expected = branches[branch], papers.get(branch, 0)
         if found != expected:
             name = " ".join(filter(None, branch))
             return f"{found} scenes of {name}, of which the paper scored {expected or 'none'}"
@@ -135,7 +129,7 @@ TABLES: Final[Mapping[str, TableForm]] = {
     "explanations": TableForm("What explains the scores, primary pairs", _BRANCH),
     "controls": TableForm("Calibration controls", (), pairs="all", paper=("controls",)),
 }
-"""The tables by name; those by a column of the index (`stratum_table`) come on top."""
+"""The tables by name; those by a column of the index come on top."""
 
 Value = Cell | FrechetDistance | str
 """The numbers of a column of frames, a distance between sets, or what the paper printed."""
@@ -195,57 +189,36 @@ def tables_of(results: Sequence[Scores], *, by: Sequence[str] = ()) -> list[Tabl
         by: Columns of the index to stratify by, besides branches and baselines.
 
     Raises:
-        EvaluationError: If the methods are of different tiers or were scored in different ways.
+        EvaluationError: If the methods are of different tiers or were scored in different ways, or
+            if the index has no such column with one value a scene.
     """
     require_comparable(results)
     has_others = any(not pair.is_primary for one in results for pair in one.pairs)
     names = ["branches", "bins_primary", *(["bins_all"] if has_others else [])]
     return [
         *(table_of(results, name) for name in names),
-        *(stratum_table(results, column) for column in by),
+        *(table_of(results, f"by_{column}", form=_form_by(column)) for column in by),
         table_of(results, "explanations"),
     ]
 
 
-def stratum_table(results: Sequence[Scores], column: str) -> Table:
-    """Return primary pairs by a column of the index.
-
-    Raises:
-        EvaluationError: If the index has no such column with one value a scene.
-    """
-    index = results[0].index
-    values = index.column(column)
-    if values.ndim != 1:
-        raise EvaluationError(
-            f"{column} has {values.shape[1]} values a scene: stratify by a column that has one."
-        )
-    used = sorted({pair.row for one in results for pair in one.pairs})
-    plain = ["" if value is None else value for value in values[used].tolist()]
-    strata_of = dict(zip(used, strata(plain, name=column), strict=True))
-    form = TableForm(f"By {column}, primary pairs", (*_BRANCH, column))
-    return table_of(results, f"by_{column}", form=form, strata_of=strata_of)
+def _form_by(column: str) -> TableForm:
+    return TableForm(f"By {column}, primary pairs", (*_BRANCH, column))
 
 
-def table_of(
-    results: Sequence[Scores],
-    name: str,
-    *,
-    form: TableForm | None = None,
-    strata_of: Mapping[int, str] | None = None,
-) -> Table:
+def table_of(results: Sequence[Scores], name: str, *, form: TableForm | None = None) -> Table:
     """Return a table: headline columns, or those that explain them, and distances of branches.
 
     Args:
         results: Each method's scores.
         name: Its name, one of `TABLES` unless a form is given.
         form: What it shows.
-        strata_of: For a key that is a column of the index, the group of each row of the index.
     """
     first, form = results[0], form or TABLES[name]
     scored_rows = {pair.row for one in results for pair in one.pairs if not pair.problem}
     scored = "all" if name == "controls" else "some"
     differs = release_difference(first.index, scored_rows, scored=scored) if form.paper else ""
-    rows = _rows(results, form, strata_of or {}, differs=differs)
+    rows = _rows(results, form, differs=differs)
     explains = name == "explanations"
     columns = [
         each for each in first.protocol.columns if (COLUMNS[each].better == "neither") == explains
@@ -266,27 +239,13 @@ def table_of(
     )
 
 
-def _rows(
-    results: Sequence[Scores],
-    form: TableForm,
-    strata_of: Mapping[int, str],
-    *,
-    differs: str,
-) -> list[TableRow]:
+def _rows(results: Sequence[Scores], form: TableForm, *, differs: str) -> list[TableRow]:
     """Return the rows of groups in the order of tables: every method's, then the paper's."""
-    index = results[0].index
-
-    def label_of(pair: PairMeans, key: str) -> str:
-        if key == "baseline":
-            return baseline_bin(pair.baseline_cm)
-        if key in _BRANCH:
-            return str(index.column(key)[pair.row] or "")
-        return strata_of[pair.row]
-
+    label_of = [_labels_by(key, results) for key in form.keys]
     groups_of = [
         group_by(
             (pair for pair in one.pairs if form.pairs == "all" or pair.is_primary),
-            lambda pair: tuple(label_of(pair, key) for key in form.keys),
+            lambda pair: tuple(label(pair) for label in label_of),
         )
         for one in results
     ]
@@ -309,6 +268,23 @@ def _rows(
                     rows += [row for row in paper if row.method.startswith(f"{one.name} (")]
         rows += paper if form.keys else []
     return rows
+
+
+def _labels_by(key: str, results: Sequence[Scores]) -> Callable[[PairMeans], str]:
+    """Return what tells the group of a pair by one key of a table."""
+    if key == "baseline":
+        return lambda pair: baseline_bin(pair.baseline_cm)
+    values = results[0].index.column(key)
+    if key in _BRANCH:
+        return lambda pair: str(values[pair.row] or "")
+    if values.ndim != 1:
+        raise EvaluationError(
+            f"{key} has {values.shape[1]} values a scene: stratify by a column that has one."
+        )
+    used = sorted({pair.row for one in results for pair in one.pairs})
+    plain = ["" if value is None else value for value in values[used].tolist()]
+    strata_of = dict(zip(used, strata(plain, name=key), strict=True))
+    return lambda pair: strata_of[pair.row]
 
 
 def _rank(label: str) -> tuple[float, str]:

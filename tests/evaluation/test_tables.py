@@ -12,7 +12,7 @@ from stereogenbench_data import EvaluationError, EvaluationProtocol, tables_of, 
 from stereogenbench_data.evaluation.aggregate import PairMeans, Scores, tally
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.report import document, latex, markdown
-from stereogenbench_data.evaluation.tables import release_difference, stratum_table, table_of
+from stereogenbench_data.evaluation.tables import release_difference, table_of
 
 PAPERS = EvaluationProtocol()
 INF, NAN = float("inf"), float("nan")
@@ -105,14 +105,13 @@ def test_bins_are_in_order_with_the_papers_beside(scores):
 
 
 def test_a_column_of_the_index_makes_strata(scores, scored_index):
-    by_map = stratum_table([scores()], "map_name")
-    by_focal = stratum_table([scores()], "focal_mm")
+    by_map, by_focal = tables_of([scores()], by=["map_name", "focal_mm"])[3:5]
     focals_mm = {f"{scored_index.scene(row).rig.focal_mm:g}" for row in range(3)}
 
     assert [row.labels[2] for row in by_map.rows] == ["SynthStage", "SynthYard"]
     assert {row.labels[2] for row in by_focal.rows} == focals_mm
     with pytest.raises(EvaluationError, match="baselines_cm has 15 values a scene"):
-        stratum_table([scores()], "baselines_cm")
+        tables_of([scores()], by=["baselines_cm"])
 
 
 def test_methods_of_one_tier_share_a_table_and_those_of_two_do_not(scores):
