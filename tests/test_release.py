@@ -4,7 +4,6 @@ import importlib.util
 import os
 import re
 import subprocess
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,6 @@ import pytest
 from tests.servers.tools import require_tool
 
 HOME = Path(__file__).resolve().parents[1]
-PROJECT = tomllib.loads((HOME / "pyproject.toml").read_text())
 ENTRIES = """# Changelog
 
 ## [Unreleased]

@@ -97,3 +97,10 @@ def test_a_filter_that_no_folder_matches_says_what_folders_there_are(small_relea
 
     assert refused.exit_code == 2
     assert there in refused.stderr
+
+
+def test_all_frames_can_be_audited(small_shards, run):
+    result = run(small_shards, "--workers", "1", "--where", f"scene={SCENE}", "--per-scene", "all")
+
+    assert "1 of 4 scenes, all frames of each." in result.stdout
+    assert "7/7 frames" in result.stderr

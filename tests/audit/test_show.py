@@ -88,6 +88,13 @@ def test_the_bar_of_disparity_says_depth_in_metres_below_pixels(reader, row):
     assert float(metres(60.0)) == pytest.approx(10 * float(sample["baseline_m"]), rel=1e-2)
 
 
+def test_nothing_measured_has_a_scale_too():
+    nothing = np.zeros((2, 2), dtype=bool)
+
+    scale = ColourScale.of(np.zeros((2, 2)), measured=nothing, kind="log")
+    assert (scale.paint(np.zeros((2, 2)), measured=nothing) == NOT_MEASURED).all()
+
+
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
 def test_a_clip_has_a_page_for_every_frame_at_the_scenes_rate(reader, row, tmp_path, suffix):
     counted = []

@@ -16,6 +16,7 @@ from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.croissant.check import check_descriptor
 from stereogenbench_data.bridges.croissant.descriptor import write_descriptor
 from stereogenbench_data.errors import DescriptorError
+from stereogenbench_data.shards.download import download, plan_download
 from stereogenbench_data.shards.pack import pack
 from tests.cli.command import invoke
 from tests.servers.tools import require_module, require_tool
@@ -196,6 +197,19 @@ def test_shards_of_packed_depth_are_described_by_its_suffix(small_release, tmp_p
     depth = stored(packed, *((camera, f"cam_{camera:02d}_depth.b2frame") for camera in cameras))
     assert records["contents"]["depth_videos"] == depth
     assert records["counts"]["media_files"] == 12 * len(packed)
+    assert check_descriptor(path) == []
+
+
+def test_a_partial_download_is_described_by_its_videos(small_shards, tmp_path):
+    whole = SceneIndex.open(small_shards)
+    part = plan_download(whole, [0, 1], cameras=(2, 3), streams=("depth",))
+    download(whole, part, tmp_path / "tree")
+    pack(tmp_path / "tree", tmp_path / "shards", workers=1)
+    path = tmp_path / "data.json"
+    written = write_descriptor(SceneIndex.open(tmp_path / "shards"), path)
+
+    kinds = [each["@id"] for each in written["recordSet"] if each["@id"].endswith("_videos")]
+    assert kinds == ["depth_videos"]
     assert check_descriptor(path) == []
 
 

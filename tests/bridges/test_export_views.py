@@ -233,6 +233,25 @@ def test_moges_depth_is_read_back_whatever_its_range(tmp_path, values, close):
     np.testing.assert_allclose(np.nan_to_num(found, nan=0.0), depth_m, rtol=close)
 
 
+def test_the_size_of_an_export_is_that_of_its_pictures_depth_and_cameras(
+    detailed_release, tmp_path
+):
+    size = (48, 80)
+    (folder,) = exported(
+        detailed_release, tmp_path / "t", layout="transforms", size=size, points="all"
+    )
+    about = json.loads((folder / "transforms.json").read_text())
+    sample = SceneViews(detailed_release, size=size)[0]
+    frame = about["frames"][2]
+
+    assert (about["w"], about["h"]) == (80, 48)
+    assert np.load(folder / frame["depth_file_path"]).shape == size
+    with Image.open(folder / frame["file_path"]) as picture:
+        assert picture.size == (80, 48)
+    lens = (about["fl_x"], about["fl_y"], about["cx"], about["cy"])
+    assert lens == tuple(sample["intrinsics"].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]])
+
+
 @pytest.mark.parametrize("layout", ["colmap", "moge"])
 def test_what_was_exported_before_is_kept(indexed_release, tmp_path, layout):
     options = {"layout": layout, "frames": [0, 4], "size": (32, 32)}

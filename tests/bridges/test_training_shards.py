@@ -9,6 +9,8 @@ import pytest
 import webdataset
 
 from stereogenbench_data import SceneIndex, StereoPairs
+from stereogenbench_data.audit.statistics import statistics
+from stereogenbench_data.audit.statistics_report import statistics_markdown
 from stereogenbench_data.bridges.card import card
 from stereogenbench_data.bridges.croissant.check import check_descriptor
 from stereogenbench_data.bridges.croissant.descriptor import write_descriptor
@@ -88,3 +90,11 @@ def test_the_card_says_so_and_lists_the_file_that_says_it(packed, small_release,
     assert "size=(480, 832)" not in derived
     assert "training.json" not in released
     assert "Derived for training" not in released
+
+
+def test_statistics_say_so(packed, small_shards):
+    found = statistics(SceneIndex.open(packed))
+
+    assert "derived at 48x32" in statistics_markdown(found)
+    assert "derived at 48x32" in found.to_json()["derived"]
+    assert "derived" not in statistics_markdown(statistics(SceneIndex.open(small_shards)))

@@ -2,6 +2,7 @@
 
 import gc
 import json
+import tempfile
 
 import numpy as np
 import pytest
@@ -44,6 +45,12 @@ def test_the_stage_gives_the_samples_of_the_map_style_dataset(urls, small_shards
         assert equal_samples(found[sample["__key__"]], sample)
 
 
+def test_the_url_is_that_of_the_shard(scenes, urls):
+    sample = next(decode(("left", "__url__"))(scenes))
+
+    assert sample["__url__"] in urls
+
+
 def test_a_baseline_leaves_out_scenes_without_such_a_pair(scenes):
     narrow = list(decode(("baseline_m",), pairs="all", baseline_cm=(0, 8))(scenes))
 
@@ -60,6 +67,16 @@ def test_random_frames_differ_among_scenes_and_epochs_and_repeat_by_seed(scenes)
     assert frames(0, 0) == frames(0, 0)
     assert frames(0, 0) != frames(0, 1)
     assert frames(0, 0) != frames(1, 0)
+
+
+def test_nothing_is_left_in_the_temporary_folder(scenes, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+    next(decode(("left",))(scenes))
+    list(decode(("left",))(scenes))
+    gc.collect()
+
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_missing_member_is_named(scenes):

@@ -3,12 +3,9 @@
 import math
 
 import pytest
-from hypothesis import strategies as st
 
 from stereogenbench_data import EvaluationError
 from stereogenbench_data.evaluation.aggregate import PairMeans, cell, strata, tally
-
-finite = st.floats(-1e6, 1e6)
 
 
 def pair(scene, numbers, *, cameras=(0, 1)):

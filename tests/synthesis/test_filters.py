@@ -62,6 +62,12 @@ def test_a_pit_refuses_the_subject_that_walks_over_it():
     assert refusal.limit == LIMITS.support_gap_m
 
 
+def test_nothing_below_the_subject_refuses_it():
+    refusal = spawn_refusal(Blocks([((5, 5, -1), (6, 6, 0))]))
+
+    assert (refusal.reason, refusal.value) == ("spawn_support", np.inf)
+
+
 def test_a_subject_that_floats_or_sinks_is_refused():
     assert spawn_refusal(yard(sunk_m=-0.3)).value == pytest.approx(0.3)
     assert spawn_refusal(yard(sunk_m=0.3)).reason == "spawn_support"
@@ -93,6 +99,12 @@ def test_a_low_ceiling_refuses_all_floors():
 
     assert (refusal.reason, refusal.limit) == ("spawn_space", 2.0)
     assert refusal.value == pytest.approx(1.5)
+
+
+def test_a_hole_without_a_floor_refuses_the_place():
+    world = Blocks([((5, 5, -1), (6, 6, 0))])
+
+    assert find_spawn(proposal(), world=world).reason == "spawn_support"
 
 
 # Poses.
@@ -163,6 +175,12 @@ def test_a_camera_outside_the_map_collides_though_nothing_is_near_it():
     checks = looking(world, eye=(4, 0, 1.0))
 
     assert (checks.reasons[0], checks.values[0]) == ("collision", pytest.approx(-1.0))
+
+
+def test_a_camera_inside_the_subject_collides():
+    near = Rig(np.linspace(-0.01, 0.01, 6), (8.0, 8.0))
+
+    assert looking(yard(), eye=(0.45, 0, 0.9), rig=near).reasons[0] == "collision"
 
 
 @pytest.mark.parametrize(

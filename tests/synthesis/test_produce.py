@@ -116,3 +116,16 @@ def test_two_runs_do_not_draw_the_same_part_at_once(tmp_path):
     first = synthesise(tmp_path, request, part=(1, 2), progress=second_run)
 
     assert [len(contents(tmp_path / key)) for key in first] == [17, 17]
+
+
+def test_parts_that_share_scenes_may_run_side_by_side(tmp_path):
+    request = SynthRequest(scenes=2, **SMALL)
+
+    def second_run(done, total):
+        if done == 6:
+            assert len(synthesise(tmp_path, request)) == 2
+
+    (first,) = synthesise(tmp_path, request, part=(1, 2), progress=second_run)
+
+    assert len(contents(tmp_path / first)) == 17
+    assert not list(tmp_path.glob(".generation/*/"))

@@ -69,6 +69,27 @@ def test_the_depth_of_a_ball_is_that_of_the_nearest_point_on_its_axis():
     assert faces[0, 0] == SKY
 
 
+def test_a_nearer_shape_hides_a_farther_one_in_either_order():
+    near = Shape("box", np.array([3.0, 0.0, 2.0]), np.eye(3), np.full(3, 0.4), STONE)
+    far = Shape("box", np.array([8.0, 0.0, 2.0]), np.eye(3), np.full(3, 3.9), STONE)
+    view = view_from([0.0, 0.0, 2.0])
+
+    first, _ = depth_of([near, far], view)
+    second, _ = depth_of([far, near], view)
+
+    np.testing.assert_array_equal(first, second)
+    assert first[2, 2] == pytest.approx(2.6)
+    assert first[2, 0] == pytest.approx(4.1)
+
+
+def test_a_shape_behind_the_camera_is_not_seen():
+    behind = Shape("box", np.array([-3.0, 0.0, 2.0]), np.eye(3), np.full(3, 1.0), STONE)
+
+    depth_m, _ = depth_of([behind], view_from([0.0, 0.0, 2.0]))
+
+    assert depth_m[2, 2] == np.inf
+
+
 @pytest.mark.parametrize("index", range(2))
 def test_every_hit_lies_on_the_surface_of_its_solid(index):
     """Independent of how it was found: the point at that depth fulfils the solid's equation."""
