@@ -23,6 +23,7 @@ from stereogenbench_data.audit.contract.verdict import (
     Verdict,
     encoding_line,
 )
+from stereogenbench_data.audit.scene_access import spread
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import SelectionError, StereoGenBenchError, StorageError
 from stereogenbench_data.index.learning import (
@@ -142,7 +143,7 @@ def survey(  # noqa: PLR0913 - each names one thing that a user chooses
     usable = [each.scene for each in found if each.scene is not None]
     tested.problems.extend(scene.remark("left") for scene in usable if scene.remark("left"))
     if usable and pictured:
-        report = _tested(tested, _spread(usable, 2 * pictured), None, how)
+        report = _tested(tested, _some(usable, 2 * pictured), None, how)
         for verdict in () if report is None else report.worlds:
             told = f"{_SHARES}: {'; '.join(verdict.lines)}"
             (tested.problems if verdict.is_wrong else tested.poses).append(f"poses: {told}")
@@ -186,7 +187,7 @@ def _learning(
         lines, before = surveyed.notes.setdefault((number, "depth"), []), len(surveyed.verdicts)
         report = None
         if pictured and teaching:
-            teaching, others = _spread(teaching, pictured), _spread(others, pictured)
+            teaching, others = _some(teaching, pictured), _some(others, pictured)
             shape, report = _with_measured_depth(surveyed, shape, teaching, others, how)
         if shape.poses is None and teaching and teaching[0].remark("world"):
             notes = surveyed.notes.setdefault((number, "poses"), [])
@@ -237,9 +238,9 @@ class _ExamineTask:
             return None
 
 
-def _spread(scenes: Sequence[Scene], count: int) -> list[Scene]:
+def _some(scenes: Sequence[Scene], count: int) -> list[Scene]:
     """Return at most this number of scenes, evenly spread."""
-    return list(scenes[:: max(1, -(-len(scenes) // count))])
+    return [scenes[place] for place in spread(len(scenes), count)]
 
 
 def _diagnosed(

@@ -1,4 +1,4 @@
-"""Where the files of one scene are, for a task of its own."""
+"""Which scenes and frames are looked at, and where the files of one scene are."""
 
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Scene
@@ -10,3 +10,16 @@ def source_of(index: SceneIndex, scene: Scene) -> MemberSource:
     paths = {member.path for member in scene.members.values()}
     shards = {path: index.shards[path] for path in paths if path in index.shards}
     return MemberSource(index.root, shards=shards, revision=index.digest, retry=index.retry)
+
+
+def spread(available: int, wanted: int) -> tuple[int, ...]:
+    """Return this many numbers below ``available``, evenly spread from first to last; 0 means all.
+
+    >>> spread(81, 5), spread(2, 5)
+    ((0, 20, 40, 60, 80), (0, 1))
+    """
+    if wanted == 0 or wanted >= available:
+        return tuple(range(available))
+    if wanted == 1:
+        return (available // 2,)
+    return tuple(round(step * (available - 1) / (wanted - 1)) for step in range(wanted))

@@ -32,9 +32,9 @@ def doctor(  # noqa: PLR0913 - one parameter an option
     """Find from the pictures how stored depth becomes metres.
 
     The doctor compares what the cameras of a scene see with what depth predicts: planar or ray,
-    inverse, frame lag, camera order, flips, offset, unit / (focal length x baseline), and each
-    camera beside the others. The declared contract is that of the files and of --conventions
-    FILE. -o writes a picture. The exit status is 0 if the declared contract
+    inverse, frame lag, camera order, flips, unit / (focal length x baseline), and each camera
+    beside the others. The declared contract is that of the files and of --conventions FILE. -o
+    writes a picture. The exit status is 0 if the declared contract
     fits or the pictures cannot tell, 1 if another one is clearly better or a camera does not fit,
     2 if the command failed.
 

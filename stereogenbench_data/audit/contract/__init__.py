@@ -2,6 +2,6 @@
 
 The modules in the order in which a scene passes through them: `hypotheses` (what may be wrong),
 `matching` (pixels found in two pictures), `scoring` (how well a hypothesis explains them),
-`fitting` (its scale and offsets), `cameras` (each camera beside the others), `diagnosis` (one
+`fitting` (its scale), `cameras` (each camera beside the others), `diagnosis` (one
 scene), `verdict` (scenes together), `doctor` (a whole data set) and `picture` (a drawing of it).
 """

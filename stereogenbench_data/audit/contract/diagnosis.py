@@ -5,14 +5,14 @@ further change clearly improves. `diagnose_scene` reports how well that contract
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from stereogenbench_data.audit.contract.cameras import CameraCheck, CameraComparison
+from stereogenbench_data.audit.contract.cameras import CameraCheck, check_cameras
 from stereogenbench_data.audit.contract.fitting import (
     RayPower,
-    fit_hypothesis,
+    fit_scale,
     ray_power,
     voted,
 )
@@ -22,27 +22,19 @@ from stereogenbench_data.audit.contract.matching import (
     SceneFrames,
     disparity_px,
     relative_step,
-    spread_px,
 )
 from stereogenbench_data.audit.contract.scoring import (
     LEAST_ERRORS,
-    NOTHING,
-    OFFSET,
-    SCALE,
     Evidence,
-    Free,
-    Pair,
     ScoredContract,
     evidence,
     score_hypothesis,
 )
-from stereogenbench_data.schema.records import Scene
 
 LEAST_LOG_SCALE: Final = 0.01
 """A smaller error of the unit is not called wrong."""
 BIAS_PX: Final = 0.1
 """Systematic error of disparity, by interpolation on small pictures."""
-LEAST_OFFSET_PX: Final = 0.3
 _NOTHING: Final = Evidence(math.nan, math.inf)
 
 
@@ -65,54 +57,40 @@ class SceneDiagnosis:
     Attributes:
         key: The scene.
         views: How many views (a pair in a frame) were compared.
-        pairs: The pairs.
         matches: Pixels that were found in both pictures of a view.
         unit_m: The declared unit of the primary pair's left depth, in metres.
         unit_source: Where it comes from: "tag", "default", "conventions", "user" or "unreadable".
-        recorded_pair: The recorded primary pair if, by the poses, its left camera stands to the
-            right of the other; else None.
         declared: The declared answers.
         best: The answers of the best contract.
         problem: Why the scene could not be judged; empty if it could.
-        changed: What else the best contract changes: the scale, the offset, or both.
+        is_scaled: Whether the best contract has another scale too.
         scale: Found over declared disparity, fitted with the best contract's answers.
         scale_error: Standard error of log(scale).
         other_kind_scale: Scale with the other kind of depth, all else as in the best contract.
-        offsets_px: Constant disparity of each pair with the best contract.
         gain: By how much the best contract is better than the declared one.
         rivals: The other answers.
         disparity_px: Root mean square of the disparities found.
-        spread_px: The same, less the mean of each view.
         depth_step: The `relative_step` of stored depths.
         check: How well each camera fits the best contract.
     """
 
     key: str
     views: int
-    pairs: tuple[Pair, ...]
     matches: int
     unit_m: float
     unit_source: str
-    recorded_pair: Pair | None
     declared: Hypothesis
     best: Hypothesis
     problem: str = ""
-    changed: Free = NOTHING
+    is_scaled: bool = False
     scale: float = 1.0
     scale_error: float = math.inf
     other_kind_scale: float = math.nan
-    offsets_px: dict[Pair, float] = field(default_factory=dict)
     gain: Evidence = _NOTHING
     rivals: tuple[Rival, ...] = ()
     disparity_px: float = math.inf
-    spread_px: float = math.inf
     depth_step: float = 0.0
     check: CameraCheck = field(default_factory=CameraCheck)
-
-    @property
-    def fits_scale(self) -> bool:
-        """Whether the best contract has a scale of its own."""
-        return "scale" in self.changed or self.best.form != self.declared.form
 
 
 def allowed_log_scale(depth_step: float) -> float:
@@ -122,12 +100,6 @@ def allowed_log_scale(depth_step: float) -> float:
     step allows for truncation.
     """
     return max(LEAST_LOG_SCALE, depth_step / 4 + depth_step**2)
-
-
-def crossed_pair(scene: Scene) -> Pair | None:
-    """Return the recorded primary pair if the poses put its cameras in the other order."""
-    left, right = scene.rig.primary_pair
-    return (left, right) if scene.lateral_m[left] > scene.lateral_m[right] else None
 
 
 _COARSEST_STEP: Final = 0.5
@@ -161,25 +133,28 @@ class ContractSearch:
         # The pairs next but one serve the comparison of cameras.
         self._matches = [match for match in matches if match.pair in near] or list(matches)
         self._bias = BIAS_PX / max(disparity_px(matches), 1e-6)
-        self._bias_beside_offset = BIAS_PX / max(spread_px(matches), 1e-6)
-        self._fitted: dict[tuple[Hypothesis, Free], ScoredContract] = {}
+        self._fitted: dict[tuple[Hypothesis, bool], ScoredContract] = {}
         self._likely: dict[Hypothesis, tuple[Hypothesis, ...]] = {}
-        self._powers: dict[tuple[Hypothesis, Free], RayPower] = {}
-        self.declared = self.candidate(Hypothesis.declared(views.encoding), free=NOTHING)
+        self._powers: dict[Hypothesis, RayPower] = {}
+        self.declared = self.candidate(Hypothesis.declared(views.encoding), is_scaled=False)
 
-    def candidate(self, hypothesis: Hypothesis, *, free: Free) -> ScoredContract:
-        """Return a contract, fitted."""
-        if (hypothesis, free) not in self._fitted:
-            found = fit_hypothesis(self._views, self._matches, hypothesis, free=free)
-            self._fitted[hypothesis, free] = replace(found, free=free)
-        return self._fitted[hypothesis, free]
+    def candidate(self, hypothesis: Hypothesis, *, is_scaled: bool = True) -> ScoredContract:
+        """Return a contract, its scale fitted or as declared."""
+        if (hypothesis, is_scaled) not in self._fitted:
+            fit = fit_scale if is_scaled else score_hypothesis
+            found = fit(self._views, self._matches, hypothesis)
+            self._fitted[hypothesis, is_scaled] = replace(found, is_scaled=is_scaled)
+        return self._fitted[hypothesis, is_scaled]
 
     def best(self) -> ScoredContract:
         """Return the contract with the fewest changes that no further change clearly improves."""
         current = self.declared
         for _ in range(_MOST_CHANGES):
-            one = self._most_better(current, self._one_change(current))
-            two = self._most_better(current, self._two_changes(current))
+            is_scaled = current.is_scaled
+            changed = list(self._other_answers(current, is_scaled=is_scaled))
+            changed += [] if is_scaled else [self.candidate(current.hypothesis)]
+            twice = [] if is_scaled else self._other_answers(current, is_scaled=True)
+            one, two = (self._most_better(current, each) for each in (changed, twice))
             if one is not None and (two is None or not self._is_better(two, one)):
                 current = one
             elif two is not None:
@@ -194,35 +169,23 @@ class ContractSearch:
         A scale explains most of the difference, so the search may have chosen a scale instead.
         """
         (other,) = current.hypothesis.alternatives("kind")
-        free = current.free | SCALE
-        mine, theirs = (self.candidate(each, free=free) for each in (current.hypothesis, other))
+        mine, theirs = (self.candidate(each) for each in (current.hypothesis, other))
         # A ray is longer than its depth by a limited factor; more than that is another scale.
         most = math.log(float(self._views.ray_per_planar.max())) + self._least_log_scale
         if abs(math.log(mine.scale / current.scale)) > most:
             return current
         return self._pruned(theirs) if self.gain(theirs, mine).by_shape else current
 
-    def _one_change(self, current: ScoredContract) -> Iterator[ScoredContract]:
-        """Yield contracts that change one answer, or fit one more length."""
-        yield from self._other_answers(current, current.free)
-        for length in (SCALE, OFFSET):
-            if not length <= current.free:
-                yield self.candidate(current.hypothesis, free=current.free | length)
-
-    def _two_changes(self, current: ScoredContract) -> Iterator[ScoredContract]:
-        """Yield contracts that change one answer and the scale, or scale and offset."""
-        free = current.free | SCALE
-        if free != current.free:
-            yield from self._other_answers(current, free)
-            yield self.candidate(current.hypothesis, free=SCALE | OFFSET)
-
-    def _other_answers(self, current: ScoredContract, free: Free) -> Iterator[ScoredContract]:
+    def _other_answers(
+        self, current: ScoredContract, *, is_scaled: bool
+    ) -> Iterator[ScoredContract]:
+        """Yield contracts that change one answer, with the declared scale or a fitted one."""
         for question in QUESTIONS:
             others = current.hypothesis.alternatives(question)
-            if question == "order" and free:
+            if question == "order" and is_scaled:
                 others = self._promising(current.hypothesis)
-            fitted = free | SCALE if question == "form" else free
-            yield from (self.candidate(hypothesis, free=fitted) for hypothesis in others)
+            fitted = is_scaled or question == "form"
+            yield from (self.candidate(hypothesis, is_scaled=fitted) for hypothesis in others)
 
     def _promising(self, current: Hypothesis) -> tuple[Hypothesis, ...]:
         """Return the orders that explain most matches, at any scale."""
@@ -235,54 +198,47 @@ class ContractSearch:
         return self._likely[current]
 
     def _most_better(
-        self, current: ScoredContract, others: Iterator[ScoredContract]
+        self, current: ScoredContract, others: Iterable[ScoredContract]
     ) -> ScoredContract | None:
         """Return the contract that improves most on the current one, None if none clearly does."""
-        better = [other for other in others if self._is_better(other, current)]
-        shifted = [other for other in better if "offset" in _new(other, current)]
-        scaled = [other for other in better if "scale" in _new(other, current)]
-        for other in shifted:
-            # One number for all pairs is preferred to one for each.
-            if any(not self.gain(other, plain).is_clear() for plain in scaled):
-                better.remove(other)
+        better = (other for other in others if self._is_better(other, current))
         return max(better, key=lambda other: self.gain(other, current).mean_db, default=None)
 
     def _pruned(self, current: ScoredContract) -> ScoredContract:
         """Undo changes that another change has made unnecessary."""
-        for simpler in list(self._simpler(current)):
-            if not self._is_better(current, simpler):
-                return self._pruned(simpler)
-        return current
-
-    def _simpler(self, current: ScoredContract) -> Iterator[ScoredContract]:
-        """Yield contracts with one change fewer."""
         declared = self.declared.hypothesis
-        for question in current.hypothesis.changes_from(declared):
-            back = current.hypothesis.changed(question, getattr(declared, question))
-            yield self.candidate(back, free=current.free)
-        for length in sorted(current.free):
-            if current.hypothesis.form == declared.form or length != "scale":
-                yield self.candidate(current.hypothesis, free=current.free - {length})
+        simpler = [
+            self.candidate(
+                current.hypothesis.changed(question, getattr(declared, question)),
+                is_scaled=current.is_scaled,
+            )
+            for question in current.hypothesis.changes_from(declared)
+        ]
+        if current.is_scaled and current.hypothesis.form == declared.form:
+            simpler.append(self.candidate(current.hypothesis, is_scaled=False))
+        for each in simpler:
+            if not self._is_better(current, each):
+                return self._pruned(each)
+        return current
 
     def simplest(self) -> ScoredContract:
         """Return the declared contract, with another scale if that is clearly better."""
-        scaled = self.candidate(self.declared.hypothesis, free=SCALE)
+        scaled = self.candidate(self.declared.hypothesis)
         return scaled if self._is_better(scaled, self.declared) else self.declared
 
     def cameras(self, contract: ScoredContract, *, depth_step: float) -> CameraCheck:
         """Return how well each camera fits a contract, its scale fitted."""
-        fitted_too = self.candidate(contract.hypothesis, free=contract.free | SCALE)
         hypothesis = contract.hypothesis
         matches = self._every
         if hypothesis.order != self.declared.hypothesis.order:
             # Other files are neighbours.
             frames = len({match.frame for match in matches})
             matches = self._views.frame_matches(frames=frames, hypothesis=hypothesis)
-        return CameraComparison(self._views, matches, fitted_too, depth_step=depth_step).check()
+        fitted = self.candidate(hypothesis)
+        return check_cameras(self._views, matches, fitted, depth_step=depth_step)
 
     def rivals(self, best: ScoredContract) -> tuple[Rival, ...]:
         """Return the other answers to every question, each with its own scale."""
-        free = best.free | SCALE
         likely = self._promising(best.hypothesis)
         found = []
         for question in QUESTIONS:
@@ -290,12 +246,11 @@ class ContractSearch:
                 if question == "order" and hypothesis not in likely:
                     # An exchange of two cameras leaves the others, and so the scale, as they are.
                     other = score_hypothesis(
-                        self._views, self._matches, hypothesis,
-                        scale=best.scale, offsets_px=best.offsets_px,
-                    )  # fmt: skip
-                    other = replace(other, free=best.free)
+                        self._views, self._matches, hypothesis, scale=best.scale
+                    )
+                    other = replace(other, is_scaled=best.is_scaled)
                 else:
-                    other = self.candidate(hypothesis, free=free)
+                    other = self.candidate(hypothesis)
                 answer = getattr(hypothesis, question)
                 found.append(Rival(question, answer, self.gain(best, other)))
         return tuple(found)
@@ -312,46 +267,28 @@ class ContractSearch:
         only_kind = better.hypothesis.changes_from(worse.hypothesis) == ("kind",)
         # Coarse depth has a shape of its own.
         is_fine = self._least_log_scale <= LEAST_LOG_SCALE
-        if is_fine and only_kind and worse.free in (better.free, better.free | SCALE):
-            power = self._power(better)
-            shape_kind = power.kind
+        if is_fine and only_kind and worse.is_scaled >= better.is_scaled:
+            shape_kind = self._power(better).kind
             if shape_kind is not None and (shape_kind != kind or found.mean_db > 0):
-                return replace(found, by_shape=shape_kind == kind, shape=power.interval)
+                return replace(found, by_shape=shape_kind == kind)
         return found
 
     def _power(self, candidate: ScoredContract) -> RayPower:
         """Return the power of the ray's length for a contract of any kind and scale."""
         planar = candidate.hypothesis.changed("kind", "planar")
-        free = candidate.free | SCALE
-        if (planar, free) not in self._powers:
-            start = self.candidate(planar, free=free)
-            self._powers[planar, free] = ray_power(self._views, self._matches, start)
-        return self._powers[planar, free]
+        if planar not in self._powers:
+            start = self.candidate(planar)
+            self._powers[planar] = ray_power(self._views, self._matches, start)
+        return self._powers[planar]
 
     def _is_better(self, other: ScoredContract, current: ScoredContract) -> bool:
-        """Tell whether a contract is clearly better, and its fitted lengths are significant."""
+        """Tell whether a contract is clearly better, and a scale that only it has significant."""
         gain = self.gain(other, current)
-        new = other.free - current.free
-        is_same = other.hypothesis == current.hypothesis and current.free <= other.free
-        if is_same and new == SCALE:
-            off = abs(math.log(other.scale))
-            least = max(self._least_log_scale, self._bias)
-            if "offset" in current.free:
-                # Two errors at once need more evidence.
-                least = max(2 * self._least_log_scale, self._bias_beside_offset)
-            sure = off > least + LEAST_ERRORS * min(other.scale_error, 1e3)
-            return sure and gain.is_clear(least_db=_LEAST_SCALE_DB, errors=_SCALE_ERRORS)
-        if "offset" in new:
-            largest_px = max(map(abs, other.offsets_px.values()), default=0.0)
-            return largest_px >= LEAST_OFFSET_PX and gain.is_clear()
-        return gain.is_clear()
-
-
-def _new(other: ScoredContract, current: ScoredContract) -> set[str]:
-    """Return which of "scale" and "offset" a contract fits beyond another one."""
-    if other.hypothesis != current.hypothesis:
-        return set()
-    return set(other.free - current.free)
+        if other.hypothesis != current.hypothesis or other.is_scaled <= current.is_scaled:
+            return gain.is_clear()
+        least = max(self._least_log_scale, self._bias) + LEAST_ERRORS * min(other.scale_error, 1e3)
+        is_sure = abs(math.log(other.scale)) > least
+        return is_sure and gain.is_clear(least_db=_LEAST_SCALE_DB, errors=_SCALE_ERRORS)
 
 
 def _checked(
@@ -387,13 +324,11 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
     scene = SceneDiagnosis(
         key=views.scene.id.key,
         views=len(matches) // 2,
-        pairs=tuple(views.chosen_pairs(Hypothesis())),
         matches=sum(len(match.rows) for match in matches[::2]),
         unit_m=views.unit_m(file),
         unit_source=(
             views.encoding.source if views.encoding.unit_m else views.scene.depth_unit_source[file]
         ),
-        recorded_pair=crossed_pair(views.scene),
         declared=declared,
         best=declared,
     )
@@ -408,7 +343,6 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         scene,
         depth_step=relative_step(units[known]),
         disparity_px=disparity_px(matches),
-        spread_px=spread_px(matches),
     )
     if scene.depth_step > _COARSEST_STEP:
         problem = f"stored depth is too coarse: its steps are {scene.depth_step:.0%} of it"
@@ -429,17 +363,15 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         return replace(scene, problem=problem)
     (other_kind,) = best.hypothesis.alternatives("kind")
     with_scale, of_other_kind = (
-        search.candidate(hypothesis, free=best.free | SCALE)
-        for hypothesis in (best.hypothesis, other_kind)
+        search.candidate(hypothesis) for hypothesis in (best.hypothesis, other_kind)
     )
     return replace(
         scene,
         best=best.hypothesis,
-        changed=best.free,
+        is_scaled=best.is_scaled,
         scale=with_scale.scale,
         scale_error=with_scale.scale_error,
         other_kind_scale=of_other_kind.scale,
-        offsets_px=search.candidate(best.hypothesis, free=best.free | OFFSET).offsets_px,
         gain=search.gain(best, search.declared),
         check=check,
         rivals=search.rivals(best),

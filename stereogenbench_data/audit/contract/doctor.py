@@ -15,8 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis, diagnose_scene
 from stereogenbench_data.audit.contract.matching import SceneFrames
 from stereogenbench_data.audit.contract.verdict import Verdict, group_by_contract, judge
@@ -28,7 +26,7 @@ from stereogenbench_data.audit.contract.worlds import (
     judge_worlds,
     rival_readings,
 )
-from stereogenbench_data.audit.scene_access import source_of
+from stereogenbench_data.audit.scene_access import source_of, spread
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.evidence import shape_of
@@ -129,9 +127,7 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
         if not residual <= MOST_RESIDUAL_PX
     }
     usable = rows[residual_px <= MOST_RESIDUAL_PX]
-    chosen = usable[
-        np.unique(np.linspace(0, len(usable) - 1, min(scenes, len(usable))).astype(int))
-    ]
+    chosen = usable[list(spread(len(usable), scenes))]
     tasks = [
         DiagnosisTask(scene, source_of(index, scene), frames, depth or depth_of(scene))
         for scene in (index.scene(int(row)) for row in chosen)

@@ -1,8 +1,8 @@
-"""A contract's scale and offsets, found from matches and refined on the pictures.
+"""A contract's scale, found from matches and refined on the pictures.
 
 The ratios of found to predicted disparities vote for a scale, which needs no starting value. Robust
 Gauss-Newton steps on the difference of the pictures then refine it (Lucas and Kanade, 1981, with
-disparity as a scale and an offset of the predicted one).
+disparity as a multiple of the predicted one).
 
 Planar and ray depth differ by a few per cent towards the corners, and by less with a long lens.
 Their scores in dB hardly differ then, and a slightly different unit explains most of the rest. So
@@ -11,9 +11,9 @@ depth along the optical axis, 1 along the ray.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -22,8 +22,6 @@ from stereogenbench_data.audit.contract.hypotheses import Hypothesis
 from stereogenbench_data.audit.contract.matching import FrameMatch, Points, SceneFrames
 from stereogenbench_data.audit.contract.scoring import (
     LEAST_ERRORS,
-    Free,
-    Pair,
     ScoredContract,
     sample_along_rows,
     score_hypothesis,
@@ -35,8 +33,8 @@ _BIN: Final = 0.02
 _LOG_RANGE: Final = 32.0
 _STEPS: Final = 10
 _LARGEST_STEP_PX: Final = 1.0
-_LARGEST_BENT: Final[dict[object, float]] = {"scale": 0.1, "ray": 0.5}
-"""Largest steps while the power of the ray is fitted, which moves wide disparities far."""
+_LARGEST_STEPS: Final = {1: np.array([0.3]), 2: np.array([0.1, 0.5])}
+"""Largest steps of log(scale) and of the ray's power, by how many of them are fitted."""
 _FEWEST_USABLE: Final = 10
 _NEAR_PX: Final = 3 * _TOLERANCE_PX
 """Matches further from the prediction are not used to refine it."""
@@ -46,44 +44,28 @@ _NEAR_PX: Final = 3 * _TOLERANCE_PX
 class _Term:
     """The pixels of a frame match where depth is known, and the disparity predicted there.
 
-    ``log_ray`` is the logarithm of each ray's length to depth 1, ``large_px`` the 90th percentile
-    of the predicted disparities' size. ``sign`` is 1 if the pixels are those of the file with the
-    lower number, from which offsets are counted, else -1.
+    ``basis`` (2, n) is what log(scale) and the power of the ray add to the logarithm of disparity:
+    1, and the logarithm of each ray's length to depth 1. ``large_px`` is the 90th percentile of
+    the predicted disparities' size.
     """
 
     match: FrameMatch
     predicted_px: Points
-    log_ray: Points
+    basis: Float64[np.ndarray, "2 n"]
     large_px: float
-    sign: int
 
 
-@dataclass(frozen=True, slots=True)
-class _Lengths:
-    """What is fitted: disparity is scale * predicted * ray ** bend, and an offset for each pair."""
-
-    scale: float
-    offsets_px: dict[Pair, float]
-    bend: float = 0.0
-
-
-_Unknown = Literal["scale", "ray"] | Pair
-
-
-def fit_hypothesis(
-    views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis, *, free: Free
+def fit_scale(
+    views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis
 ) -> ScoredContract:
-    """Return a hypothesis with the scale and the offsets that explain the pictures best."""
-    terms = _fit_terms(views, matches, hypothesis) if free else []
+    """Return a hypothesis with the scale that explains the pictures best."""
+    terms = _fit_terms(views, matches, hypothesis)
     if not terms:
         return score_hypothesis(views, matches, hypothesis)
-    unknowns: list[_Unknown] = ["scale"] if "scale" in free else []
-    unknowns += _pairs(terms) if "offset" in free else []
-    lengths, errors = _refined(views, terms, _start(terms, free=free), unknowns)
+    (log_scale,), (error,) = _refined(views, terms, [math.log(_voted_scale(*_joined(terms)))])
     return score_hypothesis(
-        views, matches, hypothesis, scale=lengths.scale, offsets_px=lengths.offsets_px,
-        scale_error=errors.get("scale", math.inf),
-    )  # fmt: skip
+        views, matches, hypothesis, scale=math.exp(log_scale), scale_error=error
+    )
 
 
 def _fit_terms(
@@ -97,14 +79,10 @@ def _fit_terms(
             known = match.at(predicted[1])
             predicted_px = predicted[0][predicted[1]]
             log_ray = np.log(views.ray_per_planar[known.rows, known.columns])
+            basis = np.stack([np.ones_like(log_ray), log_ray])
             large_px = float(np.percentile(np.abs(predicted_px), 90))
-            sign = 1 if match.left < match.right else -1
-            terms.append(_Term(known, predicted_px, log_ray, large_px, sign))
+            terms.append(_Term(known, predicted_px, basis, large_px))
     return terms
-
-
-def _pairs(terms: Iterable[_Term]) -> list[Pair]:
-    return list(dict.fromkeys(term.match.pair for term in terms))
 
 
 def voted(
@@ -120,22 +98,11 @@ def voted(
 
 
 def _joined(terms: Iterable[_Term]) -> tuple[Points, Points]:
-    """Return the disparities found and predicted, counted from the files with the lower number."""
+    """Return the disparities found and predicted."""
     found, predicted = zip(
-        *((term.sign * term.match.matched_px, term.sign * term.predicted_px) for term in terms),
-        strict=True,
+        *((term.match.matched_px, term.predicted_px) for term in terms), strict=True
     )
     return np.concatenate(found), np.concatenate(predicted)
-
-
-def _start(terms: Sequence[_Term], *, free: Free) -> _Lengths:
-    """Return a scale and offsets from the matches alone."""
-    scale = _voted_scale(*_joined(terms)) if "scale" in free else 1.0
-    offsets_px = {}
-    for pair in _pairs(terms) if "offset" in free else ():
-        found, predicted = _joined(term for term in terms if term.match.pair == pair)
-        offsets_px[pair] = _densest(found - scale * predicted)
-    return _Lengths(scale, offsets_px)
 
 
 def _agreement(found: Points, predicted: Points) -> float:
@@ -159,62 +126,33 @@ def _voted_scale(found: Points, predicted: Points) -> float:
     return float(max(scales, key=lambda scale: _agreement(found, scale * predicted)))
 
 
-def _densest(values: Points) -> float:
-    """Return where most values lie, to half a pixel or better."""
-    places = np.round(values * 4)
-    numbers, counts = np.unique(places, return_counts=True)
-    tallest = numbers[counts.argsort()[-8:]] / 4
-    best = max(tallest, key=lambda place: _agreement(values, np.full_like(values, place)))
-    near = values[np.abs(values - best) < _TOLERANCE_PX]
-    return float(np.median(near))
-
-
 def _refined(
-    views: SceneFrames, terms: Sequence[_Term], lengths: _Lengths, unknowns: Sequence[_Unknown]
-) -> tuple[_Lengths, dict[_Unknown, float]]:
-    """Return the lengths after Gauss-Newton steps, and the errors of log(scale), bend, offsets."""
-    errors: dict[_Unknown, float] = {}
-    is_bent = "ray" in unknowns
+    views: SceneFrames, terms: Sequence[_Term], start: Sequence[float]
+) -> tuple[list[float], list[float]]:
+    """Return log(scale), and the ray's power if it has a start too, after Gauss-Newton steps.
+
+    Their standard errors come with them.
+    """
+    values = np.array(start)
+    count = len(values)
     for _ in range(_STEPS):
-        normals = np.zeros((len(terms), len(unknowns), len(unknowns)))
-        rights = np.zeros((len(terms), len(unknowns)))
+        normals, rights = np.zeros((len(terms), count, count)), np.zeros((len(terms), count))
         for number, term in enumerate(terms):
-            grown_px = lengths.scale * term.predicted_px * np.exp(lengths.bend * term.log_ray)
-            shift_px = term.match.shift_px(lengths.offsets_px)
-            difference, slope, weight = _compared(views, term, grown_px + shift_px)
+            grown_px = term.predicted_px * np.exp(values @ term.basis[:count])
+            difference, slope, weight = _compared(views, term, grown_px)
             if weight is not None:
-                moved: dict[_Unknown, Points] = {"scale": grown_px, "ray": grown_px * term.log_ray,
-                         term.match.pair: np.full(len(slope), term.sign)}  # fmt: skip
-                columns = np.stack([
-                    slope * moved.get(name, np.zeros(len(slope))) for name in unknowns
-                ])  # fmt: skip
+                columns = slope * grown_px * term.basis[:count]
                 normals[number] = (columns * weight) @ columns.T
                 rights[number] = (columns * weight) @ difference
-        step, spread = _solved(normals, rights)
-        errors = dict(zip(unknowns, spread.tolist(), strict=True))
-        changes = dict(zip(unknowns, step.tolist(), strict=True))
-        moves_px = (_moved_px(term, lengths.scale, changes) for term in terms)
-        moved_px = max(moves_px, default=0.0)
-        part = 1.0 if is_bent else min(1.0, _LARGEST_STEP_PX / max(moved_px, 1e-12))
-        largest: dict[object, float] = _LARGEST_BENT if is_bent else {"scale": 0.3}
-        offsets_px = dict(lengths.offsets_px)
-        for name, change in changes.items():
-            most = largest.get(name, _LARGEST_STEP_PX if is_bent else math.inf)
-            changes[name] = float(np.clip(part * change, -most, most))
-            if isinstance(name, tuple):
-                offsets_px[name] = offsets_px.get(name, 0.0) + changes[name]
-        scale = lengths.scale * math.exp(changes.get("scale", 0.0))
-        lengths = _Lengths(scale, offsets_px, lengths.bend + changes.get("ray", 0.0))
+        step, errors = _solved(normals, rights)
+        large_px = np.exp(values[0]) * np.array([term.large_px for term in terms])
+        longest = np.array([term.basis[:count].max(axis=1) for term in terms])
+        moved_px = float(np.abs(large_px * (longest @ step)).max())
+        part = 1.0 if count > 1 else min(1.0, _LARGEST_STEP_PX / max(moved_px, 1e-12))
+        values += np.clip(part * step, -_LARGEST_STEPS[count], _LARGEST_STEPS[count])
         if moved_px < 5e-3:
             break
-    return lengths, errors
-
-
-def _moved_px(term: _Term, scale: float, changes: Mapping[_Unknown, float]) -> float:
-    """Return how far a step moves a term's matches with large disparities."""
-    ray = float(term.log_ray.max()) * changes.get("ray", 0.0)
-    grown_px = scale * term.large_px * (changes.get("scale", 0.0) + ray)
-    return abs(grown_px + changes.get(term.match.pair, 0.0))
+    return values.tolist(), errors.tolist()
 
 
 def _compared(
@@ -279,17 +217,13 @@ class RayPower:
         away = self.power - (1 if kind == "ray" else 0)
         return kind if abs(away) <= 2 * _RAY_BIAS + LEAST_ERRORS * self.error else None
 
-    @property
-    def interval(self) -> tuple[float, float]:
-        """The power and half its 95 % interval, its systematic error included."""
-        return self.power, math.hypot(1.96 * self.error, _RAY_BIAS)
-
 
 def ray_power(
     views: SceneFrames, matches: Sequence[FrameMatch], contract: ScoredContract
 ) -> RayPower:
-    """Return the power that fits the pictures best, together with the scale and the offsets."""
+    """Return the power that fits the pictures best, together with the scale."""
     terms = _fit_terms(views, matches, contract.hypothesis)
-    start = _Lengths(contract.scale, contract.offsets_px)
-    fitted, errors = _refined(views, terms, start, ["scale", "ray", *contract.offsets_px])
-    return RayPower(fitted.bend + (contract.hypothesis.kind == "ray"), errors["ray"])
+    if not terms:
+        return RayPower(0.0, math.inf)
+    (_, bend), (_, error) = _refined(views, terms, [math.log(contract.scale), 0.0])
+    return RayPower(bend + (contract.hypothesis.kind == "ray"), error)

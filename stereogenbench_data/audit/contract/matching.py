@@ -45,27 +45,13 @@ _BLOCK: Final = 2**18
 where several processes share a machine (25 times slower, measured)."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RowMatches:
-    """Pixels of a left picture that were found in the right one.
-
-    Attributes:
-        rows: (n,) rows.
-        columns: (n,) columns.
-        disparity_px: (n,) how far to the left each was found, negative to the right.
-        grain_px: Size of the compared pixels, in pixels of the picture.
-    """
-
-    rows: Int64[np.ndarray, " n"]
-    columns: Int64[np.ndarray, " n"]
-    disparity_px: Float32[np.ndarray, " n"]
-    grain_px: float = 1.0
+RowMatches = Float32[np.ndarray, "n 3"]
 
 
 def match_pairs(
     pictures: Mapping[int, Luma], pairs: Sequence[tuple[int, int]]
 ) -> dict[tuple[int, int], RowMatches]:
-    """Return the matches of each pair.
+    """Return the matches of each pair: row, column, and how far to the left each was found, in px.
 
     Disparity is accurate to about 0.2 pixels. Pictures wider than 512 columns are reduced first;
     then it is accurate to half a pixel of the full size.
@@ -75,7 +61,7 @@ def match_pairs(
         pairs: Numbers of the left and the right picture.
     """
     height, width = next(iter(pictures.values())).shape
-    factor = -(-width // _WIDEST_PX)
+    factor = _grain(width)
     height, width = height // factor, width // factor
     small = {  # the means of blocks of factor x factor pixels
         number: picture[: height * factor, : width * factor]
@@ -85,8 +71,8 @@ def match_pairs(
     }
     inner = np.arange(_RADIUS_PX, height - _RADIUS_PX if width > 2 * _RADIUS_PX else 0)
     rows = inner[np.unique(np.linspace(0, len(inner) - 1, min(_ROWS, len(inner))).astype(int))]
-    found: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray, np.ndarray]]]
-    found = {pair: [] for pair in pairs}
+    found: dict[tuple[int, int], list[np.ndarray]]
+    found = {pair: [np.zeros((0, 3), dtype=np.float32)] for pair in pairs}
     left_numbers = {left for left, _ in pairs}
     side = 2 * _RADIUS_PX + 1
     for row in rows:
@@ -107,10 +93,16 @@ def match_pairs(
             columns, disparity_px = _match_row(
                 _product(patches[left], patches[right]), has_texture[left]
             )
-            found[left, right].append(
-                (np.full(len(columns), row), columns + _RADIUS_PX, disparity_px)
-            )
-    return {pair: _gathered(found[pair], factor=factor) for pair in pairs}
+            here = np.full(len(columns), row), columns + _RADIUS_PX, disparity_px
+            found[left, right].append(np.stack(here, axis=-1, dtype=np.float32))
+    # A block's centre is a pixel or nearly so.
+    middle = np.array([factor // 2, factor // 2, 0], dtype=np.float32)
+    return {pair: np.concatenate(rows) * factor + middle for pair, rows in found.items()}
+
+
+def _grain(width_px: int) -> int:
+    """Return the size of the pixels that are compared, in pixels of a picture."""
+    return -(-width_px // _WIDEST_PX)
 
 
 def _normalised(
@@ -159,20 +151,6 @@ def _match_row(
     return columns, (columns - best - np.clip(shift, -0.5, 0.5)).astype(np.float32)
 
 
-def _gathered(found: list[tuple[np.ndarray, np.ndarray, np.ndarray]], *, factor: int) -> RowMatches:
-    """Join the rows, and scale to the full size; a block's centre is a pixel or nearly so."""
-    empty = (np.zeros(0, int), np.zeros(0, int), np.zeros(0, np.float32))
-    rows, columns, disparity_px = (
-        np.concatenate(part) for part in zip(*[empty, *found], strict=True)
-    )
-    return RowMatches(
-        rows=rows.astype(np.int64) * factor + factor // 2,
-        columns=columns.astype(np.int64) * factor + factor // 2,
-        disparity_px=(disparity_px * factor).astype(np.float32),
-        grain_px=float(factor),
-    )
-
-
 Points = Float64[np.ndarray, " n"]
 _Prediction = tuple[Points, Bool[np.ndarray, " n"]]
 _Numbers = tuple[UInt16[np.ndarray, " n"], Bool[np.ndarray, " n"]]
@@ -213,7 +191,7 @@ class FrameMatch:
     slope: Float32[np.ndarray, " n"]
     cells: Int64[np.ndarray, " n"]
     cap: float
-    grain_px: float = 1.0
+    grain_px: int = 1
 
     @property
     def pair(self) -> tuple[int, int]:
@@ -228,11 +206,6 @@ class FrameMatch:
             slope=self.slope[pixels], cells=self.cells[pixels],
         )  # fmt: skip
 
-    def shift_px(self, offsets_px: dict[tuple[int, int], float]) -> float:
-        """Return this match's offset; ``offsets_px`` count from each pair's lower number."""
-        offset_px = offsets_px.get(self.pair, 0.0)
-        return offset_px if self.left < self.right else -offset_px
-
 
 class SceneFrames:
     """One scene's pictures and depth, each decoded once."""
@@ -246,7 +219,7 @@ class SceneFrames:
         self._bands: dict[tuple[int, int], Luma] = {}
         self._stored: dict[tuple[FrameMatch, int, int], dict[Flip, _Numbers]] = {}
         self._predicted_by: Hypothesis | None = None
-        self._predictions: dict[tuple[FrameMatch, int], _Prediction | None] = {}
+        self._predictions: dict[FrameMatch, _Prediction | None] = {}
         self._depths: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
 
     @property
@@ -332,17 +305,6 @@ class SceneFrames:
                 matches += self._both_ways(frame, left, right, row_matches)
         return matches
 
-    def matched_later(self, frame: int, file: int, other: int, *, lag: int) -> FrameMatch | None:
-        """Return the pixels of a file's frame that another file shows ``lag`` frames later.
-
-        None if there is no such frame.
-        """
-        if not 0 <= frame + lag < self.scene.frames:
-            return None
-        pictures = {file: self.band(frame, file), other: self.band(frame + lag, other)}
-        row_matches = match_pairs(pictures, [(file, other)])[file, other]
-        return self._both_ways(frame, file, other, row_matches)[0]
-
     def chosen_pairs(self, hypothesis: Hypothesis) -> list[tuple[int, int]]:
         """Return the `neighbours`, and the pairs next but one; the lower number comes first."""
         across = self._across(hypothesis)
@@ -366,11 +328,11 @@ class SceneFrames:
         self, frame: int, left: int, right: int, row_matches: RowMatches
     ) -> tuple[FrameMatch, FrameMatch]:
         """Return one set of matches from both sides, so that both cameras' depth is tested."""
-        keep = np.arange(len(row_matches.rows))
-        if len(keep) > _MOST_POINTS:
-            keep = np.sort(np.random.default_rng(0).choice(keep, _MOST_POINTS, replace=False))
-        rows, columns = row_matches.rows[keep], row_matches.columns[keep]
-        matched_px = row_matches.disparity_px[keep].astype(np.float64)
+        if len(row_matches) > _MOST_POINTS:
+            chosen = np.random.default_rng(0).choice(len(row_matches), _MOST_POINTS, replace=False)
+            row_matches = row_matches[np.sort(chosen)]
+        rows, columns = row_matches[:, :2].T.astype(np.int64)
+        matched_px = row_matches[:, 2].astype(np.float64)
         height, width = self.band(frame, left).shape
         found = np.clip(np.rint(columns - matched_px), 0, width - 1).astype(np.int64)
         sides = []
@@ -391,31 +353,26 @@ class SceneFrames:
                     slope=(band[rows, after] - band[rows, before]) / 2,
                     cells=rows * SIDE_CELLS // height * SIDE_CELLS + at * SIDE_CELLS // width,
                     cap=2 * float((band[rows, at] ** 2).mean()) if len(rows) else 1.0,
-                    grain_px=row_matches.grain_px,
+                    grain_px=_grain(width),
                 )
             )
         return sides[0], sides[1]
 
-    def predicted(
-        self, match: FrameMatch, hypothesis: Hypothesis, *, depth_file: int | None = None
-    ) -> _Prediction | None:
+    def predicted(self, match: FrameMatch, hypothesis: Hypothesis) -> _Prediction | None:
         """Return the disparity of matched pixels at the declared unit, and where it is known.
 
-        None if the frame of depth does not exist. ``depth_file`` replaces the file that the
-        hypothesis names. The predictions of one hypothesis are kept, read-only, until another is
-        asked for, because it is fitted, scored and drawn at many scales.
+        None if the frame of depth does not exist. The predictions of one hypothesis are kept,
+        read-only, until another is asked for, because it is fitted, scored and drawn at many
+        scales.
         """
-        file = hypothesis.depth_file(match.left) if depth_file is None else depth_file
         if hypothesis != self._predicted_by:
             self._predicted_by, self._predictions = hypothesis, {}
-        if (match, file) not in self._predictions:
-            self._predictions[match, file] = self._predict(match, hypothesis, file=file)
-        return self._predictions[match, file]
+        if match not in self._predictions:
+            self._predictions[match] = self._predict(match, hypothesis)
+        return self._predictions[match]
 
-    def _predict(
-        self, match: FrameMatch, hypothesis: Hypothesis, *, file: int
-    ) -> _Prediction | None:
-        frame = match.frame + hypothesis.frame_lag
+    def _predict(self, match: FrameMatch, hypothesis: Hypothesis) -> _Prediction | None:
+        file, frame = hypothesis.depth_file(match.left), match.frame + hypothesis.frame_lag
         if not 0 <= frame < self.scene.frames:
             return None
         units, known = self._numbers(match, frame=frame, file=file)[hypothesis.flip]
@@ -442,12 +399,6 @@ class SceneFrames:
 def disparity_px(matches: Sequence[FrameMatch]) -> float:
     """Return the root mean square of found disparities."""
     return float(np.sqrt((np.concatenate([match.matched_px for match in matches]) ** 2).mean()))
-
-
-def spread_px(matches: Sequence[FrameMatch]) -> float:
-    """Return the root mean square of found disparities about the mean of each frame match."""
-    spreads = [match.matched_px - match.matched_px.mean() for match in matches if len(match.rows)]
-    return float(np.sqrt((np.concatenate(spreads) ** 2).mean())) if spreads else 0.0
 
 
 def chosen_frames(available: int, *, count: int) -> list[int]:

@@ -69,15 +69,14 @@ def _view_tiles(
     left, right = (
         channels_last(views.rgb(match.frame, file)) for file in (match.left, match.right)
     )
-    best_scale = diagnosis.scale if diagnosis.fits_scale else 1.0
-    is_shifted = "offset" in diagnosis.changed
-    shift_px = match.shift_px(diagnosis.offsets_px) if is_shifted else 0.0
+    is_scaled = diagnosis.is_scaled or diagnosis.best.form != diagnosis.declared.form
+    best_scale = diagnosis.scale if is_scaled else 1.0
     rows = []
-    for name, picture, words, hypothesis, lengths in (
-        ("left", left, "declared", diagnosis.declared, (1.0, 0.0)),
-        ("right", right, "best", diagnosis.best, (best_scale, shift_px)),
+    for name, picture, words, hypothesis, scale in (
+        ("left", left, "declared", diagnosis.declared, 1.0),
+        ("right", right, "best", diagnosis.best, best_scale),
     ):
-        warped, known = _warped(views, match, hypothesis, *lengths)
+        warped, known = _warped(views, match, hypothesis, scale)
         away = np.abs(left.astype(np.float32) - warped).mean(axis=-1)
         painted = _DIFFERENCES.paint(away, measured=known)
         rows.append([
@@ -89,7 +88,7 @@ def _view_tiles(
 
 
 def _warped(
-    views: SceneFrames, match: FrameMatch, hypothesis: Hypothesis, scale: float, shift_px: float
+    views: SceneFrames, match: FrameMatch, hypothesis: Hypothesis, scale: float
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """Return the right picture warped to the left, and where depth and picture are known."""
     size = views.intrinsics.height_px, views.intrinsics.width_px
@@ -98,7 +97,7 @@ def _warped(
     if predicted is None:
         return np.full((*size, 3), _NOT_KNOWN, dtype=np.uint8), np.zeros(size, dtype=bool)
     disparity_px, known = predicted
-    landing_px = (columns + 0.5 - scale * disparity_px - shift_px).reshape(size)
+    landing_px = (columns + 0.5 - scale * disparity_px).reshape(size)
     landing = Projection(u_px=landing_px, v_px=None, depth_m=np.ones(size))
     warped, inside = backward_warp(views.rgb(match.frame, match.right), landing)
     shown = known.reshape(size) & inside

@@ -21,7 +21,7 @@ NOT_TESTED: Final = (
     "and all other frames."
 )
 _DB_NOTE: Final = (
-    "dB of the quotient, kind and offset count small differences under a tight cap: they "
+    "dB of the quotient and the kind count small differences under a tight cap: they "
     "are not comparable with dB of flips, lags and orders."
 )
 _READINGS: Final = (
@@ -50,7 +50,7 @@ def doctor_lines(report: DoctorReport) -> list[str]:
         rows += [_row(answer) for answer in verdict.answers]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines += ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
-        lines += ["", *_conclusion(verdict), *_tested(verdict), NOT_TESTED, *verdict.beside]
+        lines += ["", *_conclusion(verdict), *_tested(verdict), NOT_TESTED]
     if len(silent) < len(report.scenes):
         lines += ["", QUOTIENT_MEANS, _DB_NOTE]
     return lines + [line for each in report.worlds for line in ("", _READINGS, *each.lines)]
@@ -155,10 +155,6 @@ def doctor_json(report: DoctorReport) -> dict[str, Any]:
         }
         for each in report.verdicts
     ]
-    scenes = []
-    for scene in report.scenes:
-        offsets_px = [{"pair": pair, "px": px} for pair, px in scene.offsets_px.items()]
-        scenes.append({**asdict(scene), "offsets_px": offsets_px})
     document: dict[str, Any] = plain({
         "data": report.data,
         "verdict": _headline(report),
@@ -166,7 +162,7 @@ def doctor_json(report: DoctorReport) -> dict[str, Any]:
         "quotient_means": QUOTIENT_MEANS,
         "not_tested": NOT_TESTED,
         "verdicts": verdicts,
-        "scenes": scenes,
+        "scenes": [asdict(scene) for scene in report.scenes],
         "left_out": report.left_out,
     })  # fmt: skip
     return document

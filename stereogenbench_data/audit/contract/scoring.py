@@ -7,7 +7,7 @@ scores in one scene; `pooled` takes several scenes together.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -44,7 +44,6 @@ class Evidence:
             if it does not decide.
         least_db: Smaller differences are not believed.
         wide_db: The larger estimate of the error; intervals use it.
-        shape: The power of the ray's length, and half its 95 % interval.
     """
 
     mean_db: float
@@ -52,7 +51,6 @@ class Evidence:
     by_shape: bool | None = None
     least_db: float = LEAST_DB
     wide_db: float | None = None
-    shape: tuple[float, float] | None = None
 
     def is_clear(self, *, least_db: float | None = None, errors: float = LEAST_ERRORS) -> bool:
         """Tell whether the difference is large and certain enough to be believed."""
@@ -70,20 +68,16 @@ class Gain:
         mean_db: The mean, weighted by how certain each scene is; nan for nothing to compare.
         low_db: Lower end.
         high_db: Upper end.
-        count: How many scenes were compared.
         is_clear: Whether the difference may be believed.
         by_shape: Whether the shape of disparity decides, however few dB it makes.
-        shape: The power of the ray's length, and half its 95 % interval; None if not known.
         margin_db: How far the interval must be from 0 to confirm.
     """
 
     mean_db: float
     low_db: float
     high_db: float
-    count: int
     is_clear: bool
     by_shape: bool = False
-    shape: tuple[float, float] | None = None
     margin_db: float = LEAST_DB
 
     @property
@@ -130,10 +124,8 @@ def pooled(scenes: Sequence[Evidence]) -> Gain:
     )
     is_opposed = any(scene.is_clear() for scene in against)
     return Gain(
-        mean_db, low_db, high_db, len(tested), is_clear and not is_opposed,
-        by_shape=any(scene.by_shape for scene in tested),
-        shape=next((scene.shape for scene in tested if scene.by_shape), None),
-        margin_db=least_db,
+        mean_db, low_db, high_db, is_clear and not is_opposed,
+        by_shape=any(scene.by_shape for scene in tested), margin_db=least_db,
     )  # fmt: skip
 
 
@@ -144,13 +136,6 @@ _SMALLEST = 1e-6
 Pair = tuple[int, int]
 
 
-Free = frozenset[Literal["scale", "offset"]]
-"""The lengths that are fitted."""
-NOTHING: Final[Free] = frozenset()
-SCALE: Final[Free] = frozenset({"scale"})
-OFFSET: Final[Free] = frozenset({"offset"})
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoredContract:
     """A contract and its score.
@@ -158,20 +143,17 @@ class ScoredContract:
     Attributes:
         hypothesis: Its answers.
         scale: Measured disparity over that at the declared unit: the unit is declared / scale.
-        offsets_px: Constant disparity to add, by pair (lower number first, counted from it); 0 for
-            pairs that are missing.
         scale_error: Standard error of log(scale), inf if it was not fitted.
         errors: For each frame match the capped squared difference at each pixel; nan where the
             contract predicts nothing.
-        free: Which lengths were fitted.
+        is_scaled: Whether the scale was fitted.
     """
 
     hypothesis: Hypothesis
     scale: float
-    offsets_px: dict[Pair, float]
     scale_error: float
     errors: list[Float32[np.ndarray, " n"]] = field(repr=False)
-    free: Free = NOTHING
+    is_scaled: bool = False
 
 
 def sample_along_rows(
@@ -204,31 +186,28 @@ def score_hypothesis(
     hypothesis: Hypothesis,
     *,
     scale: float = 1.0,
-    offsets_px: dict[Pair, float] | None = None,
     scale_error: float = math.inf,
 ) -> ScoredContract:
     """Return a contract's score on the frame matches of a scene.
 
     A pixel counts with its capped squared difference, or with the cap if it leaves the picture.
     """
-    offsets_px = offsets_px or {}
     errors = []
     for match in matches:
         predicted = views.predicted(match, hypothesis)
         squares = np.full(len(match.rows), np.nan, dtype=np.float32)
         if predicted is not None:
             disparity_px, known = predicted
-            shift_px = match.shift_px(offsets_px)
             there, _, inside = sample_along_rows(
                 views.band(match.frame, match.right),
                 match.rows,
-                match.columns - (scale * disparity_px + shift_px),
+                match.columns - scale * disparity_px,
             )
             square = (there - match.brightness) ** 2
             capped = np.where(inside, np.minimum(square, match.cap), match.cap)
             squares[known] = capped[known]
         errors.append(squares)
-    return ScoredContract(hypothesis, scale, offsets_px, scale_error, errors)
+    return ScoredContract(hypothesis, scale, scale_error, errors)
 
 
 def evidence(
@@ -238,7 +217,7 @@ def evidence(
 
     Only pixels for which both predict something are compared, in the views that they do not read
     alike (an exchange of two cameras leaves the others as they are). Contracts that read the same
-    depth (another unit, ray, offset) differ a little at many pixels: there a pixel counts at most
+    depth (another unit, ray) differ a little at many pixels: there a pixel counts at most
     a small part of the cap, so that wrong matches do not outweigh it. Others (lag, order, flips)
     differ much at some pixels, which count in full.
 

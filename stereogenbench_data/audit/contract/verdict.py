@@ -1,8 +1,8 @@
 """From the diagnoses of scenes to an answer for each question, and the contract to paste.
 
-The questions concern the hypothesis (kind, form, lag, order, flip), a constant offset, and the
-lengths, of which disparity shows one quotient: unit / (focal length x baseline). `judge` answers
-them all; `group_by_contract` decides which scenes are judged together.
+The questions concern the hypothesis (kind, form, lag, order, flip) and the lengths, of which
+disparity shows one quotient: unit / (focal length x baseline). `judge` answers them all;
+`group_by_contract` decides which scenes are judged together.
 """
 
 import math
@@ -16,7 +16,6 @@ from stereogenbench_data.audit.contract.cameras import LEAST_SHARE
 from stereogenbench_data.audit.contract.diagnosis import (
     BIAS_PX,
     LEAST_LOG_SCALE,
-    LEAST_OFFSET_PX,
     Rival,
     SceneDiagnosis,
     allowed_log_scale,
@@ -25,8 +24,6 @@ from stereogenbench_data.audit.contract.hypotheses import LAGS, QUESTIONS, Quest
 from stereogenbench_data.audit.contract.scoring import (
     LEAST_ERRORS,
     NORMAL_975,
-    NOTHING,
-    SCALE,
     Gain,
     pooled,
     weighted_mean,
@@ -51,8 +48,6 @@ _WORDS: Final[dict[Any, str]] = {
     "ray": "the ray",
     "inverse": "inverse depth",
 }
-_OFFSET_SPREAD: Final = 0.1
-"""Share by which one camera's shift may differ from pair to pair."""
 _MOST_NAMED: Final = 4
 
 
@@ -122,14 +117,6 @@ def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
     doubtful = list(dict.fromkeys(answer for answer, gain in each_gain if not gain.is_excluded))
     is_sure = not (close or lacking or doubtful) and bool(tested)
     words = _words_beside(best, close, untested, question=question)
-    if best == "as recorded" and question == "order" and first.recorded_pair is not None:
-        left, right = first.recorded_pair
-        named, seen = f"primary: left {left}, right {right}", f"left {right}, right {left}"
-        note = "by poses and pictures alike"
-        return Answer(blank.topic, named, seen, "wrong", nearest, note)
-    if question == "order" and best.startswith("depth of") and "offset" in first.changed:
-        note = f"a picture that is shifted against its depth looks like {describe(best)}"
-        return replace(blank, behind=gains.get(declared), note=note)
     if best == declared:
         if close or lacking or not tested:
             return replace(blank, behind=nearest, note=words)
@@ -139,9 +126,6 @@ def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
             return replace(
                 blank, found=describe(best), status="not contradicted", behind=nearest, note=note
             )
-        shape = next((gain.shape for _, gain in each_gain if gain.by_shape and gain.shape), None)
-        if shape is not None:
-            words = f"by shape: the ray's power is {shape[0]:.2f} ± {shape[1]:.2f} (0 axis, 1 ray)"
         return replace(
             blank, found=describe(best), status="confirmed", behind=nearest, note=words,
             is_sure=True,
@@ -203,47 +187,6 @@ def describe(answer: Any) -> str:
     return _WORDS.get(answer, f"{answer}")
 
 
-def _offset_answer(scenes: Sequence[SceneDiagnosis]) -> Answer:
-    """Return whether disparity is off by a constant, and by which.
-
-    It is never confirmed, because no interval is known for it.
-    """
-    first = scenes[0]
-    blank = _no_answer(scenes, "disparity offset", "0 px")
-    if blank.note:
-        return blank
-    if "offset" in first.changed:
-        gain = pooled([scene.gain for scene in scenes])
-        note = "or pictures of another moment, which look alike where little moves"
-        found = offset_words(first.offsets_px)
-        return replace(blank, found=found, status="wrong", behind=gain, note=note)
-    largest_px = max((abs(px) for scene in scenes for px in scene.offsets_px.values()), default=0.0)
-    if largest_px > LEAST_OFFSET_PX or math.isnan(first.check.agreement):
-        return replace(blank, note=f"fits up to {largest_px:.2g} px, none clearly better than 0")
-    found = f"0 px (all pairs within {largest_px:.2f})"
-    return replace(blank, found=found, status="not contradicted")
-
-
-def offset_words(offsets_px: dict[tuple[int, int], float]) -> str:
-    """Return constant disparities in words: for all pairs, for one camera, or pair by pair."""
-    values = list(offsets_px.values())
-    if max(values) - min(values) < LEAST_OFFSET_PX:
-        return f"{np.mean(values):+.2f} px for every pair"
-    for camera in range(CAMERA_COUNT):
-        # A picture shifted to the right by s adds s to the disparity of its own pixels, and
-        # subtracts s in pairs in which it is the right one.
-        shifts = [
-            px if pair[0] == camera else -px for pair, px in offsets_px.items() if camera in pair
-        ]
-        others = [px for pair, px in offsets_px.items() if camera not in pair]
-        alike = bool(shifts) and max(shifts) - min(shifts) < max(
-            LEAST_OFFSET_PX, _OFFSET_SPREAD * abs(float(np.mean(shifts)))
-        )
-        if alike and max(map(abs, others), default=0.0) < LEAST_OFFSET_PX:
-            return f"camera {camera}'s picture is {np.mean(shifts):+.2f} px to the right"
-    return ", ".join(f"{px:+.2f} px for {a}-{b}" for (a, b), px in offsets_px.items())
-
-
 _BIAS: Final = 0.002
 """Systematic error of a quotient, as a share, by interpolation and rounding."""
 MARGIN: Final = 0.02
@@ -283,11 +226,7 @@ def _common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
     """Return the unit that scenes agree on, weighted by how sure each is."""
     fitted = [scene for scene in scenes if math.isfinite(scene.scale_error)]
     coarse = max(allowed_log_scale(scene.depth_step) for scene in scenes)
-    seen_px = max(
-        # Beside an offset, only the spread of disparities determines the scale.
-        scene.spread_px if "offset" in scene.changed else scene.disparity_px
-        for scene in scenes
-    )
+    seen_px = max(scene.disparity_px for scene in scenes)
     bias = coarse if coarse > LEAST_LOG_SCALE else max(_BIAS, BIAS_PX / seen_px)
     if not fitted:
         return Unit(scenes[0].unit_m / scenes[0].scale, math.inf)
@@ -307,7 +246,7 @@ def _quotient(scenes: Sequence[SceneDiagnosis], unit: Unit) -> Answer:
     if first.best.form != first.declared.form:
         note = f"numbers of another form: {describe(first.best.form)} has a unit of its own"
         return replace(blank, found=found, note=note)
-    if "scale" in first.changed:
+    if first.is_scaled:
         blank = replace(blank, behind=pooled([scene.gain for scene in scenes]))
         if _kind_explains_scale(scenes):
             kind = describe(first.best.kind)
@@ -331,36 +270,17 @@ def _doubt(first: SceneDiagnosis, unit: Unit, *, found: str) -> str:
     off = abs(math.log(unit.metres / first.unit_m))
     is_coarse = allowed_log_scale(first.depth_step) > LEAST_LOG_SCALE
     why = "depth is stored in too large steps" if is_coarse else "too little parallax"
-    if unit.uncertainty > MARGIN:
-        return f"known only to {unit.uncertainty:.0%}: {why}"
-    if off > LEAST_LOG_SCALE:
-        return f"{found} fits best, but is not clearly better{': ' + why if is_coarse else ''}"
-    if off > max(unit.uncertainty, _LEAST_TOLERANCE):
-        return f"{found} fits best; less than {LEAST_LOG_SCALE:.0%} is not called wrong"
     if off + unit.uncertainty > MARGIN:
-        return f"{found}: the 95 % interval reaches beyond {MARGIN:.0%}"
+        return f"{found}: the 95 % interval reaches beyond {MARGIN:.0%}: {why}"
+    if off > max(unit.uncertainty, _LEAST_TOLERANCE):
+        return f"{found} fits best, but is not clearly better"
     return ""
-
-
-def _length_choices(first: SceneDiagnosis, unit: Unit, pasted: str) -> tuple[str, ...]:
-    """Return the lengths that would explain the quotient, each by itself.
-
-    ``pasted`` is the contract with the unit that would be right if the other lengths are.
-    """
-    factor = first.unit_m / unit.metres
-    words = [f"if focal length and baselines are right: {pasted}"]
-    if first.best.form == first.declared.form:
-        words += [
-            f"if unit and baselines are right: a focal length of {factor:.4g} x what is recorded",
-            f"if unit and focal length are right: baselines of {factor:.4g} x those of the poses",
-        ]
-    return tuple(words)
 
 
 def _kind_explains_scale(scenes: Sequence[SceneDiagnosis]) -> bool:
     """Tell whether the other kind of depth explains as much as a scale, and is not ruled out."""
     first = scenes[0]
-    if first.best != first.declared or first.changed != SCALE:
+    if first.best != first.declared or not first.is_scaled:
         return False
     if any(behind(scenes, rival).is_clear for rival in first.rivals if rival.question == "kind"):
         return False
@@ -392,7 +312,6 @@ class Verdict:
         untested_cameras: Cameras whose depth was not tested in some scene.
         unexplained_cameras: Cameras whose depth explains less than half of their matches in some
             scene.
-        beside: Advice that a `DepthEncoding` cannot express.
         fits: Whether the declared contract fits, with all cameras tested.
     """
 
@@ -408,7 +327,6 @@ class Verdict:
     problems: tuple[str, ...]
     untested_cameras: tuple[int, ...]
     unexplained_cameras: tuple[int, ...]
-    beside: tuple[str, ...]
     fits: bool
 
     @property
@@ -443,7 +361,7 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
     unit = _common_unit(scenes)
     hypothesis = [_question_answer(scenes, question) for question in QUESTIONS]
     quotient = _quotient(scenes, unit)
-    answers = (quotient, *hypothesis, _offset_answer(scenes))
+    answers = (quotient, *hypothesis)
     problems = tuple(
         f"{scene.key}: {problem}" if len(scenes) > 1 else problem
         for scene in scenes
@@ -467,16 +385,19 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
     )
     choices: tuple[str, ...] = ()
     if is_measured and quotient.status != "confirmed" and explains and not problems:
-        with_unit = _pasted(first, declared, unit_m=unit.rounded_m)
-        choices = _length_choices(first, unit, encoding_line(with_unit))
+        line = encoding_line(_pasted(first, declared, unit_m=unit.rounded_m))
+        factor = first.unit_m / unit.metres
+        choices = (
+            f"if focal length and baselines are right: {line}",
+            f"if unit and baselines are right: a focal length of {factor:.4g} x what is recorded",
+            f"if unit and focal length are right: baselines of {factor:.4g} x those of the poses",
+        )[: 3 if first.best.form == first.declared.form else 1]
     return Verdict(
         scenes=tuple(scene.key for scene in scenes),
         declared=declared,
         answers=answers,
         gain=pooled([scene.gain for scene in scenes]),
-        agreement=math.nan
-        if first.problem
-        else float(np.nanmean([scene.check.agreement for scene in scenes])),
+        agreement=float(np.mean([scene.check.agreement for scene in scenes])),
         encoding=pasted if is_sure else None,
         quotient=unit.metres / first.unit_m if is_measured else math.nan,
         quotient_error=unit.uncertainty if is_measured else math.nan,
@@ -484,9 +405,8 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
         problems=problems,
         untested_cameras=tuple(sorted(untested)),
         unexplained_cameras=tuple(sorted(unexplained)),
-        beside=tuple(_beside(scenes, answers)),
         fits=explains and not (wrong or problems or untested)
-        and all(answer.status != "cannot tell" for answer in (quotient, *hypothesis)),
+        and all(answer.status != "cannot tell" for answer in answers),
     )  # fmt: skip
 
 
@@ -511,33 +431,6 @@ def encoding_line(encoding: DepthEncoding) -> str:
     return f"DepthEncoding({', '.join(arguments)})"
 
 
-def _beside(scenes: Sequence[SceneDiagnosis], answers: Sequence[Answer]) -> list[str]:
-    """Return advice that a `DepthEncoding` cannot express."""
-    first = scenes[0]
-    wrong = {answer.topic for answer in answers if answer.status == "wrong"}
-    lines = []
-    if TOPICS["flip"] in wrong:
-        lines.append(f"Depth is flipped {first.best.flip}ly: store it anew.")
-    if first.best.order != first.declared.order and TOPICS["order"] in wrong:
-        lines.append(f"Files: {first.best.order}. Rename the files, or correct the metadata.")
-    if first.recorded_pair is not None and TOPICS["order"] in wrong:
-        lines.append("baseline.json names the primary pair's cameras the wrong way round.")
-    if "disparity offset" in wrong:
-        lines.append(
-            f"Constant disparity: {offset_words(first.offsets_px)}. Shift the pictures, or record "
-            "each camera's principal point."
-        )
-    if not first.problem and allowed_log_scale(first.depth_step) > LEAST_LOG_SCALE:
-        lines.append(
-            f"Stored depth is coarse: its steps are {first.depth_step:.1%} of it or more in a "
-            "quarter of the picture, so the quotient is not known better."
-        )
-    if _kind_explains_scale(scenes):
-        (other,) = first.best.alternatives("kind")
-        lines.append(f"Fits alike: depth along {describe(other.kind)}, the unit as declared.")
-    return lines
-
-
 def group_by_contract(scenes: Sequence[SceneDiagnosis]) -> list[list[SceneDiagnosis]]:
     """Return scenes in groups with one contract, the largest first.
 
@@ -559,7 +452,7 @@ def group_by_contract(scenes: Sequence[SceneDiagnosis]) -> list[list[SceneDiagno
 
 
 def _is_changed(scene: SceneDiagnosis) -> bool:
-    return scene.best != scene.declared or scene.changed != NOTHING
+    return scene.best != scene.declared or scene.is_scaled
 
 
 def _fits(scene: SceneDiagnosis, leader: SceneDiagnosis) -> bool:
@@ -574,11 +467,9 @@ def _fits(scene: SceneDiagnosis, leader: SceneDiagnosis) -> bool:
     if _is_changed(scene):
         units = (found.unit_m / found.scale for found in (scene, leader))
         same_unit = abs(math.log(next(units) / next(units))) <= error
-        return scene.best == leader.best and scene.changed == leader.changed and same_unit
+        return scene.best == leader.best and scene.is_scaled == leader.is_scaled and same_unit
     if not _is_changed(leader):
         return True
-    if "offset" in leader.changed:
-        return False
     ruled_out = {
         (rival.question, rival.answer) for rival in scene.rivals if rival.behind.is_clear()
     }
