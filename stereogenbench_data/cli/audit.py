@@ -31,19 +31,12 @@ def audit(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
     *,
     scenes: Annotated[
-        int | None, typer.Option(min=1, help="Scenes to draw at random [all].")
+        int | None, typer.Option(min=1, help="Scenes to audit, evenly spread [all].")
     ] = None,
     per_scene: Annotated[
         str, typer.Option(metavar="N|all", help="Frames of each scene; all, as in the paper.")
     ] = "5",
     chosen: SceneOptions,
-    limit: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=NUMBER",
-            help="Such as baseline_cm=0.01. May be repeated.",
-        ),
-    ] = None,
     out: OutOption = None,
     as_json: JsonOption = False,
     work: WorkOptions,
@@ -59,7 +52,6 @@ def audit(  # noqa: PLR0913 - one parameter an option
     Example: `stereogenbench audit shards/ --scenes 20 -o audit.md`
     """
     from stereogenbench_data.audit.geometry import audit as geometry_audit
-    from stereogenbench_data.audit.geometry.checks import parse_limits
     from stereogenbench_data.audit.geometry.table import audit_markdown
 
     if out is not None and out.is_dir():
@@ -74,7 +66,6 @@ def audit(  # noqa: PLR0913 - one parameter an option
     request = geometry_audit.AuditRequest(
         sample=scenes,
         frames=0 if per_scene == _ALL else int(per_scene),
-        limits=parse_limits(limit or []),
     )
     options: Any = chosen.filters() | work.options()
     with progress_bar("reading the index", unit="scenes") as progress:
@@ -101,6 +92,6 @@ def audit(  # noqa: PLR0913 - one parameter an option
 def _journal(out: Path | None, data: str, request: "AuditRequest") -> Path:
     if out is not None:
         return out.with_name(f"{out.name}.journal")
-    audited = repr((full_place(data), request.frames, request.depth)).encode(errors="replace")
+    audited = repr((full_place(data), request.frames)).encode(errors="replace")
     name = f"audit-{hashlib.sha256(audited).hexdigest()[:16]}.journal"
     return Path.home() / ".cache" / "stereogenbench" / name

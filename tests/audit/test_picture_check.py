@@ -6,51 +6,45 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.audit.geometry.picture_check import (
-    LightCheck,
-    PayloadCheck,
     border_occluder,
+    light_figures,
+    payload_figures,
+    stored_figures,
     stored_step,
     subject_m,
 )
 from stereogenbench_data.audit.geometry.records import Figure
 
 
-def grey(level, *, size=(24, 32)):
-    return np.full((3, *size), level, np.uint8)
-
-
 def stripes(low, high):
-    picture = grey(low)
-    picture[:, :, ::2] = high
-    return picture
+    luma = np.full((24, 32), low, np.float32)
+    luma[:, ::2] = high
+    return luma
 
 
-def test_change_counts_only_while_the_camera_moves():
-    check = LightCheck()
-    check.take(stripes(20, 200), 0, moved=False)
-    check.take(stripes(20, 200), 5, moved=False)
-    check.take(stripes(24, 204), 10, moved=True)
-    check.take(stripes(24, 206), 15, moved=True)
+def test_light_is_that_of_a_picture_and_change_that_from_the_one_before():
+    found = light_figures("a.mp4", 15, stripes(24, 206), before=(10, stripes(24, 204)))
 
     # Half of the pixels change by 2 grey levels.
-    assert list(check.figures("a.mp4")) == [
-        Figure("brightness", "a.mp4", pytest.approx(200, abs=0.01), "frame 0"),
-        Figure("contrast", "a.mp4", pytest.approx(180, abs=0.01), "frame 0"),
+    assert list(found) == [
+        Figure("brightness", "a.mp4", pytest.approx(206, abs=0.01), "frame 15"),
+        Figure("contrast", "a.mp4", pytest.approx(182, abs=0.01), "frame 15"),
         Figure("change", "a.mp4", pytest.approx(1.0, abs=0.01), "frame 10"),
     ]
 
 
-def test_a_payload_may_stand_still_while_the_camera_does():
-    check = PayloadCheck()
+def test_a_payload_has_its_share_of_depth_its_change_and_the_numbers_that_it_stores():
     units = np.arange(48, dtype=np.uint16).reshape(6, 8) * 10
-    for frame in range(3):
-        check.take(units, units > 0, frame, moved=False)
+    seen = np.zeros(1 << 16, bool)
+    seen[units[units > 0]] = True
 
-    assert list(check.figures("a.mkv")) == [
-        Figure("mean_valid_depth", "a.mkv", pytest.approx(47 / 48)),
-        Figure("valid_depth", "a.mkv", pytest.approx(47 / 48), "frame 0"),
-        Figure("depth_levels", "a.mkv", 47.0),
-    ]
+    found = payload_figures("a.mkv", 3, units, units > 0, before=(1, np.roll(units, 1)))
+    alone = payload_figures("a.mkv", 3, units, units > 0, before=None)
+
+    valid = Figure("valid_depth", "a.mkv", pytest.approx(47 / 48), "frame 3")
+    assert list(found) == [valid, Figure("depth_change", "a.mkv", 1.0, "frame 1")]
+    assert list(alone) == [valid]
+    assert list(stored_figures("a.mkv", seen)) == [Figure("depth_levels", "a.mkv", 47.0)]
 
 
 def test_numbers_that_were_stretched_from_10_bits_are_64_apart():

@@ -6,8 +6,7 @@ inverse depth, interpolated at that place, equals the expected one but for round
 is reported without a cause: the doctor (`audit.contract`) looks for one.
 
 A point is seen through if the target sees something behind it. An occluder never causes that: it
-hides what is behind it. In correct data the share of such points is 0 to 0.1 % between cameras at
-one moment; moving objects cause it between two moments.
+hides what is behind it. In correct data the share of such points is 0 to 0.1 % between cameras.
 
 Pictures are only correlated, at the points that depth puts in the same place, and those of the
 frames beside with them: whether each camera shows its own view and moment.
@@ -22,9 +21,10 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from stereogenbench_data.audit.geometry.records import Figure
-from stereogenbench_data.audit.geometry.reprojection import MeasuredDepth
+from stereogenbench_data.audit.geometry.reprojection import MeasuredDepth, moved_points
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.geometry.projection import Projection, backward_warp
 from stereogenbench_data.schema.release import CAMERA_COUNT, depth_name, rgb_name
 
 ALIGNED_PAIRS: Final = tuple(
@@ -36,8 +36,6 @@ ALIGNED_PAIRS: Final = tuple(
 """Directed pairs that are compared: neighbours, next but one, and the outermost."""
 
 _POINTS: Final = 1600
-_FEW_FRAMES: Final = 4
-"""Fewer frames are compared in both directions; of more, each takes half of the directions."""
 _FEWEST_POINTS: Final = 100
 _FEWEST_MOVED: Final = 1000
 _TOLERANCE: Final = 0.005
@@ -56,7 +54,6 @@ _TELLS_TIME: Final = 0.02
 """Pictures tell the time where those of a frame beside lower the correlation by as much."""
 LEAST_CONTRAST: Final = 2.0
 """Least standard deviation, in grey levels, of a band-passed picture with texture."""
-_ALL: Final = -1
 
 Points = Float64[np.ndarray, " n"]
 
@@ -93,10 +90,11 @@ def _bend(patch: Any) -> Any:
     return np.maximum(across, down).max(axis=(0, 1))
 
 
-def _between(inner: Any, x: Points, y: Points) -> Any:
-    """Return (2, 2, n) values interpolated bilinearly."""
-    above, below = inner[0, 0] * (1 - x) + inner[0, 1] * x, inner[1, 0] * (1 - x) + inner[1, 1] * x
-    return above * (1 - y) + below * y
+def _sampled(values: Any, u_px: Points, v_px: Points) -> Points:
+    """Return values of a picture or map between its pixels, interpolated bilinearly."""
+    places = Projection(u_px=u_px[None], v_px=v_px[None], depth_m=np.ones((1, len(u_px))))
+    sampled: Points = backward_warp(values[None], places)[0][0, 0]
+    return sampled
 
 
 def _landed(
@@ -115,31 +113,26 @@ def _landed(
     )  # fmt: skip
     known = source.measured[rows, columns]
     rows, columns = rows[known], columns[known]
-    inverse = 1 / source.depth_m[rows, columns]
-    camera = intrinsics
-    x = (columns + 0.5 - camera.cx_px) / camera.fx_px
-    y = (rows + 0.5 - camera.cy_px) / camera.fy_px
-    ahead = motion[:3, :3] @ np.stack([x, y, np.ones_like(x)]) + motion[:3, 3:] * inverse
-    far = np.where(ahead[2] > 1e-6, ahead[2], np.nan)
-    u_px = camera.fx_px * ahead[0] / far + camera.cx_px
-    v_px = camera.fy_px * ahead[1] / far + camera.cy_px
+    depth_m = source.depth_m[rows, columns]
+    u_px, v_px, ahead_m = moved_points(columns + 0.5, rows + 0.5, depth_m, intrinsics, motion)
     keep = (u_px >= 1.5) & (u_px < width - 2) & (v_px >= 1.5) & (v_px < height - 2)
     if keep.sum() < _FEWEST_POINTS:
         return None
-    rows, columns, inverse, far, u_px, v_px = (
-        each[keep] for each in (rows, columns, inverse, far, u_px, v_px)
+    rows, columns, depth_m, ahead_m, u_px, v_px = (
+        each[keep] for each in (rows, columns, depth_m, ahead_m, u_px, v_px)
     )
     left, top = np.floor(u_px - 0.5).astype(np.intp), np.floor(v_px - 0.5).astype(np.intp)
     here = _patch(source, rows - 1, columns - 1, side=3)
     there = _patch(target, top - 1, left - 1, side=4)
-    expected = inverse / far
-    found = _between(there[1:3, 1:3], u_px - 0.5 - left, v_px - 0.5 - top)
-    steps = np.maximum(*(each.steps_m(1 / expected) * expected for each in (source, target)))
-    smooth = (_bend(here) <= (_BEND + 4 * steps) * inverse) & (
-        _bend(there) <= (_BEND + 4 * steps) * expected
+    x, y = u_px - 0.5 - left, v_px - 0.5 - top
+    above, below = (there[row, 1] * (1 - x) + there[row, 2] * x for row in (1, 2))
+    found = above * (1 - y) + below * y
+    steps = np.maximum(*(each.steps_m(ahead_m) / ahead_m for each in (source, target)))
+    smooth = (_bend(here) <= (_BEND + 4 * steps) / depth_m) & (
+        _bend(there) <= (_BEND + 4 * steps) / ahead_m
     )
     return _Landed(
-        rows=rows, columns=columns, u_px=u_px, v_px=v_px, off=found / expected - 1, steps=steps,
+        rows=rows, columns=columns, u_px=u_px, v_px=v_px, off=found * ahead_m - 1, steps=steps,
         smooth=smooth & np.isfinite(found) & (steps <= _COARSE),
     )  # fmt: skip
 
@@ -172,17 +165,15 @@ class _Residuals:
 class AlignmentCheck:
     """Takes a scene's frames one after another; `figures` returns what all frames show."""
 
-    def __init__(self, intrinsics: Intrinsics, *, frames: int) -> None:
-        """Prepare for a number of frames of one rig."""
+    def __init__(self, intrinsics: Intrinsics) -> None:
+        """Take the intrinsics of all cameras."""
         self.intrinsics = intrinsics
-        self._is_both_ways = frames < _FEW_FRAMES
         self._depth = {(a, b): _Residuals() for a, b in ALIGNED_PAIRS if a < b}
         self._motion = _Residuals()
         self._correlations: dict[tuple[int, int], list[float]] = {}
         self._lags: dict[tuple[int, int], list[float]] = {}
         self._moved_px: list[float] = []
-        self._frames = 0
-        self._last: tuple[int, dict[int, MeasuredDepth]] | None = None
+        self._last: tuple[int, Mapping[int, MeasuredDepth]] = (0, {})
 
     def take(
         self,
@@ -200,8 +191,7 @@ class AlignmentCheck:
             poses: Poses of all frames.
         """
         for source, target in ALIGNED_PAIRS:
-            is_turn = self._is_both_ways or (source < target) == (self._frames % 2 == 0)
-            if is_turn and source in depths and target in depths:
+            if source in depths and target in depths:
                 motion = poses.cam_from_cam(frame, target=target, source=source)
                 landed = _landed(
                     depths[source], depths[target], intrinsics=self.intrinsics, motion=motion
@@ -209,33 +199,18 @@ class AlignmentCheck:
                 if landed is not None:
                     self._depth[min(source, target), max(source, target)].add(landed)
                     self._add_pictures((source, target), frame, landed, bands)
-        if self._last is not None:
-            before, others = self._last
-            for camera in others.keys() & depths.keys():
-                self._add_motion(camera, (before, others[camera]), (frame, depths[camera]), poses)
+        before = self._last[0]
+        for camera in self._last[1].keys() & depths.keys():
+            sides = (before, self._last[1][camera]), (frame, depths[camera])
+            for (here, shown), (there, other) in (sides, sides[::-1]):
+                world_from_there = poses.world_from_cam(there, camera)
+                motion = np.linalg.inv(world_from_there) @ poses.world_from_cam(here, camera)
+                landed = _landed(shown, other, intrinsics=self.intrinsics, motion=motion)
+                if landed is not None:
+                    self._motion.add(landed)
+                    away = landed.u_px - landed.columns - 0.5, landed.v_px - landed.rows - 0.5
+                    self._moved_px.append(float(np.median(np.hypot(*away))))
         self._last = (frame, dict(depths))
-        self._frames += 1
-
-    def _add_motion(
-        self,
-        camera: int,
-        before: tuple[int, MeasuredDepth],
-        after: tuple[int, MeasuredDepth],
-        poses: CameraPoses,
-    ) -> None:
-        ways = ((before, after), (after, before))
-        turn = (self._frames + camera) % 2
-        for (here, source), (there, target) in ways if self._is_both_ways else ways[turn:][:1]:
-            motion = np.linalg.inv(poses.world_from_cam(there, camera)) @ poses.world_from_cam(
-                here, camera
-            )
-            landed = _landed(source, target, intrinsics=self.intrinsics, motion=motion)
-            if landed is not None:
-                self._motion.add(landed)
-                away_px = np.hypot(
-                    landed.u_px - landed.columns - 0.5, landed.v_px - landed.rows - 0.5
-                )
-                self._moved_px.append(float(np.median(away_px)))
 
     def _add_pictures(
         self,
@@ -255,7 +230,7 @@ class AlignmentCheck:
             (landed.u_px[seen] * across, landed.v_px[seen] * down),
         )
         values = {
-            (camera, lag): _value(bands[camera, frame + lag], *place)
+            (camera, lag): _sampled(bands[camera, frame + lag], *place)
             for camera, place in zip(pair, places, strict=True)
             for lag in (-1, 0, 1)
             if (camera, frame + lag) in bands
@@ -266,7 +241,7 @@ class AlignmentCheck:
         now = _correlation(values[source, 0], values[target, 0])
         self._correlations.setdefault((min(pair), max(pair)), []).append(now)
         for lag in (-1, 1):
-            for camera, one, two in ((source, lag, 0), (target, 0, lag), (_ALL, lag, lag)):
+            for camera, one, two in ((source, lag, 0), (target, 0, lag)):
                 if (source, one) in values and (target, two) in values:
                     then = _correlation(values[source, one], values[target, two])
                     self._lags.setdefault((camera, lag), []).append(then - now)
@@ -294,17 +269,15 @@ class AlignmentCheck:
         yield from _untested("picture_odd", seen, "no texture, or no depth")
 
     def _motion_figures(self) -> Iterator[Figure]:
-        moved = self._motion
         moved_px = float(np.mean(self._moved_px)) if self._moved_px else 0.0
-        if moved.smooth < _FEWEST_MOVED:
+        if self._motion.smooth < _FEWEST_MOVED:
             why = "too few points of smooth surfaces, or one frame"
-        else:
-            yield Figure("moved_through", "", moved.through / moved.smooth)
+        elif moved_px < _STILL_PX:
             why = f"points move by {moved_px:.2f} px from one audited frame to the next"
-        if moved.smooth < _FEWEST_MOVED or moved_px < _STILL_PX:
-            yield Figure("motion_residual", where=why)
         else:
-            yield Figure("motion_residual", "", moved.percentile(50))
+            yield Figure("motion_residual", "", self._motion.percentile(50))
+            return
+        yield Figure("motion_residual", where=why)
 
     def _time_figures(self) -> Iterator[Figure]:
         gains: dict[int, dict[int, float]] = {}
@@ -314,7 +287,7 @@ class AlignmentCheck:
         for camera, of in gains.items():
             lag = max(of, key=lambda lag: of[lag])
             beside = f"by those of the frame {'before' if lag < 0 else 'after'}"
-            yield Figure("picture_lag", "" if camera < 0 else rgb_name(camera), of[lag], beside)
+            yield Figure("picture_lag", rgb_name(camera), of[lag], beside)
             timed |= {camera} if min(of.values()) <= -_TELLS_TIME else set()
         why = "pictures of the neighbouring frames fit as well, or there are none"
         yield from _untested("picture_lag", timed, why)
@@ -338,17 +311,6 @@ def _untested(quantity: str, tested: set[int], why: str) -> Iterator[Figure]:
         all_of_them = len(others) == CAMERA_COUNT
         which = "all cameras" if all_of_them else f"camera {', '.join(map(str, others))}"
         yield Figure(quantity, where=f"{which}: {why}")
-
-
-def _value(picture: Any, u_px: Points, v_px: Points) -> Points:
-    """Return a picture's values between its pixels."""
-    height, width = picture.shape
-    x, y = np.clip(u_px - 0.5, 0, width - 1.001), np.clip(v_px - 0.5, 0, height - 1.001)
-    left, top = x.astype(np.intp), y.astype(np.intp)
-    steps = np.arange(2)
-    inner = picture[top + steps[:, None, None], left + steps[:, None]]
-    value: Points = _between(inner, x - left, y - top)
-    return value
 
 
 def _correlation(first: Points, second: Points) -> float:

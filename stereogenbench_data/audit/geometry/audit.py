@@ -5,7 +5,7 @@ import json
 import warnings
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Unpack
 
@@ -13,15 +13,14 @@ import numpy as np
 from jaxtyping import Int64
 
 from stereogenbench_data.audit.geometry.checks import (
-    LIMITS,
     broken_finding,
     findings_of,
     untested_of,
 )
 from stereogenbench_data.audit.geometry.records import AuditReport, SceneAudit, plain
-from stereogenbench_data.audit.geometry.scene_audit import AuditTask, audit_scene, spread_frames
+from stereogenbench_data.audit.geometry.scene_audit import AuditTask, audit_scene
 from stereogenbench_data.audit.geometry.table import table_rows
-from stereogenbench_data.audit.scene_access import source_of
+from stereogenbench_data.audit.scene_access import source_of, spread
 from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
 from stereogenbench_data.index.build import Journal, walk
@@ -32,7 +31,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.index.tree import SceneFolder
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
-from stereogenbench_data.schema.records import DepthEncoding, Scene
+from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes, may_pass
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.sources.location import is_remote, joined, local_path
@@ -40,19 +39,16 @@ from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import MissingObject
 
 DEFAULT_FRAMES: Final = 5
-_FORMAT: Final = 5
+_FORMAT: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
 class AuditRequest:
-    """What to audit, and against which limits.
+    """What to audit.
 
     Attributes:
-        sample: How many scenes to draw at random; None for all.
+        sample: How many scenes, evenly spread; None for all.
         frames: How many frames of each scene, evenly spread; 0 for all, as in the paper.
-        seed: Seed of the random draw.
-        depth: A depth contract that overrides what the files state, or None.
-        limits: Values beyond which a figure is a finding, see `checks.LIMITS`.
 
     Raises:
         SelectionError: If a number is too small.
@@ -60,15 +56,10 @@ class AuditRequest:
 
     sample: int | None = None
     frames: int = DEFAULT_FRAMES
-    seed: int = 0
-    depth: DepthEncoding | None = None
-    limits: Mapping[str, float] = field(default_factory=lambda: LIMITS)
 
     def __post_init__(self) -> None:
         """Refuse numbers that are too small."""
-        for name, value, least in (
-            ("sample", self.sample, 1), ("frames", self.frames, 0), ("seed", self.seed, 0),
-        ):  # fmt: skip
+        for name, value, least in (("sample", self.sample, 1), ("frames", self.frames, 0)):
             if value is not None and value < least:
                 raise SelectionError(f"{name} must be at least {least}, got {value}.")
 
@@ -143,7 +134,7 @@ def audit(
 
     Args:
         data: A released tree, shards, an index file, the URL of either, or an index.
-        request: What to audit, and against which limits.
+        request: What to audit.
         workers: Number of worker processes; None is one a core.
         engine: Where they run: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called with the number of frames audited and of all frames.
@@ -175,12 +166,12 @@ def audit(
         stamps = {scene.id.key: _stamp(index, scene) for scene in scenes}
         found = _known(journal, stamps)
     tasks = [
-        AuditTask(scene, source_of(index, scene), request.frames, request.depth)
+        AuditTask(scene, source_of(index, scene), request.frames)
         for scene in scenes
         if scene.id.key not in found
     ]
     advance = advance_of(
-        progress, total=sum(len(spread_frames(scene.frames, request.frames)) for scene in scenes)
+        progress, total=sum(len(spread(scene.frames, request.frames)) for scene in scenes)
     )
     advance(sum(len(known.audited_frames) for known in found.values()))
     for each in engine.map(
@@ -192,16 +183,14 @@ def audit(
     audited = [found[scene.id.key] for scene in scenes]
     findings = [broken_finding(key, text) for key, text in sorted(broken.items())]
     for scene in audited:
-        findings += findings_of(scene, request.limits)
+        findings += findings_of(scene)
     untested = [each for scene in audited for each in untested_of(scene)]
     return AuditReport(
         root=index.where,
         scenes_there=len(index) + len(index.broken) + len(index.incomplete),
         scenes_audited=len(audited),
         frames=request.frames,
-        seed=request.seed,
-        limits=request.limits,
-        rows=table_rows(audited, request.limits, findings=findings),
+        rows=table_rows(audited, findings),
         findings=tuple(findings),
         untested=tuple(untested),
         notes=tuple(f"incomplete, not audited: {text}" for text in incomplete.values()),
@@ -236,23 +225,20 @@ def _chosen(
         if not left_out:
             raise
         return np.empty(0, dtype=np.int64)
-    if request.sample is None or request.sample >= len(rows):
-        return rows
-    drawn = np.random.default_rng(request.seed).choice(rows, request.sample, replace=False)
-    return np.sort(drawn)
+    return rows[list(spread(len(rows), request.sample or 0))]
 
 
 def audit_journal(path: Path, index: SceneIndex, request: AuditRequest) -> Journal:
     """Return the journal of an audit.
 
-    The journal starts anew for another root, depth contract or number of frames. Limits, filters
-    and the number of scenes may differ.
+    The journal starts anew for another root or number of frames. Filters and
+    the number of scenes may differ.
 
     Raises:
         StorageError: If the file exists and cannot be read.
     """
     work = {"audit": _FORMAT, "root": index.where, "frames": request.frames}
-    return Journal(path, work={**work, "depth": repr(request.depth)})
+    return Journal(path, work=work)
 
 
 def _known(journal: Journal, stamps: Mapping[str, str]) -> dict[str, SceneAudit]:

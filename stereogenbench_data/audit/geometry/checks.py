@@ -1,14 +1,13 @@
 """What an audit checks: each quantity, its limit, and which figures of a scene are beyond it."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
 from stereogenbench_data.audit.geometry.picture_check import FLAT
 from stereogenbench_data.audit.geometry.records import Figure, Finding, SceneAudit
 from stereogenbench_data.audit.paper_numbers import AUDIT
-from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.media.clock import MOST_EXTRA_FRAMES
 
 
@@ -19,7 +18,7 @@ class Check:
     Attributes:
         name: The check's name.
         what: The quantity, in words.
-        limit: Beyond which a figure is a finding, unless the user sets another limit.
+        limit: A figure beyond it is a finding.
         worst: `max` where large figures are wrong, `min` where small ones are.
         unit: Such as "px"; "%" for a share.
         paper: The paper's figure.
@@ -62,10 +61,6 @@ CHECKS: Final = {
         "depth residual",
         "90th percentile of what inverse depth differs between cameras, beyond one step", 0.0005,
         unit="%"),
-    "moved_through": Check(
-        "motion",
-        "share of points on smooth surfaces that the next audited frame sees through", 0.35,
-        unit="%"),
     "motion_residual": Check(
         "motion residual",
         "median of what inverse depth differs from frame to frame, beyond one step", 0.001,
@@ -94,63 +89,36 @@ CHECKS: Final = {
 }  # fmt: skip
 """By quantity, in the order of the table."""
 
-LIMITS: Final[Mapping[str, float]] = {
-    "frames": 0.0, **{quantity: check.limit for quantity, check in CHECKS.items()}
-}  # fmt: skip
-"""The usual limits. Videos must have ``frames`` frames; 0 means as many as the scene has poses."""
 
-
-def parse_limits(settings: Sequence[str]) -> dict[str, float]:
-    """Return the limits, some of them set by texts such as ``baseline_cm=0.01``.
-
-    Raises:
-        SelectionError: If a text does not name a limit and a number.
-    """
-    limits = dict(LIMITS)
-    for setting in settings:
-        name, _, number = setting.partition("=")
-        try:
-            value = float(number)
-        except ValueError:
-            value = math.nan
-        if name not in limits or math.isnan(value):
-            raise SelectionError(
-                f"limit {setting!r} is not NAME=NUMBER with a name of {', '.join(limits)}."
-            )
-        limits[name] = value
-    return limits
-
-
-def findings_of(scene: SceneAudit, limits: Mapping[str, float]) -> Iterator[Finding]:
+def findings_of(scene: SceneAudit) -> Iterator[Finding]:
     """Yield the files of a scene that cannot be read, and its figures beyond a limit."""
     for name, text in scene.problems.items():
         # The file's path stands in front of some messages.
         place, colon, rest = text.partition(f"{name}: ")
         yield Finding(scene.key, name, "unreadable", rest if colon and " " not in place else text)
     for figure in scene.figures:
-        found = None if figure.member in scene.problems else _beyond(scene, figure, limits)
+        found = None if figure.member in scene.problems else _beyond(scene, figure)
         if found is not None:
             yield Finding(scene.key, figure.member, *found)
 
 
-def _beyond(
-    scene: SceneAudit, figure: Figure, limits: Mapping[str, float]
-) -> tuple[str, str] | None:
+def _beyond(scene: SceneAudit, figure: Figure) -> tuple[str, str] | None:
     """Return the check and what a figure beyond its limit says, None for any other."""
     if figure.quantity == "frames":
-        expected = int(limits["frames"]) or scene.frames
-        more = figure.value - expected
+        more = figure.value - scene.frames
         # Opening tells of a few more than the scene uses.
-        is_right = more == 0 or (0 < more <= MOST_EXTRA_FRAMES and not limits["frames"])
         kind = "missing frames" if more < 0 else "more frames"
-        return None if is_right else (kind, f"has {figure.value} frames of {expected}")
-    check, limit = CHECKS.get(figure.quantity), limits.get(figure.quantity, math.nan)
-    if check is None or figure.value == limit or check.worst(figure.value, limit) != figure.value:
+        found = f"has {figure.value} frames of {scene.frames}"
+        return None if 0 <= more <= MOST_EXTRA_FRAMES else (kind, found)
+    check = CHECKS.get(figure.quantity)
+    if check is None or figure.value == check.limit:
+        return None
+    if check.worst(figure.value, check.limit) != figure.value:  # nan is not beyond it either
         return None
     place = f", {figure.where}" if figure.where else ""
     cause = _DOCTOR if figure.quantity in ("depth_residual", "motion_residual") else ""
-    found = f"{check.what} is {check.text(figure.value)}{place} (limit {check.text(limit)}){cause}"
-    return check.name, found
+    value, limit = check.text(figure.value), check.text(check.limit)
+    return check.name, f"{check.what} is {value}{place} (limit {limit}){cause}"
 
 
 def untested_of(scene: SceneAudit) -> Iterator[Finding]:

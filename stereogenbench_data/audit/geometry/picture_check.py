@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -17,7 +16,6 @@ MOVED_SHARE: Final = 0.01
 """Motion of a picture's middle, as a share of its width, beyond which pictures must change."""
 _COVERED: Final = 0.8
 _LOOKED_AT_PX: Final = 320
-_STORED_NUMBERS: Final = 1 << 16
 ENOUGH_LEVELS: Final = 64
 """Least count of different numbers whose spacing shows how they were rounded."""
 FLAT: Final = 8.0
@@ -27,6 +25,7 @@ _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 Luma = Float32[np.ndarray, "h w"]
 Mask = Bool[np.ndarray, "h w"]
 Map = Float64[np.ndarray, "h w"]
+Units = UInt16[np.ndarray, "h w"]
 
 
 def luma_of(picture: UInt8[np.ndarray, "3 h w"]) -> Luma:
@@ -53,95 +52,55 @@ def band_passed(luma: Luma) -> Luma:
     return band
 
 
-@dataclass(slots=True)
-class Least:
-    """The least of some figures, and its frame."""
-
-    value: float = math.nan
-    frame: int = -1
-
-    def take(self, value: float, frame: int) -> None:
-        """Add a figure."""
-        if not self.value <= value:
-            self.value, self.frame = float(value), frame
-
-    def figure(self, quantity: str, member: str) -> Figure:
-        """Return the least figure as a row."""
-        return Figure(quantity, member, self.value, f"frame {self.frame}")
-
-
 def reduced_size(height_px: int, width_px: int) -> tuple[int, int]:
     """Return the (height, width) at which light and motion are judged."""
     factor = max(1, math.ceil(max(height_px, width_px) / _LOOKED_AT_PX))
     return max(1, height_px // factor), max(1, width_px // factor)
 
 
-class LightCheck:
-    """Brightness, contrast and change of one camera's pictures."""
+def light_figures(
+    member: str, frame: int, luma: Luma, *, before: tuple[int, Luma] | None
+) -> Iterator[Figure]:
+    """Yield brightness, contrast and change of one picture.
 
-    def __init__(self) -> None:
-        self.brightness, self.contrast, self.change = Least(), Least(), Least()
-        self._last: tuple[int, np.ndarray] | None = None
-
-    def take(self, picture: UInt8[np.ndarray, "3 h w"], frame: int, *, moved: bool) -> None:
-        """Add the next picture.
-
-        Args:
-            picture: The picture.
-            frame: Its number.
-            moved: Whether the camera has moved since the last one, so that it must differ.
-        """
-        luma = luma_of(picture)
-        dark, bright = np.percentile(luma, (5, 95))
-        self.brightness.take(bright, frame)
-        self.contrast.take(bright - dark, frame)
-        if moved and self._last is not None:
-            self.change.take(float(np.abs(luma - self._last[1]).mean()), self._last[0])
-        self._last = (frame, luma)
-
-    def figures(self, member: str) -> Iterator[Figure]:
-        """Yield what was found in a camera's file; flat pictures do not change."""
-        if self._last is not None:
-            yield self.brightness.figure("brightness", member)
-            yield self.contrast.figure("contrast", member)
-            if self.change.frame >= 0 and self.contrast.value >= FLAT:
-                yield self.change.figure("change", member)
+    Args:
+        member: Its file.
+        frame: Its number.
+        luma: The picture.
+        before: An earlier frame's number and picture that this one must differ from, if any.
+    """
+    dark, bright = np.percentile(luma, (5, 95))
+    yield Figure("brightness", member, float(bright), f"frame {frame}")
+    yield Figure("contrast", member, float(bright - dark), f"frame {frame}")
+    if before is not None:
+        yield Figure("change", member, float(np.abs(luma - before[1]).mean()), f"frame {before[0]}")
 
 
-class PayloadCheck:
-    """The numbers that one camera's depth stores, and whether they change."""
+def payload_figures(
+    member: str, frame: int, units: Units, measured: Mask, *, before: tuple[int, Units] | None
+) -> Iterator[Figure]:
+    """Yield the share of valid depth in one depth picture, and its change.
 
-    def __init__(self) -> None:
-        self.least_valid, self.change = Least(), Least()
-        self._shares: list[float] = []
-        self._seen = np.zeros(_STORED_NUMBERS, dtype=np.bool_)
-        self._last: tuple[int, np.ndarray] | None = None
+    Args:
+        member: Its file.
+        frame: Its number.
+        units: What it stores.
+        measured: Where that is depth.
+        before: An earlier frame's number and units that this one must differ from, if any.
+    """
+    yield Figure("valid_depth", member, float(measured.mean()), f"frame {frame}")
+    if before is not None and measured.any():
+        change = float((units != before[1]).mean())
+        yield Figure("depth_change", member, change, f"frame {before[0]}")
 
-    def take(
-        self, units: UInt16[np.ndarray, "h w"], measured: Mask, frame: int, *, moved: bool
-    ) -> None:
-        """Add the next depth picture: stored numbers, and where they are measured."""
-        share = float(measured.mean())
-        self._shares.append(share)
-        self.least_valid.take(share, frame)
-        self._seen[units[measured]] = True
-        if moved and share and self._last is not None:
-            self.change.take(float((units != self._last[1]).mean()), self._last[0])
-        self._last = (frame, units)
 
-    def figures(self, member: str) -> Iterator[Figure]:
-        """Yield what was found in a camera's file."""
-        if not self._shares:
-            return
-        valid, numbers = float(np.mean(self._shares)), np.flatnonzero(self._seen)
-        yield Figure("mean_valid_depth", member, valid)
-        yield self.least_valid.figure("valid_depth", member)
-        if self.change.frame >= 0:
-            yield self.change.figure("depth_change", member)
-        if valid > 0:
-            yield Figure("depth_levels", member, float(len(numbers)))
-        if len(numbers) >= ENOUGH_LEVELS:
-            yield Figure("depth_step", member, stored_step(numbers))
+def stored_figures(member: str, seen: Bool[np.ndarray, " 65536"]) -> Iterator[Figure]:
+    """Yield how many numbers a file stores, and their step, by which numbers were seen in it."""
+    numbers = np.flatnonzero(seen)
+    if len(numbers):
+        yield Figure("depth_levels", member, float(len(numbers)))
+    if len(numbers) >= ENOUGH_LEVELS:
+        yield Figure("depth_step", member, stored_step(numbers))
 
 
 def stored_step(numbers: np.ndarray) -> float:

@@ -1,7 +1,7 @@
 """The records of an audit, in types that JSON has: one row for each figure of a scene."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -28,41 +28,32 @@ class Figure:
 
 
 @dataclass(frozen=True, slots=True)
-class ToleranceAudit:
-    """Reprojection errors of one pair at one tolerance: how many, and their quantiles in px."""
-
-    tolerance: str
-    kept: int
-    errors_px: tuple[float, ...]
-
-    @property
-    def median_px(self) -> float:
-        """The median error, nan if no pixel was kept."""
-        return self.errors_px[QUANTILES.index(0.5)] if self.errors_px else math.nan
-
-
-@dataclass(frozen=True, slots=True)
 class PairAudit:
-    """Reprojection of one pair over the audited frames; counts are of pixels.
+    """Reprojection of one pair over the audited frames.
 
-    ``comparable`` pixels land inside the right picture where depth was measured. Of these, nothing
-    in the left view hides the ``unhidden`` ones; of these, the two depths agree at the ``agreeing``
-    ones.
+    Attributes:
+        comparable: Pixels that land inside the right picture where depth was measured.
+        unhidden: Those of them that nothing in the left view hides.
+        agreeing: Those of the unhidden ones whose two depths agree.
+        kept: For each of `reprojection.TOLERANCES`, the pixels kept.
+        errors_px: For each of them the `QUANTILES` of the errors; empty if no pixel was kept.
     """
 
-    left: int
-    right: int
-    frames: int
-    measured: int
     comparable: int
     unhidden: int
     agreeing: int
-    tolerances: tuple[ToleranceAudit, ...]
+    kept: Sequence[int]
+    errors_px: Sequence[Sequence[float]]
 
     @property
     def agreement(self) -> float:
         """Share of the unhidden pixels whose depths agree, nan if there are no such pixels."""
         return self.agreeing / self.unhidden if self.unhidden else math.nan
+
+    def median_px(self, tolerance: int) -> float:
+        """Return the median error at a tolerance, by its place; nan if no pixel was kept."""
+        errors_px = self.errors_px[tolerance]
+        return errors_px[QUANTILES.index(0.5)] if errors_px else math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,19 +83,14 @@ class SceneAudit:
         Raises:
             TypeError: If a field is missing or unknown.
         """
-        pairs = []
-        for pair in record["pairs"]:
-            tolerances = (
-                ToleranceAudit(each["tolerance"], each["kept"], tuple(each["errors_px"]))
-                for each in pair["tolerances"]
-            )
-            pairs.append(PairAudit(**{**pair, "tolerances": tuple(tolerances)}))
         figures = (
             Figure(**{**each, "value": math.nan if each["value"] is None else each["value"]})
             for each in record["figures"]
         )
-        parts = {"audited_frames": record["audited_frames"], "figures": figures, "pairs": pairs}
-        return cls(**{**record, **{name: tuple(part) for name, part in parts.items()}})
+        pairs = (PairAudit(**each) for each in record["pairs"])
+        frames = tuple(record["audited_frames"])
+        parts = {"figures": tuple(figures), "pairs": tuple(pairs), "audited_frames": frames}
+        return cls(**{**record, **parts})
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,8 +136,6 @@ class AuditReport:
         scenes_there: Number of scenes of the index.
         scenes_audited: How many of them were audited.
         frames: Number of frames audited of each scene; 0 for all.
-        seed: Seed of the random choice of scenes.
-        limits: The limits beyond which a figure is a finding.
         rows: The table.
         findings: The findings, in the order of scenes.
         untested: Checks that the content of a scene does not allow.
@@ -163,8 +147,6 @@ class AuditReport:
     scenes_there: int
     scenes_audited: int
     frames: int
-    seed: int
-    limits: Mapping[str, float]
     rows: tuple[AuditRow, ...]
     findings: tuple[Finding, ...]
     untested: tuple[Finding, ...]

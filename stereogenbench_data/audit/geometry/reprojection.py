@@ -22,7 +22,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Bool, Float64, UInt16
 
-from stereogenbench_data.audit.geometry.records import QUANTILES, PairAudit, ToleranceAudit
+from stereogenbench_data.audit.geometry.records import QUANTILES, PairAudit
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.projection import Projection, visible_from_source
 from stereogenbench_data.media.depth import depth_m_from_units
@@ -31,6 +31,7 @@ from stereogenbench_data.schema.records import DepthEncoding
 _SIGNIFICANT: Final = 7
 
 Map = Float64[np.ndarray, "h w"]
+Points = Float64[np.ndarray, "*any"]
 Mask = Bool[np.ndarray, "h w"]
 
 MOST_PIXELS: Final = 250_000
@@ -101,14 +102,13 @@ class PairErrors:
     """The reprojection of one pair in one frame.
 
     Attributes:
-        measured: Number of left pixels with depth.
-        comparable: How many land inside the right picture where depth was measured.
+        comparable: Number of left pixels that land inside the right picture where depth was
+            measured.
         errors_px: For each of `TOLERANCES`, (n,) float64 errors of the pixels kept.
         unhidden: Comparable pixels that nothing in the left view hides.
         agreeing: Those of them kept at the last tolerance.
     """
 
-    measured: int
     comparable: int
     errors_px: tuple[Float64[np.ndarray, " n"], ...]
     unhidden: int
@@ -136,14 +136,14 @@ def reproject(
     depth_m, measured = left.depth_m[first::step], left.measured[first::step]
     u_px = np.broadcast_to(np.arange(width_px) + 0.5, depth_m.shape)
     v_px = np.broadcast_to(np.arange(first, height_px, step)[:, None] + 0.5, depth_m.shape)
-    forth_u, forth_v, expected_m = _moved(u_px, v_px, depth_m, intrinsics, right_from_left)
+    forth_u, forth_v, expected_m = moved_points(u_px, v_px, depth_m, intrinsics, right_from_left)
     inside = measured & (expected_m > 0)
     inside &= (forth_u >= 0) & (forth_u < width_px) & (forth_v >= 0) & (forth_v < height_px)
     column = np.where(inside, forth_u, 0).astype(np.intp)
     row = np.where(inside, forth_v, 0).astype(np.intp)
     found_m = right.depth_m[row, column]
     comparable = inside & right.measured[row, column]
-    back_u, back_v, _ = _moved(
+    back_u, back_v, _ = moved_points(
         forth_u, forth_v, found_m, intrinsics, np.linalg.inv(right_from_left)
     )
     error_px = np.hypot(back_u - u_px, back_v - v_px)
@@ -160,7 +160,6 @@ def reproject(
         tolerance=STANDARD.share,
     )
     return PairErrors(
-        measured=int(measured.sum()),
         comparable=int(comparable.sum()),
         errors_px=tuple(error_px[each] for each in kept),
         unhidden=int(unhidden.sum()),
@@ -168,13 +167,13 @@ def reproject(
     )
 
 
-def _moved(
-    u_px: Map,
-    v_px: Map,
-    depth_m: Map,
+def moved_points(
+    u_px: Points,
+    v_px: Points,
+    depth_m: Points,
     intrinsics: Intrinsics,
     target_from_source: Float64[np.ndarray, "4 4"],
-) -> tuple[Map, Map, Map]:
+) -> tuple[Points, Points, Points]:
     """Return where points of one camera land in the other, and their depth; nan if behind it."""
     x_m = (u_px - intrinsics.cx_px) / intrinsics.fx_px * depth_m
     y_m = (v_px - intrinsics.cy_px) / intrinsics.fy_px * depth_m
@@ -189,21 +188,17 @@ def _moved(
     )
 
 
-def pair_audit(pair: tuple[int, int], found: list[PairErrors]) -> PairAudit:
+def pair_audit(found: list[PairErrors]) -> PairAudit:
     """Return the figures of a pair over all audited frames."""
-    tolerances = []
-    for place, tolerance in enumerate(TOLERANCES):
-        errors_px = np.concatenate([np.empty(0), *(each.errors_px[place] for each in found)])
-        quantiles = np.quantile(errors_px, QUANTILES).tolist() if len(errors_px) else []
-        rounded = tuple(float(f"{each:.{_SIGNIFICANT}g}") for each in quantiles)
-        tolerances.append(ToleranceAudit(tolerance.name, len(errors_px), rounded))
+    errors_px = [
+        np.concatenate([np.empty(0), *of_frames])
+        for of_frames in zip(*(each.errors_px for each in found), strict=True)
+    ] or [np.empty(0)] * len(TOLERANCES)
+    quantiles = [np.quantile(each, QUANTILES).tolist() if len(each) else [] for each in errors_px]
     return PairAudit(
-        left=pair[0],
-        right=pair[1],
-        frames=len(found),
-        measured=sum(each.measured for each in found),
         comparable=sum(each.comparable for each in found),
         unhidden=sum(each.unhidden for each in found),
         agreeing=sum(each.agreeing for each in found),
-        tolerances=tuple(tolerances),
+        kept=[len(each) for each in errors_px],
+        errors_px=[[float(f"{px:.{_SIGNIFICANT}g}") for px in each] for each in quantiles],
     )

@@ -5,22 +5,26 @@ A file that cannot be read does not stop the audit: it is noted, and the rest is
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from itertools import combinations
-from typing import Any, Final, Literal, TypeVar
+from contextlib import closing, nullcontext
+from dataclasses import dataclass
+from itertools import combinations, product
+from pathlib import Path
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
 from stereogenbench_data.audit.geometry.alignment import AlignmentCheck
+from stereogenbench_data.audit.geometry.checks import CHECKS
 from stereogenbench_data.audit.geometry.picture_check import (
     FLAT,
     MOVED_SHARE,
-    LightCheck,
-    PayloadCheck,
     band_passed,
     border_occluder,
+    light_figures,
     luma_of,
+    payload_figures,
     reduced_size,
+    stored_figures,
     subject_m,
 )
 from stereogenbench_data.audit.geometry.records import Figure, SceneAudit
@@ -31,6 +35,7 @@ from stereogenbench_data.audit.geometry.reprojection import (
     reproject,
 )
 from stereogenbench_data.audit.geometry.rig_check import motion_px, rig_figures
+from stereogenbench_data.audit.scene_access import spread
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
 from stereogenbench_data.geometry.camera import rig_intrinsics
@@ -66,11 +71,10 @@ class AuditedFiles:
         problems: Maps the name of a file that cannot be read to the reason; it is not tried again.
     """
 
-    def __init__(self, scene: Scene, source: MemberSource, *, contract: DepthEncoding) -> None:
+    def __init__(self, scene: Scene, source: MemberSource) -> None:
         """Prepare to read; nothing is opened yet."""
         self.problems: dict[str, str] = {}
         self.scene, self.source = scene, source
-        self.contract = contract
         self.streams = Streams(self.source)
         self.intrinsics = rig_intrinsics(self.scene.rig)
 
@@ -96,21 +100,15 @@ class AuditedFiles:
             reason = self.scene.remark("videos" if name in VIDEO_FILES else "poses")
             raise StorageError(reason or "is missing: the index has no such file of this scene")
 
-    def frames_of(self, name: str) -> int | None:
-        """Return the number of frames of a video, None for one that does not open."""
-        return self.attempt(name, self._probed, name, "later" if "rgb" in name else "needed")
-
-    def _probed(self, name: str, pixel_format: Literal["needed", "later"]) -> int:
+    def frame_count(self, name: str) -> int:
+        """Return the number of frames of a video."""
         self._require_member(name)
         held = self.scene.held_name(name)
         opened = self.source.open(self.scene, held)
         label = self.source.label(self.scene, held)
-        try:
-            return probe(opened, name=label, pixel_format=pixel_format).frames
-        finally:
-            close = getattr(opened, "close", None)
-            if close is not None:
-                close()
+        with nullcontext() if isinstance(opened, Path) else closing(opened):
+            facts = probe(opened, name=label, pixel_format="later" if "rgb" in name else "needed")
+        return facts.frames
 
     def picture(self, camera: int, frame: int) -> Any:
         """Return a frame as (3, h, w) uint8, at the reduced size that the checks use."""
@@ -120,7 +118,9 @@ class AuditedFiles:
 
     def depth(self, camera: int, frame: int) -> tuple[Any, MeasuredDepth] | None:
         """Return stored numbers and depth, None if the frame lag leaves the frame without depth."""
-        encoding = self._encoding(camera)
+        encoding = self.encoding(camera)
+        if encoding.unit_m is None:
+            raise MediaError(self.scene.remark("depth") or NO_DEPTH_UNIT)
         index = depth_frame_index(frame, encoding=encoding, frames=self.scene.frames)
         if index is None:
             return None
@@ -131,18 +131,9 @@ class AuditedFiles:
             stored.units, stored.measured, encoding=encoding, intrinsics=self.intrinsics
         )
 
-    def _encoding(self, camera: int) -> DepthEncoding:
-        encoding = self.scene.depth_encoding(camera, self.contract)
-        if encoding.unit_m is None:
-            raise MediaError(self.scene.remark("depth") or NO_DEPTH_UNIT)
-        return encoding
-
-    def unit_m(self, camera: int) -> float:
-        """Return the metres in a stored unit of a camera's depth, nan if its tags contradict."""
-        try:
-            return self._encoding(camera).known_unit_m
-        except MediaError:
-            return math.nan
+    def encoding(self, camera: int) -> DepthEncoding:
+        """Return the contract of a camera's depth; its unit is None if tags contradict it."""
+        return self.scene.depth_encoding(camera, depth_of(self.scene))
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,26 +144,11 @@ class AuditTask:
         scene: The scene.
         source: Its files.
         frames: How many frames to audit, evenly spread; 0 for all.
-        depth: The depth contract, None for what the files state.
     """
 
     scene: Scene
     source: MemberSource
     frames: int
-    depth: DepthEncoding | None = None
-
-
-def spread_frames(frames: int, wanted: int) -> tuple[int, ...]:
-    """Return the numbers of ``wanted`` frames, evenly spread from first to last; 0 means all.
-
-    >>> spread_frames(81, 5), spread_frames(2, 5)
-    ((0, 20, 40, 60, 80), (0, 1))
-    """
-    if wanted == 0 or wanted >= frames:
-        return tuple(range(frames))
-    if wanted == 1:
-        return (frames // 2,)
-    return tuple(round(step * (frames - 1) / (wanted - 1)) for step in range(wanted))
 
 
 def audit_scene(task: AuditTask, after_bytes: Advance) -> SceneAudit:
@@ -190,19 +166,17 @@ class _SceneCheck:
 
     def __init__(self, task: AuditTask) -> None:
         self.scene = task.scene
-        self.frames = spread_frames(self.scene.frames, task.frames)
-        self.files = AuditedFiles(
-            task.scene, task.source, contract=task.depth or depth_of(task.scene)
-        )
+        self.frames = spread(self.scene.frames, task.frames)
+        self.files = AuditedFiles(task.scene, task.source)
         self.intrinsics = self.files.intrinsics
-        self.light = [LightCheck() for _ in range(CAMERA_COUNT)]
-        self.payload = [PayloadCheck() for _ in range(CAMERA_COUNT)]
-        self.occluders = [Figure("occluder", depth_name(each)) for each in range(CAMERA_COUNT)]
+        self.of_frames: list[Figure] = []
+        self.last: dict[str, tuple[int, Any]] = {}
+        self.numbers = np.zeros((CAMERA_COUNT, 1 << 16), dtype=np.bool_)
         self.copies: dict[tuple[int, int], list[bool]] = {}
         self.errors: dict[tuple[int, int], list[PairErrors]] = {
             self.scene.rig.primary_pair: [], LONG_PAIR: [],
         }  # fmt: skip
-        self.alignment = AlignmentCheck(self.intrinsics, frames=len(self.frames))
+        self.alignment = AlignmentCheck(self.intrinsics)
         self.seen: dict[tuple[int, int], tuple[Any, Any]] = {}
 
     def run(self, after_bytes: Advance) -> SceneAudit:
@@ -210,20 +184,17 @@ class _SceneCheck:
         try:
             figures, poses = self._metadata()
             for name in VIDEO_FILES:
-                count = self.files.frames_of(name)
+                count = self.files.attempt(name, self.files.frame_count, name)
                 figures += [] if count is None else [Figure("frames", name, count)]
-            before: int | None = None
             for frame in self.frames:
-                self._frame(frame, before, poses)
-                before = frame
+                self._frame(frame, poses)
                 after_bytes(1)
         finally:
             self.files.streams.close()
-        pairs = tuple(pair_audit(pair, found) for pair, found in self.errors.items())
-        figures.append(Figure("reprojection_px", "", pairs[0].tolerances[-1].median_px))
+        pairs = tuple(pair_audit(found) for found in self.errors.values())
+        figures.append(Figure("reprojection_px", "", pairs[0].median_px(-1)))
         figures += self.alignment.figures()
-        for camera in range(CAMERA_COUNT):
-            figures += self._of_camera(camera)
+        figures += self._of_files()
         if stated_twice := self.scene.remark("left"):
             self.files.problems.setdefault(TRAJECTORY_JSON, stated_twice)
         return SceneAudit(
@@ -257,7 +228,7 @@ class _SceneCheck:
         )
         return figures, None
 
-    def _frame(self, frame: int, before: int | None, poses: CameraPoses | None) -> None:
+    def _frame(self, frame: int, poses: CameraPoses | None) -> None:
         """Decode one frame of all cameras, and add it to the checks."""
         depths: dict[int, MeasuredDepth] = {}
         stored: dict[int, Any] = {}
@@ -267,55 +238,53 @@ class _SceneCheck:
             if read is not None:
                 stored[camera], depths[camera] = read
         far_m = subject_m([(each.depth_m, each.measured) for each in depths.values()])
-        pictures: dict[int, np.ndarray] = {}
-        for camera in range(CAMERA_COUNT):
-            # A camera that moved this far must show another picture.
-            moved = (
-                before is not None
-                and poses is not None
-                and motion_px(
-                    poses, camera, (before, frame), intrinsics=self.intrinsics, far_m=far_m
-                )
-                >= MOVED_SHARE * self.intrinsics.width_px
-            )
-            depth = depths.get(camera)
-            if depth is not None:
-                share, side = border_occluder(depth.depth_m, depth.measured, far_m=far_m)
-                if not share <= self.occluders[camera].value:
-                    where = f"frame {frame}, {side or 'no'} border"
-                    self.occluders[camera] = replace(
-                        self.occluders[camera], value=share, where=where
-                    )
-                self.payload[camera].take(stored[camera], depth.measured, frame, moved=moved)
-            picture = self._seen(camera, frame)
-            if picture is not None:
-                pictures[camera] = picture
-                self.light[camera].take(picture, frame, moved=moved)
-        for pair in combinations(pictures, 2):
-            is_copy = np.array_equal(pictures[pair[0]], pictures[pair[1]])
+        for camera, depth in depths.items():
+            name, units = depth_name(camera), stored[camera]
+            before = self._must_differ(name, camera, frame, poses, far_m=far_m)
+            self.of_frames += payload_figures(name, frame, units, depth.measured, before=before)
+            share, side = border_occluder(depth.depth_m, depth.measured, far_m=far_m)
+            where = f"frame {frame}, {side or 'no'} border"
+            self.of_frames.append(Figure("occluder", name, share, where))
+            self.numbers[camera, units[depth.measured]] = True
+            self.last[name] = (frame, units)
+        self._see(frame)
+        lumas = {camera: luma for (camera, at), (luma, _) in self.seen.items() if at == frame}
+        for camera, luma in lumas.items():
+            name = rgb_name(camera)
+            before = self._must_differ(name, camera, frame, poses, far_m=far_m)
+            self.of_frames += light_figures(name, frame, luma, before=before)
+            self.last[name] = (frame, luma)
+        for pair in combinations(sorted(lumas), 2):
+            is_copy = np.array_equal(lumas[pair[0]], lumas[pair[1]])
             self.copies.setdefault(pair, []).append(is_copy)
         if poses is not None:
             self._reproject(frame, depths, poses)
-            bands = {place: found[1] for place, found in self.seen.items()}
+            bands = {place: band for place, (_, band) in self.seen.items()}
             self.alignment.take(frame, depths, bands, poses)
 
-    def _seen(self, camera: int, frame: int) -> Any:
-        """Return a picture, None if it cannot be read; its neighbours in time are kept with it."""
-        near = [
-            at for at in range(max(0, frame - 1), min(frame + 2, self.scene.frames))
-            if at in self.frames or frame in self.frames[1::max(2, len(self.frames) - 3)]
-        ]  # fmt: skip
-        kept = {at: self.seen.get((camera, at)) for at in near}
-        self.seen = {place: each for place, each in self.seen.items() if place[0] != camera}
-        for at in near:
-            found = kept[at]
-            if found is None:
-                picture = self.files.attempt(rgb_name(camera), self.files.picture, camera, at)
-                found = None if picture is None else (picture, band_passed(luma_of(picture)))
-            if found is not None:
-                self.seen[camera, at] = found
-        shown = self.seen.get((camera, frame))
-        return None if shown is None else shown[0]
+    def _must_differ(
+        self, name: str, camera: int, frame: int, poses: CameraPoses | None, *, far_m: float
+    ) -> tuple[int, Any] | None:
+        """Return what a file showed last if its camera has moved since, so that it must differ."""
+        before = self.last.get(name)
+        if before is None or poses is None:
+            return None
+        moved_px = motion_px(
+            poses, camera, (before[0], frame), intrinsics=self.intrinsics, far_m=far_m
+        )
+        return before if moved_px >= MOVED_SHARE * self.intrinsics.width_px else None
+
+    def _see(self, frame: int) -> None:
+        """Decode a frame's pictures and, of an inner one, its neighbours'; forget all others."""
+        is_inner = 0 < frame < self.scene.frames - 1
+        near = range(frame - is_inner, frame + is_inner + 1)
+        self.seen = {place: each for place, each in self.seen.items() if place[1] in near}
+        for place in product(range(CAMERA_COUNT), near):
+            if place not in self.seen:
+                picture = self.files.attempt(rgb_name(place[0]), self.files.picture, *place)
+                if picture is not None:
+                    luma = luma_of(picture)
+                    self.seen[place] = luma, band_passed(luma)
 
     def _reproject(self, frame: int, depths: dict[int, MeasuredDepth], poses: CameraPoses) -> None:
         for (left, right), found in self.errors.items():
@@ -324,16 +293,28 @@ class _SceneCheck:
                 both, camera = (depths[left], depths[right]), self.intrinsics
                 found.append(reproject(*both, intrinsics=camera, right_from_left=motion))
 
-    def _of_camera(self, camera: int) -> Iterator[Figure]:
-        light, rgb, depth = self.light[camera], rgb_name(camera), depth_name(camera)
-        yield from light.figures(rgb)
-        yield from self.payload[camera].figures(depth)
-        yield self.occluders[camera]
-        yield Figure("depth_unit_m", depth, self.files.unit_m(camera))
-        shares = {
-            other: float(np.mean(same)) for (other, copy), same in self.copies.items()
-            if copy == camera and light.contrast.value >= FLAT
+    def _of_files(self) -> Iterator[Figure]:
+        """Yield the worst figure of all frames of each file, and figures of whole files."""
+        worst: dict[tuple[str, str], Figure] = {}
+        for figure in self.of_frames:
+            found = worst.setdefault((figure.quantity, figure.member), figure)
+            if CHECKS[figure.quantity].worst(found.value, figure.value) != found.value:
+                worst[figure.quantity, figure.member] = figure
+        shows_much = {
+            member for (quantity, member), figure in worst.items()
+            if quantity == "contrast" and figure.value >= FLAT
         }  # fmt: skip
-        if shares:
-            other = max(shares, key=lambda other: shares[other])
-            yield Figure("copied", rgb, shares[other], f"as in {rgb_name(other)}")
+        for (quantity, member), figure in worst.items():
+            if quantity != "change" or member in shows_much:
+                yield figure
+        for camera in range(CAMERA_COUNT):
+            name = depth_name(camera)
+            valid = [each.value for each in self.of_frames
+                     if (each.quantity, each.member) == ("valid_depth", name)]  # fmt: skip
+            yield Figure("mean_valid_depth", name, float(np.mean(valid)) if valid else math.nan)
+            yield from stored_figures(name, self.numbers[camera])
+            yield Figure("depth_unit_m", name, self.files.encoding(camera).unit_m or math.nan)
+        for (other, camera), copies in self.copies.items():
+            if rgb_name(camera) in shows_much:
+                where = f"as in {rgb_name(other)}"
+                yield Figure("copied", rgb_name(camera), float(np.mean(copies)), where)

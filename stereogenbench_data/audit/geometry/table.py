@@ -1,7 +1,7 @@
 """The audit's table, and the report as Markdown: our figures, the paper's, and the limits."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -13,7 +13,6 @@ from stereogenbench_data.audit.geometry.records import (
     AuditRow,
     Finding,
     SceneAudit,
-    ToleranceAudit,
 )
 from stereogenbench_data.audit.geometry.reprojection import TOLERANCES
 from stereogenbench_data.audit.geometry.scene_audit import LONG_PAIR
@@ -24,18 +23,16 @@ from stereogenbench_data.schema.text import counted, markdown_table, markdown_te
 _LISTED: Final = 500
 
 
-def table_rows(
-    scenes: Sequence[SceneAudit], limits: Mapping[str, float], *, findings: Sequence[Finding]
-) -> tuple[AuditRow, ...]:
+def table_rows(scenes: Sequence[SceneAudit], findings: Sequence[Finding]) -> tuple[AuditRow, ...]:
     """Return the table of an audit over scenes."""
     counts = [
         f"{check} {len({each.scene for each in findings if each.check == check})}"
         for check in dict.fromkeys(finding.check for finding in findings)
     ]
     return (
-        *_check_rows(scenes, limits),
+        *_check_rows(scenes),
         *_reprojection_rows(scenes),
-        *_frame_rows(scenes, limits),
+        *_frame_rows(scenes),
         *_depth_rows(scenes),
         AuditRow("findings", "scenes with", ", ".join(counts) or "none", "none", "none"),
     )
@@ -45,7 +42,7 @@ def _values(scenes: Sequence[SceneAudit], quantity: str) -> list[float]:
     return [each.value for scene in scenes for each in scene.figures if each.quantity == quantity]
 
 
-def _check_rows(scenes: Sequence[SceneAudit], limits: Mapping[str, float]) -> Iterator[AuditRow]:
+def _check_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
     for quantity, check in CHECKS.items():
         ours = check.text(_over(check.worst, _values(scenes, quantity)))
         blind = {
@@ -54,7 +51,7 @@ def _check_rows(scenes: Sequence[SceneAudit], limits: Mapping[str, float]) -> It
         }  # fmt: skip
         if blind:
             ours += f"; not testable in {len(blind)} of {counted(len(scenes), 'scene')}"
-        yield AuditRow(check.name, check.what, ours, check.paper, check.text(limits[quantity]))
+        yield AuditRow(check.name, check.what, ours, check.paper, check.text(check.limit))
 
 
 def _reprojection_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
@@ -65,9 +62,12 @@ def _reprojection_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
     ):
         comparable = sum(pair.comparable for pair in pairs)
         for place, tolerance in enumerate(TOLERANCES):
-            audits = [pair.tolerances[place] for pair in pairs]
-            median_px, p95_px = (_number(pooled_px(audits, share)) for share in (0.5, 0.95))
-            kept = _percent(_ratio(sum(each.kept for each in audits), comparable))
+            counts = [pair.kept[place] for pair in pairs]
+            errors_px = [pair.errors_px[place] for pair in pairs]
+            median_px, p95_px = (
+                _number(pooled_px(counts, errors_px, share)) for share in (0.5, 0.95)
+            )
+            kept = _percent(_ratio(sum(counts), comparable))
             yield AuditRow(
                 "reprojection",
                 f"{name}, {tolerance.name}: median / 95th percentile (pixels kept)",
@@ -83,14 +83,14 @@ def _reprojection_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
         )
 
 
-def _frame_rows(scenes: Sequence[SceneAudit], limits: Mapping[str, float]) -> Iterator[AuditRow]:
+def _frame_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
     for name in ("RGB", "depth"):
         found = {
             (scene.key, each.member): int(each.value) for scene in scenes for each in scene.figures
             if each.quantity == "frames" and name.lower() in each.member
         }  # fmt: skip
         missing = sum(
-            max(0, (int(limits["frames"]) or scene.frames) - found.get((scene.key, member), 0))
+            max(0, scene.frames - found.get((scene.key, member), 0))
             for scene in scenes for member in VIDEO_FILES if name.lower() in member
         )  # fmt: skip
         counts = list(found.values()) or [0]
@@ -101,7 +101,7 @@ def _frame_rows(scenes: Sequence[SceneAudit], limits: Mapping[str, float]) -> It
             f"{name} frames in all (of a video), missing",
             f"{sum(counts):,} ({span}), {missing:,} missing",
             f"{FRAMES_A_SCENE} of a video, 0 missing",
-            f"{limits['frames']:g}" if limits["frames"] else "as poses",
+            "as poses",
         )
 
 
@@ -117,23 +117,20 @@ def _depth_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
     yield AuditRow("depth unit", "metres in a stored unit", ours, "0.1 m without a tag")
 
 
-def pooled_px(audits: Iterable[ToleranceAudit], share: float) -> float:
+def pooled_px(counts: Sequence[int], errors_px: Sequence[Sequence[float]], share: float) -> float:
     """Return a quantile of the errors of several scenes together, nan for no errors.
 
     The scenes' own quantile functions are mixed, weighted by their numbers of pixels.
     """
-    kept = [each for each in audits if each.kept]
+    kept = [(count, each) for count, each in zip(counts, errors_px, strict=True) if count]
     if not kept:
         return math.nan
     if len(kept) == 1:
-        return float(np.interp(share, QUANTILES, kept[0].errors_px))
-    values = np.array([each.errors_px for each in kept])
-    middles = ((values[:, 1:] + values[:, :-1]) / 2).ravel()
-    weights = np.repeat([each.kept for each in kept], values.shape[1] - 1)
-    order = np.argsort(middles)
-    reached = np.cumsum(weights[order]) / weights.sum()
-    place = min(int(np.searchsorted(reached, share)), len(order) - 1)
-    return float(middles[order][place])
+        return float(np.interp(share, QUANTILES, kept[0][1]))
+    values = np.array([each for _, each in kept])
+    middles = (values[:, 1:] + values[:, :-1]) / 2
+    weights = np.repeat([count for count, _ in kept], middles.shape[1])
+    return float(np.quantile(middles.ravel(), share, weights=weights, method="inverted_cdf"))
 
 
 def audit_markdown(report: AuditReport) -> str:
