@@ -88,15 +88,20 @@ def test_a_long_list_comes_in_parts(index):
     assert catalogue.place({}, "train/scene_000321") == 321
 
 
-@pytest.mark.parametrize(
-    ("query", "reason"),
-    [
-        ({"bin": ["[1,2)"]}, r"no choice '\[1,2\)'"),
-        ({"pairs": ["sweep"]}, "no choice 'sweep'"),
-        ({"focal_low": ["wide"]}, "focal must be of numbers, got 'wide'"),
-        ({"baseline_high": ["inf"]}, "baseline must be of finite numbers, got 'inf'"),
-    ],
-)
-def test_a_choice_that_is_none_is_refused(query, reason):
-    with pytest.raises(SelectionError, match=reason):
-        parse_choice(query)
+def test_a_bin_that_is_none_leaves_nothing_and_says_why(catalogue):
+    told = catalogue.summary(parse_choice({"bin": ["[1,2)"]}))
+
+    assert (told["scenes"], told["pairs"]) == (0, 0)
+    assert "no baseline bin '[1,2)'" in told["reason"]
+
+
+@pytest.mark.parametrize("pairs", ["sweep", "0-5"])
+def test_pairs_that_the_page_cannot_show_are_refused(pairs):
+    with pytest.raises(SelectionError, match=f"no choice '{pairs}'"):
+        parse_choice({"pairs": [pairs]})
+
+
+@pytest.mark.parametrize("number", ["wide", "inf", "nan"])
+def test_a_number_that_is_none_is_refused(number):
+    with pytest.raises(SelectionError, match=rf"focal must be of numbers, got \['{number}', ''\]"):
+        parse_choice({"focal_low": [number]})

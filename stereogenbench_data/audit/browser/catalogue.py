@@ -1,9 +1,7 @@
 """What the page lists: the scenes and pairs that a choice leaves, counts, and a Python line."""
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Int64
@@ -24,8 +22,7 @@ MOST_ROWS: Final = 200
 
 FACETS: Final = {"split": "split", "subset": "subset", "family": "family", "map": "map_name"}
 """The filters whose values the page lists, and the index columns of these."""
-PairKind = Literal["primary", "adjacent", "all"]
-
+PAIR_KINDS: Final = ("primary", "adjacent", "all")
 
 Choice = Mapping[str, Any]
 """The filters that are set on the page, as keyword arguments of `StereoPairs`."""
@@ -40,17 +37,8 @@ def parse_choice(query: Mapping[str, list[str]]) -> Choice:
             ``pairs`` with one.
 
     Raises:
-        SelectionError: If a number is not a number, or there is no such value.
+        SelectionError: If a number is not a number, or there are no such pairs.
     """
-    bins = sorted(set(query.get("bin", ())))
-    unknown = [name for name in bins if name not in BASELINE_BINS]
-    pairs = query.get("pairs", ["all"])[0]
-    if unknown or pairs not in get_args(PairKind):
-        known = BASELINE_BINS if unknown else get_args(PairKind)
-        raise SelectionError(
-            f"there is no choice {shortened((unknown or [pairs])[0])!r}: choose among "
-            f"{', '.join(known)}."
-        )
     texts = {name: sorted(set(query[name])) for name in FACETS if query.get(name)}
     choice: dict[str, Any] = {
         name: values[0] if len(values) == 1 else values for name, values in texts.items()
@@ -58,36 +46,30 @@ def parse_choice(query: Mapping[str, list[str]]) -> Choice:
     choice |= {
         "focal_mm": _range(query, "focal"),
         "caption": " ".join(query.get("caption", [""])[0].split()),
-        "baseline_cm": bins or _range(query, "baseline"),
+        "baseline_cm": sorted(set(query.get("bin", ()))) or _range(query, "baseline"),
     }
+    pairs = query.get("pairs", ["all"])[0]
+    if pairs not in PAIR_KINDS:
+        known = ", ".join(PAIR_KINDS)
+        raise SelectionError(f"there is no choice {shortened(pairs)!r}: choose among {known}.")
     return {name: value for name, value in choice.items() if value} | {"pairs": pairs}
 
 
-def _range(query: Mapping[str, list[str]], name: str) -> tuple[float, float] | None:
+def _range(query: Mapping[str, list[str]], name: str) -> tuple[float, ...] | None:
     """Return the closed range of two numbers; an end that is left out is open."""
-    ends: list[float] = []
-    for end, default in (("low", 0.0), ("high", 1e6)):
-        text = query.get(f"{name}_{end}", [""])[0].strip()
-        try:
-            ends.append(float(text) if text else default)
-        except ValueError:
-            raise SelectionError(f"{name} must be of numbers, got {shortened(text)!r}.") from None
-        if not math.isfinite(ends[-1]):
-            raise SelectionError(f"{name} must be of finite numbers, got {shortened(text)!r}.")
-        if ends[-1].is_integer():
-            ends[-1] = int(ends[-1])
-    return None if ends == [0.0, 1e6] else (ends[0], ends[1])
+    ends = [query.get(f"{name}_{end}", [""])[0].strip() for end in ("low", "high")]
+    try:
+        numbers = [
+            float(text or open_end) for text, open_end in zip(ends, ("0", "1e6"), strict=True)
+        ]
+        whole = tuple(int(each) if each == round(each) else each for each in numbers)
+    except (ValueError, OverflowError):
+        raise SelectionError(f"{name} must be of numbers, got {shortened(str(ends))}.") from None
+    return whole if any(ends) else None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ChosenPairs:
-    """The scenes and pairs that a choice leaves.
-
-    Attributes:
-        rows: Rows of scenes with a pair left, ascending.
-        pairs: These pairs.
-        reason: Why there is no pair; empty if there is one.
-    """
+class ChosenPairs(NamedTuple):
+    """Rows of scenes with a pair left, ascending; these pairs; and why there is none, if so."""
 
     rows: Int64[np.ndarray, " n"]
     pairs: PairList
@@ -258,10 +240,6 @@ def _facts(scene: Scene) -> dict[str, Any]:
     return {
         "key": scene.id.key,
         "caption": scene.caption,
-        "split": scene.id.split,
-        "subset": scene.id.subset or "",
-        "family": scene.id.family,
-        "map": scene.id.map_name,
         "frames": scene.frames,
         "frame_rate_hz": scene.frame_rate_hz,
         "width_px": rig.image_width_px,

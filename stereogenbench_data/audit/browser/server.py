@@ -1,13 +1,12 @@
 """A read-only web server for the browser page, on this machine alone."""
 
-import json
 import sys
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
 from urllib.parse import parse_qs, urlsplit
 
-from stereogenbench_data.audit.browser.service import Response, Service
+from stereogenbench_data.audit.browser.service import Response, Service, json_response
 from stereogenbench_data.errors import SelectionError, StereoGenBenchError
 
 LOOPBACK: Final = "127.0.0.1"
@@ -61,6 +60,8 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """Answer a request."""
         status, answer = self._response()
+        if isinstance(answer, str):
+            answer = json_response({"error": answer})
         self.send_response(status)
         for name, value in _HEADERS.items():
             self.send_header(name, value)
@@ -73,25 +74,20 @@ class _Handler(BaseHTTPRequestHandler):
     def log_message(self, format: str, *args: Any) -> None:
         """Keep quiet."""
 
-    def _response(self) -> tuple[HTTPStatus, Response]:
+    def _response(self) -> tuple[HTTPStatus, Response | str]:
         if self.headers.get("Host", "").lower() not in self.server.hosts:
-            return HTTPStatus.FORBIDDEN, _error(
-                f"this is {self.server.url}, but the request names another host"
-            )
+            told = f"this is {self.server.url}, but the request names another host"
+            return HTTPStatus.FORBIDDEN, told
         try:
             parts = urlsplit(self.path)
             query = parse_qs(parts.query, max_num_fields=200, errors="strict")
             response = self.server.service.answer(parts.path, query)
         except SelectionError as error:
-            return HTTPStatus.BAD_REQUEST, _error(str(error))
+            return HTTPStatus.BAD_REQUEST, str(error)
         except StereoGenBenchError as error:
-            return HTTPStatus.UNPROCESSABLE_ENTITY, _error(f"{type(error).__name__}: {error}")
+            return HTTPStatus.UNPROCESSABLE_ENTITY, f"{type(error).__name__}: {error}"
         except ValueError:
-            return HTTPStatus.BAD_REQUEST, _error("the request is malformed")
+            return HTTPStatus.BAD_REQUEST, "the request is malformed"
         if response is None:
-            return HTTPStatus.NOT_FOUND, _error("there is nothing here")
+            return HTTPStatus.NOT_FOUND, "there is nothing here"
         return HTTPStatus.OK, response
-
-
-def _error(message: str) -> Response:
-    return Response(json.dumps({"error": message}).encode(), "application/json")

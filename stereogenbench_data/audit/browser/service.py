@@ -2,11 +2,9 @@
 
 import io
 import json
-import secrets
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from importlib import resources
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -15,28 +13,33 @@ from stereogenbench_data.audit.browser.catalogue import Catalogue, parse_choice
 from stereogenbench_data.audit.pictures.scene_pictures import HIDDEN
 from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 from stereogenbench_data.errors import SelectionError
-from stereogenbench_data.samples.picture import COLOUR_STOPS, NOT_MEASURED
+from stereogenbench_data.samples.picture import COLOUR_STOPS, NOT_MEASURED, channels_last
 from stereogenbench_data.schema.text import shortened
 
 Query = Mapping[str, list[str]]
 
-_SCRIPTS: Final = (
-    "choosing", "copying", "drawer", "keys", "moment", "page", "panes", "pixel", "reading", "state",
-    "views",
-)  # fmt: skip
+_KINDS: Final = {
+    "html": "text/html; charset=utf-8", "css": "text/css; charset=utf-8",
+    "js": "text/javascript; charset=utf-8", "svg": "image/svg+xml",
+}  # fmt: skip
 STATIC: Final = {
-    "/": ("index.html", "text/html; charset=utf-8"),
-    "/page.css": ("page.css", "text/css; charset=utf-8"),
-    "/icon.svg": ("icon.svg", "image/svg+xml"),
-} | {f"/{name}.js": (f"{name}.js", "text/javascript; charset=utf-8") for name in _SCRIPTS}
+    f"/{file.name}".removesuffix("index.html"): file
+    for file in (resources.files("stereogenbench_data.audit.browser") / "static").iterdir()
+}
 """The files of the page by their paths; no other file on disk is served."""
 
 _JPEG_QUALITY: Final = 95
 _MAP_FIELDS: Final = ("disparity", "valid", "depth")
+_FIELDS: Final = {
+    "/left.jpg": "left", "/right.jpg": "right", "/disparity.f32": "disparity",
+    "/depth.f32": "depth", "/visible.u8": "visible",
+}  # fmt: skip
+_COLOURS: Final = {
+    "stops": COLOUR_STOPS.tolist(), "not_measured": NOT_MEASURED, "hidden": HIDDEN,
+}  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class Response:
+class Response(NamedTuple):
     """What is sent back: bytes, their media type, and whether the browser may keep them."""
 
     content: bytes
@@ -51,24 +54,14 @@ class Service:
         """Take the catalogue of scenes and their reader."""
         self._catalogue = catalogue
         self._reader = reader
-        self._started = secrets.token_hex(4)
-        self._routes: dict[str, Callable[[Query], Response]] = {
-            "/api/about": self._about,
-            "/api/choice": lambda query: _json(catalogue.summary(parse_choice(query))),
-            "/api/scenes": lambda query: _json(
-                catalogue.listed(
-                    parse_choice(query), first=_whole(query, "first"), count=_whole(query, "count")
-                )
+        self._routes: dict[str, Callable[[Query], Any]] = {
+            "/api/about": lambda _: catalogue.about() | {"colours": _COLOURS},
+            "/api/choice": lambda query: catalogue.summary(parse_choice(query)),
+            "/api/scenes": lambda query: catalogue.listed(
+                parse_choice(query), first=_whole(query, "first"), count=_whole(query, "count")
             ),
-            "/api/scene": lambda query: _json(
-                catalogue.scene(_text(query, "key"), parse_choice(query))
-            ),
+            "/api/scene": lambda query: catalogue.scene(_text(query, "key"), parse_choice(query)),
             "/api/line": self._line,
-            "/left.jpg": lambda query: self._picture(query, "left"),
-            "/right.jpg": lambda query: self._picture(query, "right"),
-            "/disparity.f32": lambda query: self._map(query, "disparity"),
-            "/depth.f32": lambda query: self._map(query, "depth"),
-            "/visible.u8": self._visible,
         }
 
     def answer(self, path: str, query: Query) -> Response | None:
@@ -80,45 +73,35 @@ class Service:
             MediaError: If a video does not decode to what the index says.
         """
         if path in STATIC:
-            name, kind = STATIC[path]
-            place = resources.files("stereogenbench_data.audit.browser") / "static" / name
-            return Response(place.read_bytes(), kind)
+            file = STATIC[path]
+            return Response(file.read_bytes(), _KINDS[file.name.rpartition(".")[2]])
+        if path in _FIELDS:
+            return self._field(query, _FIELDS[path])
         route = self._routes.get(path)
-        return None if route is None else route(query)
+        return None if route is None else json_response(route(query))
 
-    def _about(self, query: Query) -> Response:
-        colours = {
-            "stops": COLOUR_STOPS.tolist(),
-            "not_measured": list(NOT_MEASURED),
-            "hidden": list(HIDDEN),
-        }
-        return _json(self._catalogue.about() | {"colours": colours, "started": self._started})
-
-    def _line(self, query: Query) -> Response:
+    def _line(self, query: Query) -> dict[str, str]:
         key, _, pair, frame = self._moment(query)
-        return _json({"line": self._catalogue.sample_line(key, pair=pair, frame=frame)})
+        return {"line": self._catalogue.sample_line(key, pair=pair, frame=frame)}
 
-    def _picture(self, query: Query, name: str) -> Response:
-        _, row, pair, frame = self._moment(query)
-        sample = self._reader.pair(row, pair=pair, frame=frame, fields=(name,))
-        out = io.BytesIO()
-        picture = Image.fromarray(np.ascontiguousarray(sample[name].transpose(1, 2, 0)))
-        picture.save(out, format="JPEG", quality=_JPEG_QUALITY, subsampling=0)
-        return Response(out.getvalue(), "image/jpeg", keep=True)
+    def _field(self, query: Query, name: str) -> Response:
+        """Return a picture as JPEG, a map as float32 row by row, or a mask as bytes of 0 and 1.
 
-    def _map(self, query: Query, name: str) -> Response:
-        """Return a map as little-endian float32, row by row, nan where nothing was measured."""
+        Maps are little-endian, nan where nothing was measured.
+        """
         _, row, pair, frame = self._moment(query)
-        sample = self._reader.pair(row, pair=pair, frame=frame, fields=_MAP_FIELDS)
-        numbers = np.where(sample["valid"], sample[name], np.float32(np.nan)).astype("<f4")
+        is_map = name in _MAP_FIELDS
+        fields = _MAP_FIELDS if is_map else (name,)
+        sample = self._reader.pair(row, pair=pair, frame=frame, fields=fields)
+        if name in ("left", "right"):
+            out = io.BytesIO()
+            picture = Image.fromarray(channels_last(sample[name]))
+            picture.save(out, format="JPEG", quality=_JPEG_QUALITY, subsampling=0)
+            return Response(out.getvalue(), "image/jpeg", keep=True)
+        numbers = sample[name].astype(np.uint8)
+        if is_map:
+            numbers = np.where(sample["valid"], sample[name], np.float32(np.nan)).astype("<f4")
         return Response(numbers.tobytes(), "application/octet-stream", keep=True)
-
-    def _visible(self, query: Query) -> Response:
-        """Return one byte for each pixel, 1 where the right camera sees it too."""
-        _, row, pair, frame = self._moment(query)
-        sample = self._reader.pair(row, pair=pair, frame=frame, fields=("visible",))
-        numbers = sample["visible"].astype(np.uint8).tobytes()
-        return Response(numbers, "application/octet-stream", keep=True)
 
     def _moment(self, query: Query) -> tuple[str, int, tuple[int, int], int]:
         key = _text(query, "key")
@@ -126,7 +109,8 @@ class Service:
         return key, self._catalogue.row(key), pair, _whole(query, "frame")
 
 
-def _json(value: Any) -> Response:
+def json_response(value: Any) -> Response:
+    """Return a value as JSON."""
     return Response(json.dumps(value, allow_nan=False).encode(), "application/json")
 
 
