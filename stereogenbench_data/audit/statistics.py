@@ -1,6 +1,6 @@
 """The paper's statistics, from an index alone: counts, baselines and focal lengths."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Unpack
 
@@ -23,28 +23,15 @@ _SPLITS: Final = ("train", "eval")
 _SUBSETS: Final = ("", "seen_map", "unseen_map")
 
 
-@dataclass(frozen=True, slots=True)
-class Distribution:
-    """The distribution of some numbers; the standard deviation divides by their count."""
+_FIGURES: Final[dict[str, Callable[[Any], Any]]] = {
+    "min": np.min, "max": np.max, "mean": np.mean, "std": np.std, "median": np.median,
+}  # fmt: skip
 
-    count: int
-    min: float
-    max: float
-    mean: float
-    std: float
-    median: float
 
-    @classmethod
-    def of(cls, values: Float64[np.ndarray, "*any"]) -> "Distribution":
-        """Return the distribution of one or more numbers."""
-        return cls(
-            count=int(values.size),
-            min=float(values.min()),
-            max=float(values.max()),
-            mean=float(values.mean()),
-            std=float(values.std()),
-            median=float(np.median(values)),
-        )
+def distribution(values: Float64[np.ndarray, "*any"]) -> dict[str, float]:
+    """Return count, min, max, mean, std and median; the standard deviation divides by the count."""
+    found = {name: float(figure(values)) for name, figure in _FIGURES.items()}
+    return {"count": values.size} | found
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,10 +55,10 @@ class FamilyStatistics:
     family: str
     scenes: int
     maps: dict[str, int]
-    adjacent_cm: Distribution
-    all_pairs_cm: Distribution
-    bins: dict[str, tuple[int, int, int]]
-    focal_mm: Distribution
+    adjacent_cm: dict[str, float]
+    all_pairs_cm: dict[str, float]
+    bins: dict[str, tuple[int, ...]]
+    focal_mm: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,18 +141,16 @@ def _family(
         family=family,
         scenes=len(rows),
         maps=dict(zip(names.tolist(), counts.tolist(), strict=True)),
-        adjacent_cm=Distribution.of(adjacent_cm),
-        all_pairs_cm=Distribution.of(baselines_cm),
+        adjacent_cm=distribution(adjacent_cm),
+        all_pairs_cm=distribution(baselines_cm),
         bins={
-            name: (
-                int(in_bin(primary_cm, name).sum()),
-                int(in_bin(adjacent_cm, name).sum()),
-                int(in_bin(baselines_cm, name).sum()),
+            name: tuple(
+                int(in_bin(each, name).sum()) for each in (primary_cm, adjacent_cm, baselines_cm)
             )
             for name in BASELINE_BINS
             if in_bin(baselines_cm, name).any()
         },
-        focal_mm=Distribution.of(focal_mm),
+        focal_mm=distribution(focal_mm),
     )
 
 

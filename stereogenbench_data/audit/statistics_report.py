@@ -90,7 +90,7 @@ def _baseline_lines(found: Statistics) -> Iterator[Line]:
                 ours = "-"
                 if branch is not None:
                     decimals = len(paper.partition(".")[2])
-                    ours = f"{getattr(getattr(branch, attribute), name):.{decimals}f}"
+                    ours = f"{getattr(branch, attribute)[name]:.{decimals}f}"
                 item = f"{kind}, {split} {family}: {name}" + (" (cm)" if name != "count" else "")
                 yield Line(split, table, item, paper, ours)
 
@@ -114,7 +114,7 @@ def _focal_lines(found: Statistics) -> Iterator[Line]:
         spreads = [each.focal_mm for each in found.branches if each.split == split]
         if not spreads:
             continue
-        least, most = min(each.min for each in spreads), max(each.max for each in spreads)
+        least, most = min(each["min"] for each in spreads), max(each["max"] for each in spreads)
         ours = paper if low <= least and most <= high else f"{least:g} to {most:g}"
         item = f"focal lengths within (mm), {split}"
         yield Line(split, "appendix on generation parameters", item, paper, ours)
@@ -179,10 +179,8 @@ def _count_rows(found: Statistics) -> Iterator[Sequence[str]]:
 def _spread_rows(branches: Sequence[FamilyStatistics], name: str) -> Iterator[Sequence[str]]:
     yield ("split", "family", "count", "min", "max", "mean", "std", "median")
     for each in branches:
-        spread = getattr(each, name)
-        lengths = (spread.min, spread.max, spread.mean, spread.std, spread.median)
-        cells = (f"{length:.4f}" for length in lengths)
-        yield (each.split, each.family, f"{spread.count:,}", *cells)
+        count, *lengths = getattr(each, name).values()
+        yield (each.split, each.family, f"{count:,}", *(f"{length:.4f}" for length in lengths))
 
 
 def _bin_rows(families: Sequence[FamilyStatistics]) -> Iterator[Sequence[str]]:

@@ -71,12 +71,12 @@ def test_baselines_bins_and_focal_lengths_of_three_scenes(three):
         3,
     )
     assert family.maps == {"Car_Dealer": 3}
-    assert family.adjacent_cm.count == 15
-    assert family.adjacent_cm.mean == pytest.approx(plain_statistics.mean(adjacent))
-    assert family.adjacent_cm.std == pytest.approx(plain_statistics.pstdev(adjacent))
-    assert family.adjacent_cm.median == plain_statistics.median(adjacent)
-    assert (family.adjacent_cm.min, family.adjacent_cm.max) == (6.0, 300.0)
-    assert family.all_pairs_cm.max == 422.0
+    assert family.adjacent_cm["count"] == 15
+    assert family.adjacent_cm["mean"] == pytest.approx(plain_statistics.mean(adjacent))
+    assert family.adjacent_cm["std"] == pytest.approx(plain_statistics.pstdev(adjacent))
+    assert family.adjacent_cm["median"] == plain_statistics.median(adjacent)
+    assert (family.adjacent_cm["min"], family.adjacent_cm["max"]) == (6.0, 300.0)
+    assert family.all_pairs_cm["max"] == 422.0
     # Primary 1-2: 15, 30, 30 cm. Of the adjacent ones 150 cm is the last value of its bin.
     assert family.bins["[10,30)"][:2] == (1, 2 + 4)
     assert family.bins["[30,60)"][:2] == (2, 1 + 2)
@@ -84,7 +84,11 @@ def test_baselines_bins_and_focal_lengths_of_three_scenes(three):
     assert family.bins["[100,150]"][:2] == (0, 1)
     assert family.bins["(150,inf)"][:2] == (0, 2)
     assert sum(every for _, _, every in family.bins.values()) == 45
-    assert (family.focal_mm.min, family.focal_mm.median, family.focal_mm.max) == (20, 85, 90)
+    assert (family.focal_mm["min"], family.focal_mm["median"], family.focal_mm["max"]) == (
+        20,
+        85,
+        90,
+    )
 
 
 def test_filters_choose_what_is_counted(three):

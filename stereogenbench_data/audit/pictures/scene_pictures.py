@@ -84,7 +84,7 @@ def scene_sheet(
     pair = pair or scene.rig.primary_pair
     sample = reader.pair(row, pair=pair, frame=frame, fields=SHEET_FIELDS)
     views = reader.views(row, frame=frame)
-    encoding = scene.depth_encoding(pair[0], reader.depth or depth_of(scene))
+    encoding = scene.depth_encoding(pair[0], depth_of(scene))
     title = _title(scene, sample, encoding, pair=pair, frame=frame)
     rows = [_view_tiles(scene, views, pair), _pair_tiles(scene, sample)]
     return draw_sheet(title, rows, width_px=tile_width(scene, tile_px))

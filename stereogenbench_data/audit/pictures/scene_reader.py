@@ -12,7 +12,6 @@ from stereogenbench_data.media.depth import DEPTH_CURES, NO_DEPTH_UNIT
 from stereogenbench_data.samples.fields import Request, Sample
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.schema.conventions import depth_of
-from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.pairs import require_pairs
 from stereogenbench_data.selection.plan import Address
@@ -28,15 +27,9 @@ class SceneReader:
     parallel. Only the last frame of each open video is kept.
     """
 
-    def __init__(self, index: SceneIndex, *, depth: DepthEncoding | None = None) -> None:
-        """Prepare to read; nothing is opened yet.
-
-        Args:
-            index: The index of the data.
-            depth: A depth contract in place of that of files and release.
-        """
+    def __init__(self, index: SceneIndex) -> None:
+        """Prepare to read the data of an index; nothing is opened yet."""
         self.index = index
-        self.depth = depth
         self._lock = threading.Lock()
         self._loaders: dict[tuple[str, ...], tuple[SampleLoader, threading.Lock, bool]] = {}
 
@@ -80,20 +73,19 @@ class SceneReader:
         with self._lock:
             if fields not in self._loaders:
                 layout: Literal["single", "stacked"] = "stacked" if kind == "views" else "single"
-                request = Request(kind=kind, fields=fields, layout=layout, depth=self.depth)
+                request = Request(kind=kind, fields=fields, layout=layout)
                 loader = SampleLoader(self.index, request)
                 loader.keep_open(OPEN_VIDEOS)
                 needs_depth = not request.streams.isdisjoint({"source_depth", "target_depth"})
                 self._loaders[fields] = (loader, threading.Lock(), needs_depth)
             loader, turn, needs_depth = self._loaders[fields]
-        if needs_depth:
-            self._require_depth_units(scene, (address.source, *address.targets))
-        with turn:
-            return loader.load(address, clip="frame")
-
-    def _require_depth_units(self, scene: Scene, cameras: tuple[int, ...]) -> None:
-        contract = self.depth or depth_of(scene)
-        if any(scene.depth_encoding(camera, contract).unit_m is None for camera in cameras):
+        encodings = (
+            scene.depth_encoding(camera, depth_of(scene))
+            for camera in (address.source, *address.targets)
+        )
+        if needs_depth and any(encoding.unit_m is None for encoding in encodings):
             raise MediaError(
                 scene.remark("depth") or f"{scene.id.key}: {NO_DEPTH_UNIT}. {DEPTH_CURES}"
             )
+        with turn:
+            return loader.load(address, clip="frame")
