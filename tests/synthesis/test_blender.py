@@ -350,7 +350,7 @@ FAULTS = {
     "huge.blend": r"huge\.blend: its width is 8e\+04 m.*Set scale = 0\.001",
     "far_texture.blend": r"refers to .*outside.far\.png, which is outside the asset folder.*Copy",
     "cut.blend": r"cut\.blend: Blender cannot open it",
-    "cut.fbx": r"cut\.fbx: Blender cannot import it.*Open it in Blender",
+    "cut.fbx": r"cut\.fbx: Blender cannot open it .*Repair it, and save it",
 }
 
 

@@ -12,6 +12,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -182,20 +183,25 @@ def _rate_hz(scene: Any) -> float:
     return float(scene.render.fps / scene.render.fps_base)
 
 
-def _import(path: str, where: str) -> None:
-    """Add the content of a glTF or FBX file to the scene."""
-    suffix = Path(path).suffix.lower()
+@contextmanager
+def _opening(where: str) -> Iterator[None]:
+    """Say which file Blender cannot open."""
     try:
-        if suffix in (".glb", ".gltf"):
-            bpy.ops.import_scene.gltf(filepath=path, import_scene_as_collection=False)
-        else:
-            bpy.ops.wm.fbx_import(filepath=path)
-    except RuntimeError as error:
-        text = str(error).strip().splitlines()
+        yield
+    except (OSError, RuntimeError) as error:
+        why = str(error).strip().rpartition("\n")[2] or "no reason given"
         raise SynthesisError(
-            f"{where}: Blender cannot import it ({text[-1] if text else 'no reason given'}). Open "
-            f"it in Blender, repair it and save it as a .blend file."
+            f"{where}: Blender cannot open it ({why}). Repair it, and save it by Blender 5.2 as a "
+            f".blend file."
         ) from error
+
+
+def _import(path: str) -> None:
+    """Add the content of a glTF or FBX file to the scene."""
+    if Path(path).suffix.lower() in (".glb", ".gltf"):
+        bpy.ops.import_scene.gltf(filepath=path, import_scene_as_collection=False)
+    else:
+        bpy.ops.wm.fbx_import(filepath=path)
 
 
 def _add(path: str, where: str) -> tuple[list[Any], list[Any], float]:
@@ -205,14 +211,9 @@ def _add(path: str, where: str) -> tuple[list[Any], list[Any], float]:
         if action.library is None:
             action.name = f"stereogenbench {number}"  # So that takes keep the names in their file.
     if Path(path).suffix.lower() == ".blend":
-        try:
-            with bpy.data.libraries.load(path, link=False) as (there, wanted):
-                wanted.scenes = there.scenes[:1]
-                wanted.actions = there.actions
-        except (OSError, RuntimeError) as error:
-            raise SynthesisError(
-                f"{where}: Blender cannot open it ({error}). Save it again with Blender 5.2."
-            ) from error
+        with _opening(where), bpy.data.libraries.load(path, link=False) as (there, wanted):
+            wanted.scenes = there.scenes[:1]
+            wanted.actions = there.actions
         rate_hz = 24.0
         here = bpy.context.scene.collection
         for scene in wanted.scenes:
@@ -224,7 +225,8 @@ def _add(path: str, where: str) -> tuple[list[Any], list[Any], float]:
             bpy.data.scenes.remove(scene)
     else:
         rate_hz = _rate_hz(bpy.context.scene)
-        _import(path, where)
+        with _opening(where):
+            _import(path)
     objects = [item for item in bpy.data.objects if item not in before]
     return objects, [item for item in bpy.data.actions if item not in actions], rate_hz
 
@@ -521,16 +523,11 @@ class Stage:
         where = asset.where
         bpy.ops.wm.read_factory_settings(use_empty=True)
         bpy.context.preferences.filepaths.use_scripts_auto_execute = False
-        if Path(asset.file).suffix.lower() == ".blend":
-            try:
+        with _opening(where):
+            if Path(asset.file).suffix.lower() == ".blend":
                 bpy.ops.wm.open_mainfile(filepath=asset.file, load_ui=False, use_scripts=False)
-            except RuntimeError as error:
-                raise SynthesisError(
-                    f"{where}: Blender cannot open it ({str(error).strip()}). Save it again with "
-                    f"Blender 5.2."
-                ) from error
-        else:
-            _import(asset.file, where)
+            else:
+                _import(asset.file)
         check_files(where, root=self.root)
         self.scene = bpy.context.scene
         units = self.scene.unit_settings
