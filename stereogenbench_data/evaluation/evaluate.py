@@ -279,8 +279,8 @@ def score_workload(
 
     Raises:
         PredictionError: If a right view is missing or is not what it must be, and is not allowed.
-        EvaluationError: If more are than are allowed, if ``out`` holds results of other settings,
-            or if right views that were scored before have changed since.
+        EvaluationError: If more are than are allowed, or if ``out`` holds results of other
+            settings.
         StorageError: If data or results cannot be read or written.
         ExtraError: If a package or weights that a metric needs are not there.
     """

@@ -28,7 +28,7 @@ from stereogenbench_data.schema.release import BASELINE_BINS, baseline_bin
 from stereogenbench_data.schema.text import counted, markdown_table, markdown_text
 from stereogenbench_data.sources.files import open_atomic, write_atomic
 
-FORMAT: Final = 4
+FORMAT: Final = 5
 _GAPS_SHOWN: Final = 20
 ABSENT: Final = "-"
 _ARROWS: Final = {"higher": "↑", "lower": "↓", "neither": ""}

@@ -67,5 +67,5 @@ def test_what_scores_are_of_is_printed(scored_index, right_views, protocol):
 
 
 def test_only_a_report_of_this_format_is_compared():
-    with pytest.raises(EvaluationError, match="must have format 4, and this one has None"):
-        differences({"format": 4}, {})
+    with pytest.raises(EvaluationError, match="must have format 5, and this one has None"):
+        differences({"format": 5}, {})
