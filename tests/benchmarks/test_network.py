@@ -1,8 +1,6 @@
 """The server for measuring and the races over a network, run once on tiny data."""
 
 import asyncio
-import urllib.error
-import urllib.request
 
 import pytest
 
@@ -10,7 +8,7 @@ import benchmarks.server
 from benchmarks.network import LOCAL, OURS, Plan, network_tables, run_network
 from benchmarks.plots import plot_all
 from benchmarks.results import Results
-from benchmarks.server import Network, serving
+from benchmarks.server import Network
 
 DATA = bytes(range(256)) * 4000
 
@@ -20,35 +18,6 @@ def folder(tmp_path):
     (tmp_path / "web").mkdir()
     (tmp_path / "web" / "x.tar").write_bytes(DATA)
     return tmp_path / "web"
-
-
-@pytest.fixture
-def started(folder):
-    """Start a server with a network before it."""
-
-    def start(**how):
-        return serving(folder, network=Network(**how))
-
-    return start
-
-
-def test_the_delayed_server_answers_as_web_servers_do(started):
-    def answer(url, **headers):
-        try:
-            with urllib.request.urlopen(urllib.request.Request(url, headers=headers)) as found:
-                return found.status, found.read()
-        except urllib.error.HTTPError as error:
-            return error.code, b""
-
-    with started() as server:
-        url = f"{server.url}/x.tar"
-        assert answer(url) == (200, DATA)
-        assert answer(url, Range="bytes=-10") == (206, DATA[-10:])
-        assert answer(url, Range="bytes=1023990-") == (206, DATA[-10:])
-        assert answer(url, Range="bytes=1024000-1024009") == (416, b"")
-        assert answer(url, **{"Range": "bytes=0-9", "If-Range": '"other"'}) == (200, DATA)
-        assert answer(f"{server.url}/%2e%2e/home") == (404, b"")
-        assert answer(f"{server.url}/none") == (404, b"")
 
 
 @pytest.fixture

@@ -189,9 +189,7 @@ def test_without_datasets_the_extra_is_named(monkeypatch):
 
 
 DERIVED = {
-    "shuffled": lambda stream: stream.shuffle(seed=0, buffer_size=1),
     "mapped": lambda stream: stream.map(lambda sample: sample),
-    "a rank's": lambda stream: split_dataset_by_node(stream, rank=0, world_size=2),
     "a shard's": lambda stream: stream.shard(num_shards=2, index=1),
     "shuffled, a rank's": lambda stream: split_dataset_by_node(
         stream.shuffle(seed=0, buffer_size=1), rank=1, world_size=2

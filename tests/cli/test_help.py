@@ -1,6 +1,5 @@
 """Help and examples: what a newcomer meets first."""
 
-import os
 import re
 import shlex
 import subprocess
@@ -10,7 +9,7 @@ import pytest
 import typer
 
 from stereogenbench_data.cli.commands import app
-from tests.cli.command import invoke, one_line, run
+from tests.cli.command import invoke, one_line
 
 COMMANDS = typer.main.get_command(app).commands
 
@@ -63,21 +62,6 @@ def test_sixteen_commands_stand_at_the_top_with_220_options_in_all():
     assert len(COMMANDS) <= 16
     options = [each for call in CALLS.values() for each in call.params if each.opts[0][0] == "-"]
     assert len(options) <= 220
-
-
-def completed(line):
-    words = shlex.split(line)
-    last = "" if line.endswith(" ") else words.pop()
-    variables = {
-        "_STEREOGENBENCH_COMPLETE": "complete_bash",
-        "COMP_WORDS": " ".join([*words, last]),
-        "COMP_CWORD": str(len(words)),
-    }
-    return run(env=os.environ | variables).stdout.split()
-
-
-def test_completion_knows_commands():
-    assert completed("stereogenbench s") == ["synth", "show", "stats"]
 
 
 def test_help_imports_neither_torch_nor_numpy():

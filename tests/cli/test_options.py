@@ -30,6 +30,7 @@ def refused(*words):
         (["stats", "d"], "--where", "focal_mm=wide", "18:35"),
         (["index", "d", "-o", "i"], "--where", "caption=red", "family or map"),
         (["stats", "d"], "--where", "min_frames=x", "whole number"),
+        (["show", "d"], "--pair", "left", "0-5"),
         (["show", "d"], "--pair", "5-0", "write it as 0-5"),
         (["eval", "controls", "d"], "--pairs", "5-2", "write it as 2-5"),
         (["download", "d", "-o", "o"], "--cameras", "6", "0 to 5"),

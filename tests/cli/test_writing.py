@@ -5,7 +5,6 @@ import os
 import resource
 import signal
 import stat
-import subprocess
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import pytest
 
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import write_report, writing
-from tests.cli.command import COMMAND, invoke, one_line
+from tests.cli.command import invoke, one_line
 
 
 @contextmanager
@@ -92,17 +91,6 @@ def test_an_index_does_not_replace_a_device_or_a_pipe(small_release, tmp_path):
     assert shown.exit_code == 2
     assert "is not a regular file" in one_line(shown.stderr)
     assert stat.S_ISFIFO(pipe.stat().st_mode)
-
-
-def test_a_command_whose_stdout_was_closed_does_its_work(tmp_path):
-    written = tmp_path / "about.json"
-    words = ("publish", "croissant", "--template", "-o", written)
-    ended = subprocess.run(
-        ["sh", "-c", '"$@" >&-', "sh", *COMMAND, *words],
-        stderr=subprocess.PIPE, text=True, check=False,
-    )  # fmt: skip
-
-    assert (ended.returncode, ended.stderr, written.exists()) == (0, "", True)
 
 
 @pytest.fixture

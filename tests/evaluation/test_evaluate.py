@@ -330,15 +330,6 @@ def test_a_folder_that_is_none_is_refused(scored_index, protocol, tmp_path):
         scored(scored_index, tmp_path / "nowhere", protocol)
 
 
-def test_progress_counts_frames_of_pairs_up_to_all(scored_index, right_views, protocol):
-    told = []
-    scored(scored_index, right_views, protocol, progress=lambda *counts: told.append(counts))
-
-    assert told[0] == (0, 3 * FRAMES)
-    assert told[-1] == (3 * FRAMES, 3 * FRAMES)
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
-
-
 def test_scores_are_the_same_on_one_thread_and_on_three_whose_number_is_left_as_it_was(
     scored_index, other_views
 ):

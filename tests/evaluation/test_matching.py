@@ -145,18 +145,6 @@ def test_sift_on_photographs_orders_target_noise_copy_and_another_scene(cones, s
     assert other["e_match"] > 90
 
 
-def test_sift_keypoints_are_the_strongest_distinct_and_inside(cones):
-    left = cones[0]
-    few, all_points = Sift(keypoints=50).detect(left), Sift().detect(left)
-
-    assert len(few.xy_px) == 50
-    assert len(all_points.xy_px) <= 2048
-    np.testing.assert_array_equal(few.xy_px, all_points.xy_px[:50])
-    assert (all_points.xy_px > 0).all()
-    assert (all_points.xy_px < (left.shape[2], left.shape[1])).all()
-    np.testing.assert_array_equal(all_points.descriptors, np.rint(all_points.descriptors))
-
-
 def test_sift_points_to_the_middle_of_a_spot(sift):
     """A bright spot whose centre is that of the pixel in column 40, row 30."""
     rows, columns = np.mgrid[:64, :80]

@@ -77,13 +77,6 @@ def test_a_damaged_file_is_named(tmp_path, content):
         load_file(torch.nn.Linear(1, 1), path)
 
 
-def test_a_file_of_something_else_is_named(tmp_path):
-    torch.save(torch.zeros(3), tmp_path / I3D.file)
-
-    with pytest.raises(EvaluationError, match="are a Tensor, not a table of tensors"):
-        load_model("learned metric", "fvd", weights=tmp_path)
-
-
 def test_weights_of_another_network_are_named(tmp_path):
     torch.save({"conv.weight": torch.zeros(3)}, tmp_path / I3D.file)
 

@@ -140,15 +140,6 @@ def test_a_camera_inside_a_solid_sees_nothing(renderer):
     assert checks.reasons.tolist()[1] == ""
 
 
-def test_cameras_stay_below_a_ceiling_and_may_rise_above_a_yard(renderer):
-    room, yard = (renderer.world(proposal(on=name)) for name in ("Room", "Yard"))
-
-    np.testing.assert_allclose(room.bounds_m.high_m, [4.7, 3.7, 3.4], atol=1e-6)
-    assert room.spawn_bounds_m.high_m[2] == pytest.approx(3.19)
-    assert yard.bounds_m.high_m[2] == pytest.approx(24.0)
-    np.testing.assert_allclose(yard.spawn_bounds_m.high_m, [3, 3, 1])
-
-
 @pytest.mark.parametrize("yaw_deg", [0.0, 90.0, -30.0])
 def test_the_subject_stands_on_its_place_and_walks_where_it_faces(renderer, yaw_deg):
     world = renderer.world(proposal(frames=81))

@@ -4,29 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
-from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.synthesis.planning import plan_scene, propose
 from stereogenbench_data.synthesis.renderer import ScenePlan, Spawn
 from stereogenbench_data.synthesis.request import SynthRequest
-from stereogenbench_data.synthesis.scene_files import recorded_rotation
 
 angles = st.floats(-180, 180)
 rotators = st.tuples(st.floats(-90, 90), angles, angles).map(np.array)
-
-
-@given(rotator_deg=rotators)
-@settings(max_examples=50, deadline=None)
-def test_the_quaternion_is_the_same_rotation_as_the_matrix(rotator_deg):
-    pitch, yaw, roll = rotator_deg
-    composed = Rotation.from_euler("ZYX", [yaw, -pitch, -roll], degrees=True).as_matrix()
-
-    matrix = rotation_from_rotator_deg(rotator_deg)
-    quaternion = recorded_rotation(rotator_deg, form="quaternion_xyzw")
-
-    np.testing.assert_allclose(matrix, composed, atol=1e-12)
-    np.testing.assert_allclose(Rotation.from_quat(quaternion).as_matrix(), composed, atol=1e-12)
 
 
 @given(rotator_deg=rotators, offset_cm=st.tuples(*[st.floats(-1e6, 1e6)] * 3).map(np.array))
