@@ -46,9 +46,11 @@ AXES: Final[dict[str, tuple[tuple[int, int], ...]]] = {
     "opencv": ((2, 1), (0, 1), (1, -1)),
     "opengl": ((2, -1), (0, 1), (1, 1)),
     "ros": ((0, 1), (1, -1), (2, 1)),
+    "pytorch3d": ((2, 1), (0, -1), (1, 1)),
 }
 """Of which columns of a camera's rotation, with which sign, are forward, right and up. Blender's
-cameras are those of OpenGL."""
+cameras are those of OpenGL. PyTorch3D's are OpenCV's upside down, with left and right exchanged: so
+these are tried only where a file names them."""
 
 _ALIASES: Final = {
     "gltf": "opengl",
@@ -237,6 +239,8 @@ def _all_readings(recorded: RecordedPoses) -> Iterator[_Form]:
               and b.components not in (("pitch", "yaw", "roll"), ("rx", "ry", "rz"))
               and (b.words & _LOCATION or (b.components and not b.words & _ROTATION))]  # fmt: skip
     for turn, axes in itertools.product(blocks, AXES):
+        if axes == "pytorch3d" and axes not in hints:
+            continue
         for kind in _kinds(turn):
             own_place = turn.values.shape[2:] in ((4, 4), (16,), (3, 4), (12,))
             for place in [None] if own_place else places:

@@ -47,7 +47,14 @@ _SHOWN: Final = 4
 
 
 class SidesError(SchemaError):
-    """What a trajectory says of baselines, lens or the left camera contradicts the rig."""
+    """What a trajectory says of baselines, lens or the left camera contradicts the rig.
+
+    Attributes:
+        scale: By how many times all distances of its cameras are the recorded baselines; None where
+            they differ otherwise.
+    """
+
+    scale: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,10 +146,18 @@ def _readings_as(recorded: RecordedPoses, named: PosesAs) -> Iterator[Reading]:
             yield replace(reading, tier=0, is_named=True, trajectory=trajectory)
 
 
+@dataclass(frozen=True, slots=True)
+class _Failed:
+    """Why a reading does not fit a rig, and by which scale of all distances, if that is why."""
+
+    reason: str
+    scale: float | None = None
+
+
 def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
     """Return the poses of the first tier of readings that fit a rig, as `understood_poses` says."""
     failures: dict[str, str] = {}
-    scaled: list[str] = []
+    scaled: list[_Failed] = []
     loose: list[_Passed] = []
     exact: list[_Passed] = []
     reversed_: list[_Passed] = []
@@ -152,9 +167,9 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
         for reading in tier:
             first = first or reading
             checked = _checked(reading, rig)
-            if isinstance(checked, str):
-                failures.setdefault(checked, reading.name)
-                scaled += [checked] if reading.tier == 0 and _IN_ANOTHER_UNIT in checked else []
+            if isinstance(checked, _Failed):
+                failures.setdefault(checked.reason, reading.name)
+                scaled += [checked] if reading.tier == 0 and checked.scale else []
             elif checked.lateral_m[left] > checked.lateral_m[right]:
                 reversed_.append(checked)
             else:
@@ -168,7 +183,9 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
             f"of camera {right}, and by baseline.json it is the left one. Correct one of them."
         )
     if scaled and not passed:
-        raise SidesError(f"{where}: {scaled[0]}. Correct the unit of one of them.")
+        error = SidesError(f"{where}: {scaled[0].reason}. Correct the unit of one of them.")
+        error.scale = scaled[0].scale
+        raise error
     if not passed:
         tried = "; ".join(f"{reason} ({name})" for reason, name in list(failures.items())[:_SHOWN])
         raise SchemaError(
@@ -271,12 +288,12 @@ def poses_as(text: bytes, form: str | None, *, where: str) -> CameraPoses:
     )
 
 
-def _checked(reading: Reading, rig: Rig) -> _Passed | str:
+def _checked(reading: Reading, rig: Rig) -> _Passed | _Failed:
     """Return a reading that fits a rig, or why it does not."""
     try:
         poses = CameraPoses.from_trajectory(reading.trajectory)
     except GeometryError as error:
-        return str(error)
+        return _Failed(str(error))
     steps = poses.centres[:, _RIGHT] - poses.centres[:, _LEFT]
     baselines_cm = np.array(rig.baselines_cm)
     distances = np.linalg.norm(steps, axis=-1)
@@ -298,10 +315,12 @@ def _checked(reading: Reading, rig: Rig) -> _Passed | str:
         # One ratio in all pairs and frames is no rounding: it is a unit, or a scale.
         is_one = bool((np.abs(scaled_cm - baselines_cm) <= _DEVIATION_SHARE * baselines_cm).all())
         is_told = np.isfinite(stated_m) and (is_one or (is_scaled and not 0.5 < ratio / unit_m < 2))
-        return (
+        other_unit = ", as if one of the two were in another unit or scaled" if is_told else ""
+        return _Failed(
             f"baseline.json says that cameras {a} and {b} are {baselines_cm[pair]:.6g} cm apart, "
             f"and by the poses they are {distances[frame, pair] * unit_m * 100:.6g} cm apart in "
-            f"frame {frame}{_IN_ANOTHER_UNIT if is_told else ''}"
+            f"frame {frame}{other_unit}",
+            scale=unit_m / ratio if is_told else None,
         )
     poses = replace(poses, unit_m=unit_m)
     lateral_m = lateral_offsets_m(poses)
@@ -310,7 +329,7 @@ def _checked(reading: Reading, rig: Rig) -> _Passed | str:
     if not (beside_cm >= _LEAST_BESIDE * baselines_cm).all() or not np.isfinite(residual_px):
         pair = int(np.argmin(beside_cm / baselines_cm))
         a, b = CAMERA_PAIRS[pair]
-        return (
+        return _Failed(
             f"cameras {a} and {b} are {beside_cm[pair]:.6g} cm beside each other as camera 0 "
             f"looks, and {baselines_cm[pair]:.6g} cm apart; or a camera looks away from what the "
             f"others see"
@@ -321,14 +340,13 @@ def _checked(reading: Reading, rig: Rig) -> _Passed | str:
     off, turns = float(sines.max()), poses.world_from_cam_rotations
     is_off = (sines * baselines_cm > _OFF_AXIS * baselines_cm + _DEVIATION_CM).any()
     if is_off and np.abs(turns - turns[:, :1]).max() <= _EXACT:
-        return (
+        return _Failed(
             f"the cameras look one way, and stand {np.degrees(np.arcsin(off)):.3g} degrees off "
             f"the axis to their right"
         )
     return _Passed(reading, poses, off, lateral_m)
 
 
-_IN_ANOTHER_UNIT: Final = ", as if one of the two were in another unit or scaled"
 _ROUGH: Final = 0.1
 """How far the median of distances may be from a unit before they are compared one by one."""
 

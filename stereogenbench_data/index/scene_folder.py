@@ -66,6 +66,7 @@ from stereogenbench_data.schema.document import (
 from stereogenbench_data.schema.parse import (
     contradictions,
     counted_otherwise,
+    is_of_family,
     parse_caption,
     parse_complete,
     parse_rig,
@@ -442,7 +443,11 @@ class _Description:
             text = self.folder.read(TRAJECTORY_JSON)
             return understood_poses(text, rig, where=where, named=named), ""
         except SidesError as error:
-            self.remark("left", str(error))
+            family, scale = parse_scene_key(self.key).family, error.scale
+            # Poses in a unit by which the rig would be of no scene of the family are wrong.
+            is_theirs = scale and not is_of_family(rig, family, scale=scale)
+            if not (is_theirs and is_of_family(rig, family)):
+                self.remark("left", str(error))
             return None, str(error)
         except SchemaError as error:
             if named is not None:

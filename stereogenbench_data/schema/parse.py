@@ -316,6 +316,13 @@ _UNREAD: Final = 'Or read no poses: form = "unknown" below [poses] in a file of 
 _OWN: Final = re.compile(r"\$\.rig(?:\.\w+)+(?:\[\d+\])*")
 
 
+def is_of_family(rig: Rig, family: str, *, scale: float = 1.0) -> bool:
+    """Return whether neighbours' baselines, times a scale, lie in the paper's range of a family."""
+    low_cm, high_cm = ADJACENT_CM.get(family, (0.0, math.inf))
+    adjacent_cm = [rig.baseline_cm(a, b) * scale for a, b in ADJACENT_PAIRS]
+    return low_cm * _NEARLY[0] <= min(adjacent_cm) and max(adjacent_cm) <= high_cm * _NEARLY[1]
+
+
 def require_unit(rig: Rig, *, family: str, where: str) -> tuple[Remark, ...]:
     """Return a remark on baselines that the paper's family does not have.
 
@@ -325,7 +332,7 @@ def require_unit(rig: Rig, *, family: str, where: str) -> tuple[Remark, ...]:
     low_cm, high_cm = ADJACENT_CM.get(family, (0.0, math.inf))
     adjacent_cm = [rig.baseline_cm(a, b) for a, b in ADJACENT_PAIRS]
     least_cm, most_cm = min(adjacent_cm), max(adjacent_cm)
-    if low_cm * _NEARLY[0] <= least_cm and most_cm <= high_cm * _NEARLY[1]:
+    if is_of_family(rig, family):
         return ()
     told = (
         f"{where}: neighbouring cameras are {least_cm:.6g} to {most_cm:.6g} cm apart, and in the "
@@ -371,7 +378,7 @@ class _Length:
     @property
     def rounding_cm(self) -> float:
         """Half of the last digit that is written."""
-        return self.cm / self.stated.value * self.stated.rounding if self.stated.value else 0.0
+        return self.cm / abs(self.stated.value) * self.stated.rounding if self.stated.value else 0.0
 
 
 class _RigFile(MetadataFile):
@@ -742,8 +749,10 @@ class _RigFile(MetadataFile):
         found = as_stated(value, "", at)
         if self.shape is not None and self.shape.ignores(found.path):
             return
-        if is_number(found.value) and found.value > 0:
-            cm = float(found.value) * (UNITS_M.get(found.unit, unit_m) / 0.01)
+        # A length from the camera with the higher number may be signed.
+        sign = -1 if cameras[0] > cameras[1] and is_number(found.value) and found.value < 0 else 1
+        if is_number(found.value) and found.value * sign > 0:
+            cm = float(found.value) * sign * (UNITS_M.get(found.unit, unit_m) / 0.01)
             self._found.append(_Length(cameras, cm, found, is_by_place))
             if math.isnan(cm):
                 self.problems.append(

@@ -35,10 +35,11 @@ CAMERAS = {
     "opencv": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
     "opengl": np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
     "ros": np.diag([1.0, -1.0, 1.0]),
+    "pytorch3d": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
 }
 """A camera's x, y and z axes, as columns, in Unreal's forward, right and up."""
 WORLDS = {"unreal": np.eye(3), "opencv": OPENCV_FROM_UNREAL, "opengl": np.diag([1.0, -1.0, 1.0]),
-          "ros": np.diag([1.0, -1.0, 1.0])}  # fmt: skip
+          "ros": np.diag([1.0, -1.0, 1.0]), "pytorch3d": CAMERAS["pytorch3d"].T}  # fmt: skip
 
 
 def path(rotators, first_cm=(120.0, -340.0, 155.0)):
@@ -176,7 +177,7 @@ def test_each_form_is_read_in_each_unit(form, unit):
     np.testing.assert_allclose(motions(found.poses), truth(*TURNED), atol=1e-9)
 
 
-@pytest.mark.parametrize("axes", ["opencv", "opengl", "ros"])
+@pytest.mark.parametrize("axes", ["opencv", "opengl", "ros", "pytorch3d"])
 @pytest.mark.parametrize("form", sorted(set(FORMS) - ROTATORS_ONLY))
 def test_right_handed_worlds_are_read_and_never_mirrored(form, axes):
     found = understood(written(form, *TURNED, axes=axes, unit="m", coordinate_system=axes))

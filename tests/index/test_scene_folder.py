@@ -302,6 +302,24 @@ def test_a_baseline_may_differ_by_a_millimetre_and_a_thousandth_and_no_more(
         describe_scene(root, KEY)
 
 
+@pytest.mark.parametrize(("scale", "is_left"), [(0.01, ""), (1.1, "scaled"), (100.0, "")])
+def test_poses_by_which_a_rig_would_be_of_no_scene_of_its_family_hold_up_poses_alone(
+    make_scene, root, rewrite, scale, is_left
+):
+    def scaled(document):
+        for frame in document["frames"]:
+            for pose in frame["cameras"]:
+                pose["location"] = {axis: scale * cm for axis, cm in pose["location"].items()}
+
+    rewrite(make_scene() / "trajectory.json", scaled)
+
+    scene = describe_scene(root, KEY)
+
+    assert "in another unit or scaled" in scene.remark("poses")
+    assert is_left in scene.remark("left")
+    assert bool(is_left) == bool(scene.remark("left"))
+
+
 @pytest.mark.parametrize(
     ("name", "key", "value", "told"),
     [

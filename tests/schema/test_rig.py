@@ -373,11 +373,11 @@ def pairs_as(document, write):
             ]}, id="two units that agree"),
         pytest.param(
             lambda pairs: {"pairwise_pairs": [
-                {"camera_index_a": b, "camera_index_b": a, "baseline_cm": cm}
+                {"camera_index_a": b, "camera_index_b": a, "baseline_cm": -cm}
                 for a, b, cm in reversed(pairs)
             ] + [
                 {"camera_index_a": a, "camera_index_b": b, "baseline_cm": cm} for a, b, cm in pairs
-            ]}, id="both directions"),
+            ]}, id="both directions, signed"),
         pytest.param(
             lambda pairs: {"adjacent_baselines_cm": [cm for a, b, cm in pairs if b == a + 1]},
             id="neighbours alone"),
@@ -425,6 +425,9 @@ def pairs_as(document, write):
         pytest.param(
             lambda pairs: {"baseline_matrix_cm": [[abs(a - b) for b in PLACES_CM]
                                                   for a in PLACES_CM]}, id="a matrix"),
+        pytest.param(
+            lambda pairs: {"baseline_matrix_cm": [[b - a for b in PLACES_CM]
+                                                  for a in PLACES_CM]}, id="a signed matrix"),
         pytest.param(
             lambda pairs: {"pairwise_pairs": {
                 f"Town_7_Cam_{a:02d}__Town_7_Cam_{b:02d}": {"baseline_cm": cm}
