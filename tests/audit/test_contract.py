@@ -18,13 +18,11 @@ from stereogenbench_data.audit.contract.scoring import Evidence, pooled
 from stereogenbench_data.audit.contract.verdict import (
     QUOTIENT,
     TOPICS,
-    Unit,
     encoding_line,
     group_by_contract,
     judge,
 )
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.schema.release import CAMERA_PAIRS
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.render import RAY_CASTING, RayCasting
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
@@ -641,14 +639,6 @@ def test_matching_finds_a_shift_of_either_sign_to_a_part_of_a_pixel():
         np.testing.assert_allclose(matches[:, 2], shift_px, atol=0.2)
 
 
-def test_every_exchange_of_two_cameras_is_requested_about():
-    orders = {order.order for order in Hypothesis().alternatives("order")}
-
-    for a, b in CAMERA_PAIRS:
-        for words in ("cameras", "pictures of cameras", "depth of cameras"):
-            assert f"{words} {a} and {b} exchanged" in orders
-
-
 @given(scenes=st.lists(st.tuples(st.floats(-9, 9), st.floats(0.01, 9)), min_size=1, max_size=5))
 def test_what_is_pooled_is_at_least_as_sure_as_each_part(scenes):
     parts = [pooled([Evidence(*scene)]) for scene in scenes]
@@ -673,10 +663,3 @@ def test_what_is_pooled_is_at_least_as_sure_as_each_part(scenes):
 )
 def test_what_one_scene_rules_out_is_ruled_out_unless_another_says_the_opposite(scenes, clear):
     assert pooled(scenes).is_clear == clear
-
-
-@pytest.mark.parametrize(
-    ("metres", "rounded"), [(0.00100051, 0.001), (0.0009801, 0.00098), (0.012346, 0.01235)]
-)
-def test_a_unit_is_rounded_to_the_shortest_number_near_it(metres, rounded):
-    assert Unit(metres, 0.002).rounded_m == pytest.approx(rounded, rel=1e-12)

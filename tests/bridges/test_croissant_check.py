@@ -80,15 +80,6 @@ def test_a_mutation_is_reported_by_name(written, name):
     assert any(re.search(message, problem) for problem in problems), problems
 
 
-@pytest.mark.parametrize("published", ["2026", "2026-05"])
-def test_a_year_a_month_and_a_day_are_dates(written, published):
-    document = json.loads(written.read_text())
-    document["datePublished"] = published
-    written.write_text(json.dumps(document))
-
-    assert check_descriptor(written) == []
-
-
 def test_without_mlcroissant_its_extra_is_named(written, monkeypatch):
     monkeypatch.setitem(sys.modules, "mlcroissant", None)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from stereogenbench_data.cli.errors import ErrorsReported
-from stereogenbench_data.errors import ExtraError, SelectionError
+from stereogenbench_data.errors import SelectionError
 from tests.cli.command import COMMAND, invoke, run
 
 
@@ -28,11 +28,6 @@ def reported(error, capsys):
     ("error", "status", "lines"),
     [
         (SelectionError("no pair; take another"), 2, ["SelectionError: no pair; take another"]),
-        (
-            ExtraError("needs matplotlib: pip install 'stereogenbench-data[plots]'"),
-            2,
-            ["ExtraError: needs matplotlib: pip install 'stereogenbench-data[plots]'"],
-        ),
         (
             PermissionError(errno.EACCES, "Permission denied", "out/sheet.png"),
             2,

@@ -49,8 +49,6 @@ def test_it_says_what_was_written_and_what_was_there(indexed_release, tmp_path):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--size", "480,832"], ["--size", "480,832", "WIDTHxHEIGHT"]),
-        (["--pairs", "0:1"], ["--pairs", "0:1", "0-1,0-5"]),
         (["--length", "7"], ["length=7", "4N+1", "5 or 9"]),
         (["--stride", "0"], ["at least 1", "got 0"]),
         (["--where", "family=Narrow"], ["family", "Narrow", "Uniform"]),

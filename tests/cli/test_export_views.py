@@ -44,8 +44,6 @@ def test_filters_cameras_frames_and_points_are_taken(indexed_release, tmp_path):
     [
         (["--cameras", "a,b"], "'a,b': write numbers from 0 to 5"),
         (["--points", "many"], "'many' is not a number or all"),
-        (["--frames", "some"], "'some' is not all, first"),
-        (["--size", "big"], "size must be WIDTHxHEIGHT"),
     ],
 )
 def test_a_text_that_is_not_understood_is_named(indexed_release, tmp_path, options, message):

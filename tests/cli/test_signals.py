@@ -1,12 +1,9 @@
-"""Signals while the command imports what it needs, and signals of a process that calls it."""
+"""Signals while the command imports what it needs."""
 
-import signal
 import subprocess
 import sys
 
 import pytest
-
-from tests.cli.command import invoke
 
 pytestmark = pytest.mark.usefixtures("usual_signals")
 
@@ -44,10 +41,3 @@ def test_ctrl_c_that_is_ignored_stays_ignored():
 
     assert (ended.returncode, ended.stderr) == (0, "")
     assert ended.stdout.startswith("stereogenbench-data ")
-
-
-def test_calling_commands_in_a_process_leaves_its_signals_alone(small_shards):
-    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    assert invoke("stats", small_shards).exit_code == 0
-
-    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before

@@ -27,18 +27,6 @@ def exported(scored_index, tmp_path_factory):
     return folders
 
 
-def test_there_is_an_item_for_each_pair_and_a_picture_for_each_frame(scored_index, exported):
-    items = {item_name(key, (0, 1)) for key in scored_index.column("key")}
-
-    for folder in exported.values():
-        shown = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
-        assert shown == items | {"inputs.json"}
-        for item in items:
-            names = {path.name for path in (folder / item / "left").iterdir()}
-
-            assert names == {f"{frame:03d}.png" for frame in range(FRAMES)}
-
-
 def test_inputs_are_the_samples_fields(scored_index, exported):
     pairs = StereoPairs(
         scored_index, frames="all", size=SIZE,
