@@ -9,7 +9,7 @@ import av
 import numpy as np
 
 from benchmarks.material import Material
-from benchmarks.results import Report, spread_of
+from benchmarks.results import Report
 from benchmarks.ways import WAYS, Pair, interpolated
 from stereogenbench_data.geometry.disparity import disparity_error_px
 from stereogenbench_data.index.table import SceneIndex
@@ -75,13 +75,13 @@ def measure_accuracy(
     calls[CONVERSION] = lambda: left.astype(np.float32)
     resized, resizing = _resized(material.size_px)
     calls |= resizing
-    spent = beside(time_calls(calls, pixels=left.size, rounds=rounds), base=CONVERSION)
+    spent = time_calls(calls, pixels=left.size, rounds=rounds)
     for way in (*ways, *resized):
-        way["ns_a_pixel"] = spent[way["name"]]
+        way["ns_a_pixel"] = _spread(spent[way["name"]], beside=spent[CONVERSION])
     return {
         "pixels": left.size,
         "cases": cases * PIXELS[0] * PIXELS[1],
-        "conversion_ns": spent[CONVERSION],
+        "conversion_ns": _spread(spent[CONVERSION], beside=spent[CONVERSION]),
         "ways": ways,
         "resized": resized,
         "justified": justified(ways),
@@ -220,16 +220,14 @@ def time_calls(
     return times
 
 
-def beside(times: Mapping[str, list[float]], *, base: str) -> dict[str, dict[str, float]]:
-    """Return the spread of the times of every call, and their median ratio to the base's.
+def _spread(values: list[float], *, beside: list[float]) -> dict[str, float]:
+    """Return the median and quartiles of times, and the median of their ratios to others.
 
-    The base is a conversion of the map, so ratios are called conversions.
+    The others are those of a conversion of the map, so ratios are called conversions.
     """
-    found = {}
-    for name, values in times.items():
-        ratio = spread_of(value / plain for value, plain in zip(values, times[base], strict=True))
-        found[name] = spread_of(values) | {"conversions": ratio["median"]}
-    return found
+    low, median, high = np.quantile(values, [0.25, 0.5, 0.75]).tolist()
+    conversions = float(np.median(np.divide(values, beside)))
+    return {"median": median, "low": low, "high": high, "conversions": conversions}
 
 
 def _first_depth(path: Path) -> np.ndarray:

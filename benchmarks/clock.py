@@ -20,7 +20,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from benchmarks.contestants import limit
-from benchmarks.field import CONTESTANTS, LIMIT
+from benchmarks.field import CONTESTANTS
 from benchmarks.workloads import Job, Wanted
 
 LONGEST_S: Final = 300.0
@@ -97,8 +97,9 @@ def _report(work: Callable[[], Any], to: Connection) -> None:
 def _run(name: str, job: Job, *, workers: int) -> Measured:
     torch.set_num_threads(1)
     list(job.of_scene)  # Computed before the clock starts.
-    if name != LIMIT:
-        return whole_pass(partial(CONTESTANTS[name].batches, job), workers=workers)
+    batches = CONTESTANTS[name].batches
+    if batches is not None:
+        return whole_pass(partial(batches, job), workers=workers)
     before = _cpu_s()
     samples, seconds = _bare(job, processes=max(1, workers))
     return Measured(samples, seconds, _cpu_s() - before)

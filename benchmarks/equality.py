@@ -31,8 +31,7 @@ def differences(material: Material, *, only: Collection[str] = ()) -> dict[str, 
         for name, _ in entrants(workload):
             reason = why_not(name)
             if reason is None:
-                reading = CONTESTANTS[name].reading if name in CONTESTANTS else "forwards"
-                job = Job(workload, material, reading=reading)
+                job = Job(workload, material, reading=CONTESTANTS[name].reading)
                 result = in_a_fork(lambda name=name, job=job: difference(name, job))
             else:
                 result = {"error": reason}
@@ -55,7 +54,8 @@ def difference(name: str, job: Job) -> Difference:
 
 def samples_of(name: str, job: Job) -> list[tuple[Key, dict[str, np.ndarray]]]:
     """Return all of a contestant's samples as arrays, by scene, cameras and first frame."""
-    if name == LIMIT:
+    batches = CONTESTANTS[name].batches
+    if batches is None:
         return [
             (
                 (wanted.scene, wanted.left, wanted.right, wanted.frames[0]),
@@ -65,7 +65,7 @@ def samples_of(name: str, job: Job) -> list[tuple[Key, dict[str, np.ndarray]]]:
             for wanted in [sample.pop("wanted")]
         ]
     found = []
-    for batch in CONTESTANTS[name].batches(job, num_workers=0):
+    for batch in batches(job, num_workers=0):
         for place in range(len(batch["scene"])):
             sample = {field: values[place] for field, values in batch.items()}
             arrays = {

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from typing import Any, Final
 
@@ -20,91 +21,63 @@ class Contestant:
     """One contestant.
 
     Attributes:
-        name: Its name in results.
         title: Its name in tables.
         reading: The slice that it loads.
-        batches: Returns the `DataLoader` for a job, with the given options.
+        batches: Returns the `DataLoader` for a job, with the given options; None of the limit,
+            which has no batches.
         module: A module that it needs beside the package, if any.
     """
 
-    name: str
     title: str
     reading: Reading
-    batches: Callable[..., DataLoader[Any]]
+    batches: Callable[..., DataLoader[Any]] | None
     module: str | None = None
 
 
-def _anywhere(dataset: Callable[[Job], Any]) -> Callable[..., DataLoader[Any]]:
-    """Return a `DataLoader` of single samples, independent of each other."""
-    return lambda job, **options: DataLoader(dataset(job), batch_size=1, **options)
+def _torch(dataset: Callable[[Job], Any]) -> Callable[..., DataLoader[Any]]:
+    """Return torch's own `DataLoader`; samples that are independent come one by one."""
+    return lambda job, **options: DataLoader(
+        dataset(job), batch_size=1 if job.reading == "anywhere" else job.workload.batch, **options
+    )
 
 
-def _forwards(dataset: Callable[[Job], Any]) -> Callable[..., DataLoader[Any]]:
-    return lambda job, **options: DataLoader(dataset(job), batch_size=job.workload.batch, **options)
+_torchcodec = partial(random_access.KeptOpenPairs, video=random_access.TorchcodecVideo)
+_decord = partial(random_access.KeptOpenPairs, video=random_access.DecordVideo)
+
+CONTESTANTS: Final = {
+    LIMIT: Contestant("limit: bare PyAV loop", "forwards", None),
+    NAIVE: Contestant("naive: the paper's snippet", "anywhere", _torch(naive.NaivePairs)),
+    "webdataset": Contestant(
+        "webdataset + decode step", "forwards", _torch(scenewise.webdataset_samples), "webdataset"
+    ),
+    "datasets": Contestant(
+        "HF datasets streaming + decode step", "forwards",
+        _torch(scenewise.hugging_face_samples), "datasets",
+    ),
+    "torchcodec": Contestant(
+        "torchcodec RGB, PyAV depth", "anywhere", _torch(_torchcodec), "torchcodec"
+    ),
+    "decord": Contestant("decord RGB, PyAV depth", "anywhere", _torch(_decord), "decord"),
+    OURS: Contestant("ours, StereoPairs.loader", "forwards", ours.mapped),
+    "ours-stream": Contestant("ours, StereoPairStream", "forwards", ours.streamed),
+    "ours-shards": Contestant("ours, from shards", "forwards", ours.from_shards),
+}  # fmt: skip
 
 
-_TITLES: Final = {
-    LIMIT: "limit: bare PyAV loop",
-    NAIVE: "naive: the paper's snippet",
-    "webdataset": "webdataset + decode step",
-    "datasets": "HF datasets streaming + decode step",
-    "torchcodec": "torchcodec RGB, PyAV depth",
-    "decord": "decord RGB, PyAV depth",
-    OURS: "ours, StereoPairs.loader",
-    "ours-stream": "ours, StereoPairStream",
-    "ours-shards": "ours, from shards",
-}
-
-_CONTESTANTS: Final = (
-    Contestant(NAIVE, _TITLES[NAIVE], "anywhere", _anywhere(naive.NaivePairs)),
-    Contestant(
-        "webdataset", _TITLES["webdataset"], "forwards",
-        _forwards(scenewise.webdataset_samples), "webdataset",
-    ),
-    Contestant(
-        "datasets", _TITLES["datasets"], "forwards",
-        _forwards(scenewise.hugging_face_samples), "datasets",
-    ),
-    Contestant(
-        "torchcodec", _TITLES["torchcodec"], "anywhere",
-        _anywhere(lambda job: random_access.KeptOpenPairs(job, random_access.TorchcodecVideo)),
-        "torchcodec",
-    ),
-    Contestant(
-        "decord", _TITLES["decord"], "anywhere",
-        _anywhere(lambda job: random_access.KeptOpenPairs(job, random_access.DecordVideo)),
-        "decord",
-    ),
-    Contestant(
-        OURS, _TITLES[OURS], "forwards", lambda job, **o: ours.mapped(job, job.tree, **o)
-    ),
-    Contestant(
-        "ours-stream", _TITLES["ours-stream"], "forwards",
-        lambda job, **o: ours.streamed(job, job.tree, **o),
-    ),
-    Contestant(
-        "ours-shards", _TITLES["ours-shards"], "forwards",
-        lambda job, **o: ours.mapped(job, job.material.shards, **o),
-    ),
-)  # fmt: skip
-CONTESTANTS: Final = {contestant.name: contestant for contestant in _CONTESTANTS}
-
-
-def title(name: str) -> str:
-    """Return the name of a contestant in tables."""
-    return _TITLES[name]
+def unavailable(load: Callable[[], object]) -> str | None:
+    """Return why a library cannot be imported here, None where it can."""
+    try:
+        load()
+    except (ImportError, RuntimeError, OSError) as error:
+        return f"cannot be imported: {str(error).splitlines()[0]}"
+    return None
 
 
 def why_not(name: str) -> str | None:
     """Return why a contestant cannot race here, None where it can."""
-    contestant = CONTESTANTS.get(name)
-    if contestant is None or contestant.module is None:
-        return None
-    try:
-        import_module(contestant.module)
-    except (ImportError, RuntimeError, OSError) as error:
-        return f"{contestant.module} cannot be imported: {str(error).splitlines()[0]}"
-    return None
+    module = CONTESTANTS[name].module
+    reason = None if module is None else unavailable(partial(import_module, module))
+    return None if reason is None else f"{module} {reason}"
 
 
 def entrants(workload: Workload) -> list[tuple[str, int]]:

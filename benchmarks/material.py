@@ -99,15 +99,8 @@ def _draw(material: Material, *, report: Report, workers: int) -> None:
         request = SynthRequest(
             family=family, scenes=2, size_px=material.size_px, frames=material.frames, seed=seed
         )
-        shown = -1
-
-        def progress(done: int, total: int, family: str = family) -> None:
-            nonlocal shown
-            if done * 20 // total > shown:
-                shown = done * 20 // total
-                report(f"drawing {family}: {done} of {total} frames")
-
-        synthesise(material.release, request, workers=workers, progress=progress)
+        report(f"drawing {family}")
+        synthesise(material.release, request, workers=workers)
 
 
 def _link(release: Path, tree: Path, *, scenes: int) -> None:

@@ -16,23 +16,23 @@ import resource
 import shutil
 import tempfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from torch.utils.data import DataLoader, IterableDataset
+from torch.utils.data import DataLoader
 
 from benchmarks.clock import Measured, MeasurementError, in_a_fork, whole_pass
 from benchmarks.contestants import mosaic, scenewise
-from benchmarks.contestants.rig import camera_files
+from benchmarks.field import unavailable
 from benchmarks.material import Material
 from benchmarks.results import Report, Results, Spread
 from benchmarks.server import Network, serving
 from benchmarks.tables import rate_text, spread_text, table
-from benchmarks.workloads import SEED, Wanted, Workload
+from benchmarks.workloads import SEED, Job, Wanted, Workload
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
@@ -42,12 +42,24 @@ from stereogenbench_data.sources.members import open_local
 
 LOCAL: Final = "ours, local"
 OURS: Final = "ours"
-RIVALS: Final = ("webdataset", "HF datasets", "Mosaic Streaming")
+RIVALS: Final = {
+    "webdataset": partial(import_module, "webdataset"),
+    "HF datasets": lambda: (import_module("aiohttp"), import_module("datasets")),
+    "Mosaic Streaming": mosaic.streaming_module,
+}
+"""The other contestants, and what imports their libraries."""
 
-DELAYS_MS: Final = (0.0, 20.0, 60.0, 150.0)
-BANDWIDTHS_MB_S: Final = (0.0, 20.0)
-FAULTS: Final = (Network(0.06, refused=0.05), Network(0.06, lost=0.05))
-"""Networks with faults, in which ours alone races."""
+
+NETWORKS: Final = (
+    *(
+        Network(delay_s, connection_mb_s=mb_s)
+        for mb_s in (0.0, 20.0)
+        for delay_s in (0.0, 0.02, 0.06, 0.15)
+    ),
+    Network(0.06, refused=0.05),
+    Network(0.06, lost=0.05),
+)
+"""Networks of the races; where they have faults, ours alone races."""
 
 WORKLOADS: Final = (
     Workload("all-frames", "all frames", 16, "all", "all"),
@@ -68,9 +80,7 @@ class Plan:
     Attributes:
         rounds: The number of rounds.
         workers: Worker processes.
-        delays_ms: Delays of the networks.
-        bandwidths_mb_s: Bandwidths of a connection; 0 is unlimited.
-        faults: Networks with faults, in which ours alone races.
+        networks: The networks.
         scenes: The number of scenes of every workload; 0 is the workload's own.
         workloads: The names of the workloads.
         resume: Whether rounds in the results count.
@@ -78,37 +88,26 @@ class Plan:
 
     rounds: int = 3
     workers: int = 2
-    delays_ms: tuple[float, ...] = DELAYS_MS
-    bandwidths_mb_s: tuple[float, ...] = BANDWIDTHS_MB_S
-    faults: tuple[Network, ...] = FAULTS
+    networks: tuple[Network, ...] = NETWORKS
     scenes: int = 0
     workloads: tuple[str, ...] = tuple(workload.name for workload in WORKLOADS)
     resume: bool = False
 
-    def networks(self) -> list[tuple[Network, tuple[str, ...]]]:
-        """Return every network with those that race in it; the local one always does."""
-        plain = [
-            Network(delay_ms / 1e3, connection_mb_s=mb_s)
-            for mb_s, delay_ms in itertools.product(self.bandwidths_mb_s, self.delays_ms)
-        ]
-        return [(each, (LOCAL, OURS, *RIVALS)) for each in plain] + [
-            (each, (LOCAL, OURS)) for each in self.faults
-        ]
-
 
 @dataclass(frozen=True)
-class Job:
-    """A workload on its linked shards.
+class LinkedJob(Job):
+    """A workload on linked shards.
 
     Attributes:
-        workload: The workload.
-        root: The folder that the server serves.
         scenes: The number of scenes.
     """
 
-    workload: Workload
-    root: Path
-    scenes: int
+    scenes: int = 0
+
+    @property
+    def root(self) -> Path:
+        """The folder that the server serves."""
+        return self.material.root / "network"
 
     @property
     def shards(self) -> Path:
@@ -133,7 +132,7 @@ class Job:
 
         Scenes that are links to one shard have the frames of the first of them.
         """
-        pairs, found = self.pairs(self.shards), {}
+        pairs, found = self.pairs(self.shards), dict[str, list[Wanted]]()
         keys = pairs.index.column("key").tolist()
         drawn = (self.shards / "keys.txt").read_text().split()
         for number in range(len(pairs)):
@@ -144,12 +143,6 @@ class Job:
                 wanted = Wanted(drawn[place], address.source, right, address.frames)
                 found.setdefault(drawn[place], []).append(wanted)
         return found
-
-    @cached_property
-    def files(self) -> list[str]:
-        """The names of the files that the samples need."""
-        wanted = itertools.chain(*self.of_scene.values())
-        return ["baseline.json", *camera_files(wanted, both_ways=self.workload.both_ways)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,14 +162,14 @@ class Turn(Measured):
     failures: int = 0
 
 
-def link_shards(material: Material, job: Job) -> None:
+def link_shards(job: LinkedJob) -> None:
     """Make as many shards as a job has scenes: links to the packed ones in turn, with an index.
 
     Of a shard that holds several scenes, as in tests, the first counts.
     """
     if (job.shards / INDEX_NAME).exists():
         return
-    index = SceneIndex.open(material.shards)
+    index = SceneIndex.open(job.material.shards)
     index.load_seek_tables()
     firsts: dict[str, Scene] = {}
     for row in range(len(index)):
@@ -190,7 +183,7 @@ def link_shards(material: Material, job: Job) -> None:
         (path,) = {member.path for member in scene.members.values()}
         name = f"net-{number:06d}.tar"
         if not (job.shards / name).exists():
-            os.link(material.shards / path, job.shards / name)
+            os.link(job.material.shards / path, job.shards / name)
         facts[name] = index.shards[path]
         family = scene.id.family
         key = f"train/{family}/SynthStage/{_LINKED.format(number)}"
@@ -202,11 +195,11 @@ def link_shards(material: Material, job: Job) -> None:
     SceneIndex.from_scenes(scenes, job.shards, shards=facts).write(job.shards / INDEX_NAME)
 
 
-def link_mds(material: Material, job: Job) -> None:
+def link_mds(job: LinkedJob) -> None:
     """Make Mosaic's shards of the same scenes, whole like the tar files."""
     if (job.mds / "index.json").exists():
         return
-    index = SceneIndex.open(material.shards)
+    index = SceneIndex.open(job.material.shards)
     distinct = job.root / "mds"
     if not (distinct / "index.json").exists():
         shutil.rmtree(distinct, ignore_errors=True)
@@ -223,46 +216,33 @@ def link_mds(material: Material, job: Job) -> None:
     mosaic.repeat_shards(distinct, job.mds, count=job.scenes)
 
 
-def why_not(name: str) -> str | None:
-    """Return why a contestant cannot race here, None where it can."""
-    modules = {"webdataset": ("webdataset",), "HF datasets": ("aiohttp", "datasets")}
-    try:
-        for module in modules.get(name, ()):
-            import_module(module)
-        if name == "Mosaic Streaming":
-            mosaic.streaming_module()
-    except (ImportError, RuntimeError, OSError) as error:
-        return f"cannot be imported: {str(error).splitlines()[0]}"
-    return None
-
-
 def run_network(material: Material, results: Results, *, plan: Plan, report: Report) -> list[str]:
     """Run the races; results are written after every network.
 
     Returns:
         A message for each failure.
     """
-    reasons = {name: why for name in RIVALS if (why := why_not(name)) is not None}
+    reasons = {name: why for name, load in RIVALS.items() if (why := unavailable(load))}
     section = results.sections.get("network", {}) if plan.resume else {}
     section = {"failed": reasons, "workers": plan.workers, "races": section.get("races", [])}
     failed = []
     for workload in (each for each in WORKLOADS if each.name in plan.workloads):
         scenes = plan.scenes or workload.scenes
-        job = Job(workload, material.root / "network", scenes)
-        link_shards(material, job)
+        job = LinkedJob(workload, material, scenes=scenes)
+        link_shards(job)
         if "Mosaic Streaming" not in reasons:
-            in_a_fork(lambda job=job: link_mds(material, job))
-        for number, (network, names) in itertools.product(range(plan.rounds), plan.networks()):
+            in_a_fork(partial(link_mds, job))
+        for number, network in itertools.product(range(plan.rounds), plan.networks):
             place = {
                 "workload": workload.name, "scenes": scenes, "round": number, **asdict(network)
             }  # fmt: skip
             if any(place.items() <= race.items() for race in section["races"]):
                 continue
             report(f"network, {workload.title}, {_named(network)}: round {number + 1}")
-            field = [name for name in names if name not in reasons]
-            turns = field if number % 2 == 0 else field[::-1]
+            rivals = () if network.refused or network.lost else RIVALS
+            names = [name for name in (LOCAL, OURS, *rivals) if name not in reasons]
             found = {}
-            for name in turns:
+            for name in names if number % 2 == 0 else names[::-1]:
                 try:
                     found[name] = asdict(measured(name, job, network, workers=plan.workers))
                 except MeasurementError as error:
@@ -273,57 +253,44 @@ def run_network(material: Material, results: Results, *, plan: Plan, report: Rep
     return failed
 
 
-def measured(name: str, job: Job, network: Network, *, workers: int) -> Turn:
+def measured(name: str, job: LinkedJob, network: Network, *, workers: int) -> Turn:
     """Return what one contestant's turn took, over a network.
 
     Raises:
         MeasurementError: If it fails.
     """
-    if name == LOCAL:
-        found: Turn = in_a_fork(lambda: _run(name, job, "", workers=workers), longest_s=LONGEST_S)
-        return found
     with serving(job.root, network=network) as server:
-        found = in_a_fork(lambda: _run(name, job, server.url, workers=workers), longest_s=LONGEST_S)
+        run = partial(_run, name, job, server.url, workers=workers)
+        found: Turn = in_a_fork(run, longest_s=LONGEST_S)
         counts = server.counts()
     sent_mb = round(counts.sent_bytes / 1e6, 3)
     return replace(found, requests=counts.requests, sent_mb=sent_mb, failures=counts.failures)
 
 
-def _run(name: str, job: Job, url: str, *, workers: int) -> Turn:
+def _run(name: str, job: LinkedJob, url: str, *, workers: int) -> Turn:
     list(job.of_scene)  # computed before the clock starts
     with tempfile.TemporaryDirectory() as local:
-        took = whole_pass(partial(_loaders()[name], job, url, Path(local)), workers=workers)
+        took = whole_pass(partial(_loader, name, job, url, Path(local)), workers=workers)
     peak_kb = resource.getrusage(
         resource.RUSAGE_CHILDREN if workers else resource.RUSAGE_SELF
     ).ru_maxrss
     return Turn(**asdict(took), peak_mb=round(peak_kb / 1e3, 1))
 
 
-def _loaders() -> dict[str, Callable[..., Any]]:
-    def ours(job: Job, data: str | Path, **options: Any) -> Any:
-        return job.pairs(data).loader(job.workload.batch, drop_last=False, seed=SEED, **options)
-
-    def theirs(job: Job, dataset: IterableDataset[Any], **options: Any) -> DataLoader[Any]:
-        return DataLoader(dataset, batch_size=job.workload.batch, **options)
-
-    def tars(job: Job, url: str) -> list[str]:
-        return [f"{url}/{job.shards.name}/{path.name}" for path in sorted(job.shards.glob("*.tar"))]
-
-    return {
-        LOCAL: lambda job, url, local, **o: ours(job, job.shards, **o),
-        OURS: lambda job, url, local, **o: ours(job, f"{url}/{job.shards.name}", **o),
-        "webdataset": lambda job, url, local, **o: theirs(
-            job, scenewise.webdataset_stream(job, tars(job, url)), **o
-        ),
-        "HF datasets": lambda job, url, local, **o: theirs(
-            job, scenewise.hugging_face_stream(job, tars(job, url)), **o
-        ),
-        "Mosaic Streaming": lambda job, url, local, **o: theirs(
-            job,
-            mosaic.MosaicScenes(job, server=url, remote=f"s3://{job.mds.name}", local=local),
-            **o,
-        ),
-    }
+def _loader(name: str, job: LinkedJob, url: str, local: Path, **options: Any) -> DataLoader[Any]:
+    """Return a contestant's loader; an empty folder is for what it downloads."""
+    place, batch = f"{url}/{job.shards.name}", job.workload.batch
+    if name in (LOCAL, OURS):
+        pairs = job.pairs(job.shards if name == LOCAL else place)
+        return pairs.loader(batch, drop_last=False, seed=SEED, **options)
+    tars = [f"{place}/{path.name}" for path in sorted(job.shards.glob("*.tar"))]
+    if name == "webdataset":
+        stream = scenewise.webdataset_stream(job, tars)
+    elif name == "HF datasets":
+        stream = scenewise.hugging_face_stream(job, tars)
+    else:
+        stream = mosaic.MosaicScenes(job, server=url, remote=f"s3://{job.mds.name}", local=local)
+    return DataLoader(stream, batch_size=batch, **options)
 
 
 def _named(network: Network) -> str:
@@ -339,20 +306,14 @@ _Value = Callable[[dict[str, Any], dict[str, Any]], float]
 """A figure of a contestant's turn, given that of ours from the local disk in the same round."""
 
 
-@dataclass(slots=True)
-class _Group:
-    """The rounds of one workload over one network."""
+_Rounds = list[dict[str, dict[str, Any]]]
+"""What was found in each round of one workload over one network, by contestant."""
 
-    network: Network
-    rounds: list[dict[str, Any]] = field(default_factory=list)
 
-    def spread(self, name: str, value: _Value) -> Spread | None:
-        """Return the spread of a value of a contestant, given its turn and the local one's."""
-        return Spread.of(
-            value(found[name], found[LOCAL])
-            for found in self.rounds
-            if name in found and LOCAL in found
-        )
+def _spread(rounds: _Rounds, name: str, value: _Value) -> Spread | None:
+    """Return the spread of a value of a contestant, given its turn and the local one's."""
+    both = [found for found in rounds if name in found and LOCAL in found]
+    return Spread.of(value(found[name], found[LOCAL]) for found in both)
 
 
 def _rate(turn: dict[str, Any]) -> float:
@@ -365,13 +326,13 @@ def _later_rate(turn: dict[str, Any]) -> float:
     return float((turn["samples"] - turn["first_samples"]) / seconds) if seconds > 0 else 0.0
 
 
-def _groups(section: dict[str, Any], workload: str) -> list[_Group]:
-    groups: dict[Network, _Group] = {}
+def _by_network(section: dict[str, Any], workload: Workload) -> dict[Network, _Rounds]:
+    found: dict[Network, _Rounds] = {}
     for race in section["races"]:
-        if race["workload"] == workload:
+        if race["workload"] == workload.name:
             network = Network(**{name: race[name] for name in asdict(Network())})
-            groups.setdefault(network, _Group(network)).rounds.append(race["found"])
-    return list(groups.values())
+            found.setdefault(network, []).append(race["found"])
+    return found
 
 
 def network_tables(section: dict[str, Any]) -> str:
@@ -383,18 +344,18 @@ def network_tables(section: dict[str, Any]) -> str:
         "out. Requests and bytes are the server's own count.\n",
     ]
     for workload in WORKLOADS:
-        groups = _groups(section, workload.name)
-        if not groups:
+        races = _by_network(section, workload)
+        if not races:
             continue
         scenes = next(r["scenes"] for r in section["races"] if r["workload"] == workload.name)
-        rounds = max(len(group.rounds) for group in groups)
         rows = [
-            _row(group, name)
-            for group in groups
+            _row(network, rounds, name)
+            for network, rounds in races.items()
             for name in (LOCAL, OURS, *RIVALS)
-            if any(name in found for found in group.rounds)
+            if any(name in found for found in rounds)
         ]
-        first = f"{workload.title}, {scenes} scenes, {counted(rounds, 'round')}"
+        most = counted(max(map(len, races.values())), "round")
+        first = f"{workload.title}, {scenes} scenes, {most}"
         head = (
             first, "contestant", "samples/s",
             "to local", "(after the first batch)", "first batch, s", "the same, delays more than "
@@ -407,18 +368,18 @@ def network_tables(section: dict[str, Any]) -> str:
     return "\n".join([*parts, "![Speed over a network](network.png)\n"])
 
 
-def _row(group: _Group, name: str) -> list[str]:
+def _row(network: Network, rounds: _Rounds, name: str) -> list[str]:
     """Return the row of a contestant; ours from the local disk is compared with nothing."""
-    delay_s = group.network.delay_s
+    delay_s = network.delay_s
 
     def cell(value: _Value) -> str:
-        return rate_text(group.spread(name, value))
+        return rate_text(_spread(rounds, name, value))
 
     def compared(value: _Value, text: Callable[[Spread | None], str] = rate_text) -> str:
-        return "" if name == LOCAL else text(group.spread(name, value))
+        return "" if name == LOCAL else text(_spread(rounds, name, value))
 
     return [
-        _named(group.network), name, cell(lambda turn, _: _rate(turn)),
+        _named(network), name, cell(lambda turn, _: _rate(turn)),
         compared(lambda turn, own: _rate(turn) / _rate(own), spread_text),
         compared(
             lambda turn, own: _later_rate(turn) / max(_later_rate(own), 1e-9), spread_text
@@ -441,13 +402,13 @@ def network_plot(section: dict[str, Any]) -> Any:
     """Return a figure: the speed of each contestant as a share of ours from the local disk."""
     import matplotlib.pyplot as plt
 
-    shown = [each for each in WORKLOADS if _groups(section, each.name)]
+    shown = [each for each in WORKLOADS if _by_network(section, each)]
     bars = {
         workload.title: [
-            (_named(group.network), name, found)
-            for group in _groups(section, workload.name)
+            (_named(network), name, found)
+            for network, rounds in _by_network(section, workload).items()
             for name in (OURS, *RIVALS)
-            if (found := group.spread(name, lambda turn, own: _rate(turn) / _rate(own)))
+            if (found := _spread(rounds, name, lambda turn, own: _rate(turn) / _rate(own)))
         ]
         for workload in shown
     }

@@ -73,19 +73,10 @@ def _race(
         found = {}
         for name, workers in in_turn if number % 2 == 0 else in_turn[::-1]:
             try:
-                found[entry(name, workers)] = _measured(name, job, workers=workers)
+                own = replace(job, reading=CONTESTANTS[name].reading)
+                found[entry(name, workers)] = asdict(measured(name, own, workers=workers))
             except MeasurementError as error:
                 section["failed"][entry(name, workers)] = str(error)[-500:]
                 report(f"{workload.name}: {name} failed: {str(error)[-300:]}")
         section["rounds"].append(found)
         results.put_race(workload.name, section)
-
-
-def _measured(name: str, job: Job, *, workers: int) -> dict[str, float]:
-    """Return the record of one contestant's turn.
-
-    Raises:
-        MeasurementError: If it failed.
-    """
-    reading = CONTESTANTS[name].reading if name in CONTESTANTS else "forwards"
-    return asdict(measured(name, replace(job, reading=reading), workers=workers))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import av
 import numpy as np
@@ -82,41 +82,27 @@ def entry(name: str, workers: int) -> str:
     return f"{name}/{workers}"
 
 
+def _speed(run: dict[str, float], *, by: str = "seconds") -> float:
+    return run["samples"] / run[by]
+
+
 def rates(rounds: list[Round], entrant: str) -> Spread | None:
     """Return an entrant's samples a second."""
+    return Spread.of(_speed(found[entrant]) for found in rounds if entrant in found)
+
+
+def ratios(
+    rounds: list[Round], entrant: str, *, to: str, by: Literal["seconds", "cpu_s"] = "seconds"
+) -> Spread | None:
+    """Return the ratio of the speeds of two entrants, one per round.
+
+    Speeds by processor time are disturbed less by other processes.
+    """
     return Spread.of(
-        found[entrant]["samples"] / found[entrant]["seconds"]
-        for found in rounds
-        if entrant in found
-    )
-
-
-def ratios(rounds: list[Round], entrant: str, *, to: str) -> Spread | None:
-    """Return the ratio of the speeds of two entrants, one per round."""
-    return Spread.of(
-        found[entrant]["samples"] / found[entrant]["seconds"]
-        / (found[to]["samples"] / found[to]["seconds"])
-        for found in rounds
-        if entrant in found and to in found
-    )  # fmt: skip
-
-
-def cpu_ratios(rounds: list[Round], entrant: str, *, to: str) -> Spread | None:
-    """Return the ratio of processor times per sample, which other processes disturb less."""
-    return Spread.of(
-        (found[to]["cpu_s"] / found[to]["samples"])
-        / (found[entrant]["cpu_s"] / found[entrant]["samples"])
+        _speed(found[entrant], by=by) / _speed(found[to], by=by)
         for found in rounds
         if entrant in found and to in found
     )
-
-
-def spread_of(values: Iterable[float]) -> dict[str, float]:
-    """Return the median and the quartiles of some numbers, as the results file keeps them."""
-    spread = Spread.of(values)
-    return {} if spread is None else {
-        "median": spread.median, "low": spread.low, "high": spread.high
-    }  # fmt: skip
 
 
 _PACKAGES: Final = (

@@ -1,27 +1,24 @@
 """A web server on this machine that answers ranges and counts, as if it were far away.
 
-``python -m benchmarks.server FOLDER --delay-ms 60`` serves a folder until it is stopped.
-
-It waits before the first byte of each response, limits the bandwidth of each connection and of all
-together, cuts connections and answers 503. It does not imitate handshakes, TCP's slow start or lost
-packets. It runs in one process, and the kernel copies the bytes of files, so it takes little of a
+It waits before the first byte of each response, limits the bandwidth of each connection, cuts
+connections and answers 503. It does not imitate handshakes, TCP's slow start or lost packets. It
+runs in a process of its own, and the kernel copies the bytes of files, so it takes little of a
 processor that contestants need.
 """
 
-import argparse
 import asyncio
 import contextlib
 import json
-import os
 import random
 import re
-import signal
 import subprocess
 import sys
 import urllib.request
 from asyncio import sleep
+from bisect import bisect_left
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
+from itertools import islice, takewhile
 from pathlib import Path
 from time import monotonic
 from typing import Final, Literal
@@ -50,29 +47,22 @@ class Network:
     Attributes:
         delay_s: Seconds before the first byte of each response.
         connection_mb_s: Megabytes a second of each connection; 0 is unlimited.
-        total_mb_s: Megabytes a second of all connections together; 0 is unlimited.
         lost: The share of responses that are cut, some before their first byte.
         refused: The share of requests that are answered 503.
     """
 
     delay_s: float = 0.0
     connection_mb_s: float = 0.0
-    total_mb_s: float = 0.0
     lost: float = 0.0
     refused: float = 0.0
 
-    def words(self) -> list[str]:
-        """Return the options of the command."""
-        return [f"--{name.replace('_', '-')}={value}" for name, value in asdict(self).items()]
 
-
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Counts:
-    """What a server has counted: requests, bytes of bodies, connections, cut or refused ones."""
+    """What a server has counted: requests, bytes of bodies, responses cut or refused."""
 
-    requests: int
-    sent_bytes: int
-    connections: int = 0
+    requests: int = 0
+    sent_bytes: int = 0
     failures: int = 0
 
 
@@ -93,9 +83,8 @@ def serving(
     folder: Path, *, network: Network, kind: Literal["plain", "hub"] = "plain"
 ) -> Iterator[WebServer]:
     """Serve a folder on a free port of this machine through a network."""
-    command = [sys.executable, "-m", "benchmarks.server", str(folder)]
-    command += ["--hub"] if kind == "hub" else []
-    command += network.words()
+    command = [sys.executable, "-m", "benchmarks.server", str(folder.resolve()), kind]
+    command.append(json.dumps(asdict(network)))
     place = Path(__file__).parents[1]
     with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=place) as running:
         try:
@@ -108,118 +97,105 @@ def serving(
             running.terminate()
 
 
-class _Line:
-    """A line of limited bandwidth: who sends reserves the time that the bytes take."""
-
-    def __init__(self, mb_s: float) -> None:
-        self._bytes_s = mb_s * 1e6
-        self._free_s = 0.0
-
-    def reserve(self, count: int) -> float:
-        """Return for how many seconds to wait before so many bytes have gone through."""
-        if not self._bytes_s:
-            return 0.0
-        now_s = monotonic()
-        self._free_s = max(self._free_s, now_s) + count / self._bytes_s
-        return self._free_s - now_s
-
-    def piece(self, count: int) -> int:
-        """Return how many of some bytes to send at once."""
-        return min(count, max(16_384, int(self._bytes_s * _PIECE_S))) if self._bytes_s else count
-
-
-@dataclass(frozen=True, slots=True)
-class _Asked:
-    """A request's path, and its range: the first and the last byte, None where it has none."""
-
-    method: str
-    path: str
-    range: tuple[str, str] | None
-    condition: str
-    keeps: bool
-
-
 class _Server:
     """Answers requests for files of a folder, as if they came through a network."""
 
     def __init__(self, folder: Path, network: Network) -> None:
         self.url = ""
-        self._folder = folder.resolve()
+        self._folder = folder
         self._network = network
-        self._total = _Line(network.total_mb_s)
         self._chance = random.Random(7)
-        self._counts = {"requests": 0, "sent_bytes": 0, "connections": 0, "failures": 0}
+        self._counts = Counts()
 
     async def answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer the requests of a connection."""
-        line = _Line(self._network.connection_mb_s)
-        self._counts["connections"] += 1
         with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
-            keeps = True
-            while keeps and (asked := await _next_request(reader)) is not None:
-                if asked.path == _COUNTS:
-                    self._counts["connections"] -= 1
-                    text = json.dumps(self._counts).encode()
-                    writer.write(_head(200, "OK", len(text), "") + text)
+            while True:
+                # The method, the path, the headers.
+                first, *lines = (
+                    (await reader.readuntil(b"\r\n\r\n")).decode("latin-1").split("\r\n")
+                )
+                method, path, _ = first.split(" ")
+                parted = (line.partition(":") for line in lines)
+                headers = {name.lower(): value.strip() for name, _, value in parted}
+                if path == _COUNTS:
+                    text = json.dumps(asdict(self._counts)).encode()
+                    writer.write(_head("200 OK", len(text)) + text)
                     break
-                self._counts["requests"] += 1
+                self._counts.requests += 1
                 await sleep(self._network.delay_s)
-                keeps = asked.keeps
-                if not await self._send(asked, writer, line):
+                fault, found = self._chance.random(), self._found(path)
+                if fault < self._network.refused:
+                    self._counts.failures += 1
+                    writer.write(_head("503 Service Unavailable"))
+                elif isinstance(found, bytes):
+                    writer.write(found)
+                else:
+                    is_cut = fault < self._network.refused + self._network.lost
+                    await self._send(found, method, headers, writer, is_cut=is_cut)
+                if headers.get("connection", "").lower() == "close":
                     break
         writer.close()
 
-    async def _send(self, asked: _Asked, writer: asyncio.StreamWriter, line: _Line) -> bool:
-        """Send a response; return whether the connection is to be kept."""
-        fault = self._chance.random()
-        if fault < self._network.refused:
-            self._counts["failures"] += 1
-            writer.write(_head(503, "Service Unavailable", 0, ""))
-            return True
-        path = self._folder / unquote(urlsplit(asked.path).path).lstrip("/")
-        if not path.resolve().is_relative_to(self._folder) or not path.is_file():
-            writer.write(_head(404, "Not Found", 0, ""))
-            return True
-        status = path.stat()
-        tag = f'"{status.st_size:x}-{status.st_mtime_ns:x}"'
-        is_part = asked.range is not None and asked.condition in ("", tag)
-        start, stop = _bounds(asked.range, status.st_size) if is_part else (0, status.st_size)
-        if start >= stop and is_part:
-            whole = f"Content-Range: bytes */{status.st_size}\r\n"
-            writer.write(_head(416, "Range Not Satisfiable", 0, whole))
-            return True
-        more = f"ETag: {tag}\r\nAccept-Ranges: bytes\r\n"
-        if is_part:
-            more += f"Content-Range: bytes {start}-{stop - 1}/{status.st_size}\r\n"
-        names = (206, "Partial Content") if is_part else (200, "OK")
+    def _found(self, path: str) -> Path | bytes:
+        """Return the file of a request's path, or a response that is no file."""
+        file = self._folder / unquote(urlsplit(path).path).lstrip("/")
+        is_below = file.resolve().is_relative_to(self._folder)
+        return file if is_below and file.is_file() else _head("404 Not Found")
+
+    async def _send(
+        self,
+        path: Path,
+        method: str,
+        headers: dict[str, str],
+        writer: asyncio.StreamWriter,
+        *,
+        is_cut: bool,
+    ) -> None:
+        """Send a file or the range of it that is asked for; `ConnectionError` where it is cut."""
+        facts = path.stat()
+        tag = f'"{facts.st_size:x}-{facts.st_mtime_ns:x}"'
+        asked = re.fullmatch(r"bytes=(\d*)-(\d*)", headers.get("range", ""))
+        start, stop, status = 0, facts.st_size, "200 OK"
+        more = [f"ETag: {tag}", "Accept-Ranges: bytes"]
+        if asked and headers.get("if-range", tag) == tag:
+            start = int(asked[1]) if asked[1] else max(0, stop - int(asked[2]))
+            stop = min(stop, int(asked[2]) + 1) if asked[1] and asked[2] else stop
+            if start >= stop:
+                length = f"Content-Range: bytes */{facts.st_size}"
+                writer.write(_head("416 Range Not Satisfiable", 0, length))
+                return
+            status = "206 Partial Content"
+            more.append(f"Content-Range: bytes {start}-{stop - 1}/{facts.st_size}")
         cut = stop
-        if fault < self._network.refused + self._network.lost:
-            self._counts["failures"] += 1
-            if self._chance.random() < 0.5:
-                writer.transport.abort()
-                return False
-            cut = start + int(self._chance.random() * (stop - start))
-        writer.write(_head(*names, stop - start, more))
-        if asked.method == "GET":
-            await self._send_bytes(path, start, cut, writer, line)
-        if cut < stop:
+        if is_cut:
+            self._counts.failures += 1
+            cut = start + int(max(0.0, self._chance.uniform(-1, 1)) * (stop - start))
+        if cut > start or not is_cut:
+            writer.write(_head(status, stop - start, *more))
+            if method == "GET":
+                await self._send_bytes(path, start, cut, writer)
+        if is_cut:
             writer.transport.abort()
-            return False
-        return True
+            raise ConnectionError
 
     async def _send_bytes(
-        self, path: Path, start: int, stop: int, writer: asyncio.StreamWriter, line: _Line
+        self, path: Path, start: int, stop: int, writer: asyncio.StreamWriter
     ) -> None:
-        loop = asyncio.get_running_loop()
+        """Send a part of a file, in pieces where the bandwidth is limited."""
+        bytes_s, loop = self._network.connection_mb_s * 1e6, asyncio.get_running_loop()
+        free_s = monotonic()
         with path.open("rb") as file:
             while start < stop:
-                count = self._total.piece(line.piece(stop - start))
-                wait_s = max(line.reserve(count), self._total.reserve(count))
-                if wait_s > 0:
-                    await sleep(wait_s)
+                count = stop - start
+                if bytes_s:  # wait for as long as the bytes take
+                    count = min(count, max(16_384, int(bytes_s * _PIECE_S)))
+                    now_s = monotonic()
+                    free_s = max(free_s, now_s) + count / bytes_s
+                    await sleep(free_s - now_s)
                 await writer.drain()
                 await loop.sendfile(writer.transport, file, start, count)
-                self._counts["sent_bytes"] += count
+                self._counts.sent_bytes += count
                 start += count
 
 
@@ -232,127 +208,69 @@ class _Hub(_Server):
 
     def __init__(self, folder: Path, network: Network) -> None:
         super().__init__(folder, network)
-        self._entries: dict[str, list[tuple[str, int]]] = {"": []}
-        for place, folders, files in os.walk(self._folder):
-            below = Path(place).relative_to(self._folder).as_posix().removeprefix(".")
-            own = [(name, -1) for name in folders]
-            own += [(name, Path(place, name).stat().st_size) for name in files]
-            self._entries[below] = [(f"{below}/{name}".lstrip("/"), size) for name, size in own]
+        self._entries = sorted(
+            (path.relative_to(folder).as_posix(), -1 if path.is_dir() else path.stat().st_size)
+            for path in folder.rglob("*")
+        )
 
-    async def _send(self, asked: _Asked, writer: asyncio.StreamWriter, line: _Line) -> bool:
-        """Send a response; return whether the connection is to be kept."""
-        parts = urlsplit(asked.path)
-        path, commit = unquote(parts.path), f"X-Repo-Commit: {COMMIT}\r\n"
-        if path.startswith(f"/api/datasets/{REPOSITORY}/tree/"):
-            folder = path.split("/", 7)[7:]
-            text, more = self._page(folder[0] if folder else "", parse_qs(parts.query), parts.path)
-            writer.write(_head(200, "OK", len(text), more) + text)
-            return True
-        name = path.removeprefix(f"/datasets/{REPOSITORY}/resolve/").partition("/")[2]
-        if path.startswith("/files/"):
-            asked = replace(asked, path=parts.path.removeprefix("/files"))
-        elif not (self._folder / name).is_file():
-            missing = f"X-Error-Code: EntryNotFound\r\n{commit}"
-            writer.write(_head(404, "Not Found", 0, missing))
-            return True
-        elif name.endswith((".json", ".txt")):
-            text = (self._folder / name).read_bytes()
-            writer.write(_head(200, "OK", len(text), commit) + text)
-            return True
-        else:
-            place = f"Location: /files/{quote(name)}?signature=1\r\n{commit}"
-            writer.write(_head(302, "Found", 0, place))
-            return True
-        return await super()._send(asked, writer, line)
+    def _found(self, path: str) -> Path | bytes:
+        """Return the file of a signed path, or a response that is no file."""
+        parts = urlsplit(path)
+        place, commit = unquote(parts.path), f"X-Repo-Commit: {COMMIT}"
+        if place.startswith("/files/"):
+            return super()._found(path.removeprefix("/files"))
+        _, tree, folder = place.partition(f"/api/datasets/{REPOSITORY}/tree/")
+        if tree:
+            return self._page(folder.partition("/")[2], parse_qs(parts.query), parts.path)
+        name = place.removeprefix(f"/datasets/{REPOSITORY}/resolve/").partition("/")[2]
+        if not (self._folder / name).is_file():
+            return _head("404 Not Found", 0, "X-Error-Code: EntryNotFound", commit)
+        if not name.endswith((".json", ".txt")):
+            return _head("302 Found", 0, f"Location: /files/{quote(name)}?signature=1", commit)
+        text = (self._folder / name).read_bytes()
+        return _head("200 OK", len(text), commit) + text
 
-    def _page(self, folder: str, query: dict[str, list[str]], path: str) -> tuple[bytes, str]:
-        """Return a page of a folder's listing, and the header that says where the next one is."""
-        names = list(self._entries.get(folder, ()))
+    def _page(self, folder: str, query: dict[str, list[str]], path: str) -> bytes:
+        """Return a page of a folder's listing, whose headers say where the next one is."""
         is_recursive = query.get("recursive", [""])[0].lower() == "true"
-        for name, size in names if is_recursive else ():
-            names += self._entries.get(name, ()) if size < 0 else ()
+        above = f"{folder}/" if folder else ""
+        first = bisect_left(self._entries, (above, -1))
+        below = takewhile(
+            lambda entry: entry[0].startswith(above), islice(self._entries, first, None)
+        )
+        names = [each for each in below if is_recursive or "/" not in each[0].removeprefix(above)]
         start = int(query.get("cursor", ["0"])[0])
-        page = sorted(names)[start : start + _PAGE]
         entries = [
             {"type": "directory", "oid": COMMIT, "size": 0, "path": name}
             if size < 0
             else {"type": "file", "oid": f"{hash(name) % 16**15:015x}", "size": size, "path": name}
-            for name, size in page
+            for name, size in names[start : start + _PAGE]
         ]
-        more = "Content-Type: application/json\r\n"
+        more = ["Content-Type: application/json"]
         if start + _PAGE < len(names):
             following = f"{self.url}{path}?recursive={is_recursive}&cursor={start + _PAGE}"
-            more += f'Link: <{following}>; rel="next"\r\n'
-        return json.dumps(entries).encode(), more
+            more.append(f'Link: <{following}>; rel="next"')
+        text = json.dumps(entries).encode()
+        return _head("200 OK", len(text), *more) + text
 
 
-async def _next_request(reader: asyncio.StreamReader) -> _Asked | None:
-    """Return the next request of a connection, None at its end."""
-    try:
-        text = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
-    except (asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-        return None
-    first, *lines = text.split("\r\n")
-    method, _, rest = first.partition(" ")
-    headers = {
-        name.strip().lower(): value.strip() for name, _, value in (x.partition(":") for x in lines)
-    }
-    found = re.fullmatch(r"bytes=(\d*)-(\d*)", headers.get("range", ""))
-    return _Asked(
-        method, rest.partition(" ")[0], (found[1], found[2]) if found else None,
-        headers.get("if-range", ""), headers.get("connection", "").lower() != "close",
-    )  # fmt: skip
+def _head(status: str, length: int = 0, *more: str) -> bytes:
+    lines = [f"HTTP/1.1 {status}", f"Content-Length: {length}", *more, "", ""]
+    return "\r\n".join(lines).encode()
 
 
-def _bounds(asked: tuple[str, str] | None, size: int) -> tuple[int, int]:
-    """Return the first byte of a range and the one behind its last."""
-    first, last = asked or ("", "")
-    if not first:
-        return (max(0, size - int(last)), size) if last else (0, size)
-    return int(first), min(size, int(last) + 1 if last else size)
-
-
-def _head(status: int, reason: str, length: int, more: str) -> bytes:
-    return f"HTTP/1.1 {status} {reason}\r\nContent-Length: {length}\r\n{more}\r\n".encode()
-
-
-async def _serve(options: argparse.Namespace, network: Network) -> None:
-    server = (_Hub if options.hub else _Server)(options.folder, network)
+async def _serve(folder: str, kind: str, network: str) -> None:
+    """Serve until the process is ended; the first line on stdout is the URL."""
+    server = (_Hub if kind == "hub" else _Server)(Path(folder), Network(**json.loads(network)))
     listening = await asyncio.start_server(
-        server.answer, "127.0.0.1", options.port, limit=_LARGEST_HEAD, backlog=512
+        server.answer, "127.0.0.1", limit=_LARGEST_HEAD, backlog=512
     )
     host, port = listening.sockets[0].getsockname()[:2]
     server.url = f"http://{host}:{port}"
     print(server.url, flush=True)  # noqa: T201 - whoever started it reads this
-    stopped = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
-    await stopped.wait()
-    os._exit(0)  # clients may hold connections as long as they like
-
-
-def main() -> None:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.server", description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
-    parser.add_argument("folder", type=Path, help="what to serve")
-    parser.add_argument("--hub", action="store_true", help=f"answer as the Hub, for {REPOSITORY}")
-    parser.add_argument("--port", type=int, default=0, help="0 is a free one [0]")
-    parser.add_argument("--delay-s", type=float, default=0.0, help=argparse.SUPPRESS)
-    parser.add_argument("--delay-ms", type=float, default=0.0, help="before each first byte")
-    parser.add_argument("--connection-mb-s", type=float, default=0.0, help="0 is unlimited [0]")
-    parser.add_argument("--total-mb-s", type=float, default=0.0, help="0 is unlimited [0]")
-    parser.add_argument("--lost", type=float, default=0.0, help="share of responses cut [0]")
-    parser.add_argument("--refused", type=float, default=0.0, help="share answered 503 [0]")
-    options = parser.parse_args()
-    network = Network(
-        options.delay_s + options.delay_ms / 1e3, options.connection_mb_s,
-        options.total_mb_s, options.lost, options.refused,
-    )  # fmt: skip
-    asyncio.run(_serve(options, network))
+    await listening.serve_forever()
 
 
 if __name__ == "__main__":
-    main()
+    with contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(_serve(*sys.argv[1:]))

@@ -3,8 +3,8 @@
 from collections.abc import Iterable
 from typing import Any
 
-from benchmarks.field import CONTESTANTS, LIMIT, NAIVE, OURS, title
-from benchmarks.results import Spread, cpu_ratios, entry, rates, ratios
+from benchmarks.field import CONTESTANTS, LIMIT, NAIVE, OURS
+from benchmarks.results import Spread, entry, rates, ratios
 from benchmarks.training import MARK_OWN
 from benchmarks.workloads import WORKLOADS, Workload
 from stereogenbench_data.schema.text import counted
@@ -138,38 +138,36 @@ def headlines(races: dict[str, Any]) -> str:
 def race_table(workload: Workload, race: dict[str, Any]) -> str:
     """Return the table of one race: a row for each contestant and number of workers."""
     rounds = race["rounds"]
-    names = {name for found in rounds for name in found}
+    there = {name for found in rounds for name in found}
+
+    def beside(entrant: str, other: str, form: str = ".2f", **how: Any) -> str:
+        ratio = ratios(rounds, entrant, to=other, **how)
+        return "" if entrant == other else spread_text(ratio, form)
+
     rows = []
     for workers in sorted(workload.workers):
-        base, naive = entry(LIMIT, workers), entry(NAIVE, workers)
-        first = (LIMIT, OURS)
-        for name in (*first, *(n for n in _order(names) if n not in first)):
-            entrant = entry(name, workers)
-            if entrant not in names:
-                continue
-            rows.append(
-                [
-                    title(name), str(workers), rate_text(rates(rounds, entrant)),
-                    spread_text(ratios(rounds, entrant, to=base)) if entrant != base else "",
-                    spread_text(cpu_ratios(rounds, entrant, to=base)) if entrant != base else "",
-                    spread_text(ratios(rounds, entrant, to=naive), ".1f") if name != NAIVE else "",
-                ]
-            )  # fmt: skip
-    head = [
+        limit, naive = entry(LIMIT, workers), entry(NAIVE, workers)
+        for name in dict.fromkeys((LIMIT, OURS, *CONTESTANTS)):
+            own = entry(name, workers)
+            if own in there:
+                rows.append(
+                    [
+                        CONTESTANTS[name].title, str(workers), rate_text(rates(rounds, own)),
+                        beside(own, limit), beside(own, limit, by="cpu_s"),
+                        beside(own, naive, ".1f"),
+                    ]
+                )  # fmt: skip
+    head = (
         "", "workers", "samples/s", "to the limit", "to the limit, by processor time", "to naive",
-    ]  # fmt: skip
+    )  # fmt: skip
     slices = f"{race['settings']['samples']} samples of {counted(workload.scenes, 'scene')}"
-    failed = [f"- {title(name.split('/')[0])}: {why}" for name, why in race["failed"].items()]
     text = f"## {workload.title}\n\n{counted(len(rounds), 'round')}, {slices}.\n\n"
     text += table(head, rows)
-    return text + (
-        "\nDid not race, or failed in a round:\n" + "\n".join(failed) + "\n" if failed else ""
-    )
-
-
-def _order(names: set[str]) -> list[str]:
-    found = {name.split("/")[0] for name in names}
-    return [name for name in CONTESTANTS if name in found]
+    if race["failed"]:
+        text += "\nDid not race, or failed in a round:\n"
+    for name, why in race["failed"].items():
+        text += f"- {CONTESTANTS[name.partition('/')[0]].title}: {why}\n"
+    return text
 
 
 def table(head: Iterable[str], rows: list[list[str]]) -> str:

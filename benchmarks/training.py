@@ -14,10 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import av
 import numpy as np
 import torch
-from av.video.reformatter import Interpolation, VideoReformatter
 
 from benchmarks.clock import in_a_fork
 from benchmarks.contestants import limit, ours
@@ -68,38 +66,17 @@ MARK_OWN: Final = 0.85
 """The mark for training shards against a bare loop over themselves."""
 
 
-class _Pictures:
+class _Pictures(limit.Stream):
     """The pictures of a video in a shard: on from the last, or from the key frame before."""
 
-    def __init__(self, file: Any) -> None:
-        self._container = av.open(file)
-        self._video = self._container.streams.video[0]
-        self._video.codec_context.thread_count = 1
-        self._decoded = self._container.decode(self._video)
-        self._scaler = VideoReformatter()
-        self._ticks = float(1 / (self._video.time_base * self._video.average_rate))
-        self._at = -1
-        self._kept: list[np.ndarray] = []
-
-    def colours(self, index: int) -> list[np.ndarray]:
-        """Return the red, green and blue planes of a frame."""
-        if index != self._at:
-            if index != self._at + 1:
-                self._container.seek(round(index * self._ticks), stream=self._video)
-                self._decoded = self._container.decode(self._video)
-            for frame in self._decoded:
-                if frame.pts >= round(index * self._ticks):
-                    break
-            picture = self._scaler.reformat(
-                frame, format="gbrp", threads=1, interpolation=Interpolation.BICUBIC
-            )
-            self._at = index
-            self._kept = [limit._plane(picture, number, "u1") for number in (2, 0, 1)]
-        return self._kept
-
-    def close(self) -> None:
-        """Close the video."""
-        self._container.close()
+    def _frame(self, index: int) -> Any:
+        video = self.container.streams.video[0]
+        ticks = round(index / (video.time_base * video.average_rate))
+        if index != self._at + 1:
+            self.container.seek(ticks, stream=video)
+            self._decoded = self.container.decode(video)
+        self._at = index
+        return next(frame for frame in self._decoded if frame.pts >= ticks)
 
 
 class _Depth(DepthFrames):
@@ -119,28 +96,27 @@ class _Depth(DepthFrames):
         return next(float(value) for key, value in tags.items() if "scale" in key.lower())
 
 
-class _Shards:
-    """Opens the videos of training shards for a bare loop."""
+def opener(folder: Path) -> Callable[..., limit.Opened]:
+    """Return what opens the videos of training shards for a bare loop."""
+    index = SceneIndex.open(folder)
+    source = MemberSource(index.root, shards=index.shards, revision=index.digest)
+    scenes = {scene.id.key: scene for scene in map(index.scene, range(len(index)))}
 
-    def __init__(self, folder: Path) -> None:
-        index = SceneIndex.open(folder)
-        self._source = MemberSource(index.root, shards=index.shards, revision=index.digest)
-        self._scenes = {index.scene(row).id.key: index.scene(row) for row in range(len(index))}
-
-    def __call__(self, job: Job, key: str, names: Sequence[str]) -> limit.Opened:
-        source, scene = self._source, self._scenes[key]
+    def opened(job: Job, key: str, names: Sequence[str]) -> limit.Opened:
+        scene = scenes[key]
+        size = scene.rig.image_height_px, scene.rig.image_width_px
         streams = {
             name: _Depth(source.open(scene, name), name=name, frames="any")
             if name.endswith(".mkv")
-            else _Pictures(source.open(scene, name))
+            else _Pictures(source.open(scene, name), size)
             for name in names
         }
         return json.loads(source.read(scene, BASELINE_JSON)), streams
 
+    return opened
 
-def measure_training(
-    material: Material, *, rounds: int, workers: int, report: Report
-) -> dict[str, Any]:
+
+def measure_training(material: Material, *, rounds: int, report: Report) -> dict[str, Any]:
     """Return the section of the results: the machine, and seconds a sample by workload.
 
     Each contestant runs in a process of its own, in turn, and the fastest of its runs counts.
@@ -149,14 +125,14 @@ def measure_training(
     shards = material.root / "training"
     if not (shards / "index.parquet").exists():
         report(f"packing {shards}")
-        pack(material.eight, shards, training=TrainingSettings(size), workers=workers)
+        pack(material.eight, shards, training=TrainingSettings(size))
     rows: dict[str, Any] = {}
     for workload, mark in WORKLOADS:
         job = Job(replace(workload, size=size), material)
         list(job.of_scene)  # computed before the clock starts
         ways: dict[str, Callable[[], Iterable[Any]]] = {
             "released": partial(limit.samples, job, job.of_scene),
-            "training": partial(limit.samples, job, job.of_scene, opened=_Shards(shards)),
+            "training": partial(limit.samples, job, job.of_scene, opened=opener(shards)),
             "ours, released": partial(ours.mapped, job, job.tree),
             "ours, training": partial(ours.mapped, job, shards),
             "ours, in order": partial(ours.mapped, job, shards, shuffle=False),

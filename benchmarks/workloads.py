@@ -6,6 +6,7 @@ every sample, later frames cost more, so their slice is drawn from *all* samples
 spread evenly over the video. Both are samples of the same workload.
 """
 
+import itertools
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -217,7 +218,8 @@ class Job:
         # Imported here: the module of the rig needs `Wanted`.
         from benchmarks.contestants.rig import camera_files
 
-        return ["baseline.json", *camera_files(self.wanted, both_ways=self.workload.both_ways)]
+        wanted = itertools.chain(*self.of_scene.values())
+        return ["baseline.json", *camera_files(wanted, both_ways=self.workload.both_ways)]
 
     @cached_property
     def of_scene(self) -> dict[str, list[Wanted]]:

@@ -6,7 +6,6 @@ not even allocate memory. With N processes, N of these loops run over different 
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, Final
 
 import av
@@ -23,9 +22,9 @@ _RED_GREEN_BLUE: Final = (2, 0, 1)
 class Stream:
     """The frames of one video, forwards; keeps the last converted frame."""
 
-    def __init__(self, path: Path, size: tuple[int, int]) -> None:
+    def __init__(self, file: Any, size: tuple[int, int]) -> None:
         """Open a video, to be scaled to (height, width); one thread decodes."""
-        self.container = av.open(str(path))
+        self.container = av.open(file)
         video = self.container.streams.video[0]
         video.codec_context.thread_count = 1
         self._decoded = self.container.decode(video)

@@ -17,7 +17,8 @@ from typing import Any
 
 from torch.utils.data import IterableDataset
 
-from benchmarks.contestants.scenewise import DecodedJob, decoded
+from benchmarks.contestants.scenewise import decoded
+from benchmarks.workloads import Job
 
 
 def streaming_module() -> Any:
@@ -77,7 +78,7 @@ def repeat_shards(distinct: Path, out: Path, *, count: int) -> None:
 class MosaicScenes(IterableDataset[dict[str, Any]]):
     """The samples of scenes that Streaming streams."""
 
-    def __init__(self, job: DecodedJob, *, server: str, remote: str, local: Path) -> None:
+    def __init__(self, job: Job, *, server: str, remote: str, local: Path) -> None:
         """Open a stream.
 
         Args:

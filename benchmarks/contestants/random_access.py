@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
-from benchmarks.contestants.rig import PairNumbers, disparity_px, pair_numbers, sample_of, unit_m_of
+from benchmarks.contestants.rig import sample_of, unit_m_of
 from benchmarks.workloads import Job
 
 
@@ -76,19 +76,12 @@ class DepthVideo:
         return [self._frame(index).to_ndarray() for index in frames]
 
     def _frame(self, index: int) -> Any:
+        rate, base = self._stream.average_rate, self._stream.time_base
         if not self._next <= index < self._next + 12:
-            rate, base = self._stream.average_rate, self._stream.time_base
             self._container.seek(round(index / rate / base), stream=self._stream)
             self._frames = self._container.decode(self._stream)
-            frame = next(self._frames)
-            self._next = round(frame.pts * base * rate) + 1
-            if self._next == index + 1:
-                return frame
-        while True:
-            frame = next(self._frames)
-            self._next += 1
-            if self._next == index + 1:
-                return frame
+        self._next = index + 1
+        return next(frame for frame in self._frames if round(frame.pts * base * rate) == index)
 
 
 class KeptOpenPairs(Dataset[dict[str, Any]]):
@@ -99,7 +92,7 @@ class KeptOpenPairs(Dataset[dict[str, Any]]):
         self._job = job
         self._video = video
         self._open: OrderedDict[Path, Any] = OrderedDict()
-        self._pairs: dict[tuple[str, int, int], PairNumbers] = {}
+        self._documents: dict[str, Any] = {}
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -107,21 +100,20 @@ class KeptOpenPairs(Dataset[dict[str, Any]]):
 
     def __getitem__(self, number: int) -> dict[str, Any]:
         """Return a sample."""
-        workload, wanted = self._job.workload, self._job.wanted[number]
+        wanted = self._job.wanted[number]
         scene = self._job.tree / wanted.scene
-        pair = self._pair(scene, wanted.scene, wanted.left, wanted.right)
-        pictures = {}
-        for name, camera in (("left", wanted.left), ("right", wanted.right)):
-            video = self._kept(scene / f"cam_{camera:02d}_rgb.mp4")
-            pictures[name] = video.pictures(wanted.frames)
-        for name, camera in (("disparity", wanted.left), ("disparity_right", wanted.right)):
-            if name in workload.fields:
-                video = self._kept(scene / f"cam_{camera:02d}_depth.mkv")
-                pictures[name] = [
-                    disparity_px(units, pair, unit_m=video.unit_m, size=workload.size)
-                    for units in video.units(wanted.frames)
-                ]
-        return sample_of(wanted, pair, pictures, clip=workload.is_clip)
+        if wanted.scene not in self._documents:
+            self._documents[wanted.scene] = json.loads((scene / "baseline.json").read_text())
+
+        def colours(camera: int) -> Any:
+            return self._kept(scene / f"cam_{camera:02d}_rgb.mp4").pictures(wanted.frames)
+
+        def depth(camera: int) -> tuple[list[np.ndarray], float]:
+            video = self._kept(scene / f"cam_{camera:02d}_depth.mkv")
+            return video.units(wanted.frames), video.unit_m
+
+        document = self._documents[wanted.scene]
+        return sample_of(self._job.workload, wanted, document, colours=colours, depth=depth)
 
     def _kept(self, path: Path) -> Any:
         if path not in self._open:
@@ -132,11 +124,3 @@ class KeptOpenPairs(Dataset[dict[str, Any]]):
             self._open[path] = DepthVideo(path) if is_depth else self._video(path, size)
         self._open.move_to_end(path)
         return self._open[path]
-
-    def _pair(self, scene: Path, key: str, left: int, right: int) -> PairNumbers:
-        if (key, left, right) not in self._pairs:
-            document = json.loads((scene / "baseline.json").read_text())
-            width_px = (self._job.workload.size or (0, document["image_width"]))[1]
-            numbers = pair_numbers(document, left=left, right=right, width_px=width_px)
-            self._pairs[key, left, right] = numbers
-        return self._pairs[key, left, right]

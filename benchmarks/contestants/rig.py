@@ -1,13 +1,13 @@
 """What a careful user of any library adds to its decoder: the numbers of a pair, and disparity."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.workloads import Wanted
+from benchmarks.workloads import Wanted, Workload
 
 NO_DEPTH: Final = (0, 65535)
 """Stored numbers that mean "not measured"."""
@@ -68,22 +68,43 @@ def disparity_px(
     return np.where(measured, scale / np.maximum(units, 1).astype(np.float32), np.float32(0))[None]
 
 
+def rgb_of(frame: Any, size: tuple[int, int] | None) -> np.ndarray:
+    """Return a decoded picture as uint8 (3, h, w), at its own size or scaled to (height, width)."""
+    scaled = {} if size is None else {"height": size[0], "width": size[1], "interpolation": "AREA"}
+    found: np.ndarray = frame.to_ndarray(format="rgb24", **scaled).transpose(2, 0, 1)
+    return found
+
+
 def sample_of(
-    wanted: Wanted, pair: PairNumbers, pictures: dict[str, list[np.ndarray]], *, clip: bool
+    workload: Workload,
+    wanted: Wanted,
+    document: dict[str, Any],
+    *,
+    colours: Callable[[int], list[np.ndarray]],
+    depth: Callable[[int], tuple[list[np.ndarray], float]],
 ) -> dict[str, Any]:
     """Return a sample as a dict that torch's own collate takes.
 
     Args:
+        workload: What samples hold.
         wanted: Which sample.
-        pair: Its numbers.
-        pictures: left, right, disparity (and disparity_right), one array a frame.
-        clip: Whether a sample has a time axis.
+        document: The scene's ``baseline.json``.
+        colours: Returns the pictures of a camera, one a frame.
+        depth: Returns the stored depth of a camera, one map a frame, and metres in its unit.
     """
-    arrays = {name: np.stack(found) if clip else found[0] for name, found in pictures.items()}
-    frames = np.array(wanted.frames, dtype=np.int64)
-    return arrays | {
+    width_px = (workload.size or (0, document["image_width"]))[1]
+    pair = pair_numbers(document, left=wanted.left, right=wanted.right, width_px=width_px)
+    pictures = {"left": colours(wanted.left), "right": colours(wanted.right)}
+    for name, camera in (("disparity", wanted.left), ("disparity_right", wanted.right)):
+        if name in workload.fields:
+            stored, unit_m = depth(camera)
+            pictures[name] = [
+                disparity_px(units, pair, unit_m=unit_m, size=workload.size) for units in stored
+            ]
+    frames, cut = np.array(wanted.frames), slice(None) if workload.is_clip else 0
+    return {name: np.stack(found)[cut] for name, found in pictures.items()} | {
         "baseline_m": np.float64(pair.baseline_m),
-        "frame_index": frames if clip else frames[0],
-        "pair": np.array([wanted.left, wanted.right], dtype=np.int64),
+        "frame_index": frames[cut],
+        "pair": np.array([wanted.left, wanted.right]),
         "scene": wanted.scene,
     }

@@ -8,20 +8,15 @@ shuffling them over scenes would need a buffer of many scenes' samples.
 import io
 import json
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from functools import partial
+from typing import Any
 
 import av
 import numpy as np
 from torch.utils.data import IterableDataset
 
-from benchmarks.contestants.rig import (
-    camera_files,
-    disparity_px,
-    pair_numbers,
-    sample_of,
-    unit_m_of,
-)
-from benchmarks.workloads import Job, Wanted, Workload
+from benchmarks.contestants.rig import camera_files, rgb_of, sample_of, unit_m_of
+from benchmarks.workloads import Job, Wanted
 from stereogenbench_data.index.table import SceneIndex
 
 
@@ -39,23 +34,7 @@ def shards_of(job: Job) -> list[str]:
     return [f"{job.material.shards}/{name}" for name in names]
 
 
-class DecodedJob(Protocol):
-    """What the decode step needs of a job."""
-
-    @property
-    def workload(self) -> Workload:
-        """The workload."""
-
-    @property
-    def of_scene(self) -> dict[str, list[Wanted]]:
-        """The samples of each scene, by its key in the shards."""
-
-    @property
-    def files(self) -> list[str]:
-        """The names of the files that the samples need."""
-
-
-def decoded(job: DecodedJob, key: str, files: dict[str, bytes]) -> Iterator[dict[str, Any]]:
+def decoded(job: Job, key: str, files: dict[str, bytes]) -> Iterator[dict[str, Any]]:
     """Yield a scene's samples: the decode step."""
     workload = job.workload
     wanted = job.of_scene.get(key)
@@ -78,7 +57,10 @@ def decoded(job: DecodedJob, key: str, files: dict[str, bytes]) -> Iterator[dict
         for frames in [frames for frames in moments if frames[-1] == index]:
             arrays = {number: _arrays(recent[number], workload.size) for number in frames}
             for sample in moments[frames]:
-                yield _sample(job, sample, arrays, document, containers)
+                yield sample_of(
+                    workload, sample, document,
+                    colours=partial(_shown, arrays), depth=partial(_stored, arrays, containers),
+                )  # fmt: skip
         earliest = min((frames[0] for frames in moments if frames[-1] > index), default=index)
         for number in [number for number in recent if number < earliest]:
             del recent[number]
@@ -88,44 +70,27 @@ def decoded(job: DecodedJob, key: str, files: dict[str, bytes]) -> Iterator[dict
 
 def _arrays(frames: dict[str, Any], size: tuple[int, int] | None) -> dict[str, np.ndarray]:
     """Return pictures (3, h, w) and stored depth (h, w) of one frame."""
-    scaled = {} if size is None else {"height": size[0], "width": size[1], "interpolation": "AREA"}
     return {
-        name: frame.to_ndarray()
-        if name.endswith(".mkv")
-        else frame.to_ndarray(format="rgb24", **scaled).transpose(2, 0, 1)
+        name: frame.to_ndarray() if name.endswith(".mkv") else rgb_of(frame, size)
         for name, frame in frames.items()
     }
 
 
-def _sample(
-    job: DecodedJob,
-    wanted: Wanted,
-    arrays: dict[int, dict[str, np.ndarray]],
-    document: dict[str, Any],
-    containers: dict[str, Any],
-) -> dict[str, Any]:
-    workload = job.workload
-    width_px = (workload.size or (0, document["image_width"]))[1]
-    pair = pair_numbers(document, left=wanted.left, right=wanted.right, width_px=width_px)
-    pictures: dict[str, list[np.ndarray]] = {}
-    for index in wanted.frames:
-        for name, camera in (("left", wanted.left), ("right", wanted.right)):
-            pictures.setdefault(name, []).append(arrays[index][f"cam_{camera:02d}_rgb.mp4"])
-        for name, camera in (("disparity", wanted.left), ("disparity_right", wanted.right)):
-            if name in workload.fields:
-                depth = f"cam_{camera:02d}_depth.mkv"
-                found = disparity_px(
-                    arrays[index][depth], pair, unit_m=unit_m_of(containers[depth]),
-                    size=workload.size,
-                )  # fmt: skip
-                pictures.setdefault(name, []).append(found)
-    return sample_of(wanted, pair, pictures, clip=workload.is_clip)
+def _shown(arrays: dict[int, dict[str, np.ndarray]], camera: int) -> list[np.ndarray]:
+    return [each[f"cam_{camera:02d}_rgb.mp4"] for each in arrays.values()]
+
+
+def _stored(
+    arrays: dict[int, dict[str, np.ndarray]], containers: dict[str, Any], camera: int
+) -> tuple[list[np.ndarray], float]:
+    name = f"cam_{camera:02d}_depth.mkv"
+    return [each[name] for each in arrays.values()], unit_m_of(containers[name])
 
 
 class DecodedScenes(IterableDataset[dict[str, Any]]):
     """A stream of scenes' files, decoded."""
 
-    def __init__(self, job: DecodedJob, scenes: Callable[[], Any]) -> None:
+    def __init__(self, job: Job, scenes: Callable[[], Any]) -> None:
         """Take a function that makes an iterable of scenes; torch's workers share its shards."""
         self._job = job
         self._scenes = scenes()
@@ -141,7 +106,7 @@ def webdataset_samples(job: Job) -> IterableDataset[dict[str, Any]]:
     return webdataset_stream(job, shards_of(job))
 
 
-def webdataset_stream(job: DecodedJob, shards: list[str]) -> IterableDataset[dict[str, Any]]:
+def webdataset_stream(job: Job, shards: list[str]) -> IterableDataset[dict[str, Any]]:
     """Return the samples of some shards through plain webdataset."""
     import webdataset
 
@@ -163,7 +128,7 @@ def hugging_face_samples(job: Job) -> IterableDataset[dict[str, Any]]:
     return hugging_face_stream(job, shards_of(job))
 
 
-def hugging_face_stream(job: DecodedJob, shards: list[str]) -> IterableDataset[dict[str, Any]]:
+def hugging_face_stream(job: Job, shards: list[str]) -> IterableDataset[dict[str, Any]]:
     """Return the samples of some shards through Hugging Face datasets, streaming."""
     from datasets import Features, Value, load_dataset
 

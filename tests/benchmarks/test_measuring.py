@@ -78,7 +78,7 @@ def test_training_shards_are_compared_with_bare_loops_over_the_same_samples(mate
         if workload.name in drawn
     ]
     monkeypatch.setattr(training, "WORKLOADS", chosen)
-    found = training.measure_training(material, rounds=1, workers=1, report=str)
+    found = training.measure_training(material, rounds=1, report=str)
 
     assert found["rows"].keys() == {"random frames", "random clip"}
     assert all(cost_s > 0 for row in found["rows"].values() for cost_s in row["cpu_s"].values())
@@ -87,7 +87,7 @@ def test_training_shards_are_compared_with_bare_loops_over_the_same_samples(mate
     shards = material.root / "training"
     job = Job(replace(chosen[0][0], size=(32, 32)), material)
     pairs = StereoPairs(shards, **job.selection)
-    loop = limit.samples(job, job.of_scene, opened=training._Shards(shards))
+    loop = limit.samples(job, job.of_scene, opened=training.opener(shards))
     for number, bare in enumerate(loop):
         own = pairs[number]
         np.testing.assert_array_equal(bare["left"], own["left"])

@@ -54,9 +54,8 @@ def test_the_delayed_server_waits_before_each_response(folder, waits_s):
     assert waits_s == [0.05, 0.05]
 
 
-@pytest.mark.parametrize("line", ["connection_mb_s", "total_mb_s"])
-def test_the_delayed_server_limits_the_bandwidth(folder, waits_s, line):
-    assert bodies_of_two_responses(folder, Network(**{line: 4.0})) == 2
+def test_the_delayed_server_limits_the_bandwidth(folder, waits_s):
+    assert bodies_of_two_responses(folder, Network(connection_mb_s=4.0)) == 2
     assert sum(waits_s) == pytest.approx(2 * len(DATA) / 4e6)
 
 
@@ -65,8 +64,8 @@ def results(material, tmp_path_factory):
     """Return the results of one round of a race over two networks."""
     found = Results(tmp_path_factory.mktemp("out") / "results.json")
     plan = Plan(
-        rounds=1, workers=1, delays_ms=(1.0,), bandwidths_mb_s=(20.0,),
-        faults=(Network(0.001, refused=0.05),), scenes=10, workloads=("first",),
+        rounds=1, workers=1, scenes=10, workloads=("first",),
+        networks=(Network(0.001, connection_mb_s=20.0), Network(0.001, refused=0.05)),
     )  # fmt: skip
     assert run_network(material, found, plan=plan, report=str) == []
     return found
