@@ -63,12 +63,8 @@ def measure_accuracy(
 ) -> dict[str, Any]:
     """Return the section of the results: error and speed of every way."""
     report("speed against error")
-    pair, path = rendered_pair(material)
-    left = _first_depth(path)
-    ways = [
-        {"name": way.name, "offered": way.offered, "kind": "disparity"} | _errors(way.run, cases)
-        for way in WAYS
-    ]
+    pair, left = rendered_pair(material)
+    ways = [{"name": way.name, "offered": way.offered} | _errors(way.run, cases) for way in WAYS]
     calls: dict[str, Callable[[], Any]] = {
         way.name: (lambda run=way.run: run(left, pair)) for way in WAYS
     }
@@ -129,8 +125,8 @@ def justified(ways: list[dict[str, Any]]) -> str:
     return str(min(fit, key=lambda way: way["ns_a_pixel"]["median"])["name"])
 
 
-def rendered_pair(material: Material) -> tuple[Pair, Path]:
-    """Return the primary pair of a drawn scene, and the file of its left stored depth."""
+def rendered_pair(material: Material) -> tuple[Pair, np.ndarray]:
+    """Return the primary pair of a drawn scene, and its first left stored depth."""
     index = SceneIndex.open(material.eight)
     scene = index.scene(0)
     cameras = scene.rig.primary_pair
@@ -139,7 +135,9 @@ def rendered_pair(material: Material) -> tuple[Pair, Path]:
         baseline_m=scene.rig.baseline_cm(*cameras) / 100,
         unit_m=scene.depth_unit_m[cameras[0]],
     )
-    return pair, Path(index.root) / scene.members[f"cam_{cameras[0]:02d}_depth.mkv"].path
+    path = Path(index.root) / scene.members[f"cam_{cameras[0]:02d}_depth.mkv"].path
+    with av.open(str(path)) as container:
+        return pair, np.ascontiguousarray(next(container.decode(video=0)).to_ndarray())
 
 
 def two_planes(
@@ -155,7 +153,7 @@ def two_planes(
     return np.where((u - 0.45) ** 2 + (v - 0.5) ** 2 < 0.09, disc, wall), disc, wall
 
 
-def _resized(size: int) -> tuple[list[dict[str, Any]], dict[str, Callable[[], Any]]]:
+def _resized(size: int) -> tuple[list[dict[str, Any]], dict[str, Callable[[], np.ndarray]]]:
     """Return the error of every resizing policy on two planes at 832x480, and its call."""
     centres = np.arange(size) + 0.5
     here_px, _, _ = two_planes(centres[None, :], centres[:, None], size=size)
@@ -167,30 +165,23 @@ def _resized(size: int) -> tuple[list[dict[str, Any]], dict[str, Callable[[], An
     v_px = (np.arange(height) + 0.5)[:, None] * size / height
     truth, disc, wall = (surface * across for surface in two_planes(u_px, v_px, size=size))
     out = (height, width)
-    policies: dict[str, tuple[str, Callable[[], np.ndarray]]] = {
-        "nearest-exact, depth": ("default", lambda: 1000 / resized_nearest(depth, size=out)),
-        "nearest (corner), depth": (
-            "not taken", lambda: 1000 / interpolated(depth, size=out, mode="nearest"),
-        ),
-        "bilinear, depth": (
-            "not taken", lambda: 1000 / interpolated(depth, size=out, mode="bilinear"),
-        ),
-        "area, depth": ("not taken", lambda: 1000 / interpolated(depth, size=out, mode="area")),
-        "bilinear, disparity": (
-            "not taken", lambda: interpolated(disparity, size=out, mode="bilinear"),
-        ),
-        "area, disparity": ("not taken", lambda: interpolated(disparity, size=out, mode="area")),
-    }  # fmt: skip
+    policies: dict[str, Callable[[], np.ndarray]] = {
+        "nearest-exact, depth": lambda: 1000 / resized_nearest(depth, size=out),
+        "nearest (corner), depth": lambda: 1000 / interpolated(depth, size=out, mode="nearest"),
+        "bilinear, depth": lambda: 1000 / interpolated(depth, size=out, mode="bilinear"),
+        "area, depth": lambda: 1000 / interpolated(depth, size=out, mode="area"),
+        "bilinear, disparity": lambda: interpolated(disparity, size=out, mode="bilinear"),
+        "area, disparity": lambda: interpolated(disparity, size=out, mode="area"),
+    }
     found = []
-    for name, (offered, run) in policies.items():
+    for name, run in policies.items():
         found_px = run() * across
         error_px = np.abs(found_px - truth)
         nowhere_px = np.minimum(np.abs(found_px - disc), np.abs(found_px - wall))
         found.append(
             {
                 "name": name,
-                "kind": "resized",
-                "offered": offered,
+                "offered": "not taken" if found else "default",
                 "worst_px": float(error_px.max()),
                 "p999_px": float(np.quantile(error_px, 0.999)),
                 "p99_px": float(np.quantile(error_px, 0.99)),
@@ -198,7 +189,7 @@ def _resized(size: int) -> tuple[list[dict[str, Any]], dict[str, Callable[[], An
                 "invented_share": float((nowhere_px > INVENTED_PX).mean()),
             }
         )
-    return found, {name: run for name, (_, run) in policies.items()}
+    return found, policies
 
 
 def time_calls(
@@ -228,9 +219,3 @@ def _spread(values: list[float], *, beside: list[float]) -> dict[str, float]:
     low, median, high = np.quantile(values, [0.25, 0.5, 0.75]).tolist()
     conversions = float(np.median(np.divide(values, beside)))
     return {"median": median, "low": low, "high": high, "conversions": conversions}
-
-
-def _first_depth(path: Path) -> np.ndarray:
-    """Return the stored depth of a video's first frame."""
-    with av.open(str(path)) as container:
-        return np.ascontiguousarray(next(container.decode(video=0)).to_ndarray())

@@ -60,12 +60,7 @@ class Material:
         return self.root / "shards"
 
 
-def prepared(
-    material: Material,
-    *,
-    report: Report,
-    workers: int | None = None,
-) -> Material:
+def prepared(material: Material, *, report: Report, workers: int | None = None) -> Material:
     """Draw, link, index and pack what does not exist yet.
 
     Args:
@@ -84,23 +79,23 @@ def prepared(
             "remove it, or choose another folder with --data."
         )
     workers = workers or os.cpu_count() or 1
-    _draw(material, report=report, workers=workers)
-    _link(material.release, material.many, scenes=MANY)
-    _index(material.many, report=report)
-    _link(material.release, material.eight, scenes=EIGHT)
-    _index(material.eight, report=report)
-    _pack(material, report=report, workers=workers)
-    record.write_text(text)
-    return material
-
-
-def _draw(material: Material, *, report: Report, workers: int) -> None:
     for family, seed in FAMILIES:
         request = SynthRequest(
             family=family, scenes=2, size_px=material.size_px, frames=material.frames, seed=seed
         )
         report(f"drawing {family}")
         synthesise(material.release, request, workers=workers)
+    for tree, scenes in ((material.many, MANY), (material.eight, EIGHT)):
+        if not (tree / INDEX_NAME).exists():
+            report(f"linking and indexing {tree}")
+            _link(material.release, tree, scenes=scenes)
+            SceneIndex.open(tree).write(tree / INDEX_NAME)
+    if not (material.shards / INDEX_NAME).exists():
+        report(f"packing {material.shards}")
+        # Each scene is larger than a byte, so it has a shard of its own.
+        pack(material.eight, material.shards, target_bytes=1, workers=workers)
+    record.write_text(text)
+    return material
 
 
 def _link(release: Path, tree: Path, *, scenes: int) -> None:
@@ -113,26 +108,6 @@ def _link(release: Path, tree: Path, *, scenes: int) -> None:
         for file in drawn.iterdir():
             if not (linked / file.name).exists():
                 os.link(file, linked / file.name)
-
-
-def _index(tree: Path, *, report: Report) -> None:
-    if not (tree / INDEX_NAME).exists():
-        report(f"indexing {tree}")
-        SceneIndex.open(tree).write(tree / INDEX_NAME)
-
-
-def _pack(material: Material, *, report: Report, workers: int) -> None:
-    """Pack the eight scenes, one a shard."""
-    tree, out = material.eight, material.shards
-    if (out / INDEX_NAME).exists():
-        return
-    report(f"packing {out}")
-    sizes = [
-        sum(file.stat().st_size for file in scene.parent.iterdir())
-        for scene in tree.rglob("baseline.json")
-    ]
-    target_bytes = (max(sizes) * 101 // 100_000_000 + 1) * 1_000_000
-    pack(tree, out, target_bytes=target_bytes, workers=workers)
 
 
 def facts(material: Material) -> dict[str, Any]:

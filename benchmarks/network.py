@@ -22,7 +22,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 from torch.utils.data import DataLoader
 
 from benchmarks.clock import Measured, MeasurementError, in_a_fork, whole_pass
@@ -36,9 +35,8 @@ from benchmarks.workloads import SEED, Job, Wanted, Workload
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.records import Scene, SceneId
+from stereogenbench_data.schema.records import SceneId
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.sources.members import open_local
 
 LOCAL: Final = "ours, local"
 OURS: Final = "ours"
@@ -69,8 +67,6 @@ WORKLOADS: Final = (
 )
 
 LONGEST_S: Final = 1800.0
-
-_LINKED: Final = "scene_{:06d}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +130,7 @@ class LinkedJob(Job):
         """
         pairs, found = self.pairs(self.shards), dict[str, list[Wanted]]()
         keys = pairs.index.column("key").tolist()
-        drawn = (self.shards / "keys.txt").read_text().split()
+        drawn = SceneIndex.open(self.material.shards).column("key").tolist()[: self.scenes]
         for number in range(len(pairs)):
             address = pairs.plan.locate(number, epoch=0)
             place = int(str(keys[address.row]).rpartition("_")[2])
@@ -163,35 +159,26 @@ class Turn(Measured):
 
 
 def link_shards(job: LinkedJob) -> None:
-    """Make as many shards as a job has scenes: links to the packed ones in turn, with an index.
-
-    Of a shard that holds several scenes, as in tests, the first counts.
-    """
+    """Make as many shards as a job has scenes: links to the packed ones in turn, with an index."""
     if (job.shards / INDEX_NAME).exists():
         return
     index = SceneIndex.open(job.material.shards)
     index.load_seek_tables()
-    firsts: dict[str, Scene] = {}
-    for row in range(len(index)):
-        scene = replace(index.scene(row), seek_tables=index.seek_tables(row))
-        firsts.setdefault(scene.members["baseline.json"].path, scene)
-    drawn = list(firsts.values())
     job.shards.mkdir(parents=True, exist_ok=True)
     scenes, facts = [], {}
     for number in range(job.scenes):
-        scene = drawn[number % len(drawn)]
+        row = number % len(index)
+        scene, name = index.scene(row), f"net-{number:06d}.tar"
         (path,) = {member.path for member in scene.members.values()}
-        name = f"net-{number:06d}.tar"
         if not (job.shards / name).exists():
             os.link(job.material.shards / path, job.shards / name)
         facts[name] = index.shards[path]
         family = scene.id.family
-        key = f"train/{family}/SynthStage/{_LINKED.format(number)}"
+        key = f"train/{family}/SynthStage/scene_{number:06d}"
         members = {file: replace(member, path=name) for file, member in scene.members.items()}
         identity = SceneId(key, "train", None, family, scene.id.map_name)
-        scenes.append(replace(scene, id=identity, members=members))
-    keys = "\n".join(scene.id.key for scene in drawn[: job.scenes])
-    (job.shards / "keys.txt").write_text(keys)
+        tables = index.seek_tables(row)
+        scenes.append(replace(scene, id=identity, members=members, seek_tables=tables))
     SceneIndex.from_scenes(scenes, job.shards, shards=facts).write(job.shards / INDEX_NAME)
 
 
@@ -199,19 +186,10 @@ def link_mds(job: LinkedJob) -> None:
     """Make Mosaic's shards of the same scenes, whole like the tar files."""
     if (job.mds / "index.json").exists():
         return
-    index = SceneIndex.open(job.material.shards)
     distinct = job.root / "mds"
     if not (distinct / "index.json").exists():
         shutil.rmtree(distinct, ignore_errors=True)
-        drawn, scenes = (job.shards / "keys.txt").read_text().split(), {}
-        for row in np.flatnonzero(np.isin(index.column("key").astype(str), drawn)):
-            scene, files = index.scene(int(row)), {}
-            for name, member in scene.members.items():
-                opened = open_local(index.root, member, shard=index.shards.get(member.path))
-                with opened.open("rb") if isinstance(opened, Path) else opened as file:
-                    files[name] = file.read()
-            scenes[scene.id.key] = files
-        mosaic.write_shards({key: scenes[key] for key in drawn}, distinct)
+        mosaic.write_shards(SceneIndex.open(job.material.shards), distinct)
     job.mds.mkdir(parents=True, exist_ok=True)
     mosaic.repeat_shards(distinct, job.mds, count=job.scenes)
 
@@ -402,15 +380,15 @@ def network_plot(section: dict[str, Any]) -> Any:
     """Return a figure: the speed of each contestant as a share of ours from the local disk."""
     import matplotlib.pyplot as plt
 
-    shown = [each for each in WORKLOADS if _by_network(section, each)]
+    shown = {each.title: found for each in WORKLOADS if (found := _by_network(section, each))}
     bars = {
-        workload.title: [
-            (_named(network), name, found)
-            for network, rounds in _by_network(section, workload).items()
+        title: [
+            (_named(network), name, spread)
+            for network, rounds in races.items()
             for name in (OURS, *RIVALS)
-            if (found := _spread(rounds, name, lambda turn, own: _rate(turn) / _rate(own)))
+            if (spread := _spread(rounds, name, lambda turn, own: _rate(turn) / _rate(own)))
         ]
-        for workload in shown
+        for title, races in shown.items()
     }
     inches = 0.6 + 0.26 * sum(map(len, bars.values()))
     figure, column = plt.subplots(

@@ -39,15 +39,11 @@ class OrderQuality:
         batch_size: Samples in a batch.
         found: Of the order.
         shuffled: Of a fully shuffled sampler.
-        fewest_scenes: Different scenes in the batch that has fewest.
-        first_frame_spread: Standard deviation of the frame numbers in the first batch.
     """
 
     batch_size: int
     found: BatchContent
     shuffled: BatchContent
-    fewest_scenes: int
-    first_frame_spread: float
 
     @property
     def frame_spread_ratio(self) -> float:
@@ -76,39 +72,25 @@ def order_quality(order: EpochOrder, plan: Plan, *, batches: int = _LONG) -> Ord
     """
     size = order.rule.batch_size
     full = max(1, min(batches, order.samples // size))
-    numbers = np.concatenate([order.batch(number) for number in range(full)])
-    numbers = numbers[: len(numbers) // min(size, len(numbers)) * min(size, len(numbers))]
-    generator = np.random.default_rng(0)
-    drawn = generator.integers(0, order.samples, len(numbers))
-    rows = numbers.reshape(-1, min(size, len(numbers)))
-    found, frames = _content(rows, plan, epoch=order.epoch)
-    shuffled, _ = _content(drawn.reshape(rows.shape), plan, epoch=order.epoch)
-    scenes = plan.scenes_of(rows)
-    return OrderQuality(
-        batch_size=size,
-        found=found,
-        shuffled=shuffled,
-        fewest_scenes=int(_different(scenes).min()),
-        first_frame_spread=float(frames[0].std()),
-    )
+    rows = np.stack([order.batch(number) for number in range(full)])
+    drawn = np.random.default_rng(0).integers(0, order.samples, rows.shape)
+    found, shuffled = (_content(each, plan, epoch=order.epoch) for each in (rows, drawn))
+    return OrderQuality(size, found, shuffled)
 
 
-def _content(
-    numbers: Int64[np.ndarray, "b n"], plan: Plan, *, epoch: int
-) -> tuple[BatchContent, Int64[np.ndarray, "b n"]]:
+def _content(numbers: Int64[np.ndarray, "b n"], plan: Plan, *, epoch: int) -> BatchContent:
     scenes = plan.scenes_of(numbers)
     windows = (numbers - plan.first_sample[scenes]) // plan.pairs_of(scenes)
     frames = np.array(
         [plan.locate(number, epoch=epoch).frames[0] for number in numbers.ravel().tolist()]
     ).reshape(numbers.shape)
     most = int(windows.max()) + 1
-    content = BatchContent(
+    return BatchContent(
         scenes=float(_different(scenes).mean()),
         moments=float(_different(scenes * most + windows).mean()),
         frame_spread=float(frames.std(axis=1).mean()),
         scenes_in_1000_batches=len(np.unique(scenes[:_LONG])),
     )
-    return content, frames
 
 
 def _different(values: Int64[np.ndarray, "b n"]) -> Int64[np.ndarray, " b"]:

@@ -32,26 +32,22 @@ def plot_all(sections: dict[str, Any], folder: Path) -> list[Path]:
             "axes.titlelocation": "left", "figure.dpi": 130, "savefig.bbox": "tight",
         }
     )  # fmt: skip
-    races = sections.get("races", {})
-    local = [w for w in WORKLOADS if w.name in races and not w.field]
-    made = []
-    for name, wanted, make in (
-        ("speed", local, lambda: _speed(races, local)),
-        ("network", "network" in sections, lambda: network_plot(sections["network"])),
-        ("accuracy", "accuracy" in sections, lambda: _accuracy(sections["accuracy"])),
-    ):
-        if wanted:
-            path = folder / f"{name}.png"
-            _save(make(), path)
-            made.append(path)
-    return made
-
-
-def _save(figure: Any, path: Path) -> None:
     import matplotlib.pyplot as plt
 
-    figure.savefig(path, metadata={"Software": None})
-    plt.close(figure)
+    races = sections.get("races", {})
+    local = [w for w in WORKLOADS if w.name in races and not w.field]
+    drawn = {
+        "speed": lambda: local and _speed(races, local),
+        "network": lambda: "network" in sections and network_plot(sections["network"]),
+        "accuracy": lambda: "accuracy" in sections and _accuracy(sections["accuracy"]),
+    }
+    made = []
+    for name, draw in drawn.items():
+        if figure := draw():
+            made.append(folder / f"{name}.png")
+            figure.savefig(made[-1], metadata={"Software": None})
+            plt.close(figure)
+    return made
 
 
 _SHOWN: Final = (

@@ -64,9 +64,7 @@ def _race(
         **{name: why for name, why in reasons.items() if why is not None},
     }
     field = [(name, workers) for name, workers in entrants(workload) if reasons[name] is None]
-    for number in range(plan.rounds):
-        if number < len(section["rounds"]):
-            continue
+    for number in range(len(section["rounds"]), plan.rounds):
         report(f"{workload.name}: round {number + 1} of {plan.rounds}")
         turn = number % max(1, len(field))
         in_turn = field[turn:] + field[:turn]

@@ -19,6 +19,8 @@ from torch.utils.data import IterableDataset
 
 from benchmarks.contestants.scenewise import decoded
 from benchmarks.workloads import Job
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.sources.members import MemberSource
 
 
 def streaming_module() -> Any:
@@ -49,15 +51,22 @@ def streaming_module() -> Any:
     return streaming
 
 
-def write_shards(scenes: dict[str, dict[str, bytes]], out: Path) -> None:
-    """Write scenes, the bytes of their files by name, as MDS shards of one scene each."""
+def write_shards(index: SceneIndex, out: Path) -> None:
+    """Write scenes as MDS shards of one scene each: the bytes of all their files."""
+    source = MemberSource(index.root, shards=index.shards)
+    columns = {"__key__": "str"} | {_column(name): "bytes" for name in index.scene(0).members}
     writer = streaming_module().MDSWriter
-    names = sorted(next(iter(scenes.values())))
-    columns = {"__key__": "str", **{name.replace(".", "_"): "bytes" for name in names}}
     with writer(out=str(out), columns=columns, size_limit=1 << 16) as target:
-        for key, files in scenes.items():
-            row = {name.replace(".", "_"): content for name, content in files.items()}
-            target.write({"__key__": key, **row})
+        for scene in map(index.scene, range(len(index))):
+            row: dict[str, Any] = {"__key__": scene.id.key}
+            for name in scene.members:
+                with source.open(scene, name) as file:
+                    row[_column(name)] = file.read()
+            target.write(row)
+
+
+def _column(name: str) -> str:
+    return name.replace(".", "_")
 
 
 def repeat_shards(distinct: Path, out: Path, *, count: int) -> None:
@@ -105,9 +114,5 @@ class MosaicScenes(IterableDataset[dict[str, Any]]):
     def __iter__(self) -> Iterator[dict[str, Any]]:
         """Yield samples."""
         for scene in self._scenes:
-            files = {
-                name: scene[name.replace(".", "_")]
-                for name in self._job.files
-                if name.replace(".", "_") in scene
-            }
+            files = {name: scene[_column(name)] for name in self._job.files}
             yield from decoded(self._job, scene["__key__"], files)

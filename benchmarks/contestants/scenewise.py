@@ -37,9 +37,7 @@ def shards_of(job: Job) -> list[str]:
 def decoded(job: Job, key: str, files: dict[str, bytes]) -> Iterator[dict[str, Any]]:
     """Yield a scene's samples: the decode step."""
     workload = job.workload
-    wanted = job.of_scene.get(key)
-    if not wanted:  # another scene of a shard that holds several
-        return
+    wanted = job.of_scene[key]
     text: Any = files["baseline.json"]
     document = text if isinstance(text, dict) else json.loads(text)  # datasets parses by itself
     names = camera_files(wanted, both_ways=workload.both_ways)
