@@ -8,6 +8,7 @@ camera, by either depth.
 The reference is the largest group of cameras that agree with one another, if it is the majority.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,9 +17,12 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
+from stereogenbench_data.audit.contract.fitting import voted
+from stereogenbench_data.audit.contract.hypotheses import LAGS, Hypothesis, Question
 from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames
 from stereogenbench_data.audit.contract.scoring import Pair, ScoredContract, sample_along_rows
 from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.schema.text import counted
 
 LEAST_SHARE: Final = 0.5
 """Least share of a camera's matches with its neighbours that its depth must explain."""
@@ -31,6 +35,13 @@ _LEAST_UNLIKE: Final = 0.05
 that either depth explains, and those of them in which both depths agree (2 % in correct data)."""
 _LEAST_AWAY: Final = 0.25
 """Two depths of a point agree if their disparities differ by fewer pixels."""
+_LEAST_GAIN: Final = 0.01
+_LEAST_CLOSED: Final = 1 / 3
+"""Least share of the points lacking that another reading of a camera's depth must explain."""
+_GAIN_ERRORS: Final = 5.0
+"""About 90 readings are tried in a scene, so 3 standard errors occur by chance."""
+_LEAST_LEAD: Final = 1.1
+"""How many times as much the right lag of a camera's pictures explains as the next best."""
 _FEWEST_MATCHES: Final = 100
 _NARROWEST: Final = 2
 _ROWS_BESIDE: Final = 2
@@ -149,11 +160,24 @@ def check_cameras(
         f"matches, where theirs agree in {usual:.0%}"
         for camera, alike, usual in _behind(pairs, lambda beside: beside.alike, least=_LEAST_UNLIKE)
     }
-    problems |= _scale_problems(pairs, most=max(MOST_LOG_SCALE, depth_step / 4))
+    scales, scale_problems = _scale_problems(pairs, most=max(MOST_LOG_SCALE, depth_step / 4))
     rows = _row_problems(pairs)
     behind = _behind(pairs, lambda beside: beside.share, least=_LEAST_DEFICIT)
-    for camera in {*rows, *(camera for camera, *_ in behind)}:
-        problems[camera] = _picture_problem(pairs, camera, rows.get(camera))
+    odd_pictures = {*rows, *(camera for camera, *_ in behind)}
+    problems |= scale_problems
+    for camera in set(range(CAMERA_COUNT)) - odd_pictures:
+        better = _better_depth(
+            views, matches, contract, camera, scale=scales[camera], depth_step=depth_step
+        )
+        problems |= {camera: better} if better else {}
+    for camera in odd_pictures:
+        late = _late_by(views, matches, contract, pairs, camera)
+        when = f"{counted(abs(late), 'frame')} {'late' if late > 0 else 'early'}"
+        problems[camera] = (
+            f"pictures of camera {camera} are {when}"
+            if late
+            else _picture_problem(pairs, camera, rows.get(camera))
+        )
     return CameraCheck(tuple(figures), tuple(problems[camera] for camera in sorted(problems)))
 
 
@@ -202,8 +226,8 @@ def _of(pairs: Sequence[_Beside], camera: int) -> list[_Beside]:
     return sorted(own, key=lambda beside: beside.width_m)
 
 
-def _scale_problems(pairs: Sequence[_Beside], *, most: float) -> dict[int, str]:
-    """Return the cameras whose depth differs in scale from that of the reference."""
+def _scale_problems(pairs: Sequence[_Beside], *, most: float) -> tuple[list[float], dict[int, str]]:
+    """Return each camera's depth over that of the reference, and the cameras that differ."""
     # Disparity is inverse to depth: hence the sign.
     values = {beside.pair: -beside.log_ratio for beside in pairs}
     limits = {beside.pair: max(most, 4 * beside.ratio_error) for beside in pairs}
@@ -213,7 +237,7 @@ def _scale_problems(pairs: Sequence[_Beside], *, most: float) -> dict[int, str]:
         for camera, value in enumerate(logs)
         if abs(value) > min(max(limits.values()), 0.02)
     }
-    return _or_all(words, group, "scale of depth")
+    return [math.exp(value) for value in logs], _or_all(words, group, "scale of depth")
 
 
 def _row_problems(pairs: Sequence[_Beside]) -> dict[int, str]:
@@ -259,6 +283,100 @@ def _picture_problem(pairs: Sequence[_Beside], camera: int, row_problem: str | N
         f"pictures of camera {camera} do not fit those of the others, by the depth of "
         f"either: other rows, another moment or another place{found}"
     )
+
+
+def _late_by(
+    views: SceneFrames,
+    matches: Sequence[FrameMatch],
+    contract: ScoredContract,
+    pairs: Sequence[_Beside],
+    camera: int,
+) -> int:
+    """Return by how many frames a camera's pictures are late, 0 if no lag explains them."""
+    (other,) = set(_of(pairs, camera)[0].pair) - {camera}
+    counts = {lag: np.zeros(2) for lag in LAGS}
+    for frame, lag in itertools.product(dict.fromkeys(match.frame for match in matches), LAGS):
+        match = views.matched_later(frame, other, camera, lag=lag)
+        predicted = None if match is None else views.predicted(match, contract.hypothesis)
+        if match is not None and predicted is not None:
+            away_px = contract.scale * predicted[0] - match.matched_px
+            near = np.abs(away_px[predicted[1]]) < match.grain_px
+            counts[lag] += near.sum(), near.size
+    first, second = sorted(LAGS, key=lambda lag: -counts[lag][0])[:2]
+    explained, found = counts[first]
+    usual = max((each.share for each in pairs if camera not in each.pair), default=1.0)
+    is_ahead = explained > _LEAST_LEAD * counts[second][0]
+    return first if is_ahead and explained > (usual - _LEAST_DEFICIT) * found else 0
+
+
+def _better_depth(
+    views: SceneFrames,
+    matches: Sequence[FrameMatch],
+    contract: ScoredContract,
+    camera: int,
+    *,
+    scale: float,
+    depth_step: float,
+) -> str:
+    """Return, in words, another reading of a camera's depth that explains clearly more.
+
+    A reading explains the points at which it agrees with the other camera's depth: depth agrees
+    more sharply with depth than with matches, some of which are wrong.
+    """
+    hypothesis, subject = contract.hypothesis, f"depth of camera {camera}"
+    both = zip(matches[::2], matches[1::2], strict=True)
+    sides = [pair if pair[0].left == camera else pair[::-1] for pair in both
+             if camera in pair[0].pair]  # fmt: skip
+
+    def shares(
+        read: Hypothesis, *, file: int | None = None, factor: float = 1.0
+    ) -> Float64[np.ndarray, " matches"]:
+        if read.form != hypothesis.form:  # another form of depth has a scale of its own
+            factor = voted(views, [here for here, _ in sides], read)[0] / contract.scale
+        found = np.full(len(sides), np.nan)
+        for place, (here, there) in enumerate(sides):
+            mine = views.predicted(here, read, depth_file=file)
+            theirs = views.predicted(there, hypothesis)
+            if mine is not None and theirs is not None and (known := mine[1] & theirs[1]).any():
+                expected_px = -contract.scale * theirs[0][known]
+                away_px = contract.scale * factor * mine[0][known] - expected_px
+                allowed_px = _LEAST_AWAY * here.grain_px + 2 * depth_step * np.abs(expected_px)
+                found[place] = float((np.abs(away_px) < allowed_px).mean())
+        return found
+
+    words = f"{subject} is {scale:.4g} x that of the others"
+    readings = [(words, shares(hypothesis, factor=scale))]  # the simplest first
+    for question, fits in _READINGS.items():
+        for other in hypothesis.alternatives(question):
+            words = f"{subject} fits better {fits.format(getattr(other, question))}"
+            readings.append((words, shares(other)))
+    for file in set(range(CAMERA_COUNT)) - {hypothesis.depth_file(camera)}:
+        words = f"{subject} fits worse than that of file {file} does in its place"
+        readings.append((words, shares(hypothesis, file=file)))
+    now, best, most = shares(hypothesis), "", 0.0
+    for words, explained in readings:
+        gain, is_clear = _gain(explained, now)
+        if is_clear and gain > most + _LEAST_GAIN * bool(best):
+            best, most = words, gain
+    return best
+
+
+_READINGS: Final[dict[Question, str]] = {
+    "frame_lag": "with a lag of {:+d} frames", "flip": "flipped ({})", "form": "as {} depth",
+    "kind": "along the {}",
+}  # fmt: skip
+
+
+def _gain(
+    better: Float64[np.ndarray, " n"], worse: Float64[np.ndarray, " n"]
+) -> tuple[float, bool]:
+    """Return by how much one set of shares is larger on average, and whether that is certain."""
+    gains = (better - worse)[np.isfinite(better - worse)]
+    if len(gains) < _NARROWEST + 1:
+        return 0.0, False
+    mean, error = float(gains.mean()), float(gains.std(ddof=1)) / math.sqrt(len(gains))
+    lacking = 1 - float(np.nanmean(worse))
+    return mean, mean > max(_LEAST_GAIN, _LEAST_CLOSED * lacking, _GAIN_ERRORS * error)
 
 
 def _row_terms(

@@ -219,7 +219,7 @@ class SceneFrames:
         self._bands: dict[tuple[int, int], Luma] = {}
         self._stored: dict[tuple[FrameMatch, int, int], dict[Flip, _Numbers]] = {}
         self._predicted_by: Hypothesis | None = None
-        self._predictions: dict[FrameMatch, _Prediction | None] = {}
+        self._predictions: dict[tuple[FrameMatch, int], _Prediction | None] = {}
         self._depths: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
 
     @property
@@ -305,6 +305,17 @@ class SceneFrames:
                 matches += self._both_ways(frame, left, right, row_matches)
         return matches
 
+    def matched_later(self, frame: int, file: int, other: int, *, lag: int) -> FrameMatch | None:
+        """Return the pixels of a file's frame that another file shows ``lag`` frames later.
+
+        None if there is no such frame.
+        """
+        if not 0 <= frame + lag < self.scene.frames:
+            return None
+        pictures = {file: self.band(frame, file), other: self.band(frame + lag, other)}
+        row_matches = match_pairs(pictures, [(file, other)])[file, other]
+        return self._both_ways(frame, file, other, row_matches)[0]
+
     def chosen_pairs(self, hypothesis: Hypothesis) -> list[tuple[int, int]]:
         """Return the `neighbours`, and the pairs next but one; the lower number comes first."""
         across = self._across(hypothesis)
@@ -358,21 +369,26 @@ class SceneFrames:
             )
         return sides[0], sides[1]
 
-    def predicted(self, match: FrameMatch, hypothesis: Hypothesis) -> _Prediction | None:
+    def predicted(
+        self, match: FrameMatch, hypothesis: Hypothesis, *, depth_file: int | None = None
+    ) -> _Prediction | None:
         """Return the disparity of matched pixels at the declared unit, and where it is known.
 
-        None if the frame of depth does not exist. The predictions of one hypothesis are kept,
-        read-only, until another is asked for, because it is fitted, scored and drawn at many
-        scales.
+        None if the frame of depth does not exist. ``depth_file`` replaces the file that the
+        hypothesis names. The predictions of one hypothesis are kept, read-only, until another is
+        asked for, because it is fitted, scored and drawn at many scales.
         """
+        file = hypothesis.depth_file(match.left) if depth_file is None else depth_file
         if hypothesis != self._predicted_by:
             self._predicted_by, self._predictions = hypothesis, {}
-        if match not in self._predictions:
-            self._predictions[match] = self._predict(match, hypothesis)
-        return self._predictions[match]
+        if (match, file) not in self._predictions:
+            self._predictions[match, file] = self._predict(match, hypothesis, file=file)
+        return self._predictions[match, file]
 
-    def _predict(self, match: FrameMatch, hypothesis: Hypothesis) -> _Prediction | None:
-        file, frame = hypothesis.depth_file(match.left), match.frame + hypothesis.frame_lag
+    def _predict(
+        self, match: FrameMatch, hypothesis: Hypothesis, *, file: int
+    ) -> _Prediction | None:
+        frame = match.frame + hypothesis.frame_lag
         if not 0 <= frame < self.scene.frames:
             return None
         units, known = self._numbers(match, frame=frame, file=file)[hypothesis.flip]
