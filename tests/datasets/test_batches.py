@@ -1,9 +1,7 @@
 """`EpochBatches`, and positions saved and loaded."""
 
-import copy
 import itertools
 import json
-import pickle
 
 import pytest
 import torch
@@ -83,7 +81,6 @@ def test_what_is_loaded_goes_on_once_and_then_epochs_are_whole(keyed):
     ("options", "message"),
     [
         ({"batch_size": 5}, "batch_size is 5 here and 4 there"),
-        ({"seed": 1}, "seed is 1 here and 0 there"),
         ({"batch_size": 1, "shuffle_groups": 2}, "shuffle_groups is 2 here and 4 there"),
         ({"shuffle": False}, "shuffle is False here and True there"),
         ({"drop_last": "pad", "seed": 2}, "seed is 2 here.*; drop_last is 'pad' here"),
@@ -98,14 +95,6 @@ def test_a_position_in_another_order_is_refused_by_name(keyed, options, message)
         EpochBatches(keyed, **({"batch_size": size} | options)).load_state_dict(state)
 
 
-def test_a_position_saved_in_earlier_words_is_refused_by_what_it_lacks(keyed):
-    saved = EpochBatches(keyed, 4).state_at(0, 30) | {"order": "shuffled", "tail": "drop"}
-    del saved["shuffle"], saved["drop_last"]
-
-    with pytest.raises(StateError, match="has no drop_last, shuffle"):
-        EpochBatches(keyed, 4).load_state_dict(saved)
-
-
 def test_a_position_of_an_earlier_order_is_refused_by_its_version(keyed):
     """As `state_dict` wrote it for the order of version 2."""
     saved = {
@@ -116,11 +105,13 @@ def test_a_position_of_an_earlier_order_is_refused_by_its_version(keyed):
 
     with pytest.raises(StateError, match="version is 4 here and 2 there"):
         EpochBatches(keyed, 4).load_state_dict(saved)
+    with pytest.raises(StateError, match="has no drop_last, open_frames, shuffle"):
+        EpochBatches(keyed, 4).load_state_dict(saved | {"version": 4})
 
 
 @pytest.mark.parametrize(
     "options",
-    [{"shuffle_groups": 2}, {"shuffle_groups": 12, "open_scenes": 40}, {"open_scenes": 4}],
+    [{"shuffle_groups": 12, "open_scenes": 40}, {"open_scenes": 4}],
     ids=str,
 )
 def test_options_that_few_scenes_leave_without_effect_are_the_same_order(keyed, options):
@@ -148,13 +139,8 @@ def test_a_position_in_another_selection_is_refused_by_name(keyed, small_index):
     ):
         with pytest.raises(StateError, match=r"selection is '[0-9a-f]{64}' here and"):
             EpochBatches(other, 4, seed=0).load_state_dict(state)
-
-
-def test_a_position_in_another_index_is_refused_by_name(keyed):
-    state = EpochBatches(keyed, 4).state_dict() | {"index": "0" * 64}
-
     with pytest.raises(StateError, match=r"index is '[0-9a-f]{64}' here and '0{64}' there"):
-        EpochBatches(keyed, 4).load_state_dict(state)
+        EpochBatches(keyed, 4).load_state_dict(state | {"index": "0" * 64})
 
 
 @pytest.mark.parametrize(
@@ -162,10 +148,8 @@ def test_a_position_in_another_index_is_refused_by_name(keyed):
     [
         ({"batches_consumed": -1}, "batches_consumed is -1, no whole number"),
         ({"epoch": "2"}, "epoch is '2', no whole number"),
-        ({"version": 0}, "version is 4 here and 0 there"),
         ({"version": True}, "version is 4 here and True there"),
         ({"batches_consumed": 36}, "batches_consumed is 36, and there are 35"),
-        ({"batches_consumed": True}, "batches_consumed is True, no whole number"),
     ],
 )
 def test_a_damaged_position_is_refused(keyed, change, message):
@@ -187,21 +171,13 @@ def test_what_is_no_dict_is_refused(keyed, state):
     [
         ({"rank": 2, "world_size": 2}, "got rank=2, world_size=2"),
         ({"rank": 1}, "got rank=1, world_size=None"),
-        ({"drop": True}, "EpochBatches has no option 'drop'; did you mean 'drop_last'"),
         ({"drop_last": 1}, "drop_last must be True, False or 'pad', got 1"),
-        ({"shuffle": "yes"}, "shuffle must be True or False, got 'yes'"),
     ],
     ids=str,
 )
 def test_options_that_no_epoch_has_are_refused(keyed, options, message):
     with pytest.raises(SelectionError, match=message):
         EpochBatches(keyed, 4, **options)
-
-
-@pytest.mark.parametrize("size", ["4", True])
-def test_a_batch_size_that_is_no_whole_number_is_refused(keyed, size):
-    with pytest.raises(SelectionError, match="batch_size must be a whole number from 1, got"):
-        EpochBatches(keyed, size)
 
 
 def test_batches_made_before_the_process_group_are_refused_in_it(keyed, tmp_path):
@@ -219,18 +195,8 @@ def test_batches_made_before_the_process_group_are_refused_in_it(keyed, tmp_path
         torch.distributed.destroy_process_group()
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, pickle.dumps])
-def test_a_pass_over_batches_is_not_copied_and_goes_on(keyed, copied):
-    numbers = iter(EpochBatches(keyed, 9, drop_last=False))
-    next(numbers)
-
-    with pytest.raises(TypeError, match="generator"):
-        copied(numbers)
-    assert len(list(numbers)) == 15
-
-
 @pytest.mark.filterwarnings("ignore:'set_vital' is deprecated")
-@pytest.mark.parametrize(("workers", "stop"), [(0, 0), (0, 4), (2, 4), (2, 9)])
+@pytest.mark.parametrize(("workers", "stop"), [(0, 4), (2, 9)])
 def test_torchdatas_loader_saves_and_loads_its_position(keyed, workers, stop):
     keyed.set_epoch(2)
 

@@ -56,7 +56,6 @@ def harmless_flip(root):
 @pytest.mark.parametrize(
     "options",
     [
-        {"frames": "all"},
         {"frames": ("clips", 4)},
         {"frames": "first", "check": "opened"},
     ],

@@ -379,22 +379,6 @@ def test_pictures_of_another_size_than_their_depth_are_refused():
         derive(batch, fields=("left",))
 
 
-def test_memory_that_is_not_contiguous_gives_the_same():
-    batch = batch_of([scene(CONTRACTS["planar depth"], rig=rig) for rig in RIGS])
-    turned = {
-        name: values.transpose(-1, -2).contiguous().transpose(-1, -2)
-        if name in ("image", "stored_depth", "cams_from_cam")
-        else values
-        for name, values in batch.items()
-    }
-    assert not turned["stored_depth"].is_contiguous()
-
-    made, expected = derive(turned, fields=DERIVED_FIELDS), derive(batch, fields=DERIVED_FIELDS)
-
-    for name, values in made.items():
-        assert torch.equal(values, expected[name]), name
-
-
 @pytest.mark.parametrize("pairs", [[(1, 1)], [(0, 6)], [(-1, 2)], "some", []])
 def test_pairs_must_be_of_two_views_of_the_batch(pairs):
     with pytest.raises(SelectionError, match=r"pair"):

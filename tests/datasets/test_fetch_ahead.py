@@ -13,13 +13,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from stereogenbench_data import SceneIndex, StereoPairs, StereoPairStream
+from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.datasets.mapped import SeekTableWarning
-from stereogenbench_data.errors import SelectionError, StorageError
+from stereogenbench_data.errors import StorageError
 from stereogenbench_data.media.seek_table import packed_tables, parse_tables
 from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.retry import RetryPolicy
+from stereogenbench_data.sources.web import close_connections
 from tests.datasets.conftest import same
 from tests.servers.failing_server import Answer, serving
 from tests.sources.policies import LONGEST_S, ended
@@ -44,7 +45,7 @@ def alone():
     while fetching() and time.monotonic() < deadline:
         time.sleep(0.01)
     assert fetching() == []
-    remote_pools_closed()
+    close_connections()
     while len(sockets()) > len(before) and time.monotonic() < deadline:
         gc.collect()
         time.sleep(0.01)  # the server's ends are closed by its own threads
@@ -53,12 +54,6 @@ def alone():
 
 def fetching():
     return [each.name for each in threading.enumerate() if each.name == "fetch-ahead"]
-
-
-def remote_pools_closed():
-    from stereogenbench_data.sources.web import close_connections
-
-    close_connections()
 
 
 def sockets():
@@ -123,29 +118,10 @@ def test_a_pass_gives_what_local_shards_give_in_few_requests(
     assert len(asked) <= 3 * 2 * len(loader.batches.dataset.plan.scene_rows) + 6
 
 
-def test_a_stream_of_samples_is_fetched_ahead_too(served, large_shards, alone):
-    expected = [*StereoPairStream(large_shards, 2, fields=FIELDS, frames="all", drop_last=False)]
-    stream = StereoPairStream(served.url, 2, fields=FIELDS, frames="all", drop_last=False)
-    served.asked.clear()
-
-    assert all(same(*each) for each in zip(stream, expected, strict=True))
-    assert len(parts_asked(served)) <= 3 * 2 * len(stream.pairs.plan.scene_rows) + 6
-    stream.close()
-
-
-def test_a_broken_pass_leaves_nothing(served, alone):
+def test_a_broken_pass_and_a_dropped_dataset_leave_nothing(served, alone):
     pairs = StereoPairs(served.url, fields=FIELDS, frames="all")
     for _ in pairs.loader(1):
         break
-    deadline = time.monotonic() + 60
-    while fetching() and time.monotonic() < deadline:
-        time.sleep(0.01)
-
-    assert fetching() == []
-
-
-def test_a_dropped_dataset_leaves_nothing(served, alone):
-    pairs = StereoPairs(served.url, fields=FIELDS)
     pairs[0]
     del pairs
 
@@ -273,11 +249,6 @@ def test_local_data_read_no_seek_tables(large_shards):
         pairs = StereoPairs(large_shards, fields=("left",))
 
     assert pairs.index.seek_tables(0) is None
-
-
-def test_a_negative_number_of_bytes_is_named(large_shards):
-    with pytest.raises(SelectionError, match=r"fetch_ahead_bytes .* got -1"):
-        StereoPairs(large_shards, fetch_ahead_bytes=-1)
 
 
 def test_closing_does_not_wait_for_requests_that_hang_and_they_end(served):

@@ -68,9 +68,7 @@ def test_what_accelerators_need_is_added_up(small_shards, costs):
     ("options", "message"),
     [
         ({"samples_s": 0}, "samples_s must be above 0, got 0"),
-        ({"samples_s": math.nan}, "samples_s must be above 0, got nan"),
         ({"samples_s": 1, "accelerators": ()}, "accelerators must be above 0, got 0"),
-        ({"samples_s": 1, "cores": 0}, "cores must be above 0, got 0"),
     ],
 )
 def test_a_number_out_of_its_range_is_named(small_shards, options, message):

@@ -25,11 +25,11 @@ def ffmpeg(*arguments):
     subprocess.run(command, check=True, capture_output=True)
 
 
-def written(name, *codec, source=None, suffix=None, before=()):
+def written(name, *codec, source=None, before=()):
     """Return what writes a video of a scene anew, from itself or from another one."""
 
     def alter(folder):
-        aside = folder / f"aside.{suffix or name[-3:]}"
+        aside = folder / f"aside.{name[-3:]}"
         ffmpeg(*before, "-i", folder / (source or name), *codec, aside)
         aside.replace(folder / name)
 
@@ -61,12 +61,8 @@ OTHERS = {
     "sound alone": (
         lambda folder: ffmpeg("-f", "lavfi", "-i", "sine=d=1", folder / RGB), RGB, "holds audio",
     ),
-    "a still picture": (
-        written(RGB, "-frames:v", "1", "-update", "1", suffix="png"), RGB, "cannot be opened",
-    ),
     "one picture": (written(RGB, "-frames:v", "1"), RGB, "has 1|holds 1 frames"),
     "grey H.264": (written(RGB, "-c:v", "libx264", "-pix_fmt", "gray"), RGB, "grey, and"),
-    "alpha": (written(RGB, "-c:v", "png", "-pix_fmt", "rgba"), RGB, "rgba, and"),
     "pixels that are not square": (
         written(RGB, "-vf", "setsar=2/1"), RGB, "pixels 2 times as wide as high",
     ),
@@ -91,7 +87,6 @@ SEEN_IN_PICTURES = {
 FITTING = {
     "HEVC of 10 bits": written(RGB, *QUIET_HEVC, "-pix_fmt", "yuv420p10le"),
     "H.264 of red, green and blue": written(RGB, "-c:v", "libx264rgb", "-pix_fmt", "rgb24"),
-    "a rotation by nothing": written(RGB, "-c", "copy", before=("-display_rotation", "0")),
 }
 
 

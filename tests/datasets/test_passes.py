@@ -66,18 +66,6 @@ def test_a_pass_within_a_pass_takes_nothing_from_it(pairs, truth, workers, inner
     assert sum(wrong(batch, truth) for batch in held) == 0
 
 
-def test_two_passes_by_turns_are_each_whole(pairs, truth):
-    loader = pairs.loader(9, num_workers=1)
-    expected = keys_of(pairs.loader(9))
-    found = [], []
-    for batches in zip(loader, loader, strict=True):
-        for own, batch in zip(found, batches, strict=True):
-            own.append(batch["__key__"])
-            assert wrong(batch, truth) == 0
-
-    assert list(found) == [expected, expected]
-
-
 def test_workers_that_persist_tell_the_older_of_two_passes_that_it_is_over(pairs):
     loader = pairs.loader(9, num_workers=1, persistent_workers=True)
     older = iter(loader)
@@ -245,21 +233,6 @@ def test_threads_that_share_a_pass_take_turns(pairs):
 
     assert errors == []
     assert sorted(map(tuple, found)) == sorted(map(tuple, keys_of(pairs.loader(9))))
-
-
-@pytest.mark.filterwarnings("ignore:Got pickle error when attempting to start a worker")
-def test_workers_that_could_not_start_leave_nothing_to_end(pairs):
-    loader = pairs.loader(
-        9,
-        num_workers=1,
-        persistent_workers=True,
-        multiprocessing_context="spawn",
-        worker_init_fn=lambda number: None,
-    )
-    with pytest.raises((AttributeError, pickle.PicklingError), match=r"pickle|local object"):
-        next(iter(loader))
-
-    loader.close()
 
 
 def test_a_fork_that_lets_go_of_a_pass_does_not_end_its_workers(pairs):

@@ -112,20 +112,6 @@ def test_a_position_goes_on_under_other_ranks_and_workers_once(stream_of, worker
     assert sorted(flat(keys_of(loader))) == sorted(flat(unbroken))
 
 
-def test_workers_go_on_once_with_a_position_that_was_reached_without_them(stream_of):
-    unbroken = keys_of(loaded(stream_of()))
-    first = stream_of()
-    samples = iter(first)
-    for _ in range(22):
-        next(samples)
-    stream = stream_of()
-    stream.load_state_dict(first.state_dict())
-    loader = loaded(stream, 2)
-
-    assert keys_of(loader) == unbroken[2:]
-    assert keys_of(loader) == unbroken
-
-
 def test_a_stream_iterated_in_this_process_counts_by_itself(stream_of, keyed):
     stream = stream_of()
     batches = iter(loaded(stream))
@@ -148,24 +134,7 @@ def test_a_stream_iterated_by_workers_asks_how_far_the_loop_is(stream_of):
     assert stream.state_dict(batches=1)["batches_consumed"] == 1
 
 
-def test_a_position_of_other_samples_is_refused(stream_of):
-    state = stream_of(pairs="all").state_dict()
-
-    with pytest.raises(StateError, match="selection is"):
-        stream_of().load_state_dict(state)
-
-
-def test_workers_of_every_kind_begin_where_a_loaded_position_says(stream_of):
-    unbroken = keys_of(loaded(stream_of()))
-    stream = stream_of()
-    stream.load_state_dict(stream.batches.state_at(0, 5))
-    loader = loaded(stream, 2, multiprocessing_context="spawn")
-
-    assert keys_of(loader) == unbroken[5:]
-    assert keys_of(loader) == unbroken
-
-
-@pytest.mark.parametrize(("workers", "stop"), [(0, 4), (2, 0), (2, 4), (2, 15)])
+@pytest.mark.parametrize(("workers", "stop"), [(0, 4), (2, 0), (2, 4)])
 def test_torchdatas_loader_saves_and_loads_its_position(stream_of, workers, stop):
     def loader():
         return StatefulDataLoader(stream_of(), batch_size=9, num_workers=workers)
@@ -215,9 +184,7 @@ def test_a_workers_own_position_is_refused_by_another_worker(stream_of):
     ("change", "message"),
     [
         ({"start": 17}, "start is 17, and there are 16"),
-        ({"start": None}, "start is None, no whole number"),
         ({"samples_given": 145}, "samples_given is 145, and there are 144"),
-        ({"samples_given": True}, "samples_given is True, no whole number"),
     ],
     ids=str,
 )
@@ -227,12 +194,3 @@ def test_a_workers_damaged_position_is_refused(stream_of, change, message):
 
     with pytest.raises(StateError, match=message):
         stream.load_state_dict(stream.state_dict() | change)
-
-
-def test_the_shares_of_many_ranks_and_workers_are_the_selection(stream_of):
-    for world in range(1, 6):
-        shares = [stream_of(rank=rank, world_size=world) for rank in range(world)]
-        keys = [[sample["__key__"] for sample in share] for share in shares]
-
-        assert [len(share) for share in shares] == [len(own) for own in keys]
-        assert len(flat(keys)) == len(set(flat(keys))) == 140

@@ -126,18 +126,6 @@ def pid(item, advance):
     return os.getpid()
 
 
-def meet_another(item, advance):
-    """Return the process, when another one has begun too, or has had a minute to begin."""
-    number, folder = item
-    (folder / str(os.getpid())).touch()
-    for _ in range(600):
-        if len(list(folder.iterdir())) >= 2:
-            break
-        time.sleep(0.1)
-    advance(number)
-    return os.getpid()
-
-
 def refuse_three(item, advance):
     if item == 3:
         raise ShardError("three is refused")
@@ -159,18 +147,6 @@ def begin(mark, advance):
 
 def called(item):
     return f"item {item}"
-
-
-@pytest.mark.usefixtures("ray")
-def test_both_nodes_work_and_all_is_counted(tmp_path):
-    counts = []
-    items = [(number, tmp_path) for number in range(6)]
-
-    pids = list(RayCluster().map(meet_another, items, name=called, advance=counts.append))
-
-    assert len(pids) == 6
-    assert len(set(pids)) >= 2
-    assert sum(counts) == 15
 
 
 @pytest.mark.usefixtures("ray")

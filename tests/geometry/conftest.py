@@ -10,8 +10,8 @@ import torch
 
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
-from stereogenbench_data.schema.records import Rig, Trajectory
-from stereogenbench_data.schema.release import CAMERA_PAIRS
+from stereogenbench_data.geometry.projection import Projection
+from stereogenbench_data.schema.records import Trajectory
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,11 @@ class Library:
     name: str
     array: Callable[[np.ndarray], Any]
     numpy: Callable[[Any], np.ndarray]
+
+    def projection(self, u_px, v_px, depth_m, *, rows="moved"):
+        """Return a projection of this library's arrays; where rows are kept, v is left out."""
+        places = None if rows == "kept" else self.array(v_px)
+        return Projection(self.array(u_px), places, self.array(depth_m))
 
 
 @pytest.fixture(
@@ -78,25 +83,6 @@ def make_rig(make_trajectory):
                 offset_cm=offset_cm,
                 frames=frames,
             )
-        )
-
-    return make
-
-
-@pytest.fixture(scope="session")
-def recorded_rig():
-    """Return one that builds the record of a rig from its lateral positions in cm."""
-
-    def make(lateral_cm) -> Rig:
-        return Rig(
-            focal_mm=45.0,
-            sensor_width_mm=23.76,
-            sensor_height_mm=23.76,
-            image_width_px=1280,
-            image_height_px=1280,
-            principal_point_px=None,
-            baselines_cm=tuple(float(lateral_cm[b] - lateral_cm[a]) for a, b in CAMERA_PAIRS),
-            primary_pair=(0, 1),
         )
 
     return make

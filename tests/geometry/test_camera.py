@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import GeometryError
-from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
+from stereogenbench_data.geometry.camera import Intrinsics
 
 sizes_px = st.integers(1, 4000)
 
@@ -26,13 +26,6 @@ def test_a_sensor_that_is_not_square_gives_each_axis_its_own_focal_length():
     )
 
     assert intrinsics == Intrinsics(1000.0, 1500.0, 300.0, 400.0, 720, 720)
-
-
-def test_the_cameras_of_a_rig_share_the_recorded_intrinsics(recorded_rig):
-    intrinsics = rig_intrinsics(recorded_rig(np.arange(6.0)))
-
-    assert intrinsics.fx_px == pytest.approx(45 / 23.76 * 1280, rel=1e-15)
-    assert (intrinsics.width_px, intrinsics.height_px) == (1280, 1280)
 
 
 def test_the_evaluators_resize_scales_each_axis_by_its_own_factor():

@@ -122,11 +122,7 @@ def test_whole_maps_are_decided_as_pixel_by_pixel(library, seed, rows):
     )
 
     visible = visible_in_target(
-        Projection(
-            library.array(u_px),
-            None if rows == "kept" else library.array(v_px),
-            library.array(depth_m),
-        ),
+        library.projection(u_px, v_px, depth_m, rows=rows),
         measured=library.array(measured),
         target_depth_m=library.array(target_m),
         target_measured=library.array(target_measured),
@@ -154,11 +150,7 @@ def test_a_pixel_is_hidden_where_a_nearer_one_lands_beside_it(library, seed, row
     nearest_m = np.where(beside, depth_m, np.inf).min(axis=(-1, -2))
 
     visible = visible_from_source(
-        Projection(
-            library.array(u_px),
-            None if rows == "kept" else library.array(v_px),
-            library.array(depth_m),
-        ),
+        library.projection(u_px, v_px, depth_m, rows=rows),
         measured=library.array(measured),
         quantum_m=0.01,
         tolerance=0.03,

@@ -16,6 +16,7 @@ from stereogenbench_data.index.scene_folder import (
 )
 from stereogenbench_data.index.tree import SceneFolder, stamp_of
 from stereogenbench_data.schema.records import Member
+from tests.servers.videos import write_frames
 
 KEY = "train/Uniform/Car_Dealer/scene_000001"
 
@@ -154,13 +155,9 @@ def test_frames_without_poses_at_the_end_are_not_used(make_scene, root, rewrite)
 
 
 def test_depth_in_a_form_that_nothing_reads_stops_no_pictures(make_scene, root):
-    with av.open(str(make_scene() / "cam_00_depth.mkv"), "w") as container:
-        stream = container.add_stream("ffv1", rate=15)
-        stream.height, stream.width, stream.pix_fmt = 24, 32, "yuva444p"
-        for _ in range(4):
-            frame = av.VideoFrame(32, 24, "yuva444p")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+    frames = (av.VideoFrame(32, 24, "yuva444p") for _ in range(4))
+    path = make_scene() / "cam_00_depth.mkv"
+    write_frames(path, frames, codec="ffv1", pixel_format="yuva444p")
 
     scene = describe_scene(root, KEY)
 

@@ -462,28 +462,6 @@ def test_a_value_that_no_scene_has_is_refused_though_the_digest_is_right(
         SceneIndex.open(path)
 
 
-def test_a_file_that_cannot_be_written_is_named_and_leaves_nothing(scenes, tmp_path):
-    (tmp_path / "index.parquet").mkdir()
-
-    with pytest.raises(StorageError, match=r"index cannot be written .*Choose another place"):
-        SceneIndex.from_scenes(scenes, tmp_path).write(tmp_path / "index.parquet")
-
-    assert [path.name for path in tmp_path.iterdir()] == ["index.parquet"]
-
-
-def test_broken_scenes_of_a_tree_are_an_error_that_lists_them(make_scene, root):
-    for number in range(12):
-        make_scene(f"train/Uniform/Car_Dealer/scene_{number:06d}")
-        (root / f"train/Uniform/Car_Dealer/scene_{number:06d}" / "baseline.json").unlink()
-
-    with pytest.raises(StorageError, match="12 scenes cannot be used:") as caught:
-        SceneIndex.open(root)
-
-    lines = str(caught.value).splitlines()
-    assert "scene_000009: has no baseline.json" in lines[10]
-    assert lines[11].strip() == "and 2 more"
-
-
 def test_a_few_broken_scenes_of_a_tree_are_left_out_with_one_warning(make_scene, root):
     for number in range(4):
         make_scene(f"train/Uniform/Car_Dealer/scene_{number:06d}")
@@ -504,16 +482,6 @@ def test_twenty_scenes_that_fail_alike_are_told_as_a_format(make_scene, root):
 
     with pytest.raises(StorageError, match="first 20 scenes cannot be used, all for one reason"):
         SceneIndex.open(root)
-
-
-def test_scenes_that_are_not_wanted_are_not_described(make_scene, root):
-    make_scene("train/Uniform/Car_Dealer/scene_000001")
-    folder = make_scene("eval/MapSeenInTrain/Uniform/Car_Dealer/scene_000002")
-    (folder / "baseline.json").write_text("{}")
-
-    index = SceneIndex.open(root, wanted=lambda scene: scene.split == "train")
-
-    assert index.column("split").tolist() == ["train"]
 
 
 @pytest.mark.parametrize("count", [1, 3])

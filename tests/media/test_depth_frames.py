@@ -2,7 +2,6 @@
 
 import io
 import json
-import sys
 import zlib
 from dataclasses import replace
 from fractions import Fraction
@@ -11,7 +10,7 @@ import av
 import numpy as np
 import pytest
 
-from stereogenbench_data.errors import ExtraError, MediaError
+from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media import depth_frames
 from stereogenbench_data.media.depth import resolve_encoding
 from stereogenbench_data.media.depth_frames import (
@@ -23,6 +22,7 @@ from stereogenbench_data.media.depth_frames import (
 from stereogenbench_data.media.depth_packing import packed_depth, write_depth_video
 from stereogenbench_data.media.video import VideoReader, probe
 from tests.servers.tools import require_module
+from tests.servers.videos import write_frames
 
 SHAPE = (40, 56)
 TAGS = {"DEPTH_SCALE": "0.001", "TITLE": "Nowhere"}
@@ -44,11 +44,7 @@ def pictures(largest=65535):
 
 
 def write_depth(path, maps, *, pixel_format="gray16le", codec="ffv1", step=1):
-    with av.open(str(path), "w") as container:
-        container.metadata.update(TAGS)
-        stream = container.add_stream(codec, rate=15)
-        stream.height, stream.width = SHAPE
-        stream.pix_fmt = pixel_format
+    def frames():
         for number, units in enumerate(maps):
             frame = av.VideoFrame(SHAPE[1], SHAPE[0], pixel_format)
             for plane in frame.planes:
@@ -57,9 +53,9 @@ def write_depth(path, maps, *, pixel_format="gray16le", codec="ffv1", step=1):
                 rows[:, : plane.width] = numbers[: plane.height, : plane.width]
                 plane.update(rows.tobytes())
             frame.pts, frame.time_base = number * step, Fraction(1, 15)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    return path
+            yield frame
+
+    return write_frames(path, frames(), codec=codec, pixel_format=pixel_format, tags=TAGS)
 
 
 @pytest.fixture(scope="module")
@@ -158,12 +154,6 @@ def test_a_file_that_was_cut_short_is_refused(packed, left):
         opened(packed[:left])
 
 
-@pytest.mark.parametrize("index", [-1, 6])
-def test_a_frame_that_does_not_exist_is_refused(packed, index):
-    with pytest.raises(MediaError, match=f"has no frame {index}: ask for one of 0 to 5"):
-        opened(packed).units(index)
-
-
 def test_frames_too_large_are_refused_before_anything_is_allocated(packed, monkeypatch):
     monkeypatch.setattr(depth_frames, "LARGEST_FRAME_BYTES", 56 * 40 * 2 - 1)
 
@@ -249,20 +239,11 @@ def test_what_cannot_come_back_whole_is_not_packed(tmp_path, codec, pixel_format
         packed_depth(path, name="x.mkv", frames=2)
 
 
-def test_without_blosc2_the_extra_is_named(packed, monkeypatch):
-    monkeypatch.setitem(sys.modules, "blosc2", None)
-
-    with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[blosc2\]'"):
-        opened(packed)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "found"),
     [
         (b'"codec":"ffv1"', b'"codec":"h264"', "h264, gray16le"),
-        (b'"gray16le"', b'"rgb48lex"', "ffv1, rgb48lex"),
         (b'"width_px":56', b'"width_px":{}', "malformed or incomplete"),
-        (b'"rate":[15,1]', b'"rate":[1e99]', "malformed or incomplete"),
         (b'"tags":{', b'"tagz":{', "malformed or incomplete"),
         (b'"pts":[0,67', b'"pts":[99,0', "times of frames that do not ascend"),
     ],
@@ -277,11 +258,6 @@ def test_a_header_that_describes_no_packed_depth_is_refused(packed, old, new, fo
 
     with pytest.raises(MediaError, match=found):
         opened(content)
-
-
-def test_another_number_of_frames_is_refused(packed):
-    with pytest.raises(MediaError, match="holds 6 frames where 7 are expected"):
-        opened(packed, frames=7)
 
 
 def test_what_blosc2_does_not_give_back_is_an_error(blosc2, video, monkeypatch):

@@ -49,13 +49,6 @@ def test_a_normalised_stream_has_its_range_over_the_formats_largest_number():
     assert (encoding.unit_m, encoding.offset_m) == (1.0, 0.5)
 
 
-def test_contradicting_tags_are_refused_with_both():
-    tags = {"depth_scale": "0.1", "stream.depth_scale": "0.001"}
-
-    with pytest.raises(MediaError, match=r"clip: tag depth_scale = '0\.1', clip: .*'0\.001'"):
-        resolve_encoding(facts(**tags), name="clip")
-
-
 def test_the_users_contract_wins_over_any_tag():
     override = DepthEncoding(unit_m=0.02, kind="ray", source="tag")
 

@@ -1,7 +1,5 @@
 """What a file is, from few of its bytes, and counted where the header cannot be trusted."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -81,13 +79,6 @@ def test_frames_that_are_left_out_at_an_end_are_not_counted(clips, suffix, witho
     assert probe(path, name="clip").frames == frames
 
 
-def test_a_matroska_file_cut_in_the_middle_is_counted_up_to_the_cut(clips, depth_clip):
-    path = clips.folder / "cut.mkv"
-    path.write_bytes(depth_clip.read_bytes()[: depth_clip.stat().st_size // 2])
-
-    assert 20 <= probe(path, name="clip").frames <= 25
-
-
 def test_a_matroska_file_without_a_duration_is_counted(clips):
     source = clips.rgb("groups of 12.mp4", *GROUPS_OF_12)
     path = clips.folder / "live.mkv"
@@ -106,12 +97,3 @@ def test_an_mp4_whose_payload_is_cut_tells_what_is_missing(clips):
         MediaError, match=f"clip: is cut short: .* up to byte {size}, .* {size - 100}:"
     ):
         probe(path, name="clip")
-
-
-def test_the_pixel_format_may_wait_and_all_else_is_reported(clips):
-    path = clips.rgb("groups of 12.mp4", *GROUPS_OF_12)
-
-    asked, waiting = (probe(path, name="clip", pixel_format=when) for when in ("needed", "later"))
-
-    assert (asked.pixel_format, waiting.pixel_format) == ("yuv420p", "")
-    assert replace(waiting, pixel_format="yuv420p") == asked

@@ -110,20 +110,3 @@ def test_a_rate_that_no_clock_ticks_is_followed(clips, suffix):
         shown = [clips.number(read_rgb(reader, index)) for index in (33, 7, 47)]
 
     assert (shown, reader.facts.frame_rate_hz) == ([33, 7, 47], pytest.approx(24000 / 1001))
-
-
-def test_the_rendered_scene_is_ffmpegs_own_at_frames_far_apart(clips, shared_scenes):
-    path = next(shared_scenes.rglob("cam_02_rgb.mp4"))
-    frames = (77, 0, 40)
-    select = "+".join(f"eq(n,{index})" for index in frames)
-    raw = clips.ffmpeg(
-        "-i", path, "-vf", f"select='{select}'", "-fps_mode", "passthrough",
-        "-f", "rawvideo", "-pix_fmt", "rgb24", "-",
-    )  # fmt: skip
-    pictures = np.frombuffer(raw, np.uint8).reshape(3, 320, 320, 3)
-    truth = dict(zip(sorted(frames), pictures, strict=True))
-
-    with VideoReader(path, name="clip", frames=81) as reader:
-        for index in frames:
-            rgb = read_rgb(reader, index)
-            np.testing.assert_array_equal(rgb.transpose(1, 2, 0), truth[index])

@@ -5,7 +5,6 @@ import io
 import pytest
 
 from stereogenbench_data.errors import MediaError, StorageError
-from stereogenbench_data.media.container import open_container
 from stereogenbench_data.media.video import VideoReader, read_rgb
 
 GROUPS_OF_12 = ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-g", "12")
@@ -56,11 +55,6 @@ def test_a_frame_far_ahead_is_sought_and_not_decoded_up_to(clips):
     assert file.bytes_read - before < path.stat().st_size / 4
 
 
-def test_opening_decodes_no_picture(clip):
-    with open_container(clip, name="clip", pixel_format="later") as container:
-        assert container.streams.video[0].codec_context.pix_fmt is None
-
-
 def test_closing_twice_is_allowed_and_reading_after_it_is_not(clips, clip):
     reader = VideoReader(clip, name="a/cam_00_rgb.mp4", frames=clips.frames)
     reader.close()
@@ -84,13 +78,6 @@ def test_a_missing_file_is_named_with_its_path(tmp_path):
         StorageError, match=r"cam_00_rgb.mp4: cannot be read at .*none.mp4 \(No such"
     ):
         VideoReader(tmp_path / "none.mp4", name="cam_00_rgb.mp4", frames=1)
-
-
-def test_an_empty_file_is_named_as_empty(tmp_path):
-    (tmp_path / "a.mp4").touch()
-
-    with pytest.raises(MediaError, match=r"clip: is empty \(0 bytes"):
-        VideoReader(tmp_path / "a.mp4", name="clip", frames=1)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ import json
 import subprocess
 import zlib
 
-import av
 import numpy as np
 import pytest
 from hypothesis import given
@@ -22,6 +21,7 @@ from stereogenbench_data.media.seek_table import (
 from stereogenbench_data.media.video import VideoReader
 from stereogenbench_data.sources.ranged_file import RangedFile
 from tests.servers.tools import require_tool
+from tests.servers.videos import write_depth, write_rgb
 
 FRAMES = 30
 
@@ -29,22 +29,15 @@ FRAMES = 30
 def write(path, *, codec, faststart=False):
     """A video of noise, whose packets are large enough to be skipped by seeking."""
     rng = np.random.default_rng(7)
-    options = {"movflags": "faststart"} if faststart else {}
-    with av.open(str(path), "w", options=options) as container:
-        stream = container.add_stream(codec, rate=15, options={"g": "10"})
-        stream.height, stream.width = 64, 96
-        stream.pix_fmt = {"ffv1": "gray16le", "mjpeg": "yuvj420p"}.get(codec, "yuv420p")
-        for number in range(FRAMES):
-            if codec == "ffv1":
-                pixels = rng.integers(0, 2**16, (64, 96), dtype=np.uint16)
-                frame = av.VideoFrame.from_ndarray(pixels, format="gray16le")
-            else:
-                pixels = rng.integers(0, 256, (64, 96, 3), dtype=np.uint8)
-                frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
-            frame.pts = number
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    return path
+    if codec == "ffv1":
+        units = rng.integers(0, 2**16, (FRAMES, 64, 96), dtype=np.uint16)
+        return write_depth(path, units, options={"g": "10"})
+    pictures = rng.integers(0, 256, (FRAMES, 64, 96, 3), dtype=np.uint8)
+    pixel_format = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+    how = {"codec": codec, "pixel_format": pixel_format, "options": {"g": "10"}}
+    return write_rgb(
+        path, pictures, **how, file_options={"movflags": "faststart"} if faststart else {}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -179,13 +172,11 @@ def repacked(change):
     [
         b"",
         b"seek1",
-        b"seek1" + zlib.compress(b"\xff\xff\xff\xff"),
         b"seek2" + zlib.compress(b""),
         repacked({}),
         repacked([["v", 10**12, [0], 0, 0, 0, 0, 0, 0, 0]]),
         repacked([["v", -1, [0], 0, 0, 0, 0, 0, 0, 0]]),
         repacked([["v", 2, [0, 9], 0, 0, 0, 0, 0, 0, 0]]),
-        repacked([["v", 2, [0], 7, 0, 0, 0, 0, 0, 0]]),
         repacked([["v", 2, [0], 0, 0, 3, 0, 0, 0, 0]]),
         repacked([["v", 2, [0], 0, 0, 0, 0, 10**9, 0, 5]]),
         repacked([["v", 2, "x", 0, 0, 0, 0, 0, 0, 0]]),

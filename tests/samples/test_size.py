@@ -19,9 +19,7 @@ def test_a_size_is_height_and_width_or_a_text_of_width_and_height(size):
     assert require_size(size) == (480, 832)
 
 
-@pytest.mark.parametrize(
-    "size", [None, 480, (480, 832, 3), (480.5, 832), (0, 832), (480, 16385), "48"]
-)
+@pytest.mark.parametrize("size", [None, (480, 832, 3), (480.5, 832), (0, 832), (480, 16385), "48"])
 def test_what_is_no_size_is_named(size):
     with pytest.raises(FieldError, match="1 to 16384 pixels") as refused:
         require_size(size)
@@ -55,10 +53,9 @@ def test_a_size_that_turns_and_stretches_pictures_is_warned_of(size, stored):
         ((480, 832), (1280, 1280)),
         ((640, 640), (1280, 1280)),
         ((64, 48), (1280, 1280)),
-        ((100, 800), (1080, 1920)),
         ((832, 480), (1920, 1080)),
     ],
-    ids=["wide of square", "square", "little", "wide of wide", "high of high"],
+    ids=["wide of square", "square", "little", "high of high"],
 )
 def test_a_size_that_is_meant_is_not_warned_of(size, stored):
     warn_if_swapped(size, stored=stored)

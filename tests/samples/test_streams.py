@@ -51,18 +51,6 @@ def test_the_pool_keeps_no_more_videos_open_than_its_limit(data):
     assert open_files() == []
 
 
-def test_a_video_that_was_closed_in_turn_is_read_again_the_same(data):
-    scene = data.scene(0)
-    roomy, tight = pool_of(data, limit=8), pool_of(data, limit=1)
-
-    for frame in (0, 3, 1):
-        for name in RGB[:3]:
-            expected = roomy.rgb(scene, name, frame, size=None)
-            assert np.array_equal(tight.rgb(scene, name, frame, size=None), expected)
-    roomy.close()
-    tight.close()
-
-
 def test_a_picture_is_handed_out_read_only_and_not_decoded_twice(data):
     pool = pool_of(data)
     first = pool.rgb(data.scene(0), RGB[0], 2, size=None)

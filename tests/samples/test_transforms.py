@@ -84,16 +84,6 @@ def test_scaling_in_the_decoder_is_a_resize(detailed_release, plain):
     assert warped_psnr_db(decoded) > min(30, warped_psnr_db(plain)) - 1.5
 
 
-@pytest.mark.filterwarnings("ignore::stereogenbench_data.samples.fields.SwappedSizeWarning")
-def test_disparity_scales_with_the_width_alone(plain, detailed_release):
-    half = StereoPairs(detailed_release, fields=FIELDS, size=(160, 80))[0]
-
-    nearest = resized_nearest(plain["disparity"].numpy(), size=(160, 80))
-    np.testing.assert_allclose(half["disparity"].numpy(), nearest / 2, rtol=2e-7)
-    assert float(half["intrinsics"][0, 0]) == float(plain["intrinsics"][0, 0]) / 2
-    assert float(half["intrinsics"][1, 1]) == float(plain["intrinsics"][1, 1])
-
-
 def test_a_flip_swaps_the_views_and_takes_the_right_ones_disparity(detailed_release, plain):
     flipped = StereoPairs(detailed_release, fields=FIELDS, transform=HorizontalFlip(1.0))[0]
 
@@ -116,17 +106,6 @@ def test_a_flipped_pairs_poses_are_those_of_a_rig_seen_in_a_mirror(detailed_rele
     assert np.linalg.det(flipped["world_from_left"].numpy()[:3, :3]) == pytest.approx(1)
 
 
-def test_letterbox_adds_black_that_is_not_measured(detailed_release):
-    boxed = StereoPairs(detailed_release, fields=FIELDS, transform=Letterbox(80, 200))[0]
-
-    outside = torch.ones(80, 200, dtype=torch.bool)
-    outside[:, 60:140] = False
-    for name in ("left", "disparity", "valid", "visible", "depth"):
-        assert not boxed[name][..., outside].any(), name
-    assert float(boxed["intrinsics"][0, 2]) == 100.0
-    assert boxed["valid"][0, :, 60:140].float().mean() > 0.5
-
-
 def test_nearest_takes_the_centre_that_torch_calls_nearest_exact():
     maps = np.random.default_rng(0).integers(0, 65536, (2, 37, 53)).astype(np.uint16)
     for size in ((20, 30), (37, 100), (74, 53), (1, 1), (11, 7)):
@@ -144,28 +123,17 @@ def made_views(height=40, width=60):
         for camera in (0, 1)
     }
     units = generator.integers(1, 9, (2, height, width)).astype(np.uint16)
-    return Views(
-        source=0,
-        targets=(1,),
-        frames=(0, 1),
-        pictures=pictures,
-        depths={0: StoredDepth(units, units > 2)},
-        intrinsics=Intrinsics(50.0, 50.0, width / 2, height / 2, width, height),
-    )
+    camera = Intrinsics(50.0, 50.0, width / 2, height / 2, width, height)
+    return Views(0, (1,), (0, 1), pictures, {0: StoredDepth(units, units > 2)}, camera)
 
 
-def scene_of_one_colour(colour, *, height=24, width=36):
-    """Return views whose pictures have one colour and whose depth is measured everywhere."""
-    pictures = np.full((2, 3, height, width), colour, dtype=np.uint8)
-    units = np.full((2, height, width), 50, dtype=np.uint16)
-    return Views(
-        source=0,
-        targets=(1,),
-        frames=(0, 1),
-        pictures={0: pictures, 1: pictures.copy()},
-        depths={camera: StoredDepth(units.copy(), units > 0) for camera in (0, 1)},
-        intrinsics=Intrinsics(50.0, 50.0, width / 2, height / 2, width, height),
-    )
+def white_views():
+    """Return views whose pictures are white and whose depth is measured everywhere."""
+    views = made_views(24, 36)
+    pictures = {camera: np.full_like(each, 255) for camera, each in views.pictures.items()}
+    units = np.full((2, 24, 36), 50, dtype=np.uint16)
+    depths = {camera: StoredDepth(units.copy(), units > 0) for camera in (0, 1)}
+    return replace(views, pictures=pictures, depths=depths)
 
 
 class CropPart:
@@ -198,7 +166,7 @@ steps = st.one_of(
 
 @given(chain=st.lists(steps, max_size=5), start=st.builds(Letterbox, sides, sides))
 def test_no_measured_pixel_has_padding_in_it_whatever_follows_a_letterbox(chain, start):
-    moved = Compose([start, *chain])(scene_of_one_colour(255), np.random.default_rng(0))
+    moved = Compose([start, *chain])(white_views(), np.random.default_rng(0))
 
     for camera in (0, 1):
         measured = moved.depths[camera].measured
@@ -224,7 +192,7 @@ def clean_range(content, *, before_px, after_px):
 
 @given(box=st.tuples(sides, sides), size=st.tuples(sides, sides))
 def test_no_more_is_padded_after_a_resize_than_what_padding_went_into(box, size):
-    boxed = Letterbox(*box)(scene_of_one_colour(255), np.random.default_rng(0))
+    boxed = Letterbox(*box)(white_views(), np.random.default_rng(0))
     padded = Resize(*size)(boxed, np.random.default_rng(0)).padded
     own = np.ones(box, bool) if boxed.padded is None else ~boxed.padded
     axes = []
@@ -381,19 +349,16 @@ def test_the_eraser_paints_on_the_second_view_alone():
         (lambda: Compose([Eraser(), HorizontalFlip()]), "put Eraser last"),
         (lambda: Resize(0, 5), "whole numbers of pixels from 1, got"),
         (lambda: Crop(30, 0, 20, 5)(made_views(), None), "reaches beyond a picture of 60 x 40"),
-        (lambda: Crop(-1, 0, 20, 5), "whole numbers of pixels from 1, got"),
         (lambda: Resize(1.5, 5), "whole numbers of pixels from 1, got 5 x 1.5"),
         (lambda: HorizontalFlip(1.5), "probability of HorizontalFlip must be 0 to 1, got 1.5"),
         (lambda: RandomScale(2, 1), "low, high of RandomScale must be -8 to inf, ascending"),
         (lambda: ColorJitter(hue=3), "hue of ColorJitter must be 0 to 1, got 3"),
-        (lambda: Eraser(1.0, 2, 100, 50), "low, high of Eraser must be 1 to inf, ascending"),
         (lambda: Resize(64), r"write Resize\(64, 64\)"),
         (lambda: RandomCrop((1, 2, 3)), r"is \(height, width\) in pixels, got \(1, 2, 3\)"),
         (
             lambda: Compose(HorizontalFlip(1.0), RandomCrop(8)),
             r"write Compose\(\[HorizontalFlip\(.*\), RandomCrop\(height=8, width=8\)\]\)",
         ),
-        (lambda: Compose([1]), "Compose takes transforms, got 1"),
         (lambda: Compose([HorizontalFlip]), "Compose takes transforms"),
         (lambda: RandomCrop(41, 5)(made_views(), None), "larger than a picture of 60 x 40"),
     ],

@@ -5,7 +5,6 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-import av
 import fsspec
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from tests.servers.failing_server import FailingServer, serving
 from tests.servers.hub import hub_serving
 from tests.servers.nginx import Nginx, nginx_serving
 from tests.servers.tools import made_once, require_module, require_tool
+from tests.servers.videos import write_depth, write_rgb
 
 BUCKET = "some-bucket"
 NOISE_PX = 320
@@ -39,29 +39,14 @@ def large_release(small_release: Path, tmp_path_factory: pytest.TempPathFactory)
         document = json.loads(rig.read_text())
         rig.write_text(json.dumps(document | {"image_width": NOISE_PX, "image_height": NOISE_PX}))
         noise = np.random.default_rng(0)
-        for path in (*folder.glob("*.mp4"), *folder.glob("*.mkv")):
-            _write_noise(path, noise)
+        size = (NOISE_PX, NOISE_PX)
+        for path in folder.glob("*.mp4"):
+            write_rgb(path, noise.integers(0, 255, (7, *size, 3), dtype=np.uint8))
+        for path in folder.glob("*.mkv"):
+            units = noise.integers(1, 65535, (7, *size), dtype=np.uint16)
+            write_depth(path, units, tags={"DEPTH_SCALE": "0.1"})
 
     return made_once(tmp_path_factory, "large_release", make)
-
-
-def _write_noise(path: Path, noise: np.random.Generator) -> None:
-    is_depth = path.suffix == ".mkv"
-    with av.open(str(path), "w") as container:
-        if is_depth:
-            container.metadata["DEPTH_SCALE"] = "0.1"
-        stream = container.add_stream("ffv1" if is_depth else "libx264", rate=15)
-        stream.height = stream.width = NOISE_PX
-        stream.pix_fmt = "gray16le" if is_depth else "yuv420p"
-        for _ in range(7):
-            if is_depth:
-                units = noise.integers(1, 65535, (NOISE_PX, NOISE_PX), dtype=np.uint16)
-                frame = av.VideoFrame.from_ndarray(units, format="gray16le")
-            else:
-                picture = noise.integers(0, 255, (NOISE_PX, NOISE_PX, 3), dtype=np.uint8)
-                frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
 
 
 @pytest.fixture(scope="session")

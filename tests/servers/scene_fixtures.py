@@ -7,36 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import av
-import numpy as np
 import pytest
 
-FRAMES = 4
-SIZE = (24, 32)
+from tests.servers.videos import FRAMES, SIZE, write_video
+
 PLACES_CM = (0.0, 10.0, 25.0, 31.0, 60.0, 72.5)
-
-
-def write_video(
-    path: Path, *, frames: int = FRAMES, size: tuple[int, int] = SIZE, tags: dict[str, str]
-) -> Path:
-    """Write an H.264 clip (mp4) or FFV1 16-bit depth of which the first row is not measured."""
-    is_depth = path.suffix == ".mkv"
-    with av.open(str(path), "w") as container:
-        container.metadata.update(tags)
-        stream = container.add_stream("ffv1" if is_depth else "libx264", rate=15)
-        stream.height, stream.width = size
-        stream.pix_fmt = "gray16le" if is_depth else "yuv420p"
-        for index in range(frames):
-            if is_depth:
-                units = np.full(size, 3000 + index, dtype=np.uint16)
-                units[0] = 0
-                frame = av.VideoFrame.from_ndarray(units, format="gray16le")
-            else:
-                grey = np.full((*size, 3), 40 * index, dtype=np.uint8)
-                frame = av.VideoFrame.from_ndarray(grey, format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    return path
 
 
 @pytest.fixture(scope="session")

@@ -21,7 +21,7 @@ from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Member, ShardFacts
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.verify import verify
-from tests.servers.scene_fixtures import write_video
+from tests.servers.videos import write_video
 from tests.shards.shard_files import flip_byte, scenes_of, tar_of
 
 PAIR = "train-Uniform-000000.tar"
