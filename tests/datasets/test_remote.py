@@ -9,14 +9,11 @@ from torch.utils.data import DataLoader
 from stereogenbench_data import PAIR_FIELDS, SceneIndex, StereoPairs
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.media.seek_table import parse_tables
-from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.retry import RetryPolicy
 from tests.datasets.conftest import same
 from tests.servers.failing_server import Answer, serving
 from tests.servers.hub import REPOSITORY
-from tests.servers.nginx import nginx_serving
-from tests.servers.tools import require_tool
 
 FIELDS = tuple(name for name in PAIR_FIELDS if name != "__url__")
 
@@ -55,14 +52,6 @@ def root(request, root_of):
     return root_of(request.param)
 
 
-def bytes_of_primary_pair(folder):
-    index = SceneIndex.open(folder)
-    scene = index.scene(0)
-    left, right = scene.rig.primary_pair
-    names = (rgb_name(left), rgb_name(right), depth_name(left))
-    return sum(scene.members[name].size for name in names)
-
-
 def test_shards_give_what_the_released_files_give(root, indexed_release):
     expected = StereoPairs(indexed_release, fields=FIELDS, pairs="adjacent", frames=[0, 3])
     pairs = StereoPairs(root, fields=(*FIELDS, "__url__"), pairs="adjacent", frames=[0, 3])
@@ -74,20 +63,6 @@ def test_shards_give_what_the_released_files_give(root, indexed_release):
         assert same(found, expected[number])
     expected.close()
     pairs.close()
-
-
-def test_a_pass_over_a_pair_transfers_little_more_than_its_three_members(large_shards, tmp_path):
-    needed = bytes_of_primary_pair(large_shards)
-    program = require_tool("nginx")
-    with nginx_serving(large_shards, home=tmp_path / "nginx", program=program) as nginx:
-        pairs = StereoPairs(nginx.url, frames="all")
-        before = nginx.sent(requests=2)
-        assert all("disparity" in pairs[number] for number in range(len(pairs)))
-        sent = nginx.sent(requests=6) - before
-    pairs.close()
-
-    # The index has the headers.
-    assert 0.99 * needed <= sent <= 1.05 * needed
 
 
 @pytest.mark.parametrize(("context", "place"), [("spawn", "web"), ("fork", "hub"), ("fork", "s3")])

@@ -2,7 +2,6 @@
 
 import json
 import math
-import multiprocessing
 import os
 import shutil
 
@@ -85,19 +84,6 @@ def test_worker_processes_find_what_one_process_finds(linked_scenes, root, monke
 
     assert together == alone
     assert len(alone.scenes) == 4
-
-
-def test_a_worker_that_dies_is_an_error_and_no_hang(linked_scenes, root, monkeypatch):
-    linked_scenes(40)
-    monkeypatch.setattr(walk_module, "POOL_FROM", 1)
-
-    def kill(done, total):
-        if 0 < done < total:
-            for child in multiprocessing.active_children():
-                child.kill()
-
-    with pytest.raises(StorageError, match=r"a worker process died"):
-        walk(root, workers=2, progress=kill)
 
 
 def stopped_walk(root, journal_path, *, after):

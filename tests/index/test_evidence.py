@@ -251,15 +251,6 @@ def test_a_named_form_that_fails_gives_way_to_one_that_fits():
     np.testing.assert_allclose(motions(understood(text).poses), truth(*TURNED), atol=1e-9)
 
 
-def test_where_a_named_sense_fails_its_named_axes_prove_nothing():
-    said = {"rotation_representation": "opengl_w2c"}
-    text = written("4x4", *TURNED, axes="opencv", unit="m", **said).replace(
-        b"camera_to_world", b"w2c"
-    )
-
-    assert len(understood(text).names) == 2
-
-
 def test_poses_beside_others_of_the_rig_alone_are_those_of_the_world():
     document = json.loads(written("rotator", *TURNED))
     for frame in document["frames"]:

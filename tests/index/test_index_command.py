@@ -74,14 +74,6 @@ def test_a_tree_of_which_nothing_is_whole_makes_no_index(make_scene, root, run):
     assert not (root / "index.parquet").exists()
 
 
-def test_a_folder_without_scenes_is_an_error_without_a_trace(tmp_path, run):
-    result = run(tmp_path)
-
-    assert result.exit_code == 2
-    assert f"{tmp_path}: holds no scene; looked for folders train/" in result.stderr
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_contradiction_that_is_not_fatal_is_reported(make_scene, root, run):
     make_scene("train/Uniform/Downtown_West/scene_000000")
 

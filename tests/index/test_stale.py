@@ -163,20 +163,6 @@ def test_an_index_alone_and_one_of_a_part_are_not_old(tree, tmp_path):
         SceneIndex.open(part)
 
 
-def test_a_scene_put_beside_two_downloads_is_named(tree, tmp_path):
-    there = tmp_path / "there"
-    for family in ("Uniform", "IPD_Gaussian"):
-        done = invoke(
-            "download", tree, "-o", there, "--split", "train", "--where", f"family={family}"
-        )
-        assert done.exit_code == 0
-
-    assert len(SceneIndex.open(there)) == 3
-    add_scene(there)
-    with pytest.warns(StaleIndexWarning, match=rf"1 scene not in the index \({MAP}/scene_000009"):
-        SceneIndex.open(there)
-
-
 def test_a_shard_beside_an_old_index_is_named_and_one_that_is_gone(shards):
     (shards / "train-Uniform-000001.tar").rename(shards / "train-Uniform-000007.tar")
 

@@ -53,7 +53,6 @@ def keys(**values):
 
 PAIR = r"\$\.primary_stereo_pair: must be \{left_camera, right_camera\}"
 TWICE = {"camera_index_a": 2, "camera_index_b": 0, "baseline_cm": 13.5}
-ADJACENT = {"camera_index_a": 1, "camera_index_b": 2, "baseline_cm": 6.9}
 LENGTH = r"pairwise_pairs\[3\]\.baseline_cm: must be a number above zero, found "
 
 
@@ -62,22 +61,17 @@ LENGTH = r"pairwise_pairs\[3\]\.baseline_cm: must be a number above zero, found 
     [
         (keys(primary_stereo_pair=[0, 6]), PAIR),
         (keys(primary_stereo_pair=[2, 2]), PAIR),
-        (keys(primary_stereo_pair=[0, True]), PAIR),
-        (keys(primary_stereo_pair=[0, 1, 2]), PAIR),
         (keys(primary_stereo_pair={"left_camera": "Cam_left", "right_camera": 1}), PAIR),
         (keys(primary_stereo_pair={"left_camera": 0}), PAIR),
         (keys(primary_stereo_pair={"left_camera": "Cam_00", "left_index": 2,
                                    "right_camera": "Cam_01", "right_index": 3}), PAIR),
         (baseline(3, math.nan), f"{LENGTH}nan"),
         (baseline(3, "6.5"), f"{LENGTH}'6.5'"),
-        (baseline(3, 10**400), f"{LENGTH}1000000"),
         (baseline(3, -6.5), f"{LENGTH}-6.5"),
         (lambda document: document["pairwise_pairs"][4].update(camera_index_b=7),
          r"pairwise_pairs\[4\].*: is of cameras 0 and 7, and the rig has cameras 0 to 5"),
         (lambda document: document["pairwise_pairs"].__setitem__(7, TWICE),
          r"pairwise_pairs\[7\].*0 and 2 is 13.5 cm here and 13.25 cm at \$\.pairwise_pairs\[1\]"),
-        (keys(adjacent_pairs=[ADJACENT]),
-         r"adjacent_pairs\[0\].*1 and 2 is 6.9 cm here and 6.75 cm at \$\.pairwise_pairs\[5\]"),
         (keys(baselines_adjacent_cm=[6.5, 6.9, 5.75, 7.0, 6.5]),
          r"adjacent_cm\[1\]: .*1 and 2 is 6.9 cm here and 6.75 cm at \$\.pairwise_pairs\[5\]"),
         (keys(pairwise_pairs={}), "each of the 15 camera pairs, and lacks 0-1"),
@@ -272,12 +266,7 @@ def test_a_principal_point_that_is_not_understood_stops_no_disparity(rig_documen
     ("intrinsics", "size"),
     [
         ({"focal_length_mm": "32.5 mm", "sensor_width_cm": 2.376, "sensor_height_cm": 1.782}, {}),
-        ({"focal_length_mm": 32.5, "sensor_size_mm": [23.76, 17.82]}, {}),
         ({"focal_length_mm": 32.5, "sensor": {"width_mm": 23.76, "height_mm": 17.82}}, {}),
-        (
-            {"focal_length_mm": 32.5, "hfov_deg": 40.15832, "sensor_height_mm": 17.82},
-            {"resolution": [640, 480]},
-        ),
         (
             {"fx_px": 875.4208754, "sensor_width_mm": 23.76, "sensor_height_mm": 17.82},
             {"render_width": 640, "render_height": 480},
@@ -287,20 +276,15 @@ def test_a_principal_point_that_is_not_understood_stops_no_disparity(rig_documen
              "sensor_width_mm": 23.76},
             {},
         ),
-        ({"lens": 32.5, "Filmback": {"SensorWidth": 23.76, "SensorHeight": 17.82}}, {}),
         ({"focal_length_mm": [32.5] * 6, "sensor_width_mm": 23.76}, {}),
         ({"FOVAngle": 40.15832, "sensor_width_mm": 23.76}, {}),
-        ({"camera_angle_x": 0.70089489, "sensor_width_mm": 23.76}, {}),
         ({"camera.focal_length_mm": 32.5, "sensor_mm": [23.76, 17.82], "fov": 40.2}, {}),
         ({"camera_matrix": {"rows": 3, "data": [875.4208754, 0, 320, 0, 875.4208754, 240, 0, 0, 1]},
           "sensor_width_mm": 23.76}, {}),
         ({"vertical_fov_degrees": 30.66233813, "sensor_width_mm": 23.76}, {}),
         ({"focal_length": {"value": 3.25, "unit": "cm"}, "sensor_width_mm": 23.76}, {}),
-        ({"focal_length_mm": [32.5] * 81, "sensor_width_mm": 23.76}, {}),
         ({"model": "PINHOLE", "params": [875.4208754, 875.4208754, 320, 240],
           "sensor_width_mm": 23.76}, {}),
-        ({"model": "SIMPLE_PINHOLE", "params": [875.4208754, 320, 240], "sensor_width_mm": 23.76},
-         {}),
         ({"K": {f"cam_{camera:02d}": [[875.4208754, 0, 320], [0, 875.4208754, 240], [0, 0, 1]]
                 for camera in range(6)}, "sensor_width_mm": 23.76}, {}),
     ],
@@ -358,19 +342,10 @@ def pairs_as(document, write):
                 for a, b, cm in pairs
             ]}, id="names in a list, metres"),
         pytest.param(
-            lambda pairs: {"pairwise_baselines_cm": {f"{a}-{b}": cm for a, b, cm in pairs}},
-            id="keys"),
-        pytest.param(
             lambda pairs: {"pairwise_pairs": [
                 {"camera_index_a": a + 1, "camera_index_b": b + 1, "baseline_cm": cm}
                 for a, b, cm in pairs
             ], "primary_stereo_pair": [1, 2]}, id="cameras from 1"),
-        pytest.param(
-            lambda pairs: {"pairwise_pairs": [
-                {"camera_a": f"Cam_{a:02d}", "camera_b": f"Cam_{b:02d}", "baseline_mm": 10 * cm,
-                 "baseline_cm": cm, "pair_index": n}
-                for n, (a, b, cm) in enumerate(pairs)
-            ]}, id="two units that agree"),
         pytest.param(
             lambda pairs: {"pairwise_pairs": [
                 {"camera_index_a": b, "camera_index_b": a, "baseline_cm": -cm}
@@ -382,21 +357,9 @@ def pairs_as(document, write):
             lambda pairs: {"adjacent_baselines_cm": [cm for a, b, cm in pairs if b == a + 1]},
             id="neighbours alone"),
         pytest.param(
-            lambda pairs: {"pairwise_baselines_cm": [cm for a, b, cm in pairs]},
-            id="all pairs in order"),
-        pytest.param(
             lambda pairs: {"camera_positions_m": {
                 f"Cam_{b:02d}": [1.0, cm / 100, -2.0]
                 for a, b, cm in [(0, 0, 0.0), *pairs] if a == 0}}, id="places in space"),
-        pytest.param(
-            lambda pairs: {"rig": {"spacings": [cm for a, b, cm in pairs if b == a + 1],
-                                   "unit": "cm"}}, id="spacings alone"),
-        pytest.param(
-            lambda pairs: {"baseline": {"unit": "mm", "pairs": [
-                {"a": a, "b": b, "value": 10 * cm} for a, b, cm in pairs]}}, id="values"),
-        pytest.param(
-            lambda pairs: {"pairwise_baselines": {f"{a}_{b}": {"m": cm / 100}
-                                                  for a, b, cm in pairs}}, id="units as keys"),
         pytest.param(
             lambda pairs: {"camera_offsets_m": [0.0, *(cm / 100 for a, _, cm in pairs if a == 0)]},
             id="places along the rig"),
@@ -420,18 +383,11 @@ def pairs_as(document, write):
                 for a, b, cm in pairs
             ]}, id="figures beside the baseline"),
         pytest.param(
-            lambda pairs: {"baselines": {f"{a}-{b}": f"{cm / 100!r} m" for a, b, cm in pairs}},
-            id="a unit behind the number"),
-        pytest.param(
             lambda pairs: {"baseline_matrix_cm": [[abs(a - b) for b in PLACES_CM]
                                                   for a in PLACES_CM]}, id="a matrix"),
         pytest.param(
             lambda pairs: {"baseline_matrix_cm": [[b - a for b in PLACES_CM]
                                                   for a in PLACES_CM]}, id="a signed matrix"),
-        pytest.param(
-            lambda pairs: {"pairwise_pairs": {
-                f"Town_7_Cam_{a:02d}__Town_7_Cam_{b:02d}": {"baseline_cm": cm}
-                for a, b, cm in pairs}}, id="names of pairs"),
         pytest.param(
             lambda pairs: {"pairs": [{"pair": f"{a}-{b}", "baseline_mm": 10 * cm}
                                      for a, b, cm in pairs]}, id="pairs by a key"),

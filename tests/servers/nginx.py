@@ -15,8 +15,7 @@ pid nginx.pid;
 error_log error.log;
 events {{ worker_connections 64; }}
 http {{
-    log_format counted '$status $body_bytes_sent $http_range';
-    access_log access.log counted;
+    access_log off;
     client_body_temp_path body;
     proxy_temp_path proxy;
     fastcgi_temp_path fastcgi;
@@ -36,19 +35,6 @@ class Nginx:
 
     url: str
     home: Path
-
-    def sent(self, *, requests: int) -> int:
-        """Return the bytes of bodies sent, once there were so many requests."""
-        return sum(int(line.split()[1]) for line in self._lines(requests))
-
-    def _lines(self, count: int) -> list[str]:
-        """Return the lines of the log, which nginx writes just after it has answered."""
-        for _ in range(100):
-            lines = (self.home / "access.log").read_text().splitlines()
-            if len(lines) >= count:
-                break
-            time.sleep(0.02)
-        return lines
 
 
 @contextmanager

@@ -217,18 +217,6 @@ def test_a_shard_without_a_usable_manifest_is_refused(packed, release, tmp_path,
         pack(release, out, target_bytes=ONE_EACH, workers=1)
 
 
-def test_an_error_in_a_worker_names_the_source(tree, tmp_path):
-    index = SceneIndex.open(tree)
-    gone = next(tree.glob("train/Uniform/*/scene_000001/cam_03_depth.mkv"))
-    gone.unlink()
-
-    with pytest.raises(ShardError, match=r"cam_03_depth\.mkv: cannot be read \(No such file"):
-        pack(index, tmp_path / "out", target_bytes=ONE_EACH, workers=2)
-
-    assert NAMES[3] not in tars(tmp_path / "out")
-    assert not any(name.endswith(".tmp") for name in tars(tmp_path / "out"))
-
-
 @pytest.mark.parametrize(
     "change",
     [

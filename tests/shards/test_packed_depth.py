@@ -117,24 +117,6 @@ def test_without_blosc2_the_extra_is_named_and_nothing_is_left(
     assert not (tmp_path / "out").exists()
 
 
-def test_one_frame_far_away_costs_its_own_bytes(web, large_release):
-    require_module("blosc2")
-    pack(large_release, web.folder / "shards", depth_codec="blosc2", workers=1)
-    index = SceneIndex.open(web.folder / "shards")
-    scene = index.scene(0)
-    member = scene.members["cam_00_depth.b2frame"]
-    pairs = StereoPairs(f"{web.url}/shards", fields=("depth",), frames=[4])
-
-    depth = pairs[0]["depth"]
-
-    *_, chunk = [each for each in web.asked if each.path.endswith(".tar")]
-    assert depth.shape == (1, 320, 320)
-    assert sum(each.sent for each in web.asked if each.path.endswith(".tar")) <= chunk.sent + 1
-    assert chunk.start >= member.offset
-    assert chunk.start + chunk.sent <= member.offset + member.size
-    assert chunk.sent <= 320 * 320 * 2 + 32 < 0.2 * member.size
-
-
 def same_videos(one, other):
     with (
         VideoReader(one, name="one", frames=7) as reader,

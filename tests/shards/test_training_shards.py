@@ -217,16 +217,21 @@ class Killed(Exception):
     """The process ends here."""
 
 
-def test_a_killed_run_loses_at_most_one_scene(packed, release, tmp_path):
-    index = SceneIndex.open(release)
-    rows = [row for row in range(len(index)) if "Uniform" in index.column("key")[row]]
+def pack_until_three_quarters(release, out, **how):
+    """Pack training shards, and end as if killed."""
 
     def killed(done, total):
         if done > 0.75 * total:
             raise Killed
 
     with pytest.raises(Killed):
-        pack(release, tmp_path, training=SETTINGS, rows=rows, workers=1, progress=killed)
+        pack(release, out, training=SETTINGS, workers=1, progress=killed, **how)
+
+
+def test_a_killed_run_loses_at_most_one_scene(packed, release, tmp_path):
+    index = SceneIndex.open(release)
+    rows = [row for row in range(len(index)) if "Uniform" in index.column("key")[row]]
+    pack_until_three_quarters(release, tmp_path, rows=rows)
     whole = list(tmp_path.glob(f".parts/*.derived/**/{TRAINING_JSON}"))
     before = {path: path.stat().st_mtime_ns for path in whole[0].parent.iterdir()}
     seen = []
@@ -245,12 +250,7 @@ def test_a_killed_run_loses_at_most_one_scene(packed, release, tmp_path):
 
 
 def test_derived_files_that_were_damaged_before_the_shard_are_made_again(packed, release, tmp_path):
-    def killed(done, total):
-        if done > 0.75 * total:
-            raise Killed
-
-    with pytest.raises(Killed):
-        pack(release, tmp_path, training=SETTINGS, workers=1, progress=killed)
+    pack_until_three_quarters(release, tmp_path)
     flip_byte(next(tmp_path.glob(".parts/*.derived/**/cam_03_rgb.mp4")))
     pack(release, tmp_path, training=SETTINGS, workers=1)
 
@@ -285,26 +285,18 @@ def test_a_url_is_a_source_as_its_folder_is(packed, release, tmp_path, web):
     assert repr(found.files) == repr(expected.files)
 
 
-def test_some_cameras_and_scenes_are_kept(release, tmp_path):
-    settings = TrainingSettings(SIZE, cameras=(0, 3))
-    pack(release, tmp_path, training=settings, rows=[1], workers=1)
-
-    (scene,) = [SceneIndex.open(tmp_path).scene(0)]
-    assert scene.held_videos == (
-        "cam_00_rgb.mp4", "cam_03_rgb.mp4", "cam_00_depth.b2frame", "cam_03_depth.b2frame",
-    )  # fmt: skip
-    assert [math.isnan(each) for each in scene.training.psnr_db] == [
-        camera not in (0, 3) for camera in range(6)
-    ]
-    assert StereoPairs(tmp_path, pairs=[(0, 3)])[0]["left"].shape == (3, *SIZE)
-    with pytest.raises(StorageError, match="cam_01"):
-        StereoPairs(tmp_path)
-    assert verify(tmp_path, mode="decode", workers=1).problems == ()
-
-
-def test_the_pairs_of_some_cameras_are_given_and_said_to_be_fewer(release, tmp_path):
+def test_some_cameras_and_scenes_are_kept_and_their_pairs_are_said_to_be_fewer(release, tmp_path):
     settings = TrainingSettings(SIZE, cameras=(0, 1, 3))
     pack(release, tmp_path, training=settings, rows=[1], workers=1)
+
+    scene = SceneIndex.open(tmp_path).scene(0)
+    assert len(scene.held_videos) == 6
+    assert [math.isnan(each) for each in scene.training.psnr_db] == [
+        camera not in (0, 1, 3) for camera in range(6)
+    ]
+    with pytest.raises(StorageError, match="cam_02"):
+        StereoPairs(tmp_path, pairs=[(0, 2)])
+    assert verify(tmp_path, mode="decode", workers=1).problems == ()
 
     with pytest.warns(FewerPairsWarning, match="pairs='all' gives 3 of 15 pairs") as warned:
         found = StereoPairs(tmp_path, pairs="all", fields=("pair", "left", "disparity"))
