@@ -8,11 +8,11 @@ import gc
 import os
 import shutil
 import signal
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
@@ -24,6 +24,10 @@ from tests.servers.tools import made_once
 pytest_plugins = ("tests.servers.fixtures", "tests.servers.scene_fixtures")
 
 os.environ[CACHE_VARIABLE] = "off"  # no test leaves anything in the user's cache
+
+# An example may take long where other work takes the processor.
+settings.register_profile("tests", deadline=None)
+settings.load_profile("tests")
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
@@ -60,9 +64,8 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 def pytest_collection_finish() -> None:
     """Leave all that was imported to no later garbage collection, which forks would copy it for."""
-    if "hypothesis" in sys.modules:  # When imported, it looks for what freezing hides from it.
-        gc.collect()
-        gc.freeze()
+    gc.collect()
+    gc.freeze()
 
 
 def _shared_folder(name: str) -> Path:

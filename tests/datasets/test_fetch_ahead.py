@@ -6,7 +6,6 @@ import os
 import shutil
 import threading
 import time
-import warnings
 from pathlib import Path
 
 import pyarrow as pa
@@ -241,14 +240,6 @@ def test_an_index_of_an_earlier_version_reads_with_a_hint(large_shards, tmp_path
         expected = StereoPairs(large_shards, fields=("left",))
         assert same(pairs[0], expected[0])
         pairs.close()
-
-
-def test_local_data_read_no_seek_tables(large_shards):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        pairs = StereoPairs(large_shards, fields=("left",))
-
-    assert pairs.index.seek_tables(0) is None
 
 
 def test_closing_does_not_wait_for_requests_that_hang_and_they_end(served):

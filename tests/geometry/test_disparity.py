@@ -50,7 +50,7 @@ def test_disparity_of_one_pixel(library, dtype, depth_m, baseline_m, expected_px
     np.testing.assert_array_equal(library.numpy(disparity_px), [[expected_px]])
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(focal_px=focals_px, baseline_m=baselines_m, unit_m=units_m)
 def test_float32_disparity_is_the_float64_one_rounded(library, focal_px, baseline_m, unit_m):
     depth_m = (ALL_UNITS[:, 1:] * unit_m).astype(np.float32)
@@ -63,7 +63,7 @@ def test_float32_disparity_is_the_float64_one_rounded(library, focal_px, baselin
     np.testing.assert_array_equal(disparity_px, exact.astype(np.float32))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(focal_px=focals_px, baseline_m=baselines_m, unit_m=units_m)
 @pytest.mark.parametrize("form", ["depth", "inverse"])
 def test_disparity_of_every_stored_number_is_within_an_ulp(
@@ -135,7 +135,7 @@ def test_the_error_of_one_pixel_at_a_tenth_of_a_metre(library, depth_m, expected
     np.testing.assert_allclose(error_px, [[expected_px]], rtol=1e-4)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(
     focal_px=focals_px,
     baseline_m=baselines_m,

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -114,7 +114,6 @@ def test_the_world_has_x_right_y_down_and_z_forward_of_an_unturned_camera(make_r
     np.testing.assert_array_equal(poses.world_from_cam(0, 0)[:3, :3], np.eye(3))
 
 
-@settings(deadline=None)
 @given(rotator_deg=rotators_deg, offset_cm=offsets_cm, gaps=gaps_cm)
 def test_pose_baselines_match_the_recorded_ones_at_any_offset(
     make_rig, rotator_deg, offset_cm, gaps

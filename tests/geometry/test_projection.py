@@ -108,7 +108,7 @@ def test_the_chain_follows_what_was_done_to_the_picture(make_rig, intrinsics):
     require_closed_form(intrinsics, Case(), make_rig)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(
     turn_deg=st.tuples(*[st.floats(-20, 20)] * 3),
     shift_m=st.tuples(*[st.floats(-0.5, 0.5)] * 3),

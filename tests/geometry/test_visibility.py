@@ -101,7 +101,7 @@ def brute_force(projection: Projection, measured, target_m, target_measured, tol
     return visible
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), rows=st.sampled_from(["kept", "moved"]))
 def test_whole_maps_are_decided_as_pixel_by_pixel(library, seed, rows):
     rng = np.random.default_rng(seed)
@@ -133,7 +133,7 @@ def test_whole_maps_are_decided_as_pixel_by_pixel(library, seed, rows):
     np.testing.assert_array_equal(library.numpy(visible), expected)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), rows=st.sampled_from(["kept", "moved"]))
 def test_a_pixel_is_hidden_where_a_nearer_one_lands_beside_it(library, seed, rows):
     """Against each pixel's nearest rival, found by comparing all pixels with all."""

@@ -27,7 +27,7 @@ def splat_pixel_by_pixel(image, u_px, v_px, depth_m, measured):
     return warped, hole
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
     dtype=st.sampled_from([np.uint8, np.uint16, np.float32]),
@@ -68,7 +68,7 @@ def test_a_near_pixel_covers_the_far_one_and_leaves_a_hole_where_it_stood(librar
     assert library.numpy(hole).tolist() == [[False, False, False, True, False]]
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
     dtype=st.sampled_from([np.uint8, np.float32, np.float64]),

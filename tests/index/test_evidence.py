@@ -223,7 +223,7 @@ def test_readings_that_only_pictures_can_tell_apart_are_all_named():
 angles = st.tuples(st.floats(-60, 60), st.floats(-180, 180), st.floats(-15, 15))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(rotators=st.lists(angles, min_size=2, max_size=3), form=st.sampled_from(sorted(FORMS)))
 def test_any_path_in_any_form_is_read_or_refused(rotators, form):
     rotators, places_cm = path(rotators)

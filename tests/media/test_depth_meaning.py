@@ -70,7 +70,7 @@ def test_zero_and_the_formats_largest_number_are_not_measured(pixel_format, larg
     np.testing.assert_array_equal(found, [[False, True, True, False]])
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(unit_m=st.floats(1e-5, 10))
 def test_metres_are_the_exact_product_rounded_once(unit_m):
     units = np.arange(65536, dtype=np.uint16).reshape(256, 256)

@@ -37,7 +37,7 @@ def test_every_frame_in_random_order_is_ffmpegs_own(clips, structure):
             np.testing.assert_array_equal(read_rgb(reader, index), truth[index])
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=15, suppress_health_check=list(HealthCheck))
 @given(order=st.lists(st.integers(0, 47), min_size=1, max_size=6))
 @pytest.mark.parametrize("structure", ["one group with b-pyramid", "groups of 12"])
 def test_any_walk_over_the_frames_shows_the_painted_numbers(clips, structure, order):

@@ -39,22 +39,6 @@ def test_matrix_and_range_are_those_of_the_file(clips, colour, pixel_format):
     np.testing.assert_array_equal(found, clips.truth(path))
 
 
-@pytest.mark.parametrize(("height", "width"), [(62, 94), (2, 2), (46, 72)])
-def test_padded_rows_are_not_part_of_the_picture(clips, height, width):
-    path = clips.rgb(
-        f"padded {height} {width}.mp4", *X264, "-pix_fmt", "yuv420p",
-        pictures=coloured_noise(height, width),
-    )  # fmt: skip
-    raw = clips.ffmpeg("-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "-")
-    truth = np.frombuffer(raw, np.uint8).reshape(3, height, width, 3)
-
-    with VideoReader(path, name="clip", frames=3) as reader:
-        found = read_rgb(reader, 2)
-
-    assert found.flags.c_contiguous
-    np.testing.assert_array_equal(found.transpose(1, 2, 0), truth[2])
-
-
 @pytest.mark.parametrize("pixel_format", ["yuv420p", "yuv444p", "gbrp", "gray", "bgr0"])
 def test_odd_sizes_and_other_formats_are_ffmpegs_too(clips, pixel_format):
     path = clips.rgb(

@@ -441,7 +441,7 @@ def test_more_than_twenty_problems_are_counted(rig_document, dumped):
 lengths = st.floats(0.5, 5000)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(baselines=st.lists(lengths, min_size=15, max_size=15))
 def test_every_number_of_a_rig_is_read_exactly(baselines):
     pairs = zip(itertools.combinations(range(6), 2), baselines, strict=True)

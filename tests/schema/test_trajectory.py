@@ -186,7 +186,7 @@ def test_nan_under_a_key_that_nobody_reads_is_ignored(trajectory_document):
     assert len(recorded(trajectory_document).blocks) == 2
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(numbers=st.lists(st.floats(-1e6, 1e6), min_size=36, max_size=36))
 def test_every_number_of_a_pose_is_read_exactly(numbers):
     names = ("x", "y", "z", "pitch", "yaw", "roll")

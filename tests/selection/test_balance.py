@@ -43,13 +43,6 @@ def test_a_limit_is_met_exactly_and_shared_out(crowded_cm):
     assert max(shares.values()) - min(shares.values()) <= 1
 
 
-def test_the_draw_depends_on_the_seed_alone(crowded_cm):
-    one, same, other = (balanced(crowded_cm, by="bins", limit=50, seed=seed) for seed in (1, 1, 2))
-
-    assert np.array_equal(one, same)
-    assert not np.array_equal(one, other)
-
-
 def test_a_limit_beyond_the_poorest_stratum_names_it(crowded_cm):
     with pytest.raises(
         SelectionError,

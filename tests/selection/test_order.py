@@ -75,7 +75,7 @@ rules = st.fixed_dictionaries(
 
 
 @given(lengths=lengths_of_scenes, rule=rules)
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 def test_every_sample_is_in_one_batch_and_only_the_last_batch_is_short(lengths, rule):
     order = order_of(lengths, **rule)
     batches = all_batches(order)
@@ -104,7 +104,7 @@ def parts_of(order, group, *, pairs):
 
 
 @given(lengths=lengths_of_scenes, rule=rules)
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 def test_moments_of_a_run_ascend_but_for_where_a_stream_starts(lengths, rule):
     order = order_of(lengths, **(rule | {"shuffle": True, "open_frames": 1}))
     parts, goes_back = 0, 0
@@ -121,7 +121,7 @@ def test_moments_of_a_run_ascend_but_for_where_a_stream_starts(lengths, rule):
 
 
 @given(lengths=lengths_of_scenes, rule=rules)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_the_last_sample_of_each_part_of_a_run_is_marked(lengths, rule):
     order = order_of(lengths, **rule)
     seen, wanted = set(), set()
@@ -317,7 +317,7 @@ def test_streams_start_where_decoding_can_begin(pairs, open_frames):
 
 
 @given(lengths=lengths_of_scenes, rule=rules)
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 def test_in_a_block_each_pair_is_read_at_ascending_moments(lengths, rule):
     """Else a camera would go back to decode a moment that it had passed."""
     order = order_of(lengths, **(rule | {"shuffle": True, "pairs": 3}))
@@ -379,7 +379,7 @@ def test_a_rule_that_orders_nothing_is_refused(rule, message):
     ),
     shuffle=st.booleans(),
 )
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_rules_that_are_the_same_in_effect_give_the_same_order(
     lengths, pairs, size, asked, shuffle
 ):

@@ -11,11 +11,10 @@ Answering = Callable[[int, int], Iterator[bytes | float]]
 
 
 @contextmanager
-def raw_serving(answering: Answering, *, host: str = "127.0.0.1") -> Iterator[str]:
+def raw_serving(answering: Answering) -> Iterator[str]:
     """Answer on a free port of this machine; yields the address."""
     stopped = threading.Event()
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listening = socket.create_server((host, 0), family=family)
+    listening = socket.create_server(("127.0.0.1", 0))
     threads: list[threading.Thread] = []
 
     def answer(connection: socket.socket) -> None:
@@ -45,8 +44,7 @@ def raw_serving(answering: Answering, *, host: str = "127.0.0.1") -> Iterator[st
     accepting = threading.Thread(target=accept, daemon=True)
     accepting.start()
     try:
-        shown = f"[{host}]" if ":" in host else host
-        yield f"http://{shown}:{listening.getsockname()[1]}"
+        yield f"http://127.0.0.1:{listening.getsockname()[1]}"
     finally:
         stopped.set()
         with suppress(OSError):

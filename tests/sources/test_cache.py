@@ -231,7 +231,7 @@ def test_a_count_that_was_lost_is_made_again(cache, shard, tmp_path):
     opened=st.lists(st.integers(0, 11), max_size=25),
     limit=st.integers(6000, 20_000),
 )
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 def test_it_never_holds_more_than_its_limit_and_never_lies(tmp_path_factory, opened, limit):
     cache = ShardCache(tmp_path_factory.mktemp("cache"), limit_bytes=limit)
     shard = Shard()

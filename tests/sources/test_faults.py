@@ -172,15 +172,6 @@ def test_a_wait_longer_than_the_policy_allows_is_an_error_and_not_kept(served):
     assert remote.read(0, 9) == DATA[:9]
 
 
-def test_a_server_with_an_ipv6_address_is_read():
-    def whole(start, stop):
-        yield answering_head(start, stop) + DATA[start:stop]
-
-    with raw_serving(whole, host="::1") as url:
-        assert url.startswith("http://[::1]:")
-        assert RemoteObject(f"{url}/x.tar").read(0, 9) == DATA[:9]
-
-
 def test_many_threads_keep_their_connections(served, caplog):
     remote, wrong = RemoteObject(f"{served.url}/x.tar"), []
 

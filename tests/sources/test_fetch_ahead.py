@@ -39,7 +39,7 @@ def read(ahead, start, stop):
 ranges = st.tuples(st.integers(0, 9000), st.integers(1, 1200)).map(lambda r: (r[0], r[0] + r[1]))
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.lists(st.lists(ranges, max_size=4), min_size=1, max_size=8))
 @example([[(2732, 2999), (5047, 5996)]])  # as far apart as one request may join
 def test_every_byte_that_is_needed_is_fetched_once_and_no_other(samples):

@@ -60,7 +60,7 @@ def do(file, what, number):
 
 
 @given(steps=steps)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_a_ranged_file_reads_as_a_file_of_its_bytes_does(steps):
     store = Store(5000)
     ranged, plain = store.open(), io.BytesIO(store.data)
@@ -69,7 +69,7 @@ def test_a_ranged_file_reads_as_a_file_of_its_bytes_does(steps):
 
 
 @given(steps=steps)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_a_slice_of_a_local_file_reads_as_a_file_of_its_bytes_does(tmp_path_factory, steps):
     store = Store(5000)
     path = tmp_path_factory.getbasetemp() / "slice.bin"

@@ -5,7 +5,7 @@ import pytest
 
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.sources.cache import ShardCache
-from tests.servers.failing_server import Answer, serving
+from tests.servers.failing_server import serving
 from tests.servers.hub import COMMIT, REPOSITORY
 from tests.sources.source_kit import BASELINE_JSON, SourceTests
 
@@ -92,16 +92,3 @@ class TestCached(TestHttp):
     @pytest.fixture
     def cache(self, tmp_path):
         return ShardCache(tmp_path / "cache", limit_bytes=10**8)
-
-    def test_a_file_is_fetched_once_by_all_copies(self, server, make_source, scene, released):
-        for _ in range(3):
-            assert make_source().read(scene, BASELINE_JSON) == released(BASELINE_JSON)
-
-        assert len([asked for asked in server.asked if asked.stop - asked.start > 1]) == 1
-
-    def test_bytes_that_came_wrong_once_are_fetched_again(
-        self, server, make_source, scene, released
-    ):
-        server.answers = [Answer(), Answer(change=lambda data: data[::-1])]
-
-        assert make_source().read(scene, BASELINE_JSON) == released(BASELINE_JSON)
