@@ -20,8 +20,6 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),
     pytest.mark.filterwarnings("ignore::FutureWarning"),
 ]
-PAIRS = 20
-"""The adjacent pairs of the scenes: each comes with three frames."""
 
 
 @pytest.fixture(scope="module")

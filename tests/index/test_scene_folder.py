@@ -1,12 +1,13 @@
 """One scene's folder: what its row says, and each way in which it can be wrong."""
 
+import os
 import re
 import shutil
 
 import av
 import pytest
 
-from stereogenbench_data.errors import StorageError
+from stereogenbench_data.errors import SchemaError, StorageError
 from stereogenbench_data.index.open_tree import assumptions
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
@@ -331,6 +332,14 @@ def test_all_problems_of_a_scene_are_told_at_once(make_scene, root, video):
 
     assert f"{KEY}/baseline.json: not valid JSON" in str(caught.value)
     assert "cam_01_rgb.mp4 has 64x48" in str(caught.value)
+
+
+def test_a_huge_metadata_file_is_refused_by_its_size(make_scene, root):
+    path = make_scene() / "baseline.json"
+    os.truncate(path, 200 * 2**20)
+
+    with pytest.raises(SchemaError, match=r"baseline.json: .*this one has 209,715,200. It was not"):
+        describe_scene(root, KEY)
 
 
 def test_a_folder_that_is_gone_is_named(root):

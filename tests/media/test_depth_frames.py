@@ -260,6 +260,11 @@ def test_a_header_that_describes_no_packed_depth_is_refused(packed, old, new, fo
         opened(content)
 
 
+def test_another_number_of_frames_is_refused(packed):
+    with pytest.raises(MediaError, match="holds 6 frames where 7 are expected"):
+        opened(packed, frames=7)
+
+
 def test_what_blosc2_does_not_give_back_is_an_error(blosc2, video, monkeypatch):
     def forgetful(chunk, dst, **how):
         dst[...] = 1
