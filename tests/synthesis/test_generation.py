@@ -60,6 +60,12 @@ def test_parts_together_are_the_same_scenes_as_one_run(tmp_path):
     assert scenes_in(tmp_path / "parts") == scenes_in(tmp_path / "whole")
 
 
+@pytest.mark.parametrize("part", [(0, 2), (3, 2)])
+def test_a_part_that_is_none_is_refused(tmp_path, part):
+    with pytest.raises(SynthesisError, match=r"part ./.: .* from 1 to the second"):
+        synthesise(tmp_path, SynthRequest(**SMALL), part=part)
+
+
 def test_a_map_without_room_ends_with_the_reasons(tmp_path, monkeypatch):
     monkeypatch.setattr("stereogenbench_data.synthesis.planning.MOST_PROPOSALS", 5)
 
