@@ -149,19 +149,6 @@ def test_fresh_buffers_give_each_batch_memory_of_its_own(small_index):
     )
 
 
-def test_the_loaders_parts_serve_another_loader(pairs):
-    """Others build loaders of their own from a loader's dataset, batch sampler and collate."""
-    loader, expected = pairs.loader(9, num_workers=1), pairs.loader(9)
-    next(iter(loader))
-    expected.set_epoch(1)
-    other = DataLoader(
-        loader.dataset, batch_sampler=loader.batch_sampler, collate_fn=loader.collate_fn,
-        num_workers=1,
-    )  # fmt: skip
-
-    assert all(same(one, two) for one, two in zip(other, expected, strict=True))
-
-
 def test_a_position_is_not_guessed_where_another_loader_reads_the_batches(pairs):
     loader = pairs.loader(9)
     other = iter(

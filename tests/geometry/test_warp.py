@@ -57,17 +57,6 @@ def test_a_splat_is_painting_from_far_to_near(library, seed, dtype, rows):
     np.testing.assert_array_equal(library.numpy(hole), expected_hole)
 
 
-def test_a_near_pixel_covers_the_far_one_and_leaves_a_hole_where_it_stood(library):
-    depth_m = library.array(np.array([[9.0, 9.0, 9.0, 1.0, 9.0]], dtype=np.float32))
-    disparity_px = library.array(np.array([[0.0, 0.0, 0.0, 2.0, 0.0]], dtype=np.float32))
-    image = library.array(np.array([[[10, 20, 30, 40, 50]]], dtype=np.uint8))
-
-    warped, hole = splat(image, project_rectified(depth_m, disparity_px), measured=depth_m > 0)
-
-    assert library.numpy(warped).tolist() == [[[10, 40, 30, 0, 50]]]
-    assert library.numpy(hole).tolist() == [[False, False, False, True, False]]
-
-
 @settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),

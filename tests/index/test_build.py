@@ -7,7 +7,6 @@ import shutil
 
 import pytest
 
-from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import build as walk_module
 from stereogenbench_data.index.build import scene_journal, walk
 from stereogenbench_data.index.scene_folder import describe_scene
@@ -154,17 +153,6 @@ def test_the_journal_of_another_walk_is_begun_anew(linked_scenes, root, tmp_path
     known, _ = resumed_walk(root, tmp_path / "journal", name="other")
 
     assert known == 0
-
-
-def test_a_journal_that_cannot_be_written_is_named(linked_scenes, root, tmp_path):
-    linked_scenes(1)
-    (tmp_path / "file").write_text("")
-
-    with (
-        scene_journal(tmp_path / "file" / "journal", walk="w") as journal,
-        pytest.raises(StorageError, match="file/journal: the journal cannot be written"),
-    ):
-        walk(root, journal=journal)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.index.tree import find_scene_folders, release_root_of
+from stereogenbench_data.index.tree import find_scene_folders
 
 KEYS = (
     "eval/MapSeenInTrain/Uniform/Car_Dealer/scene_000000",
@@ -109,9 +109,3 @@ def test_a_folder_that_may_not_be_read_is_listed(tree, monkeypatch):
         "train/IPD_Gaussian": "cannot be searched (Permission denied). Give permission, or choose "
         "another place."
     }
-
-
-def test_the_root_of_a_scenes_folder_is_found_from_its_path(tree):
-    assert release_root_of(tree / KEYS[0]) == tree
-    assert release_root_of(tree / KEYS[1]) == tree
-    assert release_root_of(tree / "mine/scene") is None

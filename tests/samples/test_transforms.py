@@ -297,16 +297,6 @@ def test_symmetric_jitter_changes_both_views_alike_and_asymmetric_apart():
         assert not np.array_equal(jittered.pictures[0], views.pictures[0])
 
 
-def test_the_eraser_paints_on_the_second_view_alone():
-    views = made_views()
-    erased = Eraser(1.0, low=10, high=20)(views, np.random.default_rng(0))
-
-    assert np.array_equal(erased.pictures[0], views.pictures[0])
-    changed = (erased.pictures[1] != views.pictures[1]).any(axis=(0, 1))
-    assert 0.01 < changed.mean() < 0.5
-    assert erased.depths is views.depths
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -115,20 +115,6 @@ def test_the_command_says_the_size_first_and_reports(small_release, tmp_path):
     assert len(StereoPairs(dest, pairs=[(0, 5)])) == 1
 
 
-def test_the_command_takes_a_share_that_fits(small_release, tmp_path):
-    def taken(*words):
-        command = ["download", str(small_release), "-o", str(tmp_path), "--dry-run"]
-        return CliRunner().invoke(app, [*command, *words]).output
-
-    size = sum(path.stat().st_size for path in small_release.rglob("scene_*/*"))
-    fitting = taken("--max-bytes", str(size - 1))
-
-    assert taken().startswith("4 scenes, ")
-    assert taken("--scenes", "1").startswith("1 scene, ")
-    assert fitting.startswith(("1 scene, ", "2 scenes, ", "3 scenes, "))
-    assert "no scene fits into 1,000 bytes" in taken("--max-bytes", "1kB")
-
-
 def test_a_share_passes_over_scenes_without_the_wanted_videos(small_release, tmp_path):
     root = shutil.copytree(small_release, tmp_path / "part", copy_function=os.link)
     lacking = sorted(root.rglob("cam_05_rgb.mp4"))[0]
