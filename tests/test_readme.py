@@ -36,7 +36,7 @@ def folder_with_scenes(tmp_path_factory):
     (folder / "shards").symlink_to(README.parent / "shards")
     for split, scenes in (("train", 3), ("eval", 1)):
         request = SynthRequest(
-            family="Uniform", split=split, scenes=scenes, size_px=64, frames=5, seed=11
+            family="Uniform", split=split, scenes=scenes, size_px=96, frames=5, seed=11
         )
         synthesise(folder / "scenes", request)
     return folder
