@@ -6,7 +6,7 @@ import pytest
 
 from stereogenbench_data import SceneIndex, SelectionError
 from stereogenbench_data.audit.browser.catalogue import Catalogue, parse_choice
-from stereogenbench_data.schema.release import CAMERA_PAIRS
+from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
 from tests.audit.browsing import run
 
 SCENE = "train/Uniform/SynthStage/scene_000001"
@@ -46,6 +46,17 @@ def test_the_line_of_a_choice_selects_what_the_page_counts(catalogue, query):
     assert [row["key"] for row in listed["rows"]] == pairs.index.column("key")[
         pairs.plan.scene_rows
     ].tolist()
+
+
+def test_the_edges_of_bins_belong_where_the_paper_puts_them(index):
+    scene = index.scene(0)
+    edges = (0.5, 1.0, 9.99, 10.0, 30.0, 60.0, 100.0, 149.0, 150.0, 150.1, 2.0, 3.0, 4.0, 5.0, 6.0)
+    odd = dataclasses.replace(scene, rig=dataclasses.replace(scene.rig, baselines_cm=edges))
+    catalogue = Catalogue(SceneIndex.from_scenes([odd], index.root), shown_data="x")
+
+    found = [baseline_bin(cm) for cm in edges]
+    counts = catalogue.summary({})["counts"]["bin"]
+    assert counts == {name: found.count(name) for name in BASELINE_BINS}
 
 
 def test_a_scenes_pairs_go_from_the_narrowest_to_the_widest(catalogue, index):
