@@ -1,9 +1,9 @@
-"""Runs an example under torchrun, notes the samples that it takes, and kills a first attempt.
+"""Runs an example under torchrun, notes the samples that it takes, and kills it after some batches.
 
 python watched.py NOTES BATCHES EXAMPLE
 
-The batches of training samples that a torch DataLoader gives become NOTES.ATTEMPT.RANK, a list of
-the names of each one's samples. After so many batches a process of the first attempt kills itself.
+The batches of training samples that a torch DataLoader gives become NOTES.RANK, a list of the names
+of each one's samples. After so many batches the process kills itself; 0 is never.
 """
 
 import json
@@ -24,15 +24,14 @@ def names_of(batch):
 def main():
     notes, batches, example = sys.argv[1:]
     sys.argv[:] = [example]
-    attempt, rank = os.environ["TORCHELASTIC_RESTART_COUNT"], os.environ["RANK"]
     take = dataloader._BaseDataLoaderIter.__next__
     taken = []
 
     def noted(self):
         batch = take(self)
         taken.append(names_of(batch))
-        Path(f"{notes}.{attempt}.{rank}").write_text(json.dumps(taken))
-        if attempt == "0" and len(taken) == int(batches):
+        Path(f"{notes}.{os.environ['RANK']}").write_text(json.dumps(taken))
+        if len(taken) == int(batches):
             os.kill(os.getpid(), signal.SIGKILL)
         return batch
 
