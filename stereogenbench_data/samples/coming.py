@@ -19,8 +19,10 @@ from stereogenbench_data.sources.fetch_ahead import FetchAhead, Wanted
 from stereogenbench_data.sources.members import MemberSource
 
 SCENES_AHEAD: Final = 8
+MOST_SCENES_AHEAD: Final = 48
 """How many presumed scenes behind a URL are planned ahead of the one that is read, and how many are
-described ahead of these."""
+described ahead of these: at first, and at most, as each scene that was begun allows one more. Those
+that an order interleaves begin together, and end together, too."""
 
 STEPS_AHEAD: Final = 2048
 """How many steps are looked ahead for such scenes."""
@@ -236,9 +238,11 @@ class DescribedAhead:
         self._soon: set[int] = set()
         self._given: set[int] = set()
         self._ahead: set[int] = set()
+        self._begun: set[int] = set()
 
     def begin(self, row: int) -> None:
         """Take a scene as begun."""
+        self._begun.add(row)
         self._given.add(row)
         self._ahead.discard(row)
 
@@ -246,7 +250,8 @@ class DescribedAhead:
         return self
 
     def __next__(self) -> Step:
-        while len(self._soon) < SCENES_AHEAD and len(self._waiting) < STEPS_AHEAD:
+        most = min(SCENES_AHEAD + len(self._begun), MOST_SCENES_AHEAD)
+        while len(self._soon) < most and len(self._waiting) < STEPS_AHEAD:
             step = next(self._steps, None)
             if step is None:
                 break
@@ -256,7 +261,7 @@ class DescribedAhead:
                 self._soon.add(row)
                 self._describe(step.address)
         row = self._waiting[0].address.row if self._waiting else -1
-        if row < 0 or (row not in self._given and len(self._ahead) >= SCENES_AHEAD):
+        if row < 0 or (row not in self._given and len(self._ahead) >= most):
             raise StopIteration
         if row not in self._given:
             self._given.add(row)
