@@ -11,7 +11,6 @@ the interpreter's own in CPython 3.11, the new process waits for ever before its
 Python. So a forked worker says that it has begun; one that does not is forked again.
 """
 
-import functools
 import os
 import queue
 import signal
@@ -31,6 +30,9 @@ from torch.utils.data import DataLoader, Sampler
 from stereogenbench_data.datasets.batch_buffers import forget_slots
 from stereogenbench_data.datasets.batches import Pass
 from stereogenbench_data.errors import PassError, WorkerError
+
+if sys.platform != "win32":
+    from multiprocessing.context import ForkProcess
 
 _BEGUN_WITHIN_S = 20.0
 """How long a forked worker may take to its first line of Python; usually milliseconds."""
@@ -58,12 +60,11 @@ class Workers:
         self._batches: Iterator[Any] = iter(())
         self.serves: Pass | None = None
         self._numbers = _DueBatches()
-        self._context: Any = None
+        self._context: _WatchedContext | None = None
         if loader.num_workers > 0:
             given: Any = loader.multiprocessing_context
             base = given.get_context() if isinstance(given, BaseContext) else get_context(given)
-            kind: Any = type(base)
-            self._context = _watched(kind)()
+            self._context = _WatchedContext(base)
         self._torch = DataLoader(
             loader.dataset,
             batch_sampler=self._numbers,
@@ -88,7 +89,7 @@ class Workers:
         """The numbers of the processes that run."""
         if self._context is None or self._torch is None:
             return set()
-        return {process.pid for process in self._context.processes}
+        return {process.pid for process in self._context.processes if process.pid is not None}
 
     @property
     def is_of_this_process(self) -> bool:
@@ -135,7 +136,7 @@ class Workers:
         shutdown = getattr(batches, "_shutdown_workers", None)
         if shutdown is not None:
             shutdown()
-        forget_slots({process.pid for process in self._context.processes})
+        forget_slots({each.pid for each in self._context.processes if each.pid is not None})
 
     def error(self, noticed: BaseException) -> WorkerError | None:
         """Return an error that names the worker that died; None if none did.
@@ -270,11 +271,11 @@ class _ClosableQueue(_Queue):
             super().put(obj, block, timeout)
 
 
-@functools.cache
-def _forked(kind: Any) -> Any:
-    """Return a class of forked processes that are sure to have begun once they were started."""
+if sys.platform != "win32":
 
-    class Forked(kind):  # type: ignore[misc]  # mypy knows no base chosen at run time
+    class _ForkedProcess(ForkProcess):
+        """A forked process that is sure to have begun once it was started."""
+
         _begun_signal: Any
         _target: Any
         _args: Any
@@ -308,39 +309,39 @@ def _forked(kind: Any) -> Any:
                 f"without threads."
             )
 
-    return Forked
 
+class _WatchedContext(BaseContext):
+    """A context whose processes and queues can be watched; it starts them as another one does."""
 
-@functools.cache
-def _watched(kind: Any) -> Any:
-    """Return a context's class whose processes and queues can be watched."""
+    def __init__(self, base: BaseContext) -> None:
+        self._base: Any = base  # the standard library does not declare its process
+        self.processes: list[BaseProcess] = []
+        self.queues: list[_ClosableQueue] = []
+        self.events: list[_LocklessEvent] = []
 
-    class Watched(kind):  # type: ignore[misc]  # mypy knows no base chosen at run time
-        def __init__(self) -> None:
-            self.processes: list[BaseProcess] = []
-            self.queues: list[_ClosableQueue] = []
-            self.events: list[_LocklessEvent] = []
+    def get_start_method(self, allow_none: bool = False) -> str:  # noqa: FBT001, FBT002
+        """Return the start method, by which locks are made."""
+        method: str = self._base.get_start_method(allow_none)
+        return method
 
-        def told_to_end(self) -> bool:
-            """Whether torch has told the workers to end, as it does after the last batch."""
-            return any(event.is_set() for event in self.events)
+    def told_to_end(self) -> bool:
+        """Whether torch has told the workers to end, as it does after the last batch."""
+        return any(event.is_set() for event in self.events)
 
-        def Process(self, *args: Any, **kwargs: Any) -> BaseProcess:
-            make = kind.Process
-            if getattr(make, "_start_method", "") == "fork":
-                make = _forked(make)
-            process: BaseProcess = make(*args, **kwargs)
-            self.processes.append(process)
-            return process
+    def Process(self, *args: Any, **kwargs: Any) -> BaseProcess:
+        make = self._base.Process
+        if sys.platform != "win32" and make is ForkProcess:
+            make = _ForkedProcess
+        process: BaseProcess = make(*args, **kwargs)
+        self.processes.append(process)
+        return process
 
-        def Queue(self, maxsize: int = 0) -> _ClosableQueue:
-            made = _ClosableQueue(maxsize, ctx=self)
-            self.queues.append(made)
-            return made
+    def Queue(self, maxsize: int = 0) -> _ClosableQueue:
+        made = _ClosableQueue(maxsize, ctx=self)
+        self.queues.append(made)
+        return made
 
-        def Event(self) -> _LocklessEvent:
-            made = _LocklessEvent(self)
-            self.events.append(made)
-            return made
-
-    return Watched
+    def Event(self) -> Any:
+        made = _LocklessEvent(self)
+        self.events.append(made)
+        return made

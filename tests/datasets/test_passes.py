@@ -371,7 +371,6 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.parametrize("hanging", [2, 9])
 def test_a_worker_that_hangs_in_its_fork_is_forked_again(small_release, tmp_path, hanging):
     (tmp_path / "script.py").write_text(HANGING)

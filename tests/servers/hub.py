@@ -14,11 +14,11 @@ import json
 import re
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 from urllib.parse import parse_qs, unquote, urlsplit
 
 import fsspec
@@ -103,9 +103,9 @@ class HubHandler(FileHandler):
         oid = hashlib.sha1(path.read_bytes(), usedforsecurity=False).hexdigest()
         return {"type": "file", "oid": oid, "size": path.stat().st_size, "path": name}
 
-    def _known(self, revision: str | None, answer: object) -> None:
+    def _known(self, revision: str | None, answer: Callable[[], Any]) -> None:
         if revision in (None, *_REVISIONS):
-            self._json(answer())  # type: ignore[operator]
+            self._json(answer())
         else:
             self._refuse(404, "RevisionNotFound")
 

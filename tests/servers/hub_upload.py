@@ -8,6 +8,7 @@ import base64
 import hashlib
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
@@ -53,9 +54,9 @@ class UploadHubHandler(HubHandler):
         else:
             self._refuse(404, "RepoNotFound")
 
-    def _known(self, revision: str | None, answer: object) -> None:
+    def _known(self, revision: str | None, answer: Callable[[], dict[str, Any]]) -> None:
         del revision
-        self._json(answer() | {"sha": self._revision()})  # type: ignore[operator]
+        self._json(answer() | {"sha": self._revision()})
 
     def _mode(self, file: dict[str, Any]) -> dict[str, Any]:
         mode = "lfs" if file["path"].endswith((".tar", ".parquet")) else "regular"
