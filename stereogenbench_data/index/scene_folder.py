@@ -65,7 +65,6 @@ from stereogenbench_data.schema.document import (
 )
 from stereogenbench_data.schema.parse import (
     contradictions,
-    counted_otherwise,
     is_of_family,
     parse_caption,
     parse_complete,
@@ -73,7 +72,6 @@ from stereogenbench_data.schema.parse import (
     parse_scene_key,
     require_unit,
 )
-from stereogenbench_data.schema.quantities import Values
 from stereogenbench_data.schema.records import (
     DepthEncoding,
     Member,
@@ -275,12 +273,7 @@ class _Description:
     def contradicted(
         self, rig: Rig, labels: SceneLabels, frames: int | None, poses: Understood | None
     ) -> None:
-        """Note what the JSON files state otherwise than the videos and ``baseline.json``."""
-        where, ignores = self.where(BASELINE_JSON), self.shape.ignores if self.shape else None
-        own = Values(parse_object(self.folder.read(BASELINE_JSON), where=where), ignores=ignores)
-        self.remarks += counted_otherwise(
-            own, {"cameras": CAMERA_COUNT, "frames": frames}, where=where
-        )
+        """Note what other JSON files state otherwise than the videos and ``baseline.json``."""
         others = {} if poses is None else {TRAJECTORY_JSON: poses.head}
         if COMPLETE_JSON in self.files:
             with suppress(SchemaError):
@@ -335,7 +328,11 @@ class _Description:
         size_px = next(((each.width_px, each.height_px) for each in self.facts.values()), None)
         if self.document is not None:
             size_px = self.document.source_size_px
-        rig, labels, odd = parse_rig(text, where=where, shape=self.shape, size_px=size_px)
+        frames = min((each.frames for each in self.facts.values()), default=None)
+        counts = {"cameras": CAMERA_COUNT, "frames": frames if self.document is None else None}
+        rig, labels, odd = parse_rig(
+            text, where=where, shape=self.shape, size_px=size_px, counts=counts
+        )
         family = parse_scene_key(self.key).family
         self.remarks += (*odd, *require_unit(rig, family=family, where=where))
         return rig, labels

@@ -10,8 +10,9 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Final
 
 from stereogenbench_data.errors import SchemaError
@@ -211,7 +212,12 @@ def parse_caption(text: bytes, *, where: str) -> tuple[str, tuple[Remark, ...]]:
 
 
 def parse_rig(
-    text: bytes, *, where: str, shape: Shape | None = None, size_px: Pair | None = None
+    text: bytes,
+    *,
+    where: str,
+    shape: Shape | None = None,
+    size_px: Pair | None = None,
+    counts: Mapping[str, int | None] = MappingProxyType({}),
 ) -> tuple[Rig, SceneLabels, tuple[Remark, ...]]:
     """Return the rig and the identifiers that a ``baseline.json`` records, and what is odd.
 
@@ -227,6 +233,7 @@ def parse_rig(
         where: The file's path, for messages.
         shape: What conventions state about such files.
         size_px: (width, height) of the videos, where these were opened.
+        counts: The numbers of "cameras" and "frames", for a remark on others.
 
     Raises:
         SchemaError: If focal length, sensor width, a baseline or the primary pair is missing, not
@@ -243,11 +250,11 @@ def parse_rig(
             listed.append(f"and {len(file.problems) - _SHOWN} more")
         head = counted(len(file.problems), "problem")
         raise SchemaError(f"{where}: {head}:\n  " + ".\n  ".join(listed) + ".")
-    return rig, labels, tuple(file.remarks)
+    return rig, labels, (*file.remarks, *_counted_otherwise(file.values, counts, where=where))
 
 
-def counted_otherwise(
-    values: Values, known: dict[str, int | None], *, where: str
+def _counted_otherwise(
+    values: Values, known: Mapping[str, int | None], *, where: str
 ) -> tuple[Remark, ...]:
     """Return which numbers of frames, cameras or pixels a file states that are not the known ones.
 
@@ -301,7 +308,7 @@ def contradictions(
         "image_width": width,
         "image_height": height,
     }
-    told += counted_otherwise(values, known, where=where)
+    told += _counted_otherwise(values, known, where=where)
     for name in ("scene_label", "scene_index", "map_name", "map_path", "character", "animation"):
         label = getattr(labels, name)
         for each in values.stated(name):
