@@ -415,9 +415,14 @@ def _clip_name(number: int, facts: Mapping[str, Any]) -> str:
 
 
 def _is_finished(work: _ClipWork) -> bool:
-    """Return whether a clip's videos are there, and its record, which is written after them."""
-    paths = [work.record, *(work.root / path for path in work.videos.values())]
-    return all(path.is_file() for path in paths)
+    """Return whether a clip's videos are there, with the sizes that its record notes after them."""
+    if not work.record.is_file():
+        return False
+    sizes = read_json(work.record).get("bytes", {})
+    paths = {kind: work.root / path for kind, path in work.videos.items()}
+    return all(
+        path.is_file() and path.stat().st_size == sizes.get(kind) for kind, path in paths.items()
+    )
 
 
 def _write_clip(work: _ClipWork, advance: Advance) -> None:
@@ -446,6 +451,9 @@ def _write_clip(work: _ClipWork, advance: Advance) -> None:
     if draws_depth:
         record["depth_m"] = [1 / each if each else None for each in nearness[::-1]]
     record["videos"] = work.videos
+    record["bytes"] = {
+        kind: (work.root / path).stat().st_size for kind, path in work.videos.items()
+    }
     with named_errors(work.record):
         work.record.parent.mkdir(exist_ok=True)
         write_atomic(work.record, json_bytes(record))

@@ -447,6 +447,7 @@ def _export_scene(work: _SceneWork, advance: Advance) -> None:
 
 
 def _list_pictures(root: Path) -> None:
-    """Write MoGe's list of folders: all that are there."""
-    found = sorted(path.parent.relative_to(root).as_posix() for path in root.rglob("meta.json"))
-    write_atomic(root / INDEX_TXT, "".join(f"{folder}\n" for folder in found).encode())
+    """Write MoGe's list of folders: all that are there, and not what a killed run left."""
+    folders = (path.parent.relative_to(root) for path in root.rglob("meta.json"))
+    whole = sorted(each.as_posix() for each in folders if ".unfinished" not in each.as_posix())
+    write_atomic(root / INDEX_TXT, "".join(f"{folder}\n" for folder in whole).encode())

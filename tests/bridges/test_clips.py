@@ -233,11 +233,14 @@ def test_a_run_that_is_repeated_keeps_what_is_finished(indexed_release, tmp_path
     assert files_of(tmp_path) == before
 
 
-@pytest.mark.parametrize("damage", ["record removed", "mask removed"])
+@pytest.mark.parametrize("damage", ["video cut", "record removed", "mask removed"])
 def test_a_clip_that_is_not_whole_is_written_again(indexed_release, tmp_path, damage):
     names = exported(indexed_release, tmp_path).written
     before = files_of(tmp_path)
-    if damage == "record removed":
+    if damage == "video cut":
+        video = tmp_path / "right" / f"{names[1]}.mp4"
+        video.write_bytes(video.read_bytes()[:-100])
+    elif damage == "record removed":
         (tmp_path / "clips" / f"{names[1]}.json").unlink()
     else:
         shutil.rmtree(tmp_path / "mask")

@@ -289,6 +289,9 @@ def test_an_export_that_was_killed_goes_on_and_is_whole(indexed_release, tmp_pat
 
 def test_moges_index_keeps_what_was_exported_before(indexed_release, tmp_path):
     exported(indexed_release, tmp_path, layout="moge", family="Uniform")
+    left = tmp_path / ".scene.unfinished" / "cam_00"  # as a killed run leaves it
+    left.mkdir(parents=True)
+    (left / "meta.json").touch()
     exported(indexed_release, tmp_path, layout="moge", family="IPD_Gaussian", frames=[2])
     names = (tmp_path / ".index.txt").read_text().splitlines()
 
