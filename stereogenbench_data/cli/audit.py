@@ -16,6 +16,7 @@ from stereogenbench_data.cli.options import (
     SceneOptions,
     WorkOptions,
     grouped,
+    option,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import write_report, writing
@@ -30,11 +31,9 @@ _ALL = "all"
 def audit(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
     *,
-    scenes: Annotated[
-        int | None, typer.Option(min=1, help="Scenes to audit, evenly spread [all].")
-    ] = None,
+    scenes: Annotated[int | None, option("Scenes to audit, evenly spread [all].", min=1)] = None,
     per_scene: Annotated[
-        str, typer.Option(metavar="N|all", help="Frames of each scene; all, as in the paper.")
+        str, option("Frames of each scene; all, as in the paper.", metavar="N|all")
     ] = "5",
     chosen: SceneOptions,
     out: OutOption = None,
@@ -64,8 +63,7 @@ def audit(  # noqa: PLR0913 - one parameter an option
             param_hint="--per-scene",
         )
     request = geometry_audit.AuditRequest(
-        sample=scenes,
-        frames=0 if per_scene == _ALL else int(per_scene),
+        sample=scenes, frames=0 if per_scene == _ALL else int(per_scene)
     )
     options: Any = chosen.filters() | work.options()
     with progress_bar("reading the index", unit="scenes") as progress:

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from stereogenbench_data.cli.data import full_place
-from stereogenbench_data.cli.options import DataOptions, grouped
+from stereogenbench_data.cli.options import DataOptions, grouped, option
 from stereogenbench_data.schema.text import counted
 
 
@@ -14,9 +14,9 @@ from stereogenbench_data.schema.text import counted
 def browse(
     source: DataOptions,
     *,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 is any free one.")] = 0,
+    port: Annotated[int, option("Port; 0 is any free one.", min=0, max=65535)] = 0,
     open_page: Annotated[
-        bool, typer.Option("--open/--no-open", metavar="", help="Open the web browser.")
+        bool, option("--open/--no-open", "Open the web browser.", metavar="")
     ] = True,
 ) -> None:
     """Look through scenes in a local web page.

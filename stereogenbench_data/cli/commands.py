@@ -20,6 +20,7 @@ from stereogenbench_data.cli.export_clips import clips
 from stereogenbench_data.cli.export_views import colmap, moge, ply, transforms
 from stereogenbench_data.cli.forecast import forecast
 from stereogenbench_data.cli.index import index
+from stereogenbench_data.cli.options import option
 from stereogenbench_data.cli.pack import pack, unpack, verify
 from stereogenbench_data.cli.publish import card, croissant, upload
 from stereogenbench_data.cli.show import show
@@ -96,7 +97,7 @@ for _name, (_what, _functions) in _GROUPS.items():
 
 def _print_version(value: bool) -> None:
     if value:
-        typer.echo(f"stereogenbench-data {package_version('stereogenbench-data')}")
+        sys.stdout.write(f"stereogenbench-data {package_version('stereogenbench-data')}\n")
         raise typer.Exit
 
 
@@ -104,11 +105,11 @@ def _print_version(value: bool) -> None:
 def _common(
     version: Annotated[
         bool,
-        typer.Option(
+        option(
             "--version",
+            "Show the version and exit.",
             callback=_print_version,
             is_eager=True,
-            help="Show the version and exit.",
             metavar="",
         ),
     ] = False,

@@ -13,6 +13,7 @@ from stereogenbench_data.cli.options import (
     WorkOptions,
     flag,
     grouped,
+    option,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
@@ -25,15 +26,14 @@ def conventions(  # noqa: PLR0913 - one parameter an option
     *,
     out: OutOption = None,
     check: Annotated[
-        Path | None,
-        typer.Option("--check", metavar="FILE", help="Test these conventions; learn none."),
+        Path | None, option("--check", "Test these conventions; learn none.", metavar="FILE")
     ] = None,
     report: Annotated[
         bool, flag("--report", "Print the format without content, for a public issue.")
     ] = False,
-    scenes: Annotated[int, typer.Option(min=1, help="Scenes to read.")] = 20,
+    scenes: Annotated[int, option("Scenes to read.", min=1)] = 20,
     pictures: Annotated[
-        int, typer.Option(min=0, help="Scenes of a shape to measure by pictures, and to verify.")
+        int, option("Scenes of a shape to measure by pictures, and to verify.", min=0)
     ] = 3,
     chosen: SceneOptions,
     work: WorkOptions,

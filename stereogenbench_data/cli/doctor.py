@@ -13,6 +13,7 @@ from stereogenbench_data.cli.options import (
     SceneOptions,
     WorkOptions,
     grouped,
+    option,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
@@ -22,8 +23,8 @@ from stereogenbench_data.cli.writing import writing
 def doctor(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
     *,
-    scenes: Annotated[int, typer.Option(min=1, help="Scenes to look at.")] = 6,
-    per_scene: Annotated[int, typer.Option(min=1, help="Frames of each scene.")] = 4,
+    scenes: Annotated[int, option("Scenes to look at.", min=1)] = 6,
+    per_scene: Annotated[int, option("Frames of each scene.", min=1)] = 4,
     chosen: SceneOptions,
     out: OutOption = None,
     as_json: JsonOption = False,

@@ -12,6 +12,7 @@ from stereogenbench_data.cli.options import (
     SourceOptions,
     flag,
     grouped,
+    option,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.release import CAMERA_COUNT
@@ -22,11 +23,9 @@ from stereogenbench_data.schema.text import counted
 def download(  # noqa: PLR0913 - one parameter an option
     source: SourceOptions,
     *,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder to write into.")],
+    out: Annotated[Path, option("--out", "-o", "Folder to write into.", metavar="DIR")],
     cameras: CamerasOption = None,
-    streams: Annotated[
-        Literal["both", "rgb", "depth"], typer.Option(help="Which videos.")
-    ] = "both",
+    streams: Annotated[Literal["both", "rgb", "depth"], option("Which videos.")] = "both",
     chosen: SceneOptions,
     share: ShareOptions,
     dry_run: Annotated[bool, flag("--dry-run", "Print the size and fetch nothing.")] = False,

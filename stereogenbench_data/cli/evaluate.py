@@ -20,6 +20,7 @@ from stereogenbench_data.cli.options import (
     SplitOption,
     WorkOptions,
     grouped,
+    option,
     size_of,
 )
 from stereogenbench_data.cli.progress import progress_bar
@@ -36,15 +37,14 @@ _METRICS = "How metrics are computed"
 """Panel of the help for the options of metrics."""
 TierOption = Annotated[
     str,
-    typer.Option(
-        metavar="G0|G1|G2",
-        help="What the method is given beside the left view: G0 the target's depth, G1 the camera, "
+    option(
+        "What the method is given beside the left view: G0 the target's depth, G1 the camera, "
         "G2 nothing.",
+        metavar="G0|G1|G2",
     ),
 ]
 ScoredSizeOption = Annotated[
-    Any,
-    typer.Option("--size", parser=size_of, metavar="WxH", help="Width x height of what is scored."),
+    Any, option("--size", "Width x height of what is scored.", parser=size_of, metavar="WxH")
 ]
 PAPER_SIZE = "832x480"
 
@@ -61,40 +61,21 @@ class ProtocolOptions:
     """The metrics and the models that compute them."""
 
     size: ScoredSizeOption = PAPER_SIZE
-    metrics: Annotated[
-        str,
-        typer.Option(
-            help=f"Of {', '.join(METRICS)}; or all.",
-            metavar="NAMES",
-        ),
-    ] = ",".join(OFFLINE_METRICS)
+    metrics: Annotated[str, option(f"Of {', '.join(METRICS)}; or all.", metavar="NAMES")] = (
+        ",".join(OFFLINE_METRICS)
+    )
     keypoint_matcher: Annotated[
         str,
-        typer.Option(
-            metavar="NAME",
-            help="Of E_match: sift, or FILE.py:Class of your own.",
-            rich_help_panel=_METRICS,
-        ),
+        option("Of E_match: sift, or FILE.py:Class of your own.", metavar="NAME", panel=_METRICS),
     ] = "sift"
     stereo_matcher: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="Of SD: sgbm, or FILE.py:Class of your own.",
-            rich_help_panel=_METRICS,
-        ),
+        str, option("Of SD: sgbm, or FILE.py:Class of your own.", metavar="NAME", panel=_METRICS)
     ] = "sgbm"
     weights: Annotated[
         Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Folder of weights [torch.hub's checkpoints].",
-            rich_help_panel=_METRICS,
-        ),
+        option("Folder of weights [torch.hub's checkpoints].", metavar="DIR", panel=_METRICS),
     ] = None
-    device: Annotated[
-        str, typer.Option(help="Device of learned models.", rich_help_panel=_METRICS)
-    ] = "cpu"
+    device: Annotated[str, option("Device of learned models.", panel=_METRICS)] = "cpu"
 
     def protocol(self) -> "EvaluationProtocol":
         """Return the protocol of the options.
@@ -120,17 +101,15 @@ class ReportOptions:
 
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", "-o", metavar="DIR", help="Folder of the report and of partial results."
-        ),
+        option("--out", "-o", "Folder of the report and of partial results.", metavar="DIR"),
     ] = None
     compare: Annotated[
         Path | None,
-        typer.Option(
+        option(
+            "Scores to be reproduced; the exit status is 1 if these differ.",
             metavar="RESULTS.json",
             exists=True,
             dir_okay=False,
-            help="Scores to be reproduced; the exit status is 1 if these differ.",
         ),
     ] = None
     as_json: JsonOption = False
@@ -141,12 +120,7 @@ class ReportOptions:
         Raises:
             typer.Exit: If it is not what it is compared with.
         """
-        from stereogenbench_data.evaluation.report import (
-            differences,
-            document,
-            page,
-            write_report,
-        )
+        from stereogenbench_data.evaluation.report import differences, document, page, write_report
         from stereogenbench_data.jobs import read_json
 
         there = None
@@ -196,13 +170,7 @@ def inputs(
     selection, index = chosen.selection(), source.open()
     with progress_bar("writing", unit="frames") as progress:
         items = export_inputs(
-            index,
-            out,
-            tier=tier,
-            size=size,
-            **work.options(),
-            progress=progress,
-            **selection,
+            index, out, tier=tier, size=size, **work.options(), progress=progress, **selection
         )
     typer.echo(f"{out}: {counted(len(items), 'item')} of tier {tier}")
 
@@ -215,21 +183,14 @@ def score(  # noqa: PLR0913 - one parameter an option
     ],
     *,
     tier: TierOption,
-    name: Annotated[
-        str | None, typer.Option(help="Name of the method [the folder's name].")
-    ] = None,
+    name: Annotated[str | None, option("Name of the method [the folder's name].")] = None,
     chosen: ScoredOptions,
     scoring: ProtocolOptions,
     by: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="COLUMN", help="Also score by map_name, focal_mm, ... May be repeated."
-        ),
+        option("Also score by map_name, focal_mm, ... May be repeated.", metavar="COLUMN"),
     ] = None,
-    allow_missing: Annotated[
-        int,
-        typer.Option(min=0, help="Most pairs without a usable right view."),
-    ] = 0,
+    allow_missing: Annotated[int, option("Most pairs without a usable right view.", min=0)] = 0,
     report: ReportOptions,
     work: WorkOptions,
 ) -> None:

@@ -14,6 +14,7 @@ from stereogenbench_data.cli.options import (
     WorkOptions,
     flag,
     grouped,
+    option,
 )
 from stereogenbench_data.cli.progress import progress_bar
 
@@ -29,12 +30,9 @@ class ExportedPairOptions(SceneOptions):
 class ClipOptions:
     """What a clip is."""
 
-    length: Annotated[
-        int | None,
-        typer.Option(help="Frames of a clip [the most that fit]."),
-    ] = None
-    stride: Annotated[int, typer.Option(help="Take one of this many frames.")] = 1
-    step: Annotated[int | None, typer.Option(help="Frames from clip to clip [no overlap].")] = None
+    length: Annotated[int | None, option("Frames of a clip [the most that fit].")] = None
+    stride: Annotated[int, option("Take one of this many frames.")] = 1
+    step: Annotated[int | None, option("Frames from clip to clip [no overlap].")] = None
     size: SizeOption = None
     baseline_in_caption: Annotated[
         bool, flag("--baseline-in-caption", "Tell the baseline in the captions.")
@@ -58,7 +56,7 @@ def clips(
     *,
     layout: Annotated[
         Literal["diffsynth", "finetrainers", "musubi", "stereocrafter"],
-        typer.Option(help="Whose manifests to write: the trainer's."),
+        option("Whose manifests to write: the trainer's."),
     ],
     chosen: ExportedPairOptions,
     clip: ClipOptions,
@@ -78,13 +76,7 @@ def clips(
     index = source.open()
     with progress_bar("writing", unit="frames") as progress:
         report = export_clips(
-            index,
-            out,
-            layout=layout,
-            progress=progress,
-            **form,
-            **work.options(),
-            **selection,
+            index, out, layout=layout, progress=progress, **form, **work.options(), **selection
         )
     if report.without_caption:
         typer.echo(f"{counted(report.without_caption, 'clip')} without a caption", err=True)

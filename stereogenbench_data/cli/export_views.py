@@ -14,6 +14,7 @@ from stereogenbench_data.cli.options import (
     SizeOption,
     WorkOptions,
     grouped,
+    option,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted
@@ -34,14 +35,6 @@ class ViewOptions(SceneOptions):
     frames: FramesOption = "first"
     size: SizeOption = None
 
-    def selection(self) -> dict[str, Any]:
-        """Return the options of `export_views` that were given."""
-        return self.filters() | {
-            "cameras": self.cameras or "all",
-            "frames": self.frames,
-            "size": self.size,
-        }
-
 
 @dataclass(frozen=True, kw_only=True)
 class FolderOptions(ViewOptions):
@@ -49,16 +42,8 @@ class FolderOptions(ViewOptions):
 
     points: Annotated[
         Any,
-        typer.Option(
-            parser=_points_of,
-            metavar="N|all",
-            help="3D points of a picture [5000; clouds 100000].",
-        ),
+        option("3D points of a picture [5000; clouds 100000].", parser=_points_of, metavar="N|all"),
     ] = None
-
-    def selection(self) -> dict[str, Any]:
-        """Return the options of `export_views` that were given."""
-        return super().selection() | {"points": self.points}
 
 
 @grouped
@@ -121,6 +106,10 @@ def _export(
 ) -> None:
     from stereogenbench_data.bridges.export_views import export_views
 
+    names = ("cameras", "frames", "size", "points")
+    given = {
+        name: value for name, value in vars(chosen).items() if name in names and value is not None
+    }
     index = source.open()
     with progress_bar("writing", unit="pictures") as progress:
         folders = export_views(
@@ -128,7 +117,8 @@ def _export(
             out,
             layout=layout,
             progress=progress,
-            **chosen.selection(),
+            **given,
+            **chosen.filters(),
             **work.options(),
         )
     typer.echo(f"{out}: {counted(len(folders), 'folder')}")

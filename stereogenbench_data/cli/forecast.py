@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any
 
 import typer
@@ -13,11 +14,10 @@ from stereogenbench_data.cli.options import (
     SizeOption,
     frames_of,
     grouped,
+    option,
 )
 
-
-def _of(text: str, *, panel: str = "What trains, and on which network", **more: Any) -> Any:
-    return typer.Option(help=text, rich_help_panel=panel, **more)
+_of = partial(option, panel="What trains, and on which network")
 
 
 def _trained_frames(text: str) -> Any:
@@ -63,9 +63,9 @@ def forecast(
     trains: MachineOptions,
     size: SizeOption = None,
     fields: Annotated[
-        str | None, typer.Option(metavar="NAMES", help="Such as left,right [the defaults].")
+        str | None, option("Such as left,right [the defaults].", metavar="NAMES")
     ] = None,
-    batch_size: Annotated[int, typer.Option(min=1, help="Samples of a batch.")] = 8,
+    batch_size: Annotated[int, option("Samples of a batch.", min=1)] = 8,
     chosen: TrainedOptions,
 ) -> None:
     """Forecast what will limit a training: processors, network, requests.

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
-from rich.console import Console
 
 from stereogenbench_data.cli.data import full_place
 from stereogenbench_data.cli.errors import FINDINGS
@@ -19,6 +18,7 @@ from stereogenbench_data.cli.options import (
     WorkOptions,
     flag,
     grouped,
+    option,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
@@ -33,9 +33,7 @@ def index(  # noqa: PLR0913 - one parameter an option
     *,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", "-o", help=f"Index file to write [ROOT/{_INDEX_NAME}; for a URL here]."
-        ),
+        option("--out", "-o", f"Index file to write [ROOT/{_INDEX_NAME}; for a URL here]."),
     ] = None,
     work: WorkOptions,
     valid_depth: Annotated[
@@ -59,14 +57,12 @@ def index(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.schema.conventions import Conventions
     from stereogenbench_data.sources.location import is_remote, local_path, shown
 
-    console = Console(stderr=True)
     target = out or Path("." if is_remote(root) else root, _INDEX_NAME)
     mode: Literal["skip", "sample"] = "sample" if valid_depth else "skip"
     wanted = chosen.by_path()
     if wanted is not None and out is None:
         raise typer.BadParameter(
-            "the index of a part needs its own file: name it with --out FILE.",
-            param_hint="--out",
+            "the index of a part needs its own file: name it with --out FILE.", param_hint="--out"
         )
     if target.exists() and not target.is_file():
         raise typer.BadParameter(
@@ -84,7 +80,7 @@ def index(  # noqa: PLR0913 - one parameter an option
         progress_bar("indexing", unit="scenes") as progress,
     ):
         warnings.simplefilter("always", ManyRequestsWarning)
-        warnings.showwarning = lambda told, *_: console.print(plain_line(str(told)), markup=False)
+        warnings.showwarning = lambda told, *_: _tell(str(told))
         report = walk(
             root,
             **work.options(),
@@ -108,28 +104,29 @@ def index(  # noqa: PLR0913 - one parameter an option
         }
         typer.echo(json.dumps(document, indent=2))
         raise typer.Exit(status)
-    _list(console, f"{len(report.incomplete)} incomplete, left out", report.incomplete)
-    _list(console, f"{len(report.broken)} broken, left out", report.broken)
-    _list(console, counted(len(report.notes), "note"), {note: note for note in report.notes})
+    for title, lines in (
+        (f"{len(report.incomplete)} incomplete, left out", _reasons(report.incomplete)),
+        (f"{len(report.broken)} broken, left out", _reasons(report.broken)),
+        (counted(len(report.notes), "note"), report.notes),
+    ):
+        if lines:
+            _tell(f"{title}:", *(f"  {line}" for line in lines))
     if not report.scenes:
-        console.print(
-            f"{plain_line(shown(root))}: no scene is complete, so there is nothing to index",
-            markup=False,
-        )
+        _tell(f"{shown(root)}: no scene is complete, so there is nothing to index")
         raise typer.Exit(status)
     typer.echo(f"{target}: {counted(len(report.scenes), 'scene')}")
     if is_remote(root) or target.parent.resolve() != local_path(root).resolve():
-        console.print(
+        _tell(
             f"its data are not beside it: open it as SceneIndex.open({str(target)!r}, "
-            f"root={full_place(root)!r}), or with --root {full_place(root)}",
-            markup=False, highlight=False, soft_wrap=True,
-        )  # fmt: skip
+            f"root={full_place(root)!r}), or with --root {full_place(root)}"
+        )
     raise typer.Exit(status)
 
 
-def _list(console: Console, title: str, reasons: Mapping[str, str]) -> None:
-    if reasons:
-        console.print(f"{title}:", style="bold", highlight=False)
-    for key, reason in reasons.items():
-        text = reason if key in reason else f"{key}: {reason}"
-        console.print(f"  {plain_line(text)}", markup=False, highlight=False, soft_wrap=True)
+def _reasons(scenes: Mapping[str, str]) -> list[str]:
+    """Return a line for each scene that was left out, which says why."""
+    return [reason if key in reason else f"{key}: {reason}" for key, reason in scenes.items()]
+
+
+def _tell(*lines: str) -> None:
+    typer.echo("\n".join(map(plain_line, lines)), err=True)

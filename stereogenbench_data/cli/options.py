@@ -64,9 +64,21 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
     return called
 
 
+def option(*words: str, panel: str | None = None, **settings: Any) -> Any:
+    """Return an option of a command.
+
+    Args:
+        *words: Its names, if they are not those of the parameter, then the text of its help.
+        panel: Panel of the help.
+        **settings: Of ``typer.Option``.
+    """
+    *names, text = words
+    return typer.Option(*names, help=text, rich_help_panel=panel, **settings)
+
+
 def flag(name: str, text: str) -> Any:
     """Return an option that takes no value; newer typer shows the type ``<bool>`` for such."""
-    return typer.Option(name, help=text, metavar="")
+    return option(name, text, metavar="")
 
 
 def out_folder(text: str) -> Path:
@@ -162,50 +174,36 @@ def part_of(text: str) -> tuple[int, int]:
 
 SizeOption = Annotated[
     Any,
-    typer.Option(
-        "--size", parser=size_of, metavar="WxH", help="Width x height, such as 832x480 [as stored]."
-    ),
+    option("--size", "Width x height, such as 832x480 [as stored].", parser=size_of, metavar="WxH"),
 ]
 SplitOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="train|eval|all",
-        help="The split [all; to export: train].",
-        rich_help_panel=SCENES,
-    ),
+    str | None, option("The split [all; to export: train].", metavar="train|eval|all", panel=SCENES)
 ]
 FramesOption = Annotated[
     Any,
-    typer.Option(
-        parser=frames_of,
-        metavar="FRAMES",
-        help="all, first, every:K, or such as 0,40,80.",
-        rich_help_panel=SCENES,
+    option(
+        "all, first, every:K, or such as 0,40,80.", parser=frames_of, metavar="FRAMES", panel=SCENES
     ),
 ]
 CamerasOption = Annotated[
     Any,
-    typer.Option(
-        "--cameras", parser=cameras_of, metavar="N,N", help="Such as 0,1 [all that a scene has]."
-    ),
+    option("--cameras", "Such as 0,1 [all that a scene has].", parser=cameras_of, metavar="N,N"),
 ]
 PartOption = Annotated[
     Any,
-    typer.Option(
-        "--part", parser=part_of, metavar="I/N", help="The I-th of N parts, one for each machine."
-    ),
+    option("--part", "The I-th of N parts, one for each machine.", parser=part_of, metavar="I/N"),
 ]
 ShardsArgument = Annotated[str, typer.Argument(help="Folder of shards, or its index file.")]
 JsonOption = Annotated[bool, flag("--json", "Report as JSON on stdout.")]
-OutOption = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")]
+OutOption = Annotated[Path | None, option("--out", "-o", "File to write.")]
 OutArgument = Annotated[Path, typer.Argument(parser=out_folder, help="Folder to write into.")]
 RootArgument = Annotated[str, typer.Argument(help="Folder that holds train/ or eval/, or its URL.")]
 ConventionsOption = Annotated[
     Path | None,
-    typer.Option(
+    option(
         "--conventions",
+        "How files are read and what depth means, as `conventions` writes it.",
         metavar="FILE",
-        help="How files are read and what depth means, as `conventions` writes it.",
     ),
 ]
 
@@ -216,8 +214,7 @@ class SourceOptions:
 
     data: Annotated[str, typer.Argument(help="Folder of scenes or shards, an index file, or URL.")]
     data_root: Annotated[
-        str | None,
-        typer.Option("--root", help="Where the data of an index file are, if not beside."),
+        str | None, option("--root", "Where the data of an index file are, if not beside.")
     ] = None
     conventions: ConventionsOption = None
 
@@ -238,10 +235,7 @@ class DataOptions(SourceOptions):
 
     accept: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="LOSS",
-            help="Accept depth that is 8-bit ... 14-bit, lossy, chroma.",
-        ),
+        option("Accept depth that is 8-bit ... 14-bit, lossy, chroma.", metavar="LOSS"),
     ] = None
 
     def stated(self) -> "Conventions | None":
@@ -269,12 +263,12 @@ class SceneOptions:
     split: SplitOption = None
     where: Annotated[
         list[Any] | None,
-        typer.Option(
+        option(
+            "Such as scene=KEY (or a part of it), family=Uniform, map=Stylized_Egypt, "
+            "subset=unseen_map, focal_mm=18:35, min_frames=60, caption=WORDS. May be repeated.",
             parser=filter_of,
             metavar="NAME=VALUE",
-            help="Such as scene=KEY (or a part of it), family=Uniform, map=Stylized_Egypt, "
-            "subset=unseen_map, focal_mm=18:35, min_frames=60, caption=WORDS. May be repeated.",
-            rich_help_panel=SCENES,
+            panel=SCENES,
         ),
     ] = None
 
@@ -305,11 +299,11 @@ class SceneOptions:
 
 PairsOption = Annotated[
     Any,
-    typer.Option(
+    option(
+        "primary, adjacent, all, or such as 0-1,0-5; by length --where baseline_cm=10:60.",
         parser=pairs_of,
         metavar="PAIRS",
-        help="primary, adjacent, all, or such as 0-1,0-5; by length --where baseline_cm=10:60.",
-        rich_help_panel=SCENES,
+        panel=SCENES,
     ),
 ]
 
@@ -331,17 +325,14 @@ class ShareOptions:
     """How much of the chosen scenes a command takes."""
 
     scenes: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="So many scenes, of all families and maps alike.", rich_help_panel=SCENES
-        ),
+        int | None, option("So many scenes, of all families and maps alike.", min=1, panel=SCENES)
     ] = None
     max_bytes: Annotated[
         str | None,
-        typer.Option(
+        option(
+            "As many scenes as fit, such as 10GB, of all families and maps alike.",
             metavar="SIZE",
-            help="As many scenes as fit, such as 10GB, of all families and maps alike.",
-            rich_help_panel=SCENES,
+            panel=SCENES,
         ),
     ] = None
 
@@ -373,9 +364,7 @@ class WorkOptions:
 
     workers: Annotated[
         str | None,
-        typer.Option(
-            metavar="N|ray|ray://HOST:PORT", help="Processes, or a Ray cluster [one a core]."
-        ),
+        option("Processes, or a Ray cluster [one a core].", metavar="N|ray|ray://HOST:PORT"),
     ] = None
 
     def options(self, *, device: str = "cpu") -> dict[str, Any]:

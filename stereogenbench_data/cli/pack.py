@@ -20,6 +20,7 @@ from stereogenbench_data.cli.options import (
     WorkOptions,
     flag,
     grouped,
+    option,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted, plain_line
@@ -35,14 +36,13 @@ def pack(  # noqa: PLR0913 - one parameter an option
     out: OutArgument,
     *,
     shard_size: Annotated[
-        str,
-        typer.Option(help="Largest shard, such as 500MB or 2GiB; a scene is never divided."),
+        str, option("Largest shard, such as 500MB or 2GiB; a scene is never divided.")
     ] = "2GB",
     part: PartOption = "1/1",
     size: SizeOption = None,
     quality: Annotated[
         Literal["small", "balanced", "high"] | None,
-        typer.Option(help="With --size: fewest bytes, or least error [balanced]."),
+        option("With --size: fewest bytes, or least error [balanced]."),
     ] = None,
     cameras: CamerasOption = None,
     chosen: SceneOptions,
@@ -50,7 +50,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
     work: WorkOptions,
     depth_codec: Annotated[
         Literal["released", "blosc2"],
-        typer.Option(help="As released, or lossless and ten times as fast to decode."),
+        option("As released, or lossless and ten times as fast to decode."),
     ] = "released",
 ) -> None:
     """Pack scenes into WebDataset shards.
@@ -71,9 +71,9 @@ def pack(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.shards.pack import pack as packed_by
     from stereogenbench_data.shards.plan import packed_bytes, parse_bytes
 
-    for option, value in (("--quality", quality), ("--cameras", cameras)):
+    for name, value in (("--quality", quality), ("--cameras", cameras)):
         if value and size is None:
-            raise typer.BadParameter("is of training shards: give --size.", param_hint=option)
+            raise typer.BadParameter("is of training shards: give --size.", param_hint=name)
     if size is not None and depth_codec != "released":
         raise typer.BadParameter(
             "training shards have depth of their own: leave it out.", param_hint="--depth-codec"
@@ -141,10 +141,7 @@ def verify(
 
     with progress_bar("verifying", unit="MB") as progress:
         report = verified(
-            shards,
-            mode="decode" if deep else "bytes",
-            **work.options(),
-            progress=progress,
+            shards, mode="decode" if deep else "bytes", **work.options(), progress=progress
         )
     if as_json:
         typer.echo(json.dumps(asdict(report), indent=2))
@@ -164,12 +161,7 @@ def verify(
 
 
 @grouped
-def unpack(
-    shards: ShardsArgument,
-    out: OutArgument,
-    *,
-    work: WorkOptions,
-) -> None:
+def unpack(shards: ShardsArgument, out: OutArgument, *, work: WorkOptions) -> None:
     """Turn shards back into scenes.
 
     Each file is checked against the index. Files that were packed unchanged come out byte for byte.

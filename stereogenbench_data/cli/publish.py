@@ -6,11 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stereogenbench_data.cli.errors import FINDINGS
-from stereogenbench_data.cli.options import (
-    ShardsArgument,
-    flag,
-    grouped,
-)
+from stereogenbench_data.cli.options import ShardsArgument, flag, grouped, option
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted
 
@@ -19,11 +15,11 @@ if TYPE_CHECKING:
 
 AboutOption = Annotated[
     str | None,
-    typer.Option(
+    option(
         "--about",
-        metavar="FILE|release",
-        help="Name, version, licence, provenance: answers to `publish croissant --template`, or "
+        "Name, version, licence, provenance: answers to `publish croissant --template`, or "
         "release for the paper's scenes.",
+        metavar="FILE|release",
     ),
 ]
 
@@ -33,8 +29,7 @@ def _stated(about: str | None) -> "About | None":
 
 
 RepositoryArgument = Annotated[
-    str,
-    typer.Argument(metavar="ORG/NAME", help="Dataset repository on the Hub."),
+    str, typer.Argument(metavar="ORG/NAME", help="Dataset repository on the Hub.")
 ]
 
 
@@ -48,12 +43,11 @@ def croissant(
     ] = None,
     *,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Descriptor to write, with tables beside.")
+        Path | None, option("--out", "-o", "Descriptor to write, with tables beside.")
     ] = None,
     check: Annotated[bool, flag("--check", "Check a descriptor.")] = False,
     base_url: Annotated[
-        str | None,
-        typer.Option(help="URL of the data, pinned to a revision [paths from the descriptor]."),
+        str | None, option("URL of the data, pinned to a revision [paths from the descriptor].")
     ] = None,
     about: AboutOption = None,
     template: Annotated[
@@ -101,8 +95,7 @@ def card(
     repository: RepositoryArgument,
     *,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help="Folder for README.md [stdout]."),
+        Path | None, option("--out", "-o", "Folder for README.md [stdout].", metavar="DIR")
     ] = None,
     about: AboutOption = None,
 ) -> None:
@@ -129,10 +122,7 @@ def card(
 
 
 def upload(
-    shards: ShardsArgument,
-    repository: RepositoryArgument,
-    *,
-    about: AboutOption = None,
+    shards: ShardsArgument, repository: RepositoryArgument, *, about: AboutOption = None
 ) -> None:
     """Upload shards with card and descriptor to the Hub.
 

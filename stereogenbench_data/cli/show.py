@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from stereogenbench_data.cli.options import DataOptions, grouped, pair_of
+from stereogenbench_data.cli.options import DataOptions, grouped, option, pair_of
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
 
@@ -20,19 +20,16 @@ def show(
     *,
     out: Annotated[
         Path | None,
-        typer.Option(
+        option(
             "--out",
             "-o",
-            help="File to write: .png a sheet, .mp4 or .gif a clip, .rrd for Rerun [KEY.png].",
+            "File to write: .png a sheet, .mp4 or .gif a clip, .rrd for Rerun [KEY.png].",
         ),
     ] = None,
     pair: Annotated[
-        Any,
-        typer.Option(
-            parser=pair_of, metavar="LEFT-RIGHT", help="Two cameras, such as 0-5 [as recorded]."
-        ),
+        Any, option("Two cameras, such as 0-5 [as recorded].", parser=pair_of, metavar="LEFT-RIGHT")
     ] = None,
-    frame: Annotated[int, typer.Option(min=0, help="Number of the frame.")] = 0,
+    frame: Annotated[int, option("Number of the frame.", min=0)] = 0,
 ) -> None:
     """Draw one scene with the disparity of a pair.
 

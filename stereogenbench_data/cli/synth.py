@@ -11,16 +11,11 @@ from stereogenbench_data.cli.options import (
     WorkOptions,
     flag,
     grouped,
+    option,
     size_of,
 )
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.schema.release import (
-    FAMILIES,
-    FRAME_COUNT,
-    IMAGE_SIZE_PX,
-    Split,
-    Subset,
-)
+from stereogenbench_data.schema.release import FAMILIES, FRAME_COUNT, IMAGE_SIZE_PX, Split, Subset
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
@@ -36,37 +31,30 @@ def _picture_size(text: str) -> tuple[int, int]:
 def synth(  # noqa: PLR0913 - one parameter an option
     out: OutArgument,
     *,
-    family: Annotated[
-        str, typer.Option(help=f"Family of baselines: {', '.join(FAMILIES)}.")
-    ] = FAMILIES[0],
-    scenes: Annotated[int, typer.Option(help="Number of scenes; they are numbered from 0.")] = 1,
+    family: Annotated[str, option(f"Family of baselines: {', '.join(FAMILIES)}.")] = FAMILIES[0],
+    scenes: Annotated[int, option("Number of scenes; they are numbered from 0.")] = 1,
     size: Annotated[
-        Any,
-        typer.Option(
-            parser=_picture_size, metavar="WxH", help="Width x height, both even; N is NxN."
-        ),
+        Any, option("Width x height, both even; N is NxN.", parser=_picture_size, metavar="WxH")
     ] = str(IMAGE_SIZE_PX),
-    frames: Annotated[int, typer.Option(help="Frames, at 15 Hz.")] = FRAME_COUNT,
-    seed: Annotated[int, typer.Option(help="Seed of all that is random.")] = 0,
-    split: Annotated[Split, typer.Option(help="Pairwise_Uniform is only in train.")] = "train",
-    subset: Annotated[Subset, typer.Option(help="Kind of maps; used in eval.")] = "seen_map",
+    frames: Annotated[int, option("Frames, at 15 Hz.")] = FRAME_COUNT,
+    seed: Annotated[int, option("Seed of all that is random.")] = 0,
+    split: Annotated[Split, option("Pairwise_Uniform is only in train.")] = "train",
+    subset: Annotated[Subset, option("Kind of maps; used in eval.")] = "seen_map",
     map_name: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
             "--map",
-            help="Map, and folder of the scenes; given again, or 'all', each proposal draws one "
+            "Map, and folder of the scenes; given again, or 'all', each proposal draws one "
             "[SynthStage; all of the assets].",
         ),
     ] = None,
     focal_mm: Annotated[
-        float | None, typer.Option(help="Focal length, mm [random, 18 to 85, for each scene].")
+        float | None, option("Focal length, mm [random, 18 to 85, for each scene].")
     ] = None,
-    depth_unit_m: Annotated[float, typer.Option(help="Metres in a stored unit.")] = 0.001,
+    depth_unit_m: Annotated[float, option("Metres in a stored unit.")] = 0.001,
     assets: Annotated[
         Path | None,
-        typer.Option(
-            help="assets.toml of your own maps and characters, for Blender [the built-in maps]."
-        ),
+        option("assets.toml of your own maps and characters, for Blender [the built-in maps]."),
     ] = None,
     part: PartOption = "1/1",
     plan_only: Annotated[bool, flag("--plan-only", "Report on proposals, render nothing.")] = False,
