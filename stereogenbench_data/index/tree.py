@@ -167,7 +167,7 @@ def is_read(name: str) -> bool:
     return name in FILES or (name.endswith(".json") and name[0] != ".")
 
 
-_AT_A_TIME: Final = 12
+_AT_A_TIME: Final = 24
 _READ_WHOLE: Final = 4 * FIRST_BLOCK
 """Videos up to this size are fetched whole when a scene is described, of larger ones both ends."""
 
@@ -335,7 +335,7 @@ _LAYOUT: Final = "train/<family>/<map>/<scene> or eval/<subset>/<family>/<map>/<
 _SCENE_FILES: Final = frozenset({BASELINE_JSON, TRAJECTORY_JSON, COMPLETE_JSON, *VIDEO_FILES})
 _SCENE_DEPTH: Final = {"train": 4, "eval": 5}
 """How many parts a scene's path has, by its split."""
-_LISTERS: Final = 8
+_LISTERS: Final = 16
 """Folders of a server that are listed at a time."""
 _FEW: Final = 32
 """Of fewer scenes of a folder each is listed by itself."""
