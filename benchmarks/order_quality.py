@@ -67,7 +67,8 @@ def order_quality(order: EpochOrder, plan: Plan, *, batches: int = _LONG) -> Ord
 
     >>> from stereogenbench_data import EpochBatches, StereoPairs
     >>> pairs = StereoPairs(getfixture("small_release"), frames="all")
-    >>> print(order_quality(EpochBatches(pairs, 4).order(0), pairs.plan))  # doctest: +ELLIPSIS
+    >>> order = EpochBatches(pairs, 4).of_all_ranks.order(0)
+    >>> print(order_quality(order, pairs.plan))  # doctest: +ELLIPSIS
     a batch of 4 shows ... scenes in 1,000 batches
     """
     size = order.rule.batch_size

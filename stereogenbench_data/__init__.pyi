@@ -46,10 +46,10 @@ from stereogenbench_data.index.open import StaleIndexWarning as StaleIndexWarnin
 from stereogenbench_data.index.open_tree import AssumptionWarning as AssumptionWarning
 from stereogenbench_data.index.open_tree import IncompleteSceneWarning as IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex as SceneIndex
-from stereogenbench_data.samples.checks import OddSceneWarning as OddSceneWarning
 from stereogenbench_data.samples.fields import PAIR_FIELDS as PAIR_FIELDS
 from stereogenbench_data.samples.fields import VIEW_FIELDS as VIEW_FIELDS
 from stereogenbench_data.samples.fields import EnlargedSizeWarning as EnlargedSizeWarning
+from stereogenbench_data.samples.fields import OddSceneWarning as OddSceneWarning
 from stereogenbench_data.samples.fields import SwappedSizeWarning as SwappedSizeWarning
 from stereogenbench_data.samples.transforms import ColorJitter as ColorJitter
 from stereogenbench_data.samples.transforms import Compose as Compose
@@ -62,7 +62,7 @@ from stereogenbench_data.samples.transforms import RandomScale as RandomScale
 from stereogenbench_data.samples.transforms import Resize as Resize
 from stereogenbench_data.schema.conventions import Conventions as Conventions
 from stereogenbench_data.schema.records import DepthEncoding as DepthEncoding
-from stereogenbench_data.selection.pairs import FewerPairsWarning as FewerPairsWarning
+from stereogenbench_data.selection.filters import FewerPairsWarning as FewerPairsWarning
 from stereogenbench_data.sources.cache import ShardCache as ShardCache
 from stereogenbench_data.sources.retry import RetryPolicy as RetryPolicy
 

@@ -22,11 +22,11 @@ Warnings, each a `UserWarning`, stand beside the code that gives them:
 StaleIndexWarning        index.open           a folder differs from its index
 IncompleteSceneWarning   index.open_tree      some scenes of the data cannot be used
 AssumptionWarning        index.open_tree      files are not as the paper prints them
-OddSceneWarning          samples.checks       selected scenes differ from what the release promises
+OddSceneWarning          samples.fields       selected scenes differ from what the release promises
 SwappedSizeWarning       samples.fields       a size looks like (width, height)
-OpenVideosWarning        datasets.batches more videos are needed than may be open
-RepeatedDecodingWarning  datasets.batches several processes decode the same videos
-FewerPairsWarning        selection.pairs      the data hold some cameras alone
+OpenVideosWarning        datasets.batches     more videos are needed than may be open
+RepeatedDecodingWarning  datasets.batches     several processes decode the same videos
+FewerPairsWarning        selection.filters    the data hold some cameras alone
 MixedSplitsWarning       datasets.mapped      train and eval scenes come together
 RepeatedEpochWarning     datasets.batches     a pass repeats the random frames of another
 

@@ -15,8 +15,7 @@ from stereogenbench_data.schema.release import (
     CAMERA_PAIRS,
     FAMILIES,
 )
-from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
-from stereogenbench_data.selection.pairs import PAIR_NUMBER, in_bin
+from stereogenbench_data.selection.filters import PAIR_NUMBER, SceneFilters, filter_scenes, in_bin
 
 ADJACENT_COLUMNS: Final = [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]
 _SPLITS: Final = ("train", "eval")

@@ -41,8 +41,7 @@ from stereogenbench_data.media.encoder import Encoding, VideoEncoder
 from stereogenbench_data.samples.fields import Request, Sample
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
-from stereogenbench_data.selection.options import require_options
+from stereogenbench_data.selection.filters import SceneFilters, filter_scenes, require_options
 from stereogenbench_data.selection.plan import Address, FramesSpec, PairOptions, parse_frames
 from stereogenbench_data.sources.files import open_atomic, write_atomic
 

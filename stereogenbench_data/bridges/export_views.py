@@ -39,8 +39,7 @@ from stereogenbench_data.jobs import WorkOptions, atomic_folder, do_items, job_f
 from stereogenbench_data.samples.fields import Request
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.selection.filters import SceneFilters
-from stereogenbench_data.selection.options import require_options
+from stereogenbench_data.selection.filters import SceneFilters, require_options
 from stereogenbench_data.selection.plan import Address, FramesSpec
 from stereogenbench_data.sources.files import write_atomic
 

@@ -24,7 +24,7 @@ from stereogenbench_data.schema.release import (
     TRAINING_JSON,
     VIDEO_FILES,
 )
-from stereogenbench_data.selection.pairs import PairsSpec
+from stereogenbench_data.selection.filters import PairsSpec
 from stereogenbench_data.selection.plan import FramesSpec
 
 _VIDEOS: Final = (*VIDEO_FILES, *PACKED_DEPTH_NAMES.values())

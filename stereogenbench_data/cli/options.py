@@ -91,10 +91,10 @@ def out_folder(text: str) -> Path:
 def size_of(text: str) -> tuple[int, int]:
     """Return (height, width) of a size, which is WIDTHxHEIGHT."""
     from stereogenbench_data.errors import FieldError
-    from stereogenbench_data.samples.fields import parse_size
+    from stereogenbench_data.samples.fields import require_size
 
     try:
-        return parse_size(text)
+        return require_size(text)
     except FieldError as error:
         raise typer.BadParameter(str(error)) from None
 

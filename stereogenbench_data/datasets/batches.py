@@ -25,8 +25,9 @@ from torch.utils.data import Sampler
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Stream
+from stereogenbench_data.samples.streams import OPEN_STREAMS
 from stereogenbench_data.schema.release import CAMERA_COUNT
-from stereogenbench_data.selection.options import require_options
+from stereogenbench_data.selection.filters import require_options
 from stereogenbench_data.selection.order import (
     GROUPS_OF_LARGE,
     OPEN_SCENES,
@@ -56,10 +57,9 @@ class SharedNumbers:
     has numbers of its own, which its own workers share.
     """
 
-    def __init__(self, numbers: Sequence[int]) -> None:
-        """Begin with these numbers."""
-        self.tensor = torch.tensor(numbers, dtype=torch.int64)
-        self.tensor.share_memory_()
+    def __init__(self, numbers: Sequence[int] | torch.Tensor) -> None:
+        """Begin with these numbers: a tensor in shared memory stays where it is."""
+        self.tensor = torch.as_tensor(numbers, dtype=torch.int64).share_memory_()
 
     def __getitem__(self, place: int) -> int:
         """Return a number."""
@@ -74,26 +74,22 @@ class SharedNumbers:
         return SharedNumbers, (self.tensor.tolist(),)
 
 
-def _over(tensor: torch.Tensor) -> SharedNumbers:
-    """Return the numbers that lie in shared memory."""
-    numbers = SharedNumbers.__new__(SharedNumbers)
-    numbers.tensor = tensor
-    return numbers
-
-
-# Of processes of this machine alone, such as workers that are spawned.
-ForkingPickler.register(SharedNumbers, lambda numbers: (_over, (numbers.tensor,)))
+# For processes of this machine alone, such as workers that are spawned.
+ForkingPickler.register(SharedNumbers, lambda numbers: (SharedNumbers, (numbers.tensor,)))
 
 
 class SharedEpoch:
     """The epoch that a dataset draws random frames and transforms for, as all its workers see it.
 
-    A copy has an epoch of its own.
+    torch's own `DataLoader` makes passes of the same epoch until one is set, so each would draw the
+    same random frames and transforms. The first sample that any process draws in an epoch is
+    watched; the process that draws it again warns, once. A copy has an epoch of its own.
     """
 
     def __init__(self, epoch: int = 0) -> None:
-        """Begin at an epoch."""
+        """Begin at an epoch that was never set, with no sample watched."""
         self._numbers = SharedNumbers([epoch, 0])
+        self._watched = SharedNumbers([-1, -1, 0])  # epoch and sample, and whether it was told
 
     @property
     def value(self) -> int:
@@ -114,6 +110,28 @@ class SharedEpoch:
         self._numbers[0] = require_epoch(epoch)
         self._numbers[1] += 1
 
+    def mark_drawn(self, numbers: Sequence[int], *, epoch: int, dataset: object) -> None:
+        """Take random samples as drawn, and warn if the watched one is drawn again.
+
+        Args:
+            numbers: The samples.
+            epoch: Their epoch.
+            dataset: What draws them, for the warning.
+        """
+        watched, marked = self._watched, hash((epoch, self.times_set))
+        if watched[0] != marked and numbers:
+            watched[1], watched[0] = numbers[0], marked
+        elif watched[1] in numbers and not watched[2]:
+            watched[2] = 1
+            warnings.warn(
+                f"{dataset!r} is read by torch's own DataLoader, and samples of epoch {epoch} "
+                "come a second time, with the same random frames and transforms. Call "
+                "set_epoch(epoch) before each pass, or use StereoPairs(...).loader(...), whose "
+                "every pass is of the next epoch.",
+                RepeatedEpochWarning,
+                stacklevel=3,
+            )
+
 
 def require_epoch(epoch: int) -> int:
     """Return the number of an epoch.
@@ -124,41 +142,6 @@ def require_epoch(epoch: int) -> int:
     if not isinstance(epoch, int | np.integer) or not 0 <= epoch < 2**63:
         raise SelectionError(f"an epoch is a whole number from 0, got {epoch!r}.")
     return int(epoch)
-
-
-class DrawnSamples:
-    """Whether the random samples of an epoch are drawn a second time, by torch's own `DataLoader`.
-
-    Its passes are of the same epoch until ``set_epoch`` is called, so each would draw the same
-    random frames and transforms. The first sample that any process draws in an epoch is watched;
-    the process that draws it again warns, once.
-    """
-
-    def __init__(self) -> None:
-        """Begin with none: an epoch, the sample that is watched, and whether it was told."""
-        self._watched = SharedNumbers([-1, -1, 0])
-
-    def mark(self, numbers: Sequence[int], *, epoch: tuple[int, int], dataset: object) -> None:
-        """Take samples as drawn, and warn if the watched one is drawn again.
-
-        Args:
-            numbers: The samples.
-            epoch: Their epoch, and how often it was set.
-            dataset: What draws them, for the warning.
-        """
-        watched, marked = self._watched, hash(epoch)
-        if watched[0] != marked and numbers:
-            watched[1], watched[0] = numbers[0], marked
-        elif watched[1] in numbers and not watched[2]:
-            watched[2] = 1
-            warnings.warn(
-                f"{dataset!r} is read by torch's own DataLoader, and samples of epoch {epoch[0]} "
-                "come a second time, with the same random frames and transforms. Call "
-                "set_epoch(epoch) before each pass, or use StereoPairs(...).loader(...), whose "
-                "every pass is of the next epoch.",
-                RepeatedEpochWarning,
-                stacklevel=3,
-            )
 
 
 def _parted(index: SceneIndex) -> tuple[Any, ...]:
@@ -400,36 +383,39 @@ class Passes:
         return self.__dict__ | {"_running": [], "latest": None}
 
 
-class KnownOrder:
-    """What the batches of all ranks are, without the dataset that they are of.
+class GlobalBatches:
+    """The batches of all ranks, by their numbers.
 
-    The dataset keeps it to read ahead. With the batches themselves it would refer to itself, and
+    A dataset keeps them to read ahead. They do not know it: else it would refer to itself, and its
     videos would stay open after the last reference to it.
     """
 
-    def __init__(self, rule: OrderRule, *, is_padded: bool) -> None:
+    def __init__(self, rule: OrderRule, runs: Runs, *, is_padded: bool) -> None:
         """Take what the order depends on, and whether the last batches are filled up."""
-        self.rule = rule
-        self.is_padded = is_padded
+        self.rule, self.runs, self.is_padded = rule, runs, is_padded
         self._order: EpochOrder | None = None
 
-    def order(self, runs: Runs, epoch: int) -> EpochOrder:
+    def order(self, epoch: int) -> EpochOrder:
         """Return the order of an epoch; the last one is kept."""
         if self._order is None or self._order.epoch != epoch:
-            self._order = EpochOrder(runs, self.rule, epoch=epoch)
+            self._order = EpochOrder(self.runs, self.rule, epoch=epoch)
         return self._order
 
-    def batch(self, runs: Runs, number: int, *, epoch: int) -> EpochBatch:
-        """Return the samples of a global batch, without saying which of them are padding."""
-        order = self.order(runs, epoch)
+    def batch(self, number: int, *, epoch: int) -> EpochBatch:
+        """Return the samples of a batch."""
+        order, size = self.order(epoch), self.rule.batch_size
         samples = order.batch(number) if number < order.batches else np.empty(0, dtype=np.int64)
-        return EpochBatch(
+        batch = EpochBatch(
             (order.full_batch(number) if self.is_padded else samples).tolist(),
             epoch=epoch,
             ends_of_runs=samples[order.ends_run(number)].tolist() if len(samples) else (),
             number=number,
             group=number % order.groups,
         )
+        if self.is_padded:
+            places = range(number * size, (number + 1) * size)
+            batch.is_padding = [place >= order.samples for place in places]
+        return batch
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs; it computes the order itself."""
@@ -469,6 +455,7 @@ class EpochBatches(Sampler[list[int]]):
         world_size: How many ranks there are.
         drop_last: Whether what does not fill a batch of every rank is dropped.
         is_padded: Whether samples from the epoch's start fill up the last batches.
+        of_all_ranks: The batches of all ranks, by their global numbers.
         passes: Where its passes are: the position.
     """
 
@@ -492,31 +479,28 @@ class EpochBatches(Sampler[list[int]]):
         require_options(EpochBatches, options)
         if isinstance(dataset, Sampler):
             # So Lightning makes batches again. To predict, it takes the sampler of our loader.
-            self.__setstate__(_batches_behind(dataset).__dict__)
+            batches = getattr(dataset, "batches", None)
+            if not isinstance(batches, EpochBatches):
+                raise SelectionError(
+                    f"EpochBatches orders a dataset such as StereoPairs by itself, and cannot take "
+                    f"its order from a {type(dataset).__name__}. Lightning's overfit_batches puts "
+                    "one in: use limit_train_batches=... (or overfit_batches) with "
+                    "pairs.loader(..., shuffle=False)."
+                )
+            self.__setstate__(batches.__dict__)
             return
         self.dataset = dataset
-        rule = OrderRule(
-            batch_size=batch_size,
-            seed=options.get("seed", dataset.plan.seed),
-            shuffle=options.get("shuffle", True),
-        )
-        rule = fitting_rule(
-            rule, dataset.index, dataset.plan, open_scenes=options.get("open_scenes")
-        )
-        self.rule = replace(
-            rule,
-            shuffle_groups=options.get("shuffle_groups", rule.shuffle_groups),
-            open_frames=options.get("open_frames", rule.open_frames),
-        )
+        plan = dataset.plan
+        self.rule = fitting_rule(dataset.index, plan, batch_size, options)
         self.rank, self.world_size = _require_group(options.get("rank"), options.get("world_size"))
-        self._drop_last = options.get("drop_last", rule.shuffle)
+        self._drop_last = options.get("drop_last", self.rule.shuffle)
         self.drop_last, self.is_padded = self._drop_last is True, self._drop_last == "pad"
         self._follows_the_group = "rank" not in options
-        self.known_order = KnownOrder(self.rule, is_padded=self.is_padded)
+        self.of_all_ranks = GlobalBatches(self.rule, plan.runs, is_padded=self.is_padded)
         self.passes = Passes(dataset.shared_epoch, then="same epoch")
         if self.end() == 0:
             raise SelectionError(
-                f"drop_last=True drops all of {len(dataset.plan)} samples: they fill no batch of "
+                f"drop_last=True drops all of {len(plan)} samples: they fill no batch of "
                 f"{batch_size} for each of {self.world_size} ranks. Take a smaller batch_size, "
                 "drop_last='pad' or drop_last=False."
             )
@@ -575,7 +559,7 @@ class EpochBatches(Sampler[list[int]]):
                 begun.taken += 1
                 if begun.is_complete:
                     self.passes.end(begun)
-                yield self.batch(number, epoch=begun.epoch)
+                yield self.of_all_ranks.batch(number, epoch=begun.epoch)
             begun.is_exhausted = True
         finally:
             self.passes.end(begun)
@@ -676,22 +660,6 @@ class EpochBatches(Sampler[list[int]]):
                 "prepare this loader."
             )
 
-    def batch(self, number: int, *, epoch: int) -> EpochBatch:
-        """Return the samples of a global batch."""
-        batch = self.known_order.batch(self.dataset.plan.runs, number, epoch=epoch)
-        if self.is_padded:
-            batch.is_padding = self.is_padding(number).tolist()
-        return batch
-
-    def is_padding(self, number: int) -> np.ndarray:
-        """Return, for each sample of a global batch, whether it fills up after the epoch's end."""
-        size = self.rule.batch_size
-        return np.arange(number * size, (number + 1) * size) >= len(self.dataset.plan)
-
-    def order(self, epoch: int) -> EpochOrder:
-        """Return the order of an epoch; the last one is kept."""
-        return self.known_order.order(self.dataset.plan.runs, epoch)
-
     def state_at(self, epoch: int, batches: int) -> State:
         """Return the state after a number of global batches of an epoch."""
         return {
@@ -758,22 +726,6 @@ class EpochBatches(Sampler[list[int]]):
         """Become a copy, with passes of its own."""
         self.__dict__.update(state)
         self.passes = copy.copy(self.passes)
-
-
-def _batches_behind(sampler: Sampler[Any]) -> EpochBatches:
-    """Return the batches that a loader's sampler stands for.
-
-    Raises:
-        SelectionError: If it is another sampler, such as the one of Lightning's overfit_batches.
-    """
-    batches = getattr(sampler, "batches", None)
-    if not isinstance(batches, EpochBatches):
-        raise SelectionError(
-            f"EpochBatches orders a dataset such as StereoPairs by itself, and cannot take its "
-            f"order from a {type(sampler).__name__}. Lightning's overfit_batches puts one in: use "
-            "limit_train_batches=... (or overfit_batches) with pairs.loader(..., shuffle=False)."
-        )
-    return batches
 
 
 def require_count(state: Mapping[str, Any], name: str, *, most: int | None = None) -> int:
@@ -848,8 +800,6 @@ def videos_to_keep(
     warning says what to do if the process may not open that many files, or if several processes
     decode the same videos and more groups would avoid it.
     """
-    from stereogenbench_data.samples.streams import OPEN_STREAMS  # slow to import: decoders
-
     lengths = plan.runs.lengths
     groups = rule.groups_of(lengths)
     together = processes // math.gcd(rule.shuffle_groups, processes)
@@ -879,43 +829,39 @@ def videos_to_keep(
 
 
 def fitting_rule(
-    rule: OrderRule, index: SceneIndex, plan: Plan, *, open_scenes: int | None
+    index: SceneIndex, plan: Plan, batch_size: int, options: EpochOptions
 ) -> OrderRule:
     """Return a rule with as many open scenes and frames as fit into the memory of a shuffle group.
 
     They depend on the selected pairs and the stored size of their pictures alone, not on fields,
-    ranks or workers: so does the order.
+    ranks or workers: so does the order. What a user asks for counts instead.
 
-    Args:
-        rule: The rule without them.
-        index: The scenes.
-        plan: The selection.
-        open_scenes: How many scenes the user asks for; None for as many as fit.
+    Raises:
+        SelectionError: If an option is out of its range.
     """
-    shares_moments = bool((plan.runs.pairs > 1).any())
-    of_cameras = _camera_pixels(index, plan)
+    rule = OrderRule(
+        batch_size, seed=options.get("seed", plan.seed), shuffle=options.get("shuffle", True)
+    )
+    rows, shares_moments = plan.scene_rows, bool((plan.runs.pairs > 1).any())
+    pixels = (index.column("image_width_px")[rows] * index.column("image_height_px")[rows]).max()
+    of_cameras = int(pixels) * videos_per_scene(plan, frozenset({"source_rgb", "target_rgb"}))
     # About what the decoders of an open scene take, at the most.
     scene_bytes = of_cameras * (_DECODER_BYTES + (_KEPT_BYTES if shares_moments else 0))
     fitting = max(2, GROUP_BYTES // max(1, scene_bytes))
+    open_scenes = options.get("open_scenes")
     if open_scenes is None:
-        open_scenes = min(max(OPEN_SCENES, rule.batch_size), fitting)
+        open_scenes = min(max(OPEN_SCENES, batch_size), fitting)
     rule = replace(rule, open_scenes=open_scenes)
     frames = 1
     if shares_moments:
         further = FRAMES_BYTES // max(1, open_scenes * of_cameras * _FRAME_BYTES)
-        frames = max(1, min(1 + further, -(-rule.batch_size // open_scenes)))
+        frames = max(1, min(1 + further, -(-batch_size // open_scenes)))
+    groups = SHUFFLE_GROUPS if fitting >= OPEN_SCENES else GROUPS_OF_LARGE
     return replace(
         rule,
-        shuffle_groups=SHUFFLE_GROUPS if fitting >= OPEN_SCENES else GROUPS_OF_LARGE,
-        open_frames=frames,
+        shuffle_groups=options.get("shuffle_groups", groups),
+        open_frames=options.get("open_frames", frames),
     )
-
-
-def _camera_pixels(index: SceneIndex, plan: Plan) -> int:
-    """Return how many pixels the pictures of the needed cameras have, at the most."""
-    rows = plan.scene_rows
-    pixels = (index.column("image_width_px")[rows] * index.column("image_height_px")[rows]).max()
-    return int(pixels) * videos_per_scene(plan, frozenset({"source_rgb", "target_rgb"}))
 
 
 def _most_files() -> int:

@@ -197,7 +197,7 @@ def planned_bytes(pairs: StereoPairs, batch_size: int, *, workers: int) -> tuple
         ahead = PlannedFetches()
         decoder = SampleLoader(index, pairs.request, check="metadata", frames="shared", ahead=ahead)
         decoder.keep_open(own.stats().videos_limit, frames=batches.rule.open_frames)
-        first = batches.batch(worker, epoch=0)
+        first = batches.of_all_ranks.batch(worker, epoch=0)
         decoder.expect(own.steps(first, first))
         for step in itertools.islice(own.steps(first, first), _MOST_PLANNED - samples):
             decoder.begin(step.address)

@@ -1,6 +1,17 @@
 """A torch `DataLoader` over the batches of an epoch, which counts what its loop has taken.
 
-The loader starts passes. A `LoaderPass` owns its position, its workers and their memory.
+The loader starts passes. A `LoaderPass` owns its position, its workers and their memory. Workers
+are torch's own, but one that dies always ends the pass.
+
+torch shares an event and a queue with its workers, each guarded by a lock between processes. A
+worker that is killed while it holds such a lock, as by a system short of memory, would leave the
+training process waiting for ever. So the event made here has no lock, and a thread waits for the
+end of each worker: when one ends too soon it kills the others and closes the queue, so that nobody
+waits for what will not come.
+
+A fork copies locks as they are. Where a thread of another library held one, as gloo's threads do
+the interpreter's own in CPython 3.11, the new process waits for ever before its first line of
+Python. So a forked worker says that it has begun; one that does not is forked again.
 
 Accelerate and Lightning give each rank its share of a torch `DataLoader`. Our loaders have already
 done that; dividing them again would silently lose samples. Lightning leaves loaders alone whose
@@ -10,33 +21,355 @@ streams that are divided twice all the same are refused (`EpochBatches`).
 
 import copy
 import os
+import queue
+import signal
 import sys
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property, partial
-from time import perf_counter
-from typing import Any, Final, NamedTuple, SupportsIndex
-from weakref import WeakSet
+from multiprocessing import connection, get_context
+from multiprocessing.context import BaseContext
+from multiprocessing.process import BaseProcess
+from multiprocessing.queues import Queue
+from time import perf_counter, sleep
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, SupportsIndex
+from weakref import WeakSet, ref
 
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, DistributedSampler, SequentialSampler
+from torch.utils.data import DataLoader, DistributedSampler, Sampler, SequentialSampler
 
+from stereogenbench_data.datasets.batch_buffers import forget_slots
 from stereogenbench_data.datasets.batches import (
     EpochBatches,
     EpochOptions,
     Pass,
     State,
 )
-from stereogenbench_data.datasets.workers import Workers
 from stereogenbench_data.errors import (
     PassError,
     StateError,
     StereoGenBenchError,
+    WorkerError,
 )
 from stereogenbench_data.selection.order import EpochOrder, Numbers
 from stereogenbench_data.selection.plan import Plan
+
+if sys.platform != "win32":
+    from multiprocessing.context import ForkProcess
+
+_BEGUN_WITHIN_S = 20.0
+"""How long a forked worker may take to its first line of Python; usually milliseconds."""
+
+_MOST_FORKS = 3
+"""How often a worker is forked that does not begin."""
+
+_NOTICED_AFTER_S = 2.0
+"""How long torch may know of a death before this module's thread does."""
+
+
+class Workers:
+    """The workers of one pass, or of several one after another where they persist.
+
+    Attributes:
+        serves: The pass whose batches they load; None before the first.
+        batches: Its batches that were not taken yet.
+    """
+
+    def __init__(self, loader: DataLoader[Any]) -> None:
+        """Begin without processes; they are started as a loader says, when the first pass begins.
+
+        Without worker processes this one loads.
+        """
+        self._torch: DataLoader[Any] | None = None
+        self.batches: Iterator[Any] = iter(())
+        self.serves: Pass | None = None
+        self._numbers = _DueBatches()
+        self._context: _WatchedContext | None = None
+        if loader.num_workers > 0:
+            given: Any = loader.multiprocessing_context
+            base = given.get_context() if isinstance(given, BaseContext) else get_context(given)
+            self._context = _WatchedContext(base)
+        self._torch = DataLoader(
+            loader.dataset,
+            batch_sampler=self._numbers,
+            num_workers=loader.num_workers,
+            collate_fn=loader.collate_fn,
+            pin_memory=loader.pin_memory,
+            timeout=loader.timeout,
+            worker_init_fn=loader.worker_init_fn,
+            multiprocessing_context=self._context,
+            generator=loader.generator,
+            prefetch_factor=loader.prefetch_factor,
+            persistent_workers=loader.persistent_workers,
+        )
+        self._loader = ref(loader)
+        self._stop_reader, self._stop_writer = connection.Pipe(duplex=False)
+        self._thread: threading.Thread | None = None
+        self._pid = os.getpid()
+        _running.add(self)
+
+    def pids_for(self, loader: DataLoader[Any]) -> set[int]:
+        """Return the numbers of the processes that run for a loader."""
+        if self._context is None or self._torch is None or self._loader() is not loader:
+            return set()
+        return {process.pid for process in self._context.processes if process.pid is not None}
+
+    @property
+    def is_of_this_process(self) -> bool:
+        """Whether this process started them, and not one that it was forked from."""
+        return self._context is None or os.getpid() == self._pid
+
+    def begin(self, begun: Pass, numbers: Iterator[Any]) -> None:
+        """Begin a pass over batches; the pass that these workers served before has ended."""
+        if self._torch is None:
+            raise PassError("these workers have ended: call iter(loader) again.")
+        are_new, self.serves = self.serves is None, begun
+        self._numbers.due = numbers
+        self.batches = iter(self._torch)
+        if self._context is not None and are_new:
+            # The thread does not refer to these workers: without other references they end.
+            of_thread = (self._context, self._stop_reader)
+            self._thread = threading.Thread(
+                target=_watch, args=of_thread, name="worker-watch", daemon=True
+            )
+            self._thread.start()
+
+    def __del__(self) -> None:
+        """End the workers when no reference is left."""
+        self.end()
+
+    def end(self) -> None:
+        """End the workers, and release the memory that came from them."""
+        self.serves = None  # a pass that goes on is told
+        batches, self.batches = self.batches, iter(())
+        loader, self._torch = self._torch, None
+        if loader is None or self._context is None or sys.is_finalizing():
+            return
+        if not self.is_of_this_process:
+            _inherited.append((loader, batches))
+            return
+        if self._thread is not None:
+            # From now on workers may end.
+            self._stop_writer.send_bytes(b"stop")
+            if threading.current_thread() is not self._thread:
+                self._thread.join()
+            self._thread = None
+        # Now, and not when the last traceback is gone that knows the iterator. Lightning ends
+        # workers in this way, too; where none could be started there is nothing to end.
+        shutdown = getattr(batches, "_shutdown_workers", None)
+        if shutdown is not None:
+            shutdown()
+        forget_slots({each.pid for each in self._context.processes if each.pid is not None})
+
+    def error(self, noticed: BaseException) -> WorkerError | None:
+        """Return an error that names the worker that died; None if none did.
+
+        Args:
+            noticed: What the loop met. Where torch says that a worker process raised it, that is no
+                death; where it says so of its thread that pins memory, that thread may have read
+                what a dead worker left behind.
+        """
+        if self._context is None:
+            return None
+        is_a_workers_own = "in DataLoader worker process" in str(noticed).partition("\n")[0]
+        if is_a_workers_own or not self._context.is_dead.wait(_NOTICED_AFTER_S):
+            return None
+        dead: Any = self._context.dead
+        dead.join(_NOTICED_AFTER_S)
+        code = dead.exitcode
+        how, cure = f"exited with status {code}", "Its traceback is above."
+        method = getattr(dead, "_start_method", "fork")
+        if code is not None and code < 0:
+            how = f"was killed by {signal.Signals(-code).name}"
+            cure = "If memory ran out, use fewer workers or open_scenes."
+        elif method != "fork":
+            cure += (
+                f" Workers of the start method {method!r} import the script again: its loop must "
+                "stand below `if __name__ == '__main__':`."
+            )
+        return WorkerError(
+            f"a DataLoader worker (pid {dead.pid}) {how} in the middle of a pass "
+            f"({type(noticed).__name__}: {noticed}). {cure} Load the last state_dict() to go on."
+        )
+
+
+def _watch(context: "_WatchedContext", stop_reader: Any) -> None:
+    """Wait for the end of each worker: where one ends too soon, kill the others."""
+    sentinels = {process.sentinel: process for process in context.processes}
+    ready = connection.wait([stop_reader, *sentinels])
+    # torch tells the workers to end after the last batch.
+    if stop_reader in ready or any(event.is_set() for event in context.events):
+        return
+    context.dead = next(sentinels[each] for each in ready if isinstance(each, int))
+    for process in context.processes:
+        if process is not context.dead:
+            process.kill()
+    # torch makes the queue of results first; the others lead to one worker each.
+    context.queues[0].end()
+    context.is_dead.set()
+
+
+class _DueBatches(Sampler[list[int]]):
+    """The batch sampler of workers: the numbers of the samples that are due."""
+
+    def __init__(self) -> None:
+        self.due: Iterator[list[int]] = iter(())
+
+    def __iter__(self) -> Iterator[list[int]]:
+        return self.due
+
+
+_running: Final[WeakSet[Workers]] = WeakSet()
+"""The workers of the passes of this process."""
+
+_inherited: Final[list[object]] = []
+"""Workers that a fork copied. They are the parent's: if the last reference to torch's iterator were
+dropped here, torch would end them. The operating system frees all of it when this process ends."""
+
+
+def _keep_inherited() -> None:
+    _inherited.extend(_running)
+    _running.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_keep_inherited)
+
+
+class _LocklessEvent:
+    """What torch asks of an event: one byte that all processes see, and no lock.
+
+    Only the process that made it sets it: a fork that lets go of a pass does not end its workers.
+    """
+
+    def __init__(self, context: BaseContext) -> None:
+        self._byte: Any = context.RawValue("b", 0)
+        self._pid = os.getpid()
+
+    def is_set(self) -> bool:
+        return bool(self._byte.value)
+
+    def set(self) -> None:
+        if os.getpid() == self._pid:
+            self._byte.value = 1
+
+
+if TYPE_CHECKING:
+    _Queue = Queue[Any]
+else:
+    _Queue = Queue  # generic only in the stubs of Python 3.11
+
+
+class _ClosableQueue(_Queue):
+    """A queue that can be ended though a dead process holds its lock or wrote half a message."""
+
+    _is_ended = False
+
+    def end(self) -> None:
+        """Make readers see an empty queue, without waiting for a dead writer."""
+        self._is_ended = True
+        pipe: Any = self  # torch and the standard library do not declare the pipe's end
+        pipe._writer.close()  # without it a reader sees no end
+
+    def get(self, block: bool = True, timeout: float | None = None) -> Any:  # noqa: FBT001, FBT002
+        """Return the next item, as the queue that this stands for."""
+        try:
+            return super().get(block, timeout)
+        except (EOFError, OSError):
+            if not self._is_ended:
+                raise
+            sleep(0.01)
+            raise queue.Empty from None
+
+    def put(self, obj: Any, block: bool = True, timeout: float | None = None) -> None:  # noqa: FBT001, FBT002
+        """Put an item, unless the queue was ended."""
+        if not self._is_ended:
+            super().put(obj, block, timeout)
+
+
+if sys.platform != "win32":
+
+    class _ForkedProcess(ForkProcess):
+        """A forked process that is sure to have begun once it was started."""
+
+        _begun_signal: Any
+        _target: Any
+        _args: Any
+        _kwargs: Any
+
+        def run(self) -> None:
+            self._begun_signal.send_bytes(b"begun")
+            super().run()
+
+        def start(self) -> None:
+            """Start the process, again where it did not begin.
+
+            Raises:
+                WorkerError: If it never does.
+            """
+            work = (self._target, self._args, self._kwargs)
+            for _ in range(_MOST_FORKS):
+                self._target, self._args, self._kwargs = work  # a start drops them
+                begun, self._begun_signal = connection.Pipe(duplex=False)
+                with begun, self._begun_signal:
+                    super().start()
+                    if begun.poll(_BEGUN_WITHIN_S):
+                        return
+                self.kill()
+                self.join()
+                self._popen = None  # as before the start
+            raise WorkerError(
+                f"a DataLoader worker did not begin within {_BEGUN_WITHIN_S:g} s of its fork, in "
+                f"{_MOST_FORKS} attempts: a thread of this process holds a lock. Use "
+                f"multiprocessing_context='forkserver', which starts workers from a process "
+                f"without threads."
+            )
+
+
+class _WatchedContext(BaseContext):
+    """A context whose processes and queues can be watched; it starts them as another one does.
+
+    Attributes:
+        processes: The workers.
+        queues: The queue of results, and one for each worker.
+        events: What tells the workers to end.
+        dead: The first worker that ended too soon.
+        is_dead: Set when all that follows from its end is done.
+    """
+
+    def __init__(self, base: BaseContext) -> None:
+        self._base: Any = base  # the standard library does not declare its process
+        self.processes: list[BaseProcess] = []
+        self.queues: list[_ClosableQueue] = []
+        self.events: list[_LocklessEvent] = []
+        self.dead: BaseProcess | None = None
+        self.is_dead = threading.Event()
+
+    def get_start_method(self, allow_none: bool = False) -> str:  # noqa: FBT001, FBT002
+        """Return the start method, by which locks are made."""
+        method: str = self._base.get_start_method(allow_none)
+        return method
+
+    def Process(self, *args: Any, **kwargs: Any) -> BaseProcess:
+        make = self._base.Process
+        if sys.platform != "win32" and make is ForkProcess:
+            make = _ForkedProcess
+        process: BaseProcess = make(*args, **kwargs)
+        self.processes.append(process)
+        return process
+
+    def Queue(self, maxsize: int = 0) -> _ClosableQueue:
+        made = _ClosableQueue(maxsize, ctx=self)
+        self.queues.append(made)
+        return made
+
+    def Event(self) -> Any:
+        made = _LocklessEvent(self)
+        self.events.append(made)
+        return made
+
 
 _DESCRIBED_SAMPLES: Final = 100_000
 _DESCRIBED_BATCHES: Final = 200
@@ -142,6 +475,7 @@ class PairsLoader(DataLoader[Any]):
             padding. Accelerate reads these.
     """
 
+    dataset: Any
     batches: EpochBatches
     use_stateful_dataloader: Final = True
     end_of_dataloader = False
@@ -177,8 +511,6 @@ class PairsLoader(DataLoader[Any]):
             **options,
         )
         self.batches = batches
-        self._loadable = dataset
-        self._workers: WeakSet[Workers] = WeakSet()
         self._begun_passes = 0
         self._pass_began_s = self._passed_s = self._waited_s = 0.0
         self._persistent: Workers | None = None
@@ -245,8 +577,8 @@ class PairsLoader(DataLoader[Any]):
 
     def stats(self) -> LoaderStats:
         """Return what the loader has and holds now: open videos, workers, batches."""
-        pids = {pid for each in self._workers for pid in each.pids}
-        videos = self._loadable.stats()
+        pids = {pid for each in _running for pid in each.pids_for(self)}
+        videos = self.dataset.stats()
         epoch, taken = self.batches.passes.position
         return LoaderStats(
             epoch=epoch,
@@ -325,17 +657,16 @@ class PairsLoader(DataLoader[Any]):
         """End workers that persist, and close this process's videos; it can be used again."""
         if self._persistent is not None:
             self._forget(self._persistent)
-        self._loadable.close()
+        self.dataset.close()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy needs: it has passes and workers of its own."""
-        own = {"_workers": None, "_persistent": None, "_begun_passes": 0, "sampler": None}
+        own = {"_persistent": None, "_begun_passes": 0, "sampler": None}
         return self.__dict__ | own | {"batches": copy.copy(self.batches)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Become a copy."""
         self.__dict__.update(state)
-        self._workers = WeakSet()
         if isinstance(self.batch_sampler, EpochBatches):
             self.__dict__["batch_sampler"] = self.batches
         self._set_sampler()
@@ -351,7 +682,6 @@ class PairsLoader(DataLoader[Any]):
         if self._persistent is not None and self._persistent.is_of_this_process:
             return self._persistent
         workers = Workers(self)
-        self._workers.add(workers)
         if self.persistent_workers:
             self._persistent = workers
         return workers
@@ -399,7 +729,6 @@ class LoaderPass(Iterator[Any]):
         self._loader = loader
         self._pass: Pass | None = None
         self._workers: Workers | None = None
-        self._loaded: Iterator[Any] = iter(())
         self._is_closed = False
         self._error: str | None = None
         self._pid = os.getpid()
@@ -438,8 +767,8 @@ class LoaderPass(Iterator[Any]):
         if workers.serves is not begun:
             raise PassError(
                 f"this pass over epoch {begun.epoch} ended after {begun.taken} of {len(self)} "
-                "batches, as another one was begun: workers that persist serve one pass at a time. "
-                "Use a loader for each, or persistent_workers=False."
+                "batches, as another one was begun, or the loader closed: workers that persist "
+                "serve one pass at a time. Use a loader for each, or persistent_workers=False."
             )
         loader, asked_s = self._loader, perf_counter()
         with self._ended_by_errors():
@@ -457,7 +786,8 @@ class LoaderPass(Iterator[Any]):
         loader, batches = self._loader, self._loader.batches
         begun = batches.next_pass()
         # No reference to this pass in it: without a cycle, a pass that is left ends at once.
-        numbers: Iterator[Any] = map(partial(batches.batch, epoch=begun.epoch), begun.share)
+        batch_of = partial(batches.of_all_ranks.batch, epoch=begun.epoch)
+        numbers: Iterator[Any] = map(batch_of, begun.share)
         if loader.batch_sampler is not batches:
             numbers = iter(loader.batch_sampler or ())
         workers = loader._workers_of_a_pass()
@@ -466,12 +796,12 @@ class LoaderPass(Iterator[Any]):
         loader._begin(begun)
         self._pass, self._workers = begun, workers
         with self._ended_by_errors():
-            self._loaded = workers.begin(begun, numbers)
+            workers.begin(begun, numbers)
 
     def _load(self, workers: Workers) -> Any:
         """Return what the workers have next; an error that a dead worker caused names it."""
         try:
-            return next(self._loaded)
+            return next(workers.batches)
         except (RuntimeError, OSError, EOFError) as error:
             death = None if isinstance(error, StereoGenBenchError) else workers.error(error)
             if death is None:
@@ -502,10 +832,9 @@ class LoaderPass(Iterator[Any]):
         workers, self._workers = self._workers, None
         if self._pass is None or workers is None:
             return
-        self._loaded = iter(())
         self._loader._end(self._pass)
         if self._pid == os.getpid() and self._loader.num_workers == 0:
-            self._loader._loadable.stop_fetching()
+            self._loader.dataset.stop_fetching()
         if workers is not self._loader._persistent:
             workers.end()
 

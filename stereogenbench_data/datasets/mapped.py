@@ -6,7 +6,7 @@ import operator
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypedDict, Unpack, get_args
+from typing import Any, Final, Literal, Self, TypedDict, Unpack, get_args
 
 import numpy as np
 import torch
@@ -19,11 +19,10 @@ from stereogenbench_data.datasets.batch_buffers import (
     to_tensors,
 )
 from stereogenbench_data.datasets.batches import (
-    DrawnSamples,
     EpochBatch,
     EpochBatches,
     EpochOptions,
-    KnownOrder,
+    GlobalBatches,
     Passes,
     SharedEpoch,
     videos_to_keep,
@@ -33,25 +32,42 @@ from stereogenbench_data.datasets.loader import (
     PairsLoader,
     accelerates_epoch,
 )
-from stereogenbench_data.errors import FieldError, SelectionError, text_without_secrets
-from stereogenbench_data.index.open_tree import Rows
+from stereogenbench_data.errors import (
+    FieldError,
+    MediaError,
+    SelectionError,
+    StorageError,
+    text_without_secrets,
+)
+from stereogenbench_data.geometry.rig import RECTIFIED_PX
+from stereogenbench_data.index.open_tree import MOST_LEFT_OUT, Rows
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.checks import check_samples, without_odd_scenes
+from stereogenbench_data.media import depth
 from stereogenbench_data.samples.fields import (
     DEFAULT_PAIR_FIELDS,
     DEFAULT_VIEW_FIELDS,
+    EnlargedSizeWarning,
     Layout,
+    OddSceneWarning,
     Request,
     Sample,
     Transform,
     parse_request,
+    warn_if_swapped,
 )
-from stereogenbench_data.samples.load import Allocate, new_array
-from stereogenbench_data.schema.conventions import Conventions
-from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.samples.load import Allocate, SampleLoader, new_array
+from stereogenbench_data.samples.streams import StreamStats
+from stereogenbench_data.schema.conventions import Conventions, depth_of
+from stereogenbench_data.schema.records import DepthEncoding, Scene
+from stereogenbench_data.schema.release import CAMERA_COUNT, DEFAULT_DEPTH_UNIT_M, depth_name
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.selection.filters import SceneFilters, may_pass
-from stereogenbench_data.selection.options import options_of, require_options, split_options
+from stereogenbench_data.selection.filters import (
+    SceneFilters,
+    may_pass,
+    options_of,
+    require_options,
+    split_options,
+)
 from stereogenbench_data.selection.plan import (
     Address,
     FramesSpec,
@@ -65,9 +81,6 @@ from stereogenbench_data.selection.plan import (
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.fetch_ahead import FETCH_AHEAD_BYTES, FetchAhead
 from stereogenbench_data.sources.location import is_remote
-
-if TYPE_CHECKING:
-    from stereogenbench_data.samples.streams import StreamStats
 
 
 def to_raft_stereo(
@@ -208,8 +221,6 @@ class _MappedScenes(Dataset[Sample]):
     def __init__(
         self, index: SceneIndex, plan: Plan, request: Request, options: ReadOptions
     ) -> None:
-        from stereogenbench_data.samples.load import SampleLoader  # slow to import: decoders
-
         selected = len(plan.scene_rows)
         plan = without_odd_scenes(index, plan, request)
         check_samples(index, plan, request)
@@ -243,8 +254,8 @@ class _MappedScenes(Dataset[Sample]):
         self._streams = request.streams
         self.shared_epoch = SharedEpoch()
         self.is_random = _is_random(plan, request)
-        self._drawn = DrawnSamples() if self.is_random else None
-        self._known_order: KnownOrder | None = None
+        self._is_watched = self.is_random
+        self._of_all_ranks: GlobalBatches | None = None
         self._step = self._stop = 0
         self._next_batch: tuple[int, int] | None = None
 
@@ -315,11 +326,10 @@ class _MappedScenes(Dataset[Sample]):
 
     def _mark_drawn(self, batch: EpochBatch) -> None:
         """Warn once where torch's own `DataLoader` draws random samples of an epoch again."""
-        if self._drawn is not None:
+        if self._is_watched:
             fills_up = batch.is_padding or [False] * len(batch)
             own = [number for number, is_again in zip(batch, fills_up, strict=True) if not is_again]
-            epoch = batch.epoch, self.shared_epoch.times_set
-            self._drawn.mark(own, epoch=epoch, dataset=self)
+            self.shared_epoch.mark_drawn(own, epoch=batch.epoch, dataset=self)
 
     def samples_of(self, batch: EpochBatch, *, start: int = 0) -> Iterator[Sample]:
         """Yield the samples of a batch one after another, from one of its places on.
@@ -338,12 +348,12 @@ class _MappedScenes(Dataset[Sample]):
         if batch.number is None or this != self._next_batch or not self._loader.has_order:
             self._loader.expect(self.steps(batch, reading))
         self._next_batch = None
-        if batch.number is not None and self._known_order is not None:
+        if batch.number is not None and self._of_all_ranks is not None:
             self._next_batch = (batch.epoch, batch.number + self._step)
 
     def steps(self, batch: EpochBatch, reading: Sequence[int]) -> Iterator[Step]:
         """Yield the samples of a batch, and of those that this process gets after it."""
-        known, number = self._known_order, batch.number
+        known, number = self._of_all_ranks, batch.number
         while True:
             for each in reading:
                 if -len(self.plan) <= each < len(self.plan):
@@ -352,11 +362,11 @@ class _MappedScenes(Dataset[Sample]):
             if number is None or known is None or number + self._step >= self._stop:
                 return
             number += self._step
-            batch = reading = known.batch(self.plan.runs, number, epoch=batch.epoch)
+            batch = reading = known.batch(number, epoch=batch.epoch)
 
     def _address(self, number: int, epoch: int, *, group: int) -> Address:
         address = self.plan.locate(number % len(self.plan), epoch=epoch, group=group)
-        return address._replace(run=0) if self._known_order is None else address
+        return address._replace(run=0) if self._of_all_ranks is None else address
 
     def _load_into(
         self, arrays: BatchArrays | None, place: int, number: int, *, batch: EpochBatch
@@ -423,7 +433,7 @@ class _MappedScenes(Dataset[Sample]):
         require_options(self.loader, options)
         ordering, others = split_options(options, EpochOptions)
         own = self.with_own_videos()
-        own._drawn = None  # a loader's passes are each of the next epoch
+        own._is_watched = False  # a loader's passes are each of the next epoch
         batches = EpochBatches(own, batch_size, **ordering)
         batches.passes = Passes(self.shared_epoch, then="next epoch")
         return PairsLoader(own, batches, num_workers=num_workers, **others)
@@ -438,8 +448,8 @@ class _MappedScenes(Dataset[Sample]):
         twin._loader, twin.buffers = self._loader.copy(), BatchBuffers(self.buffers.kind)
         if epoch is not None:
             twin.shared_epoch = SharedEpoch(epoch)
-            twin._drawn = None
-        twin._known_order = twin._next_batch = None
+            twin._is_watched = False
+        twin._of_all_ranks = twin._next_batch = None
         return twin
 
     def keep_open(self, batches: EpochBatches, *, processes: int) -> None:
@@ -453,15 +463,14 @@ class _MappedScenes(Dataset[Sample]):
                 self.plan, batches.rule, streams=self._streams, processes=processes
             )
             self._loader.keep_open(videos, frames=batches.rule.open_frames)
-        self._known_order, self._step, self._stop = batches.known_order, processes, batches.end()
+        self._of_all_ranks, self._step, self._stop = batches.of_all_ranks, processes, batches.end()
         self._next_batch = None
 
     def stop_fetching(self) -> None:
         """End the requests of this process for coming samples."""
-        self._next_batch = None
         self._loader.stop_fetching()
 
-    def stats(self) -> "StreamStats":
+    def stats(self) -> StreamStats:
         """Return how many videos this process has open for this dataset, and may have.
 
         A loader has its own videos: see its ``stats()``.
@@ -473,7 +482,6 @@ class _MappedScenes(Dataset[Sample]):
 
         A loader has its own videos, which its ``close()`` closes.
         """
-        self._next_batch = None
         self._loader.close()
 
     def __repr__(self) -> str:
@@ -639,3 +647,180 @@ def _check_of(check: Check, plan: Plan) -> Literal["opened", "metadata"]:
     if check == "read":
         return "opened" if is_mostly_read else "metadata"
     return check
+
+
+def without_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> Plan:
+    """Return a plan without the few scenes that cannot give what is requested.
+
+    These lack a video that others have, or a field of them is held up by what is not understood.
+    `OddSceneWarning` counts them and names the first.
+
+    Raises:
+        StorageError: If they are more than a few; it names the field, the first scene and why.
+    """
+    reasons: dict[int, str] = {}
+    selected = set(plan.scene_rows.tolist())
+    for name in request.fields:
+        for about in request.known[name].stopped_by:
+            for row in selected.intersection(index.remarked(about).tolist()):
+                text = index.indexed_scene(row).remark(about).rstrip(".")
+                reasons.setdefault(row, f"{name!r} needs {text}")
+    for row in selected.intersection(index.remarked("videos").tolist()):
+        if _missing_videos(index, plan, request, int(np.searchsorted(plan.scene_rows, row))):
+            reasons.setdefault(row, index.indexed_scene(row).remark("videos"))
+    if not reasons:
+        return plan
+    first = min(reasons)
+    told = (
+        f"{index.where}: {counted(len(reasons), 'selected scene')} of {len(selected)} cannot give "
+        f"what is asked for. The first: {index.column('key')[first]}: {reasons[first]}."
+    )
+    if len(reasons) == len(selected) or len(reasons) > max(1, MOST_LEFT_OUT * len(selected)):
+        raise StorageError(
+            f"{told} Leave out that field, choose other pairs or scenes, or mend the files."
+        )
+    if multiprocessing.parent_process() is None:
+        message = f"{told} Left out: {', '.join(index.column('key')[sorted(reasons)[:3]])}."
+        warnings.warn(text_without_secrets(message), OddSceneWarning, stacklevel=5)
+    return plan.without(index, sorted(reasons))
+
+
+def check_samples(index: SceneIndex, plan: Plan, request: Request) -> None:
+    """Check, by the index alone, that the samples of a plan can be made as requested.
+
+    Warns with `OddSceneWarning` where rigs are not rectified, or where a scene's cameras state
+    several units of depth, with `SwappedSizeWarning` where height and width look exchanged, and
+    with `EnlargedSizeWarning` where a size is larger than training shards store.
+
+    Raises:
+        StorageError: If the index lacks a video that a sample needs; it names the first scene and
+            the cameras.
+        MediaError: If depth that a sample needs is stored by a codec or pixel format that loses
+            depth, and the request's depth contract does not accept it; it names the first file.
+    """
+    _require_videos(index, plan, request)
+    if request.streams & {"source_depth", "target_depth"}:
+        _require_whole_depth(index, plan, request)
+    _warn_of_odd_scenes(index, plan, request)
+    if request.size is not None and len(plan.scene_rows):
+        rig = index.indexed_scene(int(plan.scene_rows[0])).rig
+        stored = (rig.image_height_px, rig.image_width_px)
+        warn_if_swapped(request.size, stored=stored)
+        if index.is_derived and (request.size[0] > stored[0] or request.size[1] > stored[1]):
+            warnings.warn(
+                f"{index.where}: holds {index.derivation}, and size={request.size!r} (height, "
+                f"width) is larger: pictures and depth are enlarged. Leave size out, or pass "
+                f"released data.",
+                EnlargedSizeWarning,
+                stacklevel=5,
+            )
+
+
+def _require_videos(index: SceneIndex, plan: Plan, request: Request) -> None:
+    """Refuse samples of videos that the index does not have: some cameras alone were downloaded."""
+    partial = index.video_counts()[plan.scene_rows] < 2 * CAMERA_COUNT
+    for place in np.flatnonzero(partial).tolist():
+        missing = _missing_videos(index, plan, request, place)
+        if missing:
+            scene = index.indexed_scene(int(plan.scene_rows[place]))
+            there = sorted({name[4:6] for name in scene.members if name.startswith("cam_")})
+            raise StorageError(
+                f"{index.where}: {scene.id.key} has no {', '.join(missing)}; videos of cameras "
+                f"{', '.join(there) or 'none'} were fetched. Choose pairs of these, or download "
+                "the others too."
+            )
+
+
+def _missing_videos(index: SceneIndex, plan: Plan, request: Request, place: int) -> list[str]:
+    """Return the videos that the samples of a scene need and that are not there."""
+    pairs = slice(plan.first_pair[place], plan.first_pair[place + 1])
+    sources = set(plan.pairs.source[pairs].tolist())
+    targets = set(plan.pairs.targets[pairs].ravel().tolist()) - {-1}
+    needed = {
+        f"cam_{camera:02d}_{stream.partition('_')[2]}"
+        for stream in request.streams
+        for camera in (sources if stream.startswith("source") else targets)
+    }
+    members = index.indexed_scene(int(plan.scene_rows[place])).members
+    return sorted(needed - {name.partition(".")[0] for name in members})
+
+
+def _require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> None:
+    """Refuse depth that its contract does not accept, or whose unit is not known.
+
+    Files that are stored alike are one kind, of which the first is looked at.
+    """
+    pairs = plan.pairs
+    cameras = np.concatenate([pairs.source[:, None], pairs.targets], axis=1)
+    if "source_depth" not in request.streams:
+        cameras = cameras[:, 1:]
+    if "target_depth" not in request.streams:
+        cameras = cameras[:, :1]
+    pair, place = np.nonzero(cameras >= 0)
+    rows, cameras = pairs.row[pair], cameras[pair, place]
+    kinds = index.categories("conventions")[1][rows].astype(np.int64)
+    for name in ("depth_codec", "depth_pixel_format", "depth_unit_source"):
+        values, value = index.categories(name)
+        kinds = kinds * (len(values) + 1) + value[rows, cameras] + 1
+    for first in np.sort(np.unique(kinds, return_index=True)[1]):
+        _require_whole(index.indexed_scene(int(rows[first])), int(cameras[first]), request.depth)
+
+
+def _require_whole(scene: Scene, camera: int, contract: DepthEncoding | None) -> None:
+    held = scene.held_name(depth_name(camera))
+    name = scene.members[held].path
+    if not name.endswith(held):
+        name = f"{name}: {scene.id.key}.{held}"
+    encoding = scene.depth_encoding(camera, contract or depth_of(scene))
+    depth.require_depth_stream(
+        codec=scene.depth_codec[camera],
+        pixel_format=scene.depth_pixel_format[camera],
+        encoding=encoding,
+        name=name,
+    )
+    if encoding.unit_m is None:
+        unknown = f"{name}: {depth.NO_DEPTH_UNIT}. {depth.DEPTH_CURES}"
+        raise MediaError(scene.remark("depth") or unknown)
+
+
+def _warn_of_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> None:
+    needs = {request.known[name].needs_poses for name in request.fields}
+    rows = plan.scene_rows
+    if "unless rectified" in needs:
+        residuals_px = index.column("rig_residual_px")[rows]
+        _warn(
+            index, rows[residuals_px > RECTIFIED_PX],
+            f"are not rectified (by up to {residuals_px.max(initial=0):.3g} px): their pixels are "
+            "projected through the poses, and no field holds what that moves up or down",
+        )  # fmt: skip
+        unknown = np.intersect1d(rows, index.remarked("poses"))
+        reason = index.indexed_scene(int(unknown[0])).remark("poses") if len(unknown) else ""
+        _warn(
+            index, unknown,
+            f"have poses that are not understood, so their rigs are assumed rectified, with the "
+            f"baselines of baseline.json ({reason}). `stereogenbench doctor` measures from the "
+            f"pictures whether they are",
+        )  # fmt: skip
+    if request.streams & {"source_depth", "target_depth"} and not (
+        request.depth and request.depth.unit_m
+    ):
+        units_m = index.column("depth_unit_m")[rows]
+        defaults = (index.column("depth_unit_source")[rows] == "default").any(axis=1)
+        _warn(
+            index, rows[defaults],
+            f"state no unit of depth, so the release's default of {DEFAULT_DEPTH_UNIT_M:g} m is "
+            f"taken. `stereogenbench doctor {text_without_secrets(index.where)}` measures it from "
+            f"the pictures; DepthEncoding(unit_m=...) sets it",
+        )  # fmt: skip
+        _warn(
+            index, rows[(units_m != units_m[:, :1]).any(axis=1)],
+            "state other units of depth for some cameras than for others: if a tag is missing or "
+            "wrong, pass DepthEncoding(unit_m=...)",
+        )  # fmt: skip
+
+
+def _warn(index: SceneIndex, rows: Any, what: str) -> None:
+    if len(rows):
+        keys = ", ".join(index.column("key")[rows[:3]])
+        text = f"{index.where}: {len(rows)} selected scenes {what}. The first: {keys}."
+        warnings.warn(text, OddSceneWarning, stacklevel=6)

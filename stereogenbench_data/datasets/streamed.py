@@ -20,7 +20,7 @@ from stereogenbench_data.datasets.batches import (
 from stereogenbench_data.datasets.mapped import Data, PairsOptions, StereoPairs
 from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.fields import Sample
-from stereogenbench_data.selection.options import require_options, split_options
+from stereogenbench_data.selection.filters import require_options, split_options
 
 _MOST_WORKERS: Final = 4096
 """Workers for each of which a stream counts passes."""
@@ -162,7 +162,7 @@ class StereoPairStream(IterableDataset[Sample]):
 
     def _samples(self, begun: Pass) -> Iterator[Sample]:
         for number in begun.share[begun.taken :]:
-            batch = self.batches.batch(number, epoch=begun.epoch)
+            batch = self.batches.of_all_ranks.batch(number, epoch=begun.epoch)
             for sample in self.pairs.samples_of(batch, start=begun.part):
                 begun.part += 1
                 if begun.part == len(batch):

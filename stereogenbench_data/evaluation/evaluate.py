@@ -56,8 +56,7 @@ from stereogenbench_data.jobs import JobKind, WorkOptions, do_items, job_folder
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.selection.filters import may_pass
-from stereogenbench_data.selection.options import require_options
+from stereogenbench_data.selection.filters import may_pass, require_options
 from stereogenbench_data.selection.plan import Random, Selection
 from stereogenbench_data.sources.files import write_atomic
 

@@ -42,7 +42,7 @@ from stereogenbench_data.jobs import (
 )
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.selection.options import require_options
+from stereogenbench_data.selection.filters import require_options
 from stereogenbench_data.selection.plan import Selection
 
 INPUTS: Final = JobKind("inputs", "inputs.json", ".inputs.lock", EvaluationError)

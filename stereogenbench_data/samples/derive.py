@@ -8,7 +8,7 @@ from typing import Any, Final, Literal, TypeVar, cast
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt16
 
-from stereogenbench_data.errors import FieldError, GeometryError
+from stereogenbench_data.errors import FieldError
 from stereogenbench_data.geometry.arrays import (
     array_namespace,
     as_float64,
@@ -20,7 +20,6 @@ from stereogenbench_data.geometry.disparity import (
     disparity_from_depth,
     write_disparity,
 )
-from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.projection import (
     Projection,
     homography,
@@ -32,6 +31,7 @@ from stereogenbench_data.geometry.projection import (
     visible_in_target,
 )
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
+from stereogenbench_data.media.depth import depth_m_from_units
 from stereogenbench_data.samples.streams import StoredDepth, Views
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 
@@ -49,14 +49,14 @@ class SceneFacts:
     Attributes:
         scene: The row of the index.
         encodings: The depth contract of each camera.
-        poses: The poses, or None where nothing needs them.
+        poses: Its `CameraPoses`, or None where nothing needs them.
         url: Returns the file or folder that holds the scene.
         frames: All frames of the sample.
     """
 
     scene: Scene
     encodings: dict[int, DepthEncoding]
-    poses: CameraPoses | None
+    poses: Any
     url: Callable[[], str]
     frames: tuple[int, ...]
 
@@ -64,12 +64,6 @@ class SceneFacts:
     def is_rectified(self) -> bool:
         """Whether the closed form of disparity holds for this rig."""
         return self.scene.rig_residual_px <= RECTIFIED_PX
-
-    def camera_poses(self) -> CameraPoses:
-        """Return the poses, which must have been loaded."""
-        if self.poses is None:
-            raise GeometryError(f"{self.scene.id.key}: a field needs poses that were not loaded.")
-        return self.poses
 
 
 T = TypeVar("T")
@@ -279,8 +273,6 @@ class PairGeometry(Direction):
         """Depth along the optical axis, 0 where not measured; computed once for all pairs."""
         derived, key = self.stored.derived, ("depth_m", self._views.intrinsics)
         if key not in derived:
-            from stereogenbench_data.media.depth import depth_m_from_units  # slow to import
-
             derived[key] = depth_m_from_units(
                 self.stored.units,
                 measured=self.stored.measured,
@@ -330,7 +322,7 @@ class PairGeometry(Direction):
     @once
     def target_from_source(self) -> Motions:
         """Source camera's coordinates to the target camera's, in metres."""
-        poses = self._facts.camera_poses()
+        poses = self._facts.poses
         transforms: Motions = np.stack(
             [
                 poses.cam_from_cam(frame, target=self._target, source=self._source)
@@ -454,7 +446,7 @@ class PairSample:
 
     def world_from(self, camera: int) -> Motions:
         """Return a camera's poses at the sample's frames."""
-        poses = self.facts.camera_poses()
+        poses = self.facts.poses
         transforms: Motions = np.stack(
             [poses.world_from_cam(frame, camera) for frame in self.views.frames]
         )

@@ -19,7 +19,7 @@ from stereogenbench_data.errors import FieldError
 from stereogenbench_data.samples.derive import MapF32, PairSample
 from stereogenbench_data.samples.streams import Views
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.selection.options import did_you_mean
+from stereogenbench_data.selection.filters import did_you_mean
 
 Sample = dict[str, Any]
 """A flat dict of arrays (tensors, once in torch's hands) and texts, by the names of fields."""
@@ -75,6 +75,10 @@ class Field:
 
 def _table(*fields: Field) -> dict[str, Field]:
     return {each.name: each for each in fields}
+
+
+def _text(name: str, meaning: str, make: Callable[[PairSample], str]) -> Field:
+    return Field(name, "str", "", meaning, make=make, per_frame=False)
 
 
 PAIR_FIELDS: Final[dict[str, Field]] = _table(
@@ -191,35 +195,20 @@ PAIR_FIELDS: Final[dict[str, Field]] = _table(
         make=lambda s: np.array([s.views.source, s.target], dtype=np.int64),
         per_target=True, per_frame=False,
     ),
-    Field(
-        "scene", "str", "", "key of the scene",
-        make=lambda s: s.facts.scene.id.key, per_frame=False,
+    _text("scene", "key of the scene", lambda s: s.facts.scene.id.key),
+    _text("family", "baseline family", lambda s: s.facts.scene.id.family),
+    _text("map", "map", lambda s: s.facts.scene.id.map_name),
+    _text("split", "train or eval", lambda s: s.facts.scene.id.split),
+    _text(
+        "subset", "seen_map or unseen_map; empty for train",
+        lambda s: s.facts.scene.id.subset or "",
     ),
-    Field(
-        "family", "str", "", "baseline family",
-        make=lambda s: s.facts.scene.id.family, per_frame=False,
+    _text(
+        "caption", "machine-written description; empty where there is none",
+        lambda s: s.facts.scene.caption,
     ),
-    Field("map", "str", "", "map", make=lambda s: s.facts.scene.id.map_name, per_frame=False),
-    Field(
-        "split", "str", "", "train or eval",
-        make=lambda s: s.facts.scene.id.split, per_frame=False,
-    ),
-    Field(
-        "subset", "str", "", "seen_map or unseen_map; empty for train",
-        make=lambda s: s.facts.scene.id.subset or "", per_frame=False,
-    ),
-    Field(
-        "caption", "str", "", "machine-written description; empty where there is none",
-        make=lambda s: s.facts.scene.caption, per_frame=False,
-    ),
-    Field(
-        "__key__", "str", "", "scene, cameras and frame",
-        make=lambda s: s.key, per_frame=False,
-    ),
-    Field(
-        "__url__", "str", "", "file or folder that holds the scene",
-        make=lambda s: s.facts.url(), per_frame=False,
-    ),
+    _text("__key__", "scene, cameras and frame", lambda s: s.key),
+    _text("__url__", "file or folder that holds the scene", lambda s: s.facts.url()),
 )  # fmt: skip
 
 VIEW_FIELDS: Final[dict[str, Field]] = _table(
@@ -275,19 +264,18 @@ VIEW_FIELDS: Final[dict[str, Field]] = _table(
         make=lambda s: np.float64(s.backward.encoding.offset_m),
         per_target=True, per_frame=False,
     ),
-    Field(
-        "depth_kind", "str", "", "planar or ray: what stored depth measures",
-        make=lambda s: s.forward.encoding.kind, per_frame=False,
+    _text(
+        "depth_kind", "planar or ray: what stored depth measures",
+        lambda s: s.forward.encoding.kind,
     ),
-    Field(
-        "depth_form", "str", "",
+    _text(
+        "depth_form",
         "depth or inverse: what a stored number is proportional to; ranged if depth has an offset",
-        make=lambda s: "ranged" if s.forward.encoding.offset_m else s.forward.encoding.form,
-        per_frame=False,
+        lambda s: "ranged" if s.forward.encoding.offset_m else s.forward.encoding.form,
     ),
-    Field(
-        "rig", "str", "", "rectified, or posed where disparity needs the poses",
-        make=lambda s: "rectified" if s.facts.is_rectified else "posed", per_frame=False,
+    _text(
+        "rig", "rectified, or posed where disparity needs the poses",
+        lambda s: "rectified" if s.facts.is_rectified else "posed",
     ),
     Field(
         "baselines_m", "float64", "(V,)",
@@ -439,31 +427,16 @@ _LARGE_STRETCH: Final = 1.5
 _TEXT: Final = re.compile(r"(\d+)x(\d+)", re.ASCII | re.IGNORECASE)
 
 
+class OddSceneWarning(UserWarning):
+    """Selected scenes differ from what the release promises: the message says how and which."""
+
+
 class SwappedSizeWarning(UserWarning):
     """A size looks like (width, height), but (height, width) is expected."""
 
 
 class EnlargedSizeWarning(UserWarning):
     """A size is larger than training shards store: pictures are enlarged, not sharpened."""
-
-
-def parse_size(text: str) -> tuple[int, int]:
-    """Return the (height, width) in pixels of a text WIDTHxHEIGHT.
-
-    Raises:
-        FieldError: If the text is not a size, or a side is not 1 to 16384 pixels.
-
-    >>> parse_size("832x480")
-    (480, 832)
-    """
-    match = _TEXT.fullmatch(text.strip())
-    sides = (int(match[2]), int(match[1])) if match else (0, 0)
-    if not all(0 < side <= LARGEST_SIDE_PX for side in sides):
-        raise FieldError(
-            f"size must be WIDTHxHEIGHT of 1 to {LARGEST_SIDE_PX} pixels, such as 832x480, got "
-            f"{text!r}."
-        )
-    return sides
 
 
 def require_size(size: Any) -> tuple[int, int]:
@@ -474,18 +447,23 @@ def require_size(size: Any) -> tuple[int, int]:
 
     Raises:
         FieldError: If it is not two whole numbers of 1 to 16384, nor such a text.
+
+    >>> require_size("832x480")
+    (480, 832)
     """
+    sides = size
     if isinstance(size, str):
-        return parse_size(size)
+        match = _TEXT.fullmatch(size.strip())
+        sides = (int(match[2]), int(match[1])) if match else ()
     try:
-        height, width = (int(side) for side in size)
-        whole = (height, width) == tuple(size)
+        height, width = (int(side) for side in sides)
+        is_whole = (height, width) == tuple(sides)
     except (TypeError, ValueError):
-        whole = False
-    if not whole or not (0 < height <= LARGEST_SIDE_PX and 0 < width <= LARGEST_SIDE_PX):
+        is_whole = False
+    if not is_whole or not (0 < height <= LARGEST_SIDE_PX and 0 < width <= LARGEST_SIDE_PX):
         raise FieldError(
-            f"size must be (height, width) of 1 to {LARGEST_SIDE_PX} pixels, or a text "
-            f"'WIDTHxHEIGHT', got {size!r}."
+            f"size must be WIDTHxHEIGHT of 1 to {LARGEST_SIDE_PX} pixels, such as 832x480, or in "
+            f"Python (height, width), got {size!r}."
         )
     return height, width
 

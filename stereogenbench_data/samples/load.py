@@ -22,10 +22,9 @@ from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import depth_frame_index
-from stereogenbench_data.samples.checks import OddSceneWarning
 from stereogenbench_data.samples.coming import ComingSamples, DescribedAhead, NeededFiles
 from stereogenbench_data.samples.derive import PairSample, SceneFacts
-from stereogenbench_data.samples.fields import Clip, Field, Request, Sample
+from stereogenbench_data.samples.fields import Clip, Field, OddSceneWarning, Request, Sample
 from stereogenbench_data.samples.streams import StoredDepth, Streams, StreamStats, Views
 from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
@@ -436,29 +435,37 @@ class SampleLoader:
     def _decode(
         self, known: _KnownScene, address: Address, *, frames: slice, out: Mapping[int, Any]
     ) -> tuple[Views, SceneFacts]:
-        scene, intrinsics, encodings = known.scene, known.intrinsics, known.encodings
-        numbers = address.frames[frames]
+        scene, numbers, camera_px = known.scene, address.frames[frames], known.intrinsics
+        shape = (len(numbers), 3, camera_px.height_px, camera_px.width_px)
+        rgb = partial(self._streams.rgb, scene, run=address.run)
+        pictures: dict[int, Any] = {}
+        for camera in self._cameras(address, "rgb"):
+            name, size = rgb_name(camera), self._request.size
+            if self._frames == "shared" and not self._is_changed:
+                # Without a transform frames come one by one: the kept picture is all of it.
+                pictures[camera] = rgb(name=name, index=numbers[0], size=size)[None]
+                continue
+            found = out[camera] if camera in out else np.empty(shape, dtype=np.uint8)
+            for place, frame in zip(found, numbers, strict=True):
+                if self._frames == "shared":
+                    place[...] = rgb(name=name, index=frame, size=size)
+                else:
+                    rgb(name=name, index=frame, out=place)
+            pictures[camera] = found
         views = Views(
             source=address.source,
             targets=address.targets,
             frames=numbers,
-            pictures=self._pictures(
-                scene,
-                address.run,
-                self._cameras(address, "rgb"),
-                numbers,
-                shape=(len(numbers), 3, intrinsics.height_px, intrinsics.width_px),
-                out=out,
-            ),
+            pictures=pictures,
             depths={
-                camera: self._depth(scene, address, camera, numbers, encodings[camera])
+                camera: self._depth(known, address, camera, numbers)
                 for camera in self._cameras(address, "depth")
             },
-            intrinsics=intrinsics,
+            intrinsics=camera_px,
         )
         return views, SceneFacts(
             scene,
-            encodings,
+            known.encodings,
             self._camera_poses(scene),
             url=partial(self._source.url, scene, rgb_name(address.source)),
             frames=address.frames,
@@ -501,70 +508,27 @@ class SampleLoader:
             cameras.extend(address.targets)
         return list(dict.fromkeys(cameras))
 
-    def _pictures(
-        self,
-        scene: Scene,
-        run: int,
-        cameras: list[int],
-        frames: tuple[int, ...],
-        *,
-        shape: tuple[int, ...],
-        out: Mapping[int, Any],
-    ) -> dict[int, Any]:
-        pictures: dict[int, Any] = {}
-        for camera in cameras:
-            name = rgb_name(camera)
-            if self._frames == "used once":
-                found = out[camera] if camera in out else np.empty(shape, dtype=np.uint8)
-                for place, frame in zip(found, frames, strict=True):
-                    self._streams.write_rgb(scene, name, frame, out=place, run=run)
-                pictures[camera] = found
-            elif self._is_changed:
-                pictures[camera] = found = np.empty(shape, dtype=np.uint8)
-                for place, frame in zip(found, frames, strict=True):
-                    kept = self._streams.rgb(scene, name, frame, size=self._request.size, run=run)
-                    place[...] = kept
-            else:
-                # Without a transform frames come one by one: the kept picture is all of it.
-                kept = self._streams.rgb(scene, name, frames[0], size=self._request.size, run=run)
-                pictures[camera] = kept[None]
-        return pictures
-
     def _depth(
-        self,
-        scene: Scene,
-        address: Address,
-        camera: int,
-        frames: tuple[int, ...],
-        encoding: DepthEncoding,
+        self, known: _KnownScene, address: Address, camera: int, frames: tuple[int, ...]
     ) -> StoredDepth:
         """Return a camera's stored depth over frames; that of single frames is kept."""
-        stored_at = partial(self._stored, scene, camera, run=address.run, encoding=encoding)
-        if len(frames) > 1:
-            parts = [stored_at(frame=frame) for frame in frames]
-            return StoredDepth(
-                units=np.concatenate([part.units for part in parts]),
-                measured=np.concatenate([part.measured for part in parts]),
-            )
-        stored = stored_at(frame=frames[0])
-        if self._is_changed:
-            return StoredDepth(stored.units.copy(), stored.measured.copy())
-        return stored
+        parts = [self._stored(known, camera, frame, run=address.run) for frame in frames]
+        if len(parts) == 1 and not self._is_changed:
+            return parts[0]
+        return StoredDepth(
+            units=np.concatenate([part.units for part in parts]),
+            measured=np.concatenate([part.measured for part in parts]),
+        )
 
-    def _stored(
-        self, scene: Scene, camera: int, *, frame: int, run: int, encoding: DepthEncoding
-    ) -> StoredDepth:
+    def _stored(self, known: _KnownScene, camera: int, frame: int, *, run: int) -> StoredDepth:
         """Return a camera's stored depth at a frame of its pictures, (1, h, w)."""
-        size = self._request.size
+        scene, encoding = known.scene, known.encodings[camera]
         index = depth_frame_index(frame, encoding=encoding, frames=scene.frames)
         if index is None:
-            height, width = size or (scene.rig.image_height_px, scene.rig.image_width_px)
-            return StoredDepth(
-                np.zeros((1, height, width), dtype=np.uint16),
-                np.zeros((1, height, width), dtype=bool),
-            )
+            shape = (1, known.intrinsics.height_px, known.intrinsics.width_px)
+            return StoredDepth(np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=bool))
         kept = self._streams.read_stored_depth(
-            scene, depth_name(camera), index, encoding=encoding, size=size, run=run
+            scene, depth_name(camera), index, encoding=encoding, size=self._request.size, run=run
         )
         stored = StoredDepth(kept.units[None], kept.measured[None])
         # Where depth of several frames is kept, what is computed from it would be too much.

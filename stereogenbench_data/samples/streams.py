@@ -191,11 +191,25 @@ class Streams:
         self._process = os.getpid()
 
     def rgb(
-        self, scene: Scene, name: str, index: int, *, size: tuple[int, int] | None, run: int = 0
+        self,
+        scene: Scene,
+        name: str,
+        index: int,
+        *,
+        size: tuple[int, int] | None = None,
+        out: UInt8[np.ndarray, "3 h w"] | None = None,
+        run: int = 0,
     ) -> UInt8[np.ndarray, "3 h w"]:
-        """Return one frame of a scene's video as RGB, scaled to (height, width) if it is given.
+        """Return one frame of a scene's video as RGB.
 
-        Each ``run`` of a video has a decoder of its own, so that several can be read by turns.
+        Args:
+            scene: The scene.
+            name: The video, such as "cam_00_rgb.mp4".
+            index: Which frame.
+            size: (height, width) to scale it to, None for the stored size.
+            out: Where to write it, scaled to fit: for pictures that are needed once, which the pool
+                does not keep.
+            run: Each run of a video has a decoder of its own, so that several can be read by turns.
 
         Raises:
             StorageError: If the video cannot be read.
@@ -204,41 +218,19 @@ class Streams:
         most = self.kept_frames
         height, width = size or (scene.rig.image_height_px, scene.rig.image_width_px)
         with self._stream(scene, name, run) as stream:
-            kept: UInt8[np.ndarray, "3 h w"] = stream.keep(
-                (index, size),
-                lambda: _read_only(
-                    read_rgb(
-                        stream.reader,
-                        index,
-                        size=size,
-                        out=stream.picture(height=height, width=width, most=most),
-                        content="colour",
-                    )
-                ),
-                most=most,
-            )
+            if out is not None:
+                shape = (out.shape[-2], out.shape[-1])
+                read_rgb(stream.reader, index, size=shape, out=out, content="colour")
+                return out
+
+            def read() -> Any:
+                place = stream.picture(height=height, width=width, most=most)
+                return _read_only(
+                    read_rgb(stream.reader, index, size=size, out=place, content="colour")
+                )
+
+            kept: UInt8[np.ndarray, "3 h w"] = stream.keep((index, size), read, most=most)
             return kept
-
-    def write_rgb(
-        self,
-        scene: Scene,
-        name: str,
-        index: int,
-        *,
-        out: UInt8[np.ndarray, "3 h w"],
-        run: int = 0,
-    ) -> None:
-        """Write one frame of a scene's video as RGB, scaled to the array's height and width.
-
-        The picture is not kept: use this for pictures that are needed once.
-
-        Raises:
-            StorageError: If the video cannot be read.
-            MediaError: If it does not decode to the scene's number of colour pictures.
-        """
-        with self._stream(scene, name, run) as stream:
-            size = (out.shape[-2], out.shape[-1])
-            read_rgb(stream.reader, index, size=size, out=out, content="colour")
 
     def read_stored_depth(
         self,

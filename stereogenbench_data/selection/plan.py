@@ -23,16 +23,17 @@ from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_COUNT, baseline_bin
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
-from stereogenbench_data.selection.order import Runs
-from stereogenbench_data.selection.pairs import (
+from stereogenbench_data.selection.filters import (
     BaselineSpec,
     Direction,
     PairList,
     PairsSpec,
+    SceneFilters,
     baselines_cm,
     choose_pairs,
+    filter_scenes,
 )
+from stereogenbench_data.selection.order import Runs
 
 Balance = Literal["bins", "log_baseline"]
 LOG_STRATA = 16

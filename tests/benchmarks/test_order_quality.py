@@ -14,7 +14,7 @@ def pairs(small_release):
 
 def test_scenes_moments_and_frame_numbers_are_counted_as_by_hand(pairs):
     batches = EpochBatches(pairs, 12)
-    order, plan = batches.order(0), pairs.plan
+    order, plan = batches.of_all_ranks.order(0), pairs.plan
     found = order_quality(order, plan)
     rows = [
         [plan.locate(number, epoch=0) for number in order.batch(batch)]

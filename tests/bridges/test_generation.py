@@ -10,7 +10,7 @@ from PIL import Image
 from stereogenbench_data import FieldError, HorizontalFlip, Letterbox, SelectionError, StereoPairs
 from stereogenbench_data.bridges.generation import GenStereo, StereoClips
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.checks import OddSceneWarning
+from stereogenbench_data.samples.fields import OddSceneWarning
 from tests.servers.tools import require_module
 
 FIELDS = ("left", "right", "disparity", "valid", "warped_right", "hole")

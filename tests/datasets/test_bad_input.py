@@ -18,7 +18,7 @@ from stereogenbench_data import (
     StorageError,
 )
 from stereogenbench_data.index.open_tree import AssumptionWarning, IncompleteSceneWarning
-from stereogenbench_data.samples.checks import OddSceneWarning
+from stereogenbench_data.samples.fields import OddSceneWarning
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.servers.videos import write_rgb

@@ -374,7 +374,7 @@ def test_a_scene_that_is_parted_between_groups_is_read_forwards_in_each(small_in
     monkeypatch.setattr(depth, "VideoReader", Counting)
     pairs = StereoPairs(small_index, frames="all", fields=("left",))
     loader = pairs.loader(6, drop_last=False)
-    order = loader.batches.order(0)
+    order = loader.batches.of_all_ranks.order(0)
     assert order.groups == 2
     groups = [{number // 7 for number in order.group(group).tolist()} for group in (0, 1)]
     assert len(groups[0] & groups[1]) == 1

@@ -352,11 +352,11 @@ def test_an_error_ends_its_pass_and_says_so_to_who_asks_on(small_index):
 HANGING = """
 import os, sys, time
 from stereogenbench_data import StereoPairs
-from stereogenbench_data.datasets import workers
+from stereogenbench_data.datasets import loader
 
 if __name__ == "__main__":
     forks, most = [0], int(sys.argv[2])
-    workers._BEGUN_WITHIN_S = 1.0
+    loader._BEGUN_WITHIN_S = 1.0
 
     def count():
         forks[0] += 1

@@ -96,11 +96,11 @@ def test_the_memory_of_a_dropped_picture_is_written_again(data):
 def test_a_picture_can_be_written_where_it_is_wanted_and_is_not_kept(data):
     pool, scene = pool_of(data), data.scene(0)
     out = np.empty((2, 3, 64, 64), dtype=np.uint8)
-    pool.write_rgb(scene, RGB[0], 2, out=out[1])
+    pool.rgb(scene, RGB[0], 2, out=out[1])
 
     assert np.array_equal(out[1], pool.rgb(scene, RGB[0], 2, size=None))
     small = np.empty((3, 10, 20), dtype=np.uint8)
-    pool.write_rgb(scene, RGB[0], 0, out=small)
+    pool.rgb(scene, RGB[0], 0, out=small)
     assert np.array_equal(small, pool.rgb(scene, RGB[0], 0, size=(10, 20)))
     pool.close()
 

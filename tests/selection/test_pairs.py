@@ -5,8 +5,7 @@ import pytest
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.release import CAMERA_PAIRS, baseline_bin
-from stereogenbench_data.selection.filters import filter_scenes
-from stereogenbench_data.selection.pairs import choose_pairs
+from stereogenbench_data.selection.filters import choose_pairs, filter_scenes
 
 
 def chosen(index, filters=None, **options):

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from stereogenbench_data.errors import SelectionError
-from stereogenbench_data.selection.pairs import baselines_cm
+from stereogenbench_data.selection.filters import baselines_cm
 from stereogenbench_data.selection.plan import plan_pairs, plan_views
 
 

@@ -14,8 +14,14 @@ from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
 from stereogenbench_data.schema.text import shortened
-from stereogenbench_data.selection.filters import filter_scenes, find_scene
-from stereogenbench_data.selection.pairs import PairList, baselines_cm, choose_pairs, in_bin
+from stereogenbench_data.selection.filters import (
+    PairList,
+    baselines_cm,
+    choose_pairs,
+    filter_scenes,
+    find_scene,
+    in_bin,
+)
 
 MOST_ROWS: Final = 200
 """The largest number of scenes in one response."""

@@ -32,8 +32,12 @@ from stereogenbench_data.index.tree import SceneFolder
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Scene
-from stereogenbench_data.selection.filters import SceneFilters, filter_scenes, may_pass
-from stereogenbench_data.selection.options import require_options
+from stereogenbench_data.selection.filters import (
+    SceneFilters,
+    filter_scenes,
+    may_pass,
+    require_options,
+)
 from stereogenbench_data.sources.location import is_remote, joined, local_path
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import MissingObject

@@ -13,7 +13,7 @@ from stereogenbench_data.samples.fields import Request, Sample
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.release import CAMERA_COUNT
-from stereogenbench_data.selection.pairs import require_pairs
+from stereogenbench_data.selection.filters import require_pairs
 from stereogenbench_data.selection.plan import Address
 
 OPEN_VIDEOS: Final = 6
