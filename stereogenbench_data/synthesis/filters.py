@@ -106,7 +106,7 @@ def find_spawn(proposal: Proposal, *, world: World) -> Spawn | Refusal:
     The floors are found from above; each must have headroom.
     """
     rng = proposal.rng("spawn")
-    low, high = world.spawn_bounds_m.low_m, world.spawn_bounds_m.high_m
+    low, high = world.spawn_bounds_m
     x, y = rng.uniform(low[:2], high[:2])
     yaw_deg = float(np.round(rng.uniform(-180, 180), 6))
     pick = float(rng.random())
@@ -301,7 +301,7 @@ def _framing(poses: _Poses, world: World) -> list[Measured]:
 
 
 def _collision(poses: _Poses, world: World) -> list[Measured]:
-    low, high = world.bounds_m.low_m, world.bounds_m.high_m
+    low, high = world.bounds_m
     margin = np.minimum(poses.eyes - low, high - poses.eyes).min(axis=(1, 2))
     apart = poses.body_m[:, None] - poses.eyes[:, :, None]
     to_subject = np.sqrt((apart * apart).sum(axis=-1)).min(axis=(1, 2))

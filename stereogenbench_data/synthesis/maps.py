@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float64
 
-from stereogenbench_data.schema.release import FRAME_RATE_HZ, TRAIN_MAPS, UNSEEN_MAPS
+from stereogenbench_data.schema.release import TRAIN_MAPS, UNSEEN_MAPS
 from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.renderer import Bounds, Spawn, unknown_map
 from stereogenbench_data.synthesis.scene import Figure, Kind, Material, SceneModel, Shape
@@ -68,16 +68,7 @@ class RayWorld:
 
     def subject_points_m(self, spawn: Spawn, *, frame: int) -> Float64[np.ndarray, "p 3"]:
         """Return both ends of every limb; see `World.subject_points_m`."""
-        rise = self._rise(spawn)
-        return self.figure.points_m(spawn, rise=rise, moment_s=frame / FRAME_RATE_HZ)
-
-    def limbs(self, spawn: Spawn, *, frame: int) -> list[Shape]:
-        """Return the figure's limbs at a frame."""
-        return self.figure.limbs(spawn, rise=self._rise(spawn), moment_s=frame / FRAME_RATE_HZ)
-
-    def _rise(self, spawn: Spawn) -> float:
-        yaw = np.radians(spawn.yaw_deg)
-        return float(self.scene.slope @ (np.cos(yaw), np.sin(yaw)))
+        return self.figure.points_m(spawn, slope=self.scene.slope, frame=frame)
 
 
 def open_map(proposal: Proposal) -> RayWorld:
@@ -145,7 +136,7 @@ def _solid(
 
 
 def _bounds(low: tuple[float, ...], high: tuple[float, ...]) -> Bounds:
-    return Bounds(np.array(low, np.float64), np.array(high, np.float64))
+    return np.array([low, high], np.float64)
 
 
 # The stage.

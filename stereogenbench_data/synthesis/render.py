@@ -24,7 +24,7 @@ from stereogenbench_data.synthesis.ray_casting import (
     in_unit_solid,
     shape_of,
 )
-from stereogenbench_data.synthesis.renderer import RenderedView, ScenePlan, View
+from stereogenbench_data.synthesis.renderer import RenderedView, Renderer, ScenePlan, View
 from stereogenbench_data.synthesis.request import SENSOR_MM
 from stereogenbench_data.synthesis.scene import Material, SceneModel, Shape, entry_depth
 from stereogenbench_data.synthesis.textures import sample_atlas, sample_tile, texture_row
@@ -372,8 +372,8 @@ def _metres_at(texel: Array, *, scene: SceneModel) -> Array:
     return ((texel + 0.5) * (2 / _LIGHT_TEXELS) - 1) * scene.shadow_range_m
 
 
-@dataclass(frozen=True, slots=True)
-class RayCasting:
+@dataclass(frozen=True)
+class RayCasting(Renderer):
     """The built-in renderer; see `Renderer`."""
 
     name: str = "ray-casting"
@@ -394,7 +394,9 @@ class RayCasting:
         light = static_light(world.scene)
         for frame in range(plan.request.frames):
             state = SceneState(
-                world.scene, walker=world.limbs(plan.spawn, frame=frame), static_light=light
+                world.scene,
+                walker=world.figure.limbs(plan.spawn, slope=world.scene.slope, frame=frame),
+                static_light=light,
             )
             for camera in cameras:
                 yield RenderedView(*render_frame(state, view=plan.view(camera=camera, frame=frame)))

@@ -4,9 +4,10 @@ Map axes are Unreal's (left-handed: x forward, y right, z up), in metres, with a
 map chooses. Angles are degrees; yaw turns from x towards y.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -20,17 +21,8 @@ from stereogenbench_data.synthesis.request import SynthRequest
 Array = Any
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Bounds:
-    """A box along the axes of a map.
-
-    Attributes:
-        low_m: Its corner with the smallest coordinates.
-        high_m: Its corner with the largest coordinates.
-    """
-
-    low_m: Float64[np.ndarray, "3"]
-    high_m: Float64[np.ndarray, "3"]
+Bounds = Float64[np.ndarray, "2 3"]
+"""A box along the axes of a map: its corners with the smallest and with the largest coordinates."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +38,6 @@ class Spawn:
     yaw_deg: float
 
 
-@runtime_checkable
 class World(Protocol):
     """The map of one proposal. Its answers follow from the proposal alone."""
 
@@ -192,8 +183,8 @@ class RenderedView:
     depth_m: Float64[np.ndarray, "h w"]
 
 
-@runtime_checkable
-class Renderer(Protocol):
+@dataclass(frozen=True)
+class Renderer(ABC):
     """A way to draw scenes. It is pickled into worker processes, so it opens its assets there.
 
     Attributes:
@@ -207,21 +198,15 @@ class Renderer(Protocol):
         cameras_per_task: How many cameras one process draws together; 1, 2, 3 or 6.
     """
 
-    @property
-    def name(self) -> str: ...  # noqa: D102
-    @property
-    def maps(self) -> tuple[str, ...]: ...  # noqa: D102
-    @property
-    def characters(self) -> tuple[str, ...]: ...  # noqa: D102
-    @property
-    def animations(self) -> tuple[str, ...]: ...  # noqa: D102
-    @property
-    def sensors_mm(self) -> tuple[tuple[float, float], ...]: ...  # noqa: D102
-    @property
-    def fingerprint(self) -> str: ...  # noqa: D102
-    @property
-    def cameras_per_task(self) -> int: ...  # noqa: D102
+    name: str
+    maps: tuple[str, ...]
+    characters: tuple[str, ...]
+    animations: tuple[str, ...]
+    sensors_mm: tuple[tuple[float, float], ...]
+    fingerprint: str
+    cameras_per_task: int
 
+    @abstractmethod
     def world(self, proposal: Proposal) -> World:
         """Return the map of a proposal, for its filters.
 
@@ -229,6 +214,7 @@ class Renderer(Protocol):
             SynthesisError: If the map, character or animation cannot be opened.
         """
 
+    @abstractmethod
     def views(self, plan: ScenePlan, *, cameras: tuple[int, ...]) -> Iterator[RenderedView]:
         """Yield the views of cameras: all of frame 0 in the order of ``cameras``, then frame 1, on.
 
@@ -236,6 +222,7 @@ class Renderer(Protocol):
             SynthesisError: If the scene cannot be rendered.
         """
 
+    @abstractmethod
     def description(self, plan: ScenePlan) -> dict[str, object]:
         """Return the document of ``scene_description_qwen_dataset_level.json``."""
 

@@ -13,6 +13,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from jaxtyping import Float64
 
+from stereogenbench_data.schema.release import FRAME_RATE_HZ
 from stereogenbench_data.synthesis.renderer import Spawn
 
 Array = Any
@@ -193,15 +194,15 @@ class Figure:
     stride_s: float
     scale: float
 
-    def limbs(self, spawn: Spawn, *, rise: float, moment_s: float) -> list[Shape]:
-        """Return its limbs at a time.
+    def limbs(self, spawn: Spawn, *, slope: Float64[np.ndarray, "2"], frame: int) -> list[Shape]:
+        """Return its limbs at a frame.
 
         Args:
             spawn: Where it starts, and the direction in which it goes.
-            rise: Rise of the ground per metre in that direction.
-            moment_s: The time.
+            slope: Rise of the ground per metre along x and y.
+            frame: The frame, at 15 Hz.
         """
-        first, second, radii_m = self._bones(spawn, rise, moment_s)
+        first, second, radii_m = self._bones(spawn, slope, frame)
         yaw = np.radians(spawn.yaw_deg)
         side = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
         skin, upper, lower = self.clothes
@@ -213,16 +214,20 @@ class Figure:
             )
         ]
 
-    def points_m(self, spawn: Spawn, *, rise: float, moment_s: float) -> Float64[np.ndarray, "p 3"]:
-        """Return both ends of every limb at a time, given what `limbs` is given."""
-        first, second, radii_m = self._bones(spawn, rise, moment_s)
+    def points_m(
+        self, spawn: Spawn, *, slope: Float64[np.ndarray, "2"], frame: int
+    ) -> Float64[np.ndarray, "p 3"]:
+        """Return both ends of every limb at a frame, given what `limbs` is given."""
+        first, second, radii_m = self._bones(spawn, slope, frame)
         along = second - first
         along *= (0.5 * radii_m / np.sqrt((along * along).sum(axis=1)))[:, None]
         return np.stack([first - along, second + along], axis=1).reshape(-1, 3)
 
-    def _bones(self, spawn: Spawn, rise: float, moment_s: float) -> tuple[Array, Array, Array]:
+    def _bones(self, spawn: Spawn, slope: Array, frame: int) -> tuple[Array, Array, Array]:
         """Return where the limbs start and end, (13, 3) each, and their radii."""
+        moment_s = frame / FRAME_RATE_HZ
         yaw, swing = np.radians(spawn.yaw_deg), 2 * np.pi * moment_s / self.stride_s
+        rise = float(slope @ (np.cos(yaw), np.sin(yaw)))
         ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
         side = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
         feet = spawn.place_m + self.walk_m_s * moment_s * (ahead + rise * _UP)

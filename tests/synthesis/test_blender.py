@@ -19,7 +19,6 @@ from typer.testing import CliRunner
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
-from stereogenbench_data.synthesis.blender.assets import read_assets
 from stereogenbench_data.synthesis.blender.process import blender
 from stereogenbench_data.synthesis.blender.renderer import BlenderAssetWarning, BlenderRenderer
 from stereogenbench_data.synthesis.filters import check_poses
@@ -163,7 +162,7 @@ def _changed(assets, before, after):
     text = (assets / "assets.toml").read_text()
     assert before in text
     path.write_text(text.replace(before, after))
-    return read_assets(path)
+    return BlenderRenderer.from_file(path)
 
 
 def test_all_kinds_of_files_give_the_same_motion(assets):
@@ -177,7 +176,7 @@ def test_all_kinds_of_files_give_the_same_motion(assets):
             )
             path = assets / "kinds.toml"
             path.write_text(text)
-            world = BlenderRenderer(read_assets(path)).world(proposal(frames=30))
+            world = BlenderRenderer.from_file(path).world(proposal(frames=30))
             spawn = Spawn(np.zeros(3), 0.0)
             points = np.stack([world.subject_points_m(spawn, frame=t) for t in range(30)])
             found.append(np.concatenate([points.min(axis=1), points.max(axis=1)]))
@@ -189,10 +188,10 @@ def test_only_what_hangs_on_the_armature_is_the_subject(assets):
     """Neither the plinth below it nor the shape of a handle, whose collection is excluded."""
     file = '[characters.Figure]\nfile = "figure.glb"'
     spawn = Spawn(np.zeros(3), 0.0)
-    alone = BlenderRenderer(_changed(assets, file, file)).world(proposal())
+    alone = _changed(assets, file, file).world(proposal())
     changed = _changed(assets, file, file.replace("figure.glb", "figure_extra.blend"))
 
-    world = BlenderRenderer(changed).world(proposal())
+    world = changed.world(proposal())
 
     for points in (each.subject_points_m(spawn, frame=0) for each in (alone, world)):
         np.testing.assert_allclose(points[:, 2].min(), 0, atol=0.02)
@@ -202,7 +201,7 @@ def test_only_what_hangs_on_the_armature_is_the_subject(assets):
 @pytest.mark.parametrize(("take", "repeat"), [("Lean", "onward"), ("Walk", "back")])
 def test_a_take_that_cannot_go_on_is_played_back(assets, take, repeat):
     changed = _changed(assets, 'take = "Walk"', f'take = "{take}"\nrepeat = "{repeat}"')
-    world = BlenderRenderer(changed).world(proposal(frames=32))
+    world = changed.world(proposal(frames=32))
     spawn = Spawn(np.zeros(3), 0.0)
 
     points = np.stack([world.subject_points_m(spawn, frame=frame) for frame in range(32)])
@@ -282,7 +281,7 @@ def test_pictures_have_sky_exactly_where_depth_has_none(renderer):
 def test_depth_goes_through_holes_that_a_material_cuts(assets):
     """A red card with holes, before a blue wall on the left and nothing on the right."""
     changed = _changed(assets, "yard.blend", "screen.blend")
-    quick = fast(BlenderRenderer(changed), samples_per_pixel=4)
+    quick = fast(changed, samples_per_pixel=4)
     made = plan(
         proposal(frames=1), eye=(-4.0, 0.0, 1.8), target=(2.0, 0.0, 1.8), place=(0.0, 100.0, 0.0)
     )
@@ -350,7 +349,7 @@ def test_a_faulty_map_is_refused_with_the_cure(assets, name):
     changed = _changed(assets, "yard.blend", name)
 
     with pytest.raises(SynthesisError, match=rf"maps\.Yard: .*{FAULTS[name]}"):
-        BlenderRenderer(changed).world(proposal())
+        changed.world(proposal())
 
 
 @pytest.mark.parametrize(
@@ -375,14 +374,14 @@ def test_a_faulty_subject_is_refused_with_the_cure(assets, before, after, says):
     changed = _changed(assets, before, after)
 
     with pytest.raises(SynthesisError, match=says):
-        BlenderRenderer(changed).world(proposal())
+        changed.world(proposal())
 
 
 def test_scripts_in_files_do_not_run_and_are_told(assets):
     changed = _changed(assets, "yard.blend", "scripted.blend")
 
     with pytest.warns(BlenderAssetWarning, match=r"left out or not run: .*was_driven"):
-        world = BlenderRenderer(changed).world(proposal())
+        world = changed.world(proposal())
 
     assert not list((assets.parent / "outside").glob("was_*"))
     # The driver would have lifted the floor by 3 m.
@@ -396,7 +395,7 @@ def test_a_scene_on_which_blender_crashed_is_rendered_by_the_next_run(renderer, 
 
     def kill(done, total):
         if done == 6:
-            os.kill(blender(renderer.assets.maps["Yard"].file).pid, signal.SIGSEGV)
+            os.kill(blender(renderer.assets.maps["Yard"].file).process.pid, signal.SIGSEGV)
 
     with pytest.raises(SynthesisError, match=r"scene_000000, frame 1: Blender crashed"):
         synthesise(tmp_path, request, renderer=quick, progress=kill)

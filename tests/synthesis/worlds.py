@@ -4,8 +4,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stereogenbench_data.synthesis.renderer import Bounds
-
 
 @dataclass
 class Blocks:
@@ -25,11 +23,11 @@ class Blocks:
 
     @property
     def bounds_m(self):
-        return Bounds(*map(np.array, self.size_m))
+        return np.array(self.size_m)
 
     @property
     def spawn_bounds_m(self):
-        return Bounds(*map(np.array, self.spawn_m))
+        return np.array(self.spawn_m)
 
     def cast(self, origins_m, directions):
         assert origins_m.shape == directions.shape

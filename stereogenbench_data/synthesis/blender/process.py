@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from stereogenbench_data.errors import SynthesisError
+from stereogenbench_data.synthesis.blender.assets import Asked
 
 _LOG: Final = "log.txt"
 _LOG_LINES: Final = 6
@@ -21,41 +22,32 @@ _KEPT: Final = 3
 
 
 class BlenderProcess:
-    """A running Blender. Ends with this process, or by `close`."""
+    """A running Blender, in `process`. Ends with this process, or by `close`."""
 
     def __init__(self) -> None:
         self._home = tempfile.TemporaryDirectory(prefix="stereogenbench_blender_")
         self.folder = Path(self._home.name)
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, self.folder), daemon=True)
-        self._process.start()
+        self.process = context.Process(target=_serve, args=(theirs, self.folder), daemon=True)
+        self.process.start()
         theirs.close()
         atexit.register(self.close)
 
-    @property
-    def pid(self) -> int | None:
-        """The number of the process."""
-        return self._process.pid
-
-    @property
-    def is_running(self) -> bool:
-        """Whether the process still lives."""
-        return self._process.is_alive()
-
-    def call(self, name: str, *values: Any, what: str) -> Any:
-        """Call a method of the process's `stage.Server` and return what it returns.
+    def call(self, name: str, asked: Asked, *values: Any, what: str) -> Any:
+        """Call a method of the process's `stage.Stage` and return what it returns.
 
         Args:
             name: The method.
-            *values: Its arguments.
+            asked: The assets: the map, which is opened if it is another, and the subject.
+            *values: What else the method is given.
             what: What is asked, for messages.
 
         Raises:
             SynthesisError: If Blender cannot use an asset, or its process ends.
         """
         try:
-            self._connection.send((name, values))
+            self._connection.send((name, asked, values))
             error, answer = self._connection.recv()
         except (EOFError, ConnectionError) as lost:
             raise SynthesisError(f"{what}: {self._last_words()}") from lost
@@ -68,8 +60,8 @@ class BlenderProcess:
 
     def _last_words(self) -> str:
         """Return how the process ended, with the end of its log."""
-        self._process.join(10)
-        code = self._process.exitcode
+        self.process.join(10)
+        code = self.process.exitcode
         lines = (self.folder / _LOG).read_text(errors="replace").strip().splitlines()
         shown = "; ".join(line.strip() for line in lines[-_LOG_LINES:])
         self.close()
@@ -86,8 +78,8 @@ class BlenderProcess:
     def close(self) -> None:
         """End the process and remove its folder."""
         atexit.unregister(self.close)
-        self._process.kill()
-        self._process.join()
+        self.process.kill()
+        self.process.join()
         self._connection.close()
         self._home.cleanup()
 
@@ -101,7 +93,7 @@ def blender(place: str) -> BlenderProcess:
     The three that were used last are kept, because proposals go from map to map.
     """
     found = _running.pop(place, None)
-    if found is None or not found.is_running:
+    if found is None or not found.process.is_alive():
         found = BlenderProcess()
     _running[place] = found
     for old in list(_running)[:-_KEPT]:
@@ -117,15 +109,18 @@ def _serve(requests: Connection, folder: Path) -> None:
     # The user's own preferences and add-ons stay out of it.
     for name in ("RESOURCES", "CONFIG", "SCRIPTS", "EXTENSIONS", "DATAFILES"):
         os.environ[f"BLENDER_USER_{name}"] = str(folder / name.lower())
-    from stereogenbench_data.synthesis.blender.stage import Server
+    from stereogenbench_data.synthesis.blender.stage import Stage
 
-    server = Server()
+    stage = None
     while True:
         try:
-            name, values = requests.recv()
+            name, asked, values = requests.recv()
         except EOFError:
             os._exit(0)  # Blender's own clean-up takes long and may crash.
         try:
-            requests.send((None, getattr(server, name)(*values)))
+            if stage is None or (stage.root, stage.asset) != asked[:2]:
+                stage = None
+                stage = Stage(asked.root, asked.map)
+            requests.send((None, getattr(stage, name)(asked, *values)))
         except SynthesisError as error:
             requests.send((str(error), None))

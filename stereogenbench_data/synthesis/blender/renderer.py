@@ -26,8 +26,8 @@ from stereogenbench_data.synthesis.blender.assets import (
 from stereogenbench_data.synthesis.blender.process import blender
 from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.renderer import (
-    Bounds,
     RenderedView,
+    Renderer,
     ScenePlan,
     Spawn,
     unknown_map,
@@ -42,8 +42,8 @@ class BlenderAssetWarning(UserWarning):
     """Something of an asset is left out of its pictures."""
 
 
-@dataclass(frozen=True, slots=True)
-class BlenderRenderer:
+@dataclass(frozen=True)
+class BlenderRenderer(Renderer):
     """Renders users' own assets by Cycles; all cameras of a frame from one evaluated scene.
 
     Attributes:
@@ -51,8 +51,6 @@ class BlenderRenderer:
     """
 
     assets: Assets
-    name: str = "blender"
-    cameras_per_task: int = CAMERA_COUNT
 
     @classmethod
     def from_file(cls, path: str | Path) -> "BlenderRenderer":
@@ -62,35 +60,19 @@ class BlenderRenderer:
             SynthesisError: If the file does not follow the format.
             ExtraError: If Blender is not installed.
         """
-        renderer = cls(read_assets(path))
+        assets = read_assets(path)
         if find_spec("bpy") is None:
             raise missing_extra("Blender", "blender", "bpy is not installed; it needs Python 3.13")
-        return renderer
-
-    @property
-    def maps(self) -> tuple[str, ...]:
-        """Names of the maps."""
-        return tuple(sorted(self.assets.maps))
-
-    @property
-    def characters(self) -> tuple[str, ...]:
-        """Names of the subjects."""
-        return tuple(sorted(self.assets.characters))
-
-    @property
-    def animations(self) -> tuple[str, ...]:
-        """Names of the subjects' motions."""
-        return tuple(sorted(self.assets.animations))
-
-    @property
-    def sensors_mm(self) -> tuple[tuple[float, float], ...]:
-        """Sensors to draw from."""
-        return self.assets.sensors_mm or (SENSOR_MM,)
-
-    @property
-    def fingerprint(self) -> str:
-        """A digest of the assets, and the version of this code."""
-        return f"blender {_VERSION} {self.assets.digest[:32]}"
+        return cls(
+            name="blender",
+            maps=tuple(sorted(assets.maps)),
+            characters=tuple(sorted(assets.characters)),
+            animations=tuple(sorted(assets.animations)),
+            sensors_mm=assets.sensors_mm or (SENSOR_MM,),
+            fingerprint=f"blender {_VERSION} {assets.digest[:32]}",
+            cameras_per_task=CAMERA_COUNT,
+            assets=assets,
+        )
 
     def world(self, proposal: Proposal) -> "BlenderWorld":
         """Return the map of a proposal, with its subject."""
@@ -169,12 +151,12 @@ class BlenderWorld:
         """
         self._asked = renderer.asked(proposal)
         asset = renderer.map_of(proposal)
-        bounds_m, spawn_bounds_m, self._points_m = _facts(self._asked, proposal.request.frames)
+        facts = _facts(self._asked, proposal.request.frames)
+        self.bounds_m, self.spawn_bounds_m, self._points_m = facts
         if asset.bounds_m is not None:
-            bounds_m = spawn_bounds_m = np.array(asset.bounds_m, np.float64)
+            self.bounds_m = self.spawn_bounds_m = np.array(asset.bounds_m, np.float64)
         if asset.spawn_bounds_m is not None:
-            spawn_bounds_m = np.array(asset.spawn_bounds_m, np.float64)
-        self.bounds_m, self.spawn_bounds_m = Bounds(*bounds_m), Bounds(*spawn_bounds_m)
+            self.spawn_bounds_m = np.array(asset.spawn_bounds_m, np.float64)
 
     def cast(
         self, origins_m: Float64[np.ndarray, "n 3"], directions: Float64[np.ndarray, "n 3"]

@@ -2,10 +2,10 @@
 
 A process of its own imports it (`process.py`), because Blender is a global of its process.
 
-Axes here are Blender's: right-handed, x and y level, z up, in units of the map's file; `Mirror`
-turns map axes into them. Depth is Cycles' own, of a render of one ray through the centre of each
-pixel. Blender evaluates a scene anew for each render, and otherwise than for its windows. So the
-triangles that filters ask are taken from the evaluation that Cycles renders.
+Axes here are Blender's: right-handed, x and y level, z up, in units of the map's file. Map
+axes are the same but for the sign of y. Depth is Cycles' own, of a render of one ray through the
+centre of each pixel. Blender evaluates a scene anew for each render, and otherwise than for its
+windows. So the triangles that filters ask are taken from the evaluation that Cycles renders.
 """
 
 import math
@@ -33,6 +33,8 @@ from stereogenbench_data.synthesis.blender.assets import (
 
 Array = Any
 
+_FLIP: Final = np.array([1.0, -1.0, 1.0])
+"""Turns map axes into Blender's, and back."""
 _RATE_HZ: Final = 15.0
 _MESHES: Final = frozenset({"MESH", "CURVE", "SURFACE", "FONT", "META"})
 _WITHOUT_DEPTH: Final = frozenset({"VOLUME", "GREASEPENCIL"})
@@ -59,22 +61,6 @@ _NARROWEST_PX: Final = 0.01
 """Cycles' narrowest filter: rays pass within half of it of the centre of their pixel."""
 _MOST_LAYERS: Final = 64
 _GPU_KINDS: Final = ("OPTIX", "CUDA", "HIP", "ONEAPI", "METAL")
-
-
-class Mirror:
-    """Map axes and Blender's: the same but for the sign of y, and the unit."""
-
-    def __init__(self, unit_m: float) -> None:
-        self.unit_m = unit_m
-        self.flip = np.array([1.0, -1.0, 1.0])
-
-    def to_map(self, points: Array) -> Array:
-        """Return points in metres of map axes."""
-        return points * self.flip * self.unit_m
-
-    def to_blender(self, points_m: Array) -> Array:
-        """Return points in Blender's axes and the file's units."""
-        return points_m * self.flip / self.unit_m
 
 
 # What rays of the filters meet: triangles of the evaluated map.
@@ -400,7 +386,7 @@ class Subject:
         self.place(None, time_frames=time_frames)
         points = self._vertices()[self.chosen] + times * self.travel - self.soles
         turn = np.array(Matrix.Rotation(math.radians(90.0 + self.facing), 3, "Z"))
-        placed: Array = points @ turn.T * (self.scale * self.unit_m) * [1.0, -1.0, 1.0]
+        placed: Array = points @ turn.T * (self.scale * self.unit_m) * _FLIP
         return placed
 
     def _vertices(self) -> Array:
@@ -516,7 +502,11 @@ def _spread(points: Array) -> Array:
 
 
 class Stage:
-    """The one scene of this process: a map, and a subject in it."""
+    """The one scene of this process: a map, and a subject in it.
+
+    What another process calls (`cast`, `facts`, `render`) is given the assets of a proposal first.
+    Every method raises `SynthesisError` if an asset cannot be used.
+    """
 
     def __init__(self, root: str, asset: MapAsset) -> None:
         self.root, self.asset = root, asset
@@ -531,9 +521,7 @@ class Stage:
         check_files(where, root=self.root)
         self.scene = bpy.context.scene
         units = self.scene.unit_settings
-        self.mirror = Mirror(
-            asset.scale * (1.0 if units.system == "NONE" else float(units.scale_length))
-        )
+        self.unit_m = asset.scale * (1.0 if units.system == "NONE" else float(units.scale_length))
         self.start = self.scene.frame_start
         self.rate_hz = _rate_hz(self.scene)
         self.notes: list[str] = []
@@ -589,7 +577,7 @@ class Stage:
                 f"{asset.where}: the map is empty: no mesh of its scene is rendered. Show its "
                 f"collections in renders, or name another file."
             )
-        corners = self.mirror.to_map(np.stack([points.min(axis=0), points.max(axis=0)]))
+        corners = np.stack([points.min(axis=0), points.max(axis=0)]) * _FLIP * self.unit_m
         bounds_m: Array = np.sort(corners, axis=0)
         low, high = bounds_m
         floor_m, ceiling_m = self._floor_and_ceiling_m(low, high)
@@ -611,7 +599,7 @@ class Stage:
             *((np.arange(_GRID) + 0.5) / _GRID * (high - low)[axis] + low[axis] for axis in (0, 1))
         )
         bottom = np.full(across.size, low[2] - 1.0)
-        at = self.mirror.to_blender(np.stack([across.ravel(), along.ravel(), bottom], axis=1))
+        at = self._to_blender(np.stack([across.ravel(), along.ravel(), bottom], axis=1))
         upwards = np.broadcast_to([0.0, 0.0, 1.0], at.shape)
         floors, ceilings = np.full((2, len(at)), np.inf)
         for _ in range(_MOST_LAYERS):
@@ -623,47 +611,59 @@ class Stage:
             is_floor = (turned > 0) & np.isinf(floors)
             is_ceiling = (turned < 0) & np.isfinite(floors) & np.isinf(ceilings)
             floors[is_floor], ceilings[is_ceiling] = at[is_floor, 2], at[is_ceiling, 2]
-            at[:, 2] += 1e-5 / self.mirror.unit_m
+            at[:, 2] += 1e-5 / self.unit_m
         found = ceilings[np.isfinite(floors)]
         if not found.size or np.isinf(found).mean() > _OPEN_SHARE:
             return float(low[2]), math.inf
         ceiling = float(found[np.isfinite(found)].max())
-        return float(floors.min()) * self.mirror.unit_m, ceiling * self.mirror.unit_m
+        return float(floors.min()) * self.unit_m, ceiling * self.unit_m
 
-    def cast(self, origins_m: Array, directions: Array) -> Array:
+    def cast(self, asked: Asked, origins_m: Array, directions: Array) -> Array:
         """Return how many metres each ray goes until it meets the map."""
-        ways = directions * self.mirror.flip
-        distances, _ = self.triangles.first_hits(self.mirror.to_blender(origins_m), ways)
-        return distances * self.mirror.unit_m
+        ways = directions * _FLIP
+        distances, _ = self.triangles.first_hits(self._to_blender(origins_m), ways)
+        return distances * self.unit_m
 
-    def set_subject(self, character: CharacterAsset, animation: AnimationAsset) -> Subject:
+    def _to_blender(self, points_m: Array) -> Array:
+        """Return points of map axes in Blender's axes and the file's units."""
+        return points_m * _FLIP / self.unit_m
+
+    def facts(self, asked: Asked, frames: int) -> tuple[Array, Array, Array, list[str]]:
+        """Return bounds, those of spawns, the subject's points (frames, p, 3), and notes."""
+        subject = self._subject_of(asked)
+        points_m = np.stack([subject.points_m(frame) for frame in range(frames)])
+        return self.bounds_m, self.spawn_bounds_m, points_m, self.notes
+
+    def _subject_of(self, asked: Asked) -> Subject:
         """Put a character with an animation into the scene, in place of the one before."""
+        _, _, character, animation = asked
         if self.subject is None or self._subject_assets != (character, animation):
             self.subject = None
             for kind in (bpy.data.objects, bpy.data.actions):
                 for added in set(kind) - self._own:
                     kind.remove(added)
             bpy.data.orphans_purge(do_recursive=True)
-            self.subject = Subject(character, animation, root=self.root, unit_m=self.mirror.unit_m)
+            self.subject = Subject(character, animation, root=self.root, unit_m=self.unit_m)
             self._subject_assets = character, animation
         return self.subject
 
-    def render(self, subject: Subject, shot: Shot) -> Array:
+    def render(self, asked: Asked, shot: Shot) -> Array:
         """Write the pictures of several cameras at a frame; return their depths in metres."""
+        subject = self._subject_of(asked)
         time_frames, times = subject.time_of(shot.frame)
         exact = self.start + shot.frame / _RATE_HZ * self.rate_hz
         self.scene.frame_set(int(exact), subframe=exact - int(exact))
-        place = self.mirror.to_blender(shot.spawn.place_m)
+        place = self._to_blender(shot.spawn.place_m)
         subject.place((place, 90.0 - shot.spawn.yaw_deg), time_frames=time_frames, times=times)
         self.scene.frame_set(int(exact), subframe=exact - int(exact))
-        eyes = [self.mirror.to_blender(view.eye) for view in shot.views]
-        turned = [view.axes * self.mirror.flip[:, None] for view in shot.views]
+        eyes = [self._to_blender(view.eye) for view in shot.views]
+        turned = [view.axes * _FLIP[:, None] for view in shot.views]
         width_px, height_px = shot.views[0].size_px
         self._set_render(shot)
         self._set_cameras(shot, eyes=eyes, axes=turned)
         bpy.ops.render.render(write_still=True)
         depths = self._depths(width_px, height_px)
-        depths_m: Array = np.where(depths < _NOTHING, depths * self.mirror.unit_m, np.inf)
+        depths_m: Array = np.where(depths < _NOTHING, depths * self.unit_m, np.inf)
         return depths_m
 
     def _depths(self, width_px: int, height_px: int) -> Array:
@@ -736,7 +736,7 @@ class Stage:
             camera.sensor_width = 36.0
             camera.lens = fx * 36.0 / width_px
             camera.shift_x = camera.shift_y = 0.0
-            camera.clip_start, camera.clip_end = 1e-3 / self.mirror.unit_m, 1e6
+            camera.clip_start, camera.clip_end = 1e-3 / self.unit_m, 1e6
             camera.dof.use_dof = False
             view = render.views.get(name) or render.views.new(name)
             view.camera_suffix, view.use = f"_{number}", True
@@ -761,35 +761,3 @@ def _device(settings: RenderSettings) -> str:
         'device = "GPU": Cycles finds no GPU here. Install the driver of the GPU, or set '
         'device = "CPU" in [render].'
     )
-
-
-class Server:
-    """Answers requests about the one scene. Each names its map, which is opened if it is another.
-
-    Every method raises `SynthesisError` if an asset cannot be used.
-    """
-
-    def __init__(self) -> None:
-        self._stage: Stage | None = None
-
-    def _open(self, asked: Asked) -> Stage:
-        if self._stage is None or (self._stage.root, self._stage.asset) != asked[:2]:
-            self._stage = None
-            self._stage = Stage(asked.root, asked.map)
-        return self._stage
-
-    def cast(self, asked: Asked, origins_m: Array, directions: Array) -> Array:
-        """See `Stage.cast`."""
-        return self._open(asked).cast(origins_m, directions)
-
-    def facts(self, asked: Asked, frames: int) -> tuple[Array, Array, Array, list[str]]:
-        """Return bounds, those of spawns, the subject's points (frames, p, 3), and notes."""
-        stage = self._open(asked)
-        subject = stage.set_subject(asked.character, asked.animation)
-        points_m = np.stack([subject.points_m(frame) for frame in range(frames)])
-        return stage.bounds_m, stage.spawn_bounds_m, points_m, stage.notes
-
-    def render(self, asked: Asked, shot: Shot) -> Array:
-        """See `Stage.render`."""
-        stage = self._open(asked)
-        return stage.render(stage.set_subject(asked.character, asked.animation), shot)
