@@ -18,7 +18,7 @@ import av
 from av.container import InputContainer
 
 from stereogenbench_data.errors import MediaError, StorageError, cure_of
-from stereogenbench_data.media.siting import has_coded_chroma, is_coded_lossless
+from stereogenbench_data.media.siting import coded_picture
 
 
 @runtime_checkable
@@ -146,6 +146,7 @@ class StreamFacts:
             (0,) where no header does.
         container: FFmpeg's names of the container, such as "matroska,webm".
         is_lossless: Whether a header of H.264 or HEVC says that it was coded without loss.
+        siting: Where its chroma lies, see `CodedPicture`.
     """
 
     codec: str
@@ -160,6 +161,7 @@ class StreamFacts:
     key_frames: tuple[int, ...] = (0,)
     container: str = field(default="", compare=False)
     is_lossless: bool = False
+    siting: str | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,7 +358,8 @@ def stream_facts(
             f"{context.pix_fmt}, {context.width}x{context.height}). The file is cut short or "
             f"damaged: fetch it again."
         )
-    is_colour = has_coded_chroma(context.codec.canonical_name, context.extradata)
+    coded = coded_picture(context.codec.canonical_name, context.extradata)
+    is_colour = coded.has_chroma
     if context.pix_fmt is not None and is_colour is not False:
         is_colour = is_colour_format(context.pix_fmt)
     return StreamFacts(
@@ -371,7 +374,8 @@ def stream_facts(
         pixel_aspect=float(exact(stream.sample_aspect_ratio) or 0),
         key_frames=_key_frames(container),
         container=container.format.name,
-        is_lossless=is_coded_lossless(context.codec.canonical_name, context.extradata),
+        is_lossless=coded.is_lossless,
+        siting=coded.siting,
     )
 
 

@@ -7,6 +7,8 @@ HEVC report "left" for files that say nothing, so for these the sequence paramet
 Source: ITU-T H.264 (08/2021), 7.3.2.1.1 and annex E; ITU-T H.265 (08/2021), 7.3.2.2 and annex E.
 """
 
+from contextlib import suppress
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Final
 
@@ -30,7 +32,9 @@ _EXTENDED_ASPECT: Final = 255
 _GREY: Final = 0
 _SEPARATE_PLANES: Final = 3
 _PROFILE_BITS: Final = 88
-_HEVC_PICTURE_PARAMETERS: Final = 34
+_H264_SEQUENCE: Final = 7
+_HEVC_SEQUENCE: Final = 33
+_HEVC_PICTURE: Final = 34
 
 
 class Converter:
@@ -118,76 +122,50 @@ def picture_siting(frame: VideoFrame) -> str:
     return CENTRE
 
 
-def coded_siting(codec: str, extradata: bytes | None) -> str | None:
-    """Return the siting in a codec's header, "center" if it has none.
+@dataclass(slots=True)
+class CodedPicture:
+    """What a codec's header says of its pictures.
 
-    None is returned for codecs whose pictures carry it (`picture_siting`).
+    Attributes:
+        siting: Where their chroma lies, "center" if the header does not say; None for codecs whose
+            pictures carry it (`picture_siting`).
+        has_chroma: Whether they have chroma, None where it does not say: FFmpeg decodes grey H.264
+            to yuv420p whose chroma it makes up.
+        is_lossless: Whether H.264 or HEVC is coded without loss. In H.264 that is the sequence's
+            flag for transform bypass, which encoders set where they code with a quantiser of 0; in
+            HEVC the pictures' flag for transquant bypass, unless the encoder writes that it chooses
+            for each block.
     """
-    if codec in _SAYS_NOTHING:
-        return CENTRE
+
+    siting: str | None
+    has_chroma: bool | None = None
+    is_lossless: bool = False
+
+
+def coded_picture(codec: str, extradata: bytes | None) -> CodedPicture:
+    """Return what a codec's header says as far as it can be read, by FFmpeg's name of the codec."""
     if codec not in ("h264", "hevc"):
-        return None
-    bits = _sequence_parameters(codec, extradata)
-    if bits is None:
-        return CENTRE
-    try:
-        place = _h264_siting(bits) if codec == "h264" else _hevc_siting(bits)
-    except EOFError:
-        return CENTRE
-    return _SITINGS[place] if place is not None and place < len(_SITINGS) else CENTRE
-
-
-def has_coded_chroma(codec: str, extradata: bytes | None) -> bool | None:
-    """Return whether a codec's header says that pictures have chroma, None where it does not say.
-
-    FFmpeg decodes grey H.264 to yuv420p whose chroma it makes up.
-    """
-    bits = _sequence_parameters(codec, extradata)
-    if bits is None:
-        return None
-    try:
-        if codec == "hevc":
-            _skip_to_hevc_chroma(bits)
-            return bits.golomb() != _GREY
-        bits.skip(8)
-        profile = bits.take(8)
-        bits.skip(8, 8, 0)
-        return profile not in _HIGH_PROFILES or bits.golomb() != _GREY
-    except EOFError:
-        return None
-
-
-def is_coded_lossless(codec: str, extradata: bytes | None) -> bool:
-    """Return whether a header of H.264 or HEVC says that pictures are coded without loss.
-
-    In H.264 that is the sequence's flag for transform bypass, which encoders set where they code
-    with a quantiser of 0; in HEVC the picture's flag for transquant bypass, unless the encoder
-    writes that it chooses for each block.
-    """
-    units = _units(codec, extradata or b"") if codec in ("h264", "hevc") else []
-    try:
-        if codec == "h264":
-            bits = _sequence_parameters(codec, extradata)
-            return bits is not None and _has_h264_bypass(bits)
-        chosen = any(b" cu-lossless" in unit for unit in units)
-        pictures = [unit for unit in units if unit[0] >> 1 & 63 == _HEVC_PICTURE_PARAMETERS]
-        return (
-            bool(pictures)
-            and not chosen
-            and all(_has_hevc_bypass(_Bits(unit.replace(b"\0\0\3", b"\0\0"))) for unit in pictures)
-        )
-    except EOFError:
-        return False
-
-
-def _has_h264_bypass(bits: "_Bits") -> bool:
-    bits.skip(8)
-    profile = bits.take(8)
-    bits.skip(8, 8, 0)
-    if profile not in _HIGH_PROFILES:
-        return False
-    bits.skip(*([1] if bits.golomb() == _SEPARATE_PLANES else []), 0, 0)
-    return bool(bits.take())
+        return CodedPicture(CENTRE if codec in _SAYS_NOTHING else None)
+    found = CodedPicture(CENTRE)
+    units = _units(codec, extradata or b"")
+    if codec == "h264":
+        sequences = [unit for unit in units if unit[0] & 31 == _H264_SEQUENCE]
+        walk = _read_h264_sequence
+    else:
+        sequences = [unit for unit in units if unit[0] >> 1 & 63 == _HEVC_SEQUENCE]
+        walk = _read_hevc_sequence
+        pictures = [unit for unit in units if unit[0] >> 1 & 63 == _HEVC_PICTURE]
+        chooses = any(b" cu-lossless" in unit for unit in units)
+        with suppress(EOFError):
+            found.is_lossless = (
+                bool(pictures) and not chooses and all(map(_has_hevc_bypass, map(_Bits, pictures)))
+            )
+    with suppress(EOFError):
+        for sequence in sequences[:1]:
+            place = walk(_Bits(sequence), found)
+            if place is not None and place < len(_SITINGS):
+                found.siting = _SITINGS[place]
+    return found
 
 
 def _has_hevc_bypass(bits: "_Bits") -> bool:
@@ -196,17 +174,6 @@ def _has_hevc_bypass(bits: "_Bits") -> bool:
         bits.skip(0)
     bits.skip(0, 0, 1, 1, 1)
     return bool(bits.take())
-
-
-def _sequence_parameters(codec: str, extradata: bytes | None) -> "_Bits | None":
-    """Return the first sequence parameter set of a header of H.264 or HEVC, None without one."""
-    if codec not in ("h264", "hevc"):
-        return None
-    for unit in _units(codec, extradata or b""):
-        kind, wanted = (unit[0] & 31, 7) if codec == "h264" else (unit[0] >> 1 & 63, 33)
-        if kind == wanted:
-            return _Bits(unit.replace(b"\0\0\3", b"\0\0"))
-    return None
 
 
 def _units(codec: str, extradata: bytes) -> list[bytes]:
@@ -233,9 +200,10 @@ def _units(codec: str, extradata: bytes) -> list[bytes]:
 
 
 class _Bits:
-    """The bits of a header, from the most significant on."""
+    """The bits of a unit, from the most significant on."""
 
-    def __init__(self, content: bytes) -> None:
+    def __init__(self, unit: bytes) -> None:
+        content = unit.replace(b"\0\0\3", b"\0\0")
         self._bits = int.from_bytes(content, "big")
         self._left = len(content) * 8
 
@@ -277,13 +245,18 @@ def _vui_siting(bits: _Bits) -> int | None:
     return bits.golomb() if bits.take() else None
 
 
-def _h264_siting(bits: _Bits) -> int | None:
+def _read_h264_sequence(bits: _Bits, found: CodedPicture) -> int | None:
+    """Read what `CodedPicture` holds; return the number of the siting, None without one."""
     bits.skip(8)
     profile = bits.take(8)
     bits.skip(8, 8, 0)
-    if profile in _HIGH_PROFILES:
+    if profile not in _HIGH_PROFILES:
+        found.has_chroma = True
+    else:
         chroma = bits.golomb()
-        bits.skip(*([1] if chroma == _SEPARATE_PLANES else []), 0, 0, 1)
+        found.has_chroma = chroma != _GREY
+        bits.skip(*([1] if chroma == _SEPARATE_PLANES else []), 0, 0)
+        found.is_lossless = bool(bits.take())
         if bits.take():
             for number in range(12 if chroma == _SEPARATE_PLANES else 8):
                 if bits.take():
@@ -312,9 +285,12 @@ def _skip_scaling_list(bits: _Bits, size: int) -> None:
         last = following or last
 
 
-def _hevc_siting(bits: _Bits) -> int | None:
-    layers = _skip_to_hevc_chroma(bits)
-    if bits.golomb() == _SEPARATE_PLANES:
+def _read_hevc_sequence(bits: _Bits, found: CodedPicture) -> int | None:
+    """Read what `CodedPicture` holds; return the number of the siting, None without one."""
+    layers = _skip_hevc_profiles(bits)
+    chroma = bits.golomb()
+    found.has_chroma = chroma != _GREY
+    if chroma == _SEPARATE_PLANES:
         bits.skip(1)
     bits.skip(0, 0)
     if bits.take():
@@ -339,7 +315,7 @@ def _hevc_siting(bits: _Bits) -> int | None:
     return _vui_siting(bits) if bits.take() else None
 
 
-def _skip_to_hevc_chroma(bits: _Bits) -> int:
+def _skip_hevc_profiles(bits: _Bits) -> int:
     """Pass over all before chroma_format_idc; return how many layers there are beside the first."""
     bits.skip(16, 4)
     layers = bits.take(3)

@@ -42,7 +42,6 @@ from stereogenbench_data.media.packet_checksums import packet_checksums
 from stereogenbench_data.media.siting import (
     CENTRE,
     Converter,
-    coded_siting,
     is_subsampled,
     picture_siting,
 )
@@ -159,9 +158,8 @@ class VideoReader(FrameReader):
         try:
             require_whole_payload(container, name=name)
             self._crc32s = packet_checksums(container, frames=frames, name=name)
-            context = container.streams.video[0].codec_context
             self.header = stream_facts(container, name=name, frames=frames, pixel_format="later")
-            self._siting = coded_siting(context.codec.canonical_name, context.extradata)
+            self._siting = self.header.siting
             steady = steady_clock(container, frames=frames)
             if steady is None and placed == "anywhere":
                 container.close()
