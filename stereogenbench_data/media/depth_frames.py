@@ -26,7 +26,6 @@ from jaxtyping import UInt16
 
 from stereogenbench_data.errors import MediaError, missing_extra
 from stereogenbench_data.media.container import (
-    BinaryFile,
     FrameReader,
     StreamFacts,
     VideoFile,
@@ -51,6 +50,9 @@ _TOO_LATE: Final = 2**62
 _FIXED: Final = struct.Struct(">2x8sxixQ")
 """Magic, size of the header and of the whole file."""
 _MAGIC: Final = b"b2frame\0"
+_NOT_DESCRIBED: Final = (
+    ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError,
+)  # fmt: skip
 
 _CHUNK: Final = struct.Struct("<4B3i16s")
 """Versions, flags, size of a unit; bytes of units, of a block, of the chunk; filters and codec."""
@@ -110,13 +112,6 @@ def blosc2_module() -> Any:
         raise missing_extra("depth that blosc2 packed", "blosc2", error) from error
 
 
-def compressed_chunk(units: bytes) -> bytes:
-    """Return the stored numbers of a frame as a chunk; the same bytes for the same blosc2."""
-    blosc2 = blosc2_module()
-    chunk: bytes = blosc2.compress2(units, **_compression(blosc2))
-    return chunk
-
-
 def _compression(blosc2: Any) -> dict[str, Any]:
     return {
         "codec": blosc2.Codec.ZSTD,
@@ -130,15 +125,18 @@ def _compression(blosc2: Any) -> dict[str, Any]:
     }
 
 
-def is_zeros(chunk: bytes) -> bool:
-    """Return whether a chunk made here holds only zeros: blosc2 stores no bytes for it."""
-    return len(chunk) == _CHUNK.size
+def compressed_chunk(units: bytes) -> bytes:
+    """Return the stored numbers of a frame as a chunk; the same bytes for the same blosc2."""
+    blosc2 = blosc2_module()
+    chunk: bytes = blosc2.compress2(units, **_compression(blosc2))
+    return chunk
 
 
 def frame_file(clip: StoredClip, chunks: Sequence[bytes]) -> bytes:
     """Return the file that holds these chunks, as `compressed_chunk` made them."""
     blosc2 = blosc2_module()
-    kept = [b"" if is_zeros(chunk) else chunk for chunk in chunks]
+    # A chunk of nothing but zeros is a header, for which blosc2 stores no bytes.
+    kept = [chunk if len(chunk) > _CHUNK.size else b"" for chunk in chunks]
     description = {
         "format": _FORMAT,
         "clip": asdict(clip),
@@ -159,31 +157,37 @@ def frame_file(clip: StoredClip, chunks: Sequence[bytes]) -> bytes:
     return content
 
 
-def _description(header: bytes, *, name: str) -> dict[str, Any]:
-    """Return the metalayer's content: the end of the header, behind its own checksum."""
+def _described(header: bytes) -> tuple[StoredClip, list[int], list[int]]:
+    """Return what the end of a header describes: the clip, and sizes and checksums of its chunks.
+
+    What is not so described raises one of `_NOT_DESCRIBED`.
+    """
     start = header.find(b'{"format":')
     text = header[start:]
     if start < 4 or zlib.crc32(text).to_bytes(4, "big") != header[start - 4 : start]:
-        raise _unfit(name, "it has no description of itself that fits its checksum")
-    description: dict[str, Any] = json.loads(text)
-    if description["format"] != _FORMAT:
-        raise _unfit(name, "its description of itself is of another version")
-    return description
-
-
-def _clip(told: Mapping[str, Any]) -> StoredClip:
+        raise ValueError("no description that fits its checksum")
+    description = json.loads(text)
+    told = description["clip"]
     lists = {name: tuple(told[name]) for name in ("rate", "time_base", "pts")}
     tags = {name: {str(k): str(v) for k, v in told[name].items()} for name in _TAGS}
     clip = StoredClip(**{**told, **lists, **tags})
+    sizes, crc32s = (list(map(int, description[key])) for key in ("sizes", "crc32s"))
     numbers = (clip.width_px, clip.height_px, *clip.rate, *clip.time_base)
     are_whole = len(numbers) == 6 and all(type(each) is int for each in (*numbers, *clip.pts))
     if not are_whole or not 1 <= min(numbers) <= max(numbers) < _TOO_LARGE:
         raise ValueError(f"{clip.width_px}x{clip.height_px}, {clip.rate}, {clip.time_base}")
-    if clip.codec != "ffv1" or not clip.pixel_format.startswith("gray"):
-        raise ValueError(f"{clip.codec}, {clip.pixel_format}")
+    stored = (description["format"], clip.codec, clip.pixel_format[:4])
+    if stored != (_FORMAT, "ffv1", "gray"):
+        raise ValueError(f"format {stored[0]}, {clip.codec}, {clip.pixel_format}")
     if any(not -_TOO_LATE < here < there < _TOO_LATE for here, there in pairwise(clip.pts)):
         raise ValueError("times of frames that do not ascend")
-    return clip
+    largest = clip.frame_bytes + _CHUNK.size
+    if (
+        not len(sizes) == len(crc32s) == len(clip.pts)
+        or not 0 <= min(sizes) <= max(sizes) <= largest
+    ):
+        raise ValueError(f"{len(clip.pts)} times, {len(crc32s)} checksums, sizes {sizes}")
+    return clip, sizes, crc32s
 
 
 def require_chunk(chunk: bytes, *, clip: StoredClip, crc32: int, name: str) -> None:
@@ -198,17 +202,14 @@ def require_chunk(chunk: bytes, *, clip: StoredClip, crc32: int, name: str) -> N
             f"{name}: has crc32 {found:08x}, and its header says {crc32:08x}. The file is damaged: "
             f"fetch it again."
         )
-    if len(chunk) < _CHUNK.size:
-        raise _unfit(name, f"it has {len(chunk)} bytes, which is less than a chunk's header")
-    version, _, flags, typesize, units, block, size, pipeline = _CHUNK.unpack_from(chunk)
-    is_ours = (version, typesize, pipeline) == (5, UNIT_BYTES, _PIPELINE)
-    if not is_ours or flags not in _CHUNK_FLAGS:
-        raise _unfit(name, f"its header asks for another codec ({chunk[: _CHUNK.size].hex()})")
-    if (units, size) != (clip.frame_bytes, len(chunk)) or not 0 < block <= units:
+    header = chunk[: _CHUNK.size].ljust(_CHUNK.size, b"\0")
+    version, _, flags, typesize, units, block, size, pipeline = _CHUNK.unpack(header)
+    is_ours = (version, typesize, pipeline) == (5, UNIT_BYTES, _PIPELINE) and flags in _CHUNK_FLAGS
+    if not is_ours or (units, size) != (clip.frame_bytes, len(chunk)) or not 0 < block <= units:
         raise _unfit(
             name,
-            f"it claims {units} bytes of units in {size}, in blocks of {block}, and a frame of "
-            f"{clip.width_px}x{clip.height_px} has {clip.frame_bytes} in {len(chunk)}",
+            f"its header ({header.hex()}) is not that of {clip.frame_bytes} bytes of units in "
+            f"{len(chunk)}, compressed as this package does",
         )
 
 
@@ -228,6 +229,8 @@ class DepthFrames(FrameReader):
     Attributes:
         facts: What the header says, as of a video; the codec is "blosc2".
         clip: Facts of the depth video that was packed.
+        chunk_bounds: Where each frame's bytes begin, and the end of the file, which belongs to the
+            last.
     """
 
     def __init__(self, file: VideoFile, *, name: str, frames: int | Literal["any"]) -> None:
@@ -245,33 +248,13 @@ class DepthFrames(FrameReader):
         """
         self.name = name
         self._blosc2: Any = blosc2_module()
-        self._own: FileIO | None = None
-        if isinstance(file, str | Path):
-            self._own = FileIO(file)
-            self._file: BinaryFile = self._own
-        else:
-            self._file = file
+        self._own = FileIO(file) if isinstance(file, str | Path) else None
+        self._file: Any = self._own or file
         try:
             self._read_header(frames)
         except MediaError:
             self.close()
             raise
-        self.frames = len(self._sizes)
-        self.header = self.facts = StreamFacts(
-            codec=CODEC_NAME,
-            pixel_format=self.clip.pixel_format,
-            width_px=self.clip.width_px,
-            height_px=self.clip.height_px,
-            frames=self.frames,
-            frame_rate_hz=self.clip.rate[0] / self.clip.rate[1],
-            tags=merged_tags(self.clip.tags, self.clip.stream_tags),
-            is_colour=False,
-        )
-
-    @property
-    def chunk_bounds(self) -> tuple[int, ...]:
-        """Where each frame's bytes begin, and the end of the file, which belongs to the last."""
-        return (*self._offsets, self._file_bytes)
 
     def chunk(self, index: int) -> bytes:
         """Return the compressed bytes of a frame, empty for a frame of zeros.
@@ -283,14 +266,10 @@ class DepthFrames(FrameReader):
         size = self._sizes[index]
         if size == 0:
             return b""
-        self._file.seek(self._offsets[index])
+        self._file.seek(self.chunk_bounds[index])
         chunk = self._read(size)
-        require_chunk(
-            chunk,
-            clip=self.clip,
-            crc32=self._crc32s[index],
-            name=f"{self.name}: frame {index}",
-        )
+        where = f"{self.name}: frame {index}"
+        require_chunk(chunk, clip=self.clip, crc32=self._crc32s[index], name=where)
         return chunk
 
     def units(self, index: int) -> UInt16[np.ndarray, "h w"]:
@@ -328,7 +307,7 @@ class DepthFrames(FrameReader):
     def _read_header(self, frames: int | Literal["any"]) -> None:
         """Read where each chunk lies, after checking that this module wrote the header."""
         name = self.name
-        self._file_bytes = file_bytes = self._file.seek(0, 2)
+        file_bytes = self._file.seek(0, 2)
         self._file.seek(0)
         header = self._file.read(FIXED_BYTES)
         if len(header) < _FIXED.size or header[2 : 2 + len(_MAGIC)] != _MAGIC:
@@ -344,31 +323,18 @@ class DepthFrames(FrameReader):
                 f"and the file {file_bytes}: fetch it again."
             )
         try:
-            description = _description(header[:size], name=name)
-            clip = self.clip = _clip(description["clip"])
-            sizes, crc32s = (tuple(map(int, description[key])) for key in ("sizes", "crc32s"))
-        except MediaError:
-            raise
-        except (
-            ArithmeticError,
-            AttributeError,
-            LookupError,
-            RecursionError,
-            TypeError,
-            ValueError,
-        ) as error:
-            reason = shortened(repr(error))
+            self.clip, self._sizes, self._crc32s = _described(header[:size])
+        except _NOT_DESCRIBED as error:
+            reason = shortened(str(error))
             raise _unfit(name, f"its description is malformed or incomplete ({reason})") from error
-        self._sizes, self._crc32s = sizes, crc32s
-        self._offsets = tuple(accumulate(sizes, initial=size))[:-1]
-        largest = clip.frame_bytes + _CHUNK.size
-        if not len(sizes) == len(crc32s) == len(clip.pts):
-            raise _unfit(name, "its description is of different numbers of frames")
-        if not all(0 <= each <= largest for each in sizes) or size + sum(sizes) > file_bytes:
-            raise _unfit(name, f"its chunks have {sum(sizes)} bytes of {file_bytes}")
-        if frames not in ("any", len(sizes)):
+        clip, self.frames = self.clip, len(self._sizes)
+        *offsets, end = accumulate(self._sizes, initial=size)
+        self.chunk_bounds = (*offsets, file_bytes)
+        if end > file_bytes:
+            raise _unfit(name, f"its chunks end at byte {end} of {file_bytes}")
+        if frames not in ("any", self.frames):
             raise MediaError(
-                f"{name}: holds {len(sizes)} frames where {frames} are expected. "
+                f"{name}: holds {self.frames} frames where {frames} are expected. "
                 f"It belongs to another scene: fetch it again."
             )
         if clip.frame_bytes > LARGEST_FRAME_BYTES:
@@ -377,3 +343,13 @@ class DepthFrames(FrameReader):
                 f"{clip.frame_bytes:,} bytes each, and at most {LARGEST_FRAME_BYTES:,} are read: "
                 f"it is not depth of this release."
             )
+        self.header = self.facts = StreamFacts(
+            codec=CODEC_NAME,
+            pixel_format=clip.pixel_format,
+            width_px=clip.width_px,
+            height_px=clip.height_px,
+            frames=self.frames,
+            frame_rate_hz=clip.rate[0] / clip.rate[1],
+            tags=merged_tags(clip.tags, clip.stream_tags),
+            is_colour=False,
+        )
