@@ -11,11 +11,11 @@ import torch
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import (
     disparity_from_depth,
-    disparity_from_units,
+    disparity_from_shifts,
     write_disparity,
 )
 from stereogenbench_data.geometry.pose import CameraPoses
-from stereogenbench_data.geometry.projection import project_through_poses
+from stereogenbench_data.geometry.projection import homography, project_by_homography
 from stereogenbench_data.schema.records import Trajectory
 
 
@@ -91,10 +91,9 @@ def _all_measured(shape: tuple[int, ...]) -> np.ndarray:
 
 def closed_form(units: np.ndarray, pair: Pair) -> np.ndarray:
     """The same over the whole map at once, which is the package's way with torch's tensors."""
-    disparity_px = disparity_from_units(
-        torch.from_numpy(units),
-        focal_px=pair.focal_px, baseline_m=pair.baseline_m, unit_m=pair.unit_m,
-    )  # fmt: skip
+    stored = torch.from_numpy(units).to(torch.float64)
+    shift_units = torch.tensor(pair.focal_px * pair.baseline_m / pair.unit_m, dtype=stored.dtype)
+    disparity_px = disparity_from_shifts(torch.where(stored > 0, stored, torch.inf), shift_units)
     return np.asarray(disparity_px)
 
 
@@ -144,12 +143,8 @@ def poses_float32_maps(units: np.ndarray, pair: Pair) -> np.ndarray:
 
 def _through_poses(depth_m: np.ndarray, pair: Pair) -> np.ndarray:
     intrinsics = pair.intrinsics(depth_m)
-    moved = project_through_poses(
-        depth_m,
-        intrinsics=intrinsics,
-        target_intrinsics=intrinsics,
-        target_from_source=pair.poses.cam_from_cam(0, target=1, source=0),
-    )
+    target_from_source = pair.poses.cam_from_cam(0, target=1, source=0)
+    moved = project_by_homography(depth_m, *homography(intrinsics, intrinsics, target_from_source))
     return np.arange(depth_m.shape[1]) + 0.5 - moved.u_px
 
 

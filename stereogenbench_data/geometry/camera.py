@@ -148,13 +148,3 @@ def recorded_intrinsics(rig: Rig) -> Intrinsics:
         size_px=rig.recorded_size_px or (rig.image_width_px, rig.image_height_px),
         principal_point_px=rig.principal_point_px,
     )
-
-
-def require_picture_size(shape: tuple[int, ...], intrinsics: Intrinsics, *, name: str) -> None:
-    """Raise GeometryError unless a map (..., h, w) has the image size of the intrinsics."""
-    height_px, width_px = shape[-2:]
-    if (height_px, width_px) != (intrinsics.height_px, intrinsics.width_px):
-        raise GeometryError(
-            f"{name} is {width_px}x{height_px} px but its intrinsics are for "
-            f"{intrinsics.width_px}x{intrinsics.height_px} px: resize or crop both together."
-        )

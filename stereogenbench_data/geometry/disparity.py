@@ -14,14 +14,14 @@ from typing import Any, Final, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Integer
 
+from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry.arrays import (
     array_namespace,
     as_float64,
-    is_numpy_array,
     pixel_centres,
     quotient,
 )
-from stereogenbench_data.geometry.camera import Intrinsics, require_picture_size
+from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.schema.records import DepthForm
 
 _EXACT_FACTORS: Final = (128.0, 256.0)
@@ -60,80 +60,25 @@ def disparity_from_depth(
     return xp.astype(disparity_px, depth_m.dtype, copy=False)
 
 
-def depth_from_disparity(
-    disparity_px: Float[Any, "*batch h w"], *, focal_px: float, baseline_m: float
-) -> Float[Any, "*batch h w"]:
-    """Return depth along the optical axis in metres, in the disparity's dtype.
-
-    Depth is 0 ("not measured") where disparity is 0, nan, or of the sign opposite to the
-    baseline's. Disparity 0 does not distinguish sky from pixels that were not measured.
-
-    >>> depth_from_disparity(np.array([[40.0, 0.0]]), focal_px=800.0, baseline_m=0.1)
-    array([[2., 0.]])
-    """
-    xp = array_namespace(disparity_px)
-    size_px = disparity_px if baseline_m > 0 else -disparity_px
-    depth_m = quotient(focal_px * abs(baseline_m), as_float64(_inf_where_not_positive(size_px)))
-    return xp.astype(depth_m, disparity_px.dtype, copy=False)
-
-
-def disparity_from_units(
-    units: Integer[Any, "*batch h w"],
-    *,
-    focal_px: float,
-    baseline_m: float,
-    unit_m: float,
-    form: DepthForm = "depth",
-) -> Float32[Any, "*batch h w"]:
-    """Return the disparity in pixels of stored 16-bit depth, without an intermediate depth map.
-
-    The result is within 0.55 ulp of the float64 one, at float32's speed: B fx / unit_m is
-    multiplied by the j in 128..255 that brings the product nearest to a float32, and units * j
-    is exact. If no j brings it near enough, the result is computed in float64.
-
-    Args:
-        units: Stored numbers below 2 ** 16, as decoded.
-        focal_px: Horizontal focal length in pixels of this image.
-        baseline_m: Signed baseline in metres, positive for a target to the right.
-        unit_m: Metres in one stored unit; with ``form="inverse"``, the depth of the number 1.
-        form: Whether a stored number is proportional to depth or to its inverse.
-
-    Returns:
-        Disparity in pixels, 0 where the stored number is 0.
-
-    >>> disparity_from_units(np.array([[20, 0]]), focal_px=800.0, baseline_m=0.1, unit_m=0.1)
-    array([[40.,  0.]], dtype=float32)
-    """
-    xp = array_namespace(units)
-    shift_units = focal_px * baseline_m / unit_m
-    if is_numpy_array(units):
-        disparity_px = np.empty(units.shape, dtype=np.float32)
-        write_disparity(
-            disparity_px, units, measured=units != 0, shift_units=shift_units, form=form
-        )
-        return disparity_px
-    stored = as_float64(units)
-    if form == "depth":
-        stored = _inf_where_not_positive(stored)
-    shifts = xp.asarray(shift_units, dtype=xp.float64, device=units.device)
-    return disparity_from_shifts(stored, shifts, form=form)
-
-
 def disparity_from_shifts(
     stored: Float64[Any, "*batch h w"],
     shift_units: Float64[Any, "*rigs"],
     *,
     form: DepthForm = "depth",
 ) -> Float32[Any, "*batch h w"]:
-    """Return the disparity in pixels of stored depth of several rigs, bit for bit as for each one.
+    """Return the disparity in pixels of stored 16-bit depth of several rigs, without a depth map.
 
-    Each map is what `disparity_from_units` gives. The quotient is computed in float64, which has
-    digits enough that rounding it to float32 is rounding the exact quotient.
+    The result is within 0.55 ulp of the float64 one: the shift is multiplied by the j in 128..255
+    that brings the product nearest to a float32, and units * j is exact. If no j brings it near
+    enough, the float64 result is rounded. The quotient is computed in float64, which has digits
+    enough that rounding it to float32 is rounding the exact quotient: `write_disparity` gives the
+    same, bit for bit.
 
     Args:
         stored: Stored numbers below 2 ** 16; with ``form="depth"``, inf instead of 0.
         shift_units: Focal length in pixels times signed baseline, divided by metres in a stored
-            unit. Its shape is broadcast to the maps'.
+            unit; with ``form="inverse"``, by the depth of the number 1. Its shape is broadcast to
+            the maps'.
         form: Whether a stored number is proportional to depth or to its inverse.
 
     Returns:
@@ -155,9 +100,10 @@ def write_disparity(
     shift_units: float,
     form: DepthForm = "depth",
 ) -> None:
-    """Write the result of `disparity_from_units` into an array, and 0 where depth was not measured.
+    """Write what `disparity_from_shifts` gives for one rig, and 0 where depth was not measured.
 
-    A few rows at a time go through all steps, so that they stay in the processor's cache.
+    It is computed at float32's speed where a j brings the product near enough. A few rows at a time
+    go through all steps, so that they stay in the processor's cache.
 
     Args:
         out: The array to write disparity in pixels to.
@@ -264,7 +210,12 @@ def planar_from_ray(
 
     Source: Roberts et al., Hypersim, 2021, whose depth_meters is the length of the ray.
     """
-    require_picture_size(ray_m.shape, intrinsics, name="the depth map")
+    size_px = (intrinsics.width_px, intrinsics.height_px)
+    if ray_m.shape[:-3:-1] != size_px:
+        raise GeometryError(
+            f"the depth map is {ray_m.shape[-1]}x{ray_m.shape[-2]} px but its intrinsics are for "
+            f"{size_px[0]}x{size_px[1]} px: resize or crop both together."
+        )
     return ray_m / ray_per_planar(
         ray_m,
         focal_px=(intrinsics.fx_px, intrinsics.fy_px),

@@ -31,7 +31,7 @@ from stereogenbench_data.geometry.arrays import (
     values_where,
     whole_where,
 )
-from stereogenbench_data.geometry.camera import Intrinsics, require_picture_size
+from stereogenbench_data.geometry.camera import Intrinsics
 
 _BLOCK_PIXELS: Final = 64 * 1280
 """How many pixels of float maps stay in a processor's cache from one step to the next."""
@@ -91,37 +91,6 @@ def project_rectified(
     return Projection(u_px=u_px - disparity_px, v_px=None, depth_m=depth_m)
 
 
-def project_through_poses(
-    depth_m: Float[Any, "*batch h w"],
-    *,
-    intrinsics: Intrinsics,
-    target_intrinsics: Intrinsics,
-    target_from_source: Float64[np.ndarray, "4 4"],
-) -> Projection:
-    """Return the projection into any target: K_t (R K_s^-1 (u, v, 1) z + t).
-
-    The result is computed in float64 and has the depth's dtype. u and v are nan where the point is
-    on or behind the target's plane, or where depth is nan or inf.
-
-    Args:
-        depth_m: Source depth along the optical axis, in metres.
-        intrinsics: Intrinsics of the source image, which has the size of the map.
-        target_intrinsics: Intrinsics of the target image.
-        target_from_source: Rigid motion from source to target camera axes, in metres.
-
-    Raises:
-        GeometryError: If the map does not have the image size of the intrinsics.
-
-    Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., ch. 6.
-    """
-    require_picture_size(depth_m.shape, intrinsics, name="the depth map")
-    xp = array_namespace(depth_m)
-    moved = homography(intrinsics, target_intrinsics, target_from_source)
-    return project_by_homography(
-        depth_m, *(xp.asarray(each, device=depth_m.device) for each in moved)
-    )
-
-
 def homography(
     intrinsics: Intrinsics,
     target_intrinsics: Intrinsics,
@@ -140,12 +109,17 @@ def project_by_homography(
     homography: Float64[Any, "*rigs 3 3"],
     step_px_m: Float64[Any, "*rigs 3"],
 ) -> Projection:
-    """Return the projection homography (u, v, 1) z + step, as `project_through_poses` does.
+    """Return the projection into any target: K_t (R K_s^-1 (u, v, 1) z + t).
+
+    The result is computed in float64 and has the depth's dtype. u and v are nan where the point is
+    on or behind the target's plane, or where depth is nan or inf.
 
     Args:
         depth_m: Source depth along the optical axis, in metres.
         homography: K_t R K_s^-1, of one rig or of several: their shape is broadcast to the maps'.
         step_px_m: K_t t, likewise.
+
+    Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., ch. 6.
     """
     xp = array_namespace(depth_m)
     dtype = depth_m.dtype

@@ -12,13 +12,13 @@ import pytest
 from PIL import Image
 
 from stereogenbench_data.geometry.camera import Intrinsics
-from stereogenbench_data.geometry.disparity import depth_from_disparity
 from stereogenbench_data.geometry.projection import (
     Projection,
     backward_warp,
+    homography,
     lands_inside,
+    project_by_homography,
     project_rectified,
-    project_through_poses,
     visible_from_source,
     visible_in_target,
 )
@@ -27,6 +27,12 @@ from stereogenbench_data.geometry.projection import (
 def read(path: Path) -> np.ndarray:
     with Image.open(path) as picture:
         return np.asarray(picture)
+
+
+def depth_of(disparity_px: np.ndarray) -> np.ndarray:
+    """Return depth for B f = 1, and 0 where disparity is not known."""
+    known = disparity_px > 0
+    return np.where(known, 1 / np.where(known, disparity_px, 1), 0).astype(disparity_px.dtype)
 
 
 class View(NamedTuple):
@@ -89,15 +95,14 @@ def test_visibility_is_the_occlusion_map_of_cones(ground_truth, judge, least):
         read(ground_truth / "cones" / f"disp_{side}.tif") for side in ("left", "right")
     )
     visible_there = read(ground_truth / "cones" / "occlusion.png").astype(bool)
-    depth = depth_from_disparity(left_px, focal_px=1.0, baseline_m=1.0)
     known = left_px > 0
-    projection = project_rectified(depth, left_px)
+    projection = project_rectified(depth_of(left_px), left_px)
 
     if judge == "target":
         visible = visible_in_target(
             projection,
             measured=known,
-            target_depth_m=depth_from_disparity(right_px, focal_px=1.0, baseline_m=1.0),
+            target_depth_m=depth_of(right_px),
             target_measured=right_px > 0,
             quantum_m=0.0,
         )
@@ -139,17 +144,12 @@ def test_principal_points_that_differ_are_part_of_the_disparity(motorcycle):
     *_, disparity_px, known = motorcycle
     left = Intrinsics(994.978, 994.978, 311.193, 254.877, 741, 500)
     right = Intrinsics(994.978, 994.978, 311.193 + 31.086, 254.877, 741, 500)
-    depth_m = depth_from_disparity(
-        np.where(known, disparity_px.astype(np.float64) + 31.086, 0.0),
-        focal_px=994.978,
-        baseline_m=0.193001,
-    )
+    depth_m = np.where(known, depth_of(disparity_px.astype(np.float64) + 31.086), 0)
+    depth_m *= 994.978 * 0.193001
     motion = np.eye(4)
     motion[0, 3] = -0.193001
 
-    chain = project_through_poses(
-        depth_m, intrinsics=left, target_intrinsics=right, target_from_source=motion
-    )
+    chain = project_by_homography(depth_m, *homography(left, right, motion))
 
     assert depth_m[known].min() == pytest.approx(2.11, abs=0.005)
     assert depth_m[known].max() == pytest.approx(5.02, abs=0.005)

@@ -6,14 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry.camera import Intrinsics
-from stereogenbench_data.geometry.disparity import disparity_from_depth
 from stereogenbench_data.geometry.projection import (
+    homography,
     landing_pixels,
     lands_inside,
+    project_by_homography,
     project_rectified,
-    project_through_poses,
 )
 
 WIDE = Intrinsics(2694.0, 2694.0, 640.0, 640.0, 1280, 1280)
@@ -37,50 +36,25 @@ HARD_RIGS = {
 }
 
 
-def poses_of(case: Case, make_rig):
+def require_closed_form(intrinsics, case, make_rig):
+    """Check the pose chain of a lateral rig against u - B f / z, v and z, wherever it lands."""
     pitch, yaw, roll = case.rotator_deg
     rotation = Rotation.from_euler("ZYX", [yaw, -pitch, -roll], degrees=True).as_matrix()
     lateral_cm = [0.0, *(case.baseline_cm + np.arange(5.0))]
-    return make_rig(lateral_cm, rotation=rotation, offset_cm=case.offset_cm)
-
-
-def pair_motion(case: Case, make_rig):
-    """Return target_from_source and the signed baseline in metres."""
-    motion = poses_of(case, make_rig).cam_from_cam(0, target=case.target, source=case.source)
-    sign = 1 if case.target > case.source else -1
-    return motion, sign * case.baseline_cm / 100
-
-
-def sample_depth(intrinsics: Intrinsics) -> np.ndarray:
-    shape = (intrinsics.height_px, intrinsics.width_px)
-    depth_m = np.random.default_rng(0).uniform(1.0, 200.0, shape)
+    poses = make_rig(lateral_cm, rotation=rotation, offset_cm=case.offset_cm)
+    motion = poses.cam_from_cam(0, target=case.target, source=case.source)
+    baseline_m = (case.target - case.source) * case.baseline_cm / 100
+    height, width = intrinsics.height_px, intrinsics.width_px
+    depth_m = np.random.default_rng(0).uniform(1.0, 200.0, (height, width))
     depth_m[0, :3] = 1.0, 6553.4, 1e6
-    return depth_m
 
+    projection = project_by_homography(depth_m, *homography(intrinsics, intrinsics, motion))
 
-def require_agreement(projection, depth_m, disparity_px):
-    """Check a projection against u - d, v and z to 1e-6 px, wherever it lands."""
-    height, width = depth_m.shape
-    expected_u = np.arange(width) + 0.5 - disparity_px
-    assert (np.abs(projection.u_px - expected_u) < 1e-6).all()
-    assert (np.abs(projection.v_px - (np.arange(height) + 0.5)[:, None]) < 1e-6).all()
+    u_px, v_px = np.arange(width) + 0.5, (np.arange(height) + 0.5)[:, None]
+    expected_u_px = u_px - intrinsics.fx_px * baseline_m / depth_m
+    np.testing.assert_allclose(projection.u_px, expected_u_px, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(projection.v_px - v_px, 0 * depth_m, rtol=0, atol=1e-6)
     np.testing.assert_allclose(projection.depth_m, depth_m, rtol=1e-9)
-
-
-def require_closed_form(intrinsics, case, make_rig):
-    """Check the pose chain of a lateral rig against B f / z."""
-    depth_m = sample_depth(intrinsics)
-    motion, baseline_m = pair_motion(case, make_rig)
-
-    projection = project_through_poses(
-        depth_m,
-        intrinsics=intrinsics,
-        target_intrinsics=intrinsics,
-        target_from_source=motion,
-    )
-
-    disparity_px = disparity_from_depth(depth_m, focal_px=intrinsics.fx_px, baseline_m=baseline_m)
-    require_agreement(projection, depth_m, disparity_px)
 
 
 @pytest.mark.parametrize("case", HARD_RIGS.values(), ids=HARD_RIGS)
@@ -123,12 +97,8 @@ def test_any_motion_is_that_of_the_points_in_space(library, turn_deg, shift_m, s
     motion[:3, :3], motion[:3, 3] = rotation.as_matrix(), shift_m
     depth_m = np.random.default_rng(seed).uniform(2.0, 50.0, (6, 8))
 
-    projection = project_through_poses(
-        library.array(depth_m),
-        intrinsics=source,
-        target_intrinsics=target,
-        target_from_source=motion,
-    )
+    moved = map(library.array, homography(source, target, motion))
+    projection = project_by_homography(library.array(depth_m), *moved)
 
     v_px, u_px = np.mgrid[:6, :8] + 0.5
     rays = np.stack([(u_px - 4.5) / 30, (v_px - 2) / 28, np.ones((6, 8))], axis=-1)
@@ -154,11 +124,9 @@ def test_a_point_that_the_target_cannot_see_lands_nowhere(library, depth_m):
     motion = np.eye(4)
     motion[2, 3] = -1.0
 
-    projection = project_through_poses(
-        library.array(np.full((1, 3), depth_m, dtype=np.float32)),
-        intrinsics=intrinsics,
-        target_intrinsics=intrinsics,
-        target_from_source=motion,
+    moved = map(library.array, homography(intrinsics, intrinsics, motion))
+    projection = project_by_homography(
+        library.array(np.full((1, 3), depth_m, dtype=np.float32)), *moved
     )
 
     assert np.isnan(library.numpy(projection.u_px)).all()
@@ -184,13 +152,3 @@ def test_where_the_leftmost_of_three_pixels_lands(library, disparity_px, column)
 
     assert library.numpy(inside)[0, 0] == (column is not None)
     assert column is None or library.numpy(pixel)[0, 0] == column
-
-
-def test_depth_of_an_image_of_another_size_is_refused(intrinsics):
-    with pytest.raises(GeometryError, match="depth map is 6x4 px but its intrinsics are for 40x30"):
-        project_through_poses(
-            np.ones((4, 6)),
-            intrinsics=intrinsics,
-            target_intrinsics=intrinsics,
-            target_from_source=np.eye(4),
-        )
