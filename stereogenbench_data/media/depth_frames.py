@@ -299,7 +299,7 @@ class DepthFrames(FrameReader):
 
     def _read(self, size: int) -> bytes:
         """Return the next bytes, fewer only at the end: a file may give them in pieces."""
-        data = self._file.read(size)
+        data: bytes = self._file.read(size)
         while 0 < len(data) < size and (more := self._file.read(size - len(data))):
             data += more
         return data
