@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Any, Final, Literal, Self
 
 import av
 from av.container import InputContainer
@@ -20,19 +20,10 @@ from av.container import InputContainer
 from stereogenbench_data.errors import MediaError, StorageError, cure_of
 from stereogenbench_data.media.siting import coded_picture
 
+BinaryFile = io.RawIOBase | io.BufferedIOBase
+"""An open binary file that can be sought in, such as `open(path, "rb")` or `io.BytesIO`."""
 
-@runtime_checkable
-class BinaryFile(Protocol):
-    """An open binary file that can be sought in, such as `open(path, "rb")` or `io.BytesIO`."""
-
-    def read(self, size: int = -1, /) -> bytes:
-        """Return at most ``size`` bytes."""
-
-    def seek(self, offset: int, whence: int = 0, /) -> int:
-        """Move to an offset; return it."""
-
-    def tell(self) -> int:
-        """Return the current offset."""
+VideoFile = str | Path | BinaryFile
 
 
 class SeekableFile(io.RawIOBase):
@@ -58,10 +49,6 @@ class SeekableFile(io.RawIOBase):
         """Return that positions can be set."""
         return True
 
-    def tell(self) -> int:
-        """Return the position of the next byte."""
-        return self._position
-
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
         """Set the position, relative to the start, to itself or to the end; return it."""
         start = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self.size}[whence]
@@ -69,12 +56,6 @@ class SeekableFile(io.RawIOBase):
             raise ValueError(f"a file has no position {start + offset}: seek to 0 or later.")
         self._position = start + offset
         return self._position
-
-
-VideoFile = str | Path | BinaryFile
-
-
-Reader = TypeVar("Reader", bound="FrameReader")
 
 
 class FrameReader:
@@ -106,7 +87,7 @@ class FrameReader:
                 f"{self.name}: has no frame {index}: ask for one of 0 to {self.frames - 1}."
             )
 
-    def __enter__(self: Reader) -> Reader:
+    def __enter__(self) -> Self:
         """Return the reader itself."""
         return self
 

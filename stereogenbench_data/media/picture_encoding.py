@@ -173,18 +173,13 @@ def write_pictures(
             if codec.codec == "h264":
                 container.mux(stream.encode(None))
     except (av.FFmpegError, ValueError) as error:
-        if isinstance(error, OSError) and error.errno is not None and not _is_codecs(error):
+        if isinstance(error, OSError) and (error.errno or 0) > 0:  # not one of FFmpeg's own
             raise
         raise MediaError(
             f"{target}: {width}x{height} pictures cannot be encoded as {codec.codec} ({error}). "
             f"Check that this PyAV has libx264, or choose another quality."
         ) from error
     write_checksums(target, packets=len(pictures))
-
-
-def _is_codecs(error: OSError) -> bool:
-    """Return whether an error of FFmpeg is its own, not the operating system's."""
-    return isinstance(error, av.FFmpegError) and (error.errno or 0) < 0
 
 
 def _jpeg(pixels: UInt8[np.ndarray, "h w 3"], codec: PictureCodec) -> bytes:

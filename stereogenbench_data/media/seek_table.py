@@ -13,7 +13,7 @@ import struct
 import zlib
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -46,6 +46,10 @@ _MOST_PACKETS: Final = 2**17
 _LARGEST_TABLES: Final = 64 * 2**20
 _MAGIC: Final = b"seek1"
 _LENGTH: Final = struct.Struct(">I")
+_NO_TABLES: Final = (
+    zlib.error, struct.error, ValueError, LookupError, TypeError, RecursionError, OverflowError,
+)  # fmt: skip
+"""What bytes raise that are no packed tables."""
 _LONGEST_SPAN: Final = 2**32 - 1
 _CUES: Final = b"\x1c\x53\xbb\x6b"
 """What Matroska's list of key frames begins with."""
@@ -190,38 +194,36 @@ def read_seek_table(
     """
     if name.endswith(PACKED_SUFFIX):
         with DepthFrames(file, name=name, frames="any") as depth:
-            bounds, count = depth.chunk_bounds, depth.frames
-        table = SeekTable(bounds, tuple(range(count)), blind_jump=0)
-        return _with_header(table, file, file_bytes=bounds[-1])
+            bounds = depth.chunk_bounds
+        packed = SeekTable(bounds, tuple(range(depth.frames)))
+        return _with_header(packed, file, file_bytes=bounds[-1])
     with open_container(file, name=name, pixel_format="later") as container:
         file_bytes, begins = container.size, container.streams.video[0].start_time
         try:
             if container.streams.video[0].frames:
-                table_found = _listed(container)
+                found = _listed(container)
             elif reads == "all":
-                table_found = _gone_through(container, file)
+                found = _gone_through(container, file)
             else:
-                table_found = _by_clusters(container, file)
+                found = _by_clusters(container, file)
         except av.FFmpegError as error:
             raise MediaError(
                 f"{name}: its packets cannot be read ({error.strerror}): fetch it again."
             ) from error
-    if table_found is None or not _is_sound(table_found):
-        return None
-    table_found = _with_header(table_found, file, file_bytes=file_bytes)
-    if table_found is None or table_found.opening:
-        return table_found
-    behind_first = table_found.bounds[0] + READ_THROUGH
-    if any(table_found.bounds[key] <= behind_first for key in table_found.keys[1:]):
-        return replace(table_found, opening=1)  # FFmpeg would read on where the file seemed to end
-    is_enough = False
-    with (
-        suppress(MediaError),
-        open_container(HeaderFile(table_found), name=name, pixel_format="later") as container,
-    ):
-        # So an MP4 file can be opened without a packet, unless it is tiny.
-        is_enough = container.streams.video[0].start_time == begins
-    return table_found if is_enough else replace(table_found, opening=1)
+    table = _with_header(found, file, file_bytes=file_bytes)
+    if table is None or table.opening:
+        return table
+    # FFmpeg reads on, where the file would seem to end, if a key frame is near the first packet.
+    near = table.bounds[0] + READ_THROUGH
+    if not any(table.bounds[key] <= near for key in table.keys[1:]):
+        # An MP4 file can be opened without a packet, unless it is tiny.
+        with (
+            suppress(MediaError),
+            open_container(HeaderFile(table), name=name, pixel_format="later") as container,
+        ):
+            if container.streams.video[0].start_time == begins:
+                return table
+    return replace(table, opening=1)
 
 
 def _listed(container: InputContainer) -> SeekTable | None:
@@ -318,8 +320,10 @@ def _read(file: VideoFile, start: int, stop: int) -> bytes:
     return file.read(stop - start)
 
 
-def _with_header(table: SeekTable, file: VideoFile, *, file_bytes: int) -> SeekTable | None:
-    """Return a table with the header's bytes."""
+def _with_header(table: SeekTable | None, file: VideoFile, *, file_bytes: int) -> SeekTable | None:
+    """Return a table with the header's bytes, None if it is not sound or the header is large."""
+    if table is None or not _is_sound(table):
+        return None
     first, last = table.bounds[0], table.bounds[-1]
     if first + file_bytes - last > LARGEST_HEADER:
         return None
@@ -334,39 +338,26 @@ def _is_sound(table: SeekTable) -> bool:
         and keys[:1] == (0,)
         and bounds[0] >= 0
         and all(0 <= b - a <= _LONGEST_SPAN for a, b in pairwise(bounds))
-        and all(a < b for a, b in pairwise(keys))
-        and keys[-1] < table.packets
-        and 0 <= table.delay <= table.packets
-        and 0 <= table.opening <= table.packets
-        and table.blind_jump >= 0
+        and all(a < b for a, b in pairwise((*keys, table.packets)))
+        and min(table.delay, table.opening, table.blind_jump) >= 0
+        and max(table.delay, table.opening) <= table.packets
     )
 
 
 def packed_tables(tables: Mapping[str, SeekTable]) -> bytes:
     """Return the tables of a scene's videos in few bytes."""
     described = []
-    spans, headers = [], []
-    for name, table in sorted(tables.items()):
-        described.append(
-            [
-                name,
-                table.packets,
-                _differences(table.keys),
-                table.delay,
-                int(table.has_neighbours),
-                table.opening,
-                table.blind_jump,
-                len(table.head),
-                len(table.tail),
-                table.bounds[0],
-            ]
-        )
+    headers, spans = b"", b""
+    for name, each in sorted(tables.items()):
+        keys = np.diff(each.keys, prepend=0).tolist()
+        reads = (each.delay, int(each.has_neighbours), each.opening, each.blind_jump)
+        sizes = (len(each.head), len(each.tail), each.bounds[0])
+        described.append([name, each.packets, keys, *reads, *sizes])
+        headers += each.head + each.tail
         # As MP4 headers hold the sizes of packets, so that they are compressed to nothing.
-        spans.append(np.diff(table.bounds).astype(">u4").tobytes())
-        headers += [table.head, table.tail]
+        spans += np.diff(each.bounds).astype(">u4").tobytes()
     text = json.dumps(described, separators=(",", ":")).encode()
-    content = _LENGTH.pack(len(text)) + text + b"".join(headers) + b"".join(spans)
-    return _MAGIC + zlib.compress(content, 9)
+    return _MAGIC + zlib.compress(_LENGTH.pack(len(text)) + text + headers + spans, 9)
 
 
 def parse_tables(packed: bytes) -> dict[str, SeekTable]:
@@ -376,47 +367,31 @@ def parse_tables(packed: bytes) -> dict[str, SeekTable]:
     try:
         content = zlib.decompressobj().decompress(packed[len(_MAGIC) :], _LARGEST_TABLES)
         (length,) = _LENGTH.unpack_from(content)
-        text = content[_LENGTH.size : _LENGTH.size + length]
-        return _parsed(json.loads(text), content[_LENGTH.size + length :])
-    except (
-        zlib.error,
-        struct.error,
-        ValueError,
-        LookupError,
-        TypeError,
-        RecursionError,
-        OverflowError,
-    ):
+        content = content[_LENGTH.size :]
+        return _parsed(json.loads(content[:length]), content[length:])
+    except _NO_TABLES:
         return {}
 
 
 def _parsed(described: Any, content: bytes) -> dict[str, SeekTable]:
-    rows = [(str(row[0]), row[2], *map(int, [row[1], *row[3:]])) for row in described]
-    spans_at = sum(row[7] + row[8] for row in rows)
-    at = 0
     tables = {}
-    for name, keys, packets, delay, neighbours, opening, jump, head, tail, first in rows:
-        if min(packets, head, tail) < 0 or packets > _MOST_PACKETS:
-            return {}
+    at, spans_at = 0, sum(int(row[7]) + int(row[8]) for row in described)
+    for name, packets, keys, *reads in described:
+        delay, has_neighbours, opening, blind_jump, head, tail, first = map(int, reads)
         spans = np.frombuffer(content, dtype=">u4", count=packets, offset=spans_at)
-        bounds = first + np.concatenate([[0], np.cumsum(spans, dtype=np.int64)])
-        table = SeekTable(
-            tuple(bounds.tolist()),
-            tuple(np.cumsum(np.array(keys, dtype=np.int64)).tolist()),
+        tables[str(name)] = table = SeekTable(
+            (first, *(first + np.cumsum(spans, dtype=np.int64)).tolist()),
+            tuple(np.cumsum(keys, dtype=np.int64).tolist()),
             delay=delay,
-            has_neighbours=bool(neighbours),
+            has_neighbours=bool(has_neighbours),
             opening=opening,
-            blind_jump=jump,
+            blind_jump=blind_jump,
             head=content[at : at + head],
             tail=content[at + head : at + head + tail],
         )
-        if not _is_sound(table) or len(table.head) != first or len(table.tail) != tail:
+        sizes = (table.packets, len(table.head), first, len(table.tail))
+        if sizes != (packets, head, head, tail) or not _is_sound(table):
             return {}
-        tables[name] = table
         at += head + tail
         spans_at += 4 * packets
     return tables
-
-
-def _differences(keys: Sequence[int]) -> list[int]:
-    return np.diff(keys, prepend=0).tolist()
