@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from io import BufferedIOBase
 from pathlib import Path
-from typing import Any, BinaryIO, Final, Literal, Self, cast
+from typing import Any, BinaryIO, Final, Literal, TypeVar, cast
 
 import av
 import numpy as np
@@ -28,6 +28,7 @@ to be, and some of them any video."""
 _TO_BT601: Final = 5
 """The scaler's number of the same."""
 _LIMITED_RANGE: Final = 1
+_Writer = TypeVar("_Writer", bound="VideoWriter")
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +123,7 @@ class VideoWriter:
         self._frames += 1
         self._container.mux(self._stream.encode(frame))
 
-    def __enter__(self) -> Self:
+    def __enter__(self: _Writer) -> _Writer:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
