@@ -34,8 +34,7 @@ from torch.utils.data import default_collate, get_worker_info
 
 from stereogenbench_data.datasets.batches import SharedNumbers
 from stereogenbench_data.errors import FieldError, SelectionError
-from stereogenbench_data.samples.fields import Sample
-from stereogenbench_data.samples.load import Allocate
+from stereogenbench_data.samples.fields import Allocate, Sample
 
 Buffers = Literal["reused", "fresh"]
 """Whether the memory of batches is reused once nobody holds it."""

@@ -25,7 +25,7 @@ from torch.utils.data import Sampler
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Stream
-from stereogenbench_data.samples.streams import OPEN_STREAMS
+from stereogenbench_data.samples.load import OPEN_STREAMS
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.filters import require_options
 from stereogenbench_data.selection.order import (

@@ -772,7 +772,15 @@ class LoaderPass(Iterator[Any]):
             )
         loader, asked_s = self._loader, perf_counter()
         with self._ended_by_errors():
-            batch = self._load(workers)
+            try:
+                batch = next(workers.batches)
+            except (RuntimeError, OSError, EOFError) as error:
+                # Where a dead worker caused it, the error names that.
+                death = None if isinstance(error, StereoGenBenchError) else workers.error(error)
+                if death is None:
+                    raise
+                loader._forget(workers)
+                raise death from error
         loader._waited_s += perf_counter() - asked_s
         loader._passed_s = perf_counter() - loader._pass_began_s
         begun.taken += 1
@@ -797,17 +805,6 @@ class LoaderPass(Iterator[Any]):
         self._pass, self._workers = begun, workers
         with self._ended_by_errors():
             workers.begin(begun, numbers)
-
-    def _load(self, workers: Workers) -> Any:
-        """Return what the workers have next; an error that a dead worker caused names it."""
-        try:
-            return next(workers.batches)
-        except (RuntimeError, OSError, EOFError) as error:
-            death = None if isinstance(error, StereoGenBenchError) else workers.error(error)
-            if death is None:
-                raise
-            self._loader._forget(workers)
-            raise death from error
 
     @contextmanager
     def _ended_by_errors(self) -> Iterator[None]:

@@ -46,19 +46,20 @@ from stereogenbench_data.media import depth
 from stereogenbench_data.samples.fields import (
     DEFAULT_PAIR_FIELDS,
     DEFAULT_VIEW_FIELDS,
+    Allocate,
     EnlargedSizeWarning,
     Layout,
     OddSceneWarning,
     Request,
     Sample,
     Transform,
+    new_array,
     parse_request,
     warn_if_swapped,
 )
-from stereogenbench_data.samples.load import Allocate, SampleLoader, new_array
-from stereogenbench_data.samples.streams import StreamStats
+from stereogenbench_data.samples.load import SampleLoader, StreamStats
 from stereogenbench_data.schema.conventions import Conventions, depth_of
-from stereogenbench_data.schema.records import DepthEncoding, Scene
+from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_COUNT, DEFAULT_DEPTH_UNIT_M, depth_name
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import (
@@ -222,8 +223,12 @@ class _MappedScenes(Dataset[Sample]):
         self, index: SceneIndex, plan: Plan, request: Request, options: ReadOptions
     ) -> None:
         selected = len(plan.scene_rows)
-        plan = without_odd_scenes(index, plan, request)
-        check_samples(index, plan, request)
+        plan = _without_odd_scenes(index, plan, request)
+        _require_videos(index, plan, request)
+        if request.streams & {"source_depth", "target_depth"}:
+            _require_whole_depth(index, plan, request)
+        _warn_of_odd_scenes(index, plan, request)
+        _warn_of_odd_size(index, plan, request)
         self.index = index
         self.plan = plan
         self.left_out = selected - len(plan.scene_rows)
@@ -649,7 +654,7 @@ def _check_of(check: Check, plan: Plan) -> Literal["opened", "metadata"]:
     return check
 
 
-def without_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> Plan:
+def _without_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> Plan:
     """Return a plan without the few scenes that cannot give what is requested.
 
     These lack a video that others have, or a field of them is held up by what is not understood.
@@ -681,28 +686,13 @@ def without_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> Plan:
         )
     if multiprocessing.parent_process() is None:
         message = f"{told} Left out: {', '.join(index.column('key')[sorted(reasons)[:3]])}."
-        warnings.warn(text_without_secrets(message), OddSceneWarning, stacklevel=5)
+        warnings.warn(text_without_secrets(message), OddSceneWarning, stacklevel=4)
     return plan.without(index, sorted(reasons))
 
 
-def check_samples(index: SceneIndex, plan: Plan, request: Request) -> None:
-    """Check, by the index alone, that the samples of a plan can be made as requested.
-
-    Warns with `OddSceneWarning` where rigs are not rectified, or where a scene's cameras state
-    several units of depth, with `SwappedSizeWarning` where height and width look exchanged, and
-    with `EnlargedSizeWarning` where a size is larger than training shards store.
-
-    Raises:
-        StorageError: If the index lacks a video that a sample needs; it names the first scene and
-            the cameras.
-        MediaError: If depth that a sample needs is stored by a codec or pixel format that loses
-            depth, and the request's depth contract does not accept it; it names the first file.
-    """
-    _require_videos(index, plan, request)
-    if request.streams & {"source_depth", "target_depth"}:
-        _require_whole_depth(index, plan, request)
-    _warn_of_odd_scenes(index, plan, request)
-    if request.size is not None and len(plan.scene_rows):
+def _warn_of_odd_size(index: SceneIndex, plan: Plan, request: Request) -> None:
+    """Warn where height and width look exchanged, or exceed what training shards store."""
+    if request.size is not None:
         rig = index.indexed_scene(int(plan.scene_rows[0])).rig
         stored = (rig.image_height_px, rig.image_width_px)
         warn_if_swapped(request.size, stored=stored)
@@ -712,12 +702,16 @@ def check_samples(index: SceneIndex, plan: Plan, request: Request) -> None:
                 f"width) is larger: pictures and depth are enlarged. Leave size out, or pass "
                 f"released data.",
                 EnlargedSizeWarning,
-                stacklevel=5,
+                stacklevel=4,
             )
 
 
 def _require_videos(index: SceneIndex, plan: Plan, request: Request) -> None:
-    """Refuse samples of videos that the index does not have: some cameras alone were downloaded."""
+    """Refuse samples of videos that the index lacks: some cameras alone were downloaded.
+
+    Raises:
+        StorageError: It names the first scene and the cameras.
+    """
     partial = index.video_counts()[plan.scene_rows] < 2 * CAMERA_COUNT
     for place in np.flatnonzero(partial).tolist():
         missing = _missing_videos(index, plan, request, place)
@@ -749,6 +743,9 @@ def _require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> Non
     """Refuse depth that its contract does not accept, or whose unit is not known.
 
     Files that are stored alike are one kind, of which the first is looked at.
+
+    Raises:
+        MediaError: It names the first file.
     """
     pairs = plan.pairs
     cameras = np.concatenate([pairs.source[:, None], pairs.targets], axis=1)
@@ -763,24 +760,21 @@ def _require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> Non
         values, value = index.categories(name)
         kinds = kinds * (len(values) + 1) + value[rows, cameras] + 1
     for first in np.sort(np.unique(kinds, return_index=True)[1]):
-        _require_whole(index.indexed_scene(int(rows[first])), int(cameras[first]), request.depth)
-
-
-def _require_whole(scene: Scene, camera: int, contract: DepthEncoding | None) -> None:
-    held = scene.held_name(depth_name(camera))
-    name = scene.members[held].path
-    if not name.endswith(held):
-        name = f"{name}: {scene.id.key}.{held}"
-    encoding = scene.depth_encoding(camera, contract or depth_of(scene))
-    depth.require_depth_stream(
-        codec=scene.depth_codec[camera],
-        pixel_format=scene.depth_pixel_format[camera],
-        encoding=encoding,
-        name=name,
-    )
-    if encoding.unit_m is None:
-        unknown = f"{name}: {depth.NO_DEPTH_UNIT}. {depth.DEPTH_CURES}"
-        raise MediaError(scene.remark("depth") or unknown)
+        scene, camera = index.indexed_scene(int(rows[first])), int(cameras[first])
+        held = scene.held_name(depth_name(camera))
+        name = scene.members[held].path
+        if not name.endswith(held):
+            name = f"{name}: {scene.id.key}.{held}"
+        encoding = scene.depth_encoding(camera, request.depth or depth_of(scene))
+        depth.require_depth_stream(
+            codec=scene.depth_codec[camera],
+            pixel_format=scene.depth_pixel_format[camera],
+            encoding=encoding,
+            name=name,
+        )
+        if encoding.unit_m is None:
+            unknown = f"{name}: {depth.NO_DEPTH_UNIT}. {depth.DEPTH_CURES}"
+            raise MediaError(scene.remark("depth") or unknown)
 
 
 def _warn_of_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> None:
@@ -823,4 +817,4 @@ def _warn(index: SceneIndex, rows: Any, what: str) -> None:
     if len(rows):
         keys = ", ".join(index.column("key")[rows[:3]])
         text = f"{index.where}: {len(rows)} selected scenes {what}. The first: {keys}."
-        warnings.warn(text, OddSceneWarning, stacklevel=6)
+        warnings.warn(text, OddSceneWarning, stacklevel=5)

@@ -9,10 +9,9 @@ import os
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple, Protocol, Self
 
 from stereogenbench_data.media.seek_table import Position
-from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.selection.plan import Address, Step
 from stereogenbench_data.sources.fetch_ahead import FetchAhead, Wanted
@@ -56,6 +55,13 @@ class NeededFiles(NamedTuple):
     texts: tuple[str, ...]
 
 
+class OpenVideos(Protocol):
+    """How many videos stay open, and how many frames of each are kept."""
+
+    limit: int
+    kept_frames: int
+
+
 class _Planned(NamedTuple):
     """A planned sample, by its number, and the bytes planned for the order up to it."""
 
@@ -67,7 +73,7 @@ class _Planned(NamedTuple):
 class ComingSamples:
     """Plans the bytes of coming samples, and of the one that is read now."""
 
-    def __init__(self, source: MemberSource, ahead: FetchAhead, streams: Streams) -> None:
+    def __init__(self, source: MemberSource, ahead: FetchAhead, streams: OpenVideos) -> None:
         """Plan nothing yet.
 
         Args:

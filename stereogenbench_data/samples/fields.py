@@ -3,8 +3,8 @@
 Shapes are of one frame. A clip puts a time axis T in front; a sweep puts an axis of targets in
 front of that, in the fields that depend on the target. A new field is a new row here.
 
-`Request` is what a dataset asks of every sample. Its size of pictures is (height, width), as arrays
-have it; texts have WIDTHxHEIGHT.
+`Request` is what a dataset asks of every sample, `SampleWriter` writes it. The size of pictures is
+(height, width), as arrays have it; texts have WIDTHxHEIGHT.
 """
 
 import re
@@ -16,10 +16,10 @@ from typing import Any, Final, Literal, Protocol, runtime_checkable
 import numpy as np
 
 from stereogenbench_data.errors import FieldError
-from stereogenbench_data.samples.derive import MapF32, PairSample
-from stereogenbench_data.samples.streams import Views
+from stereogenbench_data.samples.derive import MapF32, PairSample, SceneFacts, Views
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import did_you_mean
+from stereogenbench_data.selection.plan import Address
 
 Sample = dict[str, Any]
 """A flat dict of arrays (tensors, once in torch's hands) and texts, by the names of fields."""
@@ -403,22 +403,140 @@ def parse_request(
     if depth is not None and not isinstance(depth, DepthEncoding):
         raise FieldError(f"depth must be a DepthEncoding(...), got {depth!r}.")
     if transform is not None:
-        _require_transform(transform, kind=kind)
+        says = isinstance(getattr(transform, "swaps_views", None), bool)
+        if not says or not callable(transform) or isinstance(transform, type):
+            raise FieldError(
+                f"a transform is called with (views, generator) and has an attribute swaps_views, "
+                f"True or False; got {transform!r}."
+            )
+        if kind == "views" and transform.swaps_views:
+            raise FieldError(
+                f"SceneViews takes no transform that swaps the two views of a pair, got "
+                f"{transform!r}: leave it out."
+            )
     return Request(kind, names, layout, size, depth, transform)
 
 
-def _require_transform(transform: Any, *, kind: Kind) -> None:
-    says = isinstance(getattr(transform, "swaps_views", None), bool)
-    if not says or not callable(transform) or isinstance(transform, type):
-        raise FieldError(
-            f"a transform is called with (views, generator) and has an attribute swaps_views, True "
-            f"or False; got {transform!r}."
-        )
-    if kind == "views" and transform.swaps_views:
-        raise FieldError(
-            f"SceneViews takes no transform that swaps the two views of a pair, got "
-            f"{transform!r}: leave it out."
-        )
+Allocate = Callable[[str, tuple[int, ...], Any], Any]
+"""Returns the array that a field is written into, of a name, a shape and a dtype."""
+
+
+def new_array(name: str, shape: tuple[int, ...], dtype: Any) -> Any:
+    """Return a new array for a field."""
+    del name
+    return np.empty(shape, dtype=dtype)
+
+
+class SampleWriter:
+    """Writes the fields of one sample, some frames at a time, into arrays that it allocates once.
+
+    Attributes:
+        sample: The fields so far.
+    """
+
+    def __init__(
+        self, request: Request, address: Address, *, clip: Clip, allocate: Allocate
+    ) -> None:
+        """Begin a sample.
+
+        Args:
+            request: Its fields and their layout.
+            address: Its cameras and frames.
+            clip: "clip" where the fields have a time axis, else "frame".
+            allocate: Returns the array of a field; called once for each.
+        """
+        self.sample: Sample = {}
+        known = request.known
+        self._fields = [known[name] for name in request.fields]
+        self._kind = request.kind
+        self._address = address
+        self._is_clip = clip == "clip"
+        self._targets: int | None = None
+        if request.layout == "stacked":
+            self._targets = len(address.targets) + (self._kind == "views")
+        self._allocate = allocate
+
+    def pictures(self, frames: slice, *, size: tuple[int, int]) -> dict[int, Any]:
+        """Return by camera where to decode pictures that are a field exactly as decoded.
+
+        Args:
+            frames: Which frames of the sample.
+            size: Height and width of the pictures.
+        """
+        shape = (len(self._address.frames[frames]), 3, *size)
+        found: dict[int, Any] = {}
+        for each in self._fields:
+            if each.picture_of is None:
+                continue
+            source, targets = self._address.source, self._address.targets
+            shown = (
+                (source,) if each.picture_of == "source" else self._target_cameras(source, targets)
+            )
+            for number, camera in enumerate(shown):
+                found[camera] = self._part(each, number, frames, shape=shape, dtype="u1")
+        return found
+
+    def write(self, views: Views, facts: SceneFacts, frames: slice) -> None:
+        """Write every field for some frames of the sample.
+
+        Args:
+            views: These frames.
+            facts: What is known of their scene.
+            frames: Where they lie on the sample's time axis.
+        """
+        pairs = [
+            PairSample(views, facts, target)
+            for target in self._target_cameras(views.source, views.targets)
+        ]
+        for each in self._fields:
+            for number, pair in enumerate(pairs if each.per_target else pairs[:1]):
+                if each.write is not None:
+                    count, height, width = pair.shape
+                    shape = (count, 1, height, width)
+                    part = self._part(each, number, frames, shape=shape, dtype="f4")
+                    each.write(pair, part[:, 0])
+                elif each.make is not None:
+                    value = each.make(pair)
+                    if each.dtype == "str":
+                        self.sample[each.name] = value
+                        continue
+                    part = self._part(each, number, frames, shape=value.shape, dtype=value.dtype)
+                    # A picture may have been decoded here.
+                    if not np.may_share_memory(value, part):
+                        np.copyto(part, value)
+
+    def _target_cameras(self, source: int, targets: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the cameras along the axis of targets: of views the first is the source itself."""
+        return (source, *targets) if self._kind == "views" else targets
+
+    def _part(
+        self, field: Field, number: int, frames: slice, *, shape: tuple[int, ...], dtype: Any
+    ) -> Any:
+        """Return where a field of one target is written, for some frames.
+
+        Args:
+            field: The field, which is allocated if it is not yet.
+            number: The place of the target on the axis of targets.
+            frames: Which frames of the sample.
+            shape: The shape of what is written, with a time axis in front if it is per frame.
+            dtype: Its dtype.
+
+        Returns:
+            An array of that shape, a view of the whole field.
+        """
+        is_stacked = field.per_target and self._targets is not None
+        if field.name not in self.sample:
+            whole = shape[1:] if field.per_frame else shape
+            if field.per_frame and self._is_clip:
+                whole = (len(self._address.frames), *whole)
+            if is_stacked:
+                whole = (self._targets or 0, *whole)
+            self.sample[field.name] = self._allocate(field.name, whole, np.dtype(dtype))
+        own = self.sample[field.name]
+        own = own[number, ...] if is_stacked else own
+        if not field.per_frame:
+            return own
+        return own[frames] if self._is_clip else own[None]
 
 
 LARGEST_SIDE_PX: Final = 16384

@@ -1,14 +1,25 @@
-"""One sample: decoded, transformed, written; read and decoded only as far as the fields need."""
+"""One sample: decoded, transformed, written; read and decoded only as far as the fields need.
+
+The videos of a process are opened when first needed, decoded forwards, and closed in turn. Samples
+that share a frame (pairs of one moment, fields of one pair) share its decoding: each stream keeps
+its last picture. A stream that fails is closed, and opened again when next needed.
+"""
 
 import copy
+import os
+import threading
 import warnings
+import weakref
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Final, Literal, Self
+from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
+from jaxtyping import UInt8
 
 from stereogenbench_data.errors import (
     MediaError,
@@ -21,11 +32,25 @@ from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.media.depth import depth_frame_index
+from stereogenbench_data.media.depth import (
+    depth_frame_index,
+    measured,
+    open_video,
+    read_depth_units,
+    resized_nearest,
+)
+from stereogenbench_data.media.video import read_rgb, require_indexed_picture
 from stereogenbench_data.samples.coming import ComingSamples, DescribedAhead, NeededFiles
-from stereogenbench_data.samples.derive import PairSample, SceneFacts
-from stereogenbench_data.samples.fields import Clip, Field, OddSceneWarning, Request, Sample
-from stereogenbench_data.samples.streams import StoredDepth, Streams, StreamStats, Views
+from stereogenbench_data.samples.derive import SceneFacts, StoredDepth, Views
+from stereogenbench_data.samples.fields import (
+    Allocate,
+    Clip,
+    OddSceneWarning,
+    Request,
+    Sample,
+    SampleWriter,
+    new_array,
+)
 from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import (
@@ -38,127 +63,263 @@ from stereogenbench_data.selection.plan import Address, Step
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.fetch_ahead import FetchAhead
 from stereogenbench_data.sources.members import MemberSource
+from stereogenbench_data.sources.ranged_file import MemberFile, RangedFile
 
-Allocate = Callable[[str, tuple[int, ...], Any], Any]
-"""Returns the array that a field is written into, of a name, a shape and a dtype."""
+OPEN_STREAMS: Final = 24
+"""How many videos a process keeps open: two scenes with all their cameras' colour and depth."""
+
+_Place = tuple[str, int, int]
+"""Path and offset of a video, and which run of it is read."""
+
+_inherited: Final[list[object]] = []
+"""Readers that came over a fork. They share file offsets with the parent, so they are neither read
+nor closed here: the operating system takes them back when the process ends."""
 
 
-def new_array(name: str, shape: tuple[int, ...], dtype: Any) -> Any:
-    """Return a new array for a field."""
-    del name
-    return np.empty(shape, dtype=dtype)
-
-
-class SampleWriter:
-    """Writes the fields of one sample, some frames at a time, into arrays that it allocates once.
+class StreamStats(NamedTuple):
+    """What a pool has open.
 
     Attributes:
-        sample: The fields so far.
+        videos_open: How many videos.
+        videos_limit: How many at the most.
+    """
+
+    videos_open: int
+    videos_limit: int
+
+
+@dataclass(slots=True)
+class _Stream:
+    """An open video, and what was read of it last.
+
+    Attributes:
+        reader: A `VideoReader` or, of depth that blosc2 packed, `DepthFrames`.
+        file: What it reads.
+        kept: Pictures and stored depth, by their frames.
+        memories: The memory of its last pictures, and weak references to them, the oldest first.
+    """
+
+    reader: Any
+    file: Path | MemberFile
+    kept: OrderedDict[Any, Any] = field(default_factory=OrderedDict)
+    memories: list[tuple[memoryview, Callable[[], object]]] = field(default_factory=list)
+
+    def keep(self, key: Any, make: Callable[[], Any], *, most: int) -> Any:
+        """Return what is kept under a key, made now unless it is there; the oldest makes room."""
+        if key not in self.kept:
+            while len(self.kept) >= most:
+                self.kept.popitem(last=False)
+            self.kept[key] = make()
+        return self.kept[key]
+
+    def picture(self, *, height: int, width: int, most: int) -> UInt8[np.ndarray, "3 h w"]:
+        """Return an array to write a picture into, of any content.
+
+        It lies in the memory of an earlier picture that nobody holds. New memory costs more than
+        what is written into it: the system clears it first. A weak reference shows whether anybody
+        holds a picture, or a view or tensor of it. Where an interpreter frees objects late, the
+        next picture gets memory of its own.
+        """
+        size = 3 * height * width
+        memory = np.empty(0, dtype=np.uint8).data
+        if len(self.memories) >= most:
+            memory, held = self.memories.pop(0)
+            memory = memory if held() is None else memory[:0]
+        if memory.nbytes != size:
+            memory = np.empty(size, dtype=np.uint8).data
+        # All views of the picture are based on this array, and none on what is below it.
+        base = np.frombuffer(memory, dtype=np.uint8)
+        self.memories.append((memory, weakref.ref(base)))
+        return base.reshape(3, height, width)
+
+    def close(self) -> None:
+        self.reader.close()
+        if isinstance(self.file, MemberFile):
+            self.file.close()
+
+
+class Streams:
+    """A pool of open videos that survives fork and spawn: each process opens its own.
+
+    Threads of one process take turns. Pictures and depth come back read-only, because the pool may
+    hand out the same ones again.
+
+    Attributes:
+        limit: How many videos it keeps open.
+        kept_frames: How many frames of each it keeps.
     """
 
     def __init__(
-        self, request: Request, address: Address, *, clip: Clip, allocate: Allocate
+        self, source: MemberSource, *, limit: int = OPEN_STREAMS, kept_frames: int = 1
     ) -> None:
-        """Begin a sample.
+        """Open videos from a source; none is opened yet."""
+        self._source = source
+        self.limit = limit
+        self.kept_frames = kept_frames
+        self._open: OrderedDict[_Place, _Stream] = OrderedDict()
+        self._lock = threading.RLock()
+        self._process = os.getpid()
+
+    def rgb(
+        self,
+        scene: Scene,
+        name: str,
+        index: int,
+        *,
+        size: tuple[int, int] | None = None,
+        out: UInt8[np.ndarray, "3 h w"] | None = None,
+        run: int = 0,
+    ) -> UInt8[np.ndarray, "3 h w"]:
+        """Return one frame of a scene's video as RGB.
 
         Args:
-            request: Its fields and their layout.
-            address: Its cameras and frames.
-            clip: "clip" where the fields have a time axis, else "frame".
-            allocate: Returns the array of a field; called once for each.
-        """
-        self.sample: Sample = {}
-        known = request.known
-        self._fields = [known[name] for name in request.fields]
-        self._kind = request.kind
-        self._address = address
-        self._is_clip = clip == "clip"
-        self._targets: int | None = None
-        if request.layout == "stacked":
-            self._targets = len(address.targets) + (self._kind == "views")
-        self._allocate = allocate
+            scene: The scene.
+            name: The video, such as "cam_00_rgb.mp4".
+            index: Which frame.
+            size: (height, width) to scale it to, None for the stored size.
+            out: Where to write it, scaled to fit: for pictures that are needed once, which the pool
+                does not keep.
+            run: Each run of a video has a decoder of its own, so that several can be read by turns.
 
-    def pictures(self, frames: slice, *, size: tuple[int, int]) -> dict[int, Any]:
-        """Return by camera where to decode pictures that are a field exactly as decoded.
+        Raises:
+            StorageError: If the video cannot be read.
+            MediaError: If it does not decode to the scene's number of colour pictures.
+        """
+        most = self.kept_frames
+        height, width = size or (scene.rig.image_height_px, scene.rig.image_width_px)
+        with self._stream(scene, name, run) as stream:
+            if out is not None:
+                shape = (out.shape[-2], out.shape[-1])
+                read_rgb(stream.reader, index, size=shape, out=out, content="colour")
+                return out
+
+            def read() -> Any:
+                place = stream.picture(height=height, width=width, most=most)
+                return _read_only(
+                    read_rgb(stream.reader, index, size=size, out=place, content="colour")
+                )
+
+            kept: UInt8[np.ndarray, "3 h w"] = stream.keep((index, size), read, most=most)
+            return kept
+
+    def read_stored_depth(
+        self,
+        scene: Scene,
+        name: str,
+        index: int,
+        *,
+        encoding: DepthEncoding,
+        size: tuple[int, int] | None = None,
+        run: int = 0,
+    ) -> StoredDepth:
+        """Return one depth frame of a scene's video, (h, w): stored numbers, where measured.
 
         Args:
-            frames: Which frames of the sample.
-            size: Height and width of the pictures.
+            scene: The scene.
+            name: The video, such as "cam_00_depth.mkv".
+            index: Which frame of the file; `depth_frame_index` tells which an RGB frame needs.
+            encoding: The depth contract.
+            size: (height, width) to take the nearest pixels of, None for the stored size.
+            run: As for `rgb`.
+
+        Raises:
+            StorageError: If the video cannot be read.
+            MediaError: If it is not one that the encoding describes or does not decode.
         """
-        shape = (len(self._address.frames[frames]), 3, *size)
-        found: dict[int, Any] = {}
-        for field in self._fields:
-            if field.picture_of is None:
-                continue
-            source, targets = self._address.source, self._address.targets
-            shown = (
-                (source,) if field.picture_of == "source" else self._target_cameras(source, targets)
-            )
-            for number, camera in enumerate(shown):
-                found[camera] = self._part(field, number, frames, shape=shape, dtype="u1")
-        return found
+        with self._stream(scene, name, run) as stream:
 
-    def write(self, views: Views, facts: SceneFacts, frames: slice) -> None:
-        """Write every field for some frames of the sample.
+            def read() -> StoredDepth:
+                units = read_depth_units(stream.reader, index, encoding=encoding)
+                if size is not None:
+                    units = resized_nearest(units, size=size)
+                pixel_format = stream.reader.facts.pixel_format
+                known = measured(units, encoding=encoding, pixel_format=pixel_format)
+                return StoredDepth(_read_only(units), known)
 
-        Args:
-            views: These frames.
-            facts: What is known of their scene.
-            frames: Where they lie on the sample's time axis.
-        """
-        pairs = [
-            PairSample(views, facts, target)
-            for target in self._target_cameras(views.source, views.targets)
-        ]
-        for field in self._fields:
-            for number, pair in enumerate(pairs if field.per_target else pairs[:1]):
-                if field.write is not None:
-                    count, height, width = pair.shape
-                    shape = (count, 1, height, width)
-                    part = self._part(field, number, frames, shape=shape, dtype="f4")
-                    field.write(pair, part[:, 0])
-                elif field.make is not None:
-                    value = field.make(pair)
-                    if field.dtype == "str":
-                        self.sample[field.name] = value
-                        continue
-                    part = self._part(field, number, frames, shape=value.shape, dtype=value.dtype)
-                    # A picture may have been decoded here.
-                    if not np.may_share_memory(value, part):
-                        np.copyto(part, value)
+            kept: StoredDepth = stream.keep((index, size, encoding), read, most=self.kept_frames)
+            return kept
 
-    def _target_cameras(self, source: int, targets: tuple[int, ...]) -> tuple[int, ...]:
-        """Return the cameras along the axis of targets: of views the first is the source itself."""
-        return (source, *targets) if self._kind == "views" else targets
+    @property
+    def stats(self) -> "StreamStats":
+        """What this process has open."""
+        is_own = os.getpid() == self._process
+        return StreamStats(len(self._open) if is_own else 0, self.limit)
 
-    def _part(
-        self, field: Field, number: int, frames: slice, *, shape: tuple[int, ...], dtype: Any
-    ) -> Any:
-        """Return where a field of one target is written, for some frames.
+    def release(self, scene: Scene, *, run: int = 0) -> None:
+        """Close the videos of a scene's run, of which no more is wanted for now."""
+        self._drop_inherited()
+        with self._lock:
+            for member in scene.members.values():
+                stream = self._open.pop((member.path, member.offset, run), None)
+                if stream is not None:
+                    stream.close()
 
-        Args:
-            field: The field, which is allocated if it is not yet.
-            number: The place of the target on the axis of targets.
-            frames: Which frames of the sample.
-            shape: The shape of what is written, with a time axis in front if it is per frame.
-            dtype: Its dtype.
+    def close(self) -> None:
+        """Close every video; the pool can be used again."""
+        self._drop_inherited()
+        with self._lock:
+            while self._open:
+                self._open.popitem()[1].close()
 
-        Returns:
-            An array of that shape, a view of the whole field.
-        """
-        is_stacked = field.per_target and self._targets is not None
-        if field.name not in self.sample:
-            whole = shape[1:] if field.per_frame else shape
-            if field.per_frame and self._is_clip:
-                whole = (len(self._address.frames), *whole)
-            if is_stacked:
-                whole = (self._targets or 0, *whole)
-            self.sample[field.name] = self._allocate(field.name, whole, np.dtype(dtype))
-        own = self.sample[field.name]
-        own = own[number, ...] if is_stacked else own
-        if not field.per_frame:
-            return own
-        return own[frames] if self._is_clip else own[None]
+    @contextmanager
+    def _stream(self, scene: Scene, name: str, run: int) -> Iterator[_Stream]:
+        """Yield an open video; it stays open unless reading it fails."""
+        self._drop_inherited()
+        with self._lock:
+            member, name = scene.member(name), scene.held_name(name)
+            place = (member.path, member.offset, run)
+            if place not in self._open:
+                while len(self._open) >= self.limit:
+                    self._open.popitem(last=False)[1].close()
+                file = self._source.open(scene, name)
+                with _cause_raised(file):
+                    label = self._source.label(scene, name)
+                    reader = open_video(file, name=label, frames=scene.frames)
+                    try:
+                        require_indexed_picture(reader, scene.rig)
+                    except MediaError:
+                        reader.close()
+                        raise
+                self._open[place] = _Stream(reader, file)
+            self._open.move_to_end(place)
+            stream = self._open[place]
+            try:
+                with _cause_raised(stream.file):
+                    yield stream
+            except (MediaError, StorageError):
+                self._open.pop(place).close()
+                raise
+
+    def _drop_inherited(self) -> None:
+        if os.getpid() != self._process:
+            _inherited.append(self._open)
+            self._open = OrderedDict()
+            self._lock = threading.RLock()
+            self._process = os.getpid()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what another process makes a pool of its own from."""
+        again = partial(Streams, limit=self.limit, kept_frames=self.kept_frames)
+        return again, (self._source,)
+
+
+def _read_only(picture: Any) -> Any:
+    picture.flags.writeable = False
+    return picture
+
+
+@contextmanager
+def _cause_raised(file: Path | MemberFile) -> Iterator[None]:
+    """Raise the failed fetch that made a video fail, if there was one, and close the file."""
+    try:
+        yield
+    except (MediaError, StorageError) as error:
+        if isinstance(file, MemberFile):
+            file.close()
+        failure = file.failure if isinstance(file, RangedFile) else None
+        if failure is None or failure is error:
+            raise
+        raise failure from error
 
 
 KEPT_POSES: Final = 32
@@ -249,7 +410,7 @@ class SampleLoader:
         """What this process has open."""
         return self._streams.stats
 
-    def copy(self) -> Self:
+    def copy(self) -> "SampleLoader":
         """Return a loader of the same samples with open videos of its own."""
         twin = copy.copy(self)
         if self._ahead is not None:

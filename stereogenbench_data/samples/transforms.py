@@ -19,8 +19,8 @@ import torch
 
 from stereogenbench_data.errors import FieldError
 from stereogenbench_data.media.depth import resized_nearest
+from stereogenbench_data.samples.derive import StoredDepth, Views
 from stereogenbench_data.samples.fields import Transform
-from stereogenbench_data.samples.streams import StoredDepth, Views
 
 Generator = np.random.Generator
 

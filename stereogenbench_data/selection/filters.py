@@ -153,13 +153,8 @@ class SceneFilters(TypedDict, total=False):
     caption: str | None
 
 
-_TEXT_COLUMNS = {
-    "split": "split",
-    "subset": "subset",
-    "family": "family",
+_TEXT_COLUMNS = {name: name for name in ("split", "subset", "family", "character", "animation")} | {
     "map": "map_name",
-    "character": "character",
-    "animation": "animation",
     "scenes": "key",
 }
 _RANGE_COLUMNS = ("focal_mm", "valid_depth_ratio")
@@ -235,9 +230,10 @@ def _apply(
         column = index.column(_TEXT_COLUMNS[name])
         values = column[rows]
         names = _texts(name, wanted)
-        if name == "scenes":
-            names = _whole_keys(index, names)
-        nowhere = sorted(set(names) - set(column.tolist()))
+        known = set(column.tolist())
+        if name == "scenes":  # parts of keys stand for whole ones
+            names = [key if key in known else str(column[find_scene(index, key)]) for key in names]
+        nowhere = sorted(set(names) - known)
         if nowhere and len(nowhere) < len(set(names)):
             raise SelectionError(
                 f"{filter_text(name, nowhere[0])} matches none of {counted(len(column), 'scene')} "
@@ -261,10 +257,19 @@ def _apply(
             raise SelectionError(f"min_frames must be a whole number from 1, got {wanted!r}.")
         return frames >= wanted, lambda: f"{frames.min()} to {frames.max()}."
     if name == "caption":
-        return _caption_filter(index, wanted, rows=rows)
-    known = SceneFilters.__annotations__
+        if not isinstance(wanted, str) or not wanted.split():
+            raise SelectionError(f"caption must be one or more words, got {wanted!r}.")
+        words = wanted.lower().split()
+        captions = [str(caption).lower() for caption in index.column("caption")[rows]]
+        keep = np.array(
+            [all(word in caption for word in words) for caption in captions], dtype=bool
+        )
+        written = counted(sum(map(bool, captions)), "scene")
+        every = "all of " * (len(words) > 1) + ", ".join(map(_quoted, words))
+        return keep, lambda: f"captions of {written}, none with {every}."
+    filters = SceneFilters.__annotations__
     raise SelectionError(
-        f"there is no filter {name!r}{did_you_mean(name, known)} There are {', '.join(known)}."
+        f"there is no filter {name!r}{did_you_mean(name, filters)} There are {', '.join(filters)}."
     )
 
 
@@ -287,28 +292,6 @@ def _quoted(value: Any) -> str:
         return f"{value:g}"
     is_plain = isinstance(value, str) and _PLAIN.fullmatch(value)
     return shortened(value if is_plain else repr(value), _LONGEST_SHOWN)
-
-
-def _whole_keys(index: SceneIndex, names: list[str]) -> list[str]:
-    """Return keys of scenes in place of parts of keys."""
-    known = set(index.column("key").tolist())
-    return [
-        name if name in known else str(index.column("key")[find_scene(index, name)])
-        for name in names
-    ]
-
-
-def _caption_filter(
-    index: SceneIndex, wanted: Any, *, rows: Int64[np.ndarray, " n"]
-) -> tuple[Bool[np.ndarray, " n"], Callable[[], str]]:
-    if not isinstance(wanted, str) or not wanted.split():
-        raise SelectionError(f"caption must be one or more words, got {wanted!r}.")
-    words = wanted.lower().split()
-    captions = [str(caption).lower() for caption in index.column("caption")[rows]]
-    keep = np.array([all(word in caption for word in words) for caption in captions], dtype=bool)
-    written = sum(map(bool, captions))
-    all_words = f"all of {', '.join(map(_quoted, words))}" if len(words) > 1 else _quoted(words[0])
-    return keep, lambda: f"captions of {counted(written, 'scene')}, none with {all_words}."
 
 
 def require_range(name: str, wanted: Any) -> Range:

@@ -217,11 +217,6 @@ class EpochOrder:
         again = [self.batch(place // size)[place % size] for place in places.tolist()]
         return np.concatenate([own, np.array(again, dtype=np.int64)])
 
-    def group(self, group: int) -> Numbers:
-        """Return all samples of a shuffle group, in its order."""
-        found = self._group(group)
-        return found.samples(0, found.length)[0]
-
     def _batch(self, number: int) -> tuple[Numbers, Bool[np.ndarray, " n"]]:
         if not 0 <= number < self.batches:
             raise IndexError(f"no batch {number}: the epoch has {self.batches}")
@@ -249,7 +244,11 @@ class EpochOrder:
 
     def _pieces(self, group: int) -> "_Pieces":
         """Return the runs of a group, the first and last of which may be cut."""
-        cuts = np.concatenate([[0], np.cumsum(self._group_sizes())])
+        # Whole batches, but for the epoch's last.
+        size = self.rule.batch_size
+        sizes = (self.batches - np.arange(self.groups) + self.groups - 1) // self.groups * size
+        sizes[(self.batches - 1) % self.groups] -= self.batches * size - self.samples
+        cuts = np.concatenate([[0], np.cumsum(sizes)])
         low, high = int(cuts[group]), int(cuts[group + 1])
         if low == high:
             return _Pieces(*np.empty((3, 0), dtype=np.int64))
@@ -262,14 +261,6 @@ class EpochOrder:
         stops[-1] -= int(ends[last]) - high
         begins[0] = low - (int(ends[first - 1]) if first else 0)
         return _Pieces(inside, begins, stops)
-
-    def _group_sizes(self) -> Numbers:
-        """Return how many samples each group has: whole batches, but for the epoch's last."""
-        size = self.rule.batch_size
-        turns = (self.batches - np.arange(self.groups) + self.groups - 1) // self.groups
-        sizes: Numbers = turns * size
-        sizes[(self.batches - 1) % self.groups] -= self.batches * size - self.samples
-        return sizes
 
     def raw(self, count: int, *, part: int) -> UInt64[np.ndarray, " n"]:
         """Return random numbers of a part of the epoch."""
@@ -304,7 +295,9 @@ class _Group:
         self._rule = order.rule
         self.length = int((pieces.stop - pieces.begin).sum())
         count = order.rule.streams_of(len(pieces.run))
-        draws = _uniform(order.raw(3 * count, part=group + 1)).reshape(3, count)
+        # Numbers from 0 up to 1, made of the upper 53 bits.
+        raw = order.raw(3 * count, part=group + 1).reshape(3, count)
+        draws = (raw >> np.uint64(11)) * 2.0**-53
         self._offset, self._drift = draws[0], DRIFT * (2 * draws[1] - 1)
         self._salt = int(order.raw(1, part=-1)[0])
         streams = [pieces.take(found) for found in _dealt(pieces, streams=count)]
@@ -344,9 +337,11 @@ class _Group:
             ):
                 places = np.arange(low, high)
                 times.append(self._times(stream, places))
-                found, is_last = self._samples_of(stream, places)
-                samples.append(found)
-                ends.append(is_last)
+                pieces, stops = self._streams[stream], self._ends[stream]
+                piece = np.searchsorted(stops, places, side="right")
+                place = pieces.stop[piece] - (stops[piece] - places)
+                samples.append(self._in_run(pieces.run[piece], place))
+                ends.append(places + 1 == stops[piece])
             merged = np.argsort(np.concatenate(times), kind="stable")
             self._chunks[number] = np.concatenate(samples)[merged], np.concatenate(ends)[merged]
         return self._chunks[number]
@@ -374,14 +369,6 @@ class _Group:
             before += early
         none = np.zeros((1, len(self._lengths)), dtype=np.int64)
         return np.concatenate([none, before, self._lengths[None]])
-
-    def _samples_of(self, stream: int, places: Numbers) -> tuple[Numbers, Bool[np.ndarray, " n"]]:
-        """Return the samples at places of a stream, and which are the last of their piece."""
-        pieces, ends = self._streams[stream], self._ends[stream]
-        piece = np.searchsorted(ends, places, side="right")
-        place = pieces.stop[piece] - (ends[piece] - places)
-        run = pieces.run[piece]
-        return self._in_run(run, place), places + 1 == ends[piece]
 
     def _in_run(self, run: Numbers, place: Numbers) -> Numbers:
         """Return the sample at a place of a run: blocks of moments, each pair by pair.
@@ -471,9 +458,3 @@ def _dealt(pieces: _Pieces, *, streams: int) -> list[Numbers]:
         heapq.heapreplace(loads, (load + int(lengths[piece]), number))
         dealt[number].append(piece)
     return [np.sort(np.array(own, dtype=np.int64)) for own in dealt]
-
-
-def _uniform(raw: UInt64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """Return numbers from 0 up to 1 made of the upper 53 bits."""
-    uniform: Float64[np.ndarray, " n"] = (raw >> np.uint64(11)) * 2.0**-53
-    return uniform

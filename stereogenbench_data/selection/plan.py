@@ -14,7 +14,7 @@ import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
-from typing import Any, Final, Literal, NamedTuple, TypedDict, Unpack, cast
+from typing import Any, Final, Literal, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -32,6 +32,7 @@ from stereogenbench_data.selection.filters import (
     baselines_cm,
     choose_pairs,
     filter_scenes,
+    split_options,
 )
 from stereogenbench_data.selection.order import Runs
 
@@ -321,40 +322,31 @@ def parse_frames(spec: Any) -> Windows:
     """
     if isinstance(spec, Windows):
         return spec
-    if isinstance(spec, str):
-        named: dict[str, Windows] = {"first": Chosen((0,)), "all": Every(1)}
-        if spec in named:
-            return named[spec]
-    elif isinstance(spec, int | np.integer):
-        return Chosen((_whole(spec, least=0),))
-    elif isinstance(spec, Sequence) and len(spec) > 0 and isinstance(spec[0], str):
-        found = _of_kind(spec[0], [_whole(number, least=1) for number in spec[1:]])
-        if found is not None:
-            return found
-    elif isinstance(spec, Sequence | np.ndarray) and len(spec) > 0:
-        frames = tuple(_whole(number, least=0) for number in spec)
-        if len(set(frames)) < len(frames):
-            raise SelectionError(f"frames={spec!r} names a frame twice.")
-        return Chosen(tuple(sorted(frames)))
+    if isinstance(spec, str) and spec in ("first", "all"):
+        return Every(1) if spec == "all" else Chosen((0,))
+    parts = [spec] if isinstance(spec, str | int | np.integer) else spec
+    if isinstance(parts, Sequence | np.ndarray) and len(parts) > 0:
+        if not isinstance(parts[0], str):
+            frames = tuple(_whole(number, least=0) for number in parts)
+            if len(set(frames)) < len(frames):
+                raise SelectionError(f"frames={spec!r} names a frame twice.")
+            return Chosen(tuple(sorted(frames)))
+        match parts[0], [_whole(number, least=1) for number in parts[1:]]:
+            case "every", [step]:
+                return Every(step)
+            case "random", [n]:
+                return Random(n)
+            case "clips", [length, *more] if len(more) <= 2:
+                stride = more[0] if more else 1
+                step = more[1] if len(more) == 2 else (length - 1) * stride + 1
+                return Clips(length, stride, step)
+            case "random clips", [n, length, *more] if len(more) <= 1:
+                return Random(n, Clips(length, more[0] if more else 1))
     raise SelectionError(
         f"frames={spec!r} is not understood; use 'first', 'all', a frame number, a list of them, "
         "('every', k), ('random', n), ('clips', length, stride, step) or ('random clips', n, "
         "length, stride)."
     )
-
-
-def _of_kind(kind: str, numbers: list[int]) -> Windows | None:
-    match kind, numbers:
-        case "every", [step]:
-            return Every(step)
-        case "random", [n]:
-            return Random(n)
-        case "clips", [length, *more] if len(more) <= 2:
-            stride = more[0] if more else 1
-            return Clips(length, stride, more[1] if len(more) == 2 else (length - 1) * stride + 1)
-        case "random clips", [n, length, *more] if len(more) <= 1:
-            return Random(n, Clips(length, more[0] if more else 1))
-    return None
 
 
 def _whole(number: Any, *, least: int) -> int:
@@ -510,15 +502,11 @@ def plan_pairs(index: SceneIndex, *, seed: int = 0, **selection: Unpack[Selectio
             seed is not a whole number from 0.
     """
     seed = _require_seed(seed)
-    options: dict[str, Any] = dict(selection)
-    windows = parse_frames(options.pop("frames", "first"))
-    balance, limit = options.pop("balance", None), options.pop("limit", None)
-    chosen = {
-        name: options.pop(name) for name in ("pairs", "direction", "baseline_cm") if name in options
-    }
+    chosen, filters = split_options(selection, PairOptions)
+    windows = parse_frames(filters.pop("frames", "first"))
+    balance, limit = chosen.pop("balance", None), chosen.pop("limit", None)
     # What is left are filters, whose names and values are checked there.
-    rows = filter_scenes(index, cast("SceneFilters", options))
-    pairs = choose_pairs(index, rows, **chosen)
+    pairs = choose_pairs(index, filter_scenes(index, filters), **chosen)
     if balance is not None:
         if pairs.targets.shape[1] != 1:
             raise SelectionError(f"balance={balance!r} needs single pairs, not a sweep.")
@@ -592,9 +580,7 @@ def _plan(index: SceneIndex, pairs: PairList, *, windows: Windows, seed: int) ->
     pairs_of = np.diff(first_pair)
     kinds, kind_of_row = index.key_frames()
     kind = kind_of_row[scene_rows]
-    per_scene = np.empty(len(scene_rows), dtype=np.int64)
-    run_counts = np.empty(len(scene_rows), dtype=np.int64)
-    key_distances = np.empty(len(scene_rows), dtype=np.int64)
+    per_scene, run_counts, key_distances = np.empty((3, len(scene_rows)), dtype=np.int64)
     classes: list[tuple[np.ndarray, tuple[int, ...]]] = []
     for frames, which in sorted(set(zip(frame_counts.tolist(), kind.tolist(), strict=True))):
         same = (frame_counts == frames) & (kind == which)

@@ -26,9 +26,8 @@ from stereogenbench_data import (
 from stereogenbench_data.datasets.batch_buffers import to_tensors
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
-from stereogenbench_data.samples.fields import Request
-from stereogenbench_data.samples.load import SampleWriter, new_array
-from stereogenbench_data.samples.streams import StoredDepth, Views
+from stereogenbench_data.samples.derive import StoredDepth, Views
+from stereogenbench_data.samples.fields import Request, SampleWriter, new_array
 from stereogenbench_data.schema.records import Trajectory
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from stereogenbench_data.selection.plan import Address

@@ -5,8 +5,13 @@ import pytest
 
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
-from stereogenbench_data.samples.derive import PairGeometry, PairSample, SceneFacts
-from stereogenbench_data.samples.streams import StoredDepth, Views
+from stereogenbench_data.samples.derive import (
+    PairGeometry,
+    PairSample,
+    SceneFacts,
+    StoredDepth,
+    Views,
+)
 from stereogenbench_data.schema.records import (
     DepthEncoding,
     Rig,

@@ -24,8 +24,8 @@ from stereogenbench_data import (
 )
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.media.depth import resized_nearest
+from stereogenbench_data.samples.derive import StoredDepth, Views
 from stereogenbench_data.samples.fields import PAIR_FIELDS
-from stereogenbench_data.samples.streams import StoredDepth, Views
 
 FIELDS = (
     "left", "right", "disparity", "valid", "visible", "depth", "disparity_right", "valid_right",

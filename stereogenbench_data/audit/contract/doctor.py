@@ -31,7 +31,7 @@ from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.evidence import shape_of
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.streams import Streams
+from stereogenbench_data.samples.load import Streams
 from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import TRAJECTORY_JSON

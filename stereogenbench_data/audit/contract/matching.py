@@ -22,7 +22,7 @@ from stereogenbench_data.audit.contract.hypotheses import LAGS, Flip, Hypothesis
 from stereogenbench_data.audit.geometry.picture_check import Luma, band_passed, luma_of
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
-from stereogenbench_data.samples.streams import Streams
+from stereogenbench_data.samples.load import Streams
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,

@@ -43,7 +43,7 @@ from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.index.evidence import poses_as
 from stereogenbench_data.media.depth import NO_DEPTH_UNIT, depth_frame_index
 from stereogenbench_data.media.video import probe
-from stereogenbench_data.samples.streams import Streams
+from stereogenbench_data.samples.load import Streams
 from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.document import parse_document
 from stereogenbench_data.schema.records import DepthEncoding, Scene

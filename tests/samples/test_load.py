@@ -10,7 +10,7 @@ import torch
 
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.streams import Streams
+from stereogenbench_data.samples.load import Streams
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.sources.members import MemberSource
 
