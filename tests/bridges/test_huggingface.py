@@ -174,13 +174,6 @@ def test_a_scene_of_many_samples_is_mapped_in_batches_of_one(urls):
         next(iter(rows.map(decoder)))
 
 
-def test_videos_that_datasets_decoded_are_refused(urls):
-    row = next(iter(raw(urls))) | {"cam_00_depth.mkv": object()}
-
-    with pytest.raises(StorageError, match=r"cam_00_depth\.mkv must be bytes, found object"):
-        huggingface.decode(FIELDS)(row)
-
-
 def test_without_datasets_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "datasets", None)
 

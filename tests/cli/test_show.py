@@ -49,8 +49,6 @@ def test_a_clip_is_written_by_the_ending_of_its_name(small_shards, tmp_path, nam
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (["scene_00001"], "Did you mean train/Uniform/SynthStage/scene_000001"),
-        (["scene_000000"], "is a part of 3 keys"),
         ([SCENE, "--frame", "7"], "has no frame 7: its 7 are 0 to 6"),
         ([SCENE, "-o", "sheet.jpg"], "a sheet is .png"),
         ([SCENE, "-o", "clip.avi"], "a clip .mp4 or .gif"),

@@ -1,9 +1,10 @@
-"""Runs an example under torchrun, notes the samples that it takes, and kills it after some batches.
+"""Runs an example as two ranks, notes the samples that they take, and kills each after 9 batches.
 
-python watched.py NOTES BATCHES EXAMPLE
+python -m tests.examples.watched FOLDER EXAMPLE
 
-The batches of training samples that a torch DataLoader gives become NOTES.RANK, a list of the names
-of each one's samples. After so many batches the process kills itself; 0 is never.
+Then it runs the example once more, to its end. The batches of training samples that a torch
+DataLoader gives become FOLDER/killed.RANK and FOLDER/done.RANK, a list of the names of each one's
+samples, and FOLDER/ends.json says how the ranks of both runs ended.
 """
 
 import json
@@ -13,7 +14,13 @@ import signal
 import sys
 from pathlib import Path
 
+from torch.nn import parallel
 from torch.utils.data import dataloader
+
+from stereogenbench_data.datasets import loader
+from tests.frameworks.forked import forked_ranks
+
+IMPORTED_FOR_BOTH = (loader, parallel)
 
 
 def names_of(batch):
@@ -21,9 +28,7 @@ def names_of(batch):
     return [f"{scene} {pair} {frame}" for scene, pair, frame in facts]
 
 
-def main():
-    notes, batches, example = sys.argv[1:]
-    sys.argv[:] = [example]
+def watch(notes, example, batches):
     take = dataloader._BaseDataLoaderIter.__next__
     taken = []
 
@@ -31,13 +36,19 @@ def main():
         batch = take(self)
         taken.append(names_of(batch))
         Path(f"{notes}.{os.environ['RANK']}").write_text(json.dumps(taken))
-        if len(taken) == int(batches):
+        if len(taken) == batches:
             os.kill(os.getpid(), signal.SIGKILL)
         return batch
 
     dataloader._BaseDataLoaderIter.__next__ = noted
+    sys.argv[:] = [example]
     runpy.run_path(example, run_name="__main__")
 
 
 if __name__ == "__main__":
-    main()
+    folder, example = sys.argv[1:]
+    os.chdir(folder)
+    ends = [
+        forked_ranks(watch, name, example, count) for name, count in (("killed", 9), ("done", 0))
+    ]
+    Path("ends.json").write_text(json.dumps(ends))

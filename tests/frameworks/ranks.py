@@ -1,8 +1,10 @@
-"""One of two ranks under torchrun: train with Accelerate, Lightning and Hugging Face's Trainer."""
+"""Two ranks train with Accelerate, Lightning and Hugging Face's Trainer."""
 
 import json
+import os
 import sys
 import warnings
+from importlib import import_module
 from pathlib import Path
 
 import torch
@@ -11,6 +13,7 @@ from torch.utils.data import DataLoader
 
 from stereogenbench_data import EpochBatches, SelectionError, StereoPairStream
 from tests.frameworks import runs
+from tests.frameworks.forked import forked_ranks
 
 
 def accelerate_steps(data, folder):
@@ -60,8 +63,7 @@ def refusals(data):
     return said
 
 
-def main():
-    data, folder = sys.argv[1], Path(sys.argv[2])
+def train(data, folder):
     warnings.simplefilter("ignore")
     found = {"accelerate": accelerate_steps(data, folder), "refused": refusals(data)}
     pairs = runs.random_frames(data)
@@ -81,4 +83,6 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    os.environ["HF_HUB_OFFLINE"] = "1"
+    import_module("transformers.trainer")  # once for both
+    sys.exit(any(forked_ranks(train, sys.argv[1], Path(sys.argv[2]))))

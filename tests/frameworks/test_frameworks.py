@@ -26,13 +26,9 @@ pytestmark = [
 def ranks(indexed_release, tmp_path_factory):
     """What two real processes found, by rank."""
     out = tmp_path_factory.mktemp("ranks")
-    script = "import runpy; runpy.run_module('tests.frameworks.ranks', run_name='__main__')"
-    (out / "run.py").write_text(script)
     ended = subprocess.run(
-        [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2",
-         out / "run.py", indexed_release, out],
-        capture_output=True, text=True, timeout=240, check=False,
-        env={**__import__("os").environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+        [sys.executable, "-m", "tests.frameworks.ranks", indexed_release, out],
+        cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=240, check=False,
     )  # fmt: skip
     assert ended.returncode == 0, ended.stderr
     return [json.loads((out / f"rank{rank}.json").read_text()) for rank in range(2)]

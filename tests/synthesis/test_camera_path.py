@@ -1,11 +1,10 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stereogenbench_data.synthesis.planning import plan_scene, propose
+from stereogenbench_data.synthesis.planning import propose
 from stereogenbench_data.synthesis.renderer import ScenePlan, Spawn
 from stereogenbench_data.synthesis.request import SynthRequest
 
@@ -28,18 +27,6 @@ def test_centres_keep_their_distances_at_any_offset(rotator_deg, offset_cm):
 
     distances_cm = np.linalg.norm(centres_cm[1:] - centres_cm[:-1], axis=1)
     np.testing.assert_allclose(distances_cm, np.diff(places_cm), rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("family", ["IPD_Gaussian", "Uniform", "Pairwise_Uniform"])
-def test_a_path_moves_and_is_smooth(family):
-    plan = plan_scene(SynthRequest(family=family), index=0)[0]
-
-    turns = np.diff(np.unwrap(plan.rotators_deg, axis=0, period=360), axis=0)
-    assert plan.centres_m.shape == plan.rotators_deg.shape == (81, 3)
-    assert np.abs(turns).max() < 2.5
-    assert np.abs(np.diff(turns, axis=0)).max() < 0.4
-    assert np.ptp(plan.rotators_deg[:, 2]) > 1
-    assert np.linalg.norm(np.diff(plan.centres_m, axis=0), axis=1).max() < 0.25
 
 
 def test_focal_lengths_are_proposed_over_the_range_of_the_release():

@@ -7,17 +7,19 @@ from tests.cli.command import invoke, one_line
 SMALL = ("--size", "32", "--frames", "1", "--workers", "1")
 
 
-def test_the_command_writes_scenes_and_says_where(tmp_path):
-    options = ["--family", "Uniform", "--scenes", "2", "--map", "Downtown_West"]
-    contract = ["--depth-unit-m", "0.1"]
+def test_the_command_plans_then_writes_scenes_and_says_where(tmp_path):
+    options = ["--family", "Uniform", "--scenes", "2", "--map", "all"]
+    planned = invoke("synth", tmp_path, *SMALL, *options, "--plan-only")
+    assert "all maps" in planned.stdout
+    assert not list(tmp_path.iterdir())
 
-    result = invoke("synth", tmp_path, *SMALL, *options, *contract)
+    result = invoke("synth", tmp_path, *SMALL, *options, "--part", "1/2", "--depth-unit-m", "0.1")
 
     assert result.exit_code == 0
-    assert f"{tmp_path}: 2 scenes in train/Uniform/Downtown_West" in result.stdout
-    assert "12/12" in result.stderr
-    first, _ = tmp_path.rglob("_scene_complete.json")
-    assert "depth_unit_m=0.1, " in first.read_text()
+    assert f"{tmp_path}: 1 scene in train/Uniform/" in result.stdout
+    assert "6/6" in result.stderr
+    (marker,) = tmp_path.rglob("_scene_complete.json")
+    assert "depth_unit_m=0.1, " in marker.read_text()
 
 
 def test_all_maps_and_a_map_of_its_own_contradict_each_other(tmp_path):

@@ -32,7 +32,7 @@ def spawn_refusal(world):
     return check_spawn(body_m, world=world)
 
 
-def looking(world, *, eye, rig=None, yaw=180.0, pitch=0.0):
+def looking(world, *, eye=(4, 0, 1.0), rig=None, yaw=180.0, pitch=0.0):
     """The verdict on one pose of a narrow rig; the subject stands at the origin."""
     return check_poses(
         np.array([eye], float),
@@ -46,41 +46,34 @@ def looking(world, *, eye, rig=None, yaw=180.0, pitch=0.0):
 # The spawn.
 
 
-def test_a_subject_on_an_open_floor_is_accepted():
-    assert spawn_refusal(yard()) is None
-    assert spawn_refusal(yard(walk_m=3.5)) is None
+WALL = ((2, -5, 0), (2.2, 5, 3))
+CLIFF = [((-20, -20, -1), (1, 20, 0)), ((-20, -20, -4), (20, 20, -3))]
+"""The floor ends a metre ahead; three metres below there is another one."""
+NOWHERE = Blocks([((5, 5, -1), (6, 6, 0))])
 
 
-def test_a_pit_refuses_the_subject_that_walks_over_it():
-    """The floor ends a metre ahead; three metres below there is another one."""
-    world = Blocks([((-20, -20, -1), (1, 20, 0)), ((-20, -20, -4), (20, 20, -3))], walk_m=3.5)
+@pytest.mark.parametrize("world", [yard(), yard(walk_m=3.5), yard(sunk_m=0.1), yard(WALL)])
+def test_a_subject_with_room_on_a_floor_is_accepted(world):
+    assert spawn_refusal(world) is None
 
+
+@pytest.mark.parametrize(
+    ("world", "reason", "value"),
+    [
+        (Blocks(CLIFF, walk_m=3.5), "spawn_support", 3.0),
+        (NOWHERE, "spawn_support", np.inf),
+        (yard(sunk_m=-0.3), "spawn_support", 0.3),
+        (yard(sunk_m=0.3), "spawn_support", None),
+        (yard(WALL, walk_m=1.8), "spawn_space", None),
+    ],
+    ids=["walks over a pit", "nothing below", "floats", "sinks", "walks into a wall"],
+)
+def test_a_subject_without_ground_or_room_is_refused(world, reason, value):
     refusal = spawn_refusal(world)
 
-    assert refusal.reason == "spawn_support"
-    assert refusal.value == pytest.approx(3.0)
-    assert refusal.limit == LIMITS.support_gap_m
-
-
-def test_nothing_below_the_subject_refuses_it():
-    refusal = spawn_refusal(Blocks([((5, 5, -1), (6, 6, 0))]))
-
-    assert (refusal.reason, refusal.value) == ("spawn_support", np.inf)
-
-
-def test_a_subject_that_floats_or_sinks_is_refused():
-    assert spawn_refusal(yard(sunk_m=-0.3)).value == pytest.approx(0.3)
-    assert spawn_refusal(yard(sunk_m=0.3)).reason == "spawn_support"
-    assert spawn_refusal(yard(sunk_m=0.1)) is None
-
-
-def test_a_wall_in_the_way_refuses_the_subject_that_walks_into_it():
-    wall = ((2, -5, 0), (2.2, 5, 3))
-
-    assert spawn_refusal(yard(wall)) is None
-    refusal = spawn_refusal(yard(wall, walk_m=1.8))
-    assert refusal.reason == "spawn_space"
-    assert refusal.value < LIMITS.body_space_m
+    assert refusal.reason == reason
+    assert value is None or refusal.value == pytest.approx(value)
+    assert (refusal.value > refusal.limit) == (reason == "spawn_support")
 
 
 def test_a_subject_is_put_on_a_floor_with_headroom():
@@ -92,127 +85,63 @@ def test_a_subject_is_put_on_a_floor_with_headroom():
     assert spawn.place_m[2] == pytest.approx(0.9)
 
 
-def test_a_low_ceiling_refuses_all_floors():
-    world = yard(((-9, -9, 1.5), (9, 9, 11)))
+def test_a_low_ceiling_or_a_hole_refuses_the_place():
+    low = find_spawn(proposal(), world=yard(((-9, -9, 1.5), (9, 9, 11))))
+    hole = find_spawn(proposal(), world=NOWHERE)
 
-    refusal = find_spawn(proposal(), world=world)
-
-    assert (refusal.reason, refusal.limit) == ("spawn_space", 2.0)
-    assert refusal.value == pytest.approx(1.5)
-
-
-def test_a_hole_without_a_floor_refuses_the_place():
-    world = Blocks([((5, 5, -1), (6, 6, 0))])
-
-    assert find_spawn(proposal(), world=world).reason == "spawn_support"
+    assert (low.reason, low.value, low.limit) == ("spawn_space", pytest.approx(1.5), 2.0)
+    assert hole.reason == "spawn_support"
 
 
 # Poses.
 
-
-def test_a_free_view_of_the_subject_passes():
-    assert looking(yard(), eye=(4, 0, 1.0)).passed.all()
-
-
-def test_a_wall_before_the_subject_hides_it_whatever_the_camera_sees():
-    checks = looking(yard(((1.9, -3, 0), (2, 3, 3))), eye=(4, 0, 1.0))
-
-    assert (checks.reasons[0], checks.values[0]) == ("visibility", 0.0)
-
-
-def test_a_post_before_one_of_six_cameras_is_enough():
-    """The rig is 2 m wide; the post is between camera 0 and the subject only."""
-    wide = Rig(np.linspace(-1, 1, 6), (0.99, 0.99))
-    side = -1 / 2  # Looking along -x, the camera's right is at -y: camera 0 is at +y.
-    post = ((1.9, -side - 0.25, 0), (2.1, -side + 0.25, 3))
-
-    assert looking(yard(), eye=(4, 0, 1.0), rig=wide).passed.all()
-    assert looking(yard(post), eye=(4, 0, 1.0), rig=wide).reasons[0] == "visibility"
+WIDE = Rig(np.linspace(-1, 1, 6), (0.99, 0.99))
+"""Looking along -x, the camera's right is at -y: camera 0 is at +y."""
+NARROW = Rig(np.linspace(-0.01, 0.01, 6), (1.2, 1.2))
+CLOSE = Rig(NARROW.lateral_m, (8.0, 8.0))
+SLAB = ((3.5, -2, 0), (3.6, -0.05, 3))
+POST = ((1.9, 0.25, 0), (2.1, 0.75, 3))
+BESIDE = ((3.7, -1.2, 0.7), (4.3, -0.9, 1.3))
+HOLLOW = [
+    ((2.9, -1.1, 0), (3, 1.1, 2.1)), ((5, -1.1, 0), (5.1, 1.1, 2.1)),
+    ((3, -1.1, 0), (5, -1, 2.1)), ((3, 1, 0), (5, 1.1, 2.1)), ((3, -1, 2), (5, 1, 2.1)),
+]  # fmt: skip
+"""A box of 2 m around the camera: nothing touches it, and nothing of the subject is seen."""
 
 
-def test_half_a_wall_hides_half_the_subject():
-    low, high = ((1.9, -3, 0), (2, 3, 0.6)), ((1.9, -3, 0), (2, 3, 1.2))
-
-    assert looking(yard(low), eye=(4, 0, 1.0)).passed.all()
-    checks = looking(yard(high), eye=(4, 0, 1.0))
-    assert checks.reasons[0] == "visibility"
-    assert 0 < checks.values[0] < LIMITS.visible_share
-
-
-def test_a_box_around_the_camera_leaves_it_no_view_even_if_it_is_roomy():
-    """A hollow box of 2 m: no camera touches it, and nothing of the subject is seen."""
-    hollow = [
-        ((2.9, -1.1, 0), (3, 1.1, 2.1)), ((5, -1.1, 0), (5.1, 1.1, 2.1)),
-        ((3, -1.1, 0), (5, -1, 2.1)), ((3, 1, 0), (5, 1.1, 2.1)), ((3, -1, 2), (5, 1, 2.1)),
-    ]  # fmt: skip
-
-    assert looking(yard(*hollow), eye=(4, 0, 1.0)).reasons[0] == "visibility"
-
-
-@pytest.mark.parametrize(("gap_m", "passes"), [(0.25, True), (0.15, False)])
-def test_a_camera_keeps_its_distance_from_a_wall(gap_m, passes):
-    wall = ((4 + gap_m, -5, 0), (5, 5, 3))
-
-    checks = looking(yard(wall), eye=(4, 0, 1.0))
-
-    assert checks.passed[0] == passes
-    if not passes:
-        assert checks.reasons[0] == "collision"
-        assert checks.values[0] == pytest.approx(gap_m)
-
-
-def test_the_outermost_camera_alone_can_collide():
-    wide = Rig(np.linspace(-1, 1, 6), (0.99, 0.99))
-    block = ((3.7, -1.2, 0.7), (4.3, -0.9, 1.3))
-
-    assert looking(yard(block), eye=(4, 0, 1.0)).passed.all()
-    assert looking(yard(block), eye=(4, 0, 1.0), rig=wide).reasons[0] == "collision"
-
-
-def test_a_camera_outside_the_map_collides_though_nothing_is_near_it():
-    world = yard(size_m=((-3, -3, 0), (3, 3, 3)))
-
-    checks = looking(world, eye=(4, 0, 1.0))
-
-    assert (checks.reasons[0], checks.values[0]) == ("collision", pytest.approx(-1.0))
-
-
-def test_a_camera_inside_the_subject_collides():
-    near = Rig(np.linspace(-0.01, 0.01, 6), (8.0, 8.0))
-
-    assert looking(yard(), eye=(0.45, 0, 0.9), rig=near).reasons[0] == "collision"
+POSES = [
+    ("a free view", yard(), {}, "", np.nan),
+    ("a free view of a wide rig", yard(), {"rig": WIDE}, "", np.nan),
+    ("a low wall", yard(((1.9, -3, 0), (2, 3, 0.6))), {}, "", np.nan),
+    ("a wall 25 cm behind the cameras", yard(((4.25, -5, 0), (5, 5, 3))), {}, "", np.nan),
+    ("a wall 15 cm behind them", yard(((4.15, -5, 0), (5, 5, 3))), {}, "collision", 0.15),
+    ("a block beside a narrow rig", yard(BESIDE), {}, "", np.nan),
+    ("a block in the outermost camera", yard(BESIDE), {"rig": WIDE}, "collision", 0),
+    ("outside the map", yard(size_m=((-3, -3, 0), (3, 3, 3))), {}, "collision", -1),
+    ("in the subject", yard(), {"eye": (0.45, 0, 0.9), "rig": CLOSE}, "collision", None),
+    ("a wall before the subject", yard(((1.9, -3, 0), (2, 3, 3))), {}, "visibility", 0),
+    ("a wall before half of it", yard(((1.9, -3, 0), (2, 3, 1.2))), {}, "visibility", None),
+    ("a post before one camera", yard(POST), {"rig": WIDE}, "visibility", None),
+    ("a roomy box around the cameras", yard(*HOLLOW), {}, "visibility", 0),
+    ("behind the cameras", yard(), {"yaw": 0.0}, "framing", 0),
+    ("beside the picture", yard(), {"yaw": 150.0}, "framing", 0),
+    ("larger than the picture", yard(), {"eye": (1, 0, 0.9)}, "framing", None),
+    ("small", yard(), {"eye": (18.9, 0, 1.0)}, "framing", None),
+    ("a picture full of sky", Blocks([FLOOR]), {"pitch": 8.0}, "valid_depth", None),
+    ("a near slab on the right", yard(SLAB), {"rig": NARROW}, "border_occluder", None),
+]
 
 
 @pytest.mark.parametrize(
-    ("pose", "what"),
-    [
-        ({"eye": (4, 0, 1.0), "yaw": 0.0}, "the subject is behind"),
-        ({"eye": (4, 0, 1.0), "yaw": 150.0}, "the subject is beside the picture"),
-        ({"eye": (1.0, 0, 0.9)}, "the subject is larger than the picture"),
-        ({"eye": (18.9, 0, 1.0)}, "the subject is small"),
-    ],
+    ("world", "pose", "reason", "value"), [row[1:] for row in POSES], ids=[row[0] for row in POSES]
 )
-def test_a_subject_out_of_frame_too_large_or_too_small_is_refused(pose, what):
-    checks = looking(yard(), **pose)
+def test_a_pose_is_refused_for_what_is_in_its_way(world, pose, reason, value):
+    checks = looking(world, **pose)
 
-    assert checks.reasons[0] == "framing", what
-
-
-def test_a_picture_full_of_sky_has_too_little_depth():
-    world = Blocks([FLOOR], size_m=((-20, -20, 0), (20, 20, 12)))
-
-    checks = looking(world, eye=(4, 0, 1.0), pitch=8.0)
-
-    assert checks.reasons[0] == "valid_depth"
-    assert checks.values[0] < LIMITS.valid_share
-
-
-def test_a_near_block_over_a_side_of_the_picture_is_an_occluder():
-    """A slab 40 cm before the cameras covers the right third, beside the subject."""
-    slab = ((3.5, -2, 0), (3.6, -0.05, 3))
-    narrow = Rig(np.linspace(-0.01, 0.01, 6), (1.2, 1.2))
-
-    assert looking(yard(slab), eye=(4, 0.05, 1.0), rig=narrow).reasons[0] == "border_occluder"
+    assert checks.reasons.tolist() == [reason]
+    assert value is None or checks.values[0] == pytest.approx(value, nan_ok=True)
+    if reason in ("visibility", "valid_depth"):
+        assert 0 <= checks.values[0] < checks.limits[0]
 
 
 def test_a_thin_wall_between_two_frames_is_an_obstruction():

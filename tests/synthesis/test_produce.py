@@ -9,8 +9,9 @@ import pytest
 
 from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.media.encoder import VideoWriter
-from stereogenbench_data.synthesis.produce import synthesise
+from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
+from tests.servers.tools import files_of
 
 SMALL = {"size_px": 32, "frames": 2, "seed": 9}
 
@@ -84,11 +85,13 @@ def test_incomplete_scenes_of_a_killed_run_are_rendered_again(tmp_path):
 
 def test_a_scene_that_another_request_wrote_is_neither_kept_nor_overwritten(tmp_path):
     (key,) = synthesise(tmp_path, SynthRequest(**SMALL))
-    before = contents(tmp_path / key)
+    before = files_of(tmp_path)
 
-    with pytest.raises(SynthesisError, match="scene_000000: another request wrote this scene"):
-        synthesise(tmp_path, SynthRequest(**(SMALL | {"frames": 3})))
-    assert contents(tmp_path / key) == before
+    for other in ({"frames": 3}, {"seed": 1}, {"scenes": 3, "focal_mm": 30.0}):
+        for act in (synthesise, plan_scenes):
+            with pytest.raises(SynthesisError, match="scene_000000: another request wrote"):
+                act(tmp_path, SynthRequest(**(SMALL | other)))
+    assert files_of(tmp_path) == before
     (tmp_path / key / "_scene_complete.json").unlink()
     with pytest.raises(SynthesisError, match=r"_scene_complete\.json differs or is missing"):
         synthesise(tmp_path, SynthRequest(**SMALL))

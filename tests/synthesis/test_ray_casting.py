@@ -43,51 +43,31 @@ def depth_of(shapes, view, *, slope=LEVEL):
         return 1 / inverse, faces
 
 
-def test_the_ground_is_at_height_over_descent_and_the_sky_has_no_depth():
+def solid(kind, x_m, half_m):
+    return Shape(kind, np.array([x_m, 0.0, 2.0]), np.eye(3), np.array(half_m), STONE)
+
+
+NEAR, FAR = solid("box", 3.0, [0.4] * 3), solid("box", 8.0, [3.9] * 3)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "row", "depths_m"),
+    [
+        ([], [0, 1, 2, 3, 4], [np.inf, np.inf, np.inf, 10.0, 5.0]),
+        ([solid("box", 6.0, [2.0, 1.9, 1.9])], [0, 2, 4], [4.0, 4.0, 4.0]),
+        ([solid("ellipsoid", 6.0, [1.5] * 3)], [0, 2], [np.inf, 4.5]),
+        ([NEAR, FAR], [2, 0], [2.6, 4.1]),
+        ([FAR, NEAR], [2, 0], [2.6, 4.1]),
+        ([solid("box", -3.0, [1.0] * 3)], [2], [np.inf]),
+    ],
+    ids=["ground", "a face", "a ball", "near, far", "far, near", "behind"],
+)
+def test_depth_along_the_axis_is_as_worked_by_hand(shapes, row, depths_m):
     """Rows look 0.4, 0.2, 0, -0.2, -0.4 up at depth 1, from 2 m: 10 m and 5 m to the ground."""
-    depth_m, faces = depth_of([], view_from([0.0, 0.0, 2.0]))
+    depth_m, faces = depth_of(shapes, view_from([0.0, 0.0, 2.0]))
 
-    np.testing.assert_allclose(depth_m[:, 3], [np.inf, np.inf, np.inf, 10.0, 5.0])
-    assert faces[:, 0].tolist() == [SKY, SKY, SKY, GROUND, GROUND]
-
-
-def test_the_depth_of_a_box_face_is_the_same_all_over_the_face():
-    """A face across the optical axis has one depth, whatever the length of the rays."""
-    box = Shape("box", np.array([6.0, 0.0, 2.0]), np.eye(3), np.array([2.0, 1.9, 1.9]), STONE)
-
-    depth_m, _ = depth_of([box], view_from([0.0, 0.0, 2.0]))
-
-    np.testing.assert_allclose(depth_m, np.full((5, 5), 4.0))
-
-
-def test_the_depth_of_a_ball_is_that_of_the_nearest_point_on_its_axis():
-    ball = Shape("ellipsoid", np.array([6.0, 0.0, 2.0]), np.eye(3), np.full(3, 1.5), STONE)
-
-    depth_m, faces = depth_of([ball], view_from([0.0, 0.0, 2.0]))
-
-    assert depth_m[2, 2] == pytest.approx(4.5)
-    assert faces[0, 0] == SKY
-
-
-def test_a_nearer_shape_hides_a_farther_one_in_either_order():
-    near = Shape("box", np.array([3.0, 0.0, 2.0]), np.eye(3), np.full(3, 0.4), STONE)
-    far = Shape("box", np.array([8.0, 0.0, 2.0]), np.eye(3), np.full(3, 3.9), STONE)
-    view = view_from([0.0, 0.0, 2.0])
-
-    first, _ = depth_of([near, far], view)
-    second, _ = depth_of([far, near], view)
-
-    np.testing.assert_array_equal(first, second)
-    assert first[2, 2] == pytest.approx(2.6)
-    assert first[2, 0] == pytest.approx(4.1)
-
-
-def test_a_shape_behind_the_camera_is_not_seen():
-    behind = Shape("box", np.array([-3.0, 0.0, 2.0]), np.eye(3), np.full(3, 1.0), STONE)
-
-    depth_m, _ = depth_of([behind], view_from([0.0, 0.0, 2.0]))
-
-    assert depth_m[2, 2] == np.inf
+    np.testing.assert_allclose(depth_m[row, 2], depths_m)
+    assert (faces[row, 2] == SKY).tolist() == np.isinf(depths_m).tolist()
 
 
 @pytest.mark.parametrize("index", range(2))
