@@ -33,10 +33,6 @@ def first_tar(document):
     )
 
 
-def test_a_written_descriptor_has_no_problem(written):
-    assert check_descriptor(written) == []
-
-
 MUTATIONS = {
     "dangling reference": (
         lambda d: node(d, "pairs/scene_id").update(references={"field": {"@id": "scenes/key"}}),
