@@ -236,6 +236,15 @@ def missing_extra(what: str, extra: str, error: ImportError | str) -> ExtraError
 
 
 @contextmanager
+def needs_extra(what: str, extra: str) -> Iterator[None]:
+    """Raise an `ImportError` of the block as `missing_extra` of a feature."""
+    try:
+        yield
+    except ImportError as error:
+        raise missing_extra(what, extra, error) from error
+
+
+@contextmanager
 def explain_os_errors(
     what: str, otherwise: str = "", *, kind: type[StereoGenBenchError] = StorageError
 ) -> Iterator[None]:

@@ -27,7 +27,7 @@ from stereogenbench_data.bridges import dataset_facts
 from stereogenbench_data.bridges.in_memory import columns
 from stereogenbench_data.datasets.mapped import StereoPairs
 from stereogenbench_data.engine import Advance, Progress, advance_of
-from stereogenbench_data.errors import DescriptorError, explain_os_errors, missing_extra
+from stereogenbench_data.errors import DescriptorError, explain_os_errors, needs_extra
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.picture import draw_sheet, pair_tiles
@@ -186,10 +186,8 @@ def card(index: SceneIndex, *, repository: str, about: dataset_facts.About | Non
     """
     if not index.shards:
         raise DescriptorError(f"{index.where}: not a folder of shards. Pack the data first.")
-    try:
+    with needs_extra("the dataset card", "hub"):
         from huggingface_hub import DatasetCard, DatasetCardData
-    except ImportError as error:
-        raise missing_extra("the dataset card", "hub", error) from error
     facts, configs = dataset_facts.facts_of(index, about=about), _configs(index)
     family = next(name for name in configs if name != "all")
     provenance = (facts["prov:wasGeneratedBy"], facts["prov:wasDerivedFrom"])

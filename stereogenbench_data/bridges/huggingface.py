@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Any, Final, Unpack
 from stereogenbench_data.bridges.in_memory import SampleOptions, columns, samples_of, to_arrays
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.errors import (
-    ExtraError,
     FieldError,
     SelectionError,
     StorageError,
-    missing_extra,
+    needs_extra,
 )
 from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS, Sample
 from stereogenbench_data.samples.transforms import (
@@ -32,6 +31,8 @@ from stereogenbench_data.schema.release import (
 
 _DEPTH_NAMES: Final[dict[str, Mapping[str, str]]] = {"mkv": {}, "b2frame": PACKED_DEPTH_NAMES}
 """Suffix of depth members to their names in shards, by released name."""
+
+_library = partial(needs_extra, "Hugging Face datasets", "huggingface")
 
 if TYPE_CHECKING:
     from datasets import Features
@@ -64,10 +65,8 @@ def iterable(data: Data, **options: Any) -> "SampleIterable":
         ExtraError: If ``datasets`` is not installed.
         StereoGenBenchError: As `StereoPairs` does.
     """
-    try:
+    with _library():
         from stereogenbench_data.bridges.huggingface_iterable import SampleIterable
-    except ImportError as error:
-        raise _missing(error) from error
     pairs = StereoPairs(data, **options)
     return SampleIterable.of(pairs, _features_of(pairs))
 
@@ -97,10 +96,8 @@ def sample_features(pairs: StereoPairs) -> "Features":
 
 def _features_of(pairs: StereoPairs) -> "Features | None":
     """Return the features of samples, None where they differ or cannot be foreseen."""
-    try:
+    with _library():
         from datasets import Features
-    except ImportError as error:
-        raise _missing(error) from error
     request = pairs.request
     size, targets = _size_of(pairs), set((pairs.plan.pairs.targets >= 0).sum(axis=1).tolist())
     is_stacked = request.layout == "stacked"
@@ -173,10 +170,8 @@ def features(*, depth_suffix: str = "mkv") -> "Features":
         raise SelectionError(
             f"depth_suffix must be {' or '.join(map(repr, _DEPTH_NAMES))}, got {depth_suffix!r}."
         )
-    try:
+    with _library():
         from datasets import Features, Json, Value
-    except ImportError as error:
-        raise _missing(error) from error
     kinds = columns((names.get(name, name) for name in VIDEO_FILES), of_training=bool(names))
     return Features(
         {name: Json() if kind == "json" else Value(kind) for name, kind in kinds.items()}
@@ -225,7 +220,3 @@ def _samples(row: dict[str, Any], fields: tuple[str, ...], options: SampleOption
         )
     found = samples_of(row["__key__"], row, fields=fields, epoch=0, options=options)
     return [to_arrays(sample) for sample in found]
-
-
-def _missing(error: ImportError) -> ExtraError:
-    return missing_extra("Hugging Face datasets", "huggingface", error)

@@ -24,7 +24,7 @@ from stereogenbench_data.engine import Progress
 from stereogenbench_data.errors import (
     SelectionError,
     explain_os_errors,
-    missing_extra,
+    needs_extra,
 )
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import DepthEncoding
@@ -154,8 +154,6 @@ def log_scene(  # noqa: PLR0913 - each names one thing that a user chooses
 
 
 def _rerun() -> Any:
-    try:
+    with needs_extra("recordings for Rerun", "rerun"):
         import rerun
-    except ImportError as error:
-        raise missing_extra("recordings for Rerun", "rerun", error) from error
     return rerun

@@ -15,7 +15,7 @@ from typing import Final
 
 from stereogenbench_data.bridges.croissant.descriptor import Node
 from stereogenbench_data.bridges.dataset_facts import blanks
-from stereogenbench_data.errors import DescriptorError, missing_extra
+from stereogenbench_data.errors import DescriptorError, needs_extra
 
 REQUIRED: Final = (
     "name", "description", "url", "creator", "keywords", "distribution", "recordSet",
@@ -71,11 +71,9 @@ def check_descriptor(path: Path) -> list[str]:
 
 def _validated(path: Path) -> list[str]:
     """Return the errors and warnings of mlcroissant."""
-    try:
+    with needs_extra("checking a descriptor", "croissant"):
         import mlcroissant
         from absl import logging as absl_logging
-    except ImportError as error:
-        raise missing_extra("checking a descriptor", "croissant", error) from error
     # It states some warnings in its log alone.
     logger, heard = absl_logging.get_absl_logger(), BufferingHandler(10_000)
     handlers, logger.handlers = logger.handlers, [heard]
