@@ -96,38 +96,25 @@ def whole_runs(indexed_release, tmp_path_factory):
     }
 
 
-@pytest.mark.parametrize("stop", [15, 22], ids=["last batch", "second epoch"])
-def test_lightning_goes_on_as_if_it_had_not_stopped(whole_runs, indexed_release, tmp_path, stop):
-    def loader():
-        return runs.random_frames(indexed_release).loader(4, num_workers=1)
+@pytest.mark.parametrize(
+    ("name", "stop"),
+    [("lightning", 15), ("lightning", 22), ("loader", 15), ("dataset", 22)],
+)
+def test_a_run_goes_on_as_if_it_had_not_stopped(whole_runs, indexed_release, tmp_path, name, stop):
+    """After the last batch of an epoch, and in the second one."""
 
-    whole = whole_runs["lightning"]
-    before = runs.lightning(loader(), tmp_path, stop_at=stop)
-    after = runs.lightning(loader(), tmp_path, resume=True)
-
-    assert (
-        len({tuple(sorted(keys)) for keys in of_epochs(whole, epochs=runs.EPOCHS)}) == runs.EPOCHS
-    )
-    assert len(before) == stop
-    assert before + after == whole
-
-
-@pytest.mark.parametrize(("stop", "given"), [(15, "loader"), (22, "dataset")])
-def test_hugging_faces_trainer_goes_on_as_if_it_had_not_stopped(
-    whole_runs, indexed_release, tmp_path, stop, given
-):
     def run(**options):
         pairs = runs.random_frames(indexed_release)
-        loader = pairs.loader(4, num_workers=1) if given == "loader" else None
-        return runs.hugging_face(pairs, tmp_path / "run", loader=loader, **options)
+        loader = pairs.loader(4, num_workers=1)
+        if name == "lightning":
+            return runs.lightning(loader, tmp_path, **options)
+        options["loader"] = loader if name == "loader" else None
+        return runs.hugging_face(pairs, tmp_path / "run", **options)
 
-    whole = whole_runs[given]
-    before = run(stop_at=stop)
-    after = run(resume=True)
+    whole, before, after = whole_runs[name], run(stop_at=stop), run(resume=True)
 
-    assert (
-        len({tuple(sorted(keys)) for keys in of_epochs(whole, epochs=runs.EPOCHS)}) == runs.EPOCHS
-    )
+    epochs = of_epochs(whole, epochs=runs.EPOCHS)
+    assert len({tuple(sorted(keys)) for keys in epochs}) == runs.EPOCHS
     assert len(before) == stop
     assert before + after == whole
 
