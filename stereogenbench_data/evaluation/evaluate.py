@@ -428,6 +428,11 @@ def _scores(
         scene = index.scene(row)
         branch: Labels = (scene.id.subset or "", scene.id.family)
         found = _read_scene(out, scene.id.key)
+        if not found:
+            raise StorageError(
+                f"{_scene_path(out, scene.id.key)}: the scores of {scene.id.key} were removed or "
+                f"cut while others were computed. Run it again: only this scene is scored anew."
+            )
         for each in pairs:
             scores = found[name, each.pair]
             is_primary = each.pair == scene.rig.primary_pair

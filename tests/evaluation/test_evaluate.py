@@ -247,6 +247,21 @@ def test_partial_results_that_are_cut_are_made_again_and_of_another_format_refus
         scored(scored_index, right_views, protocol, out=tmp_path)
 
 
+def test_scores_of_a_scene_that_are_removed_during_a_run_are_named_and_made_by_the_next(
+    scored_index, right_views, protocol, tmp_path
+):
+    def remove_the_first(done, total):
+        if done == total:
+            for path in (tmp_path / "scenes").iterdir():
+                path.unlink()
+
+    with pytest.raises(StorageError, match=rf"\.pt: the scores of {keys(scored_index)[0]} were re"):
+        scored(scored_index, right_views, protocol, out=tmp_path, progress=remove_the_first)
+    again = scored(scored_index, right_views, protocol, out=tmp_path)
+
+    assert numbers(again) == numbers(scored(scored_index, right_views, protocol))
+
+
 def test_results_of_another_method_are_refused_and_changed_views_are_scored_again(
     scored_index, right_views, copied, protocol, tmp_path
 ):
