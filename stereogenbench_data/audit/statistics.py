@@ -1,6 +1,6 @@
-"""The paper's statistics, from an index alone: counts, baselines and focal lengths."""
+"""The paper's statistics of an index: counts, baselines and focal lengths, beside its figures."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Unpack
 
@@ -8,13 +8,16 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from stereogenbench_data.audit.geometry.records import plain
+from stereogenbench_data.audit.paper_numbers import FOCAL_MM, paper_table
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     BASELINE_BINS,
     CAMERA_PAIRS,
     FAMILIES,
+    SCENE_COUNTS,
 )
+from stereogenbench_data.schema.text import markdown_table, markdown_text
 from stereogenbench_data.selection.filters import PAIR_NUMBER, SceneFilters, filter_scenes, in_bin
 
 ADJACENT_COLUMNS: Final = [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]
@@ -98,14 +101,16 @@ def statistics(index: SceneIndex, **filters: Unpack[SceneFilters]) -> Statistics
     appendices on realized baselines and per-map counts.
     """
     rows = filter_scenes(index, filters)
-    families = []
-    branches = []
-    for split, family, of_branch in branch_rows(index, rows):
-        branches.append(_family(index, of_branch, split=split, subset="", family=family))
-        subsets = _texts(index, "subset", of_branch)
-        for subset in _in_order(subsets, _SUBSETS):
-            chosen = of_branch[subsets == subset]
-            families.append(_family(index, chosen, split=split, subset=subset, family=family))
+    families, branches = [], []
+    splits, names = _texts(index, "split", rows), _texts(index, "family", rows)
+    for split in _in_order(splits, _SPLITS):
+        for family in _in_order(names[splits == split], FAMILIES):
+            branch = rows[(splits == split) & (names == family)]
+            branches.append(_family(index, branch, split=split, subset="", family=family))
+            subsets = _texts(index, "subset", branch)
+            for subset in _in_order(subsets, _SUBSETS):
+                chosen = branch[subsets == subset]
+                families.append(_family(index, chosen, split=split, subset=subset, family=family))
     return Statistics(
         root=index.where,
         scenes=len(rows),
@@ -113,16 +118,6 @@ def statistics(index: SceneIndex, **filters: Unpack[SceneFilters]) -> Statistics
         branches=tuple(branches),
         derived=index.derivation if index.is_derived else "",
     )
-
-
-def branch_rows(
-    index: SceneIndex, rows: Int64[np.ndarray, " n"]
-) -> Iterator[tuple[str, str, Int64[np.ndarray, " m"]]]:
-    """Yield each split and family of the data with its rows, the paper's first."""
-    splits, families = _texts(index, "split", rows), _texts(index, "family", rows)
-    for split in _in_order(splits, _SPLITS):
-        for family in _in_order(families[splits == split], FAMILIES):
-            yield split, family, rows[(splits == split) & (families == family)]
 
 
 def _family(
@@ -162,3 +157,196 @@ def _in_order(values: np.ndarray, known: tuple[str, ...]) -> list[str]:
     """Return the distinct texts, the known ones first and in their order."""
     there = set(values.tolist())
     return [*(each for each in known if each in there), *sorted(there - set(known))]
+
+
+_RELEASE_SIZED: Final = 0.1
+"""Largest relative difference between a split's number of scenes and the paper's."""
+_PAPERS_SCENES: Final = {
+    split: sum(count for place, count in SCENE_COUNTS.items() if place[0] == split)
+    for split in _SPLITS
+}
+_Counts = Mapping[tuple[str, ...], int]
+"""Numbers of scenes; a place begins with the split, and is named by all its parts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One figure of the paper and ours, both as texts with the paper's number of digits."""
+
+    split: str
+    table: str
+    item: str
+    paper: str
+    ours: str
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the two are equal."""
+        return self.paper == self.ours
+
+
+def compared(found: Statistics) -> tuple[Line, ...]:
+    """Return every figure of the paper's tables beside that of the statistics.
+
+    Only splits whose number of scenes is within a tenth of the paper's are compared.
+    """
+    whole = [
+        split
+        for split, count in _PAPERS_SCENES.items()
+        if abs(_scenes_of(found, split) - count) <= _RELEASE_SIZED * count
+    ]
+    lines = (*_count_lines(found), *_baseline_lines(found), *_bin_lines(found),
+             *_focal_lines(found), *_map_lines(found))  # fmt: skip
+    return tuple(line for line in lines if line.split in whole)
+
+
+def _scenes_of(found: Statistics, split: str) -> int:
+    return sum(each.scenes for each in found.branches if each.split == split)
+
+
+def _beside(table: str, what: str, paper: _Counts, ours: _Counts) -> Iterator[Line]:
+    """Yield the numbers of scenes that the paper or the data have, 0 where one has none."""
+    for place in dict.fromkeys([*paper, *ours]):
+        item = f"{what}, {' '.join(filter(None, place))}"
+        yield Line(place[0], table, item, str(paper.get(place, 0)), str(ours.get(place, 0)))
+
+
+def _count_lines(found: Statistics) -> Iterator[Line]:
+    paper: _Counts = {
+        **SCENE_COUNTS, **{(split, "total"): count for split, count in _PAPERS_SCENES.items()},
+    }  # fmt: skip
+    ours: _Counts = {
+        **{(each.split, each.subset, each.family): each.scenes for each in found.families},
+        **{(split, "total"): _scenes_of(found, split) for split in _SPLITS},
+    }
+    return _beside("table of scene counts by split and family", "scenes", paper, ours)
+
+
+def _baseline_lines(found: Statistics) -> Iterator[Line]:
+    branches = {(each.split, each.family): each for each in found.branches}
+    for name, table in (
+        ("adjacent", "table of realized adjacent-baseline statistics"),
+        ("all_pairs", "appendix on realized baseline distributions"),
+    ):
+        for row in paper_table(name):
+            split, family = row["split"], row["family"]
+            branch = branches.get((split, family))
+            for figure in (figure for figure in ("count", *_FIGURES) if row[figure]):
+                ours, decimals = "-", len(row[figure].partition(".")[2])
+                if branch is not None:
+                    ours = f"{getattr(branch, f'{name}_cm')[figure]:.{decimals}f}"
+                unit = "" if figure == "count" else " (cm)"
+                item = f"{name.replace('_', ' ')}, {split} {family}: {figure}{unit}"
+                yield Line(split, table, item, row[figure], ours)
+
+
+def _bin_lines(found: Statistics) -> Iterator[Line]:
+    branch = ("eval", "seen_map", "Uniform,")
+    paper = {
+        (*branch, f"{row['baseline']} cm"): int(row["n_scenes"]) for row in paper_table("bins")
+    }
+    ours = {
+        (*branch, f"{name} cm"): primary
+        for each in found.families
+        if (each.split, each.subset, f"{each.family},") == branch
+        for name, (primary, _, _) in each.bins.items()
+        if primary
+    }
+    table = "table of baseline-stratified diagnostics (N_s)"
+    return _beside(table, "scenes by primary baseline", paper, ours)
+
+
+def _focal_lines(found: Statistics) -> Iterator[Line]:
+    low, high = FOCAL_MM
+    paper = f"{low:g} to {high:g}"
+    for split in _SPLITS:
+        spreads = [each.focal_mm for each in found.branches if each.split == split]
+        if not spreads:
+            continue
+        least, most = min(each["min"] for each in spreads), max(each["max"] for each in spreads)
+        ours = paper if low <= least and most <= high else f"{least:g} to {most:g}"
+        item = f"focal lengths within (mm), {split}"
+        yield Line(split, "appendix on generation parameters", item, paper, ours)
+
+
+def _map_lines(found: Statistics) -> Iterator[Line]:
+    tables = {
+        "train": "table of train scene counts per family and map",
+        "eval": "table of evaluation scene counts per family and map",
+    }
+    for split, rows in (("train", paper_table("train_maps")), ("eval", paper_table("eval_maps"))):
+        paper = {
+            (split, family, row["map"]): int(row[family])
+            for row in rows for family in FAMILIES if int(row.get(family, 0))
+        }  # fmt: skip
+        ours = {
+            (split, each.family, name): count
+            for each in found.branches if each.split == split for name, count in each.maps.items()
+        }  # fmt: skip
+        yield from _beside(tables[split], "scenes", paper, ours)
+    subsets = {
+        name: each.subset for each in found.families if each.split == "eval" for name in each.maps
+    }
+    for row in paper_table("eval_maps"):
+        item, ours_is = f"subset of {row['map']}", subsets.get(row["map"], "-")
+        yield Line("eval", tables["eval"], item, row["subset"], ours_is)
+
+
+def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
+    """Return statistics as Markdown, with the comparison with the paper if given."""
+    text = [
+        f"# Statistics of {markdown_text(str(found.root))}",
+        *([] if not found.derived else ["", f"These are {found.derived}."]),
+        *_section("Scenes", _count_rows(found)),
+        *_section("Adjacent baselines (cm)", _spread_rows(found.branches, "adjacent_cm")),
+        *_section("Baselines of all 15 pairs (cm)", _spread_rows(found.branches, "all_pairs_cm")),
+        *_section("Pairs by baseline (cm): primary / adjacent / all", _bin_rows(found.families)),
+        *_section("Focal lengths (mm)", _spread_rows(found.branches, "focal_mm")),
+        *_section("Scenes by map", _map_rows(found.branches)),
+    ]
+    if lines:
+        agreeing = sum(line.agrees for line in lines)
+        title = f"Against the paper: {agreeing} of {len(lines)} figures agree"
+        rows = [
+            ("same" if line.agrees else "**differs**", line.item, line.paper, line.ours, line.table)
+            for line in sorted(lines, key=lambda each: each.agrees)
+        ]
+        text += _section(title, [("", "figure", "paper", "here", "source"), *rows])
+    return "\n".join(text) + "\n"
+
+
+def _section(title: str, rows: Iterable[Sequence[str]]) -> list[str]:
+    return ["", f"## {title}", "", *markdown_table(*rows)]
+
+
+def _count_rows(found: Statistics) -> Iterator[Sequence[str]]:
+    yield ("split", "subset", "family", "scenes")
+    for each in found.families:
+        yield (each.split, each.subset or "-", each.family, f"{each.scenes:,}")
+    for split in dict.fromkeys(each.split for each in found.branches):
+        yield (split, "", "total", f"{_scenes_of(found, split):,}")
+    yield ("all", "", "total", f"{found.scenes:,}")
+
+
+def _spread_rows(branches: Sequence[FamilyStatistics], name: str) -> Iterator[Sequence[str]]:
+    yield ("split", "family", "count", "min", "max", "mean", "std", "median")
+    for each in branches:
+        count, *lengths = getattr(each, name).values()
+        yield (each.split, each.family, f"{count:,}", *(f"{length:.4f}" for length in lengths))
+
+
+def _bin_rows(families: Sequence[FamilyStatistics]) -> Iterator[Sequence[str]]:
+    names = list(dict.fromkeys(name for each in families for name in each.bins))
+    names.sort(key=lambda name: float(name[1:].partition(",")[0]))
+    yield ("split", "subset", "family", *names)
+    for each in families:
+        cells = [
+            " / ".join(f"{count:,}" for count in each.bins.get(name, (0, 0, 0))) for name in names
+        ]
+        yield (each.split, each.subset or "-", each.family, *cells)
+
+
+def _map_rows(branches: Sequence[FamilyStatistics]) -> Iterator[Sequence[str]]:
+    yield ("map", *(f"{each.split} {each.family}" for each in branches))
+    for name in sorted({name for each in branches for name in each.maps}):
+        yield (name, *(f"{each.maps[name]:,}" if name in each.maps else "-" for each in branches))

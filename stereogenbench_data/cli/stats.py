@@ -29,8 +29,7 @@ def stats(
 
     Example: `stereogenbench stats shards/ -o stats.md`
     """
-    from stereogenbench_data.audit.statistics import statistics
-    from stereogenbench_data.audit.statistics_report import compared, statistics_markdown
+    from stereogenbench_data.audit.statistics import compared, statistics, statistics_markdown
 
     found = statistics(source.open(), **chosen.filters())
     lines = compared(found)

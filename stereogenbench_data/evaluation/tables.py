@@ -1,20 +1,16 @@
 """The tables of an evaluation: groups of pairs, a row for each method, the paper's rows below.
 
-A table holds methods of one tier only: rows of different tiers answer different questions. The
-paper's tables are CSV files in ``reference_tables``: numbers as printed, since the last digit of a
-reference is part of it, and an empty cell for a dash.
+A table holds methods of one tier only: rows of different tiers answer different questions.
 """
 
-import csv
 import math
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
-from importlib.resources import files
 from typing import Final, Literal, NamedTuple
 
+from stereogenbench_data.audit.paper_numbers import PaperRow, PaperTable, paper_table
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.aggregate import (
     CONTROL,
@@ -42,32 +38,13 @@ from stereogenbench_data.schema.release import (
     baseline_bin,
 )
 
-TableName = Literal["main", "unseen", "bins", "controls"]
-ReferenceRow = Mapping[str, str]
-
-
-SOURCES: Final[dict[str, str]] = {
+SOURCES: Final[dict[PaperTable, str]] = {
     "main": "tab:main-results, reference results on the seen-map evaluation split",
     "unseen": "tab:app-unseen-results, unseen-map evaluation",
     "bins": "tab:app-baseline-bins, baseline-stratified diagnostics of the seen-map Uniform branch",
     "controls": "tab:metric-calibration, calibration controls on the full evaluation split",
 }
-"""Where each table stands in the paper: its LaTeX label and what it is."""
-
-
-@cache
-def reference_table(name: TableName) -> tuple[ReferenceRow, ...]:
-    """Return the rows of one of the paper's tables, by column, as printed.
-
-    Args:
-        name: "main" (seen maps), "unseen", "bins" (baseline bins of seen-map Uniform) or
-            "controls".
-
-    >>> reference_table("controls")[0]["psnr"]
-    'inf'
-    """
-    text = files(__package__).joinpath("reference_tables", f"{name}.csv").read_text("utf-8")
-    return tuple(csv.DictReader(text.splitlines()))
+"""Where each table of scores stands in the paper: its LaTeX label and what it is."""
 
 
 def release_difference(index: SceneIndex, rows: Collection[int], *, scored: str = "some") -> str:
@@ -119,7 +96,7 @@ class TableForm(NamedTuple):
     title: str
     keys: tuple[str, ...]
     pairs: PairsShown = "primary"
-    paper: tuple[TableName, ...] = ()
+    paper: tuple[PaperTable, ...] = ()
 
 
 TABLES: Final[Mapping[str, TableForm]] = {
@@ -258,7 +235,7 @@ def _rows(results: Sequence[Scores], form: TableForm, *, differs: str) -> list[T
         paper = [
             _paper_row(row, labels, differs=differs)
             for name in form.paper
-            for row in reference_table(name)
+            for row in paper_table(name)
             if all(where.get(key, value) == value for key, value in row.items())
         ]
         for one, groups in zip(results, groups_of, strict=True):
@@ -310,7 +287,7 @@ def _row(one: Scores, labels: Labels, pairs: Sequence[PairMeans]) -> TableRow:
     )
 
 
-def _paper_row(row: ReferenceRow, labels: Labels, *, differs: str) -> TableRow:
+def _paper_row(row: PaperRow, labels: Labels, *, differs: str) -> TableRow:
     """Return a row of one of the paper's tables, its numbers as printed."""
     printed = {}
     for name in (*FRAME_METRICS, "fid", "fvd"):

@@ -1,11 +1,12 @@
-"""An index of 8,493 scenes with the statistics that the paper prints, but for those of all pairs.
+"""An index of 8,493 scenes with the statistics that the paper prints.
 
 What the paper tells of a family's baselines (count, least, largest, mean, standard deviation,
-median) fixes a list of numbers up to its shape; that shape is two power laws, found by scipy.
+median) fixes a list of numbers up to its shape; that shape is two power laws, found by scipy. Of
+Pairwise_Uniform it tells them of all pairs, too: cameras there stand on no line.
 """
 
 import numpy as np
-from scipy.optimize import fsolve
+from scipy.optimize import brentq, fsolve
 
 from stereogenbench_data.schema.records import Member, Rig, Scene, SceneId, SceneLabels
 
@@ -49,6 +50,20 @@ def spread_out(count, least, largest, mean, std, median):
     return numbers(shape)
 
 
+def apart(adjacent):
+    """Return baselines that make Pairwise_Uniform's of all pairs of those of adjacent cameras."""
+    count, mean, std, median = 55365, 97.7615, 56.7814, 93.3603
+    others = count - len(adjacent)
+    mean_of_others = (count * mean - adjacent.sum()) / others
+    square = (count * (std**2 + mean**2) - (adjacent**2).sum()) / others
+    rest = others, 10.0, 199.9969, mean_of_others, (square - mean_of_others**2) ** 0.5
+
+    def misses(middle):
+        return np.median(np.concatenate([adjacent, spread_out(*rest, middle)])) - median
+
+    return spread_out(*rest, brentq(misses, 100.0, 110.0))
+
+
 def paper_scenes():
     """Return the 8,493 scenes."""
     rng = np.random.default_rng(0)
@@ -63,8 +78,11 @@ def paper_scenes():
     for (split, family), values in adjacent.items():
         places = _places(split, family)
         rows = _in_rows(values, rng=rng)
+        far = [gaps_between(gaps) for gaps in rows]
+        if family == "Pairwise_Uniform":
+            far = rng.permutation(apart(values)).reshape(-1, 10)
         scenes += [
-            _scene(split, family, subset, name, number, rows[number])
+            _scene(split, family, subset, name, number, rows[number], far[number])
             for number, (subset, name) in enumerate(places)
         ]  # fmt: skip
     return scenes
@@ -95,10 +113,14 @@ def _in_rows(values, *, rng):
     return np.column_stack([values[primary], values[rest[102:]].reshape(-1, 4)])
 
 
-def _scene(split, family, subset, name, number, gaps):
+def gaps_between(gaps):
+    return [gaps[a:b].sum() for a in range(5) for b in range(a + 2, 6)]
+
+
+def _scene(split, family, subset, name, number, gaps, far):
     baselines = np.empty(15)
     baselines[ADJACENT] = gaps
-    baselines[OTHERS] = [gaps[a:b].sum() for a in range(5) for b in range(a + 2, 6)]
+    baselines[OTHERS] = far
     folder = {None: "", "seen_map": "MapSeenInTrain/", "unseen_map": "MapUnseen/"}[subset]
     key = f"{split}/{folder}{family}/{name}/scene_{number:06d}"
     focal_mm = 18.0 + 67.0 * (number % 100) / 99

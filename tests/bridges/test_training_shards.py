@@ -9,8 +9,7 @@ import pytest
 import webdataset
 
 from stereogenbench_data import SceneIndex, StereoPairs
-from stereogenbench_data.audit.statistics import statistics
-from stereogenbench_data.audit.statistics_report import statistics_markdown
+from stereogenbench_data.audit.statistics import statistics, statistics_markdown
 from stereogenbench_data.bridges.card import card
 from stereogenbench_data.bridges.croissant.check import check_descriptor
 from stereogenbench_data.bridges.croissant.descriptor import write_descriptor

@@ -4,13 +4,14 @@ import re
 
 import pytest
 
-from stereogenbench_data.evaluation.tables import SOURCES, reference_table
+from stereogenbench_data.audit.paper_numbers import paper_table
+from stereogenbench_data.evaluation.tables import SOURCES
 from stereogenbench_data.schema.release import BASELINE_BINS
 from tests.conftest import SHARED
 
 
 def reference_rows(table, **where):
-    rows = reference_table(table)
+    rows = paper_table(table)
     return [row for row in rows if all(row[key] == value for key, value in where.items())]
 
 
@@ -35,14 +36,14 @@ def test_a_cell_is_as_printed(table, where, column, printed):
 
 
 def test_every_table_has_all_its_rows_and_names_its_source():
-    counts = {name: len(reference_table(name)) for name in SOURCES}
+    counts = {name: len(paper_table(name)) for name in SOURCES}
 
     assert counts == {"main": 22, "unseen": 22, "bins": 55, "controls": 4}
     assert all(source.startswith("tab:") for source in SOURCES.values())
 
 
 def test_the_bins_of_every_method_cover_the_281_scenes():
-    for method in {row["method"] for row in reference_table("bins")}:
+    for method in {row["method"] for row in paper_table("bins")}:
         rows = reference_rows("bins", method=method)
 
         assert [int(row["n_scenes"]) for row in rows] == [52, 65, 70, 55, 39]
@@ -61,7 +62,7 @@ def test_every_number_stands_in_the_paper():
         there = re.findall(r"\d+\.\d+", body)
         ours = [
             value
-            for row in reference_table(name)
+            for row in paper_table(name)
             for value in row.values()
             if re.fullmatch(r"\d+\.\d+", value)
         ]

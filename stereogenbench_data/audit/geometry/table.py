@@ -16,8 +16,8 @@ from stereogenbench_data.audit.geometry.records import (
 )
 from stereogenbench_data.audit.geometry.reprojection import TOLERANCES
 from stereogenbench_data.audit.geometry.scene_audit import LONG_PAIR
-from stereogenbench_data.audit.paper_numbers import AUDIT, AUDIT_TABLE, FRAMES_A_SCENE
-from stereogenbench_data.schema.release import VIDEO_FILES
+from stereogenbench_data.audit.paper_numbers import AUDIT
+from stereogenbench_data.schema.release import FRAME_COUNT, VIDEO_FILES
 from stereogenbench_data.schema.text import counted, markdown_table, markdown_text
 
 _LISTED: Final = 500
@@ -100,7 +100,7 @@ def _frame_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
             "frames",
             f"{name} frames in all (of a video), missing",
             f"{sum(counts):,} ({span}), {missing:,} missing",
-            f"{FRAMES_A_SCENE} of a video, 0 missing",
+            f"{FRAME_COUNT} of a video, 0 missing",
             "as poses",
         )
 
@@ -140,7 +140,7 @@ def audit_markdown(report: AuditReport) -> str:
         f"# {_verdict(report)}: audit of {markdown_text(str(report.root))}",
         "",
         f"{report.scenes_audited} of {counted(report.scenes_there, 'scene')}, {frames} of "
-        f"each. Under paper: {AUDIT_TABLE}.",
+        f"each. Under paper: table of the geometry consistency audit.",
         "",
         *markdown_table(
             ("check", "quantity", "here", "paper", "limit"),
