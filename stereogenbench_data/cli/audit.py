@@ -3,7 +3,7 @@
 import hashlib
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -20,9 +20,6 @@ from stereogenbench_data.cli.options import (
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import write_report, writing
-
-if TYPE_CHECKING:
-    from stereogenbench_data.audit.geometry.audit import AuditRequest
 
 _ALL = "all"
 
@@ -62,9 +59,7 @@ def audit(  # noqa: PLR0913 - one parameter an option
             f"{per_scene!r} is neither a number of frames, such as 5, nor 'all'.",
             param_hint="--per-scene",
         )
-    request = geometry_audit.AuditRequest(
-        sample=scenes, frames=0 if per_scene == _ALL else int(per_scene)
-    )
+    frames = 0 if per_scene == _ALL else int(per_scene)
     options: Any = chosen.filters() | work.options()
     with progress_bar("reading the index", unit="scenes") as progress:
         index = geometry_audit.open_for_audit(
@@ -74,10 +69,12 @@ def audit(  # noqa: PLR0913 - one parameter an option
             conventions=source.stated(),
             **options,
         )
-    notes = _journal(out, source.data, request)
-    kept = geometry_audit.audit_journal(notes, index, request)
+    notes = _journal(out, source.data, frames)
+    kept = geometry_audit.audit_journal(notes, index, frames=frames)
     with writing(notes), kept, progress_bar("auditing", unit="frames") as progress:
-        report = geometry_audit.audit(index, request, progress=progress, journal=kept, **options)
+        report = geometry_audit.audit(
+            index, sample=scenes, frames=frames, journal=kept, progress=progress, **options
+        )
     document, markdown = json.dumps(report.to_json(), indent=1), audit_markdown(report)
     if out is not None:
         write_report(out, document if out.suffix == ".json" else markdown)
@@ -87,9 +84,9 @@ def audit(  # noqa: PLR0913 - one parameter an option
         raise typer.Exit(FINDINGS)
 
 
-def _journal(out: Path | None, data: str, request: "AuditRequest") -> Path:
+def _journal(out: Path | None, data: str, frames: int) -> Path:
     if out is not None:
         return out.with_name(f"{out.name}.journal")
-    audited = repr((full_place(data), request.frames)).encode(errors="replace")
+    audited = repr((full_place(data), frames)).encode(errors="replace")
     name = f"audit-{hashlib.sha256(audited).hexdigest()[:16]}.journal"
     return Path.home() / ".cache" / "stereogenbench" / name

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.audit.geometry.audit import (
-    AuditRequest,
     audit,
     audit_journal,
     open_for_audit,
@@ -36,13 +35,12 @@ from tests.audit.corruption import (
 )
 
 SCENE = "train/Uniform/SynthStage/scene_000000"
-THREE = AuditRequest(frames=3)
 
 
 @pytest.fixture(scope="module")
 def exact(indexed_release):
     """The audit of three frames of each of four scenes that are exact."""
-    return audit(indexed_release, THREE, workers=1)
+    return audit(indexed_release, frames=3, workers=1)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +62,7 @@ def figure(scene, quantity, member=""):
 def made_wrong(indexed_release, root, change):
     """Return the audit of one scene after change(folder)."""
     change(copied(indexed_release / SCENE, root))
-    return audit(root, THREE, workers=1)
+    return audit(root, frames=3, workers=1)
 
 
 def test_exact_scenes_have_no_finding(exact):
@@ -99,7 +97,7 @@ def test_frames_units_and_payloads_are_those_that_were_written(exact, indexed_re
 
 
 def test_shards_give_the_same_figures_as_the_folder(exact, small_shards):
-    packed = audit(small_shards, THREE, workers=1)
+    packed = audit(small_shards, frames=3, workers=1)
 
     assert packed.to_json() | {"root": ""} == exact.to_json() | {"root": ""}
 
@@ -113,8 +111,8 @@ def test_a_tree_behind_a_url_is_walked_with_its_broken_scenes(indexed_release):
         short = content[: len(content) // 2] if path.name == "cam_04_depth.mkv" else content
         store.pipe(f"/tree/{SCENE}/{path.name}", short)
 
-    report = audit("memory://tree", AuditRequest(frames=1), workers=1)
-    of_eval = audit("memory://tree", AuditRequest(frames=1), workers=1, split="eval")
+    report = audit("memory://tree", frames=1, workers=1)
+    of_eval = audit("memory://tree", frames=1, workers=1, split="eval")
     store.rm("/tree", recursive=True)
 
     (finding,) = report.findings
@@ -125,7 +123,7 @@ def test_a_tree_behind_a_url_is_walked_with_its_broken_scenes(indexed_release):
 
 
 def test_worker_processes_give_the_same_report(exact, indexed_release):
-    assert audit(indexed_release, THREE, workers=2).to_json() == exact.to_json()
+    assert audit(indexed_release, frames=3, workers=2).to_json() == exact.to_json()
 
 
 def test_the_table_has_the_papers_figures_beside(exact):
@@ -292,7 +290,7 @@ def test_what_the_content_does_not_tell_is_said_to_be_not_testable(
 
 
 def test_one_frame_tells_nothing_of_motion(indexed_release):
-    report = audit(indexed_release, AuditRequest(frames=1), workers=1, scenes=SCENE)
+    report = audit(indexed_release, frames=1, workers=1, scenes=SCENE)
 
     untested = {each.check for each in report.untested}
     assert report.findings == ()
@@ -346,8 +344,8 @@ def test_a_sample_is_spread_over_the_scenes_that_pass_the_filters(indexed_releas
     index = open_for_audit(indexed_release)
 
     def keys(sample, **filters):
-        request = AuditRequest(sample=sample, frames=1)
-        return [scene.key for scene in audit(index, request, workers=1, **filters).scenes]
+        report = audit(index, sample=sample, frames=1, workers=1, **filters)
+        return [scene.key for scene in report.scenes]
 
     every = keys(None)
     assert keys(2) == [every[0], every[-1]]
@@ -361,9 +359,8 @@ def test_a_journal_of_other_frames_or_changed_files_is_not_used(indexed_release,
     index = open_for_audit(tmp_path / "data")
 
     def run(frames):
-        request = AuditRequest(frames=frames)
-        with audit_journal(tmp_path / "j", index, request) as journal:
-            return len(journal), audit(index, request, workers=1, journal=journal)
+        with audit_journal(tmp_path / "j", index, frames=frames) as journal:
+            return len(journal), audit(index, frames=frames, workers=1, journal=journal)
 
     first = run(2)
     again = run(2)
@@ -379,23 +376,25 @@ def test_a_journal_of_other_frames_or_changed_files_is_not_used(indexed_release,
 
 
 def test_a_damaged_journal_is_passed_over(exact, indexed_release, tmp_path):
-    index, request = open_for_audit(indexed_release), THREE
-    with audit_journal(tmp_path / "j", index, request) as journal:
-        audit(index, request, workers=1, journal=journal, scenes=SCENE)
+    index = open_for_audit(indexed_release)
+
+    def run():
+        with audit_journal(tmp_path / "j", index, frames=3) as journal:
+            return audit(index, frames=3, workers=1, journal=journal, scenes=SCENE)
+
+    run()
     text = (tmp_path / "j").read_text()
     (tmp_path / "j").write_text(text.replace('"figures": [{', '"figures": [{"odd": 1, '))
-
-    with audit_journal(tmp_path / "j", index, request) as journal:
-        report = audit(index, request, workers=1, journal=journal, scenes=SCENE)
+    report = run()
 
     (expected,) = [scene for scene in exact.to_json()["scenes"] if scene["key"] == SCENE]
     assert report.to_json()["scenes"] == [expected]
 
 
 @pytest.mark.parametrize("wrong", [{"sample": 0}, {"frames": -1}])
-def test_a_request_that_cannot_be_met_is_refused(wrong):
+def test_numbers_that_are_too_small_are_refused(indexed_release, wrong):
     with pytest.raises(SelectionError, match="must be at least"):
-        AuditRequest(**wrong)
+        audit(indexed_release, **wrong)
 
 
 @pytest.mark.parametrize(
@@ -426,7 +425,7 @@ def test_quantiles_of_scenes_are_pooled_by_their_pixels():
 
 
 def test_the_shared_scene_is_right_by_its_metadata_and_depth(shared_scenes):
-    report = audit(shared_scenes, AuditRequest(frames=2), workers=1)
+    report = audit(shared_scenes, frames=2, workers=1)
 
     (scene,) = report.scenes
     assert report.findings == ()

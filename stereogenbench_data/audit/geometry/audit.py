@@ -5,23 +5,24 @@ import json
 import warnings
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, Unpack
 
 import numpy as np
 from jaxtyping import Int64
 
-from stereogenbench_data.audit.geometry.checks import (
+from stereogenbench_data.audit.geometry.records import (
+    AuditReport,
+    SceneAudit,
     broken_finding,
     findings_of,
+    plain,
     untested_of,
 )
-from stereogenbench_data.audit.geometry.records import AuditReport, SceneAudit, plain
 from stereogenbench_data.audit.geometry.scene_audit import AuditTask, audit_scene
 from stereogenbench_data.audit.geometry.table import table_rows
 from stereogenbench_data.audit.scene_access import source_of, spread
-from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
 from stereogenbench_data.index.build import Journal, walk
 from stereogenbench_data.index.open_tree import IncompleteSceneWarning
@@ -29,6 +30,7 @@ from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.rows import row_of
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.index.tree import SceneFolder
+from stereogenbench_data.jobs import WorkOptions, do_items
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Scene
@@ -37,6 +39,7 @@ from stereogenbench_data.selection.filters import (
     filter_scenes,
     may_pass,
     require_options,
+    split_options,
 )
 from stereogenbench_data.sources.location import is_remote, joined, local_path
 from stereogenbench_data.sources.remote import RemoteObject
@@ -46,58 +49,34 @@ DEFAULT_FRAMES: Final = 5
 _FORMAT: Final = 6
 
 
-@dataclass(frozen=True, slots=True)
-class AuditRequest:
-    """What to audit.
-
-    Attributes:
-        sample: How many scenes, evenly spread; None for all.
-        frames: How many frames of each scene, evenly spread; 0 for all, as in the paper.
-
-    Raises:
-        SelectionError: If a number is too small.
-    """
-
-    sample: int | None = None
-    frames: int = DEFAULT_FRAMES
-
-    def __post_init__(self) -> None:
-        """Refuse numbers that are too small."""
-        for name, value, least in (("sample", self.sample, 1), ("frames", self.frames, 0)):
-            if value is not None and value < least:
-                raise SelectionError(f"{name} must be at least {least}, got {value}.")
+class AuditOptions(WorkOptions, SceneFilters, total=False):
+    """How an audit is run (`WorkOptions`), and of which scenes (`SceneFilters`)."""
 
 
 def open_for_audit(
     data: str | Path,
     *,
     root: str | Path | None = None,
-    workers: int | None = None,
-    engine: Engine = LOCAL,
-    progress: Progress | None = None,
     conventions: str | Path | Conventions | None = None,
-    **filters: Unpack[SceneFilters],
+    **options: Unpack[AuditOptions],
 ) -> SceneIndex:
     """Return the index of data in which scenes may be broken; the index lists those scenes.
 
     Args:
         data: Whatever `SceneIndex.open` opens.
         root: Where the data of an index file are, if the user says so.
-        workers: Number of processes that read a tree without an index.
-        engine: Where these processes run.
-        progress: Called with the number of scenes read and of all scenes.
         conventions: As for `SceneIndex.open`.
-        **filters: Scenes of a tree whose paths do not match are not read.
+        **options: How a tree without an index is read (progress is in scenes); scenes of it whose
+            paths do not match are not read.
 
     Raises:
         StorageError: If there is no such data, or it has no such scene.
     """
     if root is None and _is_plain_tree(data):
+        work, filters = split_options(options, WorkOptions)
         report = walk(
             data if is_remote(data) else local_path(data),
-            workers=workers,
-            engine=engine,
-            progress=progress,
+            **work,
             wanted=may_pass(filters),
             conventions=None if conventions is None else Conventions.read(conventions),
         )
@@ -123,13 +102,11 @@ def _is_plain_tree(data: str | Path) -> bool:
 
 def audit(
     data: str | Path | SceneIndex,
-    request: AuditRequest | None = None,
     *,
-    workers: int | None = None,
-    engine: Engine = LOCAL,
-    progress: Progress | None = None,
+    sample: int | None = None,
+    frames: int = DEFAULT_FRAMES,
     journal: Journal | None = None,
-    **filters: Unpack[SceneFilters],
+    **options: Unpack[AuditOptions],
 ) -> AuditReport:
     """Measure whether data are right: the paper's geometry audit and its quality checks.
 
@@ -138,31 +115,30 @@ def audit(
 
     Args:
         data: A released tree, shards, an index file, the URL of either, or an index.
-        request: What to audit.
-        workers: Number of worker processes; None is one a core.
-        engine: Where they run: `engine.LOCAL`, or an `engine.RayCluster`.
-        progress: Called with the number of frames audited and of all frames.
+        sample: How many scenes, evenly spread; None for all.
+        frames: How many frames of each scene, evenly spread; 0 for all, as in the paper.
         journal: Keeps the result of each scene, so that a stopped audit can go on, see
             `audit_journal`; None keeps nothing.
-        **filters: Which scenes, see `SceneFilters`.
+        **options: How it is run, and of which scenes. Progress is in frames, before that in the
+            scenes of a tree that are read.
 
     Raises:
         StorageError: If there are no such data, they were derived for training, or a worker
             process died.
-        SelectionError: If no scene passes the filters.
+        SelectionError: If no scene passes the filters, or a number is too small.
 
     Source: the StereoGenBench paper, section on geometry conventions and sanity checks, and on
     quality control.
     """
-    require_options(audit, filters)
-    request = request or AuditRequest()
-    if isinstance(data, SceneIndex):
-        index = data
-    else:
-        index = open_for_audit(data, workers=workers, engine=engine, **filters)
+    require_options(audit, options)
+    for name, value, least in (("sample", sample, 1), ("frames", frames, 0)):
+        if value is not None and value < least:
+            raise SelectionError(f"{name} must be at least {least}, got {value}.")
+    work, filters = split_options(options, WorkOptions)
+    index = data if isinstance(data, SceneIndex) else open_for_audit(data, **options)
     index.require_released("The audit")
     broken, incomplete = (_wanted(each, filters) for each in (index.broken, index.incomplete))
-    rows = _chosen(index, request, filters, left_out=broken | incomplete)
+    rows = _chosen(index, sample, filters, left_out=broken | incomplete)
     scenes = [index.scene(int(row)) for row in rows]
     stamps: dict[str, str] = {}
     found: dict[str, SceneAudit] = {}
@@ -170,20 +146,25 @@ def audit(
         stamps = {scene.id.key: _stamp(index, scene) for scene in scenes}
         found = _known(journal, stamps)
     tasks = [
-        AuditTask(scene, source_of(index, scene), request.frames)
+        AuditTask(scene, source_of(index, scene), frames)
         for scene in scenes
         if scene.id.key not in found
     ]
-    advance = advance_of(
-        progress, total=sum(len(spread(scene.frames, request.frames)) for scene in scenes)
-    )
-    advance(sum(len(known.audited_frames) for known in found.values()))
-    for each in engine.map(
-        audit_scene, tasks, name=lambda task: task.scene.id.key, workers=workers, advance=advance
-    ):
+
+    def keep(each: SceneAudit) -> None:
         found[each.key] = each
         if journal is not None:
             journal.record(each.key, plain(asdict(each)), stamp=stamps[each.key])
+
+    do_items(
+        audit_scene,
+        tasks,
+        name=lambda task: task.scene.id.key,
+        keep=keep,
+        options=work,
+        done=sum(len(known.audited_frames) for known in found.values()),
+        total=sum(len(spread(scene.frames, frames)) for scene in scenes),
+    )
     audited = [found[scene.id.key] for scene in scenes]
     findings = [broken_finding(key, text) for key, text in sorted(broken.items())]
     for scene in audited:
@@ -193,7 +174,7 @@ def audit(
         root=index.where,
         scenes_there=len(index) + len(index.broken) + len(index.incomplete),
         scenes_audited=len(audited),
-        frames=request.frames,
+        frames=frames,
         rows=table_rows(audited, findings),
         findings=tuple(findings),
         untested=tuple(untested),
@@ -215,7 +196,7 @@ def _wanted(unusable: Mapping[str, str], filters: SceneFilters) -> dict[str, str
 
 
 def _chosen(
-    index: SceneIndex, request: AuditRequest, filters: SceneFilters, *, left_out: Mapping[str, str]
+    index: SceneIndex, sample: int | None, filters: SceneFilters, *, left_out: Mapping[str, str]
 ) -> Int64[np.ndarray, " n"]:
     """Return the rows to audit, ascending; none if every wanted scene was left out."""
     wanted = filters.get("scenes")
@@ -229,10 +210,10 @@ def _chosen(
         if not left_out:
             raise
         return np.empty(0, dtype=np.int64)
-    return rows[list(spread(len(rows), request.sample or 0))]
+    return rows[list(spread(len(rows), sample or 0))]
 
 
-def audit_journal(path: Path, index: SceneIndex, request: AuditRequest) -> Journal:
+def audit_journal(path: Path, index: SceneIndex, *, frames: int) -> Journal:
     """Return the journal of an audit.
 
     The journal starts anew for another root or number of frames. Filters and
@@ -241,8 +222,7 @@ def audit_journal(path: Path, index: SceneIndex, request: AuditRequest) -> Journ
     Raises:
         StorageError: If the file exists and cannot be read.
     """
-    work = {"audit": _FORMAT, "root": index.where, "frames": request.frames}
-    return Journal(path, work=work)
+    return Journal(path, work={"audit": _FORMAT, "root": index.where, "frames": frames})
 
 
 def _known(journal: Journal, stamps: Mapping[str, str]) -> dict[str, SceneAudit]:

@@ -18,8 +18,6 @@ _COVERED: Final = 0.8
 _LOOKED_AT_PX: Final = 320
 ENOUGH_LEVELS: Final = 64
 """Least count of different numbers whose spacing shows how they were rounded."""
-FLAT: Final = 8.0
-"""Pictures whose luma spans less (5th to 95th percentile) show nothing."""
 _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 
 Luma = Float32[np.ndarray, "h w"]

@@ -14,9 +14,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from stereogenbench_data.audit.geometry.alignment import AlignmentCheck
-from stereogenbench_data.audit.geometry.checks import CHECKS
 from stereogenbench_data.audit.geometry.picture_check import (
-    FLAT,
     MOVED_SHARE,
     band_passed,
     border_occluder,
@@ -27,7 +25,7 @@ from stereogenbench_data.audit.geometry.picture_check import (
     stored_figures,
     subject_m,
 )
-from stereogenbench_data.audit.geometry.records import Figure, SceneAudit
+from stereogenbench_data.audit.geometry.records import CHECKS, FLAT, Figure, SceneAudit
 from stereogenbench_data.audit.geometry.reprojection import (
     MeasuredDepth,
     PairErrors,

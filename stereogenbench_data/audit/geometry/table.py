@@ -6,8 +6,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from stereogenbench_data.audit.geometry.checks import CHECKS
 from stereogenbench_data.audit.geometry.records import (
+    CHECKS,
     QUANTILES,
     AuditReport,
     AuditRow,
