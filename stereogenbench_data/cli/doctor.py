@@ -42,8 +42,7 @@ def doctor(  # noqa: PLR0913 - one parameter an option
     Example: `stereogenbench doctor scenes/ -o doctor.png`
     """
     from stereogenbench_data.audit.contract.doctor import diagnose
-    from stereogenbench_data.audit.contract.picture import draw_report
-    from stereogenbench_data.audit.contract.report import doctor_json, doctor_lines
+    from stereogenbench_data.audit.contract.report import doctor_json, doctor_lines, draw_report
 
     if out is not None and out.suffix.lower() != ".png":
         raise typer.BadParameter(f"{out}: name a picture, *.png.", param_hint="--out")

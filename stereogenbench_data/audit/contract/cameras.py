@@ -17,10 +17,14 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from stereogenbench_data.audit.contract.fitting import voted
 from stereogenbench_data.audit.contract.hypotheses import LAGS, Hypothesis, Question
 from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames
-from stereogenbench_data.audit.contract.scoring import Pair, ScoredContract, sample_along_rows
+from stereogenbench_data.audit.contract.scoring import (
+    Pair,
+    ScoredContract,
+    sample_along_rows,
+    voted,
+)
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.text import counted
 

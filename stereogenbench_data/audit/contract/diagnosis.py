@@ -10,12 +10,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from stereogenbench_data.audit.contract.cameras import CameraCheck, check_cameras
-from stereogenbench_data.audit.contract.fitting import (
-    RayPower,
-    fit_scale,
-    ray_power,
-    voted,
-)
 from stereogenbench_data.audit.contract.hypotheses import QUESTIONS, Hypothesis, Question
 from stereogenbench_data.audit.contract.matching import (
     FrameMatch,
@@ -26,9 +20,13 @@ from stereogenbench_data.audit.contract.matching import (
 from stereogenbench_data.audit.contract.scoring import (
     LEAST_ERRORS,
     Evidence,
+    RayPower,
     ScoredContract,
     evidence,
+    fit_scale,
+    ray_power,
     score_hypothesis,
+    voted,
 )
 
 LEAST_LOG_SCALE: Final = 0.01
