@@ -29,13 +29,12 @@ def browse(
     """
     from stereogenbench_data.audit.browser.catalogue import Catalogue
     from stereogenbench_data.audit.browser.server import PageServer
-    from stereogenbench_data.audit.browser.service import Service
-    from stereogenbench_data.audit.pictures.scene_reader import SceneReader
+    from stereogenbench_data.audit.pictures import SceneReader
 
     index, shown_data = source.open(), full_place(source.data)
     reader = SceneReader(index)
-    service = Service(Catalogue(index, shown_data=shown_data), reader)
-    with PageServer(service, port=port) as server:
+    catalogue = Catalogue(index, shown_data=shown_data)
+    with PageServer(catalogue, reader, port=port) as server:
         typer.echo(f"{server.url}: {counted(len(index), 'scene')} of {shown_data}; Ctrl-C ends it")
         if index.is_derived:
             typer.echo(f"{shown_data}: {index.derivation}")

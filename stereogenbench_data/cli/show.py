@@ -39,8 +39,7 @@ def show(
 
     Example: `stereogenbench show shards/ scene_000001 --pair 0-5 -o sheet.png`
     """
-    from stereogenbench_data.audit.pictures import scene_pictures
-    from stereogenbench_data.audit.pictures.scene_reader import SceneReader
+    from stereogenbench_data.audit.pictures import SceneReader, clip_pages, scene_sheet, write_clip
     from stereogenbench_data.samples.picture import write_png
     from stereogenbench_data.selection.filters import find_scene
 
@@ -56,7 +55,7 @@ def show(
     target = out or Path(key.replace("/", "_") + ".png")
     with writing(target):
         if ending == ".png":
-            sheet = scene_pictures.scene_sheet(SceneReader(index), row, pair=pair, frame=frame)
+            sheet = scene_sheet(SceneReader(index), row, pair=pair, frame=frame)
             write_png(target, sheet)
         elif ending == ".rrd":
             from stereogenbench_data.bridges.rerun import write_recording
@@ -65,9 +64,9 @@ def show(
                 write_recording(target, index, key, pair=pair, progress=progress)
         else:
             with progress_bar("drawing", unit="frames") as progress:
-                scene_pictures.write_clip(
+                write_clip(
                     target,
-                    scene_pictures.clip_pages(SceneReader(index), row, pair=pair),
+                    clip_pages(SceneReader(index), row, pair=pair),
                     frames=recorded.frames,
                     rate_hz=recorded.frame_rate_hz,
                     progress=progress,

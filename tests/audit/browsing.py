@@ -8,15 +8,13 @@ from pathlib import Path
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.audit.browser.catalogue import Catalogue
 from stereogenbench_data.audit.browser.server import PageServer
-from stereogenbench_data.audit.browser.service import Service
-from stereogenbench_data.audit.pictures.scene_reader import SceneReader
+from stereogenbench_data.audit.pictures import SceneReader
 
 
 @contextmanager
 def serving(index: SceneIndex, data: Path) -> Iterator[PageServer]:
     """Serve the page of an index in a thread."""
-    service = Service(Catalogue(index, shown_data=str(data)), SceneReader(index))
-    with PageServer(service) as server:
+    with PageServer(Catalogue(index, shown_data=str(data)), SceneReader(index)) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         yield server

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from stereogenbench_data import SceneIndex, StereoPairs
-from stereogenbench_data.audit.browser.service import STATIC
+from stereogenbench_data.audit.browser.server import STATIC
 from tests.audit.browsing import serving
 
 SCENE = "train/Uniform/SynthStage/scene_000001"

@@ -6,14 +6,14 @@ import pytest
 from PIL import Image
 
 from stereogenbench_data import SceneIndex
-from stereogenbench_data.audit.pictures.scene_pictures import (
+from stereogenbench_data.audit.pictures import (
     HIDDEN,
+    SceneReader,
     clip_pages,
     scene_sheet,
     tile_width,
     write_clip,
 )
-from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 from stereogenbench_data.samples.picture import (
     NOT_MEASURED,
     ColourScale,
@@ -45,10 +45,9 @@ def tile(sheet, *, line, column, width_px):
     return sheet[top : top + width_px, left : left + width_px]
 
 
-@pytest.mark.parametrize("size_px", [None, 333])
-def test_the_views_of_a_sheet_are_the_six_cameras_pictures(reader, row, size_px):
-    sheet = scene_sheet(reader, row, pair=(0, 2), frame=1, tile_px=size_px)
-    width = tile_width(reader.index.scene(row), size_px)
+def test_the_views_of_a_sheet_are_the_six_cameras_pictures(reader, row):
+    sheet = scene_sheet(reader, row, pair=(0, 2), frame=1)
+    width = tile_width(reader.index.scene(row))
 
     views = reader.views(row, frame=1)
     for camera in range(6):
@@ -58,13 +57,13 @@ def test_the_views_of_a_sheet_are_the_six_cameras_pictures(reader, row, size_px)
 
 
 def test_the_maps_of_a_sheet_are_coloured_as_their_scales_say(reader, row):
-    sheet = scene_sheet(reader, row, pair=(0, 2), tile_px=256)
+    sheet = scene_sheet(reader, row, pair=(0, 2))
     sample = reader.pair(row, pair=(0, 2), frame=0,
                          fields=("left", "right", "disparity", "valid", "visible"))  # fmt: skip
     disparity, valid = sample["disparity"][0], sample["valid"][0]
     painted = ColourScale.of(disparity, measured=valid).paint(disparity, measured=valid)
     shown = {
-        name: tile(sheet, line=1, column=column, width_px=256)[2::4, 2::4]
+        name: tile(sheet, line=1, column=column, width_px=320)[2::5, 2::5]
         for column, name in ((0, "disparity"), (2, "visible"), (3, "anaglyph"))
     }
 
@@ -100,10 +99,10 @@ def test_a_clip_has_a_page_for_every_frame_at_the_scenes_rate(reader, row, tmp_p
     counted = []
     path = tmp_path / f"clip{suffix}"
     write_clip(
-        path, clip_pages(reader, row, tile_px=200), frames=7, rate_hz=15.0,
+        path, clip_pages(reader, row), frames=7, rate_hz=15.0,
         progress=lambda done, total: counted.append((done, total)),
     )  # fmt: skip
-    pages = list(clip_pages(reader, row, tile_px=200))
+    pages = list(clip_pages(reader, row))
     with av.open(path) as container:
         shown = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
         rate = float(container.streams.video[0].average_rate)

@@ -6,7 +6,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from jaxtyping import Int64
 
-from stereogenbench_data.audit.pictures.scene_pictures import derived_text
+from stereogenbench_data.audit.pictures import derived_text
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.index.table import SceneIndex

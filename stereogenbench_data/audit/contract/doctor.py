@@ -40,6 +40,8 @@ from stereogenbench_data.sources.members import MemberSource
 
 MOST_RESIDUAL_PX: Final = 0.5
 """Rigs with a larger rectification residual are left out: they need more than disparity."""
+_MOST_KEPT_PIXELS: Final = 5 * 2**20
+"""How much of each video stays decoded: every lag for small pictures."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,9 @@ class DiagnosisTask:
     @contextmanager
     def scene_frames(self) -> Iterator[SceneFrames]:
         """Open the scene's videos."""
-        with closing(Streams(self.source)) as streams:
+        pixels = self.scene.rig.image_width_px * self.scene.rig.image_height_px
+        kept = max(1, _MOST_KEPT_PIXELS // pixels)
+        with closing(Streams(self.source, kept_frames=kept)) as streams:
             yield SceneFrames(self.scene, streams, encoding=self.encoding)
 
 

@@ -20,7 +20,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from stereogenbench_data.audit.contract.hypotheses import LAGS, Flip, Hypothesis
 from stereogenbench_data.audit.geometry.picture_check import Luma, band_passed, luma_of
-from stereogenbench_data.errors import MediaError
 from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.samples.load import Streams
 from stereogenbench_data.schema.records import DepthEncoding, Scene
@@ -157,8 +156,6 @@ _Numbers = tuple[UInt16[np.ndarray, " n"], Bool[np.ndarray, " n"]]
 
 
 _MOST_POINTS: Final = 2000
-_MOST_DEPTH_BYTES: Final = 96 * 2**20
-"""How much decoded depth is kept: every lag of every camera for small pictures."""
 SIDE_CELLS: Final = 4
 """Number of parts along each side of a picture. Their spread gives a comparison's error."""
 
@@ -208,10 +205,10 @@ class FrameMatch:
 
 
 class SceneFrames:
-    """One scene's pictures and depth, each decoded once."""
+    """One scene's pictures and depth."""
 
     def __init__(self, scene: Scene, streams: Streams, *, encoding: DepthEncoding) -> None:
-        """Take a scene and the declared contract, whose unit may come from the tags."""
+        """Take a scene, and the declared contract, whose unit may come from the tags."""
         self.scene = scene
         self.encoding = encoding
         self.intrinsics: Intrinsics = rig_intrinsics(scene.rig)
@@ -220,7 +217,6 @@ class SceneFrames:
         self._stored: dict[tuple[FrameMatch, int, int], dict[Flip, _Numbers]] = {}
         self._predicted_by: Hypothesis | None = None
         self._predictions: dict[tuple[FrameMatch, int], _Prediction | None] = {}
-        self._depths: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
 
     @property
     def primary(self) -> tuple[int, int]:
@@ -234,12 +230,7 @@ class SceneFrames:
 
     def rgb(self, frame: int, file: int) -> UInt8[np.ndarray, "3 h w"]:
         """Return a picture."""
-        picture: UInt8[np.ndarray, "3 h w"] = self._streams.rgb(
-            self.scene, rgb_name(file), frame, size=None
-        )
-        expected = (self.intrinsics.height_px, self.intrinsics.width_px)
-        _require_size(picture.shape[1:], expected, where=f"{self.scene.id.key}/{rgb_name(file)}")
-        return picture
+        return self._streams.rgb(self.scene, rgb_name(file), frame, size=None)
 
     def band(self, frame: int, file: int) -> Luma:
         """Return a picture's grey levels, band-passed."""
@@ -251,17 +242,10 @@ class SceneFrames:
         self, frame: int, file: int
     ) -> tuple[UInt16[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
         """Return stored depth and where it was measured."""
-        if (frame, file) in self._depths:
-            return self._depths[frame, file]
-        name = depth_name(file)
-        stored = self._streams.read_stored_depth(self.scene, name, frame, encoding=self.encoding)
-        units = stored.units
-        expected = (self.intrinsics.height_px, self.intrinsics.width_px)
-        _require_size(units.shape, expected, where=f"{self.scene.id.key}/{name}")
-        if (len(self._depths) + 1) * units.size * 3 > _MOST_DEPTH_BYTES and self._depths:
-            self._depths.pop(next(iter(self._depths)))
-        self._depths[frame, file] = units, stored.measured & (units > 0)
-        return self._depths[frame, file]
+        stored = self._streams.read_stored_depth(
+            self.scene, depth_name(file), frame, encoding=self.encoding
+        )
+        return stored.units, stored.measured & (stored.units > 0)
 
     def _numbers(self, match: FrameMatch, *, frame: int, file: int) -> dict[Flip, _Numbers]:
         """Return what a depth frame stores at a match's pixels, as it is and flipped.
@@ -437,11 +421,3 @@ def relative_step(numbers: UInt16[np.ndarray, " n"]) -> float:
     shares = np.where(np.isfinite(nearest), nearest, 1.0) / np.maximum(values, 1)
     order = shares.argsort()
     return float(shares[order][np.searchsorted(counts[order].cumsum(), 0.75 * len(numbers))])
-
-
-def _require_size(found: Sequence[int], expected: tuple[int, int], *, where: str) -> None:
-    if tuple(found) != expected:
-        raise MediaError(
-            f"{where}: is {found[1]}x{found[0]} px where the scene's metadata says "
-            f"{expected[1]}x{expected[0]}: correct image_width and image_height, or the video."
-        )

@@ -116,20 +116,23 @@ def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
     nearest = min((gain for _, gain in each_gain), key=lambda gain: gain.low_db, default=None)
     doubtful = list(dict.fromkeys(answer for answer, gain in each_gain if not gain.is_excluded))
     is_sure = not (close or lacking or doubtful) and bool(tested)
-    words = _words_beside(best, close, untested, question=question)
+    at_end = question == "frame_lag" and abs(best) == max(LAGS)
+    want = "frames" if question == "frame_lag" else "depth where it would be"
+    is_near = best == declared and not (close or lacking)
+    words = "; ".join([
+        *([f"not excluded by the margin: {_named(doubtful)}"] if is_near and doubtful else []),
+        *([f"fit alike: {_named([best, *close])}"] if close else []),
+        *([f"not tested, for lack of {want}: {', '.join(map(describe, untested))}"]
+          if untested else []),
+        *([f"lags beyond {max(LAGS)} frames are not examined"] if at_end else []),
+    ])  # fmt: skip
     if best == declared:
         if close or lacking or not tested:
             return replace(blank, behind=nearest, note=words)
-        if not is_sure:
-            note = f"not excluded by the margin: {_named(doubtful)}"
-            note = f"{note}; {words}" if words else note
-            return replace(
-                blank, found=describe(best), status="not contradicted", behind=nearest, note=note
-            )
+        status: Status = "confirmed" if is_sure else "not contradicted"
         return replace(
-            blank, found=describe(best), status="confirmed", behind=nearest, note=words,
-            is_sure=True,
-        )  # fmt: skip
+            blank, found=describe(best), status=status, behind=nearest, note=words, is_sure=is_sure
+        )
     # To be called wrong the declared answer must be behind; to be pasted, by the margin too.
     of_declared = gains.get(declared)
     is_behind = of_declared is not None and (of_declared.by_shape or of_declared.low_db > 0)
@@ -143,7 +146,6 @@ def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
         return replace(blank, behind=of_declared, note=f"{note}; {words}" if words else note)
     others = [answer for answer in [*close, *lacking, *doubtful] if answer != declared]
     found = " or ".join(describe(answer) for answer in dict.fromkeys([best, *others]))
-    at_end = question == "frame_lag" and abs(best) == max(LAGS)
     return replace(
         blank, found=f"{found} or beyond" if at_end else found, status="wrong",
         behind=of_declared, note=words, is_sure=is_sure and not at_end,
@@ -154,21 +156,6 @@ def _named(answers: Sequence[Any]) -> str:
     words = ", ".join(describe(answer) for answer in answers[:_MOST_NAMED])
     more = len(answers) - _MOST_NAMED
     return f"{words} and {more} more" if more > 0 else words
-
-
-def _words_beside(
-    best: Any, close: Sequence[Any], untested: Sequence[Any], *, question: Question
-) -> str:
-    """Return which answers fit as well as the best one, and which were not tested."""
-    words = []
-    if close:
-        words.append(f"fit alike: {_named([best, *close])}")
-    if untested:
-        want = "frames" if question == "frame_lag" else "depth where it would be"
-        words.append(f"not tested, for lack of {want}: {', '.join(map(describe, untested))}")
-    if question == "frame_lag" and abs(best) == max(LAGS):
-        words.append(f"lags beyond {max(LAGS)} frames are not examined")
-    return "; ".join(words)
 
 
 def behind(scenes: Sequence[SceneDiagnosis], rival: Rival) -> Gain:

@@ -1,20 +1,24 @@
-"""Pictures of a scene: all views and maps on one page, or a clip of one pair over time."""
+"""Pictures of a scene: read, and drawn as all views and maps on one page or a clip over time."""
 
 import math
+import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import av
 import numpy as np
+from jaxtyping import UInt8
 from PIL import Image
 
-from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 from stereogenbench_data.engine import Progress, advance_of
-from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.errors import MediaError, SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.media.depth import DEPTH_CURES, NO_DEPTH_UNIT
 from stereogenbench_data.media.encoder import Encoding, VideoEncoder
-from stereogenbench_data.samples.fields import Sample
+from stereogenbench_data.samples.fields import Request, Sample
+from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.samples.picture import (
     FRAME,
     NOT_MEASURED,
@@ -30,7 +34,84 @@ from stereogenbench_data.samples.picture import (
 from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.selection.filters import require_pairs
+from stereogenbench_data.selection.plan import Address
 from stereogenbench_data.sources.files import open_output
+
+OPEN_VIDEOS: Final = 6
+"""How many videos the reading of one set of fields keeps open: those of a scene of one kind."""
+
+
+class SceneReader:
+    """Reads pictures and maps of one pair and one frame at a time.
+
+    Reads of the same fields take turns and share open videos; reads of other fields run in
+    parallel. Only the last frame of each open video is kept.
+    """
+
+    def __init__(self, index: SceneIndex) -> None:
+        """Prepare to read the data of an index; nothing is opened yet."""
+        self.index = index
+        self._lock = threading.Lock()
+        self._loaders: dict[tuple[str, ...], tuple[SampleLoader, threading.Lock, bool]] = {}
+
+    def pair(
+        self, row: int, *, pair: tuple[int, int], frame: int, fields: tuple[str, ...]
+    ) -> Sample:
+        """Return fields (of `PAIR_FIELDS`) of a pair at a frame, as numpy arrays.
+
+        Raises:
+            SelectionError: If there is no such pair or frame.
+            StorageError: If a file is missing or is not the one that was indexed.
+            MediaError: If a video does not decode to what the index says, or the unit of depth that
+                a field needs is not known.
+        """
+        left, right = require_pairs([pair])[0]
+        return self._read("pairs", fields, Address(row, left, (right,), (frame,)))
+
+    def views(self, row: int, *, frame: int) -> UInt8[np.ndarray, "6 3 h w"]:
+        """Return the pictures of all six cameras at a frame; raises as `pair` does."""
+        address = Address(row, 0, tuple(range(1, CAMERA_COUNT)), (frame,))
+        pictures: UInt8[np.ndarray, "6 3 h w"] = self._read("views", ("image",), address)["image"]
+        return pictures
+
+    def close(self) -> None:
+        """Close open videos; the reader can be used again."""
+        with self._lock:
+            loaders = list(self._loaders.values())
+        for loader, turn, _ in loaders:
+            with turn:
+                loader.close()
+
+    def _read(
+        self, kind: Literal["pairs", "views"], fields: tuple[str, ...], address: Address
+    ) -> Sample:
+        scene, frame = self.index.scene(address.row), address.frames[0]
+        if not 0 <= frame < scene.frames:
+            raise SelectionError(
+                f"{scene.id.key} has no frame {frame}: its {scene.frames} are 0 to "
+                f"{scene.frames - 1}. Choose one of them."
+            )
+        with self._lock:
+            if fields not in self._loaders:
+                layout: Literal["single", "stacked"] = "stacked" if kind == "views" else "single"
+                request = Request(kind=kind, fields=fields, layout=layout)
+                loader = SampleLoader(self.index, request)
+                loader.keep_open(OPEN_VIDEOS)
+                needs_depth = not request.streams.isdisjoint({"source_depth", "target_depth"})
+                self._loaders[fields] = (loader, threading.Lock(), needs_depth)
+            loader, turn, needs_depth = self._loaders[fields]
+        encodings = (
+            scene.depth_encoding(camera, depth_of(scene))
+            for camera in (address.source, *address.targets)
+        )
+        if needs_depth and any(encoding.unit_m is None for encoding in encodings):
+            raise MediaError(
+                scene.remark("depth") or f"{scene.id.key}: {NO_DEPTH_UNIT}. {DEPTH_CURES}"
+            )
+        with turn:
+            return loader.load(address, clip="frame")
+
 
 SHEET_FIELDS: Final = (
     "left", "right", "disparity", "valid", "visible", "depth", "warped_right", "hole", "baseline_m",
@@ -42,19 +123,14 @@ MOST_DIFFERENT: Final = 64
 """The difference of two pictures, of 255 levels, that is drawn white."""
 
 _NARROWEST_PX: Final = 200
+"""What a tile's caption needs."""
 _USUAL_PX: Final = 320
-_WIDEST_PX: Final = 2048
 
 
-def tile_width(scene: Scene, wanted_px: int | None) -> int:
-    """Return a tile's width in pixels: as asked, or a whole multiple of a small picture.
-
-    A tile has at least 200 pixels, enough for its caption.
-    """
+def tile_width(scene: Scene) -> int:
+    """Return a tile's width in pixels: a whole multiple of a small picture, wide enough."""
     width = scene.rig.image_width_px
-    if wanted_px is None:
-        wanted_px = _USUAL_PX if width > _USUAL_PX else width * max(1, _USUAL_PX // width)
-    return min(max(wanted_px, _NARROWEST_PX), _WIDEST_PX)
+    return max(_NARROWEST_PX, _USUAL_PX if width > _USUAL_PX else width * (_USUAL_PX // width))
 
 
 def scene_sheet(
@@ -63,7 +139,6 @@ def scene_sheet(
     *,
     pair: tuple[int, int] | None = None,
     frame: int = 0,
-    tile_px: int | None = None,
 ) -> Picture:
     """Return a scene's contact sheet as (h, w, 3) uint8.
 
@@ -71,9 +146,7 @@ def scene_sheet(
         reader: Reads the data.
         row: The scene's row in the index.
         pair: The cameras (left, right), None for the pair that the scene records.
-        frame: The frame's number.
-        tile_px: The width of one picture on the sheet, None for a suitable one. Numbers on the
-            sheet always refer to the stored pictures.
+        frame: The frame's number. Numbers on the sheet refer to the stored pictures.
 
     Raises:
         SelectionError: If there is no such pair or frame.
@@ -87,7 +160,7 @@ def scene_sheet(
     encoding = scene.depth_encoding(pair[0], depth_of(scene))
     title = _title(scene, sample, encoding, pair=pair, frame=frame)
     rows = [_view_tiles(scene, views, pair), _pair_tiles(scene, sample)]
-    return draw_sheet(title, rows, width_px=tile_width(scene, tile_px))
+    return draw_sheet(title, rows, width_px=tile_width(scene))
 
 
 def _title(
@@ -182,7 +255,6 @@ def clip_pages(
     row: int,
     *,
     pair: tuple[int, int] | None = None,
-    tile_px: int | None = None,
 ) -> Iterator[Picture]:
     """Yield a page for each frame of a scene, all of one size with even sides.
 
@@ -190,7 +262,6 @@ def clip_pages(
         reader: Reads the data.
         row: The scene's row in the index.
         pair: The cameras (left, right), None for the pair that the scene records.
-        tile_px: The width of one picture on the page, None for a suitable one.
 
     Raises:
         SelectionError: If there is no such pair.
@@ -207,7 +278,7 @@ def clip_pages(
         np.stack([sample["disparity"] for sample in found]),
         measured=np.stack([sample["valid"] for sample in found]),
     )
-    width_px, fx_px = tile_width(scene, tile_px), rig_intrinsics(scene.rig).fx_px
+    width_px, fx_px = tile_width(scene), rig_intrinsics(scene.rig).fx_px
     for frame in range(scene.frames):
         sample = reader.pair(row, pair=pair, frame=frame, fields=CLIP_FIELDS)
         heading = f"{scene.id.key}, pair {pair[0]}-{pair[1]}, frame {frame}"

@@ -1,1 +1,0 @@
-"""Pictures of scenes: read, drawn, written as sheets and clips."""
