@@ -25,7 +25,7 @@ from stereogenbench_data.audit.contract.verdict import (
 )
 from stereogenbench_data.audit.scene_access import spread
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
-from stereogenbench_data.errors import SelectionError, StereoGenBenchError, StorageError
+from stereogenbench_data.errors import StereoGenBenchError, StorageError
 from stereogenbench_data.index.learning import (
     Examined,
     Learned,
@@ -101,7 +101,7 @@ def survey(  # noqa: PLR0913 - each names one thing that a user chooses
 
     Args:
         root: The folder that holds ``train`` and ``eval``, or its URL.
-        scenes: How many scenes are read, spread over families, maps and keys of files.
+        scenes: How many scenes, at least 1, are read, spread over families, maps and keys of files.
         pictured: How many scenes of each shape are measured by their pictures, and as many others
             verify what was measured; 0 for none.
         conventions: What is tested; None to learn.
@@ -111,12 +111,9 @@ def survey(  # noqa: PLR0913 - each names one thing that a user chooses
         progress: Called with the number of scenes read and of all.
 
     Raises:
-        SelectionError: If a number is below 1.
         StorageError: If the tree holds no scenes, none is wanted, or none of those looked at is
             finished.
     """
-    if scenes < 1 or pictured < 0:
-        raise SelectionError(f"scenes must be at least 1, got {scenes}: ask for more.")
     keys = chosen_scenes(root, count=scenes, wanted=wanted)
     found = list[Examined]()
     # Reading takes less time than starting processes, unless each file is fetched.

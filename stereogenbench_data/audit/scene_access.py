@@ -15,8 +15,8 @@ def source_of(index: SceneIndex, scene: Scene) -> MemberSource:
 def spread(available: int, wanted: int) -> tuple[int, ...]:
     """Return this many numbers below ``available``, evenly spread from first to last; 0 means all.
 
-    >>> spread(81, 5), spread(2, 5)
-    ((0, 20, 40, 60, 80), (0, 1))
+    >>> spread(81, 5), spread(81, 1), spread(2, 5), spread(3, 0)
+    ((0, 20, 40, 60, 80), (40,), (0, 1), (0, 1, 2))
     """
     if wanted == 0 or wanted >= available:
         return tuple(range(available))

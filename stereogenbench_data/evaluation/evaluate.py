@@ -11,7 +11,7 @@ import hashlib
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from io import BytesIO
 from pathlib import Path
 from pickle import UnpicklingError
@@ -376,14 +376,8 @@ def _scene_path(out: Path, scene: str) -> Path:
 def _write_scene(out: Path, scene: str, scores: SceneScores) -> None:
     """Keep the scores of a scene, whole or not at all."""
     content = {
-        place: {
-            "columns": found.columns,
-            "problem": found.problem,
-            "views_sha256": found.views_sha256,
-            "stamp": found.stamp,
-            "predicted": _tensors(found.predicted),
-            "target": _tensors(found.target),
-        }
+        place: {each.name: getattr(found, each.name) for each in fields(found)}
+        | {"predicted": _tensors(found.predicted), "target": _tensors(found.target)}
         for place, found in scores.items()
     }
     packed, path = BytesIO(), _scene_path(out, scene)

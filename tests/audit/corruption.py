@@ -2,11 +2,13 @@
 
 import json
 import shutil
-from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
+
+from tests.servers.videos import write_depth as write_maps
+from tests.servers.videos import write_rgb
 
 CAMERAS = range(6)
 
@@ -25,28 +27,25 @@ def copied(source: Path, root: Path) -> Path:
 def read_depth(folder: Path, camera: int) -> tuple[np.ndarray, dict[str, str]]:
     """Return (t, h, w) uint16 and the container's tags."""
     with av.open(str(folder / f"cam_{camera:02d}_depth.mkv")) as container:
-        tags = dict(container.metadata)
-        frames = [_luma(frame) for frame in container.decode(video=0)]
-    return np.stack(frames), tags
+        return np.stack([f.to_ndarray() for f in container.decode(video=0)]), container.metadata
 
 
 def write_depth(folder: Path, camera: int, units: np.ndarray, tags: dict[str, str]) -> None:
     """Write (t, h, w) as FFV1 gray16le."""
     path = folder / f"cam_{camera:02d}_depth.mkv"
-    _write(path, np.asarray(units, np.uint16), codec="ffv1", pixel_format="gray16le", tags=tags)
+    options = {"level": "3", "slicecrc": "1"}
+    write_maps(path, np.asarray(units, np.uint16), tags=tags, options=options)
 
 
-def rewrite_depth(folder: Path, change, *, unit_factor: float = 1.0) -> None:
-    """Replace every camera's depth by change(units), and multiply what the tags say."""
-    for camera in CAMERAS:
-        rewrite_one_depth(folder, camera, change, unit_factor=unit_factor)
-
-
-def rewrite_tags(folder: Path, tags: dict[str, str], change=lambda units: units) -> None:
-    """Replace every camera's depth by change(units), and its tags by others."""
-    for camera in CAMERAS:
-        units, _ = read_depth(folder, camera)
-        write_depth(folder, camera, change(units), tags)
+def rewrite_depth(folder: Path, change=lambda units: units, *, cameras=CAMERAS, tags=None) -> None:
+    """Replace cameras' depth by change(units), and the tags; a number multiplies what they say."""
+    for camera in cameras:
+        units, told = read_depth(folder, camera)
+        scales = {key: each for key, each in told.items() if "scale" in key.lower()}
+        if isinstance(tags, float):
+            scales = {key: repr(float(each) * tags) for key, each in scales.items()}
+        new_tags = tags if isinstance(tags, dict) else scales
+        write_depth(folder, camera, change(units), new_tags)
 
 
 def as_range(near_m: float, far_m: float, *, unit_m: float):
@@ -59,24 +58,12 @@ def as_range(near_m: float, far_m: float, *, unit_m: float):
     return change
 
 
-def rewrite_one_depth(folder: Path, camera: int, change, *, unit_factor: float = 1.0) -> None:
-    """Replace one camera's depth by change(units), and multiply what its tag says."""
-    units, tags = read_depth(folder, camera)
-    kept = {
-        key: repr(float(value) * unit_factor)
-        for key, value in tags.items()
-        if "scale" in key.lower()
-    }
-    write_depth(folder, camera, change(units), kept)
-
-
 def rewrite_rgb(folder: Path, camera: int, change, *, crf: int = 18) -> None:
     """Replace a camera's pictures (t, h, w, 3) by change(pictures); 0 is without loss."""
     path = folder / f"cam_{camera:02d}_rgb.mp4"
     with av.open(str(path)) as container:
         pictures = np.stack([f.to_ndarray(format="rgb24") for f in container.decode(video=0)])
-    pixels = change(pictures)
-    _write(path, pixels, codec="libx264", pixel_format="yuv420p", tags={}, crf=crf)
+    write_rgb(path, np.ascontiguousarray(change(pictures)), options={"crf": f"{crf}"})
 
 
 def edit_baseline(folder: Path, change) -> None:
@@ -199,25 +186,3 @@ def exchange(folder: Path, cameras: dict[int, int], *, kinds=("rgb.mp4", "depth.
         }
         for camera, other in cameras.items():
             (folder / f"cam_{camera:02d}_{kind}").write_bytes(contents[other])
-
-
-def _luma(frame) -> np.ndarray:
-    plane = frame.planes[0]
-    rows = np.frombuffer(plane, np.dtype("<u2")).reshape(plane.height, plane.line_size // 2)
-    return rows[:, : plane.width].copy()
-
-
-def _write(path: Path, frames: np.ndarray, *, codec, pixel_format, tags, crf=18) -> None:
-    options = {"level": "3", "slicecrc": "1"} if codec == "ffv1" else {"crf": f"{crf}"}
-    with av.open(str(path), "w") as container:
-        container.metadata.update(tags)
-        stream = container.add_stream(codec, rate=15, options=options)
-        stream.height, stream.width = frames.shape[1:3]
-        stream.pix_fmt = pixel_format
-        stream.codec_context.thread_count = 1
-        for number, picture in enumerate(frames):
-            source = "gray16le" if codec == "ffv1" else "rgb24"
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format=source)
-            frame.pts, frame.time_base = number, Fraction(1, 15)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))

@@ -8,26 +8,9 @@ Pairwise_Uniform it tells them of all pairs, too: cameras there stand on no line
 import numpy as np
 from scipy.optimize import brentq, fsolve
 
+from stereogenbench_data.audit.paper_numbers import paper_table
 from stereogenbench_data.schema.records import Member, Rig, Scene, SceneId, SceneLabels
 
-FAMILIES = ("IPD_Gaussian", "Uniform", "Pairwise_Uniform")
-TRAIN = """
-AbandonedPowerPlant 10 27 30|AssetsvilleTown 514 7 978|Car_Dealer 255 39 9|Downtown_West 62 12 120|
-GangnyeongieonComplex 801 9 309|GeunjeongjeonComplex 211 180 200|JapaneseStyleRoom 309 39 99|
-JesuhabComplex 0 30 479|Light_Foliage 18 19 0|Modular_Scifi_Mechanic_Base 523 27 132|
-OWD_Yucca_Pack 63 40 28|ProceduralBuildingGenerator 0 58 0|ProceduralNtr_vol2 83 22 517|
-RestaurantScene 125 35 25|ROCKY_SAND_PACK 83 95 0|Scene_Bazaar_Vol1 0 5 0|Scene_Saloon 12 0 0|
-Scene_UnfinishedBuilding 8 2 7|Scene_Warehouse 50 7 0|SeyeonjeongPavilion 0 0 698|
-Stylized_Egypt 0 108 30|UndergroundSciFi 121 0 30|UtopianCity 41 13 0
-"""
-EVAL = """
-AssetsvilleTown 30 31|Car_Dealer 1 2|Downtown_West 21 12|GangnyeongieonComplex 99 0|
-GeunjeongjeonComplex 2 52|JapaneseStyleRoom 22 0|JesuhabComplex 0 1|Light_Foliage 13 35|
-Modular_Scifi_Mechanic_Base 2 14|OWD_Yucca_Pack 25 0|ProceduralNtr_vol2 23 18|RestaurantScene 2 1|
-ROCKY_SAND_PACK 0 20|Scene_Bazaar_Vol1 0 34|Scene_Warehouse 0 30|Stylized_Egypt 0 31|
-UndergroundSciFi 25 0
-"""
-UNSEEN = "DeepWaterStation_DemoMapScalabilityEpic 34 45|STF_TestMap 57 57"
 ADJACENT = [0, 5, 9, 12, 14]
 OTHERS = [place for place in range(15) if place not in ADJACENT]
 
@@ -67,36 +50,25 @@ def apart(adjacent):
 def paper_scenes():
     """Return the 8,493 scenes."""
     rng = np.random.default_rng(0)
-    adjacent = {
-        ("train", "IPD_Gaussian"): spread_out(16445, 4.5278, 8.3867, 6.3813, 0.4998, 6.3813),
-        ("train", "Uniform"): spread_out(3870, 1.0113, 149.8906, 52.7908, 38.95, 43.2916),
-        ("train", "Pairwise_Uniform"): spread_out(18455, 5.1117, 123.2309, 38.6091, 20.7742, 36.0),
-        ("eval", "IPD_Gaussian"): spread_out(1780, 4.7119, 8.3332, 6.3743, 0.5052, 6.3743),
-        ("eval", "Uniform"): spread_out(1915, 1.0058, 149.7889, 50.6741, 39.1111, 41.6438),
-    }
     scenes = []
-    for (split, family), values in adjacent.items():
-        places = _places(split, family)
+    for row in paper_table("adjacent"):
+        split, family = row["split"], row["family"]
+        least, largest, mean, std = (float(row[name]) for name in ("min", "max", "mean", "std"))
+        median = float(row["median"] or min(mean, 36.0))
+        values = spread_out(int(row["count"]), least, largest, mean, std, median)
         rows = _in_rows(values, rng=rng)
         far = [gaps_between(gaps) for gaps in rows]
         if family == "Pairwise_Uniform":
             far = rng.permutation(apart(values)).reshape(-1, 10)
+        places = [
+            (each.get("subset"), each["map"])
+            for each in paper_table(f"{split}_maps") for _ in range(int(each.get(family, 0)))
+        ]  # fmt: skip
         scenes += [
             _scene(split, family, subset, name, number, rows[number], far[number])
-            for number, (subset, name) in enumerate(places)
-        ]  # fmt: skip
+            for number, (subset, name) in enumerate(sorted(places, key=lambda each: each[0] or ""))
+        ]
     return scenes
-
-
-def _places(split, family):
-    column = 1 + FAMILIES.index(family)
-    tables = [(None, TRAIN)] if split == "train" else [("seen_map", EVAL), ("unseen_map", UNSEEN)]
-    return [
-        (subset, row.split()[0])
-        for subset, table in tables
-        for row in table.replace("\n", "").split("|")
-        for _ in range(int(row.split()[column]))
-    ]
 
 
 def _in_rows(values, *, rng):

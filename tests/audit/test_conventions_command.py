@@ -8,7 +8,7 @@ import pytest
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
-from tests.audit.corruption import as_range, rewrite_tags
+from tests.audit.corruption import as_range, rewrite_depth
 from tests.cli.command import invoke
 
 
@@ -56,7 +56,7 @@ def test_scenes_that_conventions_leave_alike_unread_are_told_once_with_the_cure(
     file, root = tmp_path / "edited.toml", tmp_path / "tagged"
     shutil.copytree(untagged, root, copy_function=shutil.copyfile)
     for folder in root.glob("*/*/*/scene_*"):
-        rewrite_tags(folder, {"DEPTH_Q": "7"})
+        rewrite_depth(folder, tags={"DEPTH_Q": "7"})
     file.write_text('[baselines]\nplace = "$.pairwise_pairs"\n')
 
     silent = invoke("conventions", root, "--check", file, "--workers", 1)
@@ -101,7 +101,7 @@ def test_the_range_of_tags_is_learned_with_its_offset(detailed_release, tmp_path
     shutil.copytree(detailed_release, root, copy_function=shutil.copyfile)
     for folder in root.glob("*/*/*/scene_*"):
         tags = {"depth_near": "0.5 m", "depth_far": "70 m"}
-        rewrite_tags(folder, tags, as_range(0.5, 70, unit_m=0.001))
+        rewrite_depth(folder, as_range(0.5, 70, unit_m=0.001), tags=tags)
 
     result = invoke("conventions", root, "-o", out, "--workers", 1)
 

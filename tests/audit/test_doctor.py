@@ -5,9 +5,7 @@ import json
 import pytest
 from PIL import Image
 
-from stereogenbench_data.audit.contract.verdict import encoding_line
-from stereogenbench_data.schema.records import DepthEncoding
-from tests.audit.corruption import copied, rewrite_one_depth, scaled
+from tests.audit.corruption import copied, rewrite_depth, scaled
 from tests.cli.command import invoke
 
 
@@ -55,7 +53,7 @@ def test_a_wrong_quotient_ends_with_1_and_no_unit_to_paste(detailed_release, tmp
 
 def test_a_camera_that_does_not_fit_ends_with_1(detailed_release, tmp_path):
     (scene,) = detailed_release.glob("*/*/*/scene_*")
-    rewrite_one_depth(copied(scene, tmp_path), 4, scaled(0.5))
+    rewrite_depth(copied(scene, tmp_path), scaled(0.5), cameras=[4])
 
     result = run(tmp_path)
 
@@ -71,12 +69,3 @@ def test_a_picture_of_no_known_kind_is_refused_before_anything_is_read(tmp_path)
 
     assert result.exit_code == 2
     assert "name a picture" in result.stderr
-
-
-def test_the_line_to_paste_is_the_contract():
-    encoding = DepthEncoding(unit_m=0.1, kind="ray", frame_lag=-1)
-
-    line = encoding_line(encoding)
-
-    assert line == "DepthEncoding(unit_m=0.1, kind='ray', frame_lag=-1)"
-    assert eval(line, {"DepthEncoding": DepthEncoding}) == encoding

@@ -15,7 +15,6 @@ from stereogenbench_data.audit.geometry.audit import (
     open_for_audit,
 )
 from stereogenbench_data.audit.geometry.table import audit_markdown, pooled_px
-from stereogenbench_data.audit.scene_access import spread
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
@@ -27,7 +26,6 @@ from tests.audit.corruption import (
     lengthen_label,
     read_depth,
     rewrite_depth,
-    rewrite_one_depth,
     rewrite_rgb,
     scale_camera,
     scaled,
@@ -142,7 +140,7 @@ def pictures(camera, change, **options):
 
 
 def depth(camera, change):
-    return lambda folder: rewrite_one_depth(folder, camera, change)
+    return lambda folder: rewrite_depth(folder, change, cameras=[camera])
 
 
 def flat(folder):
@@ -262,9 +260,9 @@ def standing_still(folder):
     def stand(frame, first):
         frame["cameras"] = first["cameras"]
 
+    rewrite_depth(folder, lambda units: units[[0] * 7])
     for camera in range(6):
         rewrite_rgb(folder, camera, lambda seen: seen[[0] * 7])
-        rewrite_one_depth(folder, camera, lambda units: units[[0] * 7])
     edit_trajectory(folder, stand)
 
 
@@ -389,20 +387,6 @@ def test_a_damaged_journal_is_passed_over(exact, indexed_release, tmp_path):
 
     (expected,) = [scene for scene in exact.to_json()["scenes"] if scene["key"] == SCENE]
     assert report.to_json()["scenes"] == [expected]
-
-
-@pytest.mark.parametrize("wrong", [{"sample": 0}, {"frames": -1}])
-def test_numbers_that_are_too_small_are_refused(indexed_release, wrong):
-    with pytest.raises(SelectionError, match="must be at least"):
-        audit(indexed_release, **wrong)
-
-
-@pytest.mark.parametrize(
-    ("frames", "wanted", "chosen"),
-    [(81, 5, (0, 20, 40, 60, 80)), (81, 1, (40,)), (3, 0, (0, 1, 2)), (4, 9, (0, 1, 2, 3))],
-)
-def test_frames_are_spread_from_the_first_to_the_last(frames, wanted, chosen):
-    assert spread(frames, wanted) == chosen
 
 
 def test_quantiles_of_scenes_are_pooled_by_their_pixels():

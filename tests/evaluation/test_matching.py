@@ -1,7 +1,7 @@
 """E_match: by hand with keypoints that are given, and with SIFT on photographs."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -16,80 +16,56 @@ from stereogenbench_data.evaluation.models.opencv import Sift
 from tests.evaluation.conftest import photograph
 
 
-def view(number: int, *, height: int = 8, width: int = 9) -> np.ndarray:
+def view(number: int) -> np.ndarray:
     """Return a picture that stands for the view of this number."""
-    return np.full((3, height, width), number, dtype=np.uint8)
-
-
-def keypoints(rows: list[float]) -> Keypoints:
-    """Return keypoints in these rows, described by their order."""
-    xy = np.array([(5.0, row) for row in rows], dtype=np.float32).reshape(-1, 2)
-    descriptors = np.arange(len(rows), dtype=np.float32)[:, None]
-    return Keypoints(xy_px=xy, descriptors=descriptors)
+    return np.full((3, 8, 9), number, dtype=np.uint8)
 
 
 @dataclass
 class Listed:
-    """A matcher whose keypoints and matches are listed by view; the left view is 0."""
+    """A matcher whose keypoints and matches are listed by view, which descriptors name."""
 
     rows: dict[int, list[float]]
     pairs: dict[int, list[tuple[int, int]]]
-    name: str = "listed"
-    settings: dict = field(default_factory=lambda: {"keypoints": 5})
-    detected: list[int] = field(default_factory=list)
-    view_of: dict[int, int] = field(default_factory=dict)
 
     def detect(self, picture):
         number = int(picture[0, 0, 0])
-        self.detected.append(number)
-        found = keypoints(self.rows[number])
-        self.view_of[id(found.xy_px)] = number
-        self.kept = [*getattr(self, "kept", []), found]
-        return found
+        xy = np.array([(5.0, row) for row in self.rows[number]], dtype=np.float32).reshape(-1, 2)
+        return Keypoints(xy, np.full((len(xy), 1), number, dtype=np.float32))
 
     def match(self, left, right):
-        pairs = self.pairs[self.view_of[id(right.xy_px)]]
+        pairs = self.pairs[int(right.descriptors[0, 0])] if len(right.descriptors) else []
         return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
 LEFT, TARGET, PREDICTED, NOTHING = range(4)
 
 
-@pytest.fixture
-def listed():
-    return Listed(
-        rows={
-            LEFT: [1, 2, 3, 4, 5],
-            TARGET: [1, 2, 3, 9],
-            PREDICTED: [1, 4.0, 5.1, 6],
-            NOTHING: [],
-        },
-        pairs={
-            LEFT: [(n, n) for n in range(5)],
-            TARGET: [(0, 0), (1, 1), (2, 2), (3, 3)],
-            PREDICTED: [(0, 0), (1, 1), (2, 2), (4, 3)],
-            NOTHING: [],
-        },
-    )
+LISTED = Listed(
+    rows={LEFT: [1, 2, 3, 4, 5], TARGET: [1, 2, 3, 9], PREDICTED: [1, 4.0, 5.1, 6], NOTHING: []},
+    pairs={
+        TARGET: [(0, 0), (1, 1), (2, 2), (3, 3)], PREDICTED: [(0, 0), (1, 1), (2, 2), (4, 3)],
+    },
+)  # fmt: skip
 
 
-def error_of(listed, predicted, *, target=TARGET):
-    against = target_matches(view(LEFT), view(target), matcher=listed)
-    return match_error(view(predicted), against=against, matcher=listed)
+def error_of(predicted, *, target=TARGET):
+    against = target_matches(view(LEFT), view(target), matcher=LISTED)
+    return match_error(view(predicted), against=against, matcher=LISTED)
 
 
-def test_matches_are_counted_as_worked_by_hand(listed):
+def test_matches_are_counted_as_worked_by_hand():
     """Of the target 4 is 5 rows off; of the prediction 2 is 2 rows off, 3 is 2.1."""
-    score = error_of(listed, PREDICTED)
+    score = error_of(PREDICTED)
 
     assert (score["keypoints"], score["target_matches"], score["predicted_matches"]) == (5, 3, 3)
     assert score["common_matches"] == 2
     assert score["e_match"] == pytest.approx(100 * (1 - 2 / 4))
 
 
-def test_where_only_one_side_matches_the_error_is_whole_and_where_none_does_there_is_none(listed):
-    assert error_of(listed, NOTHING)["e_match"] == 100
-    assert math.isnan(error_of(listed, NOTHING, target=NOTHING)["e_match"])
+def test_where_only_one_side_matches_the_error_is_whole_and_where_none_does_there_is_none():
+    assert error_of(NOTHING)["e_match"] == 100
+    assert math.isnan(error_of(NOTHING, target=NOTHING)["e_match"])
 
 
 def described(*values: float) -> Keypoints:

@@ -12,10 +12,6 @@ def test_each_tier_gives_what_the_paper_says():
     assert TIERS["G2"].inputs == ("left",)
 
 
-def test_no_tier_gives_the_rendered_right_view():
-    assert all("right" not in tier.inputs for tier in TIERS.values())
-
-
 @pytest.mark.parametrize("name", ["g0", None])
 def test_an_unknown_tier_is_refused_with_those_there_are(name):
     with pytest.raises(EvaluationError, match=r"there is no tier .*G0 \(oracle geometry"):

@@ -92,16 +92,12 @@ class Catalogue:
         self._row_of = {str(key): row for row, key in enumerate(index.column("key"))}
 
     def row(self, key: str) -> int:
-        """Return the row of a key.
+        """Return the row of a key, or of a part of one that only one scene has.
 
         Raises:
-            SelectionError: If there is no such scene.
+            SelectionError: If there is no such scene, naming those that are close.
         """
-        if key not in self._row_of:
-            raise SelectionError(
-                f"{shortened(key)!r} is not the key of any of {len(self.index)} scenes."
-            )
-        return self._row_of[key]
+        return self._row_of[key] if key in self._row_of else find_scene(self.index, key)
 
     def about(self) -> dict[str, Any]:
         """Return what the page shows of the data as a whole."""
@@ -172,7 +168,7 @@ class Catalogue:
         Raises:
             SelectionError: If there is no such scene, naming those that are close.
         """
-        row = self._row_of[key] if key in self._row_of else find_scene(self.index, key)
+        row = self.row(key)
         key = str(self.index.column("key")[row])
         scene, pairs = self.index.scene(row), self.choose(choice).pairs
         mine = pairs.row == row
@@ -201,7 +197,7 @@ class Catalogue:
 
     def sample_line(self, key: str, *, pair: tuple[int, int], frame: int) -> str:
         """Return Python that gives the sample shown; it runs as it is."""
-        self.row(key)
+        key = str(self.index.column("key")[self.row(key)])
         return self._line("sample", {"scenes": key, "pairs": [pair], "frames": frame}) + "[0]"
 
     def _line(self, name: str, options: Mapping[str, Any]) -> str:

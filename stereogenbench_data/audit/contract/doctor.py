@@ -28,7 +28,6 @@ from stereogenbench_data.audit.contract.worlds import (
 )
 from stereogenbench_data.audit.scene_access import source_of, spread
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
-from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.evidence import shape_of
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import Streams
@@ -104,8 +103,8 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
 
     Args:
         data: What `SceneIndex.open` takes, or an index.
-        scenes: How many scenes to diagnose, spread over those that pass the filters.
-        frames: How many frames of each scene.
+        scenes: How many scenes to diagnose, at least 1, spread over those that pass the filters.
+        frames: How many frames of each scene, at least 1.
         depth: The contract under test; None for what files, conventions and release state.
         workers: Number of processes, None for one a core.
         engine: Where they run: `engine.LOCAL`, or an `engine.RayCluster`.
@@ -113,14 +112,10 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
         filters: Which scenes; None for all.
 
     Raises:
-        SelectionError: If no scene passes the filters, or a number is below 1.
+        SelectionError: If no scene passes the filters.
         StorageError: If a file cannot be read.
         MediaError: If a video does not decode to what the index says.
     """
-    if scenes < 1 or frames < 1:
-        raise SelectionError(
-            f"scenes and frames must be at least 1, got {scenes} and {frames}: ask for more."
-        )
     index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
     index.require_released("The doctor")
     rows = filter_scenes(index, filters or {})

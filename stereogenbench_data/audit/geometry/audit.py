@@ -125,15 +125,12 @@ def audit(
     Raises:
         StorageError: If there are no such data, they were derived for training, or a worker
             process died.
-        SelectionError: If no scene passes the filters, or a number is too small.
+        SelectionError: If no scene passes the filters.
 
     Source: the StereoGenBench paper, section on geometry conventions and sanity checks, and on
     quality control.
     """
     require_options(audit, options)
-    for name, value, least in (("sample", sample, 1), ("frames", frames, 0)):
-        if value is not None and value < least:
-            raise SelectionError(f"{name} must be at least {least}, got {value}.")
     work, filters = split_options(options, WorkOptions)
     index = data if isinstance(data, SceneIndex) else open_for_audit(data, **options)
     index.require_released("The audit")

@@ -9,9 +9,9 @@ imports torchvision, each release of which fits one release and one build of tor
 """
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
 import torch
 from torch import nn
@@ -61,17 +61,17 @@ class Inception(nn.Module):
         self.Conv2d_2b_3x3 = _conv(32, 64, (3, 3), padding=(1, 1))
         self.Conv2d_3b_1x1 = _conv(64, 80, (1, 1))
         self.Conv2d_4a_3x3 = _conv(80, 192, (3, 3))
-        self.Mixed_5b = _Block(192, _layers_5(pooled=32), pool="mean")
-        self.Mixed_5c = _Block(256, _layers_5(pooled=64), pool="mean")
-        self.Mixed_5d = _Block(288, _layers_5(pooled=64), pool="mean")
-        self.Mixed_6a = _Block(288, _LAYERS_6A, pool="halve")
-        self.Mixed_6b = _Block(768, _layers_6(between=128), pool="mean")
-        self.Mixed_6c = _Block(768, _layers_6(between=160), pool="mean")
-        self.Mixed_6d = _Block(768, _layers_6(between=160), pool="mean")
-        self.Mixed_6e = _Block(768, _layers_6(between=192), pool="mean")
-        self.Mixed_7a = _Block(768, _LAYERS_7A, pool="halve")
-        self.Mixed_7b = _Block(1280, _LAYERS_7, pool="mean")
-        self.Mixed_7c = _Block(2048, _LAYERS_7, pool="max")
+        self.Mixed_5b = _Block(192, _branches_5(pooled=32), pool="mean")
+        self.Mixed_5c = _Block(256, _branches_5(pooled=64), pool="mean")
+        self.Mixed_5d = _Block(288, _branches_5(pooled=64), pool="mean")
+        self.Mixed_6a = _Block(288, _BRANCHES_6A, pool="halve")
+        self.Mixed_6b = _Block(768, _branches_6(between=128), pool="mean")
+        self.Mixed_6c = _Block(768, _branches_6(between=160), pool="mean")
+        self.Mixed_6d = _Block(768, _branches_6(between=160), pool="mean")
+        self.Mixed_6e = _Block(768, _branches_6(between=192), pool="mean")
+        self.Mixed_7a = _Block(768, _BRANCHES_7A, pool="halve")
+        self.Mixed_7b = _Block(1280, _BRANCHES_7, pool="mean")
+        self.Mixed_7c = _Block(2048, _BRANCHES_7, pool="max")
         self.fc = nn.Linear(_DIM, _CLASSES)
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
@@ -102,99 +102,77 @@ def _conv(
     return nn.Sequential(layers)
 
 
-class _Layer(NamedTuple):
-    """A convolution within a block.
-
-    Attributes:
-        of: The layer before it; "input" and "pool" are the block's input and its pool.
-        outputs: How many channels it makes.
-        kernel: (rows, columns).
-        step: "same" keeps the size, "halve" has a stride of 2 and no padding.
-    """
-
-    of: str
-    outputs: int
-    kernel: tuple[int, int] = (1, 1)
-    step: Literal["same", "halve"] = "same"
+_Layer = tuple[int, int, int]
+"""A convolution: how many channels it makes, and the rows and columns of its kernel."""
+_Branches = Mapping[str, Sequence[Sequence[_Layer]]]
+"""Branches of a block by name, each of steps one after another; a step is of one or two layers."""
 
 
-_Layers = Mapping[str, _Layer]
-
-
-def _layers_5(*, pooled: int) -> _Layers:
+def _branches_5(*, pooled: int) -> _Branches:
     return {
-        "branch1x1": _Layer("input", 64),
-        "branch5x5_1": _Layer("input", 48),
-        "branch5x5_2": _Layer("branch5x5_1", 64, (5, 5)),
-        "branch3x3dbl_1": _Layer("input", 64),
-        "branch3x3dbl_2": _Layer("branch3x3dbl_1", 96, (3, 3)),
-        "branch3x3dbl_3": _Layer("branch3x3dbl_2", 96, (3, 3)),
-        "branch_pool": _Layer("pool", pooled),
+        "branch1x1": [[(64, 1, 1)]],
+        "branch5x5": [[(48, 1, 1)], [(64, 5, 5)]],
+        "branch3x3dbl": [[(64, 1, 1)], [(96, 3, 3)], [(96, 3, 3)]],
+        "branch_pool": [[(pooled, 1, 1)]],
     }
 
 
-_LAYERS_6A: Final[_Layers] = {
-    "branch3x3": _Layer("input", 384, (3, 3), "halve"),
-    "branch3x3dbl_1": _Layer("input", 64),
-    "branch3x3dbl_2": _Layer("branch3x3dbl_1", 96, (3, 3)),
-    "branch3x3dbl_3": _Layer("branch3x3dbl_2", 96, (3, 3), "halve"),
+_BRANCHES_6A: Final[_Branches] = {
+    "branch3x3": [[(384, 3, 3)]],
+    "branch3x3dbl": [[(64, 1, 1)], [(96, 3, 3)], [(96, 3, 3)]],
 }
 
 
-def _layers_6(*, between: int) -> _Layers:
+def _branches_6(*, between: int) -> _Branches:
+    first, across, down = [(between, 1, 1)], [(between, 1, 7)], [(between, 7, 1)]
     return {
-        "branch1x1": _Layer("input", 192),
-        "branch7x7_1": _Layer("input", between),
-        "branch7x7_2": _Layer("branch7x7_1", between, (1, 7)),
-        "branch7x7_3": _Layer("branch7x7_2", 192, (7, 1)),
-        "branch7x7dbl_1": _Layer("input", between),
-        "branch7x7dbl_2": _Layer("branch7x7dbl_1", between, (7, 1)),
-        "branch7x7dbl_3": _Layer("branch7x7dbl_2", between, (1, 7)),
-        "branch7x7dbl_4": _Layer("branch7x7dbl_3", between, (7, 1)),
-        "branch7x7dbl_5": _Layer("branch7x7dbl_4", 192, (1, 7)),
-        "branch_pool": _Layer("pool", 192),
+        "branch1x1": [[(192, 1, 1)]],
+        "branch7x7": [first, across, [(192, 7, 1)]],
+        "branch7x7dbl": [first, down, across, down, [(192, 1, 7)]],
+        "branch_pool": [[(192, 1, 1)]],
     }
 
 
-_LAYERS_7A: Final[_Layers] = {
-    "branch3x3_1": _Layer("input", 192),
-    "branch3x3_2": _Layer("branch3x3_1", 320, (3, 3), "halve"),
-    "branch7x7x3_1": _Layer("input", 192),
-    "branch7x7x3_2": _Layer("branch7x7x3_1", 192, (1, 7)),
-    "branch7x7x3_3": _Layer("branch7x7x3_2", 192, (7, 1)),
-    "branch7x7x3_4": _Layer("branch7x7x3_3", 192, (3, 3), "halve"),
+_BRANCHES_7A: Final[_Branches] = {
+    "branch3x3": [[(192, 1, 1)], [(320, 3, 3)]],
+    "branch7x7x3": [[(192, 1, 1)], [(192, 1, 7)], [(192, 7, 1)], [(192, 3, 3)]],
 }
-
-_LAYERS_7: Final[_Layers] = {
-    "branch1x1": _Layer("input", 320),
-    "branch3x3_1": _Layer("input", 384),
-    "branch3x3_2a": _Layer("branch3x3_1", 384, (1, 3)),
-    "branch3x3_2b": _Layer("branch3x3_1", 384, (3, 1)),
-    "branch3x3dbl_1": _Layer("input", 448),
-    "branch3x3dbl_2": _Layer("branch3x3dbl_1", 384, (3, 3)),
-    "branch3x3dbl_3a": _Layer("branch3x3dbl_2", 384, (1, 3)),
-    "branch3x3dbl_3b": _Layer("branch3x3dbl_2", 384, (3, 1)),
-    "branch_pool": _Layer("pool", 192),
+_BOTH_WAYS: Final = [(384, 1, 3), (384, 3, 1)]
+_BRANCHES_7: Final[_Branches] = {
+    "branch1x1": [[(320, 1, 1)]],
+    "branch3x3": [[(384, 1, 1)], _BOTH_WAYS],
+    "branch3x3dbl": [[(448, 1, 1)], [(384, 3, 3)], _BOTH_WAYS],
+    "branch_pool": [[(192, 1, 1)]],
 }
 
 
 class _Block(nn.Module):
-    """A block of parallel branches; outputs that no other layer uses are concatenated in order."""
+    """A block of parallel branches, concatenated; one that halves the size ends with its pool.
+
+    In a block that halves, the last layer of each branch has a stride of 2 and no padding; all
+    others keep the size.
+    """
 
     def __init__(
-        self, inputs: int, layers: _Layers, *, pool: Literal["mean", "max", "halve"]
+        self, inputs: int, branches: _Branches, *, pool: Literal["mean", "max", "halve"]
     ) -> None:
         super().__init__()
-        self.layers = layers
         self.pool = pool
-        channels = {"input": inputs, "pool": inputs}
-        for name, (of, outputs, kernel, step) in layers.items():
-            halves = step == "halve"
-            padding = (0, 0) if halves else (kernel[0] // 2, kernel[1] // 2)
-            stride = 2 if halves else 1
-            conv = _conv(channels[of], outputs, kernel, stride=stride, padding=padding)
-            self.add_module(name, conv)
-            channels[name] = outputs
+        self.steps: dict[str, list[list[str]]] = {}
+        for branch, steps in branches.items():
+            channels, self.steps[branch] = inputs, []
+            for number, layers in enumerate(steps, 1):
+                halves = pool == "halve" and number == len(steps)
+                names = []
+                for letter, (outputs, rows, columns) in zip("ab", layers, strict=False):
+                    place = f"{number}{letter}" if len(layers) > 1 else f"{number}"
+                    names.append(f"{branch}_{place}" if len(steps) > 1 else branch)
+                    stride, padding = (2, (0, 0)) if halves else (1, (rows // 2, columns // 2))
+                    kernel = rows, columns
+                    conv = _conv(channels, outputs, kernel, stride=stride, padding=padding)
+                    self.add_module(names[-1], conv)
+                channels = layers[0][0]
+                self.steps[branch].append(names)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         if self.pool == "mean":
@@ -203,13 +181,13 @@ class _Block(nn.Module):
             pooled = functional.max_pool2d(x, 3, stride=1, padding=1)
         else:
             pooled = functional.max_pool2d(x, 3, stride=2)
-        made = {"input": x, "pool": pooled}
-        for name, layer in self.layers.items():
-            made[name] = self.get_submodule(name)(made[layer.of])
-        taken = {"input", *(layer.of for layer in self.layers.values())}
-        return torch.cat(
-            [made[name] for name in (*self.layers, "pool") if name not in taken], dim=1
-        )
+        made = []
+        for branch, steps in self.steps.items():
+            outputs = [pooled if branch == "branch_pool" else x]
+            for names in steps:
+                outputs = [self.get_submodule(name)(outputs[0]) for name in names]
+            made += outputs
+        return torch.cat([*made, pooled] if self.pool == "halve" else made, dim=1)
 
 
 def _resized(pictures: torch.Tensor) -> torch.Tensor:
