@@ -15,7 +15,6 @@ from stereogenbench_data.evaluation.predictions import (
     item_name,
     open_prediction,
     scaled_rgb,
-    stamp_prediction,
 )
 
 SCENE = "eval/MapSeenInTrain/Uniform/Town/scene_000001"
@@ -98,15 +97,6 @@ def test_pictures_of_the_stored_size_are_read_as_they_are_and_scaled_by_area(ite
     assert view[:, :, 9:].min() == 200
 
 
-def test_a_missing_prediction_is_reported_with_both_places(tmp_path):
-    with pytest.raises(
-        PredictionError,
-        match=rf"{SCENE}, cameras 00-01: has no prediction in .*{SCENE}/00-01 or "
-        rf"{item_name(SCENE, (0, 1))}\.",
-    ):
-        find_prediction(tmp_path, WANTED)
-
-
 def test_two_predictions_of_one_pair_are_refused(item, tmp_path):
     write_png(item, 0, picture(1))
     write_video(tmp_path / SCENE / "00-01.mkv", [1])
@@ -177,12 +167,3 @@ def test_what_is_wrong_with_a_prediction_is_named_with_its_place(item, tmp_path,
 
     with pytest.raises(PredictionError, match=rf"{SCENE}, cameras 00-01: .*{message}"):
         levels(find_prediction(tmp_path, WANTED))
-
-
-def test_a_stamp_changes_with_the_files(item):
-    write_png(item, 0, picture(1))
-    before = stamp_prediction(item)
-    write_png(item, 2, picture(1))
-
-    assert stamp_prediction(item) != before
-    assert stamp_prediction(item) == stamp_prediction(item)

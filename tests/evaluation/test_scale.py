@@ -35,26 +35,6 @@ def test_a_disparity_that_is_scaled_drifts_by_its_inverse(truth, method, factor,
     assert fit.r2 == pytest.approx(1)
 
 
-def test_both_fits_are_those_worked_by_hand():
-    # 95 pixels lie at (0, 0), 95 at (10, 5) and 10 outliers at (10, 105). Without the outliers the
-    # slope is 5 / 10. With them the true disparity at 10 is (95 * 5 + 10 * 105) / 105 in the mean.
-    estimated = np.array([0.0] * 95 + [10.0] * 105).reshape(20, 10)
-    true = np.array([0.0] * 95 + [5.0] * 95 + [105.0] * 10).reshape(20, 10)
-    everywhere = np.ones((20, 10), dtype=bool)
-
-    filtered = fit_scale(estimated, true, scored=everywhere, method="filtered")
-    plain = fit_scale(estimated, true, scored=everywhere, method="least_squares")
-
-    assert (filtered.slope, filtered.drift, filtered.outliers) == (
-        pytest.approx(0.5),
-        0.5,
-        10 / 200,
-    )
-    assert plain.slope == pytest.approx(1525 / 1050)
-    assert plain.drift == pytest.approx(475 / 1050)
-    assert (plain.valid, plain.outliers) == (1, 0)
-
-
 @pytest.mark.parametrize("seed", range(2))
 def test_both_fits_are_those_of_scipy_with_and_without_what_lies_off_the_line(seed):
     rng = np.random.default_rng(seed)
