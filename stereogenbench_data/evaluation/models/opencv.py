@@ -33,18 +33,17 @@ class Sift:
     strongest response. Descriptors are whole numbers, so matches are the same on every machine.
     """
 
-    def __init__(self, *, keypoints: int = KEYPOINTS) -> None:
-        """Make a matcher that keeps at most ``keypoints`` of each picture.
+    def __init__(self) -> None:
+        """Make the matcher.
 
         Raises:
             ExtraError: If OpenCV is not installed.
         """
         self._cv2 = require_opencv()
         self._sift = self._cv2.SIFT_create(enable_precise_upscale=True)
-        self._keypoints = keypoints
         self.name = f"SIFT (OpenCV {self._cv2.__version__})"
         self.settings: Settings = {
-            "keypoints": keypoints,
+            "keypoints": KEYPOINTS,
             "orientation": "upright",
             "upscale": "precise",
             "ratio": RATIO,
@@ -56,7 +55,7 @@ class Sift:
         grey = self._cv2.cvtColor(
             np.ascontiguousarray(picture.transpose(1, 2, 0)), self._cv2.COLOR_RGB2GRAY
         )
-        points = _strongest(self._sift.detect(grey, None), at_most=self._keypoints)
+        points = _strongest(self._sift.detect(grey, None))
         if not points:
             return Keypoints(
                 xy_px=np.zeros((0, 2), dtype=np.float32),
@@ -71,18 +70,19 @@ class Sift:
         return mutual_matches(left, right)
 
 
-def _strongest(points: Any, *, at_most: int) -> list[Any]:
-    """Return one upright keypoint for each place and size, the strongest first."""
+def _strongest(points: Any) -> list[Any]:
+    """Return one upright keypoint for each place and size, the strongest first, not too many."""
     distinct: dict[tuple[float, float, float], Any] = {}
     for point in points:
         point.angle = 0
         distinct.setdefault((*point.pt, point.size), point)
     ordered = sorted(distinct.items(), key=lambda item: (-item[1].response, item[0]))
-    return [point for _, point in ordered[:at_most]]
+    return [point for _, point in ordered[:KEYPOINTS]]
 
 
 _SUBPIXELS: Final = 16
 _LEAST_PX: Final = -16
+_DISPARITIES: Final = 192
 _BLOCK_PX: Final = 5
 
 
@@ -94,17 +94,16 @@ class Sgbm:
     whose search range leaves the picture.
     """
 
-    def __init__(self, *, disparities: int = 192) -> None:
-        """Make a matcher that searches ``disparities`` values, a multiple of 16.
+    def __init__(self) -> None:
+        """Make the matcher.
 
         Raises:
             ExtraError: If OpenCV is not installed.
         """
         self._cv2 = require_opencv()
-        self._disparities = disparities
         chosen = {
             "minDisparity": _LEAST_PX,
-            "numDisparities": disparities,
+            "numDisparities": _DISPARITIES,
             "blockSize": _BLOCK_PX,
             "P1": 8 * 3 * _BLOCK_PX**2,
             "P2": 32 * 3 * _BLOCK_PX**2,
@@ -124,9 +123,9 @@ class Sgbm:
         Raises:
             EvaluationError: If the two are narrower than the search.
         """
-        if left.shape[-1] <= self._disparities:
+        if left.shape[-1] <= _DISPARITIES:
             raise EvaluationError(
-                f"SGBM searches {self._disparities} disparities, and the pictures are "
+                f"SGBM searches {_DISPARITIES} disparities, and the pictures are "
                 f"{left.shape[-1]} px wide: score wider pictures, or leave out SD."
             )
         views = (
