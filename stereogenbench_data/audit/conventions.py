@@ -118,8 +118,8 @@ def survey(  # noqa: PLR0913 - each names one thing that a user chooses
     found = list[Examined]()
     # Reading takes less time than starting processes, unless each file is fetched.
     readers = workers if is_remote(root) or engine is not LOCAL else 1
-    results = engine.map(_ExamineTask(str(root), conventions), keys, name=str, workers=readers)
-    with closing(results):
+    task = functools.partial(_examined, str(root), conventions)
+    with closing(engine.map(task, keys, name=str, workers=readers)) as results:
         for each in results:
             found += [] if each is None else [each]
             if progress is not None:
@@ -220,19 +220,15 @@ def _alike_once(surveyed: Survey) -> list[str]:
     return told
 
 
-@dataclass(frozen=True, slots=True)
-class _ExamineTask:
-    """Examines a scene by its key, in a worker process."""
-
-    root: str
-    conventions: Conventions | None
-
-    def __call__(self, key: str, advance: Advance) -> Examined | None:
-        advance(0)
-        try:
-            return examine(self.root, key, conventions=self.conventions)
-        except IncompleteScene:
-            return None
+def _examined(
+    root: str, conventions: Conventions | None, key: str, advance: Advance
+) -> Examined | None:
+    """Return what a scene's files say, None if it is not whole."""
+    advance(0)
+    try:
+        return examine(root, key, conventions=conventions)
+    except IncompleteScene:
+        return None
 
 
 def _some(scenes: Sequence[Scene], count: int) -> list[Scene]:

@@ -20,8 +20,8 @@ from stereogenbench_data.evaluation.aggregate import CONTROL, Scores
 from stereogenbench_data.evaluation.evaluate import (
     EvaluationOptions,
     Run,
-    score_workload,
-    select_workload,
+    score_pairs,
+    select_pairs,
 )
 from stereogenbench_data.evaluation.predictions import PairFrames, Read, open_frames
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
@@ -144,13 +144,17 @@ def score_controls(
     """
     require_options(score_controls, options)
     protocol = protocol or EvaluationProtocol()
-    workload = select_workload(data, protocol, inputs=(), options=options, conventions=conventions)
-    donors = derangement(sorted({pair.scene for pair in workload.pairs}), seed=seed)
+    index, scenes = select_pairs(
+        data, protocol, inputs=(), options=options, conventions=conventions
+    )
+    donors = derangement(sorted({pairs[0].scene for pairs in scenes.values()}), seed=seed)
     run = Run(
-        protocol=protocol,
+        index,
+        scenes,
+        protocol,
         sources=tuple(Control(name, protocol.size, donors) for name in CONTROLS),
         tier=CONTROL,
         donors=donors,
         settings={"seed": seed},
     )
-    return score_workload(workload, run, options)
+    return score_pairs(run, options)

@@ -133,45 +133,26 @@ def evaluate(
                 f"{root}: is not a folder. Pass the folder that holds the predicted right views."
             )
         source = PredictionFolder(name or root.name, root)
-    workload = select_workload(
+    index, scenes = select_pairs(
         data, protocol, inputs=source.inputs, options=options, conventions=conventions
     )
-    (scores,) = score_workload(workload, Run(protocol, (source,), known.name), options)
+    (scores,) = score_pairs(Run(index, scenes, protocol, (source,), known.name), options)
     return scores
 
 
-@dataclass(frozen=True, slots=True)
-class Workload:
-    """What is scored: the scenes of an index with their pairs and frames.
-
-    Attributes:
-        index: The index.
-        scenes: What is scored of the pairs of each scene, by its row, ascending.
-    """
-
-    index: SceneIndex
-    scenes: Mapping[int, Sequence[PairFrames]]
-
-    @property
-    def pairs(self) -> list[PairFrames]:
-        """The pairs of all scenes."""
-        return [pair for pairs in self.scenes.values() for pair in pairs]
-
-    @property
-    def frames(self) -> int:
-        """How many frames of pairs there are."""
-        return sum(len(pair.frames) for pair in self.pairs)
+ScoredPairs = Mapping[int, Sequence[PairFrames]]
+"""What is scored of the pairs of each scene, by its row in an index, ascending."""
 
 
-def select_workload(
+def select_pairs(
     data: Data,
     protocol: EvaluationProtocol,
     *,
     inputs: Sequence[str],
     options: Mapping[str, Any],
     conventions: str | Path | Conventions | None = None,
-) -> Workload:
-    """Return the workload of a selection, after checking that its data can be read.
+) -> tuple[SceneIndex, ScoredPairs]:
+    """Return what a selection scores, and its index, after checking that its data can be read.
 
     Args:
         data: What `StereoPairs` takes.
@@ -239,7 +220,7 @@ def select_workload(
                 stored_size=(scene.rig.image_height_px, scene.rig.image_width_px),
             )
         )
-    return Workload(index=index, scenes=scenes)
+    return index, scenes
 
 
 def _require_whole(index: SceneIndex, lost: int, why: str = "") -> None:
@@ -254,9 +235,11 @@ def _require_whole(index: SceneIndex, lost: int, why: str = "") -> None:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """How a workload is scored, and what identifies its results.
+    """What is scored and how, and what identifies its results.
 
     Attributes:
+        index: The index of the scenes.
+        scenes: Which of their pairs and frames.
         protocol: The choices that scores depend on.
         sources: Whose right views are scored.
         tier: What the sources were given.
@@ -264,6 +247,8 @@ class Run:
         settings: What else the scores depend on, as plain values.
     """
 
+    index: SceneIndex
+    scenes: ScoredPairs
     protocol: EvaluationProtocol
     sources: tuple[PredictionSource, ...]
     tier: str
@@ -271,9 +256,7 @@ class Run:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
 
-def score_workload(
-    workload: Workload, run: Run, options: RunOptions | EvaluationOptions
-) -> list[Scores]:
+def score_pairs(run: Run, options: RunOptions | EvaluationOptions) -> list[Scores]:
     """Return the scores of every source; scenes that ``out`` holds scores of are not scored again.
 
     Raises:
@@ -283,6 +266,7 @@ def score_workload(
         StorageError: If data or results cannot be read or written.
         ExtraError: If a package or weights that a metric needs are not there.
     """
+    pairs = [pair for pairs in run.scenes.values() for pair in pairs]
     folders = [str(each.root) for each in run.sources if isinstance(each, PredictionFolder)]
     try:
         settings = settings_of(run.protocol)
@@ -290,9 +274,9 @@ def score_workload(
             "format": FORMAT,
             "tier": run.tier,
             "methods": [source.name for source in run.sources],
-            "data": workload.index.digest,
-            "frames": sorted({pair.frames for pair in workload.pairs}),
-            "pairs": sorted({pair.pair for pair in workload.pairs}),
+            "data": run.index.digest,
+            "frames": sorted({pair.frames for pair in pairs}),
+            "pairs": sorted({pair.pair for pair in pairs}),
             "settings": settings,
             **({"predictions": folders} if folders else {}),
             **run.settings,
@@ -303,15 +287,13 @@ def score_workload(
             )
             out = Path(given)
             stack.enter_context(job_folder(out, state, kind=EVALUATION))
-            _score_missing_scenes(workload, run, out, options)
-            return [_scores(workload, run, out, source.name, settings) for source in run.sources]
+            _score_missing_scenes(run, out, options)
+            return [_scores(run, out, source.name, settings) for source in run.sources]
     finally:
         model_of.cache_clear()
 
 
-def _score_missing_scenes(
-    workload: Workload, run: Run, out: Path, options: RunOptions | EvaluationOptions
-) -> None:
+def _score_missing_scenes(run: Run, out: Path, options: RunOptions | EvaluationOptions) -> None:
     """Score what is not scored yet, and keep each scene's scores as soon as it is done."""
     allowed = options.get("allow_missing", 0)
     stamps: dict[str, dict[tuple[str, Pair], str]] = {}
@@ -319,8 +301,8 @@ def _score_missing_scenes(
     missing: list[str] = []
     problems: list[str] = []
     done_frames = 0
-    rows = {str(key): row for row, key in enumerate(workload.index.column("key"))}
-    for row, pairs in workload.scenes.items():
+    rows = {str(key): row for row, key in enumerate(run.index.column("key"))}
+    for row, pairs in run.scenes.items():
         scene = pairs[0].scene
         stamps[scene] = {}
         for source in run.sources:
@@ -336,7 +318,7 @@ def _score_missing_scenes(
             done_frames += sum(len(pair.frames) for pair in pairs)
             problems.extend(found.problem for found in known.values() if found.problem)
             continue
-        index = workload.index.only({row, rows[run.donors.get(scene, scene)]})
+        index = run.index.only({row, rows[run.donors.get(scene, scene)]})
         works.append(SceneWork(index, tuple(pairs), run.protocol, run.sources))
     _require_few(missing, allowed=allowed)
     _require_few(problems, allowed=allowed)
@@ -356,7 +338,7 @@ def _score_missing_scenes(
         keep=keep,
         options=options,
         done=done_frames,
-        total=workload.frames,
+        total=sum(len(pair.frames) for pairs in run.scenes.values() for pair in pairs),
     )
 
 
@@ -412,13 +394,11 @@ def _read_scene(out: Path, scene: str) -> SceneScores:
     return scores
 
 
-def _scores(
-    workload: Workload, run: Run, out: Path, name: str, settings: Mapping[str, Any]
-) -> Scores:
+def _scores(run: Run, out: Path, name: str, settings: Mapping[str, Any]) -> Scores:
     """Return what a source scored; one scene's frames and features are in memory at a time."""
-    index, means = workload.index, []
+    index, means = run.index, []
     gathered: dict[tuple[Labels, str], tuple[FeatureStatistics, FeatureStatistics]] = {}
-    for row, pairs in workload.scenes.items():
+    for row, pairs in run.scenes.items():
         scene = index.scene(row)
         branch: Labels = (scene.id.subset or "", scene.id.family)
         found = _read_scene(out, scene.id.key)

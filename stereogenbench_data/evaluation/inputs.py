@@ -23,7 +23,7 @@ from PIL import Image
 from stereogenbench_data.datasets.mapped import Data
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.evaluate import select_workload
+from stereogenbench_data.evaluation.evaluate import select_pairs
 from stereogenbench_data.evaluation.predictions import PairFrames, frame_name, open_frames
 from stereogenbench_data.evaluation.protocol import (
     PAPER_SIZE,
@@ -94,24 +94,24 @@ def export_inputs(
     require_options(export_inputs, options)
     known, root = require_tier(tier), Path(out)
     protocol = EvaluationProtocol(metrics=("psnr",), size=size, depth=depth)
-    workload = select_workload(
+    index, scenes = select_pairs(
         data, protocol, inputs=known.inputs, options=options, conventions=conventions
     )
-    wanted = workload.pairs
+    wanted = [pair for pairs in scenes.values() for pair in pairs]
     settings = {
         "tier": known.name,
         "size": f"{size[1]}x{size[0]}",
         "frames": sorted({each.frames for each in wanted}),
-        "data": workload.index.digest,
+        "data": index.digest,
     }
     with job_folder(root, settings, kind=INPUTS):
         works = [
-            _ItemWork(workload.index.only([row]), pair, known, depth, root / pair.item)
-            for row, pairs in workload.scenes.items()
+            _ItemWork(index.only([row]), pair, known, depth, root / pair.item)
+            for row, pairs in scenes.items()
             for pair in pairs
             if not (root / pair.item).is_dir()
         ]
-        total = workload.frames
+        total = sum(len(pair.frames) for pair in wanted)
         do_items(
             _write_item,
             works,

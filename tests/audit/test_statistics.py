@@ -57,31 +57,23 @@ def test_baselines_bins_and_focal_lengths_of_three_scenes(three):
     (family,) = found.families
     gaps = [10.0, 15.0, 6.0, 30.0, 150.0]
     adjacent = [*gaps, *(2 * gap for gap in gaps), *(2 * gap for gap in gaps)]
-    assert (family.split, family.subset, family.family, family.scenes) == (
-        "train",
-        "",
-        "Uniform",
-        3,
-    )
-    assert family.maps == {"Car_Dealer": 3}
-    assert family.adjacent_cm["count"] == 15
-    assert family.adjacent_cm["mean"] == pytest.approx(plain_statistics.mean(adjacent))
-    assert family.adjacent_cm["std"] == pytest.approx(plain_statistics.pstdev(adjacent))
-    assert family.adjacent_cm["median"] == plain_statistics.median(adjacent)
-    assert (family.adjacent_cm["min"], family.adjacent_cm["max"]) == (6.0, 300.0)
+    of = (family.split, family.subset, family.family, family.scenes, family.maps)
+    assert of == ("train", "", "Uniform", 3, {"Car_Dealer": 3})
+    assert family.adjacent_cm == {
+        "count": 15, "min": 6.0, "max": 300.0,
+        "mean": pytest.approx(plain_statistics.mean(adjacent)),
+        "std": pytest.approx(plain_statistics.pstdev(adjacent)),
+        "median": plain_statistics.median(adjacent),
+    }  # fmt: skip
     assert family.all_pairs_cm["max"] == 422.0
     # Primary 1-2: 15, 30, 30 cm. Of the adjacent ones 150 cm is the last value of its bin.
-    assert family.bins["[10,30)"][:2] == (1, 2 + 4)
-    assert family.bins["[30,60)"][:2] == (2, 1 + 2)
-    assert family.bins["[60,100)"][:2] == (0, 2)
-    assert family.bins["[100,150]"][:2] == (0, 1)
-    assert family.bins["(150,inf)"][:2] == (0, 2)
+    primary_and_adjacent = {name: counts[:2] for name, counts in family.bins.items()}
+    assert primary_and_adjacent == {
+        "[1,10)": (0, 1), "[10,30)": (1, 2 + 4), "[30,60)": (2, 1 + 2), "[60,100)": (0, 2),
+        "[100,150]": (0, 1), "(150,inf)": (0, 2),
+    }  # fmt: skip
     assert sum(every for _, _, every in family.bins.values()) == 45
-    assert (family.focal_mm["min"], family.focal_mm["median"], family.focal_mm["max"]) == (
-        20,
-        85,
-        90,
-    )
+    assert [family.focal_mm[name] for name in ("min", "median", "max")] == [20, 85, 90]
 
 
 def test_filters_choose_what_is_counted(three):

@@ -122,12 +122,12 @@ def explained_shares(views: SceneFrames, text: bytes, names: Sequence[str]) -> S
         for camera in _CAMERAS:
             counts = np.zeros(2, dtype=np.int64)
             for first, later in moves:
-                errors = reproject(
-                    depths[first, camera],
-                    depths[later, camera],
-                    intrinsics=views.intrinsics,
-                    right_from_left=_moved(poses, camera, first, later),
+                # From a camera's axes in one frame to its axes in another.
+                motion = np.linalg.inv(poses.world_from_cam(later, camera)) @ (
+                    poses.world_from_cam(first, camera)
                 )
+                both, pinhole = (depths[first, camera], depths[later, camera]), views.intrinsics
+                errors = reproject(*both, intrinsics=pinhole, right_from_left=motion)
                 counts += (errors.agreeing, errors.unhidden)
             agreeing, unhidden = counts.tolist()
             shares.append(agreeing / unhidden if unhidden >= _LEAST_PIXELS else 0.0)
@@ -167,12 +167,6 @@ def judge_worlds(scenes: Sequence[Shares], *, stated: str = "") -> WorldVerdict:
 
 def _mean(scenes: Sequence[Shares], name: str) -> float:
     return float(np.mean([scene[name] for scene in scenes]))
-
-
-def _moved(poses: CameraPoses, camera: int, first: int, later: int) -> np.ndarray:
-    """Return the motion from a camera's axes in one frame to its axes in another."""
-    world_from_later = poses.world_from_cam(later, camera)
-    return np.asarray(np.linalg.inv(world_from_later) @ poses.world_from_cam(first, camera))
 
 
 def _depth(views: SceneFrames, frame: int, camera: int) -> MeasuredDepth:
