@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final, Unpack
+from typing import Any, Final, TypeVar, Unpack
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -165,8 +165,8 @@ _PAPERS_SCENES: Final = {
     split: sum(count for place, count in SCENE_COUNTS.items() if place[0] == split)
     for split in _SPLITS
 }
-_Counts = Mapping[tuple[str, ...], int]
-"""Numbers of scenes; a place begins with the split, and is named by all its parts."""
+_Place = TypeVar("_Place", bound=tuple[str, ...])
+"""What scenes are counted by, the split first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +204,9 @@ def _scenes_of(found: Statistics, split: str) -> int:
     return sum(each.scenes for each in found.branches if each.split == split)
 
 
-def _beside(table: str, what: str, paper: _Counts, ours: _Counts) -> Iterator[Line]:
+def _beside(
+    table: str, what: str, paper: Mapping[_Place, int], ours: Mapping[_Place, int]
+) -> Iterator[Line]:
     """Yield the numbers of scenes that the paper or the data have, 0 where one has none."""
     for place in dict.fromkeys([*paper, *ours]):
         item = f"{what}, {' '.join(filter(None, place))}"
@@ -212,14 +214,12 @@ def _beside(table: str, what: str, paper: _Counts, ours: _Counts) -> Iterator[Li
 
 
 def _count_lines(found: Statistics) -> Iterator[Line]:
-    paper: _Counts = {
-        **SCENE_COUNTS, **{(split, "total"): count for split, count in _PAPERS_SCENES.items()},
-    }  # fmt: skip
-    ours: _Counts = {
-        **{(each.split, each.subset, each.family): each.scenes for each in found.families},
-        **{(split, "total"): _scenes_of(found, split) for split in _SPLITS},
-    }
-    return _beside("table of scene counts by split and family", "scenes", paper, ours)
+    table = "table of scene counts by split and family"
+    ours = {(each.split, each.subset, each.family): each.scenes for each in found.families}
+    yield from _beside(table, "scenes", SCENE_COUNTS, ours)
+    totals = {(split, "total"): _scenes_of(found, split) for split in _SPLITS}
+    papers = {(split, "total"): count for split, count in _PAPERS_SCENES.items()}
+    yield from _beside(table, "scenes", papers, totals)
 
 
 def _baseline_lines(found: Statistics) -> Iterator[Line]:
