@@ -86,88 +86,81 @@ class Reading:
     trajectory: Trajectory
 
 
-def readings(
-    recorded: RecordedPoses,
-    *,
-    only: str | None = None,
-) -> Iterator[Reading]:
+def readings(recorded: RecordedPoses, *, only: str | None = None) -> Iterator[Reading]:
     """Yield the readings of recorded numbers, those that the file names first.
 
     Args:
         recorded: The numbers.
         only: The name of the one reading that is wanted.
     """
-    found = sorted(_all_readings(recorded), key=lambda each: each.tier)
-    named_axes = _hints(recorded) & {*AXES}
-    for each in found:
-        if only is None or each.name == only:
-            made = each.make()
-            if made is not None:
-                is_rotator = each.turn.components == ("pitch", "yaw", "roll")
-                is_named = each.axes in (named_axes or ({"unreal"} if is_rotator else ()))
-                yield Reading(each.name, each.tier, is_named, made)
+    hints = _hints(recorded)
+    named_axes = hints & {*AXES}
+    blocks = [block for block in recorded.blocks if not block.words & _NO_POSE]
+    places = [b for b in blocks if b.values.shape[2:] == (3,)
+              and b.components not in (_ROTATOR, ("rx", "ry", "rz"))
+              and (b.words & _LOCATION or (b.components and not b.words & _ROTATION))]  # fmt: skip
+    forms = []
+    for turn, axes in itertools.product(blocks, AXES):
+        if axes == "pytorch3d" and axes not in hints:
+            continue
+        has_place = turn.values.shape[2:] in ((4, 4), (16,), (3, 4), (12,))
+        for kind, place in itertools.product(_kinds(turn), [None] if has_place else places):
+            if place is not turn:
+                forms.append((_tier(turn, kind.split(), axes, hints), turn, place, kind, axes))
+    for tier, turn, place, kind, axes in sorted(forms, key=lambda form: form[0]):
+        where = turn.key if place is None else f"{place.key} and {turn.key}"
+        name, unit = f"{where}: {kind}, {axes} axes", (place or turn).unit
+        unit_m = np.nan if recorded.unit_m is None else recorded.unit_m
+        if unit in UNITS_M:
+            name, unit_m = f"{name}, {unit}", UNITS_M[unit]
+        if only is None or name == only:
+            trajectory = _read(turn, place, kind.split(), axes, unit_m)
+            if trajectory is not None:
+                own_axes = named_axes or ({"unreal"} if turn.components == _ROTATOR else ())
+                yield Reading(name, tier, axes in own_axes, trajectory)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Form:
-    """A location and a rotation, or a matrix, and how it is read."""
-
-    name: str
-    tier: int
-    turn: Block
-    place: Block | None
-    kind: str
-    axes: str
-    unit_m: float
-
-    def make(self) -> Trajectory | None:
-        """Return the poses, None where the numbers are no rotations of this form."""
-        names, values = self.kind.split(), self.turn.values
-        place = values[..., 3] if self.place is None else self.place.values
-        is_native = self.axes == "unreal" and "w2c" not in names
-        try:
-            if names[0] == "matrix":
-                values, place = _parted(values, names, place)
-                turns = _rotations(values)
-            elif names[0] == "quaternion":
-                values = _unit_quaternions(values[..., [names[1].index(each) for each in "xyzw"]])
-                if is_native:
-                    return _finite(place, self.unit_m, values, "quaternion_xyzw")
-                turns = rotation_from_quaternion_xyzw(values)
-            else:
-                values = _degrees(values, names, self.turn.components)
-                if is_native and names[0] == "rotator":
-                    return _finite(place, self.unit_m, values, "rotator_deg")
-                turns = _ANGLES[names[0]](values)
-        except GeometryError:
-            return None
-        if "w2c" in names:
+def _read(
+    turn: Block, place: Block | None, kind: list[str], axes: str, unit_m: float
+) -> Trajectory | None:
+    """Return the poses of a form, None where the numbers are not such rotations."""
+    values = turn.values
+    places = values[..., 3] if place is None else place.values
+    recorded: RotationKind = "matrix"
+    try:
+        if kind[0] == "matrix":
+            values, places = _parted(values, kind, places)
+            turns = values = _rotations(values)
+        elif kind[0] == "quaternion":
+            values = _unit_quaternions(values[..., [kind[1].index(each) for each in "xyzw"]])
+            turns, recorded = rotation_from_quaternion_xyzw(values), "quaternion_xyzw"
+        else:
+            values = _degrees(values, kind, turn.components)
+            turns = _ANGLES[kind[0]](values)
+            recorded = "rotator_deg" if kind[0] == "rotator" else "matrix"
+    except GeometryError:
+        return None
+    if recorded == "matrix" or axes != "unreal" or "w2c" in kind:
+        if "w2c" in kind:
             turns = np.swapaxes(turns, -1, -2)
-            place = -(turns @ place[..., None])[..., 0]
-        turns = np.stack(
-            [sign * turns[..., :, column] for column, sign in AXES[self.axes]], axis=-1
-        )
-        hands = np.linalg.det(turns)
+            places = -(turns @ places[..., None])[..., 0]
+        columns = [sign * turns[..., :, column] for column, sign in AXES[axes]]
+        values, recorded = np.stack(columns, axis=-1), "matrix"
+        hands = np.linalg.det(values)
         if not (hands.flat[0] * hands > 0).all():
             return None
         if hands.flat[0] < 0:  # The world has the other hand: all is mirrored, the cameras too.
-            turns, place = turns * _MIRROR[:, None], place * _MIRROR
-        return _finite(place, self.unit_m, turns, "matrix")
-
-
-_MIRROR: Final = np.array([1.0, -1.0, 1.0])
-
-
-def _finite(
-    places: np.ndarray, unit_m: float, turns: np.ndarray, kind: RotationKind
-) -> Trajectory | None:
-    """Return poses whose numbers are all finite, None for others."""
-    if not (np.isfinite(turns).all() and np.isfinite(places).all()):
+            values, places = values * _MIRROR[:, None], places * _MIRROR
+    if not (np.isfinite(values).all() and np.isfinite(places).all()):
         return None
-    turns, places = np.ascontiguousarray(turns), np.ascontiguousarray(places)
-    turns.setflags(write=False)
-    places.setflags(write=False)
-    return Trajectory(places, unit_m, turns, kind)
+    values, places = np.ascontiguousarray(values), np.ascontiguousarray(places)
+    for numbers in (values, places):
+        numbers.setflags(write=False)
+    return Trajectory(places, unit_m, values, recorded)
+
+
+_ROTATOR: Final = ("pitch", "yaw", "roll")
+_MIRROR: Final = np.array([1.0, -1.0, 1.0])
 
 
 def _parted(
@@ -186,8 +179,8 @@ def _degrees(
     values: np.ndarray, names: list[str], components: tuple[str, ...]
 ) -> Float64[np.ndarray, "*n 3"]:
     """Return angles in degrees: of rotators pitch, yaw, roll; of others in the order written."""
-    if names[0] == "rotator" and components != ("pitch", "yaw", "roll"):
-        values = values[..., [names.index(each) - 1 for each in ("pitch", "yaw", "roll")]]
+    if names[0] == "rotator" and components != _ROTATOR:
+        values = values[..., [names.index(each) - 1 for each in _ROTATOR]]
     degrees = np.rad2deg(values) if "rad" in names else values
     if not np.abs(degrees).max(initial=0) <= _MOST_TURNS_DEG:
         raise GeometryError("no angles")
@@ -232,40 +225,12 @@ _ANGLES: Final = {
 }  # fmt: skip
 
 
-def _all_readings(recorded: RecordedPoses) -> Iterator[_Form]:
-    hints = _hints(recorded)
-    blocks = [block for block in recorded.blocks if not block.words & _NO_POSE]
-    places = [b for b in blocks if b.values.shape[2:] == (3,)
-              and b.components not in (("pitch", "yaw", "roll"), ("rx", "ry", "rz"))
-              and (b.words & _LOCATION or (b.components and not b.words & _ROTATION))]  # fmt: skip
-    for turn, axes in itertools.product(blocks, AXES):
-        if axes == "pytorch3d" and axes not in hints:
-            continue
-        for kind in _kinds(turn):
-            own_place = turn.values.shape[2:] in ((4, 4), (16,), (3, 4), (12,))
-            for place in [None] if own_place else places:
-                if place is not turn:
-                    tier = _tier(turn, kind.split(), axes, hints)
-                    yield _form(recorded, turn, place, kind, axes, tier)
-
-
 def _hints(recorded: RecordedPoses) -> frozenset[str]:
     found = recorded.hints | {_ALIASES[hint] for hint in recorded.hints if hint in _ALIASES}
-    is_of_rotators = any(block.components == ("pitch", "yaw", "roll") for block in recorded.blocks)
+    is_of_rotators = any(block.components == _ROTATOR for block in recorded.blocks)
     if is_of_rotators and any("right_hand" in hint for hint in found):
         return (found | {"ros"}) - {"unreal"}  # as Unreal's, with y to the left
     return found
-
-
-def _form(
-    recorded: RecordedPoses, turn: Block, place: Block | None, kind: str, axes: str, tier: int
-) -> _Form:
-    where = turn.key if place is None else f"{place.key} and {turn.key}"
-    name, unit = f"{where}: {kind}, {axes} axes", (place or turn).unit
-    if unit in UNITS_M:
-        return _Form(f"{name}, {unit}", tier, turn, place, kind, axes, UNITS_M[unit])
-    unit_m = np.nan if recorded.unit_m is None else recorded.unit_m
-    return _Form(name, tier, turn, place, kind, axes, unit_m)
 
 
 _KINDS: Final = (
@@ -280,7 +245,7 @@ def _kinds(block: Block) -> list[str]:
     """Return the forms that numbers of this shape and these names can have."""
     shape, names = block.values.shape[2:], block.components
     units = ("deg", "rad")
-    if names == ("pitch", "yaw", "roll"):
+    if names == _ROTATOR:
         kinds = [f"{_KINDS[0]} {unit}" for unit in units]
     elif shape == (3,) and (block.words & _ROTATION or names == ("rx", "ry", "rz")):
         kinds = [f"{kind} {unit}" for kind, unit in itertools.product(_KINDS[:4], units)]
@@ -328,7 +293,7 @@ def _form_tier(block: Block, kind: list[str], said: frozenset[str]) -> int:
     said_orders = _ORDERS & said or ({"wxyz"} if said & {"qvec", "colmap"} else set())
     if kind[0] == "matrix":
         return 2 if kind[2] == "rows" else 0
-    if block.components in (("pitch", "yaw", "roll"), ("qx", "qy", "qz", "qw")):
+    if block.components in (_ROTATOR, ("qx", "qy", "qz", "qw")):
         return 0
     if kind[0] == "quaternion":
         return 0 if block.components or kind[1] in said_orders else 2 if said_orders else 1
