@@ -44,46 +44,6 @@ class Intrinsics:
                 f"or more, all in pixels of the image; got {self}."
             )
 
-    @classmethod
-    def from_mm(
-        cls,
-        *,
-        focal_mm: float,
-        sensor_mm: tuple[float, float],
-        size_px: tuple[int, int],
-        principal_point_px: tuple[float, float] | None = None,
-    ) -> "Intrinsics":
-        """Return the intrinsics of a lens in front of a sensor.
-
-        Args:
-            focal_mm: Focal length in mm.
-            sensor_mm: (width, height) of the sensor in mm.
-            size_px: (width, height) of the image in pixels.
-            principal_point_px: (x, y) in pixels of the image; None is the image's centre.
-
-        Raises:
-            GeometryError: If a length or a size is not positive and finite.
-
-        Source: the StereoGenBench paper, fx = f_mm / sensor_width_mm * width_px.
-
-        >>> Intrinsics.from_mm(focal_mm=32.6, sensor_mm=(23.76, 23.76), size_px=(1280, 1280)).fx_px
-        1756.2289562289561
-        """
-        if not min(sensor_mm) > 0:
-            raise GeometryError(
-                f"a sensor's width and height must be positive, got {sensor_mm} mm."
-            )
-        width_px, height_px = size_px
-        cx_px, cy_px = principal_point_px or (width_px / 2, height_px / 2)
-        return cls(
-            fx_px=focal_mm / sensor_mm[0] * width_px,
-            fy_px=focal_mm / sensor_mm[1] * height_px,
-            cx_px=float(cx_px),
-            cy_px=float(cy_px),
-            width_px=width_px,
-            height_px=height_px,
-        )
-
     def resized(self, *, width_px: int, height_px: int) -> "Intrinsics":
         """Return the intrinsics of the image stretched to exactly this size.
 
@@ -141,10 +101,25 @@ def rig_intrinsics(rig: Rig) -> Intrinsics:
 
 
 def recorded_intrinsics(rig: Rig) -> Intrinsics:
-    """Return the intrinsics of all six cameras of a rig, at the recorded image size."""
-    return Intrinsics.from_mm(
-        focal_mm=rig.focal_mm,
-        sensor_mm=(rig.sensor_width_mm, rig.sensor_height_mm),
-        size_px=rig.recorded_size_px or (rig.image_width_px, rig.image_height_px),
-        principal_point_px=rig.principal_point_px,
+    """Return the intrinsics of all six cameras of a rig, at the recorded image size.
+
+    Without a principal point it is the image's centre.
+
+    Raises:
+        GeometryError: If a length or a size is not positive and finite.
+
+    Source: the StereoGenBench paper, fx = f_mm / sensor_width_mm * width_px.
+    """
+    sensor_mm = (rig.sensor_width_mm, rig.sensor_height_mm)
+    if not min(sensor_mm) > 0:
+        raise GeometryError(f"a sensor's width and height must be positive, got {sensor_mm} mm.")
+    width_px, height_px = rig.recorded_size_px or (rig.image_width_px, rig.image_height_px)
+    cx_px, cy_px = rig.principal_point_px or (width_px / 2, height_px / 2)
+    return Intrinsics(
+        fx_px=rig.focal_mm / sensor_mm[0] * width_px,
+        fy_px=rig.focal_mm / sensor_mm[1] * height_px,
+        cx_px=float(cx_px),
+        cy_px=float(cy_px),
+        width_px=width_px,
+        height_px=height_px,
     )

@@ -103,30 +103,26 @@ def table_clock(
         steady: The clock that the header describes, if it describes one.
 
     Raises:
-        MediaError: If a packet is cut short, carries no time or another packet's time, or one
-            that contradicts the order of the file.
+        MediaError: If a packet is cut short or carries another packet's time, or one that
+            contradicts the order of the file.
     """
     times: list[int] = []
+
+    def cut_short(why: str) -> MediaError:
+        return MediaError(
+            f"{name}: cannot be read past its frame number {len(times)} as stored ({why}): fetch "
+            f"it again."
+        )
+
     try:
         for packet in container.demux(container.streams.video[0]):
-            if packet.size == 0 or packet.is_discard:
-                continue
             if packet.is_corrupt:
-                raise MediaError(
-                    f"{name}: is cut short within its frame number {len(times)} as stored: "
-                    f"fetch it again."
-                )
-            if packet.pts is None:
-                raise MediaError(
-                    f"{name}: its frame number {len(times)} as stored carries no presentation "
-                    f"time, so no frame can be found by number: write it again as MP4 or Matroska."
-                )
-            times.append(packet.pts)
+                raise cut_short("its packet is cut short")
+            # Without a time no frame can be found: there is one too few, then.
+            if packet.size and packet.pts is not None and not packet.is_discard:
+                times.append(packet.pts)
     except av.FFmpegError as error:
-        raise MediaError(
-            f"{name}: cannot be read past its frame number {len(times)} as stored "
-            f"({error.strerror}): fetch it again."
-        ) from error
+        raise cut_short(error.strerror) from error
     if stream_codec(container).is_intra_only:
         require_file_order(times, steady, name=name)
     times.sort()
@@ -145,18 +141,12 @@ def require_file_order(times: Sequence[int], steady: SteadyClock | None, *, name
     Raises:
         MediaError: Naming the first such frame.
     """
-    for number, (before, after) in enumerate(pairwise(times), 1):
-        if after <= before:
+    for number, pts in enumerate(times):
+        is_after = number == 0 or pts > times[number - 1]
+        if not is_after or (steady is not None and steady.index(pts) != number):
             raise MediaError(
-                f"{name}: its frame number {number} as stored is shown at {after} ticks and the "
-                f"one before it at {before}, and its codec stores frames in the order in which "
-                f"they are shown. A time was altered: compare the file with its checksum, or "
-                f"fetch it again."
+                f"{name}: its frame number {number} as stored is shown at {pts} ticks, and its "
+                f"codec stores frames in the order in which they are shown, at the rate in the "
+                f"header. A time was altered: compare the file with its checksum, or fetch it "
+                f"again."
             )
-    wrong = [n for n, pts in enumerate(times) if steady is not None and steady.index(pts) != n]
-    if wrong:
-        raise MediaError(
-            f"{name}: its frame number {wrong[0]} as stored is shown at {times[wrong[0]]} ticks, "
-            f"which is not its time at the rate in the header. A time was altered: compare the "
-            f"file with its checksum, or fetch it again."
-        )

@@ -17,7 +17,12 @@ from typing import Any, Final, Literal, Self
 import av
 from av.container import InputContainer
 
-from stereogenbench_data.errors import MediaError, StorageError, cure_of
+from stereogenbench_data.errors import (
+    NOT_WRITABLE,
+    MediaError,
+    StorageError,
+    describe_os_error,
+)
 from stereogenbench_data.media.siting import coded_picture
 
 BinaryFile = io.RawIOBase | io.BufferedIOBase
@@ -95,6 +100,9 @@ class FrameReader:
         """Close the reader."""
         self.close()
 
+
+_NOT_THE_FILES: Final = NOT_WRITABLE | {errno.EMFILE, errno.ENFILE}
+"""Numbers of errors that say nothing of what a file holds; others may come from its content."""
 
 _OPTIONS: Final = {"format_whitelist": "mov,matroska"}
 _UNDECODED: Final = {**_OPTIONS, "probesize": "32", "skip_frame": "all"}
@@ -220,13 +228,9 @@ def open_container(
         if not container.streams.video or container.streams.video[0].start_time is None:
             container.close()
             container = _open(file, options=_OPTIONS)
-    except PermissionError as error:
-        raise StorageError(f"{name}: permission denied: give read permission.") from error
     except av.FFmpegError as error:
-        if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
-            raise StorageError(
-                f"{name}: cannot be opened ({error.strerror}). {cure_of(error)}"
-            ) from error
+        if isinstance(error, OSError) and error.errno in _NOT_THE_FILES:
+            raise StorageError(describe_os_error(f"{name}: cannot be opened", error)) from error
         raise MediaError(
             f"{name}: cannot be opened as MP4 or Matroska ({error.strerror}). The file is cut "
             f"short, damaged or something else: fetch it again."
@@ -287,10 +291,9 @@ def _require_file(path: Path, *, name: str) -> None:
     try:
         size = path.stat().st_size
     except OSError as error:
-        raise StorageError(
-            f"{name}: cannot be read at {path} ({error.strerror}). "
-            + cure_of(error, "Fetch it, or correct the path.")
-        ) from error
+        what = f"{name}: cannot be read at {path}"
+        cure = "Fetch it, or correct the path."
+        raise StorageError(describe_os_error(what, error, cure)) from error
     if size == 0:
         raise MediaError(f"{name}: is empty (0 bytes at {path}): fetch it again.")
 

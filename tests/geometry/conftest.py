@@ -46,42 +46,24 @@ def intrinsics() -> Intrinsics:
 
 
 @pytest.fixture(scope="session")
-def make_trajectory():
-    """Return one that builds a lateral rig's trajectory, in cm and Unreal's axes.
+def make_rig():
+    """Return one that builds the poses of a lateral rig, from cm and Unreal's axes.
 
     Camera k stands ``lateral_cm[k]`` along the right axis of ``rotation`` from ``offset_cm``.
     """
 
-    def make(lateral_cm, *, rotation, rotations, rotation_kind, offset_cm=(0, 0, 0), frames=1):
-        offset_cm = np.array(offset_cm, dtype=np.float64)
-        locations = offset_cm + np.outer(lateral_cm, np.asarray(rotation)[:, 1])
-        recorded = np.broadcast_to(
-            np.asarray(rotations, dtype=np.float64), (frames, 6, *np.shape(rotations))
-        )
-        return Trajectory(
-            locations=np.broadcast_to(locations, (frames, 6, 3)).copy(),
-            unit_m=0.01,
-            rotations=recorded.copy(),
-            rotation_kind=rotation_kind,
-        )
-
-    return make
-
-
-@pytest.fixture(scope="session")
-def make_rig(make_trajectory):
-    """Return one that builds the poses of a lateral rig turned by an Unreal rotation matrix."""
-
-    def make(lateral_cm, *, rotation=None, offset_cm=(0, 0, 0), frames=1) -> CameraPoses:
-        rotation = np.eye(3) if rotation is None else rotation
+    def make(
+        lateral_cm, *, rotation=None, recorded=None, kind="matrix", offset_cm=(0, 0, 0), frames=1
+    ) -> CameraPoses:
+        rotation = np.eye(3) if rotation is None else np.asarray(rotation)
+        recorded = np.array(rotation if recorded is None else recorded, dtype=np.float64)
+        locations = np.array(offset_cm, float) + np.outer(lateral_cm, rotation[:, 1])
         return CameraPoses.from_trajectory(
-            make_trajectory(
-                lateral_cm,
-                rotation=rotation,
-                rotations=rotation,
-                rotation_kind="matrix",
-                offset_cm=offset_cm,
-                frames=frames,
+            Trajectory(
+                locations=np.tile(locations, (frames, 1, 1)),
+                unit_m=0.01,
+                rotations=np.tile(recorded, (frames, 6, *[1] * recorded.ndim)),
+                rotation_kind=kind,
             )
         )
 

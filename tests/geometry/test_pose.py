@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry.pose import (
     OPENCV_FROM_UNREAL,
-    CameraPoses,
     invert_rigid,
     nearest_rotation,
     rotation_angle_rad,
@@ -72,7 +71,7 @@ def test_a_rounded_matrix_is_replaced_by_the_nearest_rotation(rotator_deg, seed)
 
 
 @pytest.mark.parametrize("kind", ["rotator_deg", "quaternion_xyzw", "matrix"])
-def test_every_recorded_representation_gives_the_same_poses(make_trajectory, kind):
+def test_every_recorded_representation_gives_the_same_poses(make_rig, kind):
     rotation = scipy_rotation(-12.0, 200.0, 7.0)
     recorded = {
         "rotator_deg": (-12.0, 200.0, 7.0),
@@ -80,14 +79,8 @@ def test_every_recorded_representation_gives_the_same_poses(make_trajectory, kin
         "matrix": rotation.as_matrix(),
     }[kind]
 
-    poses = CameraPoses.from_trajectory(
-        make_trajectory(
-            np.arange(6.0),
-            rotation=rotation.as_matrix(),
-            rotations=recorded,
-            rotation_kind=kind,
-            frames=2,
-        )
+    poses = make_rig(
+        np.arange(6.0), rotation=rotation.as_matrix(), recorded=recorded, kind=kind, frames=2
     )
 
     expected = OPENCV_FROM_UNREAL @ rotation.as_matrix() @ OPENCV_FROM_UNREAL.T
@@ -137,16 +130,16 @@ def test_the_angle_between_rotations_is_exact_even_where_a_cosine_would_round_it
     assert rotation_angle_rad(np.eye(3), turned) == pytest.approx(angle_rad, rel=1e-7, abs=1e-15)
 
 
-def test_a_quaternion_without_direction_is_refused():
-    quaternions = np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0]])
-
-    with pytest.raises(GeometryError, match=r"quaternion \[0\.0, 0\.0, 0\.0, 0\.0\]"):
-        rotation_from_quaternion_xyzw(quaternions)
-
-
-def test_a_matrix_that_mirrors_is_refused():
-    with pytest.raises(GeometryError, match=r"\[0\.0, 0\.0, -1\.0\]\] is a reflection"):
-        nearest_rotation(np.diag([1.0, 1.0, -1.0]))
+@pytest.mark.parametrize(
+    ("convert", "numbers", "named"),
+    [
+        (rotation_from_quaternion_xyzw, [[0, 0, 0, 1], [0, 0, 0, 0]], r"quaternion \[0.0, 0.0, 0"),
+        (nearest_rotation, np.diag([1, 1, -1]), r"\[0\.0, 0\.0, -1\.0\]\] is a reflection"),
+    ],
+)
+def test_numbers_that_are_no_rotation_are_refused(convert, numbers, named):
+    with pytest.raises(GeometryError, match=named):
+        convert(np.array(numbers, dtype=np.float64))
 
 
 @given(rotator_deg=rotators_deg, shift=st.tuples(*[st.floats(-100, 100)] * 3))
