@@ -34,8 +34,8 @@ from stereogenbench_data.index.evidence import (
     understood_poses,
 )
 from stereogenbench_data.index.tree import FILES, Files, SceneFolder, folder_of
-from stereogenbench_data.media.clock import MOST_EXTRA_FRAMES
 from stereogenbench_data.media.container import StreamFacts, depth_coding
+from stereogenbench_data.media.decoder import MOST_EXTRA_FRAMES
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
     DEPTH_CURES,

@@ -1,4 +1,8 @@
-"""One run of a decoder over a stream: it seeks, skips, and checks that no picture is missing.
+"""Which frame a time stands for, and one run of a decoder that seeks, skips, and misses none.
+
+Clocks map presentation times to frame numbers, counted in the order of presentation: `SteadyClock`
+needs only the header and holds for a constant frame rate; `TableClock` knows the time of every
+frame. Times are integers in ticks of the stream's time base.
 
 A `Decoder` raises `UnexpectedPicture` at the first picture that is not due by its clock. Its caller
 decides whether the file is at fault.
@@ -10,23 +14,30 @@ Source: RFC 9043, sections 4.8 (slice footer) and 4.9.3 (CRC-32, most significan
 """
 
 import zlib
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
 from itertools import chain, islice, pairwise
 from typing import TYPE_CHECKING, Final
 
+import av
 from av.container import InputContainer
 from av.packet import Packet
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
-from stereogenbench_data.media.clock import Clock
-from stereogenbench_data.media.container import Placed, stream_codec
+from stereogenbench_data.errors import MediaError
+from stereogenbench_data.media.container import Placed, exact, frames_by_duration, stream_codec
 
 if TYPE_CHECKING:
     VideoPacket = Packet[VideoStream]
 else:
     VideoPacket = Packet  # generic only in PyAV's stubs
+
+MOST_EXTRA_FRAMES: Final = 2
+"""How many frames a video may have beyond those that its scene uses."""
 
 BLIND_JUMP: Final = 8
 """Frames to decode through rather than to seek, while a file's key frames are not known."""
@@ -41,6 +52,136 @@ _MIRRORED: Final = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 _CHECKSUM_STARTS: Final = (0xFFFFFFFF, 0xA1CEFD61)
 """What zlib's CRC-32 starts from, and ends at over a whole slice: FFV1 of version 3, and of
 version 4 as FFmpeg's experimental encoder writes it."""
+
+
+@dataclass(frozen=True, slots=True)
+class SteadyClock:
+    """Frames at one rate: frame i is shown at start + i * step ticks, give or take a rounding."""
+
+    start: int
+    step: Fraction
+
+    # A time may be off by a tick, or by a quarter of a step where that is less. It is computed in
+    # integers, as every packet asks.
+
+    def index(self, pts: int) -> int | None:
+        """Return the frame that is shown at a time, None where the time fits no frame."""
+        step, parts = self.step.numerator, self.step.denominator
+        since_start = (pts - self.start) * parts
+        index = (2 * since_start + step) // (2 * step)
+        off = abs(since_start - index * step)
+        return index if 4 * off <= min(4 * parts, step) else None
+
+    def latest(self, index: int) -> int:
+        """Return the greatest time that counts as a frame's."""
+        step, parts = self.step.numerator, self.step.denominator
+        return self.start + (4 * index * step + min(4 * parts, step)) // (4 * parts)
+
+
+@dataclass(frozen=True, slots=True)
+class TableClock:
+    """Frames at any times, in ascending order."""
+
+    times: Sequence[int]
+
+    def index(self, pts: int) -> int | None:
+        """Return the frame that is shown at a time, None where no frame is."""
+        index = bisect_left(self.times, pts)
+        return index if index < len(self.times) and self.times[index] == pts else None
+
+    def latest(self, index: int) -> int:
+        """Return a frame's time."""
+        return self.times[index]
+
+
+Clock = SteadyClock | TableClock
+
+
+def steady_clock(container: InputContainer, *, frames: int) -> SteadyClock | None:
+    """Return the clock that the header describes, None if it contradicts itself or ``frames``.
+
+    An MP4 header lists all samples: their number and decoding times must be those of ``frames``
+    frames at one rate, or of a few more. A Matroska header gives only the duration.
+    """
+    stream = container.streams.video[0]
+    rate, time_base = exact(stream.average_rate), exact(stream.time_base)
+    if stream.start_time is None or rate is None or time_base is None:
+        return None
+    step = 1 / (rate * time_base)
+    if stream.frames == 0:
+        agrees = 0 <= (frames_by_duration(container) or 0) - frames <= MOST_EXTRA_FRAMES
+    else:
+        entries = list(stream.index_entries)
+        agrees = (
+            0 <= stream.frames - frames <= MOST_EXTRA_FRAMES
+            and stream.frames == len(entries)
+            and not any(entry.is_discard for entry in entries)
+            and all(abs(b.timestamp - a.timestamp - step) <= 1 for a, b in pairwise(entries))
+        )
+    return SteadyClock(stream.start_time, step) if agrees else None
+
+
+def table_clock(
+    container: InputContainer, *, name: str, steady: SteadyClock | None = None
+) -> TableClock:
+    """Return the times of all frames, read by going through all packets from where they stand.
+
+    Frames of an intra-only codec are counted in the order of the file, with which their times
+    must agree; and with the rate, if the header gives one.
+
+    Args:
+        container: An open file.
+        name: What messages call it.
+        steady: The clock that the header describes, if it describes one.
+
+    Raises:
+        MediaError: If a packet is cut short or carries another packet's time, or one that
+            contradicts the order of the file.
+    """
+    times: list[int] = []
+
+    def cut_short(why: str) -> MediaError:
+        return MediaError(
+            f"{name}: cannot be read past its frame number {len(times)} as stored ({why}): fetch "
+            f"it again."
+        )
+
+    try:
+        for packet in container.demux(container.streams.video[0]):
+            if packet.is_corrupt:
+                raise cut_short("its packet is cut short")
+            # Without a time no frame can be found: there is one too few, then.
+            if packet.size and packet.pts is not None and not packet.is_discard:
+                times.append(packet.pts)
+    except av.FFmpegError as error:
+        raise cut_short(error.strerror) from error
+    if stream_codec(container).is_intra_only:
+        require_file_order(times, steady, name=name)
+    times.sort()
+    twice = next((a for a, b in pairwise(times) if a == b), None)
+    if twice is not None:
+        raise MediaError(
+            f"{name}: two frames are shown at the same time ({twice} ticks), so their order is "
+            f"not defined: write it again with one time for each frame."
+        )
+    return TableClock(times)
+
+
+def require_file_order(times: Sequence[int], steady: SteadyClock | None, *, name: str) -> None:
+    """Refuse times that do not ascend as frames are stored, or are not those of the rate.
+
+    Raises:
+        MediaError: Naming the first such frame.
+    """
+    for number, pts in enumerate(times):
+        is_after = number == 0 or pts > times[number - 1]
+        if not is_after or (steady is not None and steady.index(pts) != number):
+            raise MediaError(
+                f"{name}: its frame number {number} as stored is shown at {pts} ticks, and its "
+                f"codec stores frames in the order in which they are shown, at the rate in the "
+                f"header. A time was altered: compare the file with its checksum, or fetch it "
+                f"again."
+            )
 
 
 class UnexpectedPicture(Exception):

@@ -25,7 +25,6 @@ import numpy as np
 from av.container import InputContainer
 
 from stereogenbench_data.errors import MediaError
-from stereogenbench_data.media.clock import steady_clock
 from stereogenbench_data.media.container import (
     SeekableFile,
     VideoFile,
@@ -33,7 +32,7 @@ from stereogenbench_data.media.container import (
     open_container,
     stream_codec,
 )
-from stereogenbench_data.media.decoder import BLIND_JUMP
+from stereogenbench_data.media.decoder import BLIND_JUMP, steady_clock
 from stereogenbench_data.media.depth_frames import PACKED_SUFFIX, DepthFrames
 
 LARGEST_HEADER: Final = 256 * 1024

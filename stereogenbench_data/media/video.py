@@ -16,14 +16,6 @@ from av.video.reformatter import Interpolation, VideoReformatter
 from jaxtyping import UInt8, UInt16
 
 from stereogenbench_data.errors import MediaError
-from stereogenbench_data.media.clock import (
-    MOST_EXTRA_FRAMES,
-    Clock,
-    TableClock,
-    require_file_order,
-    steady_clock,
-    table_clock,
-)
 from stereogenbench_data.media.container import (
     FrameReader,
     StreamFacts,
@@ -36,7 +28,16 @@ from stereogenbench_data.media.container import (
     require_whole_payload,
     stream_facts,
 )
-from stereogenbench_data.media.decoder import Decoder, UnexpectedPicture
+from stereogenbench_data.media.decoder import (
+    MOST_EXTRA_FRAMES,
+    Clock,
+    Decoder,
+    TableClock,
+    UnexpectedPicture,
+    require_file_order,
+    steady_clock,
+    table_clock,
+)
 from stereogenbench_data.media.depth_frames import PACKED_SUFFIX, DepthFrames
 from stereogenbench_data.media.packet_checksums import packet_checksums
 from stereogenbench_data.media.siting import (

@@ -19,8 +19,8 @@ from stereogenbench_data.errors import MediaError, ShardError, cure_of
 from stereogenbench_data.index.open import StaleIndexWarning
 from stereogenbench_data.index.scene_folder import metadata_differences
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.media.clock import MOST_EXTRA_FRAMES
 from stereogenbench_data.media.container import StreamFacts, depth_coding
+from stereogenbench_data.media.decoder import MOST_EXTRA_FRAMES
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
     open_video,

@@ -59,26 +59,18 @@ class Clips:
         ]
         return subprocess.run(command, input=stdin, capture_output=True, check=True).stdout
 
-    def rgb(
-        self, name: str, *codec: str, pictures: np.ndarray | None = None, rate: str = "15"
+    def encode(
+        self,
+        name: str,
+        *codec: str,
+        pictures: np.ndarray | None = None,
+        pixel_format: str = "rgb24",
+        rate: str = "15",
     ) -> Path:
         """Encode pictures, the painted ones unless others are given."""
-        return self._encode(
-            name, *codec, pictures=self.pictures if pictures is None else pictures,
-            pixel_format="rgb24", rate=rate,
-        )  # fmt: skip
-
-    def gray(self, name: str, *codec: str, pictures: np.ndarray, pixel_format: str) -> Path:
-        """Encode pictures of one number a pixel."""
-        return self._encode(
-            name, *codec, pictures=pictures, pixel_format=pixel_format, rate="15"
-        )  # fmt: skip
-
-    def _encode(
-        self, name: str, *codec: str, pictures: np.ndarray, pixel_format: str, rate: str
-    ) -> Path:
         path = self.folder / name
         if not path.exists():
+            pictures = self.pictures if pictures is None else pictures
             height, width = pictures.shape[1:3]
             source = ("-f", "rawvideo", "-pix_fmt", pixel_format, "-s", f"{width}x{height}")
             self.ffmpeg(*source, "-r", rate, "-i", "-", *codec, path, stdin=pictures.tobytes())

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stereogenbench_data.media.clock import SteadyClock
+from stereogenbench_data.media.decoder import SteadyClock
 
 MATROSKA_15_HZ = SteadyClock(start=0, step=Fraction(1000, 15))
 

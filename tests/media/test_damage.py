@@ -15,7 +15,7 @@ X264 = ("-c:v", "libx264", "-pix_fmt", "yuv420p")
 def depth_clip(clips, name, *codec):
     rows, columns = np.indices((64, 96))
     ramps = [rows * 300 + columns * 7 + 11 * index for index in range(48)]
-    return clips.gray(
+    return clips.encode(
         name, "-c:v", "ffv1", "-g", "12", *codec,
         pictures=np.array(ramps, dtype="<u2"), pixel_format="gray16le",
     )  # fmt: skip
@@ -32,7 +32,7 @@ def outcome(reader, clips, index):
 @pytest.mark.parametrize("suffix", ["mp4", "mkv"])
 @pytest.mark.parametrize(("stored", "expected"), [(48, 49), (48, 45)])
 def test_another_number_of_frames_is_refused_when_opened(clips, suffix, stored, expected):
-    path = clips.rgb(f"groups of 12.{suffix}", *X264, "-g", "12")
+    path = clips.encode(f"groups of 12.{suffix}", *X264, "-g", "12")
 
     with pytest.raises(MediaError, match=f"clip: holds {stored} frames where {expected} are expec"):
         VideoReader(path, name="clip", frames=expected)
@@ -41,7 +41,7 @@ def test_another_number_of_frames_is_refused_when_opened(clips, suffix, stored, 
 @pytest.mark.parametrize("suffix", ["mp4", "mkv"])
 @pytest.mark.parametrize("lost", [0, 20, 47])
 def test_a_lost_frame_is_never_passed_over(clips, suffix, lost):
-    source = clips.rgb(f"intra.{suffix}", *X264, "-g", "1")
+    source = clips.encode(f"intra.{suffix}", *X264, "-g", "1")
     path = clips.remuxed(source, f"without {lost}.{suffix}", without=[lost])
 
     try:
@@ -57,7 +57,7 @@ def test_a_lost_frame_is_never_passed_over(clips, suffix, lost):
 
 
 def test_a_cut_matroska_file_gives_its_frames_up_to_the_cut(clips):
-    source = clips.rgb("groups of 12.mkv", *X264, "-g", "12")
+    source = clips.encode("groups of 12.mkv", *X264, "-g", "12")
     path = clips.folder / "cut rgb.mkv"
     path.write_bytes(source.read_bytes()[: source.stat().st_size // 2])
 
@@ -72,7 +72,7 @@ def test_a_cut_matroska_file_gives_its_frames_up_to_the_cut(clips):
 
 @pytest.mark.parametrize("suffix", ["mp4", "mkv"])
 def test_a_damaged_h264_packet_spoils_its_group_and_no_other(clips, suffix):
-    source = clips.rgb(f"slow.{suffix}", *X264, "-g", "12", "-bf", "0", "-crf", "12")
+    source = clips.encode(f"slow.{suffix}", *X264, "-g", "12", "-bf", "0", "-crf", "12")
     path = clips.damaged(source, f"damaged.{suffix}", packet=26)
 
     with VideoReader(path, name="a/cam_03_rgb.mp4", frames=48) as reader:

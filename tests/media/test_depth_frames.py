@@ -4,9 +4,7 @@ import io
 import json
 import zlib
 from dataclasses import replace
-from fractions import Fraction
 
-import av
 import numpy as np
 import pytest
 
@@ -22,10 +20,8 @@ from stereogenbench_data.media.depth_frames import (
 from stereogenbench_data.media.depth_packing import packed_depth, write_depth_video
 from stereogenbench_data.media.video import VideoReader, probe
 from tests.servers.tools import require_module
-from tests.servers.videos import write_frames
 
 SHAPE = (40, 56)
-TAGS = {"DEPTH_SCALE": "0.001", "TITLE": "Nowhere"}
 
 
 def pictures(largest=65535):
@@ -43,19 +39,11 @@ def pictures(largest=65535):
     return [each.astype(np.uint16) for each in maps]
 
 
-def write_depth(path, maps, *, pixel_format="gray16le", codec="ffv1", step=1):
-    def frames():
-        for number, units in enumerate(maps):
-            frame = av.VideoFrame(SHAPE[1], SHAPE[0], pixel_format)
-            for plane in frame.planes:
-                numbers = units.astype("u1") if pixel_format in ("gray", "yuv420p") else units
-                rows = np.zeros((plane.height, plane.line_size // numbers.itemsize), numbers.dtype)
-                rows[:, : plane.width] = numbers[: plane.height, : plane.width]
-                plane.update(rows.tobytes())
-            frame.pts, frame.time_base = number * step, Fraction(1, 15)
-            yield frame
-
-    return write_frames(path, frames(), codec=codec, pixel_format=pixel_format, tags=TAGS)
+def write_depth(clips, name, maps, *, pixel_format="gray16le", codec=("ffv1",), rate="15"):
+    pictures = np.stack(maps).astype("u1" if pixel_format == "gray" else "<u2")
+    tags = ("-metadata", "DEPTH_SCALE=0.001", "-metadata", "TITLE=Nowhere")
+    how = {"pictures": pictures, "pixel_format": pixel_format, "rate": rate}
+    return clips.encode(name, "-c:v", *codec, *tags, **how)
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +52,8 @@ def blosc2():
 
 
 @pytest.fixture(scope="module")
-def video(tmp_path_factory):
-    return write_depth(tmp_path_factory.mktemp("depth") / "cam_00_depth.mkv", pictures())
+def video(clips):
+    return write_depth(clips, "cam_00_depth.mkv", pictures())
 
 
 @pytest.fixture(scope="module")
@@ -182,15 +170,14 @@ def parse_text(content):
 
 @pytest.mark.usefixtures("blosc2")
 @pytest.mark.parametrize(("pixel_format", "largest"), [("gray16le", 65535), ("gray", 255)])
-def test_packed_depth_becomes_the_same_video_again(tmp_path, pixel_format, largest):
-    first = write_depth(
-        tmp_path / "first.mkv", pictures(largest), pixel_format=pixel_format, step=2
-    )
+def test_packed_depth_becomes_the_same_video_again(clips, tmp_path, pixel_format, largest):
+    how = {"pixel_format": pixel_format, "rate": "7.5"}
+    first = write_depth(clips, f"first {pixel_format}.mkv", pictures(largest), **how)
     content = packed_depth(first, name="first.mkv", frames=6)
 
     write_depth_video(opened(content), tmp_path / "second.mkv")
 
-    one, other = (probe(tmp_path / name, name=name) for name in ("first.mkv", "second.mkv"))
+    one, other = (probe(path, name="depth") for path in (first, tmp_path / "second.mkv"))
     assert other.tags.pop("encoder", "") != ""
     one.tags.pop("encoder")
     assert one == other
@@ -211,18 +198,16 @@ def test_packed_depth_becomes_the_same_video_again(tmp_path, pixel_format, large
 
 
 @pytest.mark.parametrize(
-    ("codec", "pixel_format", "found"),
+    ("codec", "found"),
     [
-        ("libx264", "yuv420p", "depth is stored by codec h264 as yuv420p"),
-        ("ffv1", "yuv420p10le", "depth is stored by codec ffv1 as yuv420p10le"),
+        (("libx264", "-pix_fmt", "yuv420p"), "codec h264 as yuv420p"),
+        (("ffv1", "-pix_fmt", "yuv420p10le"), "codec ffv1 as yuv420p10le"),
     ],
 )
-def test_what_cannot_come_back_whole_is_not_packed(tmp_path, codec, pixel_format, found):
-    path = write_depth(
-        tmp_path / "x.mkv", pictures(1000)[:2], codec=codec, pixel_format=pixel_format
-    )
+def test_what_cannot_come_back_whole_is_not_packed(clips, codec, found):
+    path = write_depth(clips, f"unpackable {codec[0]}.mkv", pictures(1000)[:2], codec=codec)
 
-    with pytest.raises(MediaError, match=found):
+    with pytest.raises(MediaError, match=f"depth is stored by {found}"):
         packed_depth(path, name="x.mkv", frames=2)
 
 

@@ -1,7 +1,5 @@
 """What stored depth numbers mean: unit, kind, form, what is not measured, and which frame."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,43 +16,29 @@ from stereogenbench_data.media.depth import (
 )
 from stereogenbench_data.schema.records import DepthEncoding
 
-
-def facts(**tags):
-    return StreamFacts(
-        codec="ffv1", pixel_format="gray16le", width_px=8, height_px=8, frames=1,
-        frame_rate_hz=15.0, tags=tags,
-    )  # fmt: skip
+USERS = DepthEncoding(unit_m=0.02, kind="ray", source="tag")
 
 
 @pytest.mark.parametrize(
-    ("tags", "unit_m", "source"),
+    ("tags", "override", "expected"),
     [
-        pytest.param({}, 0.1, "default", id="no tag is the release's 0.1 m"),
-        pytest.param({"encoder": "Lavf"}, 0.1, "default", id="other tags tell nothing"),
-        pytest.param({"depth_scale": "0.001"}, 0.001, "tag", id="millimetres"),
+        pytest.param({"encoder": "Lavf"}, None, (0.1, 0, "default", "planar"), id="no unit"),
+        pytest.param({"depth_scale": "0.001"}, None, (0.001, 0, "tag", "planar"), id="millimetres"),
+        pytest.param(
+            {"depth_near": "0.5 m", "depth_far": "4095.5 m"},
+            None,
+            (1.0, 0.5, "tag", "planar"),
+            id="a range over the format's largest number",
+        ),
+        pytest.param({"depth_scale": "mm"}, USERS, (0.02, 0, "user", "ray"), id="the user's"),
     ],
 )
-def test_the_unit_is_the_tags_or_the_releases(tags, unit_m, source):
-    encoding = resolve_encoding(facts(**tags), name="clip")
+def test_the_unit_is_the_users_or_the_tags_or_the_releases(tags, override, expected):
+    facts = StreamFacts("ffv1", "gray12le", 8, 8, 1, 15.0, tags)
 
-    assert (encoding.unit_m, encoding.source, encoding.kind) == (unit_m, source, "planar")
+    found = resolve_encoding(facts, name="clip", override=override)
 
-
-def test_a_normalised_stream_has_its_range_over_the_formats_largest_number():
-    tags = {"depth_near": "0.5 m", "depth_far": "4095.5 m"}
-    stream = replace(facts(**tags), pixel_format="gray12le")
-
-    encoding = resolve_encoding(stream, name="clip")
-
-    assert (encoding.unit_m, encoding.offset_m) == (1.0, 0.5)
-
-
-def test_the_users_contract_wins_over_any_tag():
-    override = DepthEncoding(unit_m=0.02, kind="ray", source="tag")
-
-    encoding = resolve_encoding(facts(depth_scale="mm"), name="clip", override=override)
-
-    assert encoding == DepthEncoding(unit_m=0.02, kind="ray", source="user")
+    assert (found.unit_m, found.offset_m, found.source, found.kind) == expected
 
 
 @pytest.mark.parametrize(
@@ -83,33 +67,23 @@ def test_metres_are_the_exact_product_rounded_once(unit_m):
     np.testing.assert_array_equal(depth_m, (units.astype(float) * unit_m).astype(np.float32))
 
 
-def test_depth_of_a_range_begins_at_its_offset():
-    units = np.array([[0, 4, 65535]], dtype=np.uint16)
-    encoding = DepthEncoding(unit_m=0.5, offset_m=0.25)
-
-    depth_m = depth_m_from_units(units, measured=units != 0, encoding=encoding)
-
-    np.testing.assert_array_equal(depth_m, [[0, 2.25, 32767.75]])
-
-
-@pytest.mark.parametrize("form", ["depth", "inverse"])
-def test_depth_is_zero_where_it_was_not_measured(form):
+@pytest.mark.parametrize(
+    ("encoding", "expected_m"),
+    [
+        (DepthEncoding(unit_m=0.5, offset_m=0.25), [0, 2.25, 32767.75]),
+        (DepthEncoding(unit_m=2.0, form="inverse"), [0, 0.5, 2 / 65535]),
+        (DepthEncoding(unit_m=2.0, form="inverse", no_depth=()), [np.inf, 0.5, 2 / 65535]),
+        (DepthEncoding(unit_m=2.0), [0, 8, 131070]),
+    ],
+    ids=["a range from its offset", "inverse", "an inverse of 0 that counts", "plain"],
+)
+def test_numbers_become_metres_and_0_where_depth_was_not_measured(encoding, expected_m):
     units = np.array([[0, 4, 65535, 4]], dtype=np.uint16)
-    encoding = DepthEncoding(unit_m=2.0, form=form)
-    where = np.array([[False, True, False, False]])
+    where = np.array([[not encoding.no_depth, True, True, False]])
 
     depth_m = depth_m_from_units(units, measured=where, encoding=encoding)
 
-    np.testing.assert_array_equal(depth_m, [[0, 8.0 if form == "depth" else 0.5, 0, 0]])
-
-
-def test_an_inverse_depth_of_zero_that_counts_is_infinitely_far():
-    units = np.array([[0, 50]], dtype=np.uint16)
-    encoding = DepthEncoding(unit_m=100.0, form="inverse", no_depth=())
-
-    depth_m = depth_m_from_units(units, measured=np.ones((1, 2), bool), encoding=encoding)
-
-    np.testing.assert_array_equal(depth_m, [[np.inf, 2.0]])
+    np.testing.assert_array_equal(depth_m, np.float32([[*expected_m, 0]]))
 
 
 def test_a_ray_becomes_depth_along_the_optical_axis():

@@ -1,16 +1,13 @@
 """Stored depth numbers come back bit for bit, and a stream that cannot keep them is refused."""
 
-import av
 import numpy as np
 import pytest
 
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.container import StreamFacts, depth_coding
 from stereogenbench_data.media.depth import ANY_DEPTH, read_depth_units, require_depth_stream
-from stereogenbench_data.media.depth_packing import grey_frame
 from stereogenbench_data.media.video import VideoReader, probe
 from stereogenbench_data.schema.records import DepthEncoding
-from tests.servers.videos import write_frames
 
 HEIGHT, WIDTH = 30, 54  # rows that FFmpeg pads
 
@@ -33,7 +30,7 @@ LOSSLESS = {
 def test_every_number_survives(clips, case):
     bits, dtype, codec, suffix = LOSSLESS[case]
     pictures = noise(bits, dtype)
-    path = clips.gray(
+    path = clips.encode(
         f"{case}.{suffix}", "-c:v", codec, pictures=pictures, pixel_format=case.split()[0]
     )
 
@@ -48,7 +45,7 @@ def test_every_number_survives(clips, case):
 
 def encoded(clips, name, *codec, bits=8):
     dtype, pixel_format = ("u1", "gray") if bits == 8 else ("<u2", f"gray{bits}le")
-    return clips.gray(name, *codec, pictures=noise(bits, dtype), pixel_format=pixel_format)
+    return clips.encode(name, *codec, pictures=noise(bits, dtype), pixel_format=pixel_format)
 
 
 REFUSED = {
@@ -129,24 +126,15 @@ def smooth_depth():
     return numbers.astype(np.uint16)
 
 
-def written_colours(path, channels, *, pixel_format, codec, options=()):
+def written_colours(clips, name, channels, pixel_format, *codec):
     """Write one picture of red, green and blue planes."""
     red, green, blue = channels
-    frame = av.VideoFrame(WIDTH, HEIGHT, pixel_format)
     if pixel_format.startswith("gbrp"):
-        planes = list(zip(frame.planes, (green, blue, red), strict=True))
+        pictures = np.stack([green, blue, red])
     else:
-        order = {"r": red, "g": green, "b": blue, "0": np.zeros_like(red)}
-        letters = pixel_format.removesuffix("24")
-        packed = np.stack([order[letter] for letter in letters], axis=-1)
-        planes = [(frame.planes[0], packed.reshape(HEIGHT, -1))]
-    for plane, numbers in planes:
-        rows = np.zeros((HEIGHT, plane.line_size // numbers.itemsize), numbers.dtype)
-        rows[:, : numbers.shape[1]] = numbers
-        plane.update(rows.tobytes())
-    return write_frames(
-        path, [frame], codec=codec, pixel_format=pixel_format, options=dict(options)
-    )
+        order = {"r": red, "g": green, "b": blue, "0": 0 * red}
+        pictures = np.stack([order[each] for each in pixel_format.removesuffix("24")], -1)[None]
+    return clips.encode(name, "-c:v", *codec, pictures=pictures, pixel_format=pixel_format)
 
 
 def read_first(path, accept=(), frames=1):
@@ -155,38 +143,38 @@ def read_first(path, accept=(), frames=1):
 
 
 BYTES = {
-    "red and green": (("high", "low", "none"), "bgr0", "ffv1", {}),
-    "blue and green": (("none", "low", "high"), "bgr0", "ffv1", {}),
-    "lossless H.264": (("high", "low", "none"), "bgr24", "libx264rgb", {"qp": "0"}),
-    "lossless HEVC": (("none", "high", "low"), "gbrp", "libx265",
-                      {"x265-params": "lossless=1:log-level=none"}),
+    "red and green": (("high", "low", "none"), "bgr0", "ffv1"),
+    "blue and green": (("none", "low", "high"), "bgr0", "ffv1"),
+    "lossless H.264": (("high", "low", "none"), "bgr24", "libx264rgb", "-qp", "0"),
+    "lossless HEVC": (
+        ("none", "high", "low"), "gbrp", "libx265", "-x265-params", "lossless=1:log-level=0",
+    ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", BYTES)
-def test_high_and_low_byte_are_found_in_channels_of_colours(tmp_path, case):
-    places, pixel_format, codec, options = BYTES[case]
+def test_high_and_low_byte_are_found_in_channels_of_colours(clips, case):
+    places, *stored = BYTES[case]
     depth = smooth_depth()
     parts = {"high": depth >> 8, "low": depth & 255, "none": 0 * depth}
     channels = [parts[place].astype(np.uint8) for place in places]
-    path = written_colours(
-        tmp_path / "x.mkv", channels, pixel_format=pixel_format, codec=codec, options=options
-    )
 
-    np.testing.assert_array_equal(read_first(path), depth)
+    found = read_first(written_colours(clips, f"bytes {case}.mkv", channels, *stored))
+
+    np.testing.assert_array_equal(found, depth)
 
 
-def test_three_equal_channels_of_16_bits_are_depth(tmp_path):
+def test_three_equal_channels_of_16_bits_are_depth(clips):
     depth = smooth_depth()
-    path = written_colours(tmp_path / "x.mkv", [depth] * 3, pixel_format="gbrp16le", codec="ffv1")
+    path = written_colours(clips, "three equal.mkv", [depth] * 3, "gbrp16le", "ffv1")
 
     np.testing.assert_array_equal(read_first(path), depth)
 
 
 @pytest.mark.parametrize("case", ["other numbers", "colours", "grey", "one byte", "noise"])
-def test_channels_that_are_no_number_are_refused(tmp_path, case):
+def test_channels_that_are_no_number_are_refused(clips, case):
     depth, flat = smooth_depth(), np.zeros((HEIGHT, WIDTH), np.uint8)
-    busy = [each.astype(np.uint8) for each in noise(8, "u1")]
+    busy = noise(8, "u1")
     channels, pixel_format = {
         "other numbers": ([depth, depth, depth // 2], "gbrp16le"),
         "colours": (busy, "bgr0"),
@@ -194,38 +182,28 @@ def test_channels_that_are_no_number_are_refused(tmp_path, case):
         "one byte": ([flat, busy[0], flat], "bgr0"),
         "noise": ([busy[0], busy[1], flat], "bgr0"),
     }[case]
-    path = written_colours(tmp_path / "x.mkv", channels, pixel_format=pixel_format, codec="ffv1")
+    path = written_colours(clips, f"no number {case}.mkv", channels, pixel_format, "ffv1")
 
     with pytest.raises(MediaError, match=r"clip: depth is stored in channels of colours, and"):
         read_first(path)
 
 
-HEVC = "x265-params"
-
-
 @pytest.mark.parametrize(
-    ("codec", "pixel_format", "options", "coding"),
+    ("bits", "codec", "options", "coding"),
     [
-        ("libx264", "gray10le", {"qp": "0"}, "h264 lossless"),
-        ("libx264", "gray10le", {"crf": "1"}, "h264"),
-        ("libx265", "gray12le", {HEVC: "lossless=1:log-level=none"}, "hevc lossless"),
-        ("libx265", "gray12le", {HEVC: "cu-lossless=1:crf=20:log-level=none"}, "hevc"),
+        (10, "libx264", ("-qp", "0"), "h264 lossless"),
+        (10, "libx264", ("-crf", "1"), "h264"),
+        (12, "libx265", ("-x265-params", "lossless=1:log-level=0"), "hevc lossless"),
+        (12, "libx265", ("-x265-params", "cu-lossless=1:crf=20:log-level=0"), "hevc"),
     ],
-)  # fmt: skip
-def test_h264_and_hevc_are_lossless_where_their_headers_say_so(
-    tmp_path, codec, pixel_format, options, coding
-):
-    bits = int(pixel_format[4:6])
-    pictures = noise(bits, "<u2")
-    frames = [grey_frame(picture, pixel_format=pixel_format) for picture in pictures]
-    write_frames(
-        tmp_path / "x.mkv", frames, codec=codec, pixel_format=pixel_format, options=options
-    )
+)
+def test_h264_and_hevc_are_lossless_where_their_headers_say_so(clips, bits, codec, options, coding):
+    path = encoded(clips, f"{codec} {options[-1][:6]}.mkv", "-c:v", codec, *options, bits=bits)
 
-    assert depth_coding(probe(tmp_path / "x.mkv", name="clip")) == coding
+    assert depth_coding(probe(path, name="clip")) == coding
     if coding.endswith("lossless"):
-        found = read_first(tmp_path / "x.mkv", frames=3, accept=[f"{bits}-bit", "chroma"])
-        np.testing.assert_array_equal(found, pictures[0])
+        found = read_first(path, frames=3, accept=[f"{bits}-bit", "chroma"])
+        np.testing.assert_array_equal(found, noise(bits, "<u2")[0])
 
 
 def test_the_rendered_scene_is_read_as_ffmpeg_reads_it(clips, shared_scenes):

@@ -13,14 +13,14 @@ FFV1 = ("-c:v", "ffv1", "-g", "12")
 @pytest.fixture(scope="module")
 def depth_clip(clips):
     noise = np.random.default_rng(0).integers(0, 65536, (48, 64, 96))
-    return clips.gray(
+    return clips.encode(
         "noise.mkv", *FFV1, "-metadata", "DEPTH_SCALE=0.001",
         pictures=noise.astype("<u2"), pixel_format="gray16le",
     )  # fmt: skip
 
 
 def test_an_mp4_is_reported_by_its_header(clips):
-    facts = probe(clips.rgb("groups of 12.mp4", *GROUPS_OF_12), name="clip")
+    facts = probe(clips.encode("groups of 12.mp4", *GROUPS_OF_12), name="clip")
 
     assert (facts.codec, facts.pixel_format, facts.width_px, facts.height_px) == (
         "h264", "yuv420p", 96, 64,
@@ -29,7 +29,7 @@ def test_an_mp4_is_reported_by_its_header(clips):
 
 
 def test_a_tag_of_the_stream_does_not_hide_the_containers(clips):
-    path = clips.rgb(
+    path = clips.encode(
         "tags.mkv", *GROUPS_OF_12, "-metadata", "Scale=1", "-metadata:s:v:0", "SCALE=2"
     )
 
@@ -40,7 +40,7 @@ def test_a_tag_of_the_stream_does_not_hide_the_containers(clips):
 
 @pytest.mark.parametrize("suffix", ["mp4", "mkv"])
 def test_a_tag_that_is_not_utf8_can_be_read_and_printed(clips, tmp_path, suffix):
-    told = clips.rgb(f"comment.{suffix}", *GROUPS_OF_12, "-metadata", "comment=cafX 10 cm")
+    told = clips.encode(f"comment.{suffix}", *GROUPS_OF_12, "-metadata", "comment=cafX 10 cm")
     path = tmp_path / told.name
     path.write_bytes(told.read_bytes().replace(b"cafX", b"caf\xe9"))
 
@@ -49,7 +49,7 @@ def test_a_tag_that_is_not_utf8_can_be_read_and_printed(clips, tmp_path, suffix)
 
 @pytest.mark.parametrize("flags", ["-movflags +faststart", ""])
 def test_probing_an_mp4_reads_its_header_and_first_frame(clips, flags):
-    path = clips.rgb(
+    path = clips.encode(
         f"probe{flags}.mp4", *GROUPS_OF_12, *flags.split(), "-crf", "1", "-g", "1",
         pictures=clips.pictures.repeat(4, axis=1).repeat(4, axis=2),
     )  # fmt: skip
@@ -73,14 +73,14 @@ def test_probing_a_matroska_file_reads_its_header_and_its_last_group(clips, dept
     ids=["without its last frame", "without its first frame"],
 )
 def test_frames_that_are_left_out_at_an_end_are_not_counted(clips, suffix, without, frames):
-    source = clips.rgb(f"intra.{suffix}", *GROUPS_OF_12[:4], "-g", "1")
+    source = clips.encode(f"intra.{suffix}", *GROUPS_OF_12[:4], "-g", "1")
     path = clips.remuxed(source, f"without {without}.{suffix}", without=without)
 
     assert probe(path, name="clip").frames == frames
 
 
 def test_a_matroska_file_without_a_duration_is_counted(clips):
-    source = clips.rgb("groups of 12.mp4", *GROUPS_OF_12)
+    source = clips.encode("groups of 12.mp4", *GROUPS_OF_12)
     path = clips.folder / "live.mkv"
     path.write_bytes(clips.ffmpeg("-i", source, "-c", "copy", "-f", "matroska", "-live", "1", "-"))
 
@@ -88,7 +88,7 @@ def test_a_matroska_file_without_a_duration_is_counted(clips):
 
 
 def test_an_mp4_whose_payload_is_cut_tells_what_is_missing(clips):
-    source = clips.rgb("fast.mp4", *GROUPS_OF_12, "-movflags", "+faststart")
+    source = clips.encode("fast.mp4", *GROUPS_OF_12, "-movflags", "+faststart")
     size = source.stat().st_size
     path = clips.folder / "payload cut.mp4"
     path.write_bytes(source.read_bytes()[: size - 100])

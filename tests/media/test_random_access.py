@@ -28,7 +28,7 @@ STRUCTURES = {
 @pytest.mark.parametrize("structure", STRUCTURES)
 def test_every_frame_in_random_order_is_ffmpegs_own(clips, structure):
     suffix = "mkv" if structure == "ffv1" else "mp4"
-    path = clips.rgb(f"{structure}.{suffix}", *STRUCTURES[structure])
+    path = clips.encode(f"{structure}.{suffix}", *STRUCTURES[structure])
     truth = clips.truth(path)
     order = random.Random(1).sample(range(clips.frames), clips.frames)
 
@@ -41,7 +41,7 @@ def test_every_frame_in_random_order_is_ffmpegs_own(clips, structure):
 @given(order=st.lists(st.integers(0, 47), min_size=1, max_size=6))
 @pytest.mark.parametrize("structure", ["one group with b-pyramid", "groups of 12"])
 def test_any_walk_over_the_frames_shows_the_painted_numbers(clips, structure, order):
-    path = clips.rgb(f"{structure}.mp4", *STRUCTURES[structure])
+    path = clips.encode(f"{structure}.mp4", *STRUCTURES[structure])
 
     with VideoReader(path, name="clip", frames=clips.frames) as reader:
         shown = [clips.number(read_rgb(reader, index)) for index in order]
@@ -49,23 +49,21 @@ def test_any_walk_over_the_frames_shows_the_painted_numbers(clips, structure, or
     assert shown == order
 
 
-def test_a_variable_frame_rate_is_counted_by_order_and_not_by_time(clips):
-    path = clips.rgb(
-        "variable.mkv", "-vf", "setpts='(N+N*N/40)/15/TB'", "-fps_mode", "vfr", *X264, "-g", "12"
-    )
-    frames = len(clips.truth(path))
-
-    with VideoReader(path, name="clip", frames=frames) as reader:
-        shown = [clips.number(read_rgb(reader, index)) for index in (30, 5, 47, 0, 46)]
-
-    assert (frames, shown) == (48, [30, 5, 47, 0, 46])
+WRITTEN = {
+    "late.mp4": ("-output_ts_offset", "2.03"),
+    "late.mkv": ("-output_ts_offset", "2.03"),
+    **{
+        f"{flags}.mp4": ("-use_editlist", "0", "-movflags", flags)
+        for flags in ("+faststart", "+negative_cts_offsets", "+frag_keyframe+empty_moov")
+    },
+}
 
 
-@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
-def test_a_late_start_does_not_shift_the_numbers(clips, suffix):
-    source = clips.rgb("groups of 12.mp4", *STRUCTURES["groups of 12"])
-    path = clips.folder / f"late.{suffix}"
-    clips.ffmpeg("-i", source, "-c", "copy", "-output_ts_offset", "2.03", path)
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_late_start_and_other_ways_of_writing_do_not_shift_the_numbers(clips, name):
+    source = clips.encode("groups of 12.mp4", *STRUCTURES["groups of 12"])
+    path = clips.folder / f"written {name}"
+    clips.ffmpeg("-i", source, "-c", "copy", *WRITTEN[name], path)
 
     with VideoReader(path, name="clip", frames=clips.frames) as reader:
         shown = [clips.number(read_rgb(reader, index)) for index in (40, 0, 1, 47)]
@@ -73,22 +71,27 @@ def test_a_late_start_does_not_shift_the_numbers(clips, suffix):
     assert shown == [40, 0, 1, 47]
 
 
-@pytest.mark.parametrize(
-    "flags", ["+faststart", "+negative_cts_offsets", "+frag_keyframe+empty_moov"]
-)
-def test_other_ways_of_writing_mp4_do_not_shift_the_numbers(clips, flags):
-    source = clips.rgb("groups of 12.mp4", *STRUCTURES["groups of 12"])
-    path = clips.folder / f"written{flags}.mp4"
-    clips.ffmpeg("-i", source, "-c", "copy", "-use_editlist", "0", "-movflags", flags, path)
+RATES = {
+    "film.mp4": ((), "24000/1001"),
+    "film.mkv": ((), "24000/1001"),
+    "variable.mkv": (("-vf", "setpts='(N+N*N/40)/15/TB'", "-fps_mode", "vfr"), "15"),
+}
+
+
+@pytest.mark.parametrize("name", RATES)
+def test_frames_are_counted_by_order_at_rates_that_vary_or_no_clock_ticks(clips, name):
+    how, rate = RATES[name]
+    path = clips.encode(name, *how, *X264, "-g", "12", rate=rate)
 
     with VideoReader(path, name="clip", frames=clips.frames) as reader:
-        shown = [clips.number(read_rgb(reader, index)) for index in (40, 0, 1, 47)]
+        shown = [clips.number(read_rgb(reader, index)) for index in (33, 5, 47, 0, 46)]
 
-    assert shown == [40, 0, 1, 47]
+    assert shown == [33, 5, 47, 0, 46]
+    assert how or reader.facts.frame_rate_hz == pytest.approx(24000 / 1001)
 
 
 def test_an_edit_list_that_hides_frames_counts_those_that_are_left(clips):
-    source = clips.rgb("groups of 12.mp4", *STRUCTURES["groups of 12"])
+    source = clips.encode("groups of 12.mp4", *STRUCTURES["groups of 12"])
     path = clips.folder / "edited.mp4"
     clips.ffmpeg("-ss", "1.01", "-i", source, "-c", "copy", path)
     truth = clips.truth(path)
@@ -100,13 +103,3 @@ def test_an_edit_list_that_hides_frames_counts_those_that_are_left(clips):
     with VideoReader(path, name="clip", frames=len(truth)) as reader:
         for index in (20, 0, len(truth) - 1, 1):
             np.testing.assert_array_equal(read_rgb(reader, index), truth[index])
-
-
-@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
-def test_a_rate_that_no_clock_ticks_is_followed(clips, suffix):
-    path = clips.rgb(f"film.{suffix}", *X264, "-g", "12", rate="24000/1001")
-
-    with VideoReader(path, name="clip", frames=clips.frames) as reader:
-        shown = [clips.number(read_rgb(reader, index)) for index in (33, 7, 47)]
-
-    assert (shown, reader.facts.frame_rate_hz) == ([33, 7, 47], pytest.approx(24000 / 1001))

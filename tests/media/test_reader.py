@@ -12,7 +12,7 @@ GROUPS_OF_12 = ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-g", "12")
 
 @pytest.fixture(scope="module")
 def clip(clips):
-    return clips.rgb("groups of 12.mp4", *GROUPS_OF_12)
+    return clips.encode("groups of 12.mp4", *GROUPS_OF_12)
 
 
 @pytest.mark.parametrize("kind", [str, "path", "file"])
@@ -43,7 +43,7 @@ def test_reading_in_order_reads_the_file_once(clips, clip):
 
 def test_a_frame_far_ahead_is_sought_and_not_decoded_up_to(clips):
     pictures = clips.pictures.repeat(4, axis=1).repeat(4, axis=2)
-    path = clips.rgb("large.mp4", *GROUPS_OF_12, "-crf", "1", pictures=pictures)
+    path = clips.encode("large.mp4", *GROUPS_OF_12, "-crf", "1", pictures=pictures)
     file = clips.counting(path)
 
     with VideoReader(file, name="clip", frames=clips.frames) as reader:

@@ -28,7 +28,7 @@ def coloured_noise(height, width):
 @pytest.mark.parametrize("pixel_format", ["yuv420p", "yuv422p"])
 @pytest.mark.parametrize("colour", COLOURS)
 def test_matrix_and_range_are_those_of_the_file(clips, colour, pixel_format):
-    path = clips.rgb(
+    path = clips.encode(
         f"{colour} {pixel_format}.mp4", *COLOURS[colour], *X264, "-pix_fmt", pixel_format,
         pictures=coloured_noise(64, 96),
     )  # fmt: skip
@@ -41,7 +41,7 @@ def test_matrix_and_range_are_those_of_the_file(clips, colour, pixel_format):
 
 @pytest.mark.parametrize("pixel_format", ["yuv420p", "yuv444p", "gbrp", "gray", "bgr0"])
 def test_odd_sizes_and_other_formats_are_ffmpegs_too(clips, pixel_format):
-    path = clips.rgb(
+    path = clips.encode(
         f"odd {pixel_format}.mkv", "-c:v", "ffv1", "-pix_fmt", pixel_format,
         pictures=coloured_noise(33, 51),
     )  # fmt: skip
@@ -62,7 +62,7 @@ def texture(clips):
     layers = [ndimage.gaussian_filter(noise, (s, s, 0)) * s for s in (1, 2, 4, 8)]
     picture = sum(layers)
     picture = np.uint8((picture - picture.min()) / np.ptp(picture) * 255)
-    path = clips.rgb("texture.mp4", *X264, "-pix_fmt", "yuv444p", pictures=picture[None])
+    path = clips.encode("texture.mp4", *X264, "-pix_fmt", "yuv444p", pictures=picture[None])
     with VideoReader(path, name="clip", frames=1) as reader:
         return path, read_rgb(reader, 0)
 

@@ -43,7 +43,7 @@ def texture():
 
 def read(clips, name, *, size=None):
     file, codec = FILES[name]
-    path = clips.rgb(f"siting {file}", *codec, pictures=texture()[None])
+    path = clips.encode(f"siting {file}", *codec, pictures=texture()[None])
     with VideoReader(path, name="clip", frames=1) as reader:
         return read_rgb(reader, 0, size=size).astype(float)
 

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 from stereogenbench_data.audit.paper_numbers import AUDIT
-from stereogenbench_data.media.clock import MOST_EXTRA_FRAMES
+from stereogenbench_data.media.decoder import MOST_EXTRA_FRAMES
 
 QUANTILES: Final = tuple(step / 40 for step in range(41))
 """The quantiles of each scene's errors that are kept: 0, 2.5 %, 5 % ... 100 %."""
