@@ -18,11 +18,6 @@ def smooth(number, height=32, width=48):
     return np.stack([columns * 2, rows * 3, rows + columns + number], axis=-1).astype(np.uint8)
 
 
-def binary(number):
-    grey = np.random.default_rng(number).integers(0, 2, (32, 48, 1)) * 255
-    return np.repeat(grey, 3, axis=-1).astype(np.uint8)
-
-
 def encoded(pictures, *, rate_hz=24.0, quality="as set", **settings):
     file = io.BytesIO()
     encoding = Encoding(**settings)
@@ -70,9 +65,7 @@ def test_the_same_pictures_give_the_same_bytes():
     pictures = random.integers(0, 256, (5, 64, 64, 3)).astype(np.uint8)
     pictures[:, :, 20:] = [smooth(number, 64, 44) for number in range(5)]
 
-    found = set()
-    for _ in range(4):
-        found.add(encoded(remembered(pictures, random)).getvalue())
+    found = {encoded(remembered(pictures, random)).getvalue() for _ in range(4)}
 
     assert len(found) == 1
 
