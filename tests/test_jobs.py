@@ -45,27 +45,17 @@ def test_of_two_jobs_at_once_one_is_whole_and_the_other_refused(indexed_release,
     assert files_of(tmp_path / "both") == files_of(tmp_path / "alone")
 
 
-def refusal(folder):
-    """Return what a job with the settings 1 is told of a folder."""
-    with pytest.raises(StorageError) as refused, job_folder(folder, {"a": 1}):
-        pass
-    return str(refused.value)
+def test_a_folder_of_something_else_or_with_broken_settings_is_refused(tmp_path):
+    def refusal(folder):
+        with pytest.raises(StorageError) as refused, job_folder(folder, {"a": 1}):
+            pass
+        return str(refused.value)
 
-
-def test_a_folder_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
 
     assert "is not empty and holds no export.json: choose a new folder" in refusal(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
-
-
-def test_settings_that_are_not_json_are_named(tmp_path):
     (tmp_path / "export.json").write_text("{")
-    (tmp_path / "right.mp4").write_text("")
-
     assert "export.json: is not JSON" in refusal(tmp_path)
-
-
-def test_a_folder_that_a_job_holds_is_refused(tmp_path):
-    with job_folder(tmp_path, {"a": 1}):
-        assert f"{tmp_path}: another process works on this folder" in refusal(tmp_path)
+    with job_folder(tmp_path / "new", {"a": 1}):
+        assert "new: another process works on this folder" in refusal(tmp_path / "new")

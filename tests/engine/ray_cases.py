@@ -16,10 +16,7 @@ from stereogenbench_data.engine import Engine, RayCluster
 from stereogenbench_data.errors import ExtraError, ShardError, StorageError
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.training import TrainingSettings
-from tests.servers.tools import require_module
-
-ONE_EACH = 250_000
-"""Of `small_release`, a shard for each scene."""
+from tests.servers.tools import files_of, require_module
 
 
 @pytest.fixture(scope="module")
@@ -51,14 +48,6 @@ def ray(cluster):
     module.init(address=cluster, log_to_driver=False)
     yield module
     module.shutdown()
-
-
-def bytes_of(folder):
-    return {
-        path.relative_to(folder): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file() and ".parts" not in path.parts
-    }
 
 
 # Tasks that die.
@@ -97,11 +86,8 @@ class LosesAWorker:
 # The batch commands.
 
 
-@pytest.fixture(scope="module")
-def material(small_release, tmp_path_factory):
-    shards = tmp_path_factory.mktemp("material") / "shards"
-    pack(small_release, shards, target_bytes=ONE_EACH, workers=1)
-    return small_release, shards
+def packed(folder):
+    return {name: content for name, content in files_of(folder).items() if ".parts" not in name}
 
 
 @pytest.mark.usefixtures("ray")
@@ -114,7 +100,7 @@ def test_a_cluster_that_loses_a_worker_gives_what_this_process_gives(small_relea
     pack(small_release, tmp_path / "there", training=training, engine=losing)
 
     assert mark.exists()
-    assert bytes_of(tmp_path / "there") == bytes_of(tmp_path / "here")
+    assert packed(tmp_path / "there") == packed(tmp_path / "here")
 
 
 # What else Ray does.
@@ -176,10 +162,11 @@ def test_closing_the_results_interrupts_tasks_that_run(tmp_path):
 
 
 def test_the_command_works_on_a_cluster_by_its_address_with_relative_paths(
-    cluster, material, tmp_path
+    cluster, small_release, tmp_path
 ):
-    release, shards = material
-    (tmp_path / "scenes").symlink_to(release)
+    """A shard for each scene."""
+    pack(small_release, tmp_path / "here", target_bytes=250_000, workers=1)
+    (tmp_path / "scenes").symlink_to(small_release)
 
     ended = subprocess.run(
         [sys.executable, "-m", "stereogenbench_data.cli.main", "pack", "scenes", "out",
@@ -189,7 +176,7 @@ def test_the_command_works_on_a_cluster_by_its_address_with_relative_paths(
 
     assert ended.returncode == 0, ended.stderr
     assert "4 shards packed, 0 kept" in ended.stdout
-    assert bytes_of(tmp_path / "out") == bytes_of(shards)
+    assert packed(tmp_path / "out") == packed(tmp_path / "here")
 
 
 def test_where_no_cluster_runs_none_is_started(monkeypatch):
