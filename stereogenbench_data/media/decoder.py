@@ -140,7 +140,7 @@ def table_clock(
     """
     times: list[int] = []
 
-    def cut_short(why: str) -> MediaError:
+    def cut_short(why: str | None) -> MediaError:
         return MediaError(
             f"{name}: cannot be read past its frame number {len(times)} as stored ({why}): fetch "
             f"it again."
