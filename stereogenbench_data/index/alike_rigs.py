@@ -6,19 +6,20 @@ the values that `parse_rig` found. Another file of that shape is read at these p
 it is as in those; where anything differs that was the same so far, `parse_rig` reads it, too.
 """
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
-from operator import itemgetter
-from typing import Any, Final, NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Final
 
 from stereogenbench_data.schema.conventions import Shape
 from stereogenbench_data.schema.document import MOST_LETTERS, camera_of, is_number, parse_object
 from stereogenbench_data.schema.parse import parse_rig
 from stereogenbench_data.schema.records import Remark, Rig, SceneLabels
-from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.schema.release import CAMERA_COUNT, CAMERA_PAIRS
 
 Parsed = tuple[Rig, SceneLabels, tuple[Remark, ...]]
+Source = tuple[tuple[int, ...], float, Any]
+"""The places in files of a shape at which a value of the records stands, what it is multiplied by
+there, and its value in the first file: without places, that of all."""
 
 _LEARNED_FROM: Final = 8
 _MOST_EXAMPLES: Final = 64
@@ -26,22 +27,8 @@ _MOST_VALUES: Final = 2000
 """A file with more values is read by itself: a released one has some hundreds."""
 _SCALES: Final = (1.0, 100.0, 0.1, 10.0, 1000.0)
 """From a unit in which lengths may be written to cm or mm."""
-_NUMBERS: Final = {
-    **dict.fromkeys(("focal_mm", "sensor_width_mm", "sensor_height_mm"), float),
-    **dict.fromkeys(("image_width_px", "image_height_px"), int),
-}
-_LABELS: Final = tuple(each.name for each in fields(SceneLabels))
-
-
-class _Source(NamedTuple):
-    """Where a value of the record stands in files of a shape, and what it is multiplied by.
-
-    Without places the value is the same in all files.
-    """
-
-    places: tuple[int, ...]
-    scale: float
-    value: Any
+_RIG, _LABELS = ([each.name for each in fields(kind) if each.name != "baselines_cm"]
+                 for kind in (Rig, SceneLabels))  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -49,80 +36,45 @@ class _Shape:
     """Files of one shape: those that `parse_rig` read, and what follows for others."""
 
     examples: list[tuple[list[Any], Parsed]] = field(default_factory=list)
-    sources: list[_Source] | None = None
-    same_at: tuple[int, ...] = ()
-    same: tuple[Any, ...] = ()
-    ends: dict[int, str] = field(default_factory=dict)
-    varied: tuple[int, ...] = ()
+    sources: list[Source] = field(default_factory=list)
+    same: dict[int, Any] = field(default_factory=dict)
 
     def add(self, values: list[Any], parsed: Parsed) -> None:
         """Take another example, and find the places anew."""
-        if len(self.examples) >= _MOST_EXAMPLES:
-            return
         self.examples.append((values, parsed))
-        if len(self.examples) >= _LEARNED_FROM:
-            self._learn()
-
-    def _learn(self) -> None:
-        self.sources = None
-        columns = list(zip(*(values for values, _ in self.examples), strict=True))
-        rig = self.examples[0][1][0]
-        if any(_unlearned(parsed[0]) != _unlearned(rig) for _, parsed in self.examples):
+        if not _LEARNED_FROM <= len(self.examples) <= _MOST_EXAMPLES:
             return
-        is_same = [all(value == column[0] for value in column) for column in columns]
-        varied = [place for place, same in enumerate(is_same) if not same]
-        sources = []
-        for wanted in zip(*(_values(parsed) for _, parsed in self.examples), strict=True):
-            source = _source(wanted, {place: columns[place] for place in varied})
-            if source is None:
-                return
-            sources.append(source)
-        self.ends = {}
-        for place in varied:
-            texts = [each for each in columns[place] if isinstance(each, str)]
-            if len({camera_of(each) for each in texts}) == 1 and camera_of(texts[0]) is not None:
-                end = texts[0]
-                while not all(text.endswith(end) for text in texts):
-                    end = end[1:]
-                self.ends[place] = end
-        same_at = [place for place, same in enumerate(is_same) if same]
-        # The first one twice: of one place `itemgetter` would return no tuple.
-        self.same_at = (*same_at, *same_at[:1])
-        self.same = itemgetter(*self.same_at)(self.examples[0][0]) if same_at else ()
-        self.varied, self.sources = tuple(varied), sources
+        columns = dict(enumerate(zip(*(values for values, _ in self.examples), strict=True)))
+        varied = {at: column for at, column in columns.items() if len({*column}) > 1}
+        wanted = zip(*(_values_of(parsed) for _, parsed in self.examples), strict=True)
+        found = [_source(each, varied) for each in wanted]
+        # Where names vary and end in one camera alike, another file may name another camera.
+        ends = ({*map(camera_of, column)} for column in varied.values()
+                if _kind_of(column[0]) is str)  # fmt: skip
+        is_odd = None in found or any(len(each) == 1 and None not in each for each in ends)
+        self.sources = [] if is_odd else [each for each in found if each]
+        self.same = {at: column[0] for at, column in columns.items() if at not in varied}
 
     def read(self, values: list[Any]) -> Parsed | None:
         """Return what a file of this shape holds; None where it is not like the examples."""
-        if self.sources is None or not self._is_alike(values):
+        if not self.sources or any(values[at] != same for at, same in self.same.items()):
+            return None
+        if not all(_is_plain(value) for at, value in enumerate(values) if at not in self.same):
             return None
         found = []
-        for places, scale, value in self.sources:
-            if not places:
-                found.append(value)
-                continue
-            stated = values[places[0]]
-            is_text = isinstance(stated, str)
-            if any(values[place] != stated for place in places) or not (is_text or stated > 0):
+        for places, scale, first in self.sources:
+            stated = values[places[0]] if places else first
+            if any(values[at] != stated for at in places):
                 return None
-            found.append(stated if is_text or scale == 1 else stated * scale)
-        return _parsed(found, like=self.examples[0][1][0])
-
-    def _is_alike(self, values: list[Any]) -> bool:
-        """Return whether what was the same in all examples is so here, and the rest is plain."""
-        if self.same and itemgetter(*self.same_at)(values) != self.same:
-            return False
-        for place in self.varied:
-            value = values[place]
-            if not isinstance(value, str):
-                if not is_number(value):
-                    return False
-            elif (
-                len(value) > MOST_LETTERS
-                or not value.isascii()
-                or not value.endswith(self.ends.get(place, ""))
-            ):
-                return False
-        return True
+            if places and not isinstance(stated, str):
+                if stated <= 0:
+                    return None
+                stated = type(first)(stated * scale)
+            found.append(stated)
+        count = len(CAMERA_PAIRS)
+        rig: dict[str, Any] = dict(zip(_RIG, found[count:], strict=False))
+        labels = SceneLabels(*found[count + len(_RIG) :])
+        return Rig(baselines_cm=tuple(found[:count]), **rig), labels, ()
 
 
 class RigReader:
@@ -143,90 +95,67 @@ class RigReader:
             SchemaError: As `parse_rig`.
         """
         shape, values = _flat(parse_object(text, where=where))
-        if len(values) > _MOST_VALUES:
-            return parse_rig(text, where=where, shape=self._stated)
         known = self._shapes.setdefault(shape, _Shape())
         found = known.read(values)
         if found is None:
             found = parse_rig(text, where=where, shape=self._stated)
-            if not found[2]:
+            if not found[2] and len(values) <= _MOST_VALUES:
                 known.add(values, found)
         return found
 
 
 def _flat(document: dict[str, Any]) -> tuple[tuple[Any, ...], list[Any]]:
-    """Return the shape of a document, which can be compared, and its texts, numbers and others.
-
-    What looks like the number of a camera is a part of the shape: primary pairs may differ.
-    """
+    """Return the shape of a document, which can be compared, and its texts, numbers and others."""
     shape: list[Any] = []
     values: list[Any] = []
     waiting: list[Any] = [document]
     for node in waiting:
-        if type(node) is dict:
-            shape.append(tuple(node))
-            inner: Any = node.values()
-        else:
-            shape.append(len(node))
-            inner = node
-        for value in inner:
-            kind: Any = type(value)
-            if kind is dict or kind is list:
+        is_object = type(node) is dict
+        shape.append(tuple(node) if is_object else len(node))
+        for value in node.values() if is_object else node:
+            if type(value) is dict or type(value) is list:
                 waiting.append(value)
+                shape.append(type(value))
             else:
                 values.append(value)
-                if kind is int and 0 <= value <= CAMERA_COUNT:
-                    kind = value
-                elif kind is str and value[-1:].isdigit() and "cam" in value.lower():
-                    kind = value[-2:]
-            shape.append(kind)
+                shape.append(_kind_of(value))
     return tuple(shape), values
 
 
-def _values(parsed: Parsed) -> list[Any]:
+def _kind_of(value: Any) -> Any:
+    """Return a value's type, or the number of a camera that it looks like: primary pairs differ."""
+    if type(value) is int and 0 <= value <= CAMERA_COUNT:
+        return value
+    if type(value) is str and value[-1:].isdigit() and "cam" in value.lower():
+        return value[-2:]
+    return type(value)
+
+
+def _is_plain(value: Any) -> bool:
+    """Return whether a value is a number or a short text that `parse_rig` accepts as a label."""
+    if isinstance(value, str):
+        return len(value) <= MOST_LETTERS and value.isascii()
+    return is_number(value)
+
+
+def _values_of(parsed: Parsed) -> list[Any]:
     """Return the values of records for which places are looked for."""
     rig, labels, _ = parsed
-    numbers = [getattr(rig, name) for name in _NUMBERS]
-    return [*numbers, *rig.baselines_cm, *(getattr(labels, name) for name in _LABELS)]
+    numbers = [*rig.baselines_cm, *(getattr(rig, name) for name in _RIG)]
+    return [*numbers, *(getattr(labels, name) for name in _LABELS)]
 
 
-def _parsed(values: Sequence[Any], *, like: Rig) -> Parsed:
-    """Return the records of such values."""
-    count = len(_NUMBERS)
-    labels_at = count + len(like.baselines_cm)
-    numbers: dict[str, Any] = {
-        name: kind(value) for (name, kind), value in zip(_NUMBERS.items(), values, strict=False)
-    }
-    rig = replace(like, baselines_cm=tuple(map(float, values[count:labels_at])), **numbers)
-    return rig, SceneLabels(*values[labels_at:]), ()
-
-
-def _unlearned(rig: Rig) -> Rig:
-    """Return what of a rig must be the same in all files of a shape."""
-    nothing: dict[str, Any] = dict.fromkeys(_NUMBERS, 0)
-    return replace(rig, baselines_cm=(), **nothing)
-
-
-def _source(wanted: tuple[Any, ...], columns: dict[int, tuple[Any, ...]]) -> _Source | None:
+def _source(wanted: tuple[Any, ...], columns: Mapping[int, tuple[Any, ...]]) -> Source | None:
     """Return where a value stands in files, given the values of some that vary."""
     if all(value == wanted[0] for value in wanted):
-        return _Source((), 1.0, wanted[0])
+        return (), 1.0, wanted[0]
     for scale in _SCALES:
         places = tuple(
-            place
-            for place, column in columns.items()
-            if all(
-                _scaled(value, scale) == other and type(value) is not bool
-                for value, other in zip(column, wanted, strict=True)
-            )
-        )
+            at for at, column in columns.items()
+            if all(other == (value * scale if is_number(value) and scale != 1 else value)
+                   and type(value) is not bool
+                   for value, other in zip(column, wanted, strict=True))
+        )  # fmt: skip
         if places:
-            return _Source(places, scale, None)
+            return places, scale, wanted[0]
     return None
-
-
-def _scaled(value: Any, scale: float) -> Any:
-    """Return a number of a file in another unit; other values as they are."""
-    if scale == 1 or not isinstance(value, int | float):
-        return value
-    return value * scale if math.isfinite(value) else math.nan

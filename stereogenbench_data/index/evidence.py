@@ -8,11 +8,11 @@ fields on which they differ are refused. Pictures tell more: see `audit.contract
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -66,8 +66,7 @@ class Understood:
         names: The readings that pass and move the cameras differently in the world, the one that
             was taken first.
         is_named: Whether the file itself names that one.
-        head: The file's JSON object, with some elements of long lists.
-        first_frame: The number of the first frame that has poses.
+        recorded: What the file records.
         form: What the index keeps of it, for `poses_as`: None for the first form that the file
             itself names, if it is the only one to pass.
     """
@@ -75,9 +74,8 @@ class Understood:
     poses: CameraPoses
     names: tuple[str, ...]
     is_named: bool
+    recorded: RecordedPoses
     form: str | None
-    head: dict[str, Any] = field(default_factory=dict)
-    first_frame: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,10 +86,6 @@ class _Passed:
     poses: CameraPoses
     off: float
     lateral_m: np.ndarray
-
-    @property
-    def name(self) -> str:
-        return f"{self.reading.name} @ {self.poses.unit_m!r}".replace("|", "/")
 
 
 def understood_poses(
@@ -114,19 +108,17 @@ def understood_poses(
     """
     recorded = record_poses(text, where=where)
     if named is None:
-        plain = _fitting(readings(recorded), rig, where=where)
-        return replace(plain, head=recorded.head, first_frame=recorded.first_frame)
+        return _fitting(recorded, readings(recorded), rig, where=where)
     found, own, reason = None, None, ""
     try:
-        found = _fitting(_readings_as(recorded, named), rig, where=where)
+        found = _fitting(recorded, _readings_as(recorded, named), rig, where=where)
     except SchemaError as error:
         reason = str(error).removeprefix(f"{where}: ").rstrip(".?")
     with suppress(SchemaError):
-        own = _fitting(readings(recorded), rig, where=where)
+        own = _fitting(recorded, readings(recorded), rig, where=where)
     own_poses = own.poses if own is not None and own.is_named else None
     if found is not None and (own_poses is None or same_poses(found.poses, own_poses)):
-        form, first_frame = "|".join(found.names), recorded.first_frame
-        return replace(found, form=form, head=recorded.head, first_frame=first_frame)
+        return replace(found, form="|".join(found.names))
     reason = reason or "the file names another form, which fits as well and differs"
     fits = "" if own is None else f" What fits is: {shortened(own.names[0], 300)}."
     stated = ((name, getattr(named, name)) for name in ("rotation", "form", "axes", "unit"))
@@ -146,18 +138,12 @@ def _readings_as(recorded: RecordedPoses, named: PosesAs) -> Iterator[Reading]:
             yield replace(reading, tier=0, is_named=True, trajectory=trajectory)
 
 
-@dataclass(frozen=True, slots=True)
-class _Failed:
-    """Why a reading does not fit a rig, and by which scale of all distances, if that is why."""
-
-    reason: str
-    scale: float | None = None
-
-
-def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
+def _fitting(
+    recorded: RecordedPoses, found: Iterable[Reading], rig: Rig, *, where: str
+) -> Understood:
     """Return the poses of the first tier of readings that fit a rig, as `understood_poses` says."""
     failures: dict[str, str] = {}
-    scaled: list[_Failed] = []
+    scaled: list[SidesError] = []
     loose: list[_Passed] = []
     exact: list[_Passed] = []
     reversed_: list[_Passed] = []
@@ -166,11 +152,13 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
     for _, tier in groupby(found, key=lambda each: each.tier):
         for reading in tier:
             first = first or reading
-            checked = _checked(reading, rig)
-            if isinstance(checked, _Failed):
-                failures.setdefault(checked.reason, reading.name)
-                scaled += [checked] if reading.tier == 0 and checked.scale else []
-            elif checked.lateral_m[left] > checked.lateral_m[right]:
+            try:
+                checked = _checked(reading, rig)
+            except (GeometryError, SchemaError) as error:
+                failures.setdefault(str(error), reading.name)
+                scaled += [error] if reading.tier == 0 and isinstance(error, SidesError) else []
+                continue
+            if checked.lateral_m[left] > checked.lateral_m[right]:
                 reversed_.append(checked)
             else:
                 (exact if checked.off <= _EXACT else loose).append(checked)
@@ -183,9 +171,9 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
             f"of camera {right}, and by baseline.json it is the left one. Correct one of them."
         )
     if scaled and not passed:
-        error = SidesError(f"{where}: {scaled[0].reason}. Correct the unit of one of them.")
-        error.scale = scaled[0].scale
-        raise error
+        told = SidesError(f"{where}: {scaled[0]}. Correct the unit of one of them.")
+        told.scale = scaled[0].scale
+        raise told
     if not passed:
         tried = "; ".join(f"{reason} ({name})" for reason, name in list(failures.items())[:_SHOWN])
         raise SchemaError(
@@ -196,21 +184,25 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
     upright = [each for each in passed if each.reading.is_named or _is_upright(each.poses)]
     passed = upright or passed
     taken = passed[0]
-    others = [each for each in passed[1:] if not _same_rig(each.poses, taken.poses)]
+    others = [each for each in passed[1:] if not _same(each.poses, taken.poses, _rig_at)]
     if others:
         listed = ", ".join(shortened(each.reading.name, 120) for each in (taken, *others)[:_SHOWN])
         raise SchemaError(
             f"{where}: several readings of its poses fit the rig and differ in how its cameras "
             f"stand to each other: {listed}. Name the right one in the file."
         )
-    worlds = [taken, *(each for each in passed[1:] if not _same_world(each.poses, taken.poses))]
-    names = tuple(each.name for each in worlds)
+    worlds = [taken, *(each for each in passed[1:]
+                       if not _same(each.poses, taken.poses, _moved))]  # fmt: skip
+    names = tuple(
+        f"{each.reading.name} @ {each.poses.unit_m!r}".replace("|", "/") for each in worlds
+    )
     own_units_m = (taken.reading.trajectory.unit_m, _UNREAL_M)
     is_own = taken.reading is first and len(names) == 1 and taken.poses.unit_m in own_units_m
     return Understood(
         taken.poses,
         names,
         is_named=taken.reading.is_named and taken.reading.tier == 0,
+        recorded=recorded,
         form=None if is_own else "|".join(names),
     )
 
@@ -288,12 +280,14 @@ def poses_as(text: bytes, form: str | None, *, where: str) -> CameraPoses:
     )
 
 
-def _checked(reading: Reading, rig: Rig) -> _Passed | _Failed:
-    """Return a reading that fits a rig, or why it does not."""
-    try:
-        poses = CameraPoses.from_trajectory(reading.trajectory)
-    except GeometryError as error:
-        return _Failed(str(error))
+def _checked(reading: Reading, rig: Rig) -> _Passed:
+    """Return a reading that fits a rig.
+
+    Raises:
+        GeometryError: If its rotations are none.
+        SchemaError: If it does not fit; `SidesError` if all distances differ by one scale.
+    """
+    poses = CameraPoses.from_trajectory(reading.trajectory)
     steps = poses.centres[:, _RIGHT] - poses.centres[:, _LEFT]
     baselines_cm = np.array(rig.baselines_cm)
     distances = np.linalg.norm(steps, axis=-1)
@@ -315,13 +309,16 @@ def _checked(reading: Reading, rig: Rig) -> _Passed | _Failed:
         # One ratio in all pairs and frames is no rounding: it is a unit, or a scale.
         is_one = bool((np.abs(scaled_cm - baselines_cm) <= _DEVIATION_SHARE * baselines_cm).all())
         is_told = np.isfinite(stated_m) and (is_one or (is_scaled and not 0.5 < ratio / unit_m < 2))
-        other_unit = ", as if one of the two were in another unit or scaled" if is_told else ""
-        return _Failed(
+        told = (
             f"baseline.json says that cameras {a} and {b} are {baselines_cm[pair]:.6g} cm apart, "
             f"and by the poses they are {distances[frame, pair] * unit_m * 100:.6g} cm apart in "
-            f"frame {frame}{other_unit}",
-            scale=unit_m / ratio if is_told else None,
+            f"frame {frame}"
         )
+        if not is_told:
+            raise SchemaError(told)
+        error = SidesError(f"{told}, as if one of the two were in another unit or scaled")
+        error.scale = unit_m / ratio
+        raise error
     poses = replace(poses, unit_m=unit_m)
     lateral_m = lateral_offsets_m(poses)
     beside_cm = np.abs(lateral_m[_RIGHT] - lateral_m[_LEFT]) * 100
@@ -329,7 +326,7 @@ def _checked(reading: Reading, rig: Rig) -> _Passed | _Failed:
     if not (beside_cm >= _LEAST_BESIDE * baselines_cm).all() or not np.isfinite(residual_px):
         pair = int(np.argmin(beside_cm / baselines_cm))
         a, b = CAMERA_PAIRS[pair]
-        return _Failed(
+        raise SchemaError(
             f"cameras {a} and {b} are {beside_cm[pair]:.6g} cm beside each other as camera 0 "
             f"looks, and {baselines_cm[pair]:.6g} cm apart; or a camera looks away from what the "
             f"others see"
@@ -340,7 +337,7 @@ def _checked(reading: Reading, rig: Rig) -> _Passed | _Failed:
     off, turns = float(sines.max()), poses.world_from_cam_rotations
     is_off = (sines * baselines_cm > _OFF_AXIS * baselines_cm + _DEVIATION_CM).any()
     if is_off and np.abs(turns - turns[:, :1]).max() <= _EXACT:
-        return _Failed(
+        raise SchemaError(
             f"the cameras look one way, and stand {np.degrees(np.arcsin(off)):.3g} degrees off "
             f"the axis to their right"
         )
@@ -353,34 +350,24 @@ _ROUGH: Final = 0.1
 
 def same_poses(first: CameraPoses, other: CameraPoses) -> bool:
     """Return whether two readings are the same poses, seen from the first place of camera 0."""
-    return _same_rig(first, other) and _same_world(first, other)
+    return _same(first, other, _rig_at) and _same(first, other, _moved)
 
 
-def _same_rig(first: CameraPoses, other: CameraPoses) -> bool:
-    """Return whether two readings agree about how cameras stand to each other, in some frames."""
-    return all(
-        np.allclose(
-            first.cam_from_cam(frame, target=target, source=source),
-            other.cam_from_cam(frame, target=target, source=source),
-            atol=_SAME,
-        )
-        for frame in _frames(first)
-        for source, target in ((0, 5), (2, 3))
-    )
+def _same(
+    first: CameraPoses, other: CameraPoses, seen: Callable[[CameraPoses, int], np.ndarray]
+) -> bool:
+    """Return whether two readings look alike in the first, a middle and the last frame."""
+    frames = (0, first.frame_count // 2, first.frame_count - 1)
+    return all(np.allclose(seen(first, each), seen(other, each), atol=_SAME) for each in frames)
 
 
-def _same_world(first: CameraPoses, other: CameraPoses) -> bool:
-    """Return whether two readings move the cameras alike, seen from their first place."""
-    turn, again = (poses.world_from_cam_rotations[0, 0] for poses in (first, other))
-    return np.allclose(turn, again, atol=_SAME) and all(
-        np.allclose(_moved(first, frame), _moved(other, frame), atol=_SAME)
-        for frame in _frames(first)
-    )
-
-
-def _frames(poses: CameraPoses) -> list[int]:
-    return sorted({0, poses.frame_count // 2, poses.frame_count - 1})
+def _rig_at(poses: CameraPoses, frame: int) -> np.ndarray:
+    """Return how some cameras stand to each other."""
+    ends = ((0, 5), (2, 3))
+    return np.array([poses.cam_from_cam(frame, target=b, source=a) for a, b in ends])
 
 
 def _moved(poses: CameraPoses, frame: int) -> np.ndarray:
-    return np.asarray(np.linalg.inv(poses.world_from_cam(0, 0)) @ poses.world_from_cam(frame, 0))
+    """Return where camera 0 stands as seen from its first place, and how it is turned there."""
+    moved = np.linalg.inv(poses.world_from_cam(0, 0)) @ poses.world_from_cam(frame, 0)
+    return np.hstack([moved[:3], poses.world_from_cam_rotations[0, 0]])

@@ -5,7 +5,7 @@ one shape. Others then verify: described by the conventions, they must be what t
 What pictures say of depth is added by `audit.conventions`.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
@@ -14,17 +14,17 @@ from typing import Final
 
 import numpy as np
 
-from stereogenbench_data.errors import MediaError, SchemaError, StereoGenBenchError
-from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.errors import StereoGenBenchError
 from stereogenbench_data.index.build import find_scenes
-from stereogenbench_data.index.evidence import understood_poses
-from stereogenbench_data.index.scene_folder import IncompleteScene, describe_scene, keys_in
-from stereogenbench_data.index.tree import (
-    SceneFolder,
-    folder_of,
+from stereogenbench_data.index.evidence import Understood
+from stereogenbench_data.index.scene_folder import (
+    Description,
+    IncompleteScene,
+    describe_scene,
+    keys_in,
 )
+from stereogenbench_data.index.tree import folder_of
 from stereogenbench_data.media.container import StreamFacts
-from stereogenbench_data.media.video import probe
 from stereogenbench_data.schema.conventions import (
     UNKNOWN,
     Conventions,
@@ -36,7 +36,6 @@ from stereogenbench_data.schema.parse import parse_scene_key, see_rig
 from stereogenbench_data.schema.records import (
     DepthEncoding,
     DepthUnitSource,
-    Rig,
     Scene,
     SceneId,
 )
@@ -46,12 +45,9 @@ from stereogenbench_data.schema.release import (
     CAMERA_PAIRS,
     COMPLETE_JSON,
     TRAJECTORY_JSON,
-    depth_name,
 )
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.schema.trajectory import record_poses
 from stereogenbench_data.sources.location import is_remote
-from stereogenbench_data.sources.ranged_file import MemberFile
 
 _KEYS_READ: Final = 500
 """Of how many scenes the keys are read, for shapes that the chosen scenes do not have."""
@@ -140,25 +136,26 @@ def examine(root: str | Path, key: str, *, conventions: Conventions | None = Non
     """
     folder = folder_of(root, key)
     files = folder.stamps()
-    scene, problem = None, ""
+    described, scene, problem = None, None, ""
     try:
-        scene = describe_scene(root, key, conventions=conventions)
+        described = Description(folder, key)
+        scene = described.scene(conventions)
     except IncompleteScene:
         raise
     except StereoGenBenchError as error:
         problem = str(error)
     shape, notes, unknown = Shape(), Notes(), list[str]()
-    with suppress(StereoGenBenchError, KeyError):  # `describe_scene` has told the problem
+    with suppress(StereoGenBenchError, KeyError):  # `Description` has told the problem
         seen = see_rig(folder.read(BASELINE_JSON), where=f"{key}/{BASELINE_JSON}")
         shape, notes, unknown = seen.shape, seen.found, seen.unknown
-    if scene is not None:
+    if scene is not None and described is not None:
         _note_camera(scene, notes)
-        named, notes["poses"] = _learned_poses(folder, scene)
+        named, notes["poses"] = _learned_poses(scene, described.understood)
         # An image size that the videos contradict is not stated, as theirs counts.
         at = {name: each for name, each in shape.at.items()
               if not (scene.remark("size") and name.startswith("image_"))}  # fmt: skip
         shape = replace(shape, at=at, poses=named)
-    depth = _depth_facts(folder, key, files)
+    depth = described.depths[0] if described is not None and described.depths else None
     notes["depth"] = [] if depth is None else _depth_notes(depth, scene)
     names = [name for name in (BASELINE_JSON, TRAJECTORY_JSON) if name in files]
     return Examined(
@@ -188,55 +185,28 @@ def _note_camera(scene: Scene, notes: Notes) -> None:
             notes.setdefault(table, []).append(scene.remark(about).removeprefix(f"{scene.id.key}/"))
 
 
-def _learned_poses(folder: SceneFolder, scene: Scene) -> tuple[PosesAs | None, list[str]]:
+def _learned_poses(scene: Scene, found: Understood | None) -> tuple[PosesAs | None, list[str]]:
     """Return how poses are read, and the evidence; None where it is not decided."""
-    reason = scene.remark("poses").replace(f"{scene.id.key}/", "")
-    if reason:
+    if found is None:
+        reason = scene.remark("poses").replace(f"{scene.id.key}/", "")
         unread = f'to train without poses and say so, write [poses] with form = "{UNKNOWN}"'
         return None, [unread, f"not understood: {reason}"]
-    text, where = folder.read(TRAJECTORY_JSON), TRAJECTORY_JSON
-    try:
-        found = understood_poses(text, scene.rig, where=where)
-    except SchemaError as error:
-        return None, [f"not understood: {error}"]
-    name = found.names[0]
-    notes = pose_evidence(found.poses, scene.rig)
-    read = set(name.partition(": ")[0].split(" and "))
-    others = [block.key for block in record_poses(text, where=where).blocks]
-    if not_read := [each for each in dict.fromkeys(others) if each not in read]:
-        notes.append(f"numbers of six cameras that are not read: {', '.join(not_read[:6])}")
-    if scene.remark("world"):
-        return None, notes
-    return PosesAs.of_reading(name), notes
-
-
-def pose_evidence(poses: CameraPoses, rig: Rig) -> list[str]:
-    """Return in words how well poses fit the baselines and the line of the cameras."""
+    poses, name = found.poses, found.names[0]
     steps = poses.centres[:, _RIGHT] - poses.centres[:, _LEFT]
     lengths_cm = np.linalg.norm(steps, axis=-1) * poses.unit_m * 100
-    off_cm = np.abs(lengths_cm - np.array(rig.baselines_cm)).max()
+    off_cm = np.abs(lengths_cm - np.array(scene.rig.baselines_cm)).max()
     lateral_m = np.array([poses.cam_from_cam(0, target=0, source=camera)[:3, 3]
                           for camera in range(1, CAMERA_COUNT)])  # fmt: skip
-    across_m = np.abs(lateral_m[:, 1:]).max()
-    return [
+    across_cm = np.abs(lateral_m[:, 1:]).max() * 100
+    notes = [
         f"distances of the cameras are the baselines to {off_cm:.2g} cm in {len(steps)} frames",
-        f"the cameras stand along the x axis of camera 0 to {across_m * 100:.2g} cm in frame 0",
+        f"the cameras stand along the x axis of camera 0 to {across_cm:.2g} cm in frame 0",
     ]
-
-
-def _depth_facts(folder: SceneFolder, key: str, files: Mapping[str, object]) -> StreamFacts | None:
-    for name in map(depth_name, range(CAMERA_COUNT)):
-        if name not in files:
-            continue
-        video = folder.video(name)
-        try:
-            return probe(video, name=f"{key}/{name}")
-        except MediaError:
-            continue
-        finally:
-            if isinstance(video, MemberFile):
-                video.close()
-    return None
+    read = set(name.partition(": ")[0].split(" and "))
+    others = dict.fromkeys(block.key for block in found.recorded.blocks)
+    if not_read := [each for each in others if each not in read]:
+        notes.append(f"numbers of six cameras that are not read: {', '.join(not_read[:6])}")
+    return None if scene.remark("world") else PosesAs.of_reading(name), notes
 
 
 def _depth_notes(facts: StreamFacts, scene: Scene | None) -> list[str]:

@@ -490,9 +490,7 @@ def _presumed(each: _Metadata, models: Sequence[Scene], stated: Shape | None) ->
     key, like = each.id.key, models[0]
     remarks = [*each.remarks]
     size_px = like.rig.image_width_px, like.rig.image_height_px
-    rig = sized_as_videos(
-        key, each.rig or like.rig, size_px, document=None, remarks=remarks, shape=stated
-    )
+    rig = sized_as_videos(key, each.rig or like.rig, size_px, remarks=remarks, shape=stated)
     places_m = assumed_places_m(rig)
     if not places_m:
         return None

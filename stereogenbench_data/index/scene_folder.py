@@ -58,10 +58,8 @@ from stereogenbench_data.schema.conventions import (
 )
 from stereogenbench_data.schema.depth_contract import Statement, stated_in_json
 from stereogenbench_data.schema.document import (
-    MOST_LETTERS,
     brief,
     parse_object,
-    parse_text,
 )
 from stereogenbench_data.schema.parse import (
     contradictions,
@@ -74,6 +72,7 @@ from stereogenbench_data.schema.parse import (
 )
 from stereogenbench_data.schema.records import (
     DepthEncoding,
+    DepthUnitSource,
     Member,
     Remark,
     Rig,
@@ -151,15 +150,22 @@ def describe_scene(
             other or the conventions, or `SchemaError` or `MediaError` if one of them is not
             understood. All problems of all files are in one message.
     """
-    described = _Description(folder or folder_of(root, key), key)
+    described = Description(folder or folder_of(root, key), key)
     scene = described.scene(conventions, videos=videos)
     if valid_depth == "sample":
         return replace(scene, valid_depth_ratio=described.valid_depth_ratio(scene.frames))
     return scene
 
 
-class _Description:
-    """What is read of a scene's files, and what is odd about them."""
+class Description:
+    """What is read of a scene's files, and what is odd about them.
+
+    Attributes:
+        remarks: What is odd.
+        facts: What the videos that can be used are, by their names.
+        depths: What the depth videos that can be opened are, also those that cannot be used.
+        understood: The poses; None where there are none.
+    """
 
     def __init__(self, folder: SceneFolder, key: str) -> None:
         """List the files; a scene of training shards says what it was derived from."""
@@ -167,6 +173,8 @@ class _Description:
         self.remarks: list[Remark] = []
         self.shape: Shape | None = None
         self.facts: dict[str, StreamFacts] = {}
+        self.depths: list[StreamFacts] = []
+        self.understood: Understood | None = None
         self.tables: dict[str, SeekTable] = {}
         self.unread: dict[str, str] = {}
         self.document: TrainingDocument | None = None
@@ -187,7 +195,9 @@ class _Description:
         """Note what is odd."""
         self.remarks.append(Remark(about, text))
 
-    def scene(self, conventions: Conventions | None, *, videos: Collection[str] | None) -> Scene:
+    def scene(
+        self, conventions: Conventions | None, *, videos: Collection[str] | None = None
+    ) -> Scene:
         """Return the row; `describe_scene` says more."""
         problems: list[StereoGenBenchError] = []
         rig, labels = None, SceneLabels()
@@ -214,10 +224,11 @@ class _Description:
             self.require_one_size()
             if rig is not None:
                 first = next(iter(self.facts.values()))
+                size_px = first.width_px, first.height_px
+                recorded_px = size_px if self.document is None else self.document.source_size_px
                 rig = sized_as_videos(
-                    self.key, rig, (first.width_px, first.height_px), document=self.document,
-                    remarks=self.remarks, shape=self.shape,
-                )  # fmt: skip
+                    self.key, rig, recorded_px, remarks=self.remarks, shape=self.shape
+                )
                 self.require_kinds(rig)
         except StereoGenBenchError as error:
             problems.append(error)
@@ -229,16 +240,16 @@ class _Description:
             raise problems[0]
         if self.unread:
             self.remark("videos", "; ".join(self.unread.values()))
-        found = self.poses(rig, frames)
+        found = self.understood = self.poses(rig, frames)
         known = frames if self.document is None else None
         self.contradicted(rig, labels, known, found)
         poses, pose_form = (None, None) if found is None else (found.poses, found.form)
         frames = frames if poses is None else min(frames, poses.frame_count)
-        own = {name: facts for name, facts in self.facts.items() if name in _DEPTHS}
-        some = next(iter(own.items()), (depth_name(0), _NO_DEPTH))
+        used = ((name, facts) for name, facts in self.facts.items() if name in _DEPTHS)
+        some = next(used, (depth_name(0), _NO_DEPTH))
         names = map(depth_name, range(CAMERA_COUNT))
-        depths = [(name, own[name]) if name in own else some for name in names]
-        encodings = self.depth_encodings(depths)
+        depths = [(name, self.facts[name]) if name in self.facts else some for name in names]
+        units_m, offsets_m, sources = zip(*self.depth_units(depths), strict=True)
         scene = Scene(
             id=parse_scene_key(self.key),
             labels=merged_labels(labels, marked),
@@ -250,14 +261,9 @@ class _Description:
             rig_residual_px=(
                 0.0 if poses is None else rectification_residual_px(poses, recorded_intrinsics(rig))
             ),
-            depth_unit_m=tuple(
-                math.nan if each is None else each.known_unit_m for each in encodings
-            ),
-            depth_offset_m=tuple(0.0 if each is None else each.offset_m for each in encodings),
-            depth_unit_source=tuple(
-                "unreadable" if each is None or each.source == "user" else each.source
-                for each in encodings
-            ),
+            depth_unit_m=units_m,
+            depth_offset_m=offsets_m,
+            depth_unit_source=sources,
             depth_codec=tuple(depth_coding(facts) for _, facts in depths),
             depth_pixel_format=tuple(facts.pixel_format for _, facts in depths),
             valid_depth_ratio=None,
@@ -274,7 +280,7 @@ class _Description:
         self, rig: Rig, labels: SceneLabels, frames: int | None, poses: Understood | None
     ) -> None:
         """Note what other JSON files state otherwise than the videos and ``baseline.json``."""
-        others = {} if poses is None else {TRAJECTORY_JSON: poses.head}
+        others = {} if poses is None else {TRAJECTORY_JSON: poses.recorded.head}
         if COMPLETE_JSON in self.files:
             with suppress(SchemaError):
                 text = self.folder.read(COMPLETE_JSON)
@@ -302,6 +308,7 @@ class _Description:
                     )
                     if is_picture and facts.is_colour is None:
                         facts = probe(video, name=where)
+                    self.depths += [facts] if name in _DEPTHS else []
                     if name in _DEPTHS:  # lossy depth passes: a `DepthEncoding` may accept it
                         require_depth_stream(
                             codec=depth_coding(facts), pixel_format=facts.pixel_format,
@@ -376,20 +383,18 @@ class _Description:
 
     def require_kinds(self, rig: Rig) -> None:
         """Refuse views without colours, and depth videos that hold colours."""
+        depths = [fact for name, fact in self.facts.items() if name in _DEPTHS]
+        grey = sum(not fact.is_colour for fact in depths)
         for name, fact in self.facts.items():
-            where = self.where(name)
+            where, stored = self.where(name), fact.pixel_format or "grey"
             require_pixel_aspect(fact.pixel_aspect, rig, name=where)
-            if name.endswith("_rgb.mp4") and not fact.is_colour:
-                stored = fact.pixel_format or "grey"
+            if name not in _DEPTHS and not fact.is_colour:
                 raise MediaError(f"{where}: is stored by codec {fact.codec} as {stored}{NO_COLOUR}")
-        depths = {name: fact for name, fact in self.facts.items() if name in _DEPTHS}
-        grey = sum(not fact.is_colour for fact in depths.values())
-        for name, fact in depths.items():
-            if fact.is_colour and (grey or "matroska" not in fact.container):
+            if name in _DEPTHS and fact.is_colour and (grey or "matroska" not in fact.container):
                 raise MediaError(
-                    f"{self.where(name)}: holds colours (codec {fact.codec}, {fact.pixel_format}), "
-                    f"and depth is one number a pixel, as in {grey} other depth videos of the "
-                    f"scene. Another video stands under this name: fetch it again."
+                    f"{where}: holds colours (codec {fact.codec}, {stored}), and depth is one "
+                    f"number a pixel, as in {grey} other depth videos of the scene. Another video "
+                    f"stands under this name: fetch it again."
                 )
 
     def poses(self, rig: Rig, frames: int) -> Understood | None:
@@ -399,11 +404,11 @@ class _Description:
             SchemaError: If conventions state how poses are read, and they do not fit the rig.
         """
         where = self.where(TRAJECTORY_JSON)
-        found, reason = self.understood(rig, where)
+        found, reason = self.understand(rig, where)
         count = frames if found is None else found.poses.frame_count
         told = f"{where}: has poses of {count} frames, and the videos have {frames}"
         # Without the last frame poses are those of the others; without the first they are not.
-        fewest = 0 if found is None or found.first_frame else -MOST_EXTRA_FRAMES
+        fewest = 0 if found is None or found.recorded.first_frame else -MOST_EXTRA_FRAMES
         if not fewest <= count - frames <= MOST_EXTRA_FRAMES:
             found, reason = None, f"{told}."
         if found is None:
@@ -428,7 +433,7 @@ class _Description:
             )
         return found
 
-    def understood(self, rig: Rig, where: str) -> tuple[Understood | None, str]:
+    def understand(self, rig: Rig, where: str) -> tuple[Understood | None, str]:
         """Return poses that fit the rig, or why there are none."""
         named = None if self.shape is None else self.shape.poses
         if named is not None and named.form == UNKNOWN:
@@ -451,10 +456,10 @@ class _Description:
                 raise
             return None, str(error)
 
-    def depth_encodings(
+    def depth_units(
         self, depths: Sequence[tuple[str, StreamFacts]]
-    ) -> list[DepthEncoding | None]:
-        """Return what files state of each camera's depth, None where that is not understood.
+    ) -> list[tuple[float, float, DepthUnitSource]]:
+        """Return what files state of each camera's depth: unit and offset in m, and by what.
 
         Such a scene can still be used, for its colours or with the user's own unit.
 
@@ -498,12 +503,16 @@ class _Description:
             for (name, _), each in zip(depths, found, strict=True):
                 if each is not None and each.source in ("tag", "metadata"):
                     depth.require(each.known_unit_m, each.offset_m, where=self.where(name))
-            return [depth.encoding] * len(found)
+            return [(depth.encoding.unit_m, depth.encoding.offset_m, "conventions")] * len(found)
         if problems:
             others = len(problems) - 1
             more = f" ({counted(others, 'other video')} likewise.)" if others else ""
             self.remark("depth", problems[0] + more)
-        return found
+        return [
+            (math.nan, 0.0, "unreadable") if each is None or each.source == "user"
+            else (each.known_unit_m, each.offset_m, each.source)
+            for each in found
+        ]  # fmt: skip
 
     def valid_depth_ratio(self, frames: int) -> float:
         """Return the share of pixels of some depth pictures that have a depth."""
@@ -524,8 +533,10 @@ class _Description:
         """Return the row, which in training shards must be what their document says."""
         if self.document is None:
             return scene
+        some = next(iter(self.facts.values()))
         for what, found, said in (
             ("key", self.key, self.document.key),
+            ("size", (some.width_px, some.height_px), self.document.size_px),
             ("key frames", scene.key_frames, self.document.key_frames),
         ):
             if found != said:
@@ -650,23 +661,13 @@ def require_finished(
 
 def caption_of(texts: Mapping[str, bytes], *, key: str) -> tuple[str, tuple[Remark, ...]]:
     """Return a scene's caption from its files: the detailed one, else the short one, else ""."""
-    written, remarks = "", list[Remark]()
-    for name in DESCRIPTIONS:
-        where = f"{key}/{name}"
-        if name not in texts or written:
-            continue
-        if name == DESCRIPTION_JSON:
-            written, odd = parse_caption(texts[name], where=where)
-            remarks += odd
-            continue
-        try:
-            written = parse_text(texts[name], where=where).strip()
-        except SchemaError as error:
-            remarks.append(Remark("caption", str(error)))
-        if len(written) > MOST_LETTERS:
-            told = f"{where}: may have {MOST_LETTERS:,} letters, this one has {len(written):,}"
-            written, remarks = "", [*remarks, Remark("caption", told)]
-    return written, tuple(remarks)
+    remarks: list[Remark] = []
+    for name in (each for each in DESCRIPTIONS if each in texts):
+        caption, odd = parse_caption(texts[name], where=f"{key}/{name}")
+        remarks += odd
+        if caption:
+            return caption, tuple(remarks)
+    return "", tuple(remarks)
 
 
 def merged_labels(labels: SceneLabels, marked: SceneLabels) -> SceneLabels:
@@ -681,7 +682,6 @@ def sized_as_videos(
     rig: Rig,
     size_px: tuple[int, int],
     *,
-    document: TrainingDocument | None,
     remarks: list[Remark],
     shape: Shape | None,
 ) -> Rig:
@@ -689,41 +689,34 @@ def sized_as_videos(
 
     A principal point, in pixels of the recorded image, moves with the size.
     """
-    recorded_px = size_px if document is None else document.source_size_px
     known_px = rig.image_width_px, rig.image_height_px
-    known, recorded, now = (f"{w}x{h}" for w, h in (known_px, recorded_px, size_px))
-    if document is not None and size_px != document.size_px:
-        raise StorageError(
-            f"{key}: {TRAINING_JSON} is for pictures of {document.size_px[0]}x"
-            f"{document.size_px[1]} pixels, and all videos have {now} pixels. Fetch the scene "
-            f"again."
-        )
+    known, now = (f"{w}x{h}" for w, h in (known_px, size_px))
     is_recorded = rig.image_size_source == "recorded"
-    if is_recorded and known_px != recorded_px:
+    if is_recorded and known_px != size_px:
         if shape is not None and not {"image_width", "image_height"}.isdisjoint(shape.at):
             raise StorageError(
                 f"{key}: by the conventions pictures have {known} pixels, and all videos have "
-                f"{recorded}. Correct [image_width] and [image_height], or leave them out: the "
+                f"{now}. Correct [image_width] and [image_height], or leave them out: the "
                 f"videos' size counts."
             )
-        told = f"is for pictures of {known} pixels, and all videos have {recorded}, which counts"
+        told = f"is for pictures of {known} pixels, and all videos have {now}, which counts"
         remarks.append(Remark("size", f"{key}: {BASELINE_JSON} {told}"))
     point_px = rig.principal_point_px
-    if point_px is not None and known_px != recorded_px:
+    if point_px is not None and known_px != size_px:
         if is_recorded:  # else it is in pixels of the videos
-            x, y = (own / known for own, known in zip(recorded_px, known_px, strict=True))
+            x, y = (own / known for own, known in zip(size_px, known_px, strict=True))
             point_px = (point_px[0] * x, point_px[1] * y)
-        if all(abs(at - side / 2) <= 1 for at, side in zip(point_px, recorded_px, strict=True)):
+        if all(abs(at - side / 2) <= 1 for at, side in zip(point_px, size_px, strict=True)):
             point_px = None
     height_mm = rig.sensor_height_mm
     if height_mm == rig.sensor_width_mm * known_px[1] / known_px[0]:
         # Recorded pixels are square, and Unreal renders square pixels at any size.
-        height_mm = rig.sensor_width_mm * recorded_px[1] / recorded_px[0]
-    aspect = rig.sensor_width_mm / height_mm * recorded_px[1] / recorded_px[0]
+        height_mm = rig.sensor_width_mm * size_px[1] / size_px[0]
+    aspect = rig.sensor_width_mm / height_mm * size_px[1] / size_px[0]
     if abs(aspect - 1) > _SQUARE:
         told = (
             f"{key}: a sensor of {rig.sensor_width_mm:.6g} x {height_mm:.6g} mm and pictures "
-            f"of {recorded} pixels have pixels that are not square ({aspect:.4g} times as wide as "
+            f"of {now} pixels have pixels that are not square ({aspect:.4g} times as wide as "
             f"high)"
         )
         remarks.append(Remark("pixels", told))
@@ -733,7 +726,6 @@ def sized_as_videos(
         sensor_height_mm=height_mm,
         image_width_px=size_px[0],
         image_height_px=size_px[1],
-        recorded_size_px=None if document is None else document.source_size_px,
     )
 
 
@@ -813,7 +805,7 @@ def _with_rig(scene: Scene, texts: Mapping[str, bytes]) -> Scene:
     text, where = texts[BASELINE_JSON], f"{key}/{BASELINE_JSON}"
     rig, labels, _ = parse_rig(text, where=where, shape=_stated_of(scene), size_px=recorded_px)
     if rig.image_size_source == "default" or scene.remark("size"):
-        rig = sized_as_videos(key, rig, recorded_px, document=None, remarks=[], shape=None)
+        rig = sized_as_videos(key, rig, recorded_px, remarks=[], shape=None)
     if (rig.image_width_px, rig.image_height_px) == recorded_px:
         recorded = scene.rig.recorded_size_px
         rig = replace(

@@ -32,6 +32,7 @@ from stereogenbench_data.schema.quantities import (
     UNITS_M,
     Stated,
     as_stated,
+    steps_of,
     value_at,
     words,
 )
@@ -47,7 +48,6 @@ UNKNOWN: Final = "unknown"
 _MOST: Final = 64
 _LEAST_OFFSET_M: Final = 1e-4
 _LONGEST: Final = 500
-_PLACE: Final = re.compile(r"\$.+", re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,7 +165,7 @@ class Shape:
         if self.poses is not None:
             table["poses"] = _plain_table(self.poses)
         if self.depth is not None:
-            table["depth"] = _plain_table(self.depth.encoding, beside=_USUAL)
+            table["depth"] = _plain_table(self.depth.encoding)
             if self.depth.instead_of_tag_m is not None:
                 table["depth"]["instead_of_tag_m"] = self.depth.instead_of_tag_m
         return table
@@ -185,15 +185,15 @@ class Shape:
             at = self.at.get(name, At())
             if at.place is not None:
                 value = value_stated(document, at.place, name, where=where)
-                known[quantity] = as_stated(value, at.unit or "", at.place)
+                known[quantity] = as_stated(Stated(value, at.unit or "", at.place))
             elif at.value is not None:
                 known[quantity] = Stated(at.value, at.unit or "", f"[{name}] of the conventions")
         return known
 
-    def ignores(self, path: str) -> bool:
-        """Return whether what stands at a JSON path, or the object around it, does not count."""
-        listed = {each for at in self.at.values() for each in at.ignored}
-        return any(path == each or path.startswith((f"{each}.", f"{each}[")) for each in listed)
+    @property
+    def ignored(self) -> list[str]:
+        """The JSON paths of what does not count in ``baseline.json``."""
+        return [each for at in self.at.values() for each in at.ignored]
 
 
 def value_stated(document: dict[str, Any], path: str | None, table: str, *, where: str) -> Any:
@@ -378,11 +378,8 @@ def _shape(table: dict[str, Any], *, where: str) -> Shape:
         for key in needed:
             if key not in values:
                 raise SchemaError(f"{place}: {key} is missing. Write a JSON path, such as $.pairs.")
-        if (
-            name in NUMBERS
-            and ("place" in values) == ("value" in values)
-            and not ("ignored" in values and "place" not in values)
-        ):
+        stated = values.keys() & {"place", "value"}
+        if name in NUMBERS and len(stated) != 1 and (stated or "ignored" not in values):
             raise SchemaError(
                 f"{place} must have either a place, such as "
                 f'place = "$.camera_intrinsics.{name}", or the value that it has in every scene.'
@@ -419,43 +416,26 @@ def _is_text(value: object) -> bool:
     return isinstance(value, str) and 0 < len(value) <= _LONGEST
 
 
-def _are_texts(value: object) -> bool:
-    return isinstance(value, list) and len(value) <= _MOST and all(map(_is_text, value))
-
-
-def _is_path(value: object) -> bool:
-    return _is_text(value) and _PLACE.fullmatch(str(value)) is not None
-
-
-_RULES: Final[dict[str, tuple[Callable[[Any], bool], str]]] = {
-    **dict.fromkeys(("kind", "form", "location", "rotation", "axes", "unit"), (_is_text, "a text")),
-    **dict.fromkeys(
-        ("place", "left", "right"),
-        (_is_path, "a JSON path, such as $.camera_intrinsics.focal_length_mm"),
-    ),
-    **dict.fromkeys(
-        ("value", "instead_of_tag_m"),
-        (lambda value: is_number(value) and value > 0, "a number above zero"),
-    ),
-    **dict.fromkeys(
-        ("unit_m", "offset_m", "frame_lag"),
-        (lambda value: not isinstance(value, bool), "a number"),
-    ),
-    "has": (_are_texts, "a list of texts"),
-    "accept": (_are_texts, "a list of texts"),
-    "ignored": (lambda value: _are_texts(value) and all(map(_is_path, value)), "JSON paths"),
-    "no_depth": (
-        lambda value: isinstance(value, list) and len(value) <= _MOST,
-        'a list of stored numbers, such as [0, "max"]',
-    ),
-}
-"""What a key's value must be."""
+_RULES: Final[tuple[tuple[str, Callable[[Any], bool], str], ...]] = (
+    ("kind form location rotation axes unit has accept", _is_text, "a text"),
+    ("place left right ignored", lambda value: _is_text(value) and value[0] == "$" < value,
+     "a JSON path, such as $.camera_intrinsics.focal_length_mm"),
+    ("value instead_of_tag_m", lambda value: is_number(value) and value > 0,
+     "a number above zero"),
+    ("unit_m offset_m frame_lag", lambda value: not isinstance(value, bool), "a number"),
+    ("no_depth", lambda value: type(value) in (int, str), 'a stored number or "max"'),
+)  # fmt: skip
+"""What the value of a key must be, or each of a list."""
+_LISTS: Final = ("has", "accept", "ignored", "no_depth")
 
 
 def _checked(key: str, value: Any, *, where: str) -> Any:
     """Return the value of a key as records hold it."""
-    is_right, what = _RULES[key]
-    if not is_right(value):
+    is_right, what = next((rule, what) for keys, rule, what in _RULES if key in keys.split())
+    is_list = isinstance(value, list)
+    values = value if is_list else [value]
+    if is_list != (key in _LISTS) or len(values) > _MOST or not all(map(is_right, values)):
+        what = f"a list, and each {what}" if key in _LISTS else what
         raise SchemaError(f"{where}: {key} must be {what}, found {_shown(value)}.")
     if key == "accept":
         _require_known(value, get_args(DepthRisk), where=f"{where}: {key}")
@@ -464,25 +444,21 @@ def _checked(key: str, value: Any, *, where: str) -> Any:
         return words(value)
     if key in ("value", "instead_of_tag_m"):
         return float(value)
-    return tuple(value) if isinstance(value, list) else value
+    return tuple(value) if is_list else value
 
 
 def _shown(value: object) -> str:
     return plain_line(shortened(repr(value)))
 
 
-def _plain_table(record: Any, *, beside: Any = None) -> dict[str, Any]:
-    """Return the fields of a record that say something, as TOML and JSON have them."""
-    table = {}
+def _plain_table(record: Any) -> dict[str, Any]:
+    """Return the fields of a record that are not as usual, as TOML and JSON have them."""
+    usual, table = type(record)(), {}
     for name in (each.name for each in fields(record) if each.name != "source"):
         value = getattr(record, name)
-        default = None if beside is None else getattr(beside, name)
-        if value is None or value == () or value == default:
-            continue
-        is_many = isinstance(value, tuple | frozenset)
-        table[name] = sorted(value, key=str) if isinstance(value, frozenset) else (
-            list(value) if is_many else value
-        )  # fmt: skip
+        if value != getattr(usual, name):
+            listed = sorted(value, key=str) if isinstance(value, frozenset) else value
+            table[name] = list(listed) if isinstance(value, tuple | frozenset) else value
     return table
 
 
@@ -552,7 +528,8 @@ def place_of(path: str) -> str:
     >>> place_of('$.pairwise_pairs[3].baseline_cm'), place_of('$.baselines["0-1"]')
     ('$.pairwise_pairs[].baseline_cm', '$.baselines.#_#')
     """
-    steps = re.findall(r'\.([^.\[]+)|\[([0-9]+)\]|\["((?:[^"\\]|\\.)*)"\]', path)
-    named = ("[]" if number else f".{re.sub('[0-9]+', '#', words(plain or quoted))}"
-             for plain, number, quoted in steps)  # fmt: skip
+    named = (
+        "[]" if isinstance(step, int) else f".{re.sub('[0-9]+', '#', words(step))}"
+        for step in steps_of(path)
+    )
     return "$" + "".join(named)

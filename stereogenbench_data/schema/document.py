@@ -134,6 +134,8 @@ def brief(value: object) -> str:
         return f"an object with {len(value)} keys ({keys})" if value else "an empty object"
     if isinstance(value, list):
         return f"a list of {len(value)}"
+    if isinstance(value, str) and len(value) > MOST_LETTERS:
+        return f"one of {len(value):,} letters, more than {MOST_LETTERS:,}"
     return "null" if value is None else shortened(repr(value))
 
 

@@ -32,16 +32,18 @@ from stereogenbench_data.schema.document import (
     is_number,
     listed_keys,
     parse_object,
+    parse_text,
 )
 from stereogenbench_data.schema.quantities import (
     NAMES,
     SPEAKS_OF_PAIRS,
     UNITS_M,
-    Node,
     Stated,
     Values,
     as_stated,
+    is_below,
     named_unit_m,
+    steps_of,
     without_unit,
     words,
 )
@@ -141,9 +143,9 @@ class MetadataFile:
         """
         self.where, self.content = where, text
         self.document = parse_object(text, where=where)
-        self.shape = shape
-        known = {} if shape is None else shape.known(self.document, where=where)
-        self.values = Values(self.document, known=known, ignores=shape.ignores if shape else None)
+        self.is_stated, self.shape = shape is not None, shape or Shape()
+        known = self.shape.known(self.document, where=where)
+        self.values = Values(self.document, known=known, ignored=self.shape.ignored)
         self.problems: list[str] = []
         self.remarks: list[Remark] = []
 
@@ -199,11 +201,14 @@ def parse_complete(text: bytes, *, where: str) -> tuple[SceneLabels, tuple[Remar
 def parse_caption(text: bytes, *, where: str) -> tuple[str, tuple[Remark, ...]]:
     """Return the caption in a scene's description: the detailed one, else the short one, else "".
 
-    What is not understood is left out with a remark: no picture depends on it.
+    A file with the suffix .txt is the caption. What is not understood is left out with a remark: no
+    picture depends on it.
 
     Source: the paper's appendix on the file schema.
     """
     try:
+        if where.endswith(".txt"):
+            text = json.dumps({"caption": parse_text(text, where=where).strip()}).encode()
         file = MetadataFile(text, where=where)
     except SchemaError as error:
         return "", (Remark("caption", str(error)),)
@@ -312,8 +317,7 @@ def contradictions(
     for name in ("scene_label", "scene_index", "map_name", "map_path", "character", "animation"):
         label = getattr(labels, name)
         for each in values.stated(name):
-            is_named = isinstance(each.at, Node) and each.at.plain == name
-            if is_named and label is not None and each.value not in (label, str(label)):
+            if each.plain == name and label is not None and each.value not in (label, str(label)):
                 states = f"{where}: {each.path} states {brief(each.value)}, and {BASELINE_JSON}"
                 told.append(Remark("stated", f"{states} {brief(label)}"))
     return tuple(told)
@@ -426,7 +430,7 @@ class _RigFile(MetadataFile):
 
     @property
     def _cure(self) -> str:
-        more = "" if self.shape is None else ", or list its place as 'ignored' in the conventions"
+        more = ", or list its place as 'ignored' in the conventions" if self.is_stated else ""
         return f"Remove the wrong one{more}"
 
     @property
@@ -496,7 +500,7 @@ class _RigFile(MetadataFile):
             if not length_mm and not any(name[:5] in problem for problem in self.problems):
                 missing = f"$.camera_intrinsics.{name} is missing; the keys are: {self._keys}"
                 self.problems.append(missing)
-        low, high = _LENSES if self.shape is None else _FOCAL_LENGTHS
+        low, high = _FOCAL_LENGTHS if self.is_stated else _LENSES
         if focal_mm and sensor_mm and not low <= focal_mm / sensor_mm <= high:
             self.problems.append(
                 f"a focal length of {focal_mm:.6g} mm on a sensor {sensor_mm:.6g} mm wide is "
@@ -529,49 +533,51 @@ class _RigFile(MetadataFile):
                if _PRINCIPAL.search(f"{node.parent}_{node.name}"
                                     if is_number(node.value) else node.name)
                and not isinstance(node.value, dict)
-               and node.path not in read and not any(path.startswith(node.path) for path in read)
+               and not any(path.startswith(node.path) for path in read)
                and node.value not in (0, [0, 0], [0.5, 0.5])
                and "cent" not in str(node.value)]  # fmt: skip
         if odd:
             self.remark("principal point", f"a principal point is not understood: {odd[0]}")
         if not any(points):
             return None
-        x, y = (
-            next((each.value / side_px for each in found if is_number(each.value)), 0.5)
-            for found, side_px in zip(points, size_px, strict=True)
-        )
+        usable = [[each for each in found if is_number(each.value)] for found in points]
+        x, y = (found[0].value / side_px if found else 0.5
+                for found, side_px in zip(usable, size_px, strict=True))  # fmt: skip
         if self.values.positive("focal_px") and x > 0.01 and abs(x - y) < _SHARE < abs(x - 0.5):
             self.problems.append(
                 f"{points[0][0].path}: by its principal point it is of other pictures than these, "
                 f"of {size_px[0]}x{size_px[1]}. State their size as image_width and image_height"
             )
-        place_px: list[float] = []
-        for found, side_px in zip(points, size_px, strict=True):
-            usable = [each for each in found if is_number(each.value)]
-            if usable and abs(usable[0].value - 0.5) < 1e-3:
-                place_px.append(side_px / 2)  # a share of the side
-            elif usable and 1 < usable[0].value < side_px:
-                place_px.append(float(usable[0].value))
-                for each in usable[1:] if self.shape is not None else ():
-                    if abs(each.value - usable[0].value) > each.rounding + usable[0].rounding:
-                        self._conflict("principal point", usable[0], each)
-            else:
-                shown = ", ".join(f"{each.path} {brief(each.value)}" for each in found)
-                self.remark(
-                    "principal point",
-                    f"the principal point is not understood ({shown or 'one side'}): it must be x "
-                    f"and y in pixels inside a picture of {size_px[0]}x{size_px[1]}",
-                )
-                return None
-        if all(abs(a - b / 2) <= _CENTRE_PX for a, b in zip(place_px, size_px, strict=True)):
+        x_px, y_px = map(self._along, usable, size_px)
+        if x_px is None or y_px is None:
+            unread = points[0 if x_px is None else 1]
+            shown = ", ".join(f"{each.path} {brief(each.value)}" for each in unread) or "one side"
+            told = f"the principal point is not understood ({shown}): it must be x and y in pixels"
+            told = f"{told} inside a picture of {size_px[0]}x{size_px[1]}"
+            self.remark("principal point", told)
             return None
-        return place_px[0], place_px[1]
+        is_centre = abs(x_px - size_px[0] / 2) <= _CENTRE_PX >= abs(y_px - size_px[1] / 2)
+        return None if is_centre else (x_px, y_px)
+
+    def _along(self, found: list[Stated], side_px: int) -> float | None:
+        """Return where along a side a principal point is, in pixels; None if not understood."""
+        if not found:
+            return None
+        first, *more = found
+        if abs(first.value - 0.5) < 1e-3:
+            return side_px / 2  # a share of the side
+        if not 1 < first.value < side_px:
+            return None
+        for each in more if self.is_stated else ():
+            if abs(each.value - first.value) > each.rounding + first.rounding:
+                self._conflict("principal point", first, each)
+        return float(first.value)
 
     def _primary_pair(self) -> Pair:
         pairs: list[tuple[Stated, Pair]] = []
         odd: list[str] = []
         stated = self.values.stated("primary_pair")
-        at = None if self.shape is None else self.shape.at.get("primary_pair")
+        at = self.shape.at.get("primary_pair")
         if at is not None:
             ends = [value_stated(self.document, path, "primary_pair", where=self.where)
                     for path in (at.left, at.right)]  # fmt: skip
@@ -615,23 +621,22 @@ class _RigFile(MetadataFile):
         for each in self.lengths:
             first = 0 if each.is_by_place else first_number
             pair = min(each.cameras) - first, max(each.cameras) - first
-            known = best.setdefault(pair, each)
             if pair not in CAMERA_PAIRS:
                 self.problems.append(
                     f"{each.stated.path}: is of cameras {each.cameras[0]} and {each.cameras[1]}, "
                     f"and the rig has cameras 0 to {CAMERA_COUNT - 1}"
                 )
-            elif abs(each.cm - known.cm) <= _FLOAT32 * known.cm:
                 continue
-            elif abs(each.cm - known.cm) > each.rounding_cm + known.rounding_cm:
+            known = best.setdefault(pair, each)
+            away_cm, least_cm = abs(each.cm - known.cm), _FLOAT32 * known.cm
+            if away_cm > max(each.rounding_cm + known.rounding_cm, least_cm):
                 self.problems.append(
                     f"{each.stated.path}: the baseline of cameras {pair[0]} and {pair[1]} is "
                     f"{each.cm:.9g} cm here and {known.cm:.9g} cm at {known.stated.path}. "
                     f"{self._cure}"
                 )
-            elif each.rounding_cm < known.rounding_cm:
+            elif away_cm > least_cm and each.rounding_cm < known.rounding_cm:
                 best[pair] = each
-        best = {pair: each for pair, each in best.items() if pair in CAMERA_PAIRS}
         listed = ", ".join(f"{a}-{b}" for a, b in CAMERA_PAIRS if (a, b) not in best)
         added_cm = _completed(best) if listed else {}
         if listed and not added_cm:
@@ -649,18 +654,17 @@ class _RigFile(MetadataFile):
         """The baselines of pairs that the file records, those of the paper's key first."""
         self._found: list[_Length] = []
         unit_m = self.values.length_unit_m or 0.01
-        at = None if self.shape is None else self.shape.at.get("baselines")
-        self._baselines_at = None if at is None else at.place
-        if at is not None and at.place is not None:
+        at = self.shape.at.get("baselines", At())
+        if at.place is not None:
             unit_m = UNITS_M.get(at.unit or "", unit_m)
             value = value_stated(self.document, at.place, "baselines", where=self.where)
             name = f"baselines_{words(at.place.rpartition('.')[2])}"
             self._look_below(value, name, at.place, unit_m)
-            quotients = [each.cm / each.stated.value for each in self._found]
-            if not any(math.isclose(each, unit_m * 100) for each in quotients):
-                unit = at.unit or "the unit of the file"
+            if not any(math.isclose(each.cm / each.stated.value, unit_m * 100)
+                       for each in self._found):  # fmt: skip
                 self.problems.append(
-                    f"{at.place}: by the conventions baselines in {unit} stand here, and "
+                    f"{at.place}: by the conventions baselines in "
+                    f"{at.unit or 'the unit of the file'} stand here, and "
                     f"{brief(value)} has none. Correct the place or the unit"
                 )
         for key in sorted(self.document, key=lambda key: key != "pairwise_pairs"):
@@ -703,7 +707,7 @@ class _RigFile(MetadataFile):
                 self._add_pair(cameras, length, own_m, place)
             elif (ends_of := self._ends_of(node, words_)) is not None:
                 for number, (ends, each) in enumerate(zip(ends_of, node, strict=True)):
-                    self._add(ends, each, own_m, (place, number), is_by_place=True)
+                    self._add(ends, each, own_m, child_path(place, number), is_by_place=True)
             elif is_of_pairs or isinstance(node, dict):
                 for key, inner in node.items() if isinstance(node, dict) else enumerate(node):
                     own, at = words(str(key)), child_path(place, key)
@@ -734,40 +738,40 @@ class _RigFile(MetadataFile):
         if not isinstance(value, dict):
             self._add(cameras, value, unit_m, path)
             return
-        at, (_, keys, unit_key) = self._baselines_at, _entry_form(tuple(value))
-        if not keys and at is not None and path.startswith((f"{at}.", f"{at}[")):
+        names = {key: words(key) for key in value}
+        keys = [key for key, name in names.items() if "length" in _roles(name)]
+        if not keys and is_below(path, [self.shape.at.get("baselines", At()).place or ""]):
             # Where conventions say that baselines stand, the only number beside cameras is one.
-            others = [key for key in value if is_number(value[key]) and not _roles(words(key))]
-            keys = [(key, "") for key in others] if len(others) == 1 else []
+            others = [key for key in value if is_number(value[key]) and not _roles(names[key])]
+            keys = others if len(others) == 1 else []
         if not keys and not any(_NO_LENGTH in problem for problem in self.problems):
             listed = ", ".join(sorted(value))
             self.problems.append(f"{path}: {_NO_LENGTH}; the keys here are: {listed}")
-        if isinstance(value.get(unit_key), str):
-            unit_m = UNITS_M.get(words(value[unit_key]), math.nan)
-        for key, unit in keys:
+        unit_m = _unit_below(value, unit_m)
+        for key in keys:
+            unit = names[key] if names[key] in UNITS_M else without_unit(names[key])[1]
             is_inner = isinstance(value[key], dict) and "value" not in value[key]
             if not is_inner and not isinstance(value[key], list) and unit in ("", *UNITS_M):
-                self._add(cameras, value[key], UNITS_M.get(unit, unit_m), (path, key))
+                at = child_path(path, key)
+                self._add(cameras, value[key], UNITS_M.get(unit, unit_m), at)
 
     def _add(
-        self, cameras: Pair, value: object, unit_m: float, at: str | tuple[str, str | int],
-        *, is_by_place: bool = False,
-    ) -> None:  # fmt: skip
-        found = as_stated(value, "", at)
-        if self.shape is not None and self.shape.ignores(found.path):
+        self, cameras: Pair, value: object, unit_m: float, path: str, *, is_by_place: bool = False
+    ) -> None:
+        found = as_stated(Stated(value, "", path))
+        length = found.value
+        if is_number(length) and cameras[0] > cameras[1]:
+            length = abs(length)  # from the camera with the higher number it may be signed
+        if is_below(path, self.shape.ignored):
             return
-        # A length from the camera with the higher number may be signed.
-        sign = -1 if cameras[0] > cameras[1] and is_number(found.value) and found.value < 0 else 1
-        if is_number(found.value) and found.value * sign > 0:
-            cm = float(found.value) * sign * (UNITS_M.get(found.unit, unit_m) / 0.01)
-            self._found.append(_Length(cameras, cm, found, is_by_place))
-            if math.isnan(cm):
-                self.problems.append(
-                    f"{found.path}: is in a unit of length that is not known: correct it"
-                )
-        else:
-            told = f"{found.path}: must be a number above zero, found {brief(value)}"
-            self.problems.append(told)
+        if not (is_number(length) and length > 0):
+            told = f"must be a number above zero, found {brief(found.value)}"
+            self.problems.append(f"{path}: {told}")
+            return
+        cm = float(length) * (UNITS_M.get(found.unit, unit_m) / 0.01)
+        self._found.append(_Length(cameras, cm, found, is_by_place))
+        if math.isnan(cm):
+            self.problems.append(f"{path}: is in a unit of length that is not known: correct it")
 
 
 _PLACES: Final = re.compile(r"offset|lateral|along|(?:camera|rig)_(?:position|place|cent[er])")
@@ -797,20 +801,6 @@ def _roles(name: str) -> frozenset[str]:
     return frozenset(found)
 
 
-@functools.lru_cache(maxsize=256)
-def _entry_form(
-    keys: tuple[str, ...],
-) -> tuple[list[tuple[str, frozenset[str]]], list[tuple[str, str]], str | None]:
-    """Return which keys may name cameras, the baselines with their units, and the unit's key."""
-    roles = {key: _roles(words(key)) for key in keys}
-    naming = [(key, each) for key, each in roles.items() if not each & {"length", "figure"}]
-    if sum(camera_of(key) is not None for key in keys) > 2:
-        naming = []  # keys of a table
-    lengths = [(key, words(key) if words(key) in UNITS_M else without_unit(words(key))[1])
-               for key in keys if "length" in roles[key]]  # fmt: skip
-    return naming, lengths, next((key for key in keys if words(key) in ("unit", "units")), None)
-
-
 def _cameras_of(entry: dict[str, Any] | list[Any]) -> Pair | None:
     """Return the two cameras that an entry names, None where it does not name two."""
     by_number: list[int] = []
@@ -819,9 +809,12 @@ def _cameras_of(entry: dict[str, Any] | list[Any]) -> Pair | None:
         is_triple = len(entry) == 3 and all(type(each) is int for each in entry[:2])
         by_number = entry[:2] if is_triple and {*entry[:2]} <= {*range(CAMERA_COUNT + 1)} else []
         entry = {}
-    for key, roles in _entry_form(tuple(entry))[0]:
-        value = entry[key]
+    is_table = sum(camera_of(key) is not None for key in entry) > 2
+    for key, value in entry.items() if not is_table else ():
+        roles = _roles(words(key))
         pair = _pair_of(value) if isinstance(value, str) and "pair" in roles else None
+        if roles & {"length", "figure"}:
+            continue
         if type(value) is int:
             by_number += [value] if "camera" in roles and 0 <= value < 100 else []
         elif isinstance(value, list) and len(value) == 2:
@@ -850,9 +843,9 @@ def named_pair(value: Any) -> Pair | None:
     ends = _ends(value)
     if isinstance(value, dict) and ends == [None, None]:
         return _cameras_of(value)
-    cameras = [_camera(value[end]) for end in ends if end is not None]
-    left, right = cameras if len(cameras) == 2 else (None, None)
-    return None if left is None or right is None else (left, right)
+    cameras = [camera for camera in (_camera(value[end]) for end in ends if end is not None)
+               if camera is not None]  # fmt: skip
+    return (cameras[0], cameras[1]) if len(cameras) == 2 else None
 
 
 def _ends(value: Any) -> list[Any]:
@@ -888,10 +881,11 @@ def _camera(value: object) -> int | None:
 
 def _unit_below(node: Any, above_m: float) -> float:
     """Return the metres in the unit that an object names, nan if not known, or in that above."""
-    named = node.get("unit", node.get("units")) if isinstance(node, dict) else None
-    if not isinstance(named, str):
-        return above_m
-    unit_m = named_unit_m(named)
+    keys = node.items() if isinstance(node, dict) else ()
+    named = [
+        each for key, each in keys if words(key) in ("unit", "units") and isinstance(each, str)
+    ]
+    unit_m = named_unit_m(named[0]) if named else above_m
     return math.nan if unit_m is None else unit_m
 
 
@@ -987,11 +981,11 @@ def see_rig(text: bytes, *, where: str) -> Seen:
     read |= {place_of(each.stated.path) for each in file.lengths}
     if file.lengths:
         first = file.lengths[0]
-        steps = [re.findall(r"\.[^.\[]+|\[[^\]]*\]", each.stated.path) for each in file.lengths]
+        steps = [steps_of(each.stated.path) for each in file.lengths]
         same = [each for each in steps if each[:1] == steps[0][:1]]
         by_step = zip(*(each[:-1] for each in same), strict=False)
         common = itertools.takewhile(lambda each: len({*each}) == 1, by_step)
-        place = "$" + "".join(each[0] for each in common)
+        place = functools.reduce(child_path, (each[0] for each in common), "$")
         unit_m = first.cm / 100 / first.stated.value
         known = [name for name, metres in UNITS_M.items() if math.isclose(metres, unit_m)]
         at["baselines"] = At(place=place, unit=next(iter(known), None))
@@ -1010,7 +1004,7 @@ def see_rig(text: bytes, *, where: str) -> Seen:
     keys = keys_of(file.document)
     unknown = sorted(
         key for key in keys
-        if not any(key == each or key.startswith((f"{each}.", f"{each}[")) for each in read)
+        if not is_below(key, read)
         and not any(each.startswith(f"{key}[]") for each in keys)
         and not _NAMES_A_CAMERA.search(key.rpartition(".")[2])
     )  # fmt: skip

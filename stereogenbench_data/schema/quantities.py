@@ -9,10 +9,12 @@ end (``focalLengthMM``, ``sensor_width (cm)``) do not matter, and the key above 
 import functools
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
+from operator import itemgetter
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -72,10 +74,10 @@ MATRICES: Final = frozenset({"k", "camera_matrix", "intrinsic_matrix", "intrinsi
 """Keys of a camera matrix, in pixels: 3 rows of 3 numbers, or 9 numbers."""
 
 LENS_PARAMS: Final = {
-    "pinhole": {"fx": 0, "fy": 1, "cx": 2, "cy": 3},
-    "simple_pinhole": {"fx": 0, "fy": 0, "cx": 1, "cy": 2},
+    ("pinhole", 4): {"fx": 0, "fy": 1, "cx": 2, "cy": 3},
+    ("simple_pinhole", 3): {"fx": 0, "fy": 0, "cx": 1, "cy": 2},
 }
-"""What stands where in COLMAP's ``params`` of a ``model``, in pixels."""
+"""What stands where in COLMAP's ``params``, by its ``model`` and their number, in pixels."""
 _MATRIX_PLACES: Final = {"fx": 0, "fy": 4, "cx": 2, "cy": 5}
 
 UNITS_M: Final = {
@@ -102,53 +104,26 @@ _MOST_NODES: Final = 20_000
 
 
 @dataclass(slots=True)
-class Node:
-    """A value below a document, and where it stands.
-
-    Attributes:
-        key: Its key in an object, or its place in a list.
-        up: What holds it; None for the document itself.
-        value: The JSON value.
-        plain: The key in words, without a unit at its end; "" in lists.
-        unit: That unit, "" without one.
-        name: The key in words, with the unit.
-        parent: The nearest key above, in words without a unit.
-    """
-
-    key: str | int
-    up: "Node | None"
-    value: Any
-    plain: str = ""
-    unit: str = ""
-    name: str = ""
-    parent: str = ""
-
-    @property
-    def path(self) -> str:
-        """The JSON path."""
-        return "$" if self.up is None else child_path(self.up.path, self.key)
-
-
-@dataclass(slots=True)
 class Stated:
     """A value as it stands in a file.
 
     Attributes:
-        value: The JSON value; a text such as "32.5 mm" is its number.
+        value: The JSON value; of a quantity, a text such as "32.5 mm" is its number.
         unit: The last words of its key, or of the text, that name a unit; "" without one.
-        at: Where it stands: a node, a place, or the place of what holds it and its key there.
+        path: Its JSON path.
+        plain: The key in words, without the unit; "" in lists.
+        name: The key in words, with the unit.
+        parent: The nearest key above, in words without a unit.
+        holder: The object or list that it stands in.
     """
 
     value: Any
     unit: str
-    at: Node | str | tuple[str, str | int]
-
-    @property
-    def path(self) -> str:
-        """Its JSON path."""
-        if isinstance(self.at, tuple):
-            return child_path(*self.at)
-        return self.at if isinstance(self.at, str) else self.at.path
+    path: str
+    plain: str = ""
+    name: str = ""
+    parent: str = ""
+    holder: Any = None
 
     @property
     def rounding(self) -> float:
@@ -187,31 +162,29 @@ def without_unit(name: str) -> tuple[str, str]:
     return name, ""
 
 
-def nodes_of(document: Any) -> list[Node]:
+def nodes_of(document: Any) -> list[Stated]:
     """Return the values below a document, the outermost first.
 
     Lists that are long, or whose keys speak of pairs, are not searched.
     """
-    waiting = [Node("", None, document)]
-    depths = [0]
-    for node, depth in zip(waiting, depths, strict=False):  # both grow
+    waiting = [(Stated(document, "", "$"), 0)]
+    for node, depth in waiting:  # which grows
         value = node.value
         if not isinstance(value, dict | list) or depth > _DEEPEST:
             continue
         if isinstance(value, list) and (len(value) > _LONGEST or SPEAKS_OF_PAIRS.search(node.name)):
             continue
-        above = node.plain or node.parent
         for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
             if len(waiting) > _MOST_NODES:
                 break
             name = words(key.rpartition(".")[2]) if isinstance(key, str) else ""
             if name or isinstance(inner, dict | list):
-                own = (*without_unit(name), name, above)
+                path, (plain, unit) = child_path(node.path, key), without_unit(name)
+                child = Stated(inner, unit, path, plain, name, node.plain or node.parent, value)
                 if node.name and isinstance(key, str) and camera_of(key) is not None:
-                    own = node.plain, node.unit, node.name, node.parent  # one camera's share
-                waiting.append(Node(key, node, inner, *own))
-                depths.append(depth + 1)
-    return [node for node in waiting if node.name and node.value is not None]
+                    child = replace(node, value=inner, path=path)  # one camera's share
+                waiting.append((child, depth + 1))
+    return [node for node, _ in waiting if node.name and node.value is not None]
 
 
 class Values:
@@ -226,7 +199,7 @@ class Values:
         document: Any,
         *,
         known: Mapping[str, Stated] = MappingProxyType({}),
-        ignores: Callable[[str], bool] | None = None,
+        ignored: Collection[str] = (),
     ) -> None:
         """Find them.
 
@@ -234,26 +207,23 @@ class Values:
             document: The document.
             known: Values that conventions state. They come first, and know the unit of a key that
                 names none.
-            ignores: Whether what stands at a JSON path does not count.
+            ignored: The JSON paths of what does not count.
         """
-        nodes = nodes_of(document)
-        self.nodes = [node for node in nodes if not ignores(node.path)] if ignores else nodes
-        found: dict[str, list[tuple[int, Stated]]] = {}
+        self.nodes = [each for each in nodes_of(document) if not is_below(each.path, ignored)]
+        ranked: dict[str, list[tuple[int, Stated]]] = defaultdict(list)
         for node in self.nodes:
             for quantity, rank in _quantities(node.plain, node.parent, node.name):
-                found.setdefault(quantity, []).append(
-                    (rank, as_stated(node.value, node.unit, node))
-                )
-            for rank, quantity, stated in _parts(node):
-                found.setdefault(quantity, []).append((rank, stated))
+                ranked[quantity].append((rank, as_stated(node)))
+            for quantity, rank, stated in _parts(node):
+                ranked[quantity].append((rank, stated))
         self._stated = {
-            quantity: [each for _, each in sorted(ranked, key=lambda each: each[0])]
-            for quantity, ranked in found.items()
+            quantity: [each for _, each in sorted(found, key=itemgetter(0))]
+            for quantity, found in ranked.items()
         }
         for quantity, first in known.items():
-            others = [
+            others = (
                 each for each in self.stated(quantity) if each.unit or each.path != first.path
-            ]
+            )
             self._stated[quantity] = [first, *others]
 
     def stated(self, quantity: str) -> list[Stated]:
@@ -298,34 +268,50 @@ def _quantities(plain: str, parent: str, name: str) -> list[tuple[str, int]]:
     return found
 
 
-def _parts(node: Node) -> Iterator[tuple[int, str, Stated]]:
+def _parts(node: Stated) -> Iterator[tuple[str, int, Stated]]:
     """Yield the quantities in a list of two numbers or in a camera matrix, with their ranks."""
-    value, pair = node.value, PAIRS.get(node.plain, ())
-    for at, quantity in enumerate(pair if not isinstance(value, dict) else ()):
-        if isinstance(value, list) and len(value) == len(pair):
-            yield 0, quantity, Stated(value[at], node.unit, child_path(node.path, at))
-        else:
-            yield 0, quantity, Stated(value, node.unit, node)
+    value = node.value
+    if node.plain in PAIRS and not isinstance(value, dict):
+        for at, quantity in enumerate(PAIRS[node.plain]):
+            is_pair = isinstance(value, list) and len(value) == len(PAIRS[node.plain])
+            yield (
+                quantity,
+                0,
+                (Stated(value[at], node.unit, child_path(node.path, at)) if is_pair else node),
+            )
     places: dict[str, int] = {}
-    if node.plain in MATRICES and isinstance(value, dict):
-        value = value.get("data")  # as OpenCV writes it
-    if node.plain in MATRICES and isinstance(value, list):
-        if len(value) in (3, 4) and all(isinstance(row, list) for row in value):
-            value = [number for row in value[:3] for number in row[:3]]
-        if len(value) == 9 and value[8] == 1 and not value[1]:  # pixels are not skewed
-            places = _MATRIX_PLACES
-    if node.plain == "params" and isinstance(value, list) and node.up is not None:
-        model = next(
-            (words(str(each)) for key, each in node.up.value.items() if "model" in key), ""
-        )
-        places = LENS_PARAMS.get(model, places)
-        places = places if len(value) == max(places.values(), default=0) + 1 else {}
+    if node.plain in MATRICES:
+        value = value.get("data") if isinstance(value, dict) else value  # as OpenCV writes it
+        if isinstance(value, list) and len(value) in (3, 4):
+            rows = [row[:3] for row in value[:3] if isinstance(row, list)]
+            value = [number for row in rows for number in row]
+        if isinstance(value, list) and len(value) == 9 and value[8] == 1 and not value[1]:
+            places = _MATRIX_PLACES  # whose pixels are not skewed
+    elif node.plain == "params" and isinstance(value, list):
+        models = (str(each) for key, each in node.holder.items() if "model" in key)
+        places = LENS_PARAMS.get((words(next(models, "")), len(value)), {})
     for name, at in places.items():
         for quantity, rank in _quantities(name, "", name):
-            yield rank, quantity, Stated(value[at], "px", node)
+            yield quantity, rank, Stated(value[at], "px", node.path)
 
 
-_STEP: Final = re.compile(r'\.([A-Za-z_][A-Za-z0-9_]*)|\[([0-9]{1,6})\]|\[("(?:[^"\\]|\\.)*")\]')
+_STEP: Final = re.compile(r'\.([^.\[]+)|\[([0-9]{1,9})\]|\[("(?:[^"\\]|\\.)*")\]')
+
+
+def steps_of(path: str) -> list[str | int]:
+    """Return the keys and places on the way to what stands at a JSON path.
+
+    Raises:
+        LookupError: If it is not written as `child_path` does.
+
+    >>> steps_of('$.a[0]["b c"]')
+    ['a', 0, 'b c']
+    """
+    steps = [*_STEP.finditer(path)]
+    if "$" + "".join(step[0] for step in steps) != path:
+        raise LookupError(path)
+    return [int(number) if number else json.loads(quoted) if quoted else plain
+            for plain, number, quoted in (step.groups() for step in steps)]  # fmt: skip
 
 
 def value_at(document: Any, path: str) -> Any:
@@ -337,22 +323,24 @@ def value_at(document: Any, path: str) -> Any:
     >>> value_at({"a": [{"b c": 7}]}, '$.a[0]["b c"]')
     7
     """
-    node, at = document, 1
-    while at < len(path):
-        step = _STEP.match(path, at)
-        plain, number, quoted = step.groups() if step else (None, None, None)
-        if step is None or not isinstance(node, list if number else dict):
+    for key in steps_of(path):
+        is_there = isinstance(document, list if isinstance(key, int) else dict)
+        if not is_there:
             raise LookupError(path)
-        key: Any = int(number) if number else json.loads(quoted) if quoted else plain
-        node = node[key]
-        at = step.end()
-    return node
+        document = document[key]
+    return document
 
 
-def as_stated(value: Any, unit: str, at: Node | str | tuple[str, str | int]) -> Stated:
+def is_below(path: str, places: Collection[str]) -> bool:
+    """Return whether a JSON path is one of some places, or below one."""
+    return any(path == each or path.startswith((f"{each}.", f"{each}[")) for each in places)
+
+
+def as_stated(found: Stated) -> Stated:
     """Return a value with its unit, which may be in it: "32 mm", [32, "mm"], {"value", "unit"}."""
+    value, unit = found.value, found.unit
     if type(value) is float or type(value) is int:
-        return Stated(value, unit, at)
+        return found
     if isinstance(value, dict) and isinstance(value.get("unit"), str) and "value" in value:
         value, unit = value["value"], words(value["unit"])
     if isinstance(value, list) and [*map(type, value)] in ([float, str], [int, str]):
@@ -363,4 +351,4 @@ def as_stated(value: Any, unit: str, at: Node | str | tuple[str, str | int]) -> 
     if text is not None and (text[2] or unit):
         with suppress(ValueError):
             value, unit = float(text[1]), text[2].lower() or unit
-    return Stated(value, unit, at)
+    return replace(found, value=value, unit=unit)

@@ -7,7 +7,10 @@ and an axis of frames; what they mean as poses is for `geometry.pose_forms` to s
 `index.evidence` to confirm.
 """
 
+import math
 import re
+from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -112,7 +115,7 @@ def record_poses(text: bytes, *, where: str) -> RecordedPoses:
     document = parse_document(text, where=where)
     if not isinstance(document, dict):
         document = {"frames": document}
-    columns = _unwrapped(_columns(document))
+    columns = _columns(document)
     if sum(len(values) for _, values in columns.values()) > _MOST_VALUES:
         raise SchemaError(f"{where}: has over {_MOST_VALUES:,} values. Replace it with the file of "
                           "the release.")  # fmt: skip
@@ -190,41 +193,46 @@ class _Odd(Exception):
     """Numbers of cameras that cannot be put in order."""
 
 
-def _columns(node: Any, depth: int = 0) -> Columns:
+def _columns(document: dict[str, Any]) -> Columns:
     """Return the values at each place of a document: the lengths of its axes, and all values.
 
-    Places that not all elements of a list have alike, and very deep ones, are left out.
+    Places that not all elements of a list have alike, and very deep ones, are left out, and so are
+    axes of one element below those of frames and cameras.
     """
-    if depth > _DEEPEST:
-        return {}
-    if isinstance(node, dict):
-        found: Columns = {}
-        for name, counted in _counted(node).items():
-            owner = (name,) if name else ()
-            for place, column in _stacked([value for _, value in counted], depth).items():
-                found[(*owner, *place)] = column
-            numbers = [number for number, _ in counted]
-            found[(*owner, "*", "#")] = ((len(numbers),), numbers)
-            among = {id(value) for _, value in counted}
-            node = {key: value for key, value in node.items() if id(value) not in among}
-        for key, value in node.items():
-            for place, column in _columns(value, depth + 1).items():
-                found[(words(key), *place)] = column
-        return found
-    if isinstance(node, list):
-        return _stacked(_by_frame(node), depth)
-    return {(): ((), [node])}
+    found: dict[Place, list[Any]] = defaultdict(list)
+    lengths: dict[Place, set[int]] = defaultdict(set)
+    for place, value in _leaves(document, (), lengths):
+        found[place].append(value)
+    columns: Columns = {}
+    for place, values in found.items():
+        axes = {at: lengths[place[: at + 1]] for at, key in enumerate(place) if key == "*"}
+        if any(len(each) > 1 for each in axes.values()):
+            continue
+        of_one = [at for at, each in [*axes.items()][2:] if each == {1}]
+        plain = tuple(key for at, key in enumerate(place) if at not in of_one)
+        if math.prod(count for (count,) in axes.values()) == len(values):
+            columns[plain] = tuple(n for at, (n,) in axes.items() if at not in of_one), values
+    return columns
 
 
-def _unwrapped(columns: Columns) -> Columns:
-    """Return columns without the axes of one element below those of frames and cameras."""
-    found: Columns = {}
-    for place, (lengths, values) in columns.items():
-        axes = [at for at, key in enumerate(place) if key == "*"]
-        ones = [at for at, length in enumerate(lengths) if at >= 2 and length == 1]
-        kept = tuple(key for at, key in enumerate(place) if at not in [axes[one] for one in ones])
-        found[kept] = tuple(n for at, n in enumerate(lengths) if at not in ones), values
-    return found
+def _leaves(node: Any, place: Place, lengths: dict[Place, set[int]]) -> Iterator[tuple[Place, Any]]:
+    """Yield the values below a node with their places, and add the lengths of the axes."""
+    if not isinstance(node, dict | list) or len(place) >= _DEEPEST:
+        yield place, node
+        return
+    is_list = isinstance(node, list)
+    groups = _counted(node) if isinstance(node, dict) else {"": [*enumerate(_by_frame(node))]}
+    for name, group in groups.items():
+        axis = (*place, name, "*") if name else (*place, "*")
+        lengths[axis].add(len(group))
+        for number, value in group:
+            yield from () if is_list else [((*axis, "#"), number)]
+            yield from _leaves(value, axis, lengths)
+    among = {id(value) for group in groups.values() for _, value in group}
+    pairs = node.items() if isinstance(node, dict) else ()
+    others = {words(key): value for key, value in pairs if id(value) not in among}
+    for name, value in others.items():
+        yield from _leaves(value, (*place, name), lengths)
 
 
 def _counted(node: dict[str, Any]) -> dict[str, list[tuple[int, Any]]]:
@@ -263,19 +271,6 @@ def _by_frame(records: list[Any]) -> list[Any]:
     if max(frames) - min(frames) >= len(frames) or {*map(len, frames.values())} != {CAMERA_COUNT}:
         return records
     return [frames[frame] for frame in sorted(frames)]
-
-
-def _stacked(nodes: list[Any], depth: int) -> Columns:
-    if all(not isinstance(node, dict | list) for node in nodes):
-        return {("*",): ((len(nodes),), nodes)}
-    parts = [_columns(node, depth + 1) for node in nodes]
-    found: Columns = {}
-    for place, (lengths, _) in parts[0].items():
-        others = [part.get(place, (None, ())) for part in parts]
-        if all(other[0] == lengths for other in others):
-            values = [value for other in others for value in other[1]]
-            found[("*", *place)] = ((len(nodes), *lengths), values)
-    return found
 
 
 def _of_list(

@@ -279,7 +279,7 @@ def test_a_unit_that_the_distances_contradict_is_refused(unit):
 def test_another_primary_pair_than_that_of_the_rig_is_told_with_its_place(pair, is_other):
     found = understood(written("rotator", *TURNED, primary_stereo_pair=pair))
 
-    remarks = contradictions(found.head, RIG, SceneLabels(), where="trajectory.json")
+    remarks = contradictions(found.recorded.head, RIG, SceneLabels(), where="trajectory.json")
     told = "".join(remark.text for remark in remarks if remark.about == "pair")
     assert ("trajectory.json: $.primary_stereo_pair states cameras" in told) == is_other
 
@@ -327,7 +327,7 @@ def test_a_focal_length_that_changes_over_frames_is_refused():
         for camera in frame["cameras"]:
             camera["focal_length_mm"] = 32.5 + number
 
-    head = understood(json.dumps(document).encode()).head
+    head = understood(json.dumps(document).encode()).recorded.head
     (remark,) = contradictions(head, RIG, SceneLabels(), where="trajectory.json")
 
     assert remark.about == "left"
