@@ -52,6 +52,7 @@ accept = ["10-bit", "lossy"]
 [[shape]]
 [shape.depth]
 frame_lag = 1
+no_depth = []
 """
 
 
@@ -72,7 +73,7 @@ def test_all_that_can_be_stated_is_read_and_written_again():
         23.76,
     )
     assert (first.depth.encoding.kind, first.depth.encoding.no_depth) == ("ray", (0, 7, "max"))
-    assert second.depth.encoding.frame_lag == 1
+    assert (second.depth.encoding.frame_lag, second.depth.encoding.no_depth) == (1, ())
     assert [shape_of_text(shape.text()) for shape in conventions.shapes] == [first, second]
 
 
