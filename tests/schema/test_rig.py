@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 import json
 import math
-import re
 
 import pytest
 from hypothesis import given, settings
@@ -12,28 +11,24 @@ from hypothesis import strategies as st
 
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.schema.parse import parse_rig, require_unit
-from stereogenbench_data.schema.records import Rig
+from stereogenbench_data.schema.records import Rig, SceneLabels
 
 BASELINES_CM = (6.5, 13.25, 19.0, 26.0, 32.5, 6.75, 12.5, 19.5, 26.0, 5.75, 12.75, 19.25)
 BASELINES_CM += (7.0, 13.5, 6.5)
 PLACES_CM = (0.0, 6.5, 13.25, 19.0, 26.0, 32.5)
 
 
-def problems_of(document, dumped):
-    with pytest.raises(SchemaError, match="problem") as caught:
-        parse_rig(dumped(document), where="baseline.json")
-    return [line.strip() for line in str(caught.value).splitlines()[1:]]
+def read(document, **known):
+    """The rig, labels and remarks of a document."""
+    return parse_rig(json.dumps(document).encode(), where="baseline.json", **known)
 
 
-def test_a_rig_is_read_as_it_is_recorded(rig_document, dumped):
-    rig, labels, _ = parse_rig(dumped(rig_document), where="baseline.json")
+def test_a_rig_is_read_as_it_is_recorded(rig_document):
+    rig, labels, remarks = read(rig_document | {"aperture_fstop": 4})
 
     assert rig == Rig(32.5, 23.76, 17.82, 640, 480, None, BASELINES_CM, (0, 1), "recorded")
-    assert (labels.scene_label, labels.scene_index, labels.map_name) == (
-        "Town_scene_1166",
-        1166,
-        "Town",
-    )
+    assert labels == SceneLabels("Town_scene_1166", 1166, "Town", aperture_fstop=4.0)
+    assert remarks == ()
 
 
 def baseline(place, value):
@@ -85,37 +80,32 @@ LENGTH = r"pairwise_pairs\[3\]\.baseline_cm: must be a number above zero, found 
          r"\$\.camera_intrinsics\.focal_length_mm is missing; the keys are: .*intrinsics\.zoom"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_a_rig_is_told_with_its_place(rig_document, dumped, change, told):
+def test_what_is_wrong_with_a_rig_is_told_with_its_place(rig_document, change, told):
     change(rig_document)
 
-    assert re.search(told, "\n".join(problems_of(rig_document, dumped)))
+    with pytest.raises(SchemaError, match=rf"(?s)baseline\.json: \d+ problem.*{told}"):
+        read(rig_document)
 
 
-def test_all_problems_of_a_file_are_reported_at_once(rig_document, dumped):
+def test_all_problems_of_a_file_are_reported_at_once_but_for_many(rig_document):
     lens(focal_length_mm="far", sensor_width_mm=0)(rig_document)
-    baseline(0, None)(rig_document)
+    baseline(3, None)(rig_document)
 
-    problems = problems_of(rig_document, dumped)
+    told = r"(?s)3 problems.*\[3\].baseline_cm.*focal_length_mm.*sensor_width_mm"
+    with pytest.raises(SchemaError, match=told):
+        read(rig_document)
+    rig_document["pairwise_pairs"] = rig_document["pairwise_pairs"][3:4] * 30
+    with pytest.raises(SchemaError, match=r"(?s)33 problems.*\n  and 13 more\.$"):
+        read(rig_document)
 
-    for place in ("baseline_cm", "focal_length_mm", "sensor_width_mm"):
-        assert any(place in problem for problem in problems)
 
-
-def test_without_an_image_size_the_releases_size_is_assumed(rig_document, dumped):
+def test_without_an_image_size_the_releases_size_is_assumed(rig_document):
     del rig_document["image_width"], rig_document["image_height"]
 
-    rig, _, _ = parse_rig(dumped(rig_document), where="baseline.json")
+    rig, _, _ = read(rig_document)
 
     assert (rig.image_width_px, rig.image_height_px) == (1280, 1280)
     assert rig.image_size_source == "default"
-
-
-def test_without_a_sensor_height_pixels_are_square(rig_document, dumped):
-    del rig_document["camera_intrinsics"]["sensor_height_mm"]
-
-    rig, _, _ = parse_rig(dumped(rig_document), where="baseline.json")
-
-    assert rig.sensor_height_mm / 480 == pytest.approx(rig.sensor_width_mm / 640, rel=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -129,21 +119,15 @@ def test_without_a_sensor_height_pixels_are_square(rig_document, dumped):
         ({"left_camera": "cam_00_rgb.mp4", "right_camera": "cam_04_rgb.mp4"}, (0, 4)),
     ],
 )
-def test_both_forms_of_the_primary_pair_are_read(rig_document, dumped, pair, expected):
-    rig_document["primary_stereo_pair"] = pair
-
-    rig, _, _ = parse_rig(dumped(rig_document), where="baseline.json")
-
-    assert rig.primary_pair == expected
+def test_each_form_of_the_primary_pair_is_read(rig_document, pair, expected):
+    assert read(rig_document | {"primary_stereo_pair": pair})[0].primary_pair == expected
 
 
 @pytest.mark.parametrize(
     "intrinsics", [{"fx": 875.4208754, "fy": 875.4208754}, {"fov_deg": 40.15832}]
 )
-def test_without_a_sensor_that_of_the_release_is_assumed(rig_document, dumped, intrinsics):
-    rig_document["camera_intrinsics"] = intrinsics
-
-    rig, _, (remark,) = parse_rig(dumped(rig_document), where="baseline.json")
+def test_without_a_sensor_that_of_the_release_is_assumed(rig_document, intrinsics):
+    rig, _, (remark,) = read(rig_document | {"camera_intrinsics": intrinsics})
 
     assert (rig.sensor_width_mm, rig.sensor_height_mm) == pytest.approx((23.76, 17.82))
     assert rig.focal_mm == pytest.approx(32.5, rel=1e-5)
@@ -162,36 +146,28 @@ def test_without_a_sensor_that_of_the_release_is_assumed(rig_document, dumped, i
     ],
     ids=["larger pictures", "smaller pictures", "skewed pixels"],
 )
-def test_a_camera_matrix_of_other_pictures_is_refused(rig_document, dumped, matrix, told):
+def test_a_camera_matrix_of_other_pictures_is_refused(rig_document, matrix, told):
     rig_document["camera_intrinsics"] = {"K": matrix}
     del rig_document["image_width"], rig_document["image_height"]
 
     with pytest.raises(SchemaError, match=told):
-        parse_rig(dumped(rig_document), where="baseline.json", size_px=(640, 480))
-
-
-def test_of_baselines_that_agree_the_most_precise_counts(rig_document, dumped):
-    rig_document["adjacent_baselines_cm"] = [6.5, 6.8, 5.8, 7.0, 6.5]
-
-    rig, _, _ = parse_rig(dumped(rig_document), where="baseline.json")
-
-    assert rig.baselines_cm == BASELINES_CM
+        read(rig_document, size_px=(640, 480))
 
 
 @pytest.mark.parametrize(("unit_cm", "unit"), [(100, "m"), (0.1, "mm")])
 def test_baselines_that_fit_their_family_in_another_unit_alone_are_refused(
-    rig_document, dumped, unit_cm, unit
+    rig_document, unit_cm, unit
 ):
     for entry in rig_document["pairwise_pairs"]:
         entry["baseline_cm"] /= unit_cm
-    rig, _, _ = parse_rig(dumped(rig_document), where="baseline.json")
+    rig, _, _ = read(rig_document)
 
     with pytest.raises(SchemaError, match=rf"4.5 to 8.5 cm. In {unit} they would be"):
         require_unit(rig, family="IPD_Gaussian", where="baseline.json")
 
 
-def test_baselines_outside_of_their_family_are_told(rig_document, dumped):
-    rig, _, _ = parse_rig(dumped(rig_document), where="baseline.json")
+def test_baselines_outside_of_their_family_are_told(rig_document):
+    rig, _, _ = read(rig_document)
     wide = dataclasses.replace(rig, baselines_cm=tuple(3 * each for each in BASELINES_CM))
 
     (remark,) = require_unit(wide, family="IPD_Gaussian", where="baseline.json")
@@ -200,66 +176,44 @@ def test_baselines_outside_of_their_family_are_told(rig_document, dumped):
     assert require_unit(rig, family="IPD_Gaussian", where="baseline.json") == ()
 
 
-def test_without_a_primary_pair_cameras_are_taken_to_ascend_to_the_right(rig_document, dumped):
-    del rig_document["primary_stereo_pair"]
-
-    rig, _, (remark,) = parse_rig(dumped(rig_document), where="baseline.json")
-
-    assert rig.primary_pair == (0, 1)
-    assert remark.about == "primary pair"
-
-
-def test_baselines_below_a_unit_that_is_not_known_are_refused(rig_document, dumped):
+def test_baselines_below_a_unit_that_is_not_known_are_refused(rig_document):
     pairs = rig_document.pop("pairwise_pairs")
     rows = [
         {"a": each["camera_index_a"], "b": each["camera_index_b"], "value": 1} for each in pairs
     ]
 
     with pytest.raises(SchemaError, match=r"value: is in a unit of length that is not known"):
-        parse_rig(dumped(rig_document | {"baseline": {"unit": "ell", "pairs": rows}}), where="rig")
+        read(rig_document | {"baseline": {"unit": "ell", "pairs": rows}})
 
 
 @pytest.mark.parametrize(
-    "written",
+    ("written", "point_px", "about"),
     [
-        {"principal_point_px": {"x": 300.5, "y": 250}},
-        {"principal_point": [300.5, 250.0]},
-        {"cx": 300.5, "cy": 250.0},
-        {"optical_center_x_px": 300.5, "optical_center_y_px": 250.0},
-    ],
-)
-def test_a_principal_point_is_found_under_likely_keys(rig_document, dumped, written):
-    rig_document["camera_intrinsics"] |= written
-
-    rig, _, remarks = parse_rig(dumped(rig_document), where="baseline.json")
-
-    assert rig.principal_point_px == (300.5, 250.0)
-    assert remarks == ()
-
-
-@pytest.mark.parametrize(
-    "written",
-    [{"principal_point": None}, {"cx": 0.5, "cy": 0.5}, {"principal_point": "image_center"}],
-)
-def test_a_principal_point_at_the_centre_is_none(rig_document, dumped, written):
-    rig, _, remarks = parse_rig(dumped(rig_document | written), where="baseline.json")
-
-    assert rig.principal_point_px is None
-    assert remarks == ()
-
-
-@pytest.mark.parametrize(
-    "written",
-    [
-        {"cx": 300.5}, {"principal_point": "left"}, {"cx": 1e9, "cy": 1}, {"shift_x": 0.05},
-        {"principal_point_normalized": [0.53, 0.5]}, {"principal_point_offset_px": [4, 0]},
+        ({"principal_point_px": {"x": 300.5, "y": 250}}, (300.5, 250.0), []),
+        ({"principal_point": [300.5, 250.0]}, (300.5, 250.0), []),
+        ({"cx": 300.5, "cy": 250.0}, (300.5, 250.0), []),
+        ({"optical_center_x_px": 300.5, "optical_center_y_px": 250.0}, (300.5, 250.0), []),
+        ({"principal_point": None}, None, []),
+        ({"cx": 0.5, "cy": 0.5}, None, []),
+        ({"principal_point": "image_center"}, None, []),
+        *(
+            (written, None, ["principal point"])
+            for written in (
+                {"cx": 300.5}, {"principal_point": "left"}, {"cx": 1e9, "cy": 1}, {"shift_x": 0.05},
+                {"principal_point_normalized": [0.53, 0.5]}, {"principal_point_offset_px": [4, 0]},
+            )
+        ),
     ],
 )  # fmt: skip
-def test_a_principal_point_that_is_not_understood_stops_no_disparity(rig_document, dumped, written):
-    rig, _, (remark,) = parse_rig(dumped(rig_document | written), where="baseline.json")
+def test_a_principal_point_is_found_or_the_centre_and_what_is_not_understood_stops_nothing(
+    rig_document, written, point_px, about
+):
+    lens(**written)(rig_document)
 
-    assert rig.principal_point_px is None
-    assert remark.about == "principal point"
+    rig, _, remarks = read(rig_document)
+
+    assert rig.principal_point_px == point_px
+    assert [remark.about for remark in remarks] == about
 
 
 @pytest.mark.parametrize(
@@ -267,6 +221,7 @@ def test_a_principal_point_that_is_not_understood_stops_no_disparity(rig_documen
     [
         ({"focal_length_mm": "32.5 mm", "sensor_width_cm": 2.376, "sensor_height_cm": 1.782}, {}),
         ({"focal_length_mm": 32.5, "sensor": {"width_mm": 23.76, "height_mm": 17.82}}, {}),
+        ({"focal_length_mm": 32.5, "sensor_width_mm": 23.76, "fov_deg": 40.16}, {}),
         (
             {"fx_px": 875.4208754, "sensor_width_mm": 23.76, "sensor_height_mm": 17.82},
             {"render_width": 640, "render_height": 480},
@@ -289,41 +244,33 @@ def test_a_principal_point_that_is_not_understood_stops_no_disparity(rig_documen
                 for camera in range(6)}, "sensor_width_mm": 23.76}, {}),
     ],
 )  # fmt: skip
-def test_a_lens_is_found_under_likely_keys(rig_document, dumped, intrinsics, size):
-    rig_document["camera_intrinsics"] = intrinsics
+def test_a_lens_is_found_under_likely_keys(rig_document, intrinsics, size):
     if size:
         del rig_document["image_width"], rig_document["image_height"]
-        rig_document |= size
 
-    rig, _, _ = parse_rig(dumped(rig_document), where="baseline.json")
+    rig, _, _ = read(rig_document | size | {"camera_intrinsics": intrinsics})
 
     assert rig.focal_mm / rig.sensor_width_mm == pytest.approx(32.5 / 23.76, rel=1e-5)
     assert rig.sensor_height_mm == pytest.approx(17.82)
     assert (rig.image_width_px, rig.image_height_px) == (640, 480)
 
 
-def test_the_side_that_a_sensor_is_fitted_to_counts(rig_document, dumped):
-    rig_document["camera_intrinsics"] |= {"sensor_width_mm": 36.0, "sensor_height_mm": 24.0}
+@pytest.mark.parametrize(("fit", "sensor_mm"), [("VERTICAL", (32.0, 24.0)), ("AUTO", (36.0, 27.0))])
+def test_the_side_that_a_sensor_is_fitted_to_counts(rig_document, fit, sensor_mm):
+    lens(sensor_width_mm=36.0, sensor_height_mm=24.0)(rig_document)
 
-    for fit, width_mm, height_mm in (("VERTICAL", 32.0, 24.0), ("AUTO", 36.0, 27.0)):
-        document = rig_document | {"sensor_fit": fit}
-        rig, _, _ = parse_rig(dumped(document), where="baseline.json")
-        assert (rig.sensor_width_mm, rig.sensor_height_mm) == pytest.approx((width_mm, height_mm))
+    rig, _, _ = read(rig_document | {"sensor_fit": fit})
+
+    assert (rig.sensor_width_mm, rig.sensor_height_mm) == pytest.approx(sensor_mm)
 
 
 @pytest.mark.parametrize(
     "written", [{"distortion": {"k1": -0.12}}, {"camera_model": "fisheye"}, {"overscan": 0.1}]
 )
-def test_a_model_of_the_lens_is_told(rig_document, dumped, written):
-    _, _, (remark,) = parse_rig(dumped(rig_document | written), where="baseline.json")
+def test_a_model_of_the_lens_is_told(rig_document, written):
+    _, _, (remark,) = read(rig_document | written)
 
     assert remark.about == "lens"
-
-
-def test_a_lens_may_be_stated_twice_within_its_rounding(rig_document, dumped):
-    lens(fov_deg=40.16)(rig_document)
-
-    assert parse_rig(dumped(rig_document), where="baseline.json")[0].focal_mm == 32.5
 
 
 def pairs_as(document, write):
@@ -398,44 +345,44 @@ def pairs_as(document, write):
             }}, id="names below names"),
     ],
 )  # fmt: skip
-def test_baselines_are_found_in_likely_forms(rig_document, dumped, write):
-    rig, _, _ = parse_rig(dumped(pairs_as(rig_document, write)), where="baseline.json")
+def test_baselines_are_found_in_likely_forms(rig_document, write):
+    rig, _, _ = read(pairs_as(rig_document, write))
 
     assert rig.baselines_cm == pytest.approx(BASELINES_CM, rel=1e-12)
     assert rig.primary_pair == (0, 1)
 
 
-def test_a_pair_that_is_not_recorded_follows_from_the_others(rig_document, dumped):
-    del rig_document["pairwise_pairs"][3]
+@pytest.mark.parametrize(
+    ("key", "about", "told"),
+    [
+        ("primary_stereo_pair", "primary pair", "has no primary_stereo_pair"),
+        ("pairwise_pairs", "baselines", "0-4"),
+    ],
+)
+def test_what_follows_from_other_values_is_told(rig_document, key, about, told):
+    recorded = rig_document.pop(key)
+    if key == "pairwise_pairs":
+        rig_document[key] = recorded[:3] + recorded[4:]
+        # Of lengths that agree the most precise counts.
+        rig_document["adjacent_baselines_cm"] = [6.5, 6.8, 5.8, 7.0, 6.5]
 
-    rig, _, (remark,) = parse_rig(dumped(rig_document), where="baseline.json")
+    rig, _, (remark,) = read(rig_document)
 
-    assert rig.baselines_cm == pytest.approx(BASELINES_CM)
-    assert "0-4" in remark.text
+    assert rig.baselines_cm == pytest.approx(BASELINES_CM, rel=1e-15)
+    assert rig.primary_pair == (0, 1)
+    assert (remark.about, told in remark.text) == (about, True)
 
 
-def test_sizes_and_labels_that_are_odd_stop_nothing(rig_document, dumped):
+def test_sizes_and_labels_that_are_odd_stop_nothing(rig_document):
     rig_document |= {
         "camera_count": "six", "image_width": 0.5, "image_height": -1, "scene_index": "no",
         "aperture_fstop": "f/4", "notes": [math.nan], "map_name": 3,
     }  # fmt: skip
 
-    rig, labels, _ = parse_rig(dumped(rig_document), where="baseline.json")
+    rig, labels, _ = read(rig_document)
 
     assert rig.image_size_source == "default"
     assert (labels.scene_index, labels.map_name) == (None, None)
-
-
-def test_more_than_twenty_problems_are_counted(rig_document, dumped):
-    rig_document["pairwise_pairs"] = [
-        {"camera_index_a": 0, "camera_index_b": 10 + place, "baseline_cm": 1.0}
-        for place in range(30)
-    ]
-
-    problems = problems_of(rig_document, dumped)
-
-    assert len(problems) == 21
-    assert problems[-1] == "and 11 more."
 
 
 lengths = st.floats(0.5, 5000)
@@ -444,14 +391,10 @@ lengths = st.floats(0.5, 5000)
 @settings(max_examples=100)
 @given(baselines=st.lists(lengths, min_size=15, max_size=15))
 def test_every_number_of_a_rig_is_read_exactly(baselines):
+    intrinsics = {"focal_length_mm": 45.0, "sensor_width_mm": 23.76, "sensor_height_mm": 13.3}
     pairs = zip(itertools.combinations(range(6), 2), baselines, strict=True)
     document = {
-        "camera_intrinsics": {
-            "focal_length_mm": 45.0,
-            "sensor_width_mm": 23.76,
-            "sensor_height_mm": 13.3,
-            "aperture_fstop": 4,
-        },
+        "camera_intrinsics": intrinsics,
         "image_width": 640,
         "image_height": 360,
         "primary_stereo_pair": [1, 2],
@@ -461,7 +404,6 @@ def test_every_number_of_a_rig_is_read_exactly(baselines):
         ],
     }
 
-    rig, labels, _ = parse_rig(json.dumps(document).encode(), where="baseline.json")
+    rig, _, _ = read(document)
 
     assert rig == Rig(45.0, 23.76, 13.3, 640, 360, None, tuple(baselines), (1, 2))
-    assert labels.aperture_fstop == 4.0
