@@ -31,33 +31,24 @@ _SPARE_BYTES: Final = 16 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
-class WantedFile:
-    """One file of a scene: the scene's key, the file's name, and where it is now."""
-
-    key: str
-    name: str
-    member: Member
-
-
-@dataclass(frozen=True, slots=True)
 class Download:
     """What to download: scenes, each with only the members that are wanted."""
 
     scenes: tuple[Scene, ...]
 
     @property
-    def files(self) -> list[WantedFile]:
-        """The files of all scenes."""
-        return [
-            WantedFile(scene.id.key, name, member)
+    def files(self) -> dict[str, Member]:
+        """The files: the path that each will have, KEY/NAME, to where it is now."""
+        return {
+            f"{scene.id.key}/{name}": member
             for scene in self.scenes
             for name, member in scene.members.items()
-        ]
+        }
 
     @property
     def size_bytes(self) -> int:
         """The size of all files."""
-        return sum(wanted.member.size for wanted in self.files)
+        return sum(member.size for member in self.files.values())
 
 
 def plan_download(
@@ -149,7 +140,7 @@ def download(
     if not is_remote(index.root):
         if dest == local_path(index.root):
             raise StorageError(f"{dest}: is the folder of the data. Choose another folder.")
-        require_own_files(index.root, sorted({each.member.path for each in wanted.files}))
+        require_own_files(index.root, sorted({member.path for member in wanted.files.values()}))
     scenes = _scenes_before(dest)
     _fetch_missing(index, wanted, dest, workers=workers, progress=progress)
     for scene in wanted.scenes:
@@ -179,10 +170,7 @@ def _scenes_before(dest: Path) -> dict[str, Scene]:
     return {
         scene.id.key: scene
         for scene in map(index.scene, range(len(index)))
-        if all(
-            _is_whole(WantedFile(scene.id.key, name, member), dest)
-            for name, member in scene.members.items()
-        )
+        if all(_is_whole(dest / member.path, member) for member in scene.members.values())
     }
 
 
@@ -194,8 +182,9 @@ def _texts(members: Mapping[str, Member]) -> dict[str, tuple[int, int | None]]:
 def _fetch_missing(
     index: SceneIndex, wanted: Download, dest: Path, *, workers: int, progress: Progress | None
 ) -> None:
-    missing = [each for each in wanted.files if not _is_whole(each, dest)]
-    needed = sum(each.member.size for each in missing)
+    files = {dest / path: member for path, member in wanted.files.items()}
+    missing = {place: member for place, member in files.items() if not _is_whole(place, member)}
+    needed = sum(member.size for member in missing.values())
     _require_room(dest, needed)
     total = wanted.size_bytes
     advance = advance_of(progress, done=total - needed, total=total)
@@ -203,7 +192,8 @@ def _fetch_missing(
     stop = Event()
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
         futures = {
-            pool.submit(_fetch, index, each, dest, stop): each.member.size for each in missing
+            pool.submit(_fetch, index, member, place, stop): member.size
+            for place, member in missing.items()
         }
         try:
             for future in as_completed(futures):
@@ -214,15 +204,14 @@ def _fetch_missing(
             pool.shutdown(cancel_futures=True)
 
 
-def _is_whole(wanted: WantedFile, dest: Path) -> bool:
+def _is_whole(path: Path, member: Member) -> bool:
     """Return whether a file was fetched before; files get their name only once they are checked.
 
     Metadata files of another revision may have the same size, so their bytes are compared.
     """
-    path, member = dest / wanted.key / wanted.name, wanted.member
     if not path.is_file() or path.stat().st_size != member.size:
         return False
-    if member.crc32 is None or wanted.name not in SCENE_TEXTS:
+    if member.crc32 is None or path.name not in SCENE_TEXTS:
         return True
     return zlib.crc32(path.read_bytes()) == member.crc32
 
@@ -242,9 +231,7 @@ def _named_errors(place: Path) -> AbstractContextManager[None]:
     return explain_os_errors(f"{place}: cannot be written", "Choose another folder.")
 
 
-def _fetch(index: SceneIndex, wanted: WantedFile, dest: Path, stop: Event) -> None:
-    place = dest / wanted.key / wanted.name
-
+def _fetch(index: SceneIndex, member: Member, place: Path, stop: Event) -> None:
     def write(chunk: bytes) -> None:
         if stop.is_set():
             raise StorageError(f"{place}: is not fetched any further.")
@@ -252,10 +239,9 @@ def _fetch(index: SceneIndex, wanted: WantedFile, dest: Path, stop: Event) -> No
 
     with _named_errors(place):
         place.parent.mkdir(parents=True, exist_ok=True)
-        with open_atomic(place) as file, closing(_chunks(index, wanted.member)) as chunks:
+        with open_atomic(place) as file, closing(_chunks(index, member)) as chunks:
             crc32 = copy_with_crc32(chunks, write)
-            name = f"{wanted.key}/{wanted.name}"
-            require_crc32(crc32, expected=wanted.member.crc32, name=name)
+            require_crc32(crc32, expected=member.crc32, name=str(place))
 
 
 def _chunks(index: SceneIndex, member: Member) -> Generator[bytes, None, None]:

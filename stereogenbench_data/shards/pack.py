@@ -8,12 +8,13 @@ import base64
 import json
 import os
 import shutil
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
+from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of, no_advance
 from stereogenbench_data.errors import ShardError, explain_os_errors
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.scene_folder import derived_scene
@@ -31,7 +32,6 @@ from stereogenbench_data.shards.plan import DEFAULT_SHARD_BYTES, DepthCodec, Sha
 from stereogenbench_data.shards.training import Derivation, TrainingSettings
 from stereogenbench_data.shards.writer import (
     PARTS,
-    TEMPORARY_SUFFIX,
     ShardManifest,
     ShardTask,
     derive_task,
@@ -116,7 +116,8 @@ def pack(  # noqa: PLR0913 - each is an option of the command
         blosc2_module()
     plan = plan_shards(index, target_bytes, depth_codec=depth_codec, training=training, rows=rows)
     if not is_remote(plan.root):
-        sources = {member.source for shard in plan.shards for member in shard.members} - {""}
+        packed_scenes = (scene for shard in plan.shards for scene in shard.scenes)
+        sources = {file.path for scene in packed_scenes for file in scene.members.values()}
         require_own_files(plan.root, sorted(sources))
     out = Path(out)
     with explain_os_errors(
@@ -129,6 +130,7 @@ def pack(  # noqa: PLR0913 - each is an option of the command
             plan.root,
             str(out),
             plan.digest,
+            depth_codec,
             None if training is None else Derivation.of_index(index, training, shard.scenes),
         )
         for shard in plan.shards
@@ -139,26 +141,23 @@ def pack(  # noqa: PLR0913 - each is an option of the command
     left = sum(task.source_bytes for task in tasks)
     advance = advance_of(progress, done=total - left, total=total)
     advance(0)
-    is_counted = False
     if training is not None and len(tasks) < (workers or os.cpu_count() or 1):
         # Fewer shards than processes: these share the scenes, and the shards are packed after.
         scenes = [(task, scene) for task in tasks for scene in task.shard.scenes]
-        for _ in engine.map(
+        derived = engine.map(
             derive_task,
             scenes,
             name=lambda work: f"{work[0].target}: {work[1].id.key}",
             workers=workers,
             advance=advance,
-        ):
-            is_counted = True
-    outcomes = engine.map(
-        pack_task,
-        tasks,
-        name=lambda task: str(task.target),
-        workers=workers,
-        advance=(lambda count: advance(0)) if is_counted else advance,
+        )
+        deque(derived, maxlen=0)
+        advance = no_advance  # all was counted
+    packed = set(
+        engine.map(
+            pack_task, tasks, name=lambda task: str(task.target), workers=workers, advance=advance
+        )
     )
-    packed = {shard.name for shard, work in outcomes if work == "packed"}
     names = tuple(task.shard.name for task in part_tasks)
     return replace(
         _finish(plan_tasks, out), part=names, packed=tuple(name for name in names if name in packed)
@@ -231,13 +230,6 @@ def _claim_folder(plan: ShardPlan, out: Path) -> None:
         OSError: If it cannot be written to.
     """
     place = out / PARTS / _PLAN_FILE
-    expected: dict[str, Any] = {
-        "plan": plan.digest,
-        "target_bytes": plan.target_bytes,
-        "shards": len(plan.shards),
-    } | ({} if plan.depth_codec == "released" else {"depth": plan.depth_codec})
-    if plan.training is not None:
-        expected["training"] = plan.training.describe()
     if not is_remote(plan.root):
         root, there = Path(plan.root).resolve(), out.resolve()
         if there == root or any(there.is_relative_to(root / split) for split in ("train", "eval")):
@@ -246,9 +238,11 @@ def _claim_folder(plan: ShardPlan, out: Path) -> None:
                 f"folder outside its train/ and eval/."
             )
     is_claimed = place.exists()
-    found = read_json(place) if is_claimed else expected
-    if found != expected:
-        differing = [key for key in {**expected, **found} if found.get(key) != expected.get(key)]
+    found = read_json(place) if is_claimed else plan.settings
+    if found != plan.settings:
+        differing = [
+            name for name in plan.settings | found if found.get(name) != plan.settings.get(name)
+        ]
         raise ShardError(
             f"{place}: this folder is for another plan ({', '.join(differing)} differ): of another "
             f"release, size of the shards, depth codec or training settings. Pack into an empty "
@@ -256,10 +250,9 @@ def _claim_folder(plan: ShardPlan, out: Path) -> None:
         )
     known = {shard.name for shard in plan.shards} if is_claimed else set()
     for path in sorted(out.iterdir()) if out.exists() else []:
-        name = path.name.removesuffix(TEMPORARY_SUFFIX)
-        is_index = name == INDEX_NAME and not is_claimed
-        if is_index or (name.endswith(".tar") and name not in known):
+        is_index = path.name == INDEX_NAME and not is_claimed
+        if is_index or (path.suffix == ".tar" and path.name not in known):
             raise not_of_plan(path)
     if not is_claimed:
         place.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(place, json.dumps(expected).encode())
+        write_atomic(place, json.dumps(plan.settings).encode())

@@ -9,7 +9,7 @@ import json
 import re
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from stereogenbench_data.errors import ShardError
@@ -72,12 +72,11 @@ class PlannedMember:
 
 @dataclass(frozen=True, slots=True)
 class PlannedShard:
-    """A planned shard: its file's name and size in bytes, and its scenes and their files."""
+    """A planned shard: its file's name and size in bytes, and its scenes."""
 
     name: str
     size: int
     scenes: tuple[Scene, ...]
-    members: tuple[PlannedMember, ...]
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -91,20 +90,22 @@ class ShardPlan:
 
     Attributes:
         root: The release's folder.
-        target_bytes: The largest size of a shard, unless one scene alone exceeds it; packed depth
-            counts with its released size, derived files with an estimate.
-        digest: sha256 of the target size, of all names and sizes and of what the index says of the
-            scenes; of training shards, also of their settings and of the source's index. It does
-            not depend on the root.
-        training: What training shards hold; None for a release.
+        shards: The shards, in the order of their names.
+        settings: What the plan is, as the folder of the shards keeps it in ``plan.json``.
     """
 
     root: str
-    target_bytes: int
     shards: tuple[PlannedShard, ...]
-    digest: str
-    depth_codec: DepthCodec = "released"
-    training: TrainingSettings | None = None
+    settings: dict[str, Any]
+
+    @property
+    def digest(self) -> str:
+        """A sha256 of the target size, of all names and sizes and of what the index says.
+
+        Of training shards, also of their settings and of the source's index. It does not depend on
+        the root.
+        """
+        return str(self.settings["plan"])
 
 
 def plan_shards(
@@ -138,27 +139,24 @@ def plan_shards(
         key=lambda scene: (_group_of(scene), scene.id.key),
     )
     shards: list[PlannedShard] = []
+    planned: dict[str, list[PlannedMember]] = {}
     for scene in scenes:
-        members = tuple(_planned_members(scene, depth_codec=depth_codec, training=training))
+        members = planned_members(scene, depth_codec=depth_codec, training=training)
+        planned[scene.id.key] = members
         group, size, number = _group_of(scene), _tar_bytes(members), 0
         last = shards[-1] if shards else None
         if last is not None and last.name[: -len("-000000.tar")] == group:
             if last.size + size <= target_bytes:
-                shards[-1] = replace(
-                    last,
-                    size=last.size + size,
-                    scenes=(*last.scenes, scene),
-                    members=last.members + members,
-                )
+                shards[-1] = PlannedShard(last.name, last.size + size, (*last.scenes, scene))
                 continue
             number = int(last.name[-len("000000.tar") : -len(".tar")]) + 1
         name = f"{group}-{number:06d}.tar"
-        shards.append(PlannedShard(name, len(END_OF_ARCHIVE) + size, (scene,), members))
+        shards.append(PlannedShard(name, len(END_OF_ARCHIVE) + size, (scene,)))
     content = [
         [
             shard.name,
             shard.size,
-            [[member.name, member.size] for member in shard.members],
+            [[member.name, member.size] for key in shard.keys for member in planned[key]],
             [_facts_of(scene) for scene in shard.scenes],
         ]
         for shard in shards
@@ -166,9 +164,17 @@ def plan_shards(
     whole: list[Any] = [target_bytes, content]
     if training is not None:
         whole += [training.describe(), index.digest]
-    content_text = json.dumps(whole, separators=(",", ":"))
-    digest = hashlib.sha256(content_text.encode()).hexdigest()
-    return ShardPlan(index.root, target_bytes, tuple(shards), digest, depth_codec, training)
+    text = json.dumps(whole, separators=(",", ":"))
+    settings: dict[str, Any] = {
+        "plan": hashlib.sha256(text.encode()).hexdigest(),
+        "target_bytes": target_bytes,
+        "shards": len(shards),
+    }
+    if depth_codec != "released":
+        settings["depth"] = depth_codec
+    if training is not None:
+        settings["training"] = training.describe()
+    return ShardPlan(index.root, tuple(shards), settings)
 
 
 def _facts_of(scene: Scene) -> dict[str, Any]:
@@ -188,14 +194,22 @@ def packed_bytes(
     Raises:
         ShardError: If the scene cannot be packed.
     """
-    members = _planned_members(scene, depth_codec=depth_codec, training=training)
+    members = planned_members(scene, depth_codec=depth_codec, training=training)
     return len(END_OF_ARCHIVE) + _tar_bytes(members)
 
 
-def _planned_members(
-    scene: Scene, *, depth_codec: DepthCodec, training: TrainingSettings | None
+def planned_members(
+    scene: Scene, *, depth_codec: DepthCodec, training: TrainingSettings | None = None
 ) -> list[PlannedMember]:
-    return _members_of(scene, depth_codec) if training is None else _derived(scene, training)
+    """Return the files of a scene in a shard, in their order.
+
+    Raises:
+        ShardError: If the scene cannot be packed.
+    """
+    planned = _released(scene, depth_codec) if training is None else _derived(scene, training)
+    for member in planned:
+        member_header(member.name, member.size)  # refuses what a tar cannot hold
+    return planned
 
 
 def _tar_bytes(members: Iterable[PlannedMember]) -> int:
@@ -282,24 +296,17 @@ def _derived(scene: Scene, training: TrainingSettings) -> list[PlannedMember]:
         path = scene.members[source].path if source else ""
         size = expected_bytes(scene, name, training)
         planned.append(PlannedMember(f"{scene.id.key}.{name}", path, size))
-        member_header(planned[-1].name, size)  # refuses what a tar cannot hold
     return planned
 
 
-def _members_of(scene: Scene, depth_codec: DepthCodec) -> list[PlannedMember]:
-    unknown = sorted(set(scene.members) - set(MEMBER_ORDER))
+def _released(scene: Scene, depth_codec: DepthCodec) -> list[PlannedMember]:
     if not scene.members.keys().isdisjoint(PACKED_DEPTH_NAMES.values()):
         raise ShardError(
             f"{scene.id.key}: its depth is packed by blosc2, but shards are made from released "
             f"videos. Run `stereogenbench unpack` on its shards, and pass the folder that it made."
         )
-    if unknown:
-        raise ShardError(
-            f"{scene.id.key}: its index names {', '.join(unknown)}, which no scene has. "
-            f"Run `stereogenbench index` again."
-        )
     packed = {} if depth_codec == "released" else PACKED_DEPTH_NAMES
-    planned = [
+    return [
         PlannedMember(
             f"{scene.id.key}.{packed.get(name, name)}",
             scene.members[name].path,
@@ -309,6 +316,3 @@ def _members_of(scene: Scene, depth_codec: DepthCodec) -> list[PlannedMember]:
         for name in MEMBER_ORDER
         if name in scene.members
     ]
-    for member in planned:
-        member_header(member.name, member.size)  # refuses what a tar cannot hold
-    return planned

@@ -34,8 +34,9 @@ from stereogenbench_data.schema.release import CAMERA_COUNT, depth_name
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.shards.plan import SCENE_TEXTS
 from stereogenbench_data.shards.tar import read_chunks
-from stereogenbench_data.shards.writer import TEMPORARY_SUFFIX, open_shards
+from stereogenbench_data.shards.writer import open_shards
 from stereogenbench_data.sources.files import copy_with_crc32
+from stereogenbench_data.sources.ranged_file import FileSlice
 
 _FETCH_AGAIN: Final = "Fetch the shard again, or pack it again."
 _WRONG_INDEX: Final = "Put the index beside the shards that it was packed with."
@@ -200,9 +201,6 @@ def _folder_problems(index: SceneIndex, expected: dict[str, _ExpectedShard]) -> 
     for name in sorted(there - expected.keys()):
         if name.endswith(".tar"):
             yield Problem(name, "", "", "is not in the index", _WRONG_INDEX)
-        elif name.endswith(f".tar{TEMPORARY_SUFFIX}"):
-            cure = "Run `stereogenbench pack` again, or remove it."
-            yield Problem(name, "", "", "is an unfinished shard", cure)
 
 
 # One shard: every byte, what lies where, and its metadata.
@@ -317,17 +315,19 @@ def _check_scene(task: _SceneTask, after_bytes: Advance) -> list[Problem]:
 
 def _decode(task: _SceneTask, name: str) -> None:
     """Decode all frames of a video in a shard, and compare its header with the index."""
-    scene, member = task.scene, task.scene.members[name]
-    file = io.BytesIO(_content(task.root, member))
-    _require_indexed(scene, name, probe(file, name=name))
-    if name.endswith("_rgb.mp4"):
-        with VideoReader(file, name=name, frames=scene.frames) as pictures:
+    scene = task.scene
+    where = scene.members[name]
+    with FileSlice(Path(task.root, where.path), where) as file:
+        _require_indexed(scene, name, probe(file, name=name))
+        file.seek(0)
+        if name.endswith("_rgb.mp4"):
+            with VideoReader(file, name=name, frames=scene.frames) as pictures:
+                for index in range(scene.frames):
+                    pictures.colour_frame(index)
+            return
+        with open_video(file, name=name, frames=scene.frames) as depth:
             for index in range(scene.frames):
-                pictures.colour_frame(index)
-        return
-    with open_video(file, name=name, frames=scene.frames) as depth:
-        for index in range(scene.frames):
-            read_depth_units(depth, index, encoding=ANY_DEPTH)
+                read_depth_units(depth, index, encoding=ANY_DEPTH)
 
 
 def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
@@ -352,9 +352,3 @@ def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
         indexed = (*indexed, scene.depth_unit_m[camera], scene.depth_offset_m[camera])
     if found != indexed:
         raise MediaError(f"{name}: is stored as {found}, and the index says {indexed}.")
-
-
-def _content(root: str, member: Member) -> bytes:
-    with Path(root, member.path).open("rb") as shard:
-        shard.seek(member.offset)
-        return shard.read(member.size)

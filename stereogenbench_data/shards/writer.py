@@ -12,14 +12,12 @@ import json
 import os
 import shutil
 import stat
-import zlib
-from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from io import FileIO
-from itertools import groupby
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, ShardError, explain_os_errors
@@ -31,26 +29,25 @@ from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_
 from stereogenbench_data.schema.records import Member, Scene
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES, TRAINING_JSON, VIDEO_FILES
 from stereogenbench_data.schema.training import parse_training
-from stereogenbench_data.shards.plan import SCENE_TEXTS, PlannedMember, PlannedShard
-from stereogenbench_data.shards.tar import (
-    BLOCK_BYTES,
-    END_OF_ARCHIVE,
-    member_header,
-    read_chunks,
+from stereogenbench_data.shards.plan import (
+    SCENE_TEXTS,
+    DepthCodec,
+    PlannedMember,
+    PlannedShard,
+    planned_members,
 )
+from stereogenbench_data.shards.tar import END_OF_ARCHIVE, member_header, padded, read_chunks
 from stereogenbench_data.shards.training import (
     Derivation,
     derive_scene,
     derived_names,
     source_bytes,
 )
-from stereogenbench_data.sources.files import copy_with_crc32, try_locked, write_atomic
+from stereogenbench_data.sources.files import copy_with_crc32, open_atomic, try_locked, write_atomic
 from stereogenbench_data.sources.location import is_remote, shown
 from stereogenbench_data.sources.ranged_file import FileSlice
 
-TEMPORARY_SUFFIX: Final = ".tmp"
-
-SEEKABLE: Final = frozenset({*VIDEO_FILES, *PACKED_DEPTH_NAMES.values()})
+_SEEKABLE: Final = frozenset({*VIDEO_FILES, *PACKED_DEPTH_NAMES.values()})
 """The files of a scene of which single frames are read."""
 
 PARTS: Final = ".parts"
@@ -65,6 +62,7 @@ class ShardTask:
     root: str
     out: str
     plan_digest: str
+    depth_codec: DepthCodec = "released"
     derivation: Derivation | None = None
 
     @property
@@ -76,7 +74,7 @@ class ShardTask:
     def source_bytes(self) -> int:
         """The size of all files that it is made from."""
         if self.derivation is None:
-            return sum(member.size for member in self.shard.members)
+            return sum(file.size for each in self.shard.scenes for file in each.members.values())
         settings = self.derivation.settings
         return sum(source_bytes(each, derived_names(each, settings)) for each in self.shard.scenes)
 
@@ -84,11 +82,6 @@ class ShardTask:
     def target(self) -> Path:
         """The path of the shard."""
         return Path(self.out, self.shard.name)
-
-    @property
-    def temporary(self) -> Path:
-        """The path of the shard until it is finished."""
-        return self.target.with_name(self.target.name + TEMPORARY_SUFFIX)
 
     @property
     def manifest(self) -> Path:
@@ -176,29 +169,28 @@ def find_packed(task: ShardTask) -> ShardManifest | None:
     return manifest
 
 
-def pack_task(
-    task: ShardTask, after_bytes: Advance
-) -> tuple[ShardManifest, Literal["packed", "kept"]]:
+def pack_task(task: ShardTask, after_bytes: Advance) -> str:
     """Pack one shard into its folder, unless it is finished; a worker process calls this.
+
+    Returns:
+        The name of the shard; "" if it was there.
 
     Raises:
         ShardError: If a source is missing, unreadable, changes meanwhile or contradicts the index;
             the disk is full; another file has its name; or another process is packing it.
     """
-    done = find_packed(task)
-    if done is not None:
-        return done, "kept"
-    with _named_errors(task), _open_exclusive(task.temporary) as file:
-        done = find_packed(task)
-        if done is not None:
-            return done, "kept"
+    with _alone(task, task.manifest.with_name(f"{task.target.name}.lock"), f"{task.target}"):
+        if find_packed(task) is not None:
+            return ""
         if task.derivation is None:
-            return _pack(task, file, after_bytes), "packed"
-        derived = _with_derived_files(task, task.derivation, after_bytes)
-        # What is copied from now on was counted when it was derived.
-        packed = _pack(derived, file, lambda count: after_bytes(0))
-        shutil.rmtree(task.derived, ignore_errors=True)
-        return packed, "packed"
+            _pack(task, after_bytes)
+        else:
+            for scene in task.shard.scenes:
+                derive_task((task, scene), after_bytes)
+            # What is copied from now on was counted when it was derived.
+            _pack(task, lambda count: after_bytes(0))
+            shutil.rmtree(task.derived, ignore_errors=True)
+        return task.shard.name
 
 
 def derive_task(work: tuple[ShardTask, Scene], after_bytes: Advance) -> None:
@@ -208,80 +200,42 @@ def derive_task(work: tuple[ShardTask, Scene], after_bytes: Advance) -> None:
         ShardError: As `pack_task` says.
     """
     task, scene = work
-    with _named_errors(task):
-        _derive(task, scene, after_bytes)
-
-
-def _named_errors(task: ShardTask) -> AbstractContextManager[None]:
-    """Turn errors of the system about a shard into a ShardError that names it."""
-    what = f"{task.target}: cannot be written"
-    return explain_os_errors(what, "Pack into another folder.", kind=ShardError)
+    folder = task.derived / scene.id.key
+    with _alone(task, folder.with_name(f".{folder.name}.lock"), f"{folder}"):
+        if task.derivation is not None:
+            derive_scene(task.derivation, scene, folder, advance=after_bytes)
 
 
 @contextmanager
-def _open_exclusive(path: Path) -> Iterator[FileIO]:
-    """Open a new, empty shard for this process alone; it is removed unless it was renamed.
+def _alone(task: ShardTask, lock: Path, work: str) -> Iterator[None]:
+    """Do some work in one process at a time, with errors of the system that name the shard.
 
-    The lock is a file in ``.parts``, which stays. On a file system without locks nothing keeps two
-    processes from writing one file; one of them will find it altered or gone.
+    A file system without locks keeps nobody from doing it twice, with the same bytes.
 
     Raises:
-        ShardError: If another process has it.
+        ShardError: If another process does it.
     """
-    lock = path.parent / PARTS / f"{path.name}.lock"
-    lock.parent.mkdir(parents=True, exist_ok=True)
-    with try_locked(lock) as is_ours:
-        if not is_ours:
-            raise ShardError(
-                f"{path}: another process is packing this shard. Give each process a part of its "
-                f"own (--part I/N), or wait for that one."
-            )
-        try:
-            with FileIO(path, "w+") as file:
-                yield file
-        finally:
-            path.unlink(missing_ok=True)
+    what = f"{task.target}: cannot be written"
+    with explain_os_errors(what, "Pack into another folder.", kind=ShardError):
+        lock.parent.mkdir(parents=True, exist_ok=True)
+        with try_locked(lock) as is_ours:
+            if not is_ours:
+                raise ShardError(
+                    f"{work}: another process is packing it. Give each process a part of its own "
+                    f"(--part I/N), or wait for that one."
+                )
+            yield
 
 
-def _derive(task: ShardTask, scene: Scene, after_bytes: Advance) -> None:
-    """Derive the files of a scene, in this process alone."""
+def _members(task: ShardTask, scene: Scene) -> list[PlannedMember]:
+    """Return the files of a scene that are packed: released ones, or those derived of them."""
     if task.derivation is None:
-        return
-    folder = task.derived / scene.id.key
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with try_locked(folder.with_name(f".{folder.name}.lock")) as is_ours:
-        if not is_ours:
-            raise ShardError(
-                f"{folder}: another process is deriving this scene. Give each process a part of "
-                f"its own (--part I/N), or wait for that one."
-            )
-        derive_scene(task.derivation, scene, folder, advance=after_bytes)
-
-
-def _with_derived_files(task: ShardTask, derivation: Derivation, after_bytes: Advance) -> ShardTask:
-    """Derive the files of a shard's scenes; return the task that packs them as they are."""
-    members = []
-    for scene in task.shard.scenes:
-        key = scene.id.key
-        _derive(task, scene, after_bytes)
-        members += [
-            PlannedMember(
-                f"{key}.{name}", f"{key}/{name}", (task.derived / key / name).stat().st_size
-            )
-            for name in derived_names(scene, derivation.settings)
-        ]
-    shard = replace(task.shard, members=tuple(members))
-    return replace(task, shard=shard, root=str(task.derived))
-
-
-def _pack(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardManifest:
-    manifest = _write_shard(task, file, after_bytes)
-    tables = _seek_tables(task, manifest)
-    encoded = {key: base64.b64encode(packed).decode() for key, packed in tables.items()}
-    manifest = replace(manifest, seek_tables=encoded)
-    write_atomic(task.manifest, json.dumps(asdict(manifest)).encode())
-    task.temporary.replace(task.target)
-    return manifest
+        return planned_members(scene, depth_codec=task.depth_codec)
+    key, folder = scene.id.key, task.derived.absolute() / scene.id.key
+    return [
+        PlannedMember(f"{key}.{name}", f"{folder / name}", (folder / name).stat().st_size)
+        for name in derived_names(scene, task.derivation.settings)
+    ]
 
 
 def not_of_plan(path: Path) -> ShardError:
@@ -292,77 +246,55 @@ def not_of_plan(path: Path) -> ShardError:
     )
 
 
-class _Output:
-    """A shard while it is written, with what its manifest lists of each member."""
+def _pack(task: ShardTask, after_bytes: Advance) -> None:
+    """Write a shard and its manifest, from files that are as the plan says."""
+    sha256, size = hashlib.sha256(), 0
+    places: dict[str, tuple[int, int, int]] = {}
+    with open_atomic(task.target) as file:
 
-    def __init__(self, file: FileIO) -> None:
-        self._file = file
-        self.sha256 = hashlib.sha256()
-        self.size = 0
-        self.members: list[tuple[int, int, int]] = []
+        def write(content: bytes) -> None:
+            nonlocal size
+            file.write(content)
+            sha256.update(content)
+            size += len(content)
 
-    def write(self, content: bytes) -> None:
-        self.sha256.update(content)
-        self.size += len(content)
-        left = memoryview(content)
-        while left:
-            left = left[self._file.write(left) :]
-
-    def end_member(self, size: int, crc32: int) -> None:
-        """Pad the member whose last byte was just written, and note its place."""
-        self.members.append((self.size - size, size, crc32))
-        self.write(bytes(-self.size % BLOCK_BYTES))
-
-    def write_member(self, name: str, content: bytes) -> None:
-        self.write(member_header(name, len(content)))
-        self.write(content)
-        self.end_member(len(content), zlib.crc32(content))
-
-
-def _write_shard(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardManifest:
-    output = _Output(file)
-    scenes = {scene.id.key: scene for scene in task.shard.scenes}
-    for key, members in groupby(task.shard.members, key=lambda each: each.name.partition(".")[0]):
-        _write_scene(task, members, output, scene=scenes.get(key), after_bytes=after_bytes)
-    output.write(END_OF_ARCHIVE)
-    os.fsync(file.fileno())
-    offsets, sizes, crc32s = zip(*output.members, strict=True)
-    return ShardManifest(
-        name=task.shard.name,
-        size=output.size,
-        sha256=output.sha256.hexdigest(),
-        members=tuple(member.name for member in task.shard.members),
-        offsets=offsets,
-        sizes=sizes,
-        crc32s=crc32s,
-        plan=task.plan_digest,
-    )
+        for scene in task.shard.scenes:
+            texts: dict[str, bytes] = {}
+            for member in _members(task, scene):
+                name, length = member.name.partition(".")[2], member.size
+                source = Path(task.root, member.source)
+                chunks = _source_chunks(source, length, after_bytes)
+                if name in SCENE_TEXTS:
+                    texts[name] = b"".join(chunks)
+                    chunks = iter([texts[name]])
+                elif member.form != "released":
+                    packed = _packed_depth(source, chunks, frames=scene.frames)
+                    length, chunks = len(packed), iter([packed])
+                write(member_header(member.name, length))
+                crc32 = copy_with_crc32(chunks, write)
+                places[member.name] = (size - length, length, crc32)
+                write(bytes(padded(length) - length))
+            _require_indexed(task, scene, texts)
+        write(END_OF_ARCHIVE)
+        file.flush()
+        tables = _seek_tables(Path(file.name), places, task.shard.keys)
+        offsets, sizes, crc32s = zip(*places.values(), strict=True)
+        manifest = ShardManifest(
+            name=task.shard.name,
+            size=size,
+            sha256=sha256.hexdigest(),
+            members=tuple(places),
+            offsets=offsets,
+            sizes=sizes,
+            crc32s=crc32s,
+            plan=task.plan_digest,
+            seek_tables=tables,
+        )
+        write_atomic(task.manifest, json.dumps(asdict(manifest)).encode())
 
 
-def _write_scene(
-    task: ShardTask,
-    members: Iterable[PlannedMember],
-    output: _Output,
-    *,
-    scene: Scene | None,
-    after_bytes: Advance,
-) -> None:
-    """Write a scene's files, whose metadata must be what the index was made from."""
-    texts: dict[str, bytes] = {}
-    for member in members:
-        name = member.name.partition(".")[2]
-        chunks = _source_chunks(Path(task.root, member.source), member.size, after_bytes)
-        if name in SCENE_TEXTS:
-            texts[name] = b"".join(chunks)
-            output.write_member(member.name, texts[name])
-        elif member.form == "released" or scene is None:
-            output.write(member_header(member.name, member.size))
-            output.end_member(member.size, copy_with_crc32(chunks, output.write))
-        else:
-            content = _packed_depth(task, member, frames=scene.frames, after_bytes=after_bytes)
-            output.write_member(member.name, content)
-    if scene is None or not texts:
-        return
+def _require_indexed(task: ShardTask, scene: Scene, texts: Mapping[str, bytes]) -> None:
+    """Refuse metadata that are not what the index was made from."""
     if task.derivation is not None:
         where = f"{scene.id.key}/{TRAINING_JSON}"
         document = parse_training(texts[TRAINING_JSON], where=where)
@@ -374,21 +306,22 @@ def _write_scene(
         )
 
 
-def _seek_tables(task: ShardTask, manifest: ShardManifest) -> dict[str, bytes]:
-    """Return each scene's `Scene.seek_tables`, from the shard before it has its final name.
+def _seek_tables(
+    shard: Path, places: Mapping[str, tuple[int, int, int]], keys: Sequence[str]
+) -> dict[str, str]:
+    """Return each scene's `Scene.seek_tables` as base64, from a shard that is written.
 
     A video that cannot be read has none; whoever reads it is told why.
     """
-    tables: dict[str, dict[str, SeekTable]] = {key: {} for key in task.shard.keys}
-    for member, place in manifest.places.items():
+    tables: dict[str, dict[str, SeekTable]] = {key: {} for key in keys}
+    for member, place in places.items():
         key, _, name = member.partition(".")
-        if key not in tables or name not in SEEKABLE:
-            continue
-        with suppress(MediaError), FileSlice(task.temporary, place) as video:
-            table = read_seek_table(video, name=name)
-            if table is not None:
-                tables[key][name] = table
-    return {key: packed_tables(found) for key, found in tables.items()}
+        if name in _SEEKABLE:
+            with suppress(MediaError), FileSlice(shard, Member("", *place)) as video:
+                table = read_seek_table(video, name=name)
+                if table is not None:
+                    tables[key][name] = table
+    return {key: base64.b64encode(packed_tables(found)).decode() for key, found in tables.items()}
 
 
 def _source_chunks(source: Path, size: int, after_bytes: Advance) -> Iterator[bytes]:
@@ -419,19 +352,13 @@ def _source_chunks(source: Path, size: int, after_bytes: Advance) -> Iterator[by
                 )
 
 
-def _packed_depth(
-    task: ShardTask, member: PlannedMember, *, frames: int, after_bytes: Advance
-) -> bytes:
+def _packed_depth(source: Path, chunks: Iterable[bytes], *, frames: int) -> bytes:
     """Return a released depth video as blosc2's frames.
 
     Raises:
         ShardError: If it cannot be read, or not be packed bit for bit.
     """
-    source = Path(task.root, member.source)
-    video = io.BytesIO(b"".join(_source_chunks(source, member.size, lambda count: after_bytes(0))))
     try:
-        content = packed_depth(video, name=str(source), frames=frames)
+        return packed_depth(io.BytesIO(b"".join(chunks)), name=str(source), frames=frames)
     except MediaError as error:
         raise ShardError(str(error)) from error
-    after_bytes(member.size)
-    return content

@@ -73,7 +73,7 @@ def test_a_stopped_run_goes_on_where_it_was(shards_on_the_web, web, tmp_path):
 def test_a_damaged_file_is_refused_and_leaves_nothing_behind(shards_on_the_web, web, tmp_path):
     index = SceneIndex.open(shards_on_the_web)
     wanted = plan_download(index, [0], cameras=[0], streams=["rgb"])
-    shard = f"shards/{wanted.files[-1].member.path}"
+    shard = f"shards/{[*wanted.files.values()][-1].path}"
     web.always[shard] = Answer(change=lambda data: bytes([data[0] ^ 1]) + data[1:])
 
     with pytest.raises(StorageError, match=r"baseline\.json: has crc32 [0-9a-f]{8}, and .* fetch"):

@@ -7,7 +7,7 @@ import pytest
 from stereogenbench_data.errors import ShardError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Member
-from stereogenbench_data.shards.plan import MEMBER_ORDER, parse_bytes, plan_shards
+from stereogenbench_data.shards.plan import MEMBER_ORDER, parse_bytes, plan_shards, planned_members
 
 
 @pytest.fixture(scope="module")
@@ -77,9 +77,9 @@ def test_splits_subsets_and_families_have_shards_of_their_own(index_of):
 
 
 def test_files_come_metadata_first_then_camera_by_camera(small_release):
-    shard = plan_shards(SceneIndex.open(small_release), 1).shards[0]
+    members = planned_members(SceneIndex.open(small_release).scene(0), depth_codec="released")
 
-    names = [member.name.partition(".")[2] for member in shard.members]
+    names = [member.name.partition(".")[2] for member in members]
 
     assert names == [name for name in MEMBER_ORDER if name in names]
     assert names[:3] == ["baseline.json", "trajectory.json", "_scene_complete.json"]
@@ -110,7 +110,7 @@ def test_another_release_or_target_is_another_plan(index_of, sizes, target):
 
 
 def test_a_file_of_8_gib_is_refused(index_of):
-    with pytest.raises(ShardError, match="has 8589934592 bytes, and ustar holds"):
+    with pytest.raises(ShardError, match="has 8589934592 bytes, and ustar cannot"):
         plan_shards(index_of({key(0): 8 * 2**30}))
 
 

@@ -7,11 +7,7 @@ import tarfile
 import pytest
 
 from stereogenbench_data.errors import ShardError
-from stereogenbench_data.shards.tar import (
-    LARGEST_MEMBER_BYTES,
-    member_header,
-    read_chunks,
-)
+from stereogenbench_data.shards.tar import member_header, read_chunks
 from tests.servers.tools import require_tool
 from tests.shards.shard_files import tar_of
 
@@ -22,7 +18,7 @@ TWO = [("a/one.json", b"{}" * 300), ("a/one.cam_00_rgb.mp4", bytes(range(256)) *
 
 
 @pytest.mark.parametrize("name", ["a.json", "train/Uniform/Town/scene_000041.cam_00_rgb.mp4", LONG])
-@pytest.mark.parametrize("size", [1, LARGEST_MEMBER_BYTES])
+@pytest.mark.parametrize("size", [1, 8**11 - 1])
 def test_a_header_is_the_one_that_tarfile_writes(name, size):
     """But for the two device numbers, in which its versions differ, and so the checksum."""
     info = tarfile.TarInfo(name)
@@ -50,25 +46,18 @@ def test_a_tar_is_the_one_that_gnu_tar_writes(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "match"),
+    ("name", "size"),
     [
-        ("/etc/passwd", "not a relative path"),
-        ("../x.json", "not a relative path"),
-        ("a/ä.json", "not a relative path in ASCII"),
-        ("", "not a relative path"),
-        (f"a/{'x' * 101}", "has 103 characters, and ustar holds 100"),
-        (f"{'f' * 80}/{'g' * 120}/x", "Shorten its folders' names"),
+        ("a/ä.json", 1),
+        (f"a/{'x' * 101}", 1),
+        (f"{'f' * 80}/{'g' * 120}/x", 1),
+        ("a.mp4", -1),
+        ("a.mp4", 8**11),
     ],
 )
-def test_a_name_that_no_shard_may_hold_is_not_written(name, match):
-    with pytest.raises(ShardError, match=match):
-        member_header(name, 1)
-
-
-@pytest.mark.parametrize("size", [-1, 8 * 2**30])
-def test_a_size_that_ustar_cannot_hold_is_not_written(size):
-    with pytest.raises(ShardError, match=f"has {size} bytes, and ustar holds 0 to 8589934591"):
-        member_header("a.mp4", size)
+def test_what_ustar_cannot_hold_is_not_written(name, size):
+    with pytest.raises(ShardError, match=f"member '{name}': has {size} bytes, and ustar cannot"):
+        member_header(name, size)
 
 
 def test_a_file_that_shrinks_while_it_is_read_is_an_error():
