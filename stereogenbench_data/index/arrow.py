@@ -70,20 +70,15 @@ def one_array(values: Any) -> Any:
         return values.chunk(0)  # Arrow would copy it
     if values.num_chunks == 0:
         return pa.nulls(0, values.type)  # Arrow would import pandas
-    values = values.combine_chunks()
-    return values.chunk(0) if isinstance(values, pa.ChunkedArray) else values
+    return pa.concat_arrays(values.chunks)
 
 
 def _stored_numbers(values: Any) -> np.ndarray:
     """Return the numbers of a column as a read-only view, with any value where one is null."""
-    kind = values.type
-    floats, unsigned = pa.types.is_floating(kind), pa.types.is_unsigned_integer(kind)
-    letter = "f" if floats else "u" if unsigned else "i"
-    dtype = np.dtype(f"{letter}{kind.bit_width // 8}")
-    if len(values) == 0:
-        return np.empty(0, dtype=dtype)
-    start = values.offset * dtype.itemsize
-    return np.frombuffer(values.buffers()[1], dtype=dtype, count=len(values), offset=start)
+    known = [None, values.buffers()[1]]
+    return np.from_dlpack(
+        pa.Array.from_buffers(values.type, len(values), known, offset=values.offset)
+    )
 
 
 def _stored_strings(values: Any) -> tuple[np.ndarray, bytes | pa.Buffer]:
@@ -92,13 +87,7 @@ def _stored_strings(values: Any) -> tuple[np.ndarray, bytes | pa.Buffer]:
         return np.empty(0, dtype=np.int32), b""
     _, offsets, content = values.buffers()
     ends = np.frombuffer(offsets, dtype=np.int32, count=len(values) + 1, offset=4 * values.offset)
-    lengths = np.diff(ends)
-    if values.null_count and lengths[~as_numpy(values.is_valid())].any():
-        encoded = [(text or "").encode() for text in values.to_pylist()]
-        return np.array([len(text) for text in encoded], dtype=np.int32), b"".join(encoded)
-    if content is None:
-        return lengths, b""
-    return lengths, content.slice(int(ends[0]), int(ends[-1] - ends[0]))
+    return np.diff(ends), content.slice(int(ends[0]), int(ends[-1] - ends[0])) if content else b""
 
 
 def table_digest(table: pa.Table) -> str:

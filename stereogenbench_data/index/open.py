@@ -17,7 +17,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -30,6 +30,14 @@ from stereogenbench_data.errors import (
 )
 from stereogenbench_data.index import compute as pc
 from stereogenbench_data.index.arrow import one_array, table_digest
+from stereogenbench_data.index.open_tree import (
+    AssumptionWarning,
+    IncompleteSceneWarning,
+    Opened,
+    Rows,
+    listed,
+    open_tree,
+)
 from stereogenbench_data.index.parquet import (
     INDEX_NAME,
     IndexHead,
@@ -58,24 +66,9 @@ from stereogenbench_data.sources.location import (
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import MissingObject, RetryPolicy
 
-if TYPE_CHECKING:
-    pass
-
-from stereogenbench_data.index.open_tree import (
-    AssumptionWarning,
-    IncompleteSceneWarning,
-    Opened,
-    Rows,
-    listed,
-    open_tree,
-)
-
 MAX_INDEX_BYTES: Final = 256 * 2**20
 
 """The largest index that is fetched. One of 8,493 scenes has a few megabytes."""
-
-
-_LONGEST_ROOT: Final = 300
 
 
 def open_table(
@@ -214,24 +207,18 @@ def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:
         place = local_path(recorded) if is_url else Path(recorded)
         folder = None if is_remote(recorded) else (beside / place).resolve()
     if folder is None or not folder.is_relative_to(beside.resolve()):
-        raise _must_be_named(path, recorded)
+        raise StorageError(
+            f"{path}: its data are not beside it, and it records their root as "
+            f"{shortened(repr(shown(recorded)), 300)}. An index opens data beside itself; any "
+            f"other root is your own word: SceneIndex.open({str(path)!r}, root=...), or --root "
+            f"with a command. Or move the index into that root."
+        )
     if not folder.is_dir():
         raise StorageError(
             f"{path}: its data were at {folder}, which is not a folder now. Move the index into "
             f"the data's root, or run `stereogenbench index` again."
         )
     return str(folder)
-
-
-def _must_be_named(path: Path, recorded: str) -> StorageError:
-    place = shown(recorded)
-    if not place.isprintable() or len(place) > _LONGEST_ROOT:
-        place = repr(shortened(place, _LONGEST_ROOT))
-    return StorageError(
-        f"{path}: its data are not beside it, and it records their root as {place}. An index opens "
-        f"data beside itself; any other root is your own word: SceneIndex.open({str(path)!r}, "
-        f"root=...), or --root with a command. Or move the index into that root."
-    )
 
 
 _OF_DEPTH: Final = ("key", "depth_unit_m", "depth_offset_m", "depth_unit_source")
@@ -312,51 +299,47 @@ def stale_message(table: pa.Table, head: IndexHead, *, index_file: Path) -> str:
         head: What is known besides them; its root is a folder of this machine.
         index_file: Where the index is.
     """
-    from stereogenbench_data.index.tree import PlacedFolders  # slow to import
+    from stereogenbench_data.index.tree import placed_folders  # slow to import
 
     root, shards = Path(head.root), set(head.shards)
-    if shards:  # folders of scenes may have other names than the scenes' keys
-        keys = set(table.column("key").to_pylist())
-    else:
-        members = one_array(table.column("members"))
-        first = pc.struct_field(members.values, "path").take(members.offsets[:-1])
-        keys = {path.rpartition("/")[0] for path in first.to_pylist()}
-    listed = PlacedFolders(root)
-    new, tars, gone_scenes = set[str](), set[str](), set[str]()
-    if not head.is_part:
-        new = listed.keys - keys - (head.broken.keys() - head.incomplete.keys())
-    for folder in {path.rpartition("/")[0] for path in shards} | {""} if shards else ():
-        names = (path.name for path in (root / folder).glob("*.tar"))
-        tars |= {f"{folder}/{name}".lstrip("/") for name in names if name[0] != "."}
-    gone_shards = {path for path in shards - tars if not (root / path).exists()}
-    if not shards:
-        gone_scenes = {key for key in keys - listed.keys if not listed.may_hold(key)}
-    found = [
-        f"{counted(len(names), what)} {why} "
-        f"({', '.join(names[:_NAMED])}{', ...' if len(names) > _NAMED else ''})"
-        for names, what, why in (
-            ([key for key in sorted(new) if _is_finished(root, key)], "scene", "not in the index"),
-            (sorted(tars - shards), "shard", "not in the index"),
-            (sorted(gone_shards if gone_shards != shards else ()), "shard", _GONE),
-            (sorted(gone_scenes if gone_scenes != keys else ()), "scene", _GONE),
-        )
-        if names
-    ]
-    if not found:
-        return ""
-    place = "" if index_file.parent == root else f" --out {index_file}"
-    cure = f"Run `stereogenbench index {root}{place}`."
     if shards:
+        what, known = "shard", shards
+        new = {path.name for path in root.glob("*.tar") if path.name[0] != "."} - shards
+        gone = {path for path in shards if not (root / path).exists()}
         cure = (
             "Fetch the index that belongs to these shards, move away what is not of it, or pack "
             "all scenes into an empty folder."
         )
-    elif head.is_part:
-        cure = "It is of a part of the folder: make it again."
-    return f"{index_file}: is older than the folder {root}: {'; '.join(found)}. {cure}"
+    else:
+        from stereogenbench_data.index.tree import placed_folders  # slow to import
 
-
-_GONE: Final = "of the index, and not there"
+        members = one_array(table.column("members"))
+        first = pc.struct_field(members.values, "path").take(members.offsets[:-1])
+        # Folders of scenes may have other names than the scenes' keys.
+        known = {path.rpartition("/")[0] for path in first.to_pylist()}
+        what, placed = "scene", placed_folders(root)
+        left_out = head.broken.keys() - head.incomplete.keys()
+        added = set() if head.is_part else placed - known - left_out
+        new = {key for key in added if _is_finished(root, key)}
+        gone = known - placed
+        place = "" if index_file.parent == root else f" --out {index_file}"
+        cure = f"Run `stereogenbench index {root}{place}`."
+        if head.is_part:
+            cure = "It is of a part of the folder: make it again."
+    found = [
+        f"{counted(len(names), what)} {why} "
+        f"({', '.join(sorted(names)[:_NAMED])}{', ...' if len(names) > _NAMED else ''})"
+        for names, why in (
+            (new, "not in the index"),
+            (set() if gone == known else gone, "of the index, and not there"),
+        )
+        if names
+    ]
+    return (
+        f"{index_file}: is older than the folder {root}: {'; '.join(found)}. {cure}"
+        if found
+        else ""
+    )
 
 
 def _is_finished(root: Path, key: str) -> bool:

@@ -180,19 +180,17 @@ def _read_bounded(
                 need += column.total_uncompressed_size + 8 * column.num_values
                 if column.physical_type == "BYTE_ARRAY":
                     texts[column.path_in_schema] = None
-        if need > most:
-            break
     plain = pa.schema([schema.field(name) for name in names])
     groups = [pa.Table.from_batches([], schema=plain)]  # `empty_table` would import pandas
-    if need <= most:
-        with pq.ParquetFile(
-            file, metadata=footer, read_dictionary=[*texts], pre_buffer=True
-        ) as parquet:
-            for number in range(footer.num_row_groups):
-                group = parquet.read_row_group(number, columns=names).replace_schema_metadata()
-                need += sum(_text_bytes(chunk) for each in group.columns for chunk in each.chunks)
-                if need > most:
-                    break
+    with pq.ParquetFile(
+        file, metadata=footer, read_dictionary=[*texts], pre_buffer=True
+    ) as parquet:
+        for number in range(footer.num_row_groups):
+            if need > most:
+                break
+            group = parquet.read_row_group(number, columns=names).replace_schema_metadata()
+            need += sum(_text_bytes(chunk) for each in group.columns for chunk in each.chunks)
+            if need <= most:
                 groups.append(group.cast(plain))
     if need <= most:
         return pa.concat_tables(groups)
@@ -420,16 +418,12 @@ def _require_whole(table: pa.Table, *, where: str) -> None:
     ):
         if len({tuple(pc.is_null(table.column(name)).to_pylist()) for name in names}) > 1:
             raise _altered(where, what)
-    lists = one_array(table.column("key_frames"))
-    flat = as_numpy(lists.flatten()).astype(np.int64)
-    scenes = as_numpy(pc.list_parent_indices(lists))
-    frames = as_numpy(table.column("frames"))
-    is_first = np.diff(scenes, prepend=-1) != 0
-    fits = np.where(is_first, flat == 0, flat > np.roll(flat, 1)) & (flat < frames[scenes])
-    is_empty = (as_numpy(pc.list_value_length(lists)) == 0).any()
-    if not fits.all() or is_empty:
-        odd = [] if is_empty else flat[~fits][:1].tolist()
-        raise _odd(where, "key_frames", odd, "not frames of the scene, ascending from 0")
+    columns = (table.column(name).to_pylist() for name in ("frames", "key_frames"))
+    for frames, keys in zip(*columns, strict=True):
+        if keys is not None and (
+            [*keys[:1]] != [0] or keys != sorted({*keys}) or keys[-1] >= frames
+        ):
+            raise _odd(where, "key_frames", keys, "not frames of the scene, ascending from 0")
 
 
 def _odd(where: str, name: str, found: Any, why: str) -> StorageError:

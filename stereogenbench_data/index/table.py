@@ -293,20 +293,10 @@ class SceneIndex:
         Returns:
             The lists, and (n,) int64, for each row the place of its list among them.
         """
-        column = one_array(self._table.column("key_frames"))
-        which = np.zeros(len(self), dtype=np.int64)
-        kinds: list[tuple[int, ...]] = [(0,)]
-        if column.null_count < len(self):
-            lengths = np.nan_to_num(as_numpy(pc.list_value_length(column))).astype(np.int64)
-            flat = as_numpy(column.flatten())
-            starts = np.cumsum(lengths) - lengths
-            for length in np.unique(lengths[lengths > 0]).tolist():
-                rows = np.flatnonzero(lengths == length)
-                lists = flat[starts[rows][:, None] + np.arange(length)]
-                found, of_row = np.unique(lists, axis=0, return_inverse=True)
-                which[rows] = len(kinds) + of_row.reshape(-1)
-                kinds += [tuple(each) for each in found.tolist()]
-        return kinds, which
+        lists = [tuple(each or (0,)) for each in self._table.column("key_frames").to_pylist()]
+        kinds = [(0,), *sorted({*lists} - {(0,)}, key=lambda each: (len(each), each))]
+        places = {each: place for place, each in enumerate(kinds)}
+        return kinds, np.array([places[each] for each in lists], dtype=np.int64)
 
     def remarked(self, about: str) -> np.ndarray:
         """Return the rows of scenes with a remark about something, ascending (`REMARKS`)."""

@@ -4,7 +4,7 @@
     ROOT/eval/<subset>/<family>/<map>/<scene>/
 
 `find_scene_folders` searches a folder of this machine and says where misplaced scenes belong;
-`find_remote_scenes` and `PlacedFolders` list only folders where scenes belong. The Hub lists a
+`find_remote_scenes` and `placed_folders` list only folders where scenes belong. The Hub lists a
 thousand files a request, so `RemoteTree` lists a whole release in some hundred. A `SceneFolder`
 reads the files of one scene; behind a URL several at a time, and of large videos both ends alone.
 
@@ -92,19 +92,18 @@ class TreeCache:
 
     def __init__(self, root: str | Path, read_as: str = "") -> None:
         """Name the tree, and the conventions it is read by; nothing is read or written yet."""
-        base = cache_folder()
         # What another version understood of the same files may differ.
         made_by = ""
         with suppress(PackageNotFoundError):  # of a checkout that is not installed
             made_by = version("stereogenbench-data")
         place = str(root) if is_remote(root) else os.path.realpath(root)
         what = [_FORMAT, made_by, SCHEMA.names, place, read_as]
-        self._folder = None if base is None else base / "trees" / _digest(json.dumps(what))
+        # Below a device nothing can be read or kept.
+        base = cache_folder() or Path(os.devnull)
+        self._folder = base / "trees" / _digest(json.dumps(what))
 
     def table(self, name: str) -> tuple[pa.Table, IndexHead, pa.BinaryArray | None] | None:
         """Return the rows that were kept under a name, and what an index knows besides."""
-        if self._folder is None:
-            return None
         path = self._folder / f"{name}.parquet"
         try:
             table, head = read_index_file(path, where=str(path))
@@ -118,8 +117,6 @@ class TreeCache:
         self, name: str, table: pa.Table, head: IndexHead, seek_tables: pa.BinaryArray | None
     ) -> None:
         """Keep rows under a name, in place of those that were used longest ago."""
-        if self._folder is None:
-            return
         with suppress(StorageError, OSError):
             write_index_file(self._folder / f"{name}.parquet", table, head, seek_tables=seek_tables)
             tables = sorted(self._folder.glob("*.parquet"), key=lambda path: path.stat().st_mtime)
@@ -128,22 +125,20 @@ class TreeCache:
 
     def read(self, kind: str, name: str) -> bytes | None:
         """Return what was kept under a kind and a name; None if there is none, or it is damaged."""
-        if self._folder is not None:
-            with suppress(OSError, zlib.error):
-                return zlib.decompress(self._place(kind, name).read_bytes())
+        with suppress(OSError, zlib.error):
+            return zlib.decompress(self._place(kind, name).read_bytes())
         return None
 
     def keep(self, kind: str, name: str, content: bytes) -> None:
         """Keep bytes under a kind and a name, which changes with what they were made of."""
-        if self._folder is not None:
-            place = self._place(kind, name)
-            with suppress(OSError):
-                place.parent.mkdir(parents=True, exist_ok=True)
-                write_atomic(place, zlib.compress(content, 1))
+        place = self._place(kind, name)
+        with suppress(OSError):
+            place.parent.mkdir(parents=True, exist_ok=True)
+            write_atomic(place, zlib.compress(content, 1))
 
     def _place(self, kind: str, name: str) -> Path:
         digest = _digest(name)
-        return Path(self._folder or "", kind, digest[:2], digest)
+        return self._folder / kind / digest[:2] / digest
 
 
 def _digest(text: str) -> str:
@@ -498,32 +493,18 @@ def _keys_below(splits: Iterable[str], folders: Callable[[str], list[str]]) -> l
     return keys
 
 
-class PlacedFolders:
-    """The folders of this machine where scenes belong, finished or not.
+def placed_folders(root: Path) -> set[str]:
+    """Return the paths where scenes belong below a folder of this machine, finished or not.
 
-    Attributes:
-        keys: Their paths below the root.
+    Folders that may not be listed are ignored.
     """
 
-    def __init__(self, root: Path) -> None:
-        """List them; folders that may not be listed are ignored."""
-        self._root = root
-        self._unlisted: list[str] = []
-        self.keys = set(_keys_below(_SCENE_DEPTH, self._folders))
+    def folders(path: str) -> list[str]:
+        with suppress(OSError), os.scandir(root / path) as entries:
+            return [each.name for each in entries if each.name[0] != "." and each.is_dir()]
+        return []
 
-    def may_hold(self, key: str) -> bool:
-        """Return whether a scene is below a folder that could not be listed."""
-        return any(key.startswith(f"{folder}/") for folder in self._unlisted)
-
-    def _folders(self, path: str) -> list[str]:
-        try:
-            with os.scandir(self._root / path) as entries:
-                return [each.name for each in entries if each.name[0] != "." and each.is_dir()]
-        except (FileNotFoundError, NotADirectoryError):
-            return []
-        except OSError:
-            self._unlisted.append(path)
-            return []
+    return set(_keys_below(_SCENE_DEPTH, folders))
 
 
 class RemoteTree:

@@ -1,9 +1,9 @@
 """The index: the same rows in memory, on disk and in another process."""
 
-import base64
 import contextlib
 import dataclasses
 import json
+import os
 import pickle
 import random
 
@@ -21,7 +21,6 @@ from stereogenbench_data.index.arrow import table_digest
 from stereogenbench_data.index.open_tree import AssumptionWarning, IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Member, Rig, Scene, SceneId, SceneLabels
-from stereogenbench_data.sources.members import MemberSource
 
 METADATA = b"stereogenbench_data.index"
 
@@ -230,11 +229,10 @@ def test_a_foreign_parquet_file_is_refused(tmp_path):
         SceneIndex.open(tmp_path / "other.parquet")
 
 
-@pytest.mark.parametrize("keep", [0, 200, 0.99])
+@pytest.mark.parametrize("keep", [0, 0.99])
 def test_a_truncated_index_is_refused(scenes, tmp_path, keep):
     path = written(scenes, tmp_path)
-    content = path.read_bytes()
-    path.write_bytes(content[: keep if isinstance(keep, int) else int(keep * len(content))])
+    os.truncate(path, int(keep * path.stat().st_size))
 
     with pytest.raises(StorageError, match=r"not a readable Parquet file .* cut short"):
         SceneIndex.open(path)
@@ -272,14 +270,6 @@ def test_an_index_behind_a_url_that_is_far_too_large_is_not_fetched(web, monkeyp
     assert web.sent == 1
 
 
-def test_an_index_kept_elsewhere_names_the_url_that_it_was_made_of(scenes, tmp_path, web):
-    SceneIndex.from_scenes(scenes, "s3://bucket/data").write(tmp_path / "kept.parquet")
-
-    with pytest.raises(StorageError, match=r"kept.parquet: .* s3://bucket/data\."):
-        SceneIndex.open(tmp_path / "kept.parquet")
-    assert SceneIndex.open(tmp_path / "kept.parquet", root=web.url).root == web.url
-
-
 def test_no_secret_is_written_into_an_index(scenes, tmp_path):
     for root, told in (
         ("https://me:word@host/data?key=secret", "https://host/data"),
@@ -292,14 +282,6 @@ def test_no_secret_is_written_into_an_index(scenes, tmp_path):
         with pytest.raises(StorageError, match=f"{told} : the URL has a login or a query"):
             index.write(tmp_path / "kept.parquet")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_index_in_its_root_moves_with_it(scenes, tmp_path):
-    (tmp_path / "old").mkdir()
-    written(scenes, tmp_path / "old")
-    (tmp_path / "old").rename(tmp_path / "new")
-
-    assert SceneIndex.open(tmp_path / "new").root == str(tmp_path / "new")
 
 
 def test_an_index_above_its_data_remembers_where_they_are(scenes, tmp_path):
@@ -384,27 +366,6 @@ def test_a_root_elsewhere_than_beside_the_index_is_the_users_own_word(
     place.parent.mkdir(parents=True)
     place.write_bytes(b"")
     assert SceneIndex.open(path).root == str(tmp_path / "a")
-
-
-@pytest.mark.filterwarnings("ignore::stereogenbench_data.index.open.StaleIndexWarning")
-def test_a_chain_that_runs_commands_is_not_opened(scenes, tmp_path, monkeypatch):
-    template = "{{ cycler.__init__.__globals__.os.system('touch RAN') }}"
-    members = [member.path for member in scenes[0].members.values()]
-    references = {"version": 1, "templates": {"u": template}, "refs": {}}
-    references["refs"] = {path: ["{{u}}", 0, 1] for path in members}
-    coded = base64.b64encode(json.dumps(references).encode()).decode()
-    root = f"reference://x::data:application/json;base64,{coded}"
-    monkeypatch.chdir(tmp_path)
-    path = recording(scenes, tmp_path / "index.parquet", root)
-    for member in members:
-        (tmp_path / member).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / member).write_bytes(b"")
-
-    index = SceneIndex.open(path)
-    source = MemberSource(index.root, shards=index.shards)
-    with pytest.raises(StorageError, match=r"has 0 bytes, and the index says"):
-        source.open(index.scene(0), "cam_00_rgb.mp4")
-    assert not (tmp_path / "RAN").exists()
 
 
 def with_row(**values):
@@ -505,34 +466,27 @@ def test_what_was_left_out_is_reported_when_the_index_is_opened(scenes, tmp_path
 
 def test_seek_tables_are_kept_apart_and_change_no_digest(tmp_path):
     plain = [scene_of(number) for number in range(3)]
-    tabled = [dataclasses.replace(each, seek_tables=b"seek") for each in plain]
-    index = SceneIndex.from_scenes(tabled, tmp_path)
+    tabled = [dataclasses.replace(each, seek_tables=bytes([n])) for n, each in enumerate(plain)]
+    index = SceneIndex.from_scenes(tabled[::-1], tmp_path)
     index.write(tmp_path / "with.parquet")
     SceneIndex.from_scenes(plain, tmp_path).write(tmp_path / "without.parquet")
+    SceneIndex.open(tmp_path / "with.parquet", root=tmp_path).write(tmp_path / "again.parquet")
 
-    opened = SceneIndex.open(tmp_path / "with.parquet", root=tmp_path)
+    opened = SceneIndex.open(tmp_path / "again.parquet", root=tmp_path)
     other = SceneIndex.open(tmp_path / "without.parquet", root=tmp_path)
 
     assert opened.digest == other.digest == index.digest
     assert opened.seek_tables(1) is None
     assert opened.load_seek_tables()
-    assert opened.seek_tables(1) == b"seek"
+    for each in (
+        opened,
+        SceneIndex.of_parts(*opened.parted()),
+        pickle.loads(pickle.dumps(opened)),
+    ):
+        assert [each.seek_tables(row) for row in range(3)] == [b"\0", b"\1", b"\2"]
     assert not other.load_seek_tables()
     assert other.seek_tables(1) is None
     assert opened.scene(1) == tabled[1] == plain[1]
-
-
-def test_an_index_that_is_written_again_keeps_its_seek_tables(tmp_path):
-    scenes = [dataclasses.replace(scene_of(n), seek_tables=bytes([n])) for n in range(3)]
-    SceneIndex.from_scenes(scenes[::-1], tmp_path).write(tmp_path / "one.parquet")
-    SceneIndex.open(tmp_path / "one.parquet", root=tmp_path).write(tmp_path / "two.parquet")
-    again = SceneIndex.open(tmp_path / "two.parquet", root=tmp_path)
-
-    assert again.load_seek_tables()
-    assert [again.seek_tables(row) for row in range(3)] == [b"\0", b"\1", b"\2"]
-    shared, rest = again.parted()
-    assert SceneIndex.of_parts(shared, rest).seek_tables(2) == b"\2"
-    assert pickle.loads(pickle.dumps(again)).seek_tables(2) == b"\2"
 
 
 @pytest.mark.parametrize("column", [pa.array(["a", "b"]), pa.array([1, 2])])
