@@ -13,10 +13,11 @@ import weakref
 from bisect import bisect_right, insort
 from collections import defaultdict, deque
 from collections.abc import Callable, Hashable, Iterable
+from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass, field
 from itertools import islice, takewhile
 from operator import attrgetter
-from typing import Final, Literal, NamedTuple
+from typing import Final, NamedTuple
 
 from stereogenbench_data.errors import SelectionError
 
@@ -69,9 +70,12 @@ class _Part:
     first: int
     last: int
     held_bytes: int
-    state: Literal["queued", "under way", "here", "failed", "dropped"] = "queued"
-    data: bytes = b""
-    error: BaseException | None = None
+    data: Future[bytes] = field(default_factory=Future)
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether its request is under way, or was made; or nobody wants it any more."""
+        return self.data.running() or self.data.done()
 
 
 @dataclass(slots=True)
@@ -79,7 +83,7 @@ class _State:
     """What the threads of a process share."""
 
     pid: int = field(default_factory=os.getpid)
-    changed: threading.Condition = field(default_factory=threading.Condition)
+    lock: threading.Lock = field(default_factory=threading.Lock)
     queue: deque[_Part] = field(default_factory=deque)
     threads: set[threading.Thread] = field(default_factory=set)
     parts: dict[Hashable, list[_Part]] = field(default_factory=lambda: defaultdict(list))
@@ -129,7 +133,7 @@ class FetchAhead:
     def plan(self, sample: int, wanted: Iterable[Wanted]) -> None:
         """Plan ranges for a sample, whose number is above those of all samples before."""
         state = self._state
-        with state.changed:
+        with state.lock:
             for each in wanted:
                 for start, stop in _uncovered(state, each, sample):
                     _add(state, each, start, stop, sample)
@@ -137,7 +141,7 @@ class FetchAhead:
     def begin(self, sample: int = sys.maxsize) -> None:
         """Fetch what is planned for the samples up to one; what is planned for others may grow."""
         state = self._state
-        with state.changed:
+        with state.lock:
             state.up_to = sample
             waiting = sum(part.first <= sample for part in state.queue)
             for _ in range(min(waiting, CONNECTIONS - len(state.threads))):
@@ -154,29 +158,32 @@ class FetchAhead:
             StorageError: If it could not be fetched.
         """
         state = self._state
-        with state.changed:
+        with state.lock:
             found = _touching(state, place, at, at + 1)
             if not found:
                 return None
             part = found[0]
             if part.first > state.up_to:
                 return None
-            state.changed.wait_for(lambda: part.state in ("here", "failed", "dropped"))
-            if part.state == "dropped":
-                return None
-            if part.error is not None:
+        try:
+            return part.start, part.data.result()
+        except CancelledError:
+            return None
+        except BaseException:
+            with state.lock:
                 _drop(state, part)  # who tries again fetches again
-                raise part.error
-            return part.start, part.data
+            raise
 
     def release(self, sample: int) -> None:
         """Forget what no sample after this one needs."""
         state = self._state
-        with state.changed:
+        with state.lock:
             for part in state.due.pop(sample, ()):
                 if part.last != sample:
                     continue
-                if part.state == "here" and part.held_bytes == part.stop - part.start:
+                has_ended = part.data.done() and not part.data.cancelled()
+                is_here = has_ended and part.data.exception() is None
+                if is_here and part.held_bytes == part.stop - part.start:
                     self.requests, self.bytes = self.requests + 1, self.bytes + part.held_bytes
                 _drop(state, part)
 
@@ -200,8 +207,8 @@ class PlannedFetches(FetchAhead):
         state.up_to = sample
         while state.queue and state.queue[0].first <= sample:
             part = state.queue.popleft()
-            if part.state == "queued":
-                part.state = "here"
+            if part.data.set_running_or_notify_cancel():
+                part.data.set_result(b"")
 
 
 def _uncovered(state: _State, wanted: Wanted, sample: int) -> list[tuple[int, int]]:
@@ -232,7 +239,7 @@ def _add(state: _State, wanted: Wanted, start: int, stop: int, sample: int) -> N
     before = parts[place - 1] if place else None
     if (
         before is not None
-        and before.state == "queued"
+        and not before.has_begun
         and start - before.stop <= LARGEST_GAP
         and stop - before.start <= LARGEST_REQUEST
     ):
@@ -254,45 +261,35 @@ def _add(state: _State, wanted: Wanted, start: int, stop: int, sample: int) -> N
 
 
 def _drop(state: _State, part: _Part) -> None:
-    if part.state == "dropped":
-        return
     parts = state.parts[part.place]
-    parts.remove(part)
+    if part in parts:
+        parts.remove(part)
+        state.planned_bytes -= part.held_bytes
+        part.data.cancel()
     if not parts:
         del state.parts[part.place]
-    state.planned_bytes -= part.held_bytes
-    part.state, part.data = "dropped", b""
-    state.changed.notify_all()
 
 
 def _work(state: _State) -> None:
     """Fetch what is queued, in a thread of its own."""
     while True:
-        with state.changed:
-            while state.queue and state.queue[0].first <= state.up_to:
-                part = state.queue.popleft()
-                if part.state == "queued":
-                    break
-            else:
+        with state.lock:
+            if not state.queue or state.queue[0].first > state.up_to:
                 state.threads.discard(threading.current_thread())
                 return
-            part.state = "under way"
-        data, error = b"", None
+            part = state.queue.popleft()
+            if not part.data.set_running_or_notify_cancel():
+                continue
         try:
-            data = part.fetch(part.start, part.stop)
-        except BaseException as found:  # noqa: BLE001 - raised again in the thread that reads
-            error = found
-        with state.changed:
-            if part in state.parts.get(part.place, ()):
-                part.data, part.error = data, error
-                part.state = "here" if error is None else "failed"
-            state.changed.notify_all()
+            part.data.set_result(part.fetch(part.start, part.stop))
+        except BaseException as error:  # noqa: BLE001 - raised again in the thread that reads
+            part.data.set_exception(error)
 
 
 def _end(state: _State) -> None:
     """Let the threads of this process find nothing more to fetch."""
     if state.pid == os.getpid():
-        with state.changed:
+        with state.lock:
             for part in [part for parts in state.parts.values() for part in parts]:
                 _drop(state, part)
             state.queue.clear()
