@@ -7,7 +7,6 @@ import os
 import sys
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
-from http import HTTPStatus
 from typing import Any, Final
 
 from stereogenbench_data.errors import ExtraError, StorageError, missing_extra
@@ -31,6 +30,7 @@ _CALL_BYTES: Final = 2 * 1024 * 1024
 """Bytes of one call of a file system, whose progress is not seen before it returns."""
 
 _CHANGED: Final = 412
+_GONE: Final = (401, 404, 410)
 _NETWORK_ERRORS: Final = (
     ("builtins", "OSError"),
     ("aiohttp", "ClientError"),
@@ -79,8 +79,7 @@ class FilesystemTransport:
     def size(self, timeout_s: float) -> int:
         """Return the size of the object in bytes."""
         with self.named_errors():
-            files, path = self._open()
-            limit = {"timeout": timeout_s} if files.async_impl else {}
+            files, path, limit = self._open(timeout_s)
             size = files.size(path, **limit)
         if not isinstance(size, int):
             raise StorageError(f"{self._where}: has no size ({size!r}): is it a folder?")
@@ -89,8 +88,7 @@ class FilesystemTransport:
     def entries(self, timeout_s: float) -> dict[str, int | None]:
         """List a folder: name to size in bytes, None for a folder."""
         with self.named_errors():
-            files, path = self._open()
-            limit = {"timeout": timeout_s} if files.async_impl else {}
+            files, path, limit = self._open(timeout_s)
             listed = files.ls(path, detail=True, **limit)
         found: dict[str, int | None] = {}
         for entry in listed:
@@ -103,7 +101,7 @@ class FilesystemTransport:
     def files(self, timeout_s: float) -> dict[str, tuple[int, str]]:
         """List all files below a folder: path to size in bytes and version."""
         with self.named_errors():
-            files, path = self._open()
+            files, path, _ = self._open(timeout_s)
             listed = files.find(path, detail=True)
         return {
             name.removeprefix(path).strip("/"): (
@@ -116,14 +114,14 @@ class FilesystemTransport:
     def part(self, start: int, stop: int, timeout_s: float) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop, or the first of them."""
         with self.named_errors():
-            files, path = self._open()
+            files, path, limit = self._open(timeout_s)
             # s3fs itself, whose objects are read by their ETag.
             if type(files).__module__.partition(".")[0] == "s3fs":
                 yield from self._s3_part(start, stop, timeout_s, files, path)
                 return
             self._require_size(timeout_s)
             # Without a cache, or fsspec would read megabytes ahead.
-            how = {"timeout": timeout_s} if files.async_impl else {"cache_type": "none"}
+            how = limit or {"cache_type": "none"}
             for first in range(start, stop, _CALL_BYTES):
                 last = min(first + _CALL_BYTES, stop)
                 data = bytes(files.cat_file(path, start=first, end=last, **how))
@@ -169,8 +167,8 @@ class FilesystemTransport:
             require_expected_size(found, expected=self._expected_size, where=self._where)
             self._seen["size"] = str(found)
 
-    def _open(self) -> tuple[Any, str]:
-        """Return this process's file system, and the object's path in it."""
+    def _open(self, timeout_s: float) -> tuple[Any, str, dict[str, Any]]:
+        """Return this process's file system, the object's path in it, and its limit of time."""
         if self._opened is None or self._opened[0] != os.getpid():
             import fsspec.core
 
@@ -179,7 +177,8 @@ class FilesystemTransport:
             except TypeError as error:  # a file system that needs more than a URL
                 raise ValueError(str(error)) from None
             self._opened = (os.getpid(), files, path)
-        return self._opened[1], self._opened[2]
+        _, files, path = self._opened
+        return files, path, {"timeout": timeout_s} if files.async_impl else {}
 
     @contextmanager
     def named_errors(self) -> Iterator[None]:
@@ -189,9 +188,7 @@ class FilesystemTransport:
         except (ExtraError, StorageError, TransientError):
             raise
         except FileNotFoundError:
-            raise MissingObject(
-                f"{self._where}: does not exist, or is private. {MISSING}"
-            ) from None
+            raise self._missing() from None
         except PermissionError as error:
             raise self._no_permission(error) from None
         except ImportError as error:
@@ -207,11 +204,14 @@ class FilesystemTransport:
             if status == _CHANGED:
                 raise replaced(self._where, "in its store", "its ETag is another") from None
             if 400 <= status < 500 and status not in PASSING:
-                kind = MissingObject if status == HTTPStatus.NOT_FOUND else StorageError
-                raise kind(f"{self._where}: {_reason(error)}. {MISSING}") from None
+                refused = StorageError(f"{self._where}: {_reason(error)}. {MISSING}")
+                raise (self._missing() if status in _GONE else refused) from None
             raise TransientError(_reason(error), wait_s=wait_s) from None
         except _loaded(_SETUP_ERRORS) as error:
             raise self._no_permission(error) from None
+
+    def _missing(self) -> MissingObject:
+        return MissingObject(f"{self._where}: does not exist, or is private. {MISSING}")
 
     def _no_permission(self, error: BaseException) -> StorageError:
         return StorageError(

@@ -7,25 +7,18 @@ the cache's place and offline mode are those of huggingface_hub (HF_ENDPOINT, HF
 HF_HUB_OFFLINE ...), and fsspec's settings for ``hf`` go before them.
 """
 
-import os
 import re
 from collections.abc import Generator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final, Literal
 from urllib.parse import quote, unquote
 
 import urllib3
 
-from stereogenbench_data.errors import StorageError, explain_os_errors
+from stereogenbench_data.errors import StorageError
 from stereogenbench_data.sources.filesystems import FilesystemTransport, require_installed
 from stereogenbench_data.sources.location import shown
-from stereogenbench_data.sources.retry import (
-    MISSING,
-    MissingObject,
-    ProcessLock,
-    require_expected_size,
-)
+from stereogenbench_data.sources.retry import MISSING, MissingObject, ProcessLock
 from stereogenbench_data.sources.web import WebTransport
 
 _ADDRESS: Final = re.compile(
@@ -34,7 +27,6 @@ _ADDRESS: Final = re.compile(
     re.ASCII,
 )
 _COMMIT: Final = re.compile(r"[0-9a-f]{40}")
-_CHUNK: Final = 1024 * 1024
 _LIBRARY: Final = "stereogenbench-data"
 _LARGEST_IN_GIT: Final = 16 * 2**20
 """Bytes of the largest file that the Hub keeps in git, whole and without ranges."""
@@ -42,10 +34,6 @@ _LARGEST_IN_GIT: Final = 16 * 2**20
 _commits: Final[dict[tuple[str, str], str]] = {}
 """Commits by the Hub's address and branch, as this process or the one it was forked from resolved
 them."""
-
-_MOST_ADDRESSES: Final = 50_000
-_addresses: Final[dict[tuple[str, str], dict[str, str]]] = {}
-"""Where files of a commit lie, by URL and login, as the Hub has redirected this process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +71,7 @@ class HubTransport(WebTransport):
     """One file of a repository of the Hub, in huggingface_hub's cache or by HTTP."""
 
     longest_whole_bytes = _LARGEST_IN_GIT
+    is_versioned = False  # a commit keeps its files; a content network's servers differ in ETags
 
     def __init__(self, url: str, *, expected_size: int | None = None) -> None:
         """Name a file; nothing is requested yet.
@@ -102,36 +91,25 @@ class HubTransport(WebTransport):
         self._file = found
         self._is_redirected = True  # so that threads do not all ask the Hub at first
         self._is_found = False
-        self._cached: Path | None = None
+        self._cached: FilesystemTransport | None = None
         self._finding = ProcessLock()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy in another process, without logins and signed URLs."""
-        return super().__getstate__() | {"_is_found": False, "_headers": {}}
+        return self.__dict__ | {"_is_found": False, "_headers": {}}
 
     def size(self, timeout_s: float) -> int:
         """Return the size of the file in bytes."""
         cached = self._in_cache(timeout_s)
-        return super().size(timeout_s) if cached is None else cached.stat().st_size
+        return super().size(timeout_s) if cached is None else cached.size(timeout_s)
 
     def part(self, start: int, stop: int, timeout_s: float) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop, or the first of them."""
         cached = self._in_cache(timeout_s)
         if cached is None:
             yield from super().part(start, stop, timeout_s)
-            return
-        gone = "It was removed from the Hub's cache: open the data again."
-        with explain_os_errors(f"{cached}: cannot be read", gone), cached.open("rb") as file:
-            found = os.fstat(file.fileno()).st_size
-            require_expected_size(found, expected=self._expected_size, where=f"{cached}")
-            if found < stop:
-                raise StorageError(
-                    f"{cached}: has {found} bytes, and byte {stop - 1} is asked for. It was cut "
-                    f"short: remove it, and it is fetched from the Hub."
-                )
-            file.seek(start)
-            for begin in range(start, stop, _CHUNK):
-                yield file.read(min(_CHUNK, stop - begin))
+        else:
+            yield from cached.part(start, stop, timeout_s)
 
     def entries(self, timeout_s: float) -> dict[str, int | None]:
         """List a folder: name to size in bytes, None for a folder."""
@@ -151,7 +129,7 @@ class HubTransport(WebTransport):
 
     def pinned(self, timeout_s: float) -> str:
         """Return the URL of a folder as of the commit that its branch is at now."""
-        file, commit = self._file, self._commit(timeout_s, of="folder")
+        file, commit = self._file, self._commit(timeout_s)
         return f"hf://{file.place}@{quote(commit, safe='')}/{file.path}".rstrip("/")
 
     def _tree(self, timeout_s: float, *, depth: Literal["one level", "all levels"]) -> list[Any]:
@@ -164,7 +142,7 @@ class HubTransport(WebTransport):
         with require_installed(self._where, extra="hub"):
             from huggingface_hub import HfApi
         file, (endpoint, token) = self._file, _settings()
-        commit = self._commit(timeout_s, of="folder")
+        commit = self._commit(timeout_s)
         with FilesystemTransport(self._where).named_errors():
             listed = HfApi(endpoint, token=token, library_name=_LIBRARY).list_repo_tree(
                 file.repository, file.path.strip("/") or None,
@@ -173,70 +151,51 @@ class HubTransport(WebTransport):
             )  # fmt: skip
             return list(listed)
 
-    def _in_cache(self, timeout_s: float) -> Path | None:
-        """Return the file in the Hub's cache; None if it is read by HTTP, from now on."""
-        if not self._is_found:
-            with self._finding.held(timeout_s):
-                if not self._is_found:
-                    self._cached = self._find(timeout_s)
-                    self._is_found = True
+    def _in_cache(self, timeout_s: float) -> FilesystemTransport | None:
+        """Return what reads the file in the Hub's cache; None if it is read by HTTP."""
+        with self._finding.held(timeout_s):
+            if not self._is_found:
+                self._cached = self._find(timeout_s)
+                self._is_found = True
         return self._cached
 
-    def _find(self, timeout_s: float) -> Path | None:
+    def _find(self, timeout_s: float) -> FilesystemTransport | None:
         with require_installed(self._where, extra="hub"):
             from huggingface_hub import constants, try_to_load_from_cache
-        offline = is_offline()
-        revision = self._file.revision if offline else self._commit(timeout_s)
+            from huggingface_hub.utils import build_hf_headers
+        file, offline = self._file, is_offline()
+        revision = file.revision if offline else self._commit(timeout_s)
         cached = try_to_load_from_cache(
-            self._file.repository, self._file.path, revision=revision,
-            repo_type=self._file.kind.removesuffix("s"),
-        )  # fmt: skip
+            file.repository, file.path, revision=revision, repo_type=file.kind.removesuffix("s")
+        )
         if isinstance(cached, str):
-            return Path(cached)
+            return FilesystemTransport(f"file://{cached}", expected_size=self._expected_size)
         if offline:
             raise StorageError(
                 f"{self._where}: HF_HUB_OFFLINE is set, and the file is not in the Hub's cache "
                 f"({constants.HF_HUB_CACHE}). Unset it, or fetch the file while online: `hf "
                 f"download`, or `stereogenbench download` and pass its folder."
             )
-        self._point_at(revision, self._file.path)
+        endpoint, token = _settings()
+        self._headers |= build_hf_headers(token=token, library_name=_LIBRARY)
+        self._url = f"{endpoint}/{file.place}/resolve/{quote(revision, safe='')}/{quote(file.path)}"
         return None
 
-    def _point_at(self, revision: str, path: str) -> None:
-        """Take the address of a file by HTTP, and the login."""
-        with require_installed(self._where, extra="hub"):
-            from huggingface_hub.utils import build_hf_headers
-        endpoint, token = _settings()
-        login = build_hf_headers(token=token, library_name=_LIBRARY)
-        place = self._file.place
-        self._headers = {"Accept-Encoding": "identity", **login}
-        self._url = f"{endpoint}/{place}/resolve/{quote(revision, safe='')}/{quote(path)}"
-        # A commit does not change; ETags and dates of a content network's servers may differ.
-        self._is_versioned = _COMMIT.fullmatch(revision) is None
-        if not self._is_versioned:  # all that reads the file asks the Hub once
-            if len(_addresses) >= _MOST_ADDRESSES:
-                _addresses.clear()
-            key = (self._url, login.get("authorization", ""))
-            self._addresses = _addresses.setdefault(key, {})
-
-    def _commit(self, timeout_s: float, *, of: Literal["file", "folder"] = "file") -> str:
-        """Return the commit of the revision, the same for all that this process reads.
-
-        The branch itself where the Hub does not say.
-        """
-        branch = self._file.revision
-        if _COMMIT.fullmatch(branch):
-            return branch
-        key = (_settings()[0], f"{self._file.place}@{branch}")
+    def _commit(self, timeout_s: float) -> str:
+        """Return the commit of the revision, the same for all that this process reads."""
+        file, (endpoint, token) = self._file, _settings()
+        if _COMMIT.fullmatch(file.revision):
+            return file.revision
+        key = (endpoint, f"{file.place}@{file.revision}")
         if key not in _commits:
-            # Of a folder, which has no such URL, a file is asked for that every repository has.
-            self._point_at(branch, self._file.path if of == "file" else ".gitattributes")
-            response = self._ask(self._url, {"Range": "bytes=0-0"}, timeout_s, follow=False)
-            response.close()
-            found = response.headers.get("X-Repo-Commit", "")
-            if response.status >= 400 and not _COMMIT.fullmatch(found):
-                raise self.refusal(response)
-            _commits.setdefault(key, found if _COMMIT.fullmatch(found) else branch)
+            with require_installed(self._where, extra="hub"):
+                from huggingface_hub import HfApi
+            with FilesystemTransport(self._where).named_errors():
+                found = HfApi(endpoint, token=token, library_name=_LIBRARY).repo_info(
+                    file.repository, revision=file.revision, timeout=timeout_s,
+                    repo_type=file.kind.removesuffix("s"),
+                )  # fmt: skip
+            _commits.setdefault(key, str(found.sha))
         return _commits[key]
 
     def refusal(self, response: urllib3.BaseHTTPResponse) -> Exception:
@@ -267,5 +226,4 @@ def is_offline() -> bool:
     """Return whether huggingface_hub is told to request nothing (HF_HUB_OFFLINE)."""
     from huggingface_hub import constants
 
-    asked = getattr(constants, "is_offline_mode", None)
-    return bool(asked() if asked is not None else constants.HF_HUB_OFFLINE)
+    return bool(constants.is_offline_mode())

@@ -74,10 +74,6 @@ class MemberSource:
         self._sound: set[tuple[str, int]] = set()
         self._objects: dict[str, RemoteObject] = {}
 
-    def __repr__(self) -> str:
-        """Return the root without secrets, and what is compared with its checksum."""
-        return f"MemberSource({shown(self._root)!r}, check={self._check!r})"
-
     def open(self, scene: Scene, name: str) -> Path | MemberFile:
         """Return one of a scene's files: its path, or an open file that is the caller's to close.
 

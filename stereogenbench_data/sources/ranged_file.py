@@ -1,7 +1,6 @@
 """A member's bytes as a seekable, read-only file of their own."""
 
 import errno
-import io
 import os
 import stat
 import zlib
@@ -67,7 +66,7 @@ class FileSlice(MemberFile):
         if not stat.S_ISREG(mode):  # opening a pipe would wait for its writer
             code = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL
             raise OSError(code, "not a regular file")
-        self._file = io.FileIO(path, "rb")
+        self._file = path.open("rb")
 
     def status(self) -> os.stat_result:
         """Return what the operating system knows of the whole file that holds the member."""
@@ -91,15 +90,12 @@ class FileSlice(MemberFile):
     def _bytes(self, start: int, stop: int) -> bytes:
         self._file.seek(self._offset + start)
         data = self._file.read(stop - start)
-        while len(data) < stop - start:
-            more = self._file.read(stop - start - len(data))
-            if not more:
-                raise StorageError(
-                    f"{self._path}: ends at byte {self._file.tell()}, within a member of "
-                    f"{self.size} bytes from {self._offset} on. It was cut short while it was "
-                    f"open: fetch it again."
-                )
-            data += more
+        if len(data) < stop - start:
+            raise StorageError(
+                f"{self._path}: ends at byte {self._file.tell()}, within a member of "
+                f"{self.size} bytes from {self._offset} on. It was cut short while it was "
+                f"open: fetch it again."
+            )
         return data
 
 

@@ -61,10 +61,6 @@ class RemoteObject:
         self._policy = retry or RetryPolicy()
         self._transport = _transport(url, expected_size=expected_size)
 
-    def __repr__(self) -> str:
-        """Return the URL, without login and query."""
-        return f"RemoteObject({self.where!r})"
-
     def below(self, path: str, *, expected_size: int | None = None) -> "RemoteObject":
         """Return a file or folder below this folder; reading it waits as long."""
         url = joined(self._url, path)

@@ -46,7 +46,7 @@ class RetryPolicy:
     """How long reading waits for a server.
 
     Attributes:
-        timeout_s: Seconds that an answer may take; a longer one is resumed by another request.
+        timeout_s: Seconds that a wait for the server may take; then another request goes on.
             Reading gives up 2.25 times as long after its last progress, connecting and retries
             included.
     """

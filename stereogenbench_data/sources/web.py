@@ -1,28 +1,22 @@
 """Ranges over http and https, with urllib3; every response is checked to be the part requested.
 
-Each process has a pool of connections of its own. urllib3 follows redirects, and the address that
-one led to is used again until it is refused, as a signed URL is that has expired.
+Each process has a pool of urllib3 of its own. urllib3 follows redirects, and the address that one
+led to is used again until it is refused, as a signed URL is that has expired.
 
 Errors do not chain urllib3's own, whose messages hold the whole URL with its secrets.
 """
 
-import atexit
-import http.client
-import io
+import functools
 import logging
 import os
 import re
-import socket
-import time
 from collections.abc import Generator, Mapping
 from contextlib import nullcontext
-from contextvars import ContextVar
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 from urllib.parse import unquote, urljoin, urlunsplit
 from urllib.request import getproxies, proxy_bypass
 
 import urllib3
-import urllib3.connection
 from urllib3.exceptions import HTTPError, MaxRetryError, ResponseError
 
 from stereogenbench_data.errors import StorageError
@@ -61,63 +55,17 @@ _CURES: Final = {
     410: MISSING,
 }
 _NUMBER: Final = re.compile(r"[0-9]{1,18}")
-_PART: Final = re.compile(r"bytes (?:([0-9]{1,18})-([0-9]{1,18})|\*)/([0-9]{1,18}|\*)")
+_PART: Final = re.compile(r"bytes (?:([0-9]{1,18})-([0-9]{1,18})|\*)/([0-9]{1,18})")
 _STRONG_TAG: Final = re.compile(r'"[!#-~]{0,256}"')
 _RATE_LIMIT: Final = re.compile(r";r=0;t=([0-9]{1,6})(?:[;,]|$)")
 
-_pools: Final[dict[tuple[int, str], urllib3.PoolManager]] = {}
-"""Connections by process and proxy: those of the process that forked this one stay its own."""
-
-
-_until_s: Final[ContextVar[float | None]] = ContextVar("_until_s", default=None)
-"""Until when, on the monotonic clock, the request that this thread makes may be answered."""
-
-
-class _LimitedStream(io.RawIOBase):
-    """The bytes of a response; all waits for them together have the time of one, as for trickles.
-
-    urllib3 limits each wait alone. A response that takes longer is resumed by another request.
-    """
-
-    def __init__(self, stream: io.RawIOBase, connection: socket.socket, until_s: float) -> None:
-        super().__init__()
-        self._stream, self._connection, self._until_s = stream, connection, until_s
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any, /) -> int | None:
-        left_s = self._until_s - time.monotonic()
-        if left_s <= 0:
-            raise TimeoutError("the answer is not whole in time")
-        self._connection.settimeout(left_s)
-        return self._stream.readinto(buffer)
-
-    def close(self) -> None:
-        self._stream.close()
-        super().close()
-
-
-class _LimitedResponse(http.client.HTTPResponse):
-    def __init__(self, sock: socket.socket, *args: Any, **how: Any) -> None:
-        super().__init__(sock, *args, **how)
-        until_s = _until_s.get()
-        if until_s is not None:
-            self.fp = io.BufferedReader(_LimitedStream(self.fp.detach(), sock, until_s))
-
-
-class _Pool(urllib3.HTTPConnectionPool):
-    class ConnectionCls(urllib3.connection.HTTPConnection):
-        response_class = _LimitedResponse
-
-
-class _SecurePool(urllib3.HTTPSConnectionPool):
-    class ConnectionCls(urllib3.connection.HTTPSConnection):
-        response_class = _LimitedResponse
+_MOST_ADDRESSES: Final = 50_000
+_addresses: Final[dict[tuple[str, str], str]] = {}
+"""Where URLs led to, by URL and login, as servers have redirected this process."""
 
 
 class _Stated(NamedTuple):
-    """The first and last byte of a response, and the object's size; -1 where it does not say."""
+    """The first and last byte of a response, -1 where it has none, and the object's size."""
 
     first: int
     last: int
@@ -129,20 +77,15 @@ class WebTransport:
 
     longest_whole_bytes = 0
     """The size up to which a whole object is accepted where a part was requested."""
+    is_versioned = True
+    """Whether another ETag or date means that the object was replaced."""
 
-    def __init__(
-        self,
-        url: str,
-        *,
-        expected_size: int | None = None,
-        headers: Mapping[str, str] | None = None,
-    ) -> None:
+    def __init__(self, url: str, *, expected_size: int | None = None) -> None:
         """Name an object; user and password of its URL are sent as a login, and never shown.
 
         Args:
             url: Where it is.
             expected_size: The size in bytes that the index records; None if it is not known.
-            headers: Further headers. "authorization" goes to the URL's own server alone.
 
         Raises:
             StorageError: If it is not a URL.
@@ -152,24 +95,17 @@ class WebTransport:
         self._where = shown(url)
         self._url = urlunsplit(parts._replace(netloc=self.server, fragment=""))
         self._expected_size = expected_size
-        self._headers = {"Accept-Encoding": "identity", **(headers or {})}
+        self._headers = {"Accept-Encoding": "identity"}
         if login:
             self._headers |= urllib3.make_headers(basic_auth=unquote(login))
         self._first_seen: dict[str, dict[str, str]] = {}
-        self._is_versioned = True
-        self._addresses: dict[str, str] = {}  # where the URL leads to, as far as it is known
         self._is_redirected = False
         self._resolving = ProcessLock()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a copy in another process, without signed URLs."""
-        return self.__dict__ | {"_addresses": {}}
 
     def size(self, timeout_s: float) -> int:
         """Return how many bytes the object has, as the response for its first byte states."""
         response, stated = self._get(0, 1, timeout_s)
         response.close()
-        self._require_size_stated(response, stated)
         return stated.size
 
     def entries(self, timeout_s: float) -> dict[str, int | None]:
@@ -214,17 +150,14 @@ class WebTransport:
             # One thread is redirected, and the others use the address that it found.
             with self._resolving.held(timeout_s) if self._is_redirected else nullcontext():
                 response = self._ask_address(part, timeout_s)
-                if response is None:
-                    response = self._ask(self._url, part, timeout_s)
+                response = response or self._ask(self._url, part, timeout_s)
         try:
             if response.status not in _WITH_CONTENT:
                 raise self.refusal(response)
             stated = self._stated(response)
             if response.status != 416:
                 self._require_same(response, stated)
-            if self._expected_size is not None:
-                self._require_size_stated(response, stated)
-                require_expected_size(stated.size, expected=self._expected_size, where=self._where)
+            require_expected_size(stated.size, expected=self._expected_size, where=self._where)
         except (StorageError, TransientError):
             response.close()
             raise
@@ -234,40 +167,38 @@ class WebTransport:
         self, part: Mapping[str, str], timeout_s: float
     ) -> urllib3.BaseHTTPResponse | None:
         """Return a response from where the URL led to; None if that is not known or refuses."""
-        address = self._addresses.get(self._url)
+        key = self._address_key
+        address = _addresses.get(key)
         if address is None:
             return None
         try:
             response = self._ask(address, part, timeout_s)
         except TransientError:
-            self._addresses.pop(self._url, None)  # its server may be gone; another one may not
+            _addresses.pop(key, None)  # its server may be gone; another one may not
             raise
         if response.status in _WITH_CONTENT or response.status in PASSING:
             return response
         response.close()
-        if self._addresses.get(self._url) == address:
-            self._addresses.pop(self._url, None)
+        if _addresses.get(key) == address:
+            _addresses.pop(key, None)
         return None
 
-    def _ask(
-        self, url: str, headers: Mapping[str, str], timeout_s: float, *, follow: bool = True
-    ) -> urllib3.BaseHTTPResponse:
+    @property
+    def _address_key(self) -> tuple[str, str]:
+        return self._url, self._headers.get("authorization", "")
+
+    def _ask(self, url: str, part: Mapping[str, str], timeout_s: float) -> urllib3.BaseHTTPResponse:
         """Return a server's response, of which nothing but the head is read yet."""
-        sent = {**self._headers, **headers}
+        sent = {**self._headers, **part}
         etag = self._first_seen.get("version", {}).get("ETag", "")
         if _STRONG_TAG.fullmatch(etag):  # a part is sent only if the object is unchanged
             sent["If-Range"] = etag
         if split_url(url)[:2] != split_url(self._url)[:2]:
-            sent = {name: sent[name] for name in sent if name.lower() != "authorization"}
-        token = _until_s.set(time.monotonic() + timeout_s)
+            sent.pop("authorization", None)
         try:
             response = _pool(url).request(
                 "GET", url,
-                headers=sent,
-                timeout=timeout_s,
-                retries=_REDIRECTS_ONLY,
-                redirect=follow,
-                preload_content=False,
+                headers=sent, timeout=timeout_s, retries=_REDIRECTS_ONLY, preload_content=False,
             )  # fmt: skip
         except (ValueError, UnicodeError):
             raise self._error(
@@ -279,20 +210,20 @@ class WebTransport:
                     f"is redirected more than {_MOST_REDIRECTS} times: check the URL."
                 ) from None
             raise TransientError(_reason(error)) from None
-        finally:
-            _until_s.reset(token)
         hops = response.retries.history if response.retries is not None else ()
         for hop in hops:
             url = urljoin(url, hop.redirect_location or "")
         if hops:
-            self._addresses[self._url], self._is_redirected = url, True
+            if len(_addresses) >= _MOST_ADDRESSES:
+                _addresses.clear()
+            _addresses[self._address_key], self._is_redirected = url, True
         return response
 
     def _require_same(self, response: urllib3.BaseHTTPResponse, stated: _Stated) -> None:
         """Refuse a response of an object that was replaced since the first read."""
-        names = ("ETag", "Last-Modified") if self._is_versioned else ()
+        names = ("ETag", "Last-Modified") if self.is_versioned else ()
         now = {name: response.headers.get(name, "").strip() for name in names}
-        now["size"] = "" if stated.size < 0 else str(stated.size)
+        now["size"] = str(stated.size)
         then = self._first_seen.setdefault("version", now)
         changes = [
             f"its {name} was {then[name][:80]} and is {now[name][:80]}"
@@ -329,7 +260,7 @@ class WebTransport:
         if response.status == 200:
             if (start, stop) != (0, size) and not stop <= size <= self.longest_whole_bytes:
                 raise self._error(
-                    f"the server sends the whole file ({size if size >= 0 else 'unknown'} bytes) "
+                    f"the server sends the whole file ({size} bytes) "
                     f"when {asked}. Members are read in parts: use a server that honours ranges, "
                     f"as nginx does, {_FETCH}."
                 )
@@ -348,52 +279,34 @@ class WebTransport:
         """Return what a response states of its part and the object.
 
         Raises:
-            StorageError: If a part is sent and it does not say which.
+            StorageError: If it does not say which part it sends, or how large the object is.
         """
-        if response.status == 200:
-            length = response.headers.get("Content-Length", "")
-            size = int(length) if _NUMBER.fullmatch(length) else -1
-            return _Stated(0, size - 1, size)
-        told = response.headers.get("Content-Range", "")
-        found = _PART.fullmatch(told)
+        header = "Content-Length" if response.status == 200 else "Content-Range"
+        told = response.headers.get(header, "")
+        found = (_NUMBER if response.status == 200 else _PART).fullmatch(told)
         if found is None:
             raise self._error(
-                f"the server answers {response.status} and does not state which part it sends "
-                f"(Content-Range: {told[:80]!r}): use another, {_FETCH}."
+                f"the server answers {response.status} and does not state which part it sends, or "
+                f"the size of the whole ({header}: {told[:80]!r}): use another, {_FETCH}."
             )
-        return _Stated(*(int(each) if each and each != "*" else -1 for each in found.groups()))
-
-    def _require_size_stated(self, response: urllib3.BaseHTTPResponse, stated: _Stated) -> None:
-        if stated.size < 0:
-            header = "Content-Length" if response.status == 200 else "Content-Range"
-            told = response.headers.get(header, "")[:80]
-            raise self._error(
-                f"its server does not state its size ({header}: {told!r}): fetch the data and pass "
-                f"the folder."
-            )
+        if response.status == 200:
+            return _Stated(0, int(told) - 1, int(told))
+        return _Stated(*(-1 if each is None else int(each) for each in found.groups()))
 
 
 def _pool(url: str) -> urllib3.PoolManager:
     """Return the connections of this process, through the machine's proxy where it has one."""
     parts = split_url(url)
     proxy = "" if proxy_bypass(parts.netloc) else getproxies().get(parts.scheme, "")
-    key = (os.getpid(), proxy)
-    if key not in _pools:
-        pool = (
-            urllib3.ProxyManager(proxy, maxsize=_MOST_CONNECTIONS)
-            if proxy
-            else urllib3.PoolManager(maxsize=_MOST_CONNECTIONS)
-        )
-        pool.pool_classes_by_scheme = {"http": _Pool, "https": _SecurePool}
-        _pools.setdefault(key, pool)
-    return _pools[key]
+    return pool_of(os.getpid(), proxy)
 
 
-@atexit.register
-def close_connections() -> None:
-    """Close the connections of this process; reading opens new ones."""
-    for key in [key for key in _pools if key[0] == os.getpid()]:
-        _pools.pop(key).clear()
+@functools.cache
+def pool_of(process: int, proxy: str) -> urllib3.PoolManager:
+    """Return the connections of a process through a proxy, "" for none."""
+    if proxy:
+        return urllib3.ProxyManager(proxy, maxsize=_MOST_CONNECTIONS)
+    return urllib3.PoolManager(maxsize=_MOST_CONNECTIONS)
 
 
 def _reason(error: BaseException) -> str:
@@ -406,8 +319,14 @@ def _reason(error: BaseException) -> str:
     return type(inner).__name__
 
 
+def _without_queries(record: logging.LogRecord) -> bool:
+    """Take the queries from the URLs that urllib3 logs, which may be signed."""
+    if isinstance(record.args, tuple):
+        record.args = tuple(
+            each.partition("?")[0] if isinstance(each, str) else each for each in record.args
+        )
+    return True
+
+
 for _name in ("connectionpool", "poolmanager", "util.retry"):
-    # What it logs of our requests holds whole URLs, which may be signed.
-    logging.getLogger(f"urllib3.{_name}").addFilter(
-        lambda record: _until_s.get() is None or record.levelno >= logging.WARNING
-    )
+    logging.getLogger(f"urllib3.{_name}").addFilter(_without_queries)

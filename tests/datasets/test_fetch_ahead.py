@@ -19,7 +19,7 @@ from stereogenbench_data.media.seek_table import packed_tables, parse_tables
 from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.retry import RetryPolicy
-from stereogenbench_data.sources.web import close_connections
+from stereogenbench_data.sources.web import pool_of
 from tests.datasets.conftest import same
 from tests.servers.failing_server import Answer, serving
 from tests.sources.policies import LONGEST_S, ended
@@ -44,7 +44,7 @@ def alone():
     while fetching() and time.monotonic() < deadline:
         time.sleep(0.01)
     assert fetching() == []
-    close_connections()
+    pool_of.cache_clear()
     while len(sockets()) > len(before) and time.monotonic() < deadline:
         gc.collect()
         time.sleep(0.01)  # the server's ends are closed by its own threads

@@ -14,7 +14,7 @@ from stereogenbench_data.sources.remote import RemoteObject
 from tests.servers.failing_server import Answer, serving
 from tests.servers.hub import COMMIT, REPOSITORY
 from tests.servers.raw import raw_serving
-from tests.sources.policies import LONGEST_S, ended, retry_policy, waits_noted
+from tests.sources.policies import ended, retry_policy, waits_noted
 
 DATA = bytes(range(256)) * 1000
 FORK = multiprocessing.get_context("fork")
@@ -26,9 +26,9 @@ def served(web):
     return web
 
 
-def answering_head(start, stop, *more):
+def answering_head(start, stop):
     told = f"bytes {start}-{stop - 1}/{len(DATA)}"
-    lines = ["HTTP/1.1 206 x", f"Content-Range: {told}", f"Content-Length: {stop - start}", *more]
+    lines = ["HTTP/1.1 206 x", f"Content-Range: {told}", f"Content-Length: {stop - start}"]
     return "\r\n".join([*lines, "", ""]).encode()
 
 
@@ -48,19 +48,6 @@ def trickling(start, stop):
         yield 0.02
 
 
-def trickling_head(start, stop):
-    for letter in answering_head(start, stop, f"X: {'x' * 5000}"):
-        yield bytes([letter])
-        yield 0.02
-
-
-def trickling_redirect(start, stop):
-    yield b"HTTP/1.1 302 x\r\nLocation: /y\r\nContent-Length: 5000\r\n\r\n"
-    while True:
-        yield b"x"
-        yield 0.02
-
-
 def hanging_up(start, stop):
     yield answering_head(start, stop) + DATA[start : start + 1]
 
@@ -75,8 +62,6 @@ DEAD = {
     "never answering": lambda: raw_serving(never),
     "hanging after its head": lambda: raw_serving(after_its_head),
     "trickling": lambda: raw_serving(trickling),
-    "trickling its head": lambda: raw_serving(trickling_head),
-    "trickling a redirect": lambda: raw_serving(trickling_redirect),
     "hanging up": lambda: raw_serving(hanging_up),
 }
 
@@ -132,21 +117,6 @@ def test_a_dead_store_is_a_named_error_within_the_longest_outage(monkeypatch, sc
         text = ended(lambda: reason_of(root, policy))
 
     assert f"{root}/x.tar : cannot be read, at byte 0 of 65536" in text
-
-
-def test_a_dead_server_is_a_named_error_in_a_forked_worker_too(served):
-    RemoteObject(f"{served.url}/x.tar").read(0, 9)  # its connection is inherited
-    policy = retry_policy(attempts=999, timeout_s=0.2, longest_outage_s=0.4)
-    here, there = FORK.Pipe(duplex=False)
-    with raw_serving(never) as dead:
-        worker = FORK.Process(target=lambda: there.send(reason_of(dead, policy)))
-        worker.start()
-        try:
-            assert here.poll(LONGEST_S)
-            assert "cannot be read, at byte" in here.recv()
-        finally:
-            worker.kill()
-            worker.join()
 
 
 @pytest.mark.parametrize("status", [429, 503])

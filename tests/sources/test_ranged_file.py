@@ -61,23 +61,16 @@ def do(file, what, number):
 
 @given(steps=steps)
 @settings(max_examples=60)
-def test_a_ranged_file_reads_as_a_file_of_its_bytes_does(steps):
-    store = Store(5000)
-    ranged, plain = store.open(), io.BytesIO(store.data)
-
-    assert [do(ranged, *step) for step in steps] == [do(plain, *step) for step in steps]
-
-
-@given(steps=steps)
-@settings(max_examples=60)
-def test_a_slice_of_a_local_file_reads_as_a_file_of_its_bytes_does(tmp_path_factory, steps):
+def test_ranged_files_and_slices_read_as_a_file_of_their_bytes_does(tmp_path_factory, steps):
     store = Store(5000)
     path = tmp_path_factory.getbasetemp() / "slice.bin"
     path.write_bytes(b"before" + store.data + b"behind")
+    plain = io.BytesIO(store.data)
+    expected = [do(plain, *step) for step in steps]
 
-    with FileSlice(path, Member("slice.bin", 6, 5000)) as cut:
-        plain = io.BytesIO(store.data)
-        assert [do(cut, *step) for step in steps] == [do(plain, *step) for step in steps]
+    with FileSlice(path, Member("slice.bin", 6, 5000)) as cut, store.open() as ranged:
+        for file in (cut, ranged):
+            assert [do(file, *step) for step in steps] == expected
 
 
 def test_a_pass_forwards_fetches_every_byte_once_in_blocks_that_grow():
