@@ -81,7 +81,9 @@ def samples_of(
         folder.mkdir(parents=True)
         _write_files(key, files, folder)
         index = SceneIndex.from_scenes([describe_scene(root, key)], root)
-        seeded: dict[str, Any] = dict(options) | {"seed": _seed(options.get("seed", 0), key)}
+        # Scenes draw different random numbers.
+        seed = (options.get("seed", 0) << 32 | zlib.crc32(key.encode())) % 2**63
+        seeded: dict[str, Any] = dict(options) | {"seed": seed}
         try:
             pairs = StereoPairs(index, fields=fields, **seeded)
         except SelectionError:
@@ -94,11 +96,6 @@ def samples_of(
                 yield pairs[number]
         finally:
             pairs.close()
-
-
-def _seed(seed: int, key: str) -> int:
-    """Return a seed for one scene, so that scenes draw different random numbers."""
-    return (seed << 32 | zlib.crc32(key.encode())) % 2**63
 
 
 def _write_files(key: str, files: Mapping[str, Any], folder: Path) -> None:

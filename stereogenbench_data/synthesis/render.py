@@ -346,7 +346,8 @@ def cast_shadow(
     drop = (corners[:, 2] - corners[:, :2] @ scene.slope) / (
         scene.sun[2] - scene.sun[:2] @ scene.slope
     )
-    texels = _texel_of(corners[:, :2] - drop[:, None] * scene.sun[:2], scene=scene)
+    place_m = corners[:, :2] - drop[:, None] * scene.sun[:2]
+    texels = (place_m / scene.shadow_range_m + 1) * (_LIGHT_TEXELS / 2) - 0.5
     low = np.clip(np.floor(texels.min(axis=0)), 0, _LIGHT_TEXELS).astype(int)
     high = np.clip(np.ceil(texels.max(axis=0)) + 1, 0, _LIGHT_TEXELS).astype(int)
     if (high <= low).any():
@@ -362,10 +363,6 @@ def cast_shadow(
     ]
     blocked = np.isfinite(entry_depth(shape, origin=origin, direction=list(from_world @ scene.sun)))
     light[low[1] : high[1], low[0] : high[0]][blocked] = _SHADE
-
-
-def _texel_of(place_m: Array, *, scene: SceneModel) -> Array:
-    return (place_m / scene.shadow_range_m + 1) * (_LIGHT_TEXELS / 2) - 0.5
 
 
 def _metres_at(texel: Array, *, scene: SceneModel) -> Array:

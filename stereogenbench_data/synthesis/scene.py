@@ -160,22 +160,18 @@ class SceneModel:
 
     def _may_meet(self, origins_m: Array, directions: Array) -> Array:
         """Return for each shape which rays pass its bounding sphere."""
-        centres, radii_m = self._spheres
+        centres = np.array([shape.centre for shape in self.static_shapes]).reshape(-1, 3)
+        radii_m = np.array(
+            [
+                np.sqrt(shape.half_m @ shape.half_m) if shape.kind == "box" else shape.half_m.max()
+                for shape in self.static_shapes
+            ]
+        )
         ahead = centres @ directions - (origins_m * directions).sum(axis=0)
         squared = (centres * centres).sum(axis=1)[:, None] - 2 * (centres @ origins_m)
         squared += (origins_m * origins_m).sum(axis=0)
         radii_m = radii_m[:, None] * 1.001 + 0.001
         return (ahead > -radii_m) & (squared - ahead * ahead < radii_m * radii_m)
-
-    @property
-    def _spheres(self) -> tuple[Array, Array]:
-        """Centres and radii of spheres around the shapes."""
-        centres = np.array([shape.centre for shape in self.static_shapes]).reshape(-1, 3)
-        radii_m = [
-            np.sqrt(shape.half_m @ shape.half_m) if shape.kind == "box" else shape.half_m.max()
-            for shape in self.static_shapes
-        ]
-        return centres, np.array(radii_m)
 
 
 @dataclass(frozen=True, slots=True)

@@ -95,19 +95,16 @@ class _Search:
         smooth = np.stack([padded[t : t + window].mean(axis=0) for t in range(self.frames)])
         self.anchor_m = np.round(smooth, _DIGITS)
         self.height_m = float(np.ptp(body_m[..., 2], axis=1).max())
+        # At this distance the subject fits into the picture of every camera.
+        width, height = self.rig.picture_at_1m
+        across = (proposal.span_m + 0.35 * self.height_m) / width
+        self.nearest_m = float(max(1.15 * self.height_m / height, across, 0.5 * self.height_m))
         # The rig looks a little beside the subject, and rolls a little.
-        self.nearest_m = self._nearest_m()
         largest = np.array([0.02 * self.nearest_m, 0.02 * self.nearest_m, 3.5])
         sizes = largest * self.rng.uniform(0.5, 1.0, 3)
         periods_s, phases = self.rng.uniform(4.0, 9.0, 3), self.rng.uniform(0, 2 * np.pi, 3)
         moments = np.arange(self.frames)[:, None] / FRAME_RATE_HZ
         self.sway = np.round(sizes * np.sin(2 * np.pi * moments / periods_s + phases), _DIGITS)
-
-    def _nearest_m(self) -> float:
-        """Return the distance at which the subject fits into the picture of every camera."""
-        width, height = self.rig.picture_at_1m
-        across = (self.proposal.span_m + 0.35 * self.height_m) / width
-        return float(max(1.15 * self.height_m / height, across, 0.5 * self.height_m))
 
     # Viewpoints.
 

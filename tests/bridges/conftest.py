@@ -4,10 +4,24 @@ import numpy as np
 import pytest
 import torch
 
+from stereogenbench_data.shards.pack import pack
+from tests.servers.tools import made_once, require_module
+
 
 @pytest.fixture(scope="session")
 def urls(small_shards):
     return sorted(str(path) for path in small_shards.glob("*.tar"))
+
+
+@pytest.fixture(scope="session")
+def packed_depth_shards(small_release, tmp_path_factory):
+    """The scenes of `small_release` in shards whose depth blosc2 packed."""
+    require_module("blosc2")
+    return made_once(
+        tmp_path_factory,
+        "packed_depth_shards",
+        lambda out: pack(small_release, out, workers=1, depth_codec="blosc2"),
+    )
 
 
 @pytest.fixture

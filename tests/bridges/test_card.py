@@ -18,7 +18,6 @@ from PIL import Image
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.card import MARK, card, write_card, write_viewer_rows
 from stereogenbench_data.errors import DescriptorError
-from stereogenbench_data.shards.pack import pack
 from tests.servers.failing_server import serving
 from tests.servers.hub import REPOSITORY, HubHandler
 from tests.servers.tools import require_module
@@ -156,11 +155,8 @@ def test_a_card_is_replaced_but_another_readme_is_not(tmp_path):
         write_card(index, tmp_path, repository="a/b")
 
 
-def test_the_card_states_the_features_of_packed_depth(small_release, tmp_path):
-    require_module("blosc2")
-    pack(small_release, tmp_path / "shards", workers=1, depth_codec="blosc2")
-
-    text = card(SceneIndex.open(tmp_path / "shards"), repository="a/b")
+def test_the_card_states_the_features_of_packed_depth(packed_depth_shards):
+    text = card(SceneIndex.open(packed_depth_shards), repository="a/b")
 
     head = yaml.safe_load(text.split("---")[1])
     names = [each["name"] for each in head["dataset_info"][0]["features"]]

@@ -19,7 +19,7 @@ from stereogenbench_data.errors import DescriptorError
 from stereogenbench_data.shards.download import download, plan_download
 from stereogenbench_data.shards.pack import pack
 from tests.cli.command import invoke
-from tests.servers.tools import require_module, require_tool
+from tests.servers.tools import require_tool
 
 HOME = Path(__file__).resolve().parents[2]
 SHIPPED = HOME / "croissant"
@@ -80,15 +80,6 @@ def test_the_shipped_descriptors_name_where_their_own_data_come_from_and_their_s
 
 
 @pytest.fixture(scope="module")
-def packed(small_release, tmp_path_factory):
-    """Shards of depth that blosc2 packed."""
-    require_module("blosc2")
-    out = tmp_path_factory.mktemp("packed") / "shards"
-    pack(small_release, out, workers=1, depth_codec="blosc2")
-    return SceneIndex.open(out)
-
-
-@pytest.fixture(scope="module")
 def of_many(index, tmp_path_factory):
     """A descriptor of shards that are too many for all of their files."""
     path = tmp_path_factory.mktemp("many") / "many.json"
@@ -99,10 +90,10 @@ def of_many(index, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def found(packed, of_many, tmp_path_factory):
+def found(packed_depth_shards, of_many, tmp_path_factory):
     """The records of four descriptors by their names, which one process loads."""
     root = tmp_path_factory.mktemp("c")
-    write_descriptor(packed, root / "packed.json")
+    write_descriptor(SceneIndex.open(packed_depth_shards), root / "packed.json")
     paths = [SHIPPED / "release.json", SHIPPED / "sample.json", root / "packed.json", of_many]
     assert check_descriptor(root / "packed.json") == []
     return {path.stem: each for path, each in zip(paths, loaded(root, *paths), strict=True)}
@@ -192,8 +183,8 @@ def test_absolute_addresses_pass_the_steps_of_the_conference_checker(web, index,
     assert records["first_of_each"] == [True] * len(records["counts"])
 
 
-def test_shards_of_packed_depth_are_described_by_its_suffix(packed, found):
-    cameras = range(6)
+def test_shards_of_packed_depth_are_described_by_its_suffix(packed_depth_shards, found):
+    packed, cameras = SceneIndex.open(packed_depth_shards), range(6)
     depth = stored(packed, *((camera, f"cam_{camera:02d}_depth.b2frame") for camera in cameras))
     assert found["packed"]["contents"]["depth_videos"] == depth
     assert found["packed"]["counts"]["media_files"] == 12 * len(packed)

@@ -12,8 +12,6 @@ from torch.utils.data import DataLoader
 from stereogenbench_data import PAIR_FIELDS, Compose, HorizontalFlip, RandomCrop, StereoPairs
 from stereogenbench_data.bridges import huggingface
 from stereogenbench_data.errors import ExtraError, FieldError, SelectionError, StorageError
-from stereogenbench_data.shards.pack import pack
-from tests.servers.tools import require_module
 
 FIELDS = ("left", "right", "disparity", "valid", "intrinsics", "pair", "scene", "__key__")
 SELECTION = {"fields": FIELDS, "pairs": "adjacent", "frames": [0, 6]}
@@ -213,12 +211,9 @@ def test_derived_datasets_use_their_own_epoch(small_shards, name, workers):
     assert len({*map(frozenset, epochs.values())}) == len(epochs)
 
 
-@pytest.fixture(scope="module")
-def packed_depth_urls(small_release, tmp_path_factory):
-    require_module("blosc2")
-    folder = tmp_path_factory.mktemp("packed") / "shards"
-    pack(small_release, folder, workers=1, depth_codec="blosc2")
-    return sorted(map(str, folder.glob("*.tar")))
+@pytest.fixture
+def packed_depth_urls(packed_depth_shards):
+    return sorted(map(str, packed_depth_shards.glob("*.tar")))
 
 
 def test_raw_shards_of_packed_depth_are_read_by_its_suffix(packed_depth_urls, expected):
