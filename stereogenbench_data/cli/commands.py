@@ -97,7 +97,8 @@ for _name, (_what, _functions) in _GROUPS.items():
 
 def _print_version(value: bool) -> None:
     if value:
-        sys.stdout.write(f"stereogenbench-data {package_version('stereogenbench-data')}\n")
+        with ErrorsReported():
+            typer.echo(f"stereogenbench-data {package_version('stereogenbench-data')}")
         raise typer.Exit
 
 

@@ -95,15 +95,20 @@ def test_colmap_reads_poses_and_points_that_project_onto_their_observations(
 
 @pytest.fixture(scope="module")
 def transforms(detailed_release, tmp_path_factory):
-    """An export for nerfstudio of every measured pixel: its folder, and what its file says."""
-    out = tmp_path_factory.mktemp("transforms")
-    (folder,) = exported(detailed_release, out, layout="transforms", points="all")
-    return folder, json.loads((folder / "transforms.json").read_text())
+    """An export for nerfstudio of every measured pixel, smaller than stored.
+
+    Its folder, what its file says, and the views that it is of.
+    """
+    out, size = tmp_path_factory.mktemp("transforms"), (80, 120)
+    (folder,) = exported(detailed_release, out, layout="transforms", points="all", size=size)
+    moment = SceneViews(detailed_release, size=size)[0]
+    return folder, json.loads((folder / "transforms.json").read_text()), moment
 
 
-def test_points_of_transforms_project_onto_the_pixels_they_are_of(transforms, moment):
-    folder, about = transforms
+def test_points_of_transforms_project_onto_the_pixels_they_are_of(transforms):
+    folder, about, moment = transforms
     lens = tuple(about[name] for name in ("fl_x", "fl_y", "cx", "cy"))
+    assert lens == tuple(moment["intrinsics"].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]])
     world, colours = read_ply(folder / about["ply_file_path"])
     first = 0
     for camera, frame in enumerate(about["frames"]):
@@ -122,13 +127,11 @@ def test_points_of_transforms_project_onto_the_pixels_they_are_of(transforms, mo
     assert first == len(world)
 
 
-def test_transforms_name_pictures_depth_in_millimetres_and_a_world_whose_z_is_up(
-    transforms, moment
-):
-    folder, about = transforms
+def test_transforms_name_pictures_depth_in_millimetres_and_a_world_whose_z_is_up(transforms):
+    folder, about, moment = transforms
     applied = np.array(about["applied_transform"])
 
-    assert (about["w"], about["h"], about["camera_model"]) == (160, 160, "OPENCV")
+    assert (about["w"], about["h"], about["camera_model"]) == (120, 80, "OPENCV")
     for camera, frame in enumerate(about["frames"]):
         with Image.open(folder / frame["file_path"]) as picture:
             expected = moment["image"][camera].permute(1, 2, 0)
@@ -231,25 +234,6 @@ def test_moges_depth_is_read_back_whatever_its_range(tmp_path, values, close):
 
     found = read_moge_depth(tmp_path / "cam_00" / "depth.png")
     np.testing.assert_allclose(np.nan_to_num(found, nan=0.0), depth_m, rtol=close)
-
-
-def test_the_size_of_an_export_is_that_of_its_pictures_depth_and_cameras(
-    detailed_release, tmp_path
-):
-    size = (48, 80)
-    (folder,) = exported(
-        detailed_release, tmp_path / "t", layout="transforms", size=size, points="all"
-    )
-    about = json.loads((folder / "transforms.json").read_text())
-    sample = SceneViews(detailed_release, size=size)[0]
-    frame = about["frames"][2]
-
-    assert (about["w"], about["h"]) == (80, 48)
-    assert np.load(folder / frame["depth_file_path"]).shape == size
-    with Image.open(folder / frame["file_path"]) as picture:
-        assert picture.size == (80, 48)
-    lens = (about["fl_x"], about["fl_y"], about["cx"], about["cy"])
-    assert lens == tuple(sample["intrinsics"].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]])
 
 
 @pytest.mark.parametrize("layout", ["colmap", "moge"])

@@ -90,13 +90,13 @@ def test_a_full_disk_is_reported():
     assert len(printed.stderr.splitlines()) == 1
 
 
-def test_output_that_nobody_reads_ends_quietly(tmp_path):
+@pytest.mark.parametrize("words", ["publish croissant --template -o about.json", "--version"])
+def test_output_that_nobody_reads_ends_quietly(tmp_path, words):
     """As `| head` does it: the pipe is closed before anything is written."""
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing, "w") as closed:
-        words = ("publish", "croissant", "--template", "-o", tmp_path / "about.json")
-        ended = run(*words, stdout=closed)
+        ended = run(*words.split(), stdout=closed, cwd=tmp_path)
 
     assert (ended.returncode, ended.stderr) == (141, "")
 

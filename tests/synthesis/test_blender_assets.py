@@ -112,13 +112,11 @@ def test_what_is_not_said_has_a_default(folder):
          r"samples_per_pixel: found 0.*at least 1"),
         ("[characters.Figure]", "scale = -1\n[characters.Figure]",
          r"maps\.Room\.scale: found -1.*positive"),
-        ("[characters.Figure]", "light = 'lamp'\n[characters.Figure]", r"light.*own, sky"),
         ("[characters.Figure]", "bounds_m = [[0, 0, 0], [1, -1, 1]]\n[characters.Figure]",
          r"bounds_m: found .*the smaller corner first"),
         ("[characters.Figure]", "[sensors]\nsmall = [0, 4]\n[characters.Figure]",
          r"sensors\.small: found \[0, 4\].*positive"),
         ("[animations.Walk]\nfile = \"figure.fbx\"", "", r"animations: found None.*one table"),
-        ("[animations.Walk]", "[animations.Walk]\nforward = '-y'", r"Walk\.forward.*unknown"),
         ("[animations.Walk]", "[animations.Walk", r"is not TOML.*line 5"),
     ],
 )  # fmt: skip
