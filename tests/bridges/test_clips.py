@@ -25,9 +25,10 @@ SHARP = Encoding(crf=1, pixel_format="yuv444p", preset="ultrafast")
 QUICK = Encoding(preset="ultrafast")
 
 
-def decoded(path):
-    """Return the pictures of a video, (t, 3, h, w) uint8."""
+def decoded(path, *, rate_hz=15):
+    """Return the pictures of a video, (t, 3, h, w) uint8, that states this rate."""
     with av.open(path) as container:
+        assert container.streams.video[0].average_rate == rate_hz
         pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     return np.stack(pictures).transpose(0, 3, 1, 2)
 
@@ -79,16 +80,6 @@ def test_each_video_shows_its_field_and_a_record_says_what_a_clip_is_of(everythi
         white = np.repeat(sample["hole"].numpy() * 255, 3, axis=1)
         np.testing.assert_array_equal(videos["mask"], white)
         assert (videos["warped"][white == 255] < 8).mean() > 0.9
-
-
-def test_the_files_state_the_rate_of_the_clip(everything, indexed_release, tmp_path):
-    exported(indexed_release, tmp_path / "thin", "stereocrafter", stride=3, length=3)
-
-    for out, rate_hz in ((everything, 15), (tmp_path / "thin", 5)):
-        record = records(out)[0]
-        with av.open(out / record["videos"]["right"]) as container:
-            assert container.streams.video[0].average_rate == rate_hz
-        assert record["frame_rate_hz"] == rate_hz
 
 
 def test_diffsynth_reads_its_table_with_pandas(everything, expected):
@@ -176,18 +167,21 @@ def test_musubi_gets_a_configuration_and_a_caption_beside_each_video(indexed_rel
 
 
 def test_stereocrafter_gets_grids_of_four(indexed_release, tmp_path):
-    one = {"size": (128, 128), "family": "IPD_Gaussian"}
-    exported(indexed_release, tmp_path, "stereocrafter", encoding=SHARP, **one)
-    options = {"split": "train", "frames": ("clips", 7)}
+    one, thin = {"size": (128, 128), "family": "IPD_Gaussian"}, {"stride": 3, "length": 3}
+    exported(indexed_release, tmp_path, "stereocrafter", encoding=SHARP, **one, **thin)
+    options = {"split": "train", "frames": ("clips", 3, 3)}
     samples = StereoPairs(indexed_release, fields=FIELDS, **options, **one)
 
     grids = sorted((tmp_path / "grid").glob("*_splatting_results.mp4"))
 
     assert len(grids) == len(samples) == 1
     for record, sample in zip(records(tmp_path), samples, strict=True):
-        grid = decoded(tmp_path / record["videos"]["grid"])
+        assert record["frame_rate_hz"] == 5
+        grid, right = (
+            decoded(tmp_path / record["videos"][kind], rate_hz=5) for kind in ("grid", "right")
+        )
         height, width = grid.shape[2] // 2, grid.shape[3] // 2
-        assert (len(grid), height, width) == (7, 128, 128)
+        assert (len(grid), height, width) == (3, 128, 128)
         assert difference(grid[..., :height, :width], sample["left"]) < 1.5
         assert difference(grid[..., height:, width:], sample["warped_right"]) < 1.5
         mask = grid[..., height:, :width].mean(axis=1, keepdims=True) / 255
@@ -199,15 +193,7 @@ def test_stereocrafter_gets_grids_of_four(indexed_release, tmp_path):
         grey = np.where(valid, (inverse - 1 / far) / (1 / near - 1 / far), 0) * 255
         assert far > near > 0
         assert difference(grid[..., :height, width:], np.repeat(grey, 3, axis=1).round()) < 1.5
-        assert difference(decoded(tmp_path / record["videos"]["right"]), sample["right"]) < 1.5
-
-
-def test_the_same_export_is_the_same_bytes_with_more_processes(indexed_release, tmp_path):
-    first = exported(indexed_release, tmp_path / "one")
-    second = exported(indexed_release, tmp_path / "two", workers=2)
-
-    assert first.written == second.written
-    assert files_of(tmp_path / "one") == files_of(tmp_path / "two")
+        assert difference(right, sample["right"]) < 1.5
 
 
 def test_clips_may_overlap_and_have_their_own_names(indexed_release, tmp_path):
@@ -222,21 +208,32 @@ def test_clips_may_overlap_and_have_their_own_names(indexed_release, tmp_path):
 # Going on.
 
 
-def test_a_run_that_is_repeated_keeps_what_is_finished(indexed_release, tmp_path):
-    first = exported(indexed_release, tmp_path)
-    before = files_of(tmp_path)
+@pytest.fixture(scope="module")
+def finished(indexed_release, tmp_path_factory):
+    """The folder of an export, and the names of its clips; not to be changed."""
+    out = tmp_path_factory.mktemp("finished")
+    return out, exported(indexed_release, out).written
 
-    again = exported(indexed_release, tmp_path)
 
-    assert (len(first.written), first.kept) == (3, ())
-    assert (again.written, again.kept) == ((), first.written)
-    assert files_of(tmp_path) == before
+def test_a_run_that_is_repeated_keeps_what_is_finished(indexed_release, finished):
+    out, names = finished
+    before = files_of(out)
+
+    again = exported(indexed_release, out)
+
+    assert (len(names), again.written, again.kept) == (3, (), names)
+    assert files_of(out) == before
+
+
+def test_the_same_export_is_the_same_bytes_with_more_processes(indexed_release, finished, tmp_path):
+    assert exported(indexed_release, tmp_path, workers=2).written == finished[1]
+    assert files_of(tmp_path) == files_of(finished[0])
 
 
 @pytest.mark.parametrize("damage", ["video cut", "record removed", "mask removed"])
-def test_a_clip_that_is_not_whole_is_written_again(indexed_release, tmp_path, damage):
-    names = exported(indexed_release, tmp_path).written
-    before = files_of(tmp_path)
+def test_a_clip_that_is_not_whole_is_written_again(indexed_release, finished, tmp_path, damage):
+    before, names = files_of(finished[0]), finished[1]
+    shutil.copytree(finished[0], tmp_path, dirs_exist_ok=True)
     if damage == "video cut":
         video = tmp_path / "right" / f"{names[1]}.mp4"
         video.write_bytes(video.read_bytes()[:-100])
@@ -295,9 +292,8 @@ def test_evaluation_scenes_need_an_explicit_word(indexed_release, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
-def test_a_folder_of_another_export_is_refused_by_what_differs(indexed_release, tmp_path):
-    exported(indexed_release, tmp_path)
-    before = files_of(tmp_path)
+def test_a_folder_of_another_export_is_refused_by_what_differs(indexed_release, finished):
+    out, before = finished[0], files_of(finished[0])
 
     for change, named in (
         ({"layout": "musubi"}, "layout"),
@@ -307,8 +303,8 @@ def test_a_folder_of_another_export_is_refused_by_what_differs(indexed_release, 
         ({"pairs": "all"}, "selection"),
     ):
         with pytest.raises(StorageError, match=rf"an export of other {named}[.\w]*: .*remove"):
-            exported(indexed_release, tmp_path, **change)
-    assert files_of(tmp_path) == before
+            exported(indexed_release, out, **change)
+    assert files_of(out) == before
 
 
 @pytest.mark.parametrize(
