@@ -415,34 +415,27 @@ def read_rgb(
 def _converted(reader: VideoReader, frame: VideoFrame, *, size: tuple[int, int]) -> VideoFrame:
     """Return a picture as gbrp or rgb24 at a size, its chroma from where it lies.
 
-    At the stored size, FFmpeg takes subsampled chroma of 8 bits to lie in the middle, whatever
-    the tag; that conversion is left where it does not.
+    At the stored size, FFmpeg's own conversion takes subsampled chroma of 8 bits to lie in the
+    middle, whatever the tag; it is not used where chroma lies elsewhere.
     """
     stored = (frame.height, frame.width)
-    siting = reader.siting(frame)
-    if size == stored and (siting == CENTRE or not is_subsampled(frame)):
+    siting, is_thinned = reader.siting(frame), is_subsampled(frame)
+    pixel_format = "gbrp"
+    flags = "area" if size[0] * size[1] < frame.height * frame.width else "bicubic"
+    if size != stored:
+        if is_thinned and (frame.width % 2 or frame.height % 2):
+            # FFmpeg stretches the chroma that reaches half a pixel beyond the edge.
+            frame = _converted(reader, frame, size=stored)
+    elif is_thinned and siting != CENTRE:
+        flags = "bicubic+accurate_rnd"
+    else:
         pixel_format = "gbrp" if _has_exact_planes(frame) else "rgb24"
         if _ignores_siting(frame):
             return reader.scaler.reformat(
                 frame, format=pixel_format, interpolation=Interpolation.BICUBIC, threads=1
             )
-        return reader.converter.convert(
-            frame, size=size, pixel_format=pixel_format, flags="bicubic", siting=siting
-        )
-    if size == stored:
-        return reader.converter.convert(
-            frame, size=size, pixel_format="gbrp", flags="bicubic+accurate_rnd", siting=siting
-        )
-    if is_subsampled(frame) and (frame.width % 2 or frame.height % 2):
-        # FFmpeg stretches the chroma that reaches half a pixel beyond the edge.
-        frame = _converted(reader, frame, size=stored)
-    shrinks = size[0] * size[1] < frame.height * frame.width
     return reader.converter.convert(
-        frame,
-        size=size,
-        pixel_format="gbrp",
-        flags="area" if shrinks else "bicubic",
-        siting=siting,
+        frame, size=size, pixel_format=pixel_format, flags=flags, siting=siting
     )
 
 
