@@ -23,8 +23,8 @@ from stereogenbench_data.engine import Advance, no_advance
 from stereogenbench_data.errors import MediaError, SchemaError, ShardError, StorageError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.container import VideoFile
+from stereogenbench_data.media.depth import packed_depth
 from stereogenbench_data.media.depth_frames import blosc2_module
-from stereogenbench_data.media.depth_packing import packed_depth
 from stereogenbench_data.media.picture_encoding import (
     QUALITIES,
     Quality,

@@ -13,8 +13,8 @@ from typing import Final, Literal
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
 from stereogenbench_data.errors import MediaError, ShardError, describe_os_error
 from stereogenbench_data.jobs import atomic_folder
+from stereogenbench_data.media.depth import write_depth_video
 from stereogenbench_data.media.depth_frames import DepthFrames
-from stereogenbench_data.media.depth_packing import write_depth_video
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
 from stereogenbench_data.shards.tar import read_chunks

@@ -24,7 +24,7 @@ from stereogenbench_data.errors import MediaError, ShardError, explain_os_errors
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.scene_folder import derived_scene, metadata_differences
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.media.depth_packing import packed_depth
+from stereogenbench_data.media.depth import packed_depth
 from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
 from stereogenbench_data.schema.records import Member, Scene
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES, TRAINING_JSON, VIDEO_FILES

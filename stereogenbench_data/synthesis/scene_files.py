@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
-from stereogenbench_data.media.depth_packing import grey_frame
+from stereogenbench_data.media.depth import grey_frame
 from stereogenbench_data.media.encoder import VideoWriter
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,

@@ -10,14 +10,13 @@ import pytest
 
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media import depth_frames
-from stereogenbench_data.media.depth import resolve_encoding
+from stereogenbench_data.media.depth import packed_depth, resolve_encoding, write_depth_video
 from stereogenbench_data.media.depth_frames import (
     LAYER,
     DepthFrames,
     compressed_chunk,
     require_chunk,
 )
-from stereogenbench_data.media.depth_packing import packed_depth, write_depth_video
 from stereogenbench_data.media.video import VideoReader, probe
 from tests.servers.tools import require_module
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stereogenbench_data.media.depth_packing import packed_depth
+from stereogenbench_data.media.depth import packed_depth
 from stereogenbench_data.media.seek_table import (
     Position,
     SeekTable,
