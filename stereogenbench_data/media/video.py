@@ -25,6 +25,7 @@ from stereogenbench_data.media.container import (
     is_colour_format,
     open_by_header,
     open_container,
+    packet_checksums,
     require_whole_payload,
     stream_facts,
 )
@@ -39,7 +40,6 @@ from stereogenbench_data.media.decoder import (
     table_clock,
 )
 from stereogenbench_data.media.depth_frames import PACKED_SUFFIX, DepthFrames
-from stereogenbench_data.media.packet_checksums import packet_checksums
 from stereogenbench_data.media.siting import (
     CENTRE,
     Converter,

@@ -25,7 +25,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.container import VideoFile
 from stereogenbench_data.media.depth import packed_depth
 from stereogenbench_data.media.depth_frames import blosc2_module
-from stereogenbench_data.media.picture_encoding import (
+from stereogenbench_data.media.encoder import (
     QUALITIES,
     Quality,
     measured_error,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.errors import MediaError
-from stereogenbench_data.media.packet_checksums import packet_checksums
-from stereogenbench_data.media.picture_encoding import write_pictures
+from stereogenbench_data.media.container import packet_checksums
+from stereogenbench_data.media.encoder import write_pictures
 from stereogenbench_data.media.video import VideoReader, read_rgb
 
 FRAMES = 9

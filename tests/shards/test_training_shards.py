@@ -27,7 +27,7 @@ from stereogenbench_data.audit.geometry.audit import audit
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import MediaError, SchemaError, ShardError, StorageError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.media.picture_encoding import (
+from stereogenbench_data.media.encoder import (
     QUALITIES,
     measured_error,
     write_pictures,
