@@ -24,7 +24,7 @@ from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from stereogenbench_data.errors import StorageError, explain_os_errors, missing_extra
+from stereogenbench_data.errors import StorageError, explain_os_errors, needs_extra
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -209,7 +209,10 @@ class ProcessPool(Engine):
                     yield result
         except BrokenProcessPool as error:
             pool.shutdown()
-            named = [work.name(items[number]) for number in _items_of_dead(workers_here, shared)]
+            # Of the workers, the pool itself ended those with these codes.
+            ended = {each.pid for each in workers_here if each.exitcode in (0, -signal.SIGTERM)}
+            worked_on = zip(items, shared.worked_on_by, strict=True)
+            named = [work.name(item) for item, pid in worked_on if pid and pid not in ended]
             where = f"{', '.join(named[:_SHOWN])}: " if named else ""
             raise StorageError(
                 f"{where}a worker process died: it was killed (is memory short?), or the calling "
@@ -222,14 +225,6 @@ class ProcessPool(Engine):
 
 
 LOCAL: Final = ProcessPool()
-
-
-def _items_of_dead(workers: set[BaseProcess], shared: _Shared) -> list[int]:
-    """Return the numbers of the items whose workers died, without those the pool then ended."""
-    ended = {each.pid for each in workers if each.exitcode in (0, -signal.SIGTERM)}
-    return [
-        number for number, pid in enumerate(shared.worked_on_by) if pid != 0 and pid not in ended
-    ]
 
 
 @contextmanager
@@ -308,10 +303,8 @@ class RayCluster(Engine):
     def _results(self, work: _Work, workers: int | None) -> Generator[Any, None, None]:
         if not work.items:
             return
-        try:
+        with needs_extra("the engine 'ray'", "ray"):
             ray = importlib.import_module("ray")
-        except ImportError as error:
-            raise missing_extra("the engine 'ray'", "ray", error) from error
         with _connected(ray, self.address):
             options = {"max_retries": _TRIES - 1, "num_cpus": 1, "num_gpus": self.gpus}
             remote = ray.remote(**options)(_run_on_ray)

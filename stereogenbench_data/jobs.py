@@ -71,20 +71,26 @@ def job_folder(
             first setting that differs.
     """
     stated = root / kind.settings
+
+    def refuse_other_work() -> None:
+        if not stated.exists() and _has_items(root, kind):
+            raise kind.error(
+                f"{root}: is not empty and holds no {kind.settings}: choose a new folder."
+            )
+
     with ExitStack() as held:
         with named_errors(root):
             root.mkdir(parents=True, exist_ok=True)
             # Nothing is left behind in a folder of something else. A job writes its lock first:
             # where its files are seen, so is the lock.
-            if _holds_other_work(root, kind) and not (root / kind.lock).exists():
-                raise _other_work(root, kind)
+            if not (root / kind.lock).exists():
+                refuse_other_work()
             if not held.enter_context(try_locked(root / kind.lock)):
                 raise StorageError(
                     f"{root}: another process works on this folder. Wait for it, or choose another "
                     "folder."
                 )
-            if _holds_other_work(root, kind):
-                raise _other_work(root, kind)
+            refuse_other_work()
             if stated.exists() and _has_items(root, kind):
                 asked = json.loads(json_bytes(settings))
                 for name, theirs, ours in _differences(read_json(stated), asked):
@@ -95,14 +101,6 @@ def job_folder(
             else:
                 write_atomic(stated, json_bytes(settings))
         yield
-
-
-def _holds_other_work(root: Path, kind: JobKind) -> bool:
-    return not (root / kind.settings).exists() and _has_items(root, kind)
-
-
-def _other_work(root: Path, kind: JobKind) -> StereoGenBenchError:
-    return kind.error(f"{root}: is not empty and holds no {kind.settings}: choose a new folder.")
 
 
 def _has_items(root: Path, kind: JobKind) -> bool:

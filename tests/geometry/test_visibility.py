@@ -5,7 +5,6 @@ from hypothesis import strategies as st
 
 from stereogenbench_data.geometry.disparity import disparity_from_depth
 from stereogenbench_data.geometry.projection import (
-    Projection,
     project_rectified,
     visible_from_source,
     visible_in_target,
@@ -84,46 +83,44 @@ def test_of_two_source_pixels_on_one_target_pixel_the_farther_is_hidden(library)
     assert library.numpy(visible).tolist() == [[False, True, False, True, True]]
 
 
-def brute_force(projection: Projection, measured, target_m, target_measured, tolerance, quantum_m):
-    """Return visibility decided pixel by pixel, in python."""
-    visible = np.zeros(measured.shape, dtype=bool)
-    for v, u in np.ndindex(*measured.shape):
-        row_px = v if projection.v_px is None else projection.v_px[v, u]
-        column_px, depth_m = projection.u_px[v, u], projection.depth_m[v, u]
-        if not (measured[v, u] and 0 <= column_px < target_m.shape[1]):
-            continue
-        if not 0 <= row_px < target_m.shape[0]:
-            continue
-        place = int(row_px), int(column_px)
-        difference_m = abs(float(target_m[place]) - float(depth_m))
-        agrees = difference_m <= tolerance * float(depth_m) + 2 * quantum_m
-        visible[v, u] = target_measured[place] and agrees
-    return visible
+class Scattered:
+    """Points of a map of 6x9 pixels that land anywhere in and around a target, some nowhere."""
+
+    def __init__(self, seed, rows, *, target_shape):
+        self.rng = np.random.default_rng(seed)
+        height, width = target_shape
+        self.depth_m = self.rng.uniform(1.0, 1.2, (6, 9))
+        self.u_px = self.rng.uniform(-2.0, width + 2.0, (6, 9))
+        self.v_px = self.rng.uniform(-2.0, height + 2.0, (6, 9))
+        if rows == "kept":
+            self.v_px = np.tile(np.arange(6)[:, None] + 0.5, (1, 9))
+        self.u_px[0, 0] = np.nan
+        self.measured = self.rng.random((6, 9)) < 0.8
+        inside = (self.u_px >= 0) & (self.u_px < width) & (self.v_px >= 0) & (self.v_px < height)
+        self.landed = self.measured & inside
+
+    def places(self):
+        """Return each pixel that lands, with the target's pixel."""
+        for place in np.argwhere(self.landed):
+            yield tuple(place), (int(self.v_px[*place]), int(self.u_px[*place]))
 
 
 @settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), rows=st.sampled_from(["kept", "moved"]))
 def test_whole_maps_are_decided_as_pixel_by_pixel(library, seed, rows):
-    rng = np.random.default_rng(seed)
-    shape, target_shape = (6, 9), (6, 9) if rows == "kept" else (5, 11)
-    depth_m = rng.uniform(1.0, 1.2, shape)
-    u_px = rng.uniform(-2.0, target_shape[1] + 2.0, shape)
-    v_px = rng.uniform(-2.0, target_shape[0] + 2.0, shape)
-    u_px[0, 0] = v_px[0, 0] = np.nan
-    measured, target_measured = rng.random(shape) < 0.8, rng.random(target_shape) < 0.8
-    target_m = rng.uniform(1.0, 1.2, target_shape)
-    expected = brute_force(
-        Projection(u_px, None if rows == "kept" else v_px, depth_m),
-        measured,
-        target_m,
-        target_measured,
-        tolerance=0.03,
-        quantum_m=0.01,
-    )
+    shape = (6, 9) if rows == "kept" else (5, 11)
+    points = Scattered(seed, rows, target_shape=shape)
+    target_m = points.rng.uniform(1.0, 1.2, shape)
+    target_measured = points.rng.random(shape) < 0.8
+    expected = np.zeros((6, 9), dtype=bool)
+    for here, there in points.places():
+        depth_m = float(points.depth_m[here])
+        agrees = abs(float(target_m[there]) - depth_m) <= 0.03 * depth_m + 2 * 0.01
+        expected[here] = target_measured[there] and agrees
 
     visible = visible_in_target(
-        library.projection(u_px, v_px, depth_m, rows=rows),
-        measured=library.array(measured),
+        library.projection(points.u_px, points.v_px, points.depth_m, rows=rows),
+        measured=library.array(points.measured),
         target_depth_m=library.array(target_m),
         target_measured=library.array(target_measured),
         quantum_m=0.01,
@@ -136,25 +133,21 @@ def test_whole_maps_are_decided_as_pixel_by_pixel(library, seed, rows):
 @settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), rows=st.sampled_from(["kept", "moved"]))
 def test_a_pixel_is_hidden_where_a_nearer_one_lands_beside_it(library, seed, rows):
-    """Against each pixel's nearest rival, found by comparing all pixels with all."""
-    rng = np.random.default_rng(seed)
-    shape = height, width = 5, 9
-    depth_m = np.where(rng.random(shape) < 0.1, np.inf, rng.uniform(1.0, 1.3, shape))
-    u_px, v_px = rng.uniform(-2.0, width + 2.0, shape), rng.uniform(-2.0, height + 2.0, shape)
-    u_px[0, 0] = v_px[0, 0] = np.nan
-    measured = rng.random(shape) < 0.8
-    row_px = np.arange(height)[:, None] + 0.5 if rows == "kept" else v_px
-    landed = measured & (u_px >= 0) & (u_px < width) & (row_px >= 0) & (row_px < height)
-    cells = np.broadcast_to(np.floor(row_px) * width + np.floor(u_px), shape)
-    beside = (cells[..., None, None] == cells) & landed
-    nearest_m = np.where(beside, depth_m, np.inf).min(axis=(-1, -2))
+    """Against each pixel's nearest rival; the sky is a rival of none."""
+    points = Scattered(seed, rows, target_shape=(6, 9))
+    points.depth_m[points.rng.random((6, 9)) < 0.1] = np.inf
+    nearest_m = dict.fromkeys((there for _, there in points.places()), np.inf)
+    for here, there in points.places():
+        nearest_m[there] = min(nearest_m[there], points.depth_m[here])
+    expected = np.zeros((6, 9), dtype=bool)
+    for here, there in points.places():
+        expected[here] = nearest_m[there] >= points.depth_m[here] * 0.97 - 0.02
 
     visible = visible_from_source(
-        library.projection(u_px, v_px, depth_m, rows=rows),
-        measured=library.array(measured),
+        library.projection(points.u_px, points.v_px, points.depth_m, rows=rows),
+        measured=library.array(points.measured),
         quantum_m=0.01,
         tolerance=0.03,
     )
 
-    expected = landed & (nearest_m >= depth_m * 0.97 - 0.02)
     np.testing.assert_array_equal(library.numpy(visible), expected)
