@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from stereogenbench_data import SceneIndex, StereoPairs
+from stereogenbench_data.media import depth
 
 
 @pytest.fixture(scope="session")
@@ -17,6 +18,25 @@ def small_index(small_release):
 def keyed(small_index):
     """All adjacent pairs of all frames, 140 samples of 4 scenes, with no field but their key."""
     return StereoPairs(small_index, fields=("__key__",), pairs="adjacent", frames="all")
+
+
+@pytest.fixture
+def read(monkeypatch):
+    """The frames that are read by each reader that is opened: (name of the video, frames)."""
+    opened = []
+
+    class Recording(depth.VideoReader):
+        def __init__(self, file, *, name, **options):
+            super().__init__(file, name=name, **options)
+            self.read = []
+            opened.append((name, self.read))
+
+        def frame(self, index):
+            self.read.append(index)
+            return super().frame(index)
+
+    monkeypatch.setattr(depth, "VideoReader", Recording)
+    return opened
 
 
 def keys_of(batches):

@@ -30,7 +30,6 @@ def test_a_batch_is_its_samples_where_they_were_written(pairs):
     for name, value in tensors(batch).items():
         assert value.is_contiguous()
         assert value.data_ptr() == samples[0][name].data_ptr()
-    pairs.close()
 
 
 def test_samples_from_elsewhere_are_copied_as_torch_does(pairs):
@@ -41,7 +40,6 @@ def test_samples_from_elsewhere_are_copied_as_torch_does(pairs):
     neighbours = pairs.__getitems__([1, 2, 3])
     for some in (neighbours[::2], neighbours[::-1], neighbours[1:], neighbours[:1] * 2):
         assert same(collate(some), default_collate(some))
-    pairs.close()
 
 
 def test_a_sample_that_comes_twice_in_a_batch_is_there_twice(pairs):
@@ -51,7 +49,6 @@ def test_a_sample_that_comes_twice_in_a_batch_is_there_twice(pairs):
     assert torch.equal(batch["left"][0], batch["left"][2])
     batch["left"][0] = 0
     assert batch["left"][2].any()
-    pairs.close()
 
 
 @pytest.mark.parametrize("fields", [tuple(PAIR_FIELDS), ("right", "visible")], ids=len)
@@ -73,7 +70,6 @@ def test_batches_that_a_loop_keeps_are_never_written_again(pairs, workers):
     for batch in kept:
         samples = [expected[key] for key in batch["__key__"]]
         assert same(batch, default_collate(samples))
-    pairs.close()
 
 
 @pytest.mark.parametrize("workers", [0, 1])
@@ -87,7 +83,6 @@ def test_a_part_of_a_batch_keeps_all_of_it(pairs, workers):
 
     for key, part in kept:
         assert torch.equal(torch.as_tensor(part).reshape(3, 64, 64), expected[key])
-    pairs.close()
 
 
 @pytest.mark.parametrize(("workers", "most"), [(0, KEPT_BUFFERS), (1, SLOTS + 2)])
@@ -100,7 +95,6 @@ def test_a_loop_that_lets_its_batches_go_uses_the_same_memory_again(pairs, worke
 
     assert len(loader) == 15
     assert len(places) <= most
-    loader.close()
 
 
 def places(loader):
@@ -121,7 +115,6 @@ def test_workers_that_persist_go_on_with_their_memory(pairs):
         assert all(same(one, other) for one, other in zip(loader, alone, strict=True))
 
     assert len(set(places(loader))) <= SLOTS
-    loader.close()
 
 
 def test_passes_broken_off_cost_workers_that_persist_no_memory(pairs):
@@ -132,7 +125,6 @@ def test_passes_broken_off_cost_workers_that_persist_no_memory(pairs):
 
     assert len(places(loader)) == 15
     assert len(set(places(loader))) <= 2 * SLOTS
-    loader.close()
 
 
 def test_fresh_buffers_give_each_batch_memory_of_its_own(small_index):

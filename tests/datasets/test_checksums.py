@@ -89,7 +89,6 @@ def test_single_frames_are_given_without_reading_the_rest(shards, options, small
     flip(shards / SHARD, member, place=1 - 1 / member.size)
 
     assert torch.equal(pairs[0]["left"], selected(small_shards)[0]["left"])
-    pairs.close()
 
 
 def test_a_video_is_compared_once_a_process(shards):

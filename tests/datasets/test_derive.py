@@ -51,7 +51,7 @@ RIGS = ("rectified", "posed")
 MASKS = ("valid", "visible", "visible_from_left", "valid_right", "visible_right", "hole")
 
 
-def scene(encoding, *, rig="rectified", seed=0):
+def scene(encoding, *, rig="rectified", seed=0, size=SIZE):
     """Return the views of a scene of 6 cameras and 2 frames, of random depth, and its facts."""
     rng = np.random.default_rng(seed)
     known = facts(encoding, residual_px=0.0 if rig == "rectified" else 1.0)
@@ -71,7 +71,7 @@ def scene(encoding, *, rig="rectified", seed=0):
     )
     depths = {}
     for camera in range(6):
-        near, far = (rng.integers(20, 400, (len(FRAMES), *SIZE)) for _ in range(2))
+        near, far = (rng.integers(20, 400, (len(FRAMES), *size)) for _ in range(2))
         stored = np.where(rng.random(near.shape) < 0.5, near, far // 8).astype(np.uint16)
         for number in (0, 7, 77, 40000, 65535):
             stored[rng.random(stored.shape) < 0.02] = number
@@ -80,11 +80,11 @@ def scene(encoding, *, rig="rectified", seed=0):
     views = Views(
         source=0, targets=(1, 2, 3, 4, 5), frames=FRAMES,
         pictures={
-            camera: rng.integers(0, 256, (len(FRAMES), 3, *SIZE), dtype=np.uint8)
+            camera: rng.integers(0, 256, (len(FRAMES), 3, *size), dtype=np.uint8)
             for camera in range(6)
         },
         depths=depths,
-        intrinsics=Intrinsics(100.0 + rng.random(), 99.0, 20.3, 6.2, SIZE[1], SIZE[0]),
+        intrinsics=Intrinsics(100.0 + rng.random(), 99.0, 20.3, 6.2, size[1], size[0]),
     )  # fmt: skip
     return views, known
 
@@ -216,32 +216,13 @@ def test_only_the_pairs_and_fields_asked_for_are_made():
     assert made["pair"].tolist() == [[[4, 1], [0, 5]]]
 
 
-def of_size(height, width, *, seed=0):
-    """Return a batch of one still of random depth, of a rectified rig."""
-    rng = np.random.default_rng(seed)
-    places_m = 0.1 * np.arange(6)
-    units = rng.integers(100, 500, (1, 6, 1, height, width), dtype=np.uint16)
-    return {
-        "image": torch.from_numpy(
-            rng.integers(0, 256, (1, 6, 3, height, width), dtype=np.uint8)
-        ),
-        "stored_depth": torch.from_numpy(units),
-        "depth_unit_m": torch.full((1, 6), 0.01, dtype=torch.float64),
-        "depth_offset_m": torch.zeros((1, 6), dtype=torch.float64),
-        "no_depth": torch.zeros(1, 6, dtype=torch.int64),
-        "depth_kind": ["planar"], "depth_form": ["depth"], "rig": ["rectified"],
-        "intrinsics": torch.tensor(
-            [[[60.0, 0, width / 2], [0, 60, height / 2], [0, 0, 1]]], dtype=torch.float64
-        ),
-        "baselines_m": torch.from_numpy(places_m[None, None] - places_m[None, :, None]),
-        "cams_from_cam": torch.eye(4, dtype=torch.float64).expand(1, 6, 6, 4, 4),
-        "camera": torch.arange(6)[None],
-    }  # fmt: skip
+def plain_batch():
+    return batch_of([scene(CONTRACTS["planar depth"])])
 
 
 def test_many_pixels_are_made_some_pairs_at_a_time():
-    """All 15 pairs are 6 million pixels: more than are made at once."""
-    batch = of_size(640, 640)
+    """All 15 pairs are 3 million pixels: more than are made at once."""
+    batch = batch_of([scene(CONTRACTS["planar depth"], size=(320, 320))])
     fields = ("disparity", "visible", "warped_right")
 
     together = derive(batch, fields=fields)
@@ -276,7 +257,7 @@ def test_torch_compile_takes_it_as_one_graph():
 
 def test_results_stay_on_the_device_that_is_asked_for():
     """The meta device takes no tensor of another one, as a GPU does not."""
-    made = derive(of_size(8, 8), fields=DERIVED_FIELDS, device="meta")
+    made = derive(plain_batch(), fields=DERIVED_FIELDS, device="meta")
 
     assert {str(values.device) for values in made.values()} == {"meta"}
 
@@ -302,12 +283,12 @@ def test_a_gpu_gives_what_the_processor_gives(contract):
 )
 def test_a_field_that_cannot_be_made_is_named(options, message):
     with pytest.raises(FieldError, match=message):
-        derive(of_size(2, 4), **options)
+        derive(plain_batch(), **options)
 
 
 @pytest.mark.parametrize("name", ["stored_depth", "image"])
 def test_a_missing_field_of_the_batch_is_named_with_the_cure(name):
-    batch = of_size(2, 4)
+    batch = plain_batch()
     del batch[name]
 
     with pytest.raises(FieldError, match=f"no {name}: .*fields=DERIVE_FIELDS"):
@@ -317,29 +298,31 @@ def test_a_missing_field_of_the_batch_is_named_with_the_cure(name):
 @pytest.mark.parametrize(
     ("change", "found"),
     [
-        (lambda depth: depth.to(torch.int32), r"torch\.int32 \(1, 6, 1, 2, 4\)"),
-        (lambda depth: depth[0], r"torch\.uint16 \(6, 1, 2, 4\)"),
+        (lambda depth: depth.to(torch.int32), r"torch\.int32 \(1, 6, 2, 1, 12, 40\)"),
+        (lambda depth: depth[0, 0], r"torch\.uint16 \(2, 1, 12, 40\)"),
     ],
 )
 def test_depth_of_another_dtype_or_without_a_batch_is_refused(change, found):
-    batch = of_size(2, 4)
+    batch = plain_batch()
 
     with pytest.raises(FieldError, match=f"stored_depth is {found}, not uint16"):
         derive(batch | {"stored_depth": change(batch["stored_depth"])})
 
 
 def test_pictures_of_another_size_than_their_depth_are_refused():
-    batch = of_size(4, 8)
+    batch = plain_batch()
     batch["image"] = batch["image"].repeat_interleave(2, dim=-1)
 
-    with pytest.raises(FieldError, match=r"image is \(1, 6, 3, 4, 16\).*\(1, 6, 1, 4, 8\).*size="):
+    with pytest.raises(
+        FieldError, match=r"image is \(1, 6, 2, 3, 12, 80\).*\(1, 6, 2, 1, 12, 40\)"
+    ):
         derive(batch, fields=("left",))
 
 
 @pytest.mark.parametrize("pairs", [[(1, 1)], [(0, 6)], [(-1, 2)], "some", []])
 def test_pairs_must_be_of_two_views_of_the_batch(pairs):
     with pytest.raises(SelectionError, match=r"pair"):
-        derive(of_size(2, 4), pairs=pairs)
+        derive(plain_batch(), pairs=pairs)
 
 
 @pytest.mark.parametrize(

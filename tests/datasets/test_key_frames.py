@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from stereogenbench_data import SceneIndex, StereoPairs
-from stereogenbench_data.media import depth
 from stereogenbench_data.selection import plan
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
@@ -92,41 +91,25 @@ def test_runs_are_shuffled_by_themselves_and_hold_the_right_frames(whole, keyed_
             torch.testing.assert_close(found[sample["__key__"]][name], sample[name], rtol=0, atol=0)
 
 
-def test_a_run_begins_decoding_at_its_key_frame(keyed_release, monkeypatch):
-    first = {}
-
-    class Counting(depth.VideoReader):
-        def frame(self, index):
-            first.setdefault(id(self), (self, index))
-            return super().frame(index)
-
-    monkeypatch.setattr(depth, "VideoReader", Counting)
-    loader = StereoPairs(keyed_release, frames="all", fields=("left",)).loader(
-        4, drop_last=False, shuffle_groups=1
-    )
-    for _ in loader:
+def test_a_run_begins_decoding_at_its_key_frame(keyed_release, read):
+    pairs = StereoPairs(keyed_release, frames="all", fields=("left",))
+    for _ in pairs.loader(4, drop_last=False, shuffle_groups=1):
         pass
 
-    assert {index for _, index in first.values()} <= {*KEY_FRAMES}
+    assert {found[0] for _, found in read if found} <= {*KEY_FRAMES}
 
 
 @pytest.mark.parametrize("open_frames", [1, 3])
-def test_interleaved_frames_of_all_pairs_are_decoded_once(keyed_release, monkeypatch, open_frames):
-    read = defaultdict(list)
-
-    class Counting(depth.VideoReader):
-        def frame(self, index):
-            read[self.name].append(index)
-            return super().frame(index)
-
-    monkeypatch.setattr(depth, "VideoReader", Counting)
+def test_interleaved_frames_of_all_pairs_are_decoded_once(keyed_release, read, open_frames):
     pairs = StereoPairs(keyed_release, frames="all", pairs="all", fields=("left", "right"))
-    loader = pairs.loader(4, drop_last=False, shuffle_groups=1, open_frames=open_frames)
-    for _ in loader:
+    for _ in pairs.loader(4, drop_last=False, shuffle_groups=1, open_frames=open_frames):
         pass
+    frames = defaultdict(list)
+    for name, found in read:
+        frames[name] += found
 
-    assert len(read) == 6 * 2
-    assert all(sorted(frames) == list(range(len(frames))) for frames in read.values())
+    assert len(frames) == 6 * 2
+    assert all(sorted(found) == list(range(len(found))) for found in frames.values())
 
 
 @pytest.mark.parametrize(

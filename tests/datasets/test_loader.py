@@ -3,7 +3,7 @@
 import itertools
 import json
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import replace
 
 import pytest
@@ -16,10 +16,7 @@ from stereogenbench_data import (
 from stereogenbench_data.datasets.batches import (
     OpenVideosWarning,
     RepeatedDecodingWarning,
-    videos_per_scene,
 )
-from stereogenbench_data.media import depth
-from stereogenbench_data.samples.fields import parse_request
 from stereogenbench_data.selection.order import OrderRule
 from tests.datasets.conftest import flat, in_turn, keys_of
 
@@ -97,7 +94,6 @@ def test_loaders_of_one_dataset_have_their_own_videos(small_index):
     one.close()
     assert one.stats().videos_open == 0
     assert len(list(samples)) == 6
-    one.close()
 
 
 @pytest.mark.parametrize(
@@ -146,47 +142,20 @@ def test_every_batch_is_a_place_to_stop(keyed):
         assert resumed.state_dict()["batches_consumed"] == 16
 
 
-def test_each_whole_pass_is_followed_by_the_next_epoch(keyed):
-    told, by_itself = keyed.loader(9), keyed.loader(9, num_workers=1)
-    expected = []
-    for epoch in range(3):
-        told.set_epoch(epoch)
-        expected.append(keys_of(told))
-    assert [keys_of(by_itself) for _ in range(3)] == expected
-    assert by_itself.epoch == 2
-
-    assert [by_itself.set_epoch(1) or keys_of(by_itself) for _ in range(2)] == [expected[1]] * 2
-    assert keys_of(by_itself) == expected[2]
-
-
-def test_a_loop_that_stops_at_the_length_has_made_a_whole_pass(keyed):
-    """Trainers that know how many batches there are do not ask for one more."""
-    loader = keyed.loader(9)
-    passes = []
-    for _ in range(3):
-        batches = iter(loader)
-        passes.append([next(batches)["__key__"] for _ in range(len(loader))])
-
-    assert passes == [keyed.set_epoch(epoch) or keys_of(keyed.loader(9)) for epoch in range(3)]
-
-
 @pytest.mark.parametrize("options", [{}, {"num_workers": 2, "persistent_workers": True}], ids=str)
-def test_a_loop_that_is_left_is_followed_by_the_next_epoch(keyed, options):
+@pytest.mark.parametrize("steps", [3, 15, 16], ids=["left", "stopped at the length", "whole"])
+def test_each_pass_is_followed_by_the_next_epoch(keyed, options, steps):
     """A fixed number of steps an epoch sees other samples in each."""
     loader = keyed.loader(9, **options)
     expected = [keyed.set_epoch(epoch) or keys_of(keyed.loader(9)) for epoch in range(4)]
     keyed.set_epoch(0)
     for epoch in range(3):
-        found = []
-        for step, batch in enumerate(loader):
-            if step == 3:
-                break
-            found.append(batch["__key__"])
+        assert keys_of(itertools.islice(loader, steps)) == expected[epoch][:steps]
         assert loader.epoch == epoch
-        assert found == expected[epoch][:3]
 
     assert keys_of(loader) == expected[3]
-    loader.close()
+    assert [loader.set_epoch(1) or keys_of(loader) for _ in range(2)] == [expected[1]] * 2
+    assert keys_of(loader) == expected[2]
 
 
 def test_in_order_no_sample_is_left_out(keyed):
@@ -198,36 +167,29 @@ def test_in_order_no_sample_is_left_out(keyed):
     assert len(keyed.loader(9, shuffle=False, drop_last=True)) == 15
 
 
-@pytest.mark.parametrize("drop_last", [False, "pad", True])
-def test_ranks_that_save_at_the_end_of_an_epoch_go_on_in_the_same_one(keyed, drop_last):
-    states = []
-    for rank in range(3):
-        loader = keyed.loader(9, rank=rank, world_size=3, drop_last=drop_last)
-        for _ in loader:
-            pass
-        states.append(loader.state_dict())
-    resumed = [keyed.loader(9, rank=rank, world_size=3, drop_last=drop_last) for rank in range(3)]
-    for loader, state in zip(resumed, states, strict=True):
-        loader.load_state_dict(state)
-
-    assert [loader.epoch for loader in resumed] == [1, 1, 1]
-    assert all(len(list(loader)) == len(loader) for loader in resumed)
-
-
-def test_ranks_that_save_before_the_end_go_on_in_it(keyed):
-    """After five steps of each: one rank has no more, and is in the epoch of the others."""
+@pytest.mark.parametrize(
+    ("drop_last", "steps", "epoch", "left"),
+    [
+        (False, 9, 1, [6, 5, 5]),
+        ("pad", 9, 1, [6, 6, 6]),
+        (True, 9, 1, [5, 5, 5]),
+        (False, 5, 0, [1, 0, 0]),
+    ],
+)
+def test_ranks_that_save_are_in_one_epoch_though_one_has_no_more(
+    keyed, drop_last, steps, epoch, left
+):
     resumed = []
     for rank in range(3):
-        loader = keyed.loader(9, rank=rank, world_size=3, drop_last=False)
-        for _ in zip(range(5), loader, strict=False):
+        options = {"rank": rank, "world_size": 3, "drop_last": drop_last}
+        loader = keyed.loader(9, **options)
+        for _ in itertools.islice(loader, steps):
             pass
-        state = loader.state_dict()
-        loader = keyed.loader(9, rank=rank, world_size=3, drop_last=False)
-        loader.load_state_dict(state)
-        resumed.append(loader)
+        resumed.append(keyed.loader(9, **options))
+        resumed[-1].load_state_dict(loader.state_dict())
 
-    assert [loader.epoch for loader in resumed] == [0, 0, 0]
-    assert [len(list(loader)) for loader in resumed] == [1, 0, 0]
+    assert [loader.epoch for loader in resumed] == [epoch] * 3
+    assert [len(list(loader)) for loader in resumed] == left
 
 
 @pytest.mark.parametrize("options", [{}, {"num_workers": 2, "persistent_workers": True}], ids=str)
@@ -274,7 +236,6 @@ def test_samples_of_a_resumed_run_are_the_same_to_the_bit(small_index):
         assert one["__key__"] == other["__key__"]
         assert torch.equal(one["left"], other["left"])
         assert torch.equal(one["disparity"], other["disparity"])
-    pairs.close()
 
 
 def test_padding_is_flagged_and_ranks_are_even(keyed):
@@ -323,55 +284,29 @@ def test_a_loader_says_which_share_of_the_time_the_loop_waited(keyed):
     assert 0 == before < slow_loop < idle_loop <= 1
 
 
-@pytest.fixture
-def opened(monkeypatch):
-    """Count how often each video is opened, and which of its frames are read, in order."""
-    counts, frames = Counter(), {}
-
-    class Counting(depth.VideoReader):
-        def __init__(self, file, *, name, **options):
-            counts[name] += 1
-            super().__init__(file, name=name, **options)
-            self._called = name
-
-        def frame(self, index):
-            frames.setdefault(self._called, []).append(index)
-            return super().frame(index)
-
-    monkeypatch.setattr(depth, "VideoReader", Counting)
-    return counts, frames
-
-
 @pytest.mark.parametrize("world", [1, 2])
 def test_each_frame_is_decoded_once_and_scenes_are_opened_again_for_their_beginning_alone(
-    small_index, opened, world
+    small_index, read, world
 ):
     """A scene that is started inside is decoded to its end and then its beginning."""
-    counts, frames = opened
     for rank in range(world):
         pairs = StereoPairs(small_index, pairs="all", frames="all")
         loader = pairs.loader(2, shuffle_groups=world, rank=rank, world_size=world, drop_last=False)
         for _ in loader:
             pass
-        pairs.close()
+    frames = defaultdict(list)
+    for name, found in read:
+        frames[name] += found
 
-    assert len(counts) == 4 * 11
-    assert max(counts.values()) <= 2
+    assert len(frames) == 4 * 11
+    assert max(Counter(name for name, _ in read).values()) <= 2
     turns = [[*range(start, 7), *range(start)] for start in range(7)]
     assert all(found in turns for found in frames.values() if world == 1)
     assert {tuple(sorted(found)) for found in frames.values()} == {tuple(range(7))}
 
 
-def test_a_scene_that_is_parted_between_groups_is_read_forwards_in_each(small_index, monkeypatch):
+def test_a_scene_that_is_parted_between_groups_is_read_forwards_in_each(small_index, read):
     """One process reads both groups; one decoder for them would go to and fro."""
-    read = {}
-
-    class Counting(depth.VideoReader):
-        def frame(self, index):
-            read.setdefault(id(self), (self, []))[1].append(index)
-            return super().frame(index)
-
-    monkeypatch.setattr(depth, "VideoReader", Counting)
     pairs = StereoPairs(small_index, frames="all", fields=("left",))
     loader = pairs.loader(6, drop_last=False)
     order = loader.batches.of_all_ranks.order(0)
@@ -384,9 +319,8 @@ def test_a_scene_that_is_parted_between_groups_is_read_forwards_in_each(small_in
     for _ in loader:
         pass
 
-    frames = [found for _, found in read.values()]
-    assert all(found == sorted(found) for found in frames)
-    assert sum(map(len, frames)) == 4 * 7
+    assert all(found == sorted(found) for _, found in read)
+    assert sum(len(found) for _, found in read) == 4 * 7
 
 
 def test_videos_are_closed_after_their_scenes_last_sample(small_index):
@@ -398,20 +332,6 @@ def test_videos_are_closed_after_their_scenes_last_sample(small_index):
 
     assert most == 11
     assert loader.stats().videos_open == 0
-
-
-def test_a_scene_needs_the_videos_that_its_fields_are_made_from(small_index):
-    def videos(fields, **selection):
-        pairs = StereoPairs(small_index, fields=fields, **selection)
-        request = parse_request("pairs", "single", fields=fields, options={})
-        return videos_per_scene(pairs.plan, request.streams)
-
-    assert videos(("left", "right", "disparity")) == 3
-    assert videos(("left", "right", "disparity"), pairs="all") == 11
-    assert videos(("left", "right", "visible"), pairs="all") == 12
-    assert videos(("left", "right", "visible"), pairs="sweep") == 12
-    assert videos(("left",), pairs="adjacent") == 5
-    assert videos(("__key__",)) == 0
 
 
 def test_too_many_open_videos_are_warned_of(small_index, monkeypatch):

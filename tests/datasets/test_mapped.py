@@ -4,13 +4,11 @@ import gc
 import os
 import pickle
 import re
-import shutil
 import subprocess
 import sys
 import warnings
 import weakref
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from functools import partial
 
 import numpy as np
@@ -27,10 +25,8 @@ from stereogenbench_data import (
     Eraser,
     FieldError,
     HorizontalFlip,
-    MediaError,
     MixedSplitsWarning,
     RandomCrop,
-    SceneIndex,
     SceneViews,
     SelectionError,
     StereoPairs,
@@ -142,17 +138,6 @@ def test_workers_of_every_kind_give_what_the_main_process_gives(indexed_release,
     )
 
     assert all(same(one, other) for one, other in zip(alone, loader, strict=True))
-    pairs.close()
-
-
-def test_random_access_gives_what_reading_in_order_gives(indexed_release):
-    pairs = StereoPairs(indexed_release, pairs="all", frames="all", fields=("left", "depth_right"))
-    order = np.random.default_rng(0).permutation(len(pairs))[:60]
-    forwards = {int(number): pairs[int(number)] for number in sorted(order)}
-
-    with closing(StereoPairs(indexed_release, pairs="all", frames="all",
-                             fields=("left", "depth_right"))) as again:  # fmt: skip
-        assert all(same(again[int(number)], forwards[int(number)]) for number in order)
 
 
 def test_a_batch_comes_in_the_order_requested_though_it_is_read_forwards(indexed_release):
@@ -177,13 +162,6 @@ def test_transforms_draw_anew_each_epoch_and_the_same_for_the_same_seed(indexed_
     assert crops(0, 0) != crops(1, 0)
 
 
-def test_a_dataset_survives_pickling_with_videos_open(indexed_release):
-    pairs = StereoPairs(indexed_release, fields=EVERY_FIELD)
-    first = pairs[0]
-
-    assert same(pickle.loads(pickle.dumps(pairs))[0], first)
-
-
 def test_what_a_user_writes_into_a_sample_stays_there(indexed_release):
     pairs = StereoPairs(indexed_release, fields=EVERY_FIELD)
     untouched = pairs[0]
@@ -206,17 +184,6 @@ def test_a_forked_child_reads_on_without_disturbing_its_parent(indexed_release):
 
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
     assert parent_right
-
-
-def test_an_error_in_a_worker_keeps_its_class_and_its_words(indexed_release, tmp_path):
-    broken = shutil.copytree(indexed_release, tmp_path / "copy")
-    index = SceneIndex.open(broken)
-    victim = next(broken.glob("train/IPD_Gaussian/*/*/cam_01_rgb.mp4"))
-    victim.write_bytes(victim.read_bytes()[:-900] + bytes(900))
-    pairs = StereoPairs(index, frames="all", family="IPD_Gaussian")
-
-    with pytest.raises(MediaError, match=r"cam_01_rgb.mp4"):
-        list(DataLoader(pairs, num_workers=1, batch_size=2))
 
 
 def test_a_batch_of_scenes_of_two_sizes_says_how_to_mend_it():

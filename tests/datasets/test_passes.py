@@ -78,7 +78,6 @@ def test_workers_that_persist_tell_the_older_of_two_passes_that_it_is_over(pairs
         next(older)
     loader.close()
     assert len(list(loader)) == 15
-    loader.close()
 
 
 def test_epochs_set_during_a_pass_are_those_of_the_next_one(small_index):
@@ -109,8 +108,6 @@ def test_a_copy_of_a_loader_has_passes_of_its_own(pairs, truth, copied):
     taken += batches
     assert sum(wrong(batch, truth) for batch in taken) == 0
     assert keys_of(taken) == keys_of(pairs.loader(9))
-    loader.close()
-    other.close()
 
 
 @pytest.mark.parametrize(("workers", "copied"), [(0, copy.deepcopy), (2, pickle.dumps)])
@@ -212,7 +209,6 @@ def test_a_fork_may_begin_a_pass_of_its_own(pairs, truth):
             assert fork_and(lambda: sum(wrong(other, truth) for other in loader) and 1 / 0) == 0
 
     assert keys_of(found) == keys_of(pairs.loader(9))
-    loader.close()
 
 
 def test_threads_that_share_a_pass_take_turns(pairs):
@@ -335,7 +331,6 @@ def test_a_worker_that_dies_ends_the_pass_whatever_it_held(
     dying.how = None
 
     assert len(list(loader)) == 14
-    loader.close()
 
 
 def test_an_error_ends_its_pass_and_says_so_to_who_asks_on(small_index):

@@ -61,8 +61,6 @@ def test_shards_give_what_the_released_files_give(root, indexed_release):
         found = pairs[number]
         assert found.pop("__url__").startswith(f"{root}/eval-" if number == 0 else str(root))
         assert same(found, expected[number])
-    expected.close()
-    pairs.close()
 
 
 @pytest.mark.parametrize(("context", "place"), [("spawn", "web"), ("fork", "hub"), ("fork", "s3")])
@@ -77,8 +75,6 @@ def test_workers_read_over_connections_of_their_own(context, place, root_of, ind
     for loaded, sample in zip(loader, expected, strict=True):
         assert same(loaded, sample)
     assert same(pairs[1], expected[1])
-    pairs.close()
-    expected.close()
 
 
 def test_a_server_that_fails_now_and_then_changes_nothing(
@@ -101,8 +97,6 @@ def test_a_server_that_fails_now_and_then_changes_nothing(
 
     assert all(same(pairs[number], expected[number]) for number in range(len(pairs)))
     assert shards_served.answers == []
-    pairs.close()
-    expected.close()
 
 
 def test_a_server_that_dies_in_the_middle_is_reported(large_shards, impatient):
@@ -115,7 +109,6 @@ def test_a_server_that_dies_in_the_middle_is_reported(large_shards, impatient):
         r"at byte \d+ of \d+ \(.*Connection refused; 10 tries\). Check the network",
     ):
         pairs[6]
-    pairs.close()
 
 
 @pytest.mark.parametrize("video", ["rgb.mp4", "depth.mkv"])
@@ -137,7 +130,6 @@ def test_bytes_that_never_come_are_no_damaged_video(video, shards_served, impati
         pairs[0]
     del shards_served.always[member.path]
     assert "disparity" in pairs[0]
-    pairs.close()
 
 
 def damage(path: Path) -> None:
@@ -158,8 +150,6 @@ def test_a_cache_that_was_damaged_on_disk_is_filled_again(shards_served, indexed
         damage(item)
 
     assert all(same(pairs[number], expected[number]) for number in range(len(pairs)))
-    pairs.close()
-    expected.close()
 
 
 def test_patience_is_set_where_data_are_opened_and_goes_to_the_workers(shards_served):

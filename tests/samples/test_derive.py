@@ -1,5 +1,7 @@
 """What is derived from decoded views, against hand-worked numbers and the long way round."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,15 +14,8 @@ from stereogenbench_data.samples.derive import (
     StoredDepth,
     Views,
 )
-from stereogenbench_data.schema.records import (
-    DepthEncoding,
-    Rig,
-    Scene,
-    SceneId,
-    SceneLabels,
-    Trajectory,
-)
-from stereogenbench_data.schema.release import CAMERA_PAIRS
+from stereogenbench_data.schema.records import DepthEncoding, Trajectory
+from tests.selection.conftest import made_scene
 
 GAP_CM = 20.0
 INTRINSICS = Intrinsics(100.0, 100.0, 20.0, 10.0, 40, 20)
@@ -28,31 +23,15 @@ INTRINSICS = Intrinsics(100.0, 100.0, 20.0, 10.0, 40, 20)
 
 def facts(encoding, *, residual_px=0.0, order=1.0, yaw_deg=(0.0,) * 6):
     """Return a scene whose cameras stand 20 cm apart, looking along Unreal's x."""
-    places = np.arange(6) * GAP_CM * order
-    centres = np.zeros((1, 6, 3))
-    centres[0, :, 1] = places
-    rotations = np.zeros((1, 6, 3))
-    rotations[0, :, 1] = yaw_deg
-    scene = Scene(
-        id=SceneId("train/Uniform/Map/scene_000000", "train", None, "Uniform", "Map"),
-        labels=SceneLabels(),
-        caption="",
-        rig=Rig(
-            focal_mm=50.0, sensor_width_mm=20.0, sensor_height_mm=10.0,
-            image_width_px=40, image_height_px=20, principal_point_px=None,
-            baselines_cm=tuple(GAP_CM * (b - a) for a, b in CAMERA_PAIRS), primary_pair=(0, 1),
-        ),
-        frames=1,
-        frame_rate_hz=15.0,
-        lateral_m=tuple(places / 100),
+    scene = made_scene("train/Uniform/Map/scene_000000", gaps_cm=(GAP_CM,) * 5, frames=1)
+    scene = replace(
+        scene,
+        lateral_m=tuple(order * place_m for place_m in scene.lateral_m),
         rig_residual_px=residual_px,
-        depth_unit_m=(encoding.unit_m,) * 6,
-        depth_unit_source=("tag",) * 6,
-        depth_codec=("ffv1",) * 6,
-        depth_pixel_format=("gray16le",) * 6,
-        valid_depth_ratio=None,
-        members={},
-    )  # fmt: skip
+    )
+    centres, rotations = np.zeros((1, 6, 3)), np.zeros((1, 6, 3))
+    centres[0, :, 1] = 100 * np.array(scene.lateral_m)
+    rotations[0, :, 1] = yaw_deg
     poses = CameraPoses.from_trajectory(Trajectory(centres, 0.01, rotations, "rotator_deg"))
     return SceneFacts(scene, dict.fromkeys(range(6), encoding), poses, lambda: "url", (0,))
 

@@ -58,7 +58,6 @@ def test_a_picture_is_handed_out_read_only_and_not_decoded_twice(data):
     assert pool.rgb(data.scene(0), RGB[0], 2, size=None) is first
     with pytest.raises(ValueError, match="read-only"):
         first[0, 0, 0] = 1
-    pool.close()
 
 
 @pytest.mark.parametrize(
@@ -78,8 +77,6 @@ def test_what_is_held_of_a_picture_stays_as_it_was(data, held):
 
     for frame, one in enumerate(kept):
         assert np.array_equal(one, held(fresh.rgb(scene, RGB[0], frame, size=None)))
-    pool.close()
-    fresh.close()
 
 
 def test_the_memory_of_a_dropped_picture_is_written_again(data):
@@ -90,7 +87,6 @@ def test_the_memory_of_a_dropped_picture_is_written_again(data):
     }
 
     assert len(places) == 1
-    pool.close()
 
 
 def test_a_picture_can_be_written_where_it_is_wanted_and_is_not_kept(data):
@@ -102,7 +98,6 @@ def test_a_picture_can_be_written_where_it_is_wanted_and_is_not_kept(data):
     small = np.empty((3, 10, 20), dtype=np.uint8)
     pool.rgb(scene, RGB[0], 0, out=small)
     assert np.array_equal(small, pool.rgb(scene, RGB[0], 0, size=(10, 20)))
-    pool.close()
 
 
 def test_stored_depth_comes_back_as_it_was_written(data):
@@ -114,7 +109,6 @@ def test_stored_depth_comes_back_as_it_was_written(data):
     assert np.array_equal(stored.measured, (stored.units != 0) & (stored.units != 65535))
     assert np.array_equal(small.units, stored.units[2::4, 1::2])
     assert np.array_equal(small.measured, stored.measured[2::4, 1::2])
-    pool.close()
 
 
 def test_a_video_that_failed_is_closed(data):
