@@ -315,19 +315,15 @@ class _MappedScenes(Dataset[Sample]):
         `EpochBatches` gives is drawn for its own epoch, and has the field ``is_padding`` with
         ``drop_last="pad"``.
         """
-        arrays = self.buffers.allocate(len(numbers))
         batch = (
             numbers if isinstance(numbers, EpochBatch) else EpochBatch(numbers, epoch=self.epoch)
         )
-        self._mark_drawn(batch)
-        loaded: dict[int, Sample] = {}
-        reading = list(enumerate(numbers))
-        if not isinstance(numbers, EpochBatch):
-            reading.sort(key=operator.itemgetter(1))
-        self._expect(batch, [number for _, number in reading])
-        for place, number in reading:
-            loaded[place] = self._load_into(arrays, place, number, batch=batch)
-        return [loaded[place] for place in range(len(numbers))]
+        places = list(range(len(batch)))
+        if batch is not numbers:
+            places.sort(key=batch.__getitem__)
+        samples = self._read(batch, places, self.buffers.allocate(len(batch)))
+        loaded = dict(zip(places, samples, strict=True))
+        return [loaded[place] for place in range(len(batch))]
 
     def _mark_drawn(self, batch: EpochBatch) -> None:
         """Warn once where torch's own `DataLoader` draws random samples of an epoch again."""
@@ -337,15 +333,26 @@ class _MappedScenes(Dataset[Sample]):
             self.shared_epoch.mark_drawn(own, epoch=batch.epoch, dataset=self)
 
     def samples_of(self, batch: EpochBatch, *, start: int = 0) -> Iterator[Sample]:
-        """Yield the samples of a batch one after another, from one of its places on.
+        """Return the samples of a batch one after another, from one of its places on.
 
         They lie side by side in memory where `BatchBuffers.collate` makes batches of them.
         """
-        self._mark_drawn(batch)
-        self._expect(batch, batch)
         arrays = self.buffers.allocate(len(batch)) if self.buffers.makes_batches else None
-        for place in range(start, len(batch)):
-            yield self._load_into(arrays, place, batch[place], batch=batch)
+        return self._read(batch, range(start, len(batch)), arrays)
+
+    def _read(
+        self, batch: EpochBatch, places: Sequence[int], arrays: BatchArrays | None
+    ) -> Iterator[Sample]:
+        """Yield samples of a batch, as slices of the batch's arrays if they are given."""
+        self._mark_drawn(batch)
+        self._expect(batch, [batch[place] for place in places])
+        for place in places:
+            allocate = new_array if arrays is None else arrays.of_sample(place)
+            sample = self._sample(batch[place], batch, allocate)
+            if batch.is_padding is not None:
+                sample["is_padding"] = allocate("is_padding", (), np.bool_)
+                sample["is_padding"][...] = batch.is_padding[place]
+            yield to_tensors(sample) if arrays is None else arrays.as_tensors(place, sample)
 
     def _expect(self, batch: EpochBatch, reading: Sequence[int]) -> None:
         """Let the bytes of a batch, in the order of reading, and of those after it be fetched."""
@@ -372,17 +379,6 @@ class _MappedScenes(Dataset[Sample]):
     def _address(self, number: int, epoch: int, *, group: int) -> Address:
         address = self.plan.locate(number % len(self.plan), epoch=epoch, group=group)
         return address._replace(run=0) if self._of_all_ranks is None else address
-
-    def _load_into(
-        self, arrays: BatchArrays | None, place: int, number: int, *, batch: EpochBatch
-    ) -> Sample:
-        """Return a sample of a batch, as slices of the batch's arrays if they are given."""
-        allocate = new_array if arrays is None else arrays.of_sample(place)
-        sample = self._sample(number, batch, allocate)
-        if batch.is_padding is not None:
-            sample["is_padding"] = allocate("is_padding", (), np.bool_)
-            sample["is_padding"][...] = batch.is_padding[place]
-        return to_tensors(sample) if arrays is None else arrays.as_tensors(place, sample)
 
     def _sample(self, number: int, batch: EpochBatch, allocate: Allocate = new_array) -> Sample:
         """Return a sample of a batch as arrays, written into what is allocated for them."""

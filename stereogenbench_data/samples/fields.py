@@ -451,9 +451,7 @@ class SampleWriter:
         self._kind = request.kind
         self._address = address
         self._is_clip = clip == "clip"
-        self._targets: int | None = None
-        if request.layout == "stacked":
-            self._targets = len(address.targets) + (self._kind == "views")
+        self._layout = request.layout
         self._allocate = allocate
 
     def pictures(self, frames: slice, *, size: tuple[int, int]) -> dict[int, Any]:
@@ -524,13 +522,14 @@ class SampleWriter:
         Returns:
             An array of that shape, a view of the whole field.
         """
-        is_stacked = field.per_target and self._targets is not None
+        is_stacked = field.per_target and self._layout == "stacked"
         if field.name not in self.sample:
             whole = shape[1:] if field.per_frame else shape
             if field.per_frame and self._is_clip:
                 whole = (len(self._address.frames), *whole)
             if is_stacked:
-                whole = (self._targets or 0, *whole)
+                shown = self._target_cameras(self._address.source, self._address.targets)
+                whole = (len(shown), *whole)
             self.sample[field.name] = self._allocate(field.name, whole, np.dtype(dtype))
         own = self.sample[field.name]
         own = own[number, ...] if is_stacked else own

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
@@ -65,6 +65,8 @@ from stereogenbench_data.sources.fetch_ahead import FetchAhead
 from stereogenbench_data.sources.members import MemberSource
 from stereogenbench_data.sources.ranged_file import MemberFile, RangedFile
 
+T = TypeVar("T")
+
 OPEN_STREAMS: Final = 24
 """How many videos a process keeps open: two scenes with all their cameras' colour and depth."""
 
@@ -88,6 +90,16 @@ class StreamStats(NamedTuple):
     videos_limit: int
 
 
+def _kept(cache: OrderedDict[Any, Any], key: Any, make: Callable[[], T], *, most: int) -> T:
+    """Return what a cache holds under a key, made now unless it is there; the oldest makes room."""
+    if key not in cache:
+        while len(cache) >= most:
+            cache.popitem(last=False)
+        cache[key] = make()
+    found: T = cache[key]
+    return found
+
+
 @dataclass(slots=True)
 class _Stream:
     """An open video, and what was read of it last.
@@ -103,14 +115,6 @@ class _Stream:
     file: Path | MemberFile
     kept: OrderedDict[Any, Any] = field(default_factory=OrderedDict)
     memories: list[tuple[memoryview, Callable[[], object]]] = field(default_factory=list)
-
-    def keep(self, key: Any, make: Callable[[], Any], *, most: int) -> Any:
-        """Return what is kept under a key, made now unless it is there; the oldest makes room."""
-        if key not in self.kept:
-            while len(self.kept) >= most:
-                self.kept.popitem(last=False)
-            self.kept[key] = make()
-        return self.kept[key]
 
     def picture(self, *, height: int, width: int, most: int) -> UInt8[np.ndarray, "3 h w"]:
         """Return an array to write a picture into, of any content.
@@ -193,14 +197,13 @@ class Streams:
                 read_rgb(stream.reader, index, size=shape, out=out, content="colour")
                 return out
 
-            def read() -> Any:
+            def read() -> UInt8[np.ndarray, "3 h w"]:
                 place = stream.picture(height=height, width=width, most=most)
-                return _read_only(
-                    read_rgb(stream.reader, index, size=size, out=place, content="colour")
-                )
+                read_rgb(stream.reader, index, size=size, out=place, content="colour")
+                place.flags.writeable = False
+                return place
 
-            kept: UInt8[np.ndarray, "3 h w"] = stream.keep((index, size), read, most=most)
-            return kept
+            return _kept(stream.kept, (index, size), read, most=most)
 
     def read_stored_depth(
         self,
@@ -234,10 +237,10 @@ class Streams:
                     units = resized_nearest(units, size=size)
                 pixel_format = stream.reader.facts.pixel_format
                 known = measured(units, encoding=encoding, pixel_format=pixel_format)
-                return StoredDepth(_read_only(units), known)
+                units.flags.writeable = False
+                return StoredDepth(units, known)
 
-            kept: StoredDepth = stream.keep((index, size, encoding), read, most=self.kept_frames)
-            return kept
+            return _kept(stream.kept, (index, size, encoding), read, most=self.kept_frames)
 
     @property
     def stats(self) -> "StreamStats":
@@ -268,23 +271,21 @@ class Streams:
         with self._lock:
             member, name = scene.member(name), scene.held_name(name)
             place = (member.path, member.offset, run)
-            if place not in self._open:
+            is_new = place not in self._open
+            if is_new:
                 while len(self._open) >= self.limit:
                     self._open.popitem(last=False)[1].close()
                 file = self._source.open(scene, name)
                 with _cause_raised(file):
                     label = self._source.label(scene, name)
                     reader = open_video(file, name=label, frames=scene.frames)
-                    try:
-                        require_indexed_picture(reader, scene.rig)
-                    except MediaError:
-                        reader.close()
-                        raise
                 self._open[place] = _Stream(reader, file)
             self._open.move_to_end(place)
             stream = self._open[place]
             try:
                 with _cause_raised(stream.file):
+                    if is_new:
+                        require_indexed_picture(stream.reader, scene.rig)
                     yield stream
             except (MediaError, StorageError):
                 self._open.pop(place).close()
@@ -301,11 +302,6 @@ class Streams:
         """Return what another process makes a pool of its own from."""
         again = partial(Streams, limit=self.limit, kept_frames=self.kept_frames)
         return again, (self._source,)
-
-
-def _read_only(picture: Any) -> Any:
-    picture.flags.writeable = False
-    return picture
 
 
 @contextmanager
@@ -698,14 +694,12 @@ class SampleLoader:
     def _camera_poses(self, scene: Scene) -> CameraPoses | None:
         if not self._needs_poses(scene):
             return None
-        poses = self._poses.get(scene.id.key)
-        if poses is None:
+
+        def read() -> CameraPoses:
             from stereogenbench_data.index.evidence import poses_as  # slow to import
 
             text = self._source.read(scene, TRAJECTORY_JSON)
             where = self._source.label(scene, TRAJECTORY_JSON)
-            poses = poses_as(text, scene.pose_form, where=where)
-            self._poses[scene.id.key] = poses
-            if len(self._poses) > KEPT_POSES:
-                self._poses.popitem(last=False)
-        return poses
+            return poses_as(text, scene.pose_form, where=where)
+
+        return _kept(self._poses, scene.id.key, read, most=KEPT_POSES)

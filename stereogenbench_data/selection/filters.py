@@ -454,15 +454,28 @@ def choose_pairs(
         raise SelectionError(
             f"direction must be 'left_to_right' or 'right_to_left', got {direction!r}."
         )
+    is_turned, count = direction == "right_to_left", len(rows)
     primary = np.stack(
         [index.column("primary_left")[rows], index.column("primary_right")[rows]], axis=1
     ).astype(np.int8)
-    if isinstance(pairs, str) and pairs == "sweep":
-        chosen = _sweeps(rows, primary, direction=direction)
+    name = pairs if isinstance(pairs, str) else ""
+    if name == "sweep":
+        cameras = np.tile(
+            np.arange(CAMERA_COUNT, dtype=np.int8)[:: -1 if is_turned else 1], (count, 1)
+        )
+        source = np.full(count, CAMERA_COUNT - 1, np.int8) if is_turned else primary.min(axis=1)
+        beside = cameras < source[:, None] if is_turned else cameras > source[:, None]
+        chosen = PairList(rows, source, _packed(cameras, beside))
     else:
-        chosen = _plain(rows, primary, pairs=pairs, direction=direction)
-        if isinstance(pairs, str) and pairs in ("adjacent", "all"):
-            chosen = _of_held_cameras(index, rows, chosen, name=pairs)
+        per_scene = primary[:, None, :]
+        if name != "primary":
+            named = {"adjacent": ADJACENT_PAIRS, "all": CAMERA_PAIRS}
+            fixed = np.array(named.get(name) or require_pairs(pairs), dtype=np.int8)
+            per_scene = np.broadcast_to(fixed, (count, *fixed.shape))
+        flat = per_scene.reshape(-1, 2)[:, :: -1 if is_turned else 1]
+        chosen = PairList(np.repeat(rows, per_scene.shape[1]), flat[:, 0], flat[:, 1:])
+        if name in ("adjacent", "all"):
+            chosen = _of_held_cameras(index, rows, chosen, name=name)
     return chosen if baseline_cm is None else _within(index, chosen, baseline_cm)
 
 
@@ -522,30 +535,6 @@ def require_pairs(pairs: Any) -> tuple[tuple[int, int], ...]:
     return tuple(found)
 
 
-def _plain(
-    rows: Int64[np.ndarray, " s"],
-    primary: Int8[np.ndarray, "s 2"],
-    *,
-    pairs: PairsSpec,
-    direction: Direction,
-) -> PairList:
-    if isinstance(pairs, str) and pairs == "primary":
-        per_scene = primary[:, None, :]
-    else:
-        fixed = {"adjacent": ADJACENT_PAIRS, "all": CAMERA_PAIRS}.get(
-            pairs if isinstance(pairs, str) else ""
-        ) or require_pairs(pairs)
-        per_scene = np.broadcast_to(np.array(fixed, dtype=np.int8), (len(rows), len(fixed), 2))
-    flat = per_scene.reshape(-1, 2)
-    if direction == "right_to_left":
-        flat = flat[:, ::-1]
-    return PairList(
-        row=np.repeat(rows, per_scene.shape[1]),
-        source=np.ascontiguousarray(flat[:, 0]),
-        targets=np.ascontiguousarray(flat[:, 1:]),
-    )
-
-
 def _of_held_cameras(
     index: SceneIndex, rows: Int64[np.ndarray, " s"], pairs: PairList, *, name: str
 ) -> PairList:
@@ -565,17 +554,6 @@ def _of_held_cameras(
         )
         warnings.warn(message, FewerPairsWarning, stacklevel=5)
     return pairs[keep]
-
-
-def _sweeps(
-    rows: Int64[np.ndarray, " s"], primary: Int8[np.ndarray, "s 2"], *, direction: Direction
-) -> PairList:
-    cameras = np.broadcast_to(np.arange(CAMERA_COUNT, dtype=np.int8), (len(rows), CAMERA_COUNT))
-    if direction == "right_to_left":
-        source = np.full(len(rows), CAMERA_COUNT - 1, dtype=np.int8)
-        return PairList(row=rows, source=source, targets=cameras[:, -2::-1])
-    source = primary.min(axis=1)
-    return PairList(row=rows, source=source, targets=_packed(cameras, cameras > source[:, None]))
 
 
 def _packed(cameras: Int8[np.ndarray, "n m"], keep: Bool[np.ndarray, "n m"]) -> Any:
