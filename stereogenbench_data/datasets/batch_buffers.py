@@ -299,13 +299,6 @@ def _layout_of(batch: dict[str, Any]) -> dict[str, BufferSpec]:
     return layout
 
 
-class _OpenedSlots(NamedTuple):
-    """The receiver's end of a worker's slots."""
-
-    status: torch.Tensor
-    memory: dict[int, torch.Tensor]
-
-
 class _OpenBatch(NamedTuple):
     """A batch that this process, or the one that it was forked from, has opened."""
 
@@ -314,8 +307,8 @@ class _OpenBatch(NamedTuple):
     slot: int
 
 
-_opened: Final[dict[SlotOwner, _OpenedSlots]] = {}
-"""The slots that this process has batches from."""
+_opened: Final[dict[SlotOwner, tuple[torch.Tensor, dict[int, torch.Tensor]]]] = {}
+"""Status and memory of the slots that this process has batches from."""
 
 _open_batches: Final[dict[int, _OpenBatch]] = {}
 """The open batches. Who takes one out of here decides what becomes of its slot."""
@@ -335,13 +328,13 @@ def _open_batch(
         if owner not in _opened:
             running = {process.pid for process in multiprocessing.active_children()}
             forget_slots({each.pid for each in _opened if each.pid not in running})
-            _opened[owner] = _OpenedSlots(status, {})
-        _opened[owner].memory[slot] = memory
-    slots = _opened[owner]
+            _opened[owner] = (status, {})
+        _opened[owner][1][slot] = memory
+    statuses, memories = _opened[owner]
     # The array lives as long as any tensor over it does, however it was sliced.
-    array = slots.memory[slot].numpy()
+    array = memories[slot].numpy()
     number = next(_count)
-    _open_batches[number] = _OpenBatch(os.getpid(), slots.status, slot)
+    _open_batches[number] = _OpenBatch(os.getpid(), statuses, slot)
     weakref.finalize(array, _release, number).atexit = False
     whole = torch.from_numpy(array)
     return {

@@ -25,13 +25,6 @@ DERIVE_FIELDS: Final = (
 )  # fmt: skip
 """The fields of `SceneViews` that `derive` takes; ``image`` only for fields that show pictures."""
 
-DERIVED_FIELDS: Final = (
-    "left", "right", "disparity", "valid", "visible", "visible_from_left", "disparity_error",
-    "depth", "depth_right", "disparity_right", "valid_right", "visible_right", "warped_right",
-    "hole", "intrinsics", "baseline_m", "pair",
-)  # fmt: skip
-"""The fields of `PAIR_FIELDS` that `derive` makes."""
-
 PairPlaces = Literal["all"] | Sequence[tuple[int, int]]
 """The pairs to make: (first view, second view), as places on the axis of views."""
 
@@ -426,3 +419,6 @@ _MAKERS: Final[dict[str, Callable[[_Pairs, _Pairs], torch.Tensor]]] = {
     "baseline_m": lambda ahead, back: ahead.baseline_m,
     "pair": lambda ahead, back: ahead.cameras,
 }
+
+DERIVED_FIELDS: Final = (*_MAKERS, "intrinsics")
+"""The fields of `PAIR_FIELDS` that `derive` makes."""

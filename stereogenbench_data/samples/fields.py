@@ -357,19 +357,11 @@ class Request:
     @property
     def streams(self) -> frozenset[Stream]:
         """The videos that the fields are made from, before or after a swap of the views."""
-        none: frozenset[Stream] = frozenset()
-        streams = none.union(*(self.known[name].streams for name in self.fields))
+        streams = NOTHING.union(*(self.known[name].streams for name in self.fields))
         if self.transform is not None and self.transform.swaps_views:
-            streams |= {SWAPPED[stream] for stream in streams}
+            for kind in (SOURCE_RGB | TARGET_RGB, SOURCE_DEPTH | TARGET_DEPTH):
+                streams |= kind if streams & kind else NOTHING
         return streams
-
-
-SWAPPED: Final[dict[Stream, Stream]] = {
-    "source_rgb": "target_rgb",
-    "target_rgb": "source_rgb",
-    "source_depth": "target_depth",
-    "target_depth": "source_depth",
-}
 
 
 def parse_request(

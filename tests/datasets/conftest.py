@@ -7,6 +7,8 @@ import torch
 
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.media import depth
+from stereogenbench_data.synthesis.produce import synthesise
+from stereogenbench_data.synthesis.request import SynthRequest
 
 
 @pytest.fixture(scope="session")
@@ -76,3 +78,11 @@ class RefuseFrame:
         if self.number in views.frames:
             raise ArithmeticError(f"frame {self.number}")
         return views
+
+
+@pytest.fixture(scope="session")
+def drawn(tmp_path_factory):
+    """A tree of one scene of 17 frames, of which tests alter copies."""
+    root = tmp_path_factory.mktemp("drawn") / "scenes"
+    synthesise(root, SynthRequest(size_px=72, frames=17, seed=3), workers=1)
+    return root

@@ -9,20 +9,11 @@ import pytest
 from stereogenbench_data import SceneIndex, StereoGenBenchError, StereoPairs
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.shards.pack import pack
-from stereogenbench_data.synthesis.produce import synthesise
-from stereogenbench_data.synthesis.request import SynthRequest
 from tests.media.test_altered_times import flipped, matroska_times
 
 FRAMES = 17
 DEPTH = "cam_00_depth.mkv"
 SHUFFLED = random.Random(3).sample(range(FRAMES), FRAMES)
-
-
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory):
-    root = tmp_path_factory.mktemp("drawn") / "scenes"
-    synthesise(root, SynthRequest(size_px=32, frames=FRAMES, seed=5), workers=1)
-    return root
 
 
 @pytest.fixture(scope="module")

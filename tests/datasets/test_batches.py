@@ -31,11 +31,6 @@ def test_drop_says_how_much_it_leaves_out(keyed):
     assert EpochBatches(keyed, 9, drop_last=False).left_out == 0
 
 
-def test_an_epoch_of_which_all_would_be_dropped_is_refused(keyed):
-    with pytest.raises(SelectionError, match=r"drops all of 140 samples.* 64 for each of 3 ranks"):
-        EpochBatches(keyed, 64, rank=0, world_size=3)
-
-
 def test_the_seed_is_the_datasets_unless_another_is_given(small_index):
     pairs = StereoPairs(small_index, fields=("__key__",), frames="all", seed=5)
     others = StereoPairs(small_index, fields=("__key__",), frames="all")
@@ -172,12 +167,16 @@ def test_what_is_no_dict_is_refused(keyed, state):
         ({"rank": 2, "world_size": 2}, "got rank=2, world_size=2"),
         ({"rank": 1}, "got rank=1, world_size=None"),
         ({"drop_last": 1}, "drop_last must be True, False or 'pad', got 1"),
+        (
+            {"batch_size": 64, "rank": 0, "world_size": 3},
+            r"drops all of 140 samples.* 64 for each of 3 ranks",
+        ),
     ],
     ids=str,
 )
 def test_options_that_no_epoch_has_are_refused(keyed, options, message):
     with pytest.raises(SelectionError, match=message):
-        EpochBatches(keyed, 4, **options)
+        EpochBatches(keyed, **({"batch_size": 4} | options))
 
 
 def test_batches_made_before_the_process_group_are_refused_in_it(keyed, tmp_path):

@@ -13,10 +13,7 @@ from stereogenbench_data.errors import StereoGenBenchError
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.verify import verify
-from stereogenbench_data.synthesis.produce import synthesise
-from stereogenbench_data.synthesis.request import SynthRequest
 
-FRAMES = 17
 RGB, DEPTH = "cam_00_rgb.mp4", "cam_00_depth.mkv"
 
 
@@ -88,13 +85,6 @@ FITTING = {
     "HEVC of 10 bits": written(RGB, *QUIET_HEVC, "-pix_fmt", "yuv420p10le"),
     "H.264 of red, green and blue": written(RGB, "-c:v", "libx264rgb", "-pix_fmt", "rgb24"),
 }
-
-
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory):
-    root = tmp_path_factory.mktemp("drawn") / "scenes"
-    synthesise(root, SynthRequest(size_px=72, frames=FRAMES, seed=3), workers=1)
-    return root
 
 
 @pytest.fixture

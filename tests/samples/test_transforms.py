@@ -20,6 +20,7 @@ from stereogenbench_data import (
     RandomCrop,
     RandomScale,
     Resize,
+    SceneViews,
     StereoPairs,
 )
 from stereogenbench_data.geometry.camera import Intrinsics
@@ -96,9 +97,7 @@ def test_a_flip_swaps_the_views_and_takes_the_right_ones_disparity(detailed_rele
     assert flipped["pair"].tolist() == plain["pair"].tolist()[::-1]
     assert float(flipped["intrinsics"][0, 2]) == 160 - float(plain["intrinsics"][0, 2])
 
-
-def test_a_flipped_pairs_poses_are_those_of_a_rig_seen_in_a_mirror(detailed_release, plain):
-    flipped = StereoPairs(detailed_release, fields=FIELDS, transform=HorizontalFlip(1.0))[0]
+    # Poses are those of a rig that is seen in a mirror.
     step = flipped["right_from_left"].numpy()
 
     np.testing.assert_allclose(step[:3, 3], [-float(plain["baseline_m"]), 0, 0], atol=1e-9)
@@ -330,8 +329,9 @@ def test_a_size_is_given_as_in_torchvision(size):
     assert Letterbox(size) == Letterbox(64, 48)
 
 
-def test_a_flip_of_a_sweep_is_refused(detailed_release):
+def test_a_flip_of_anything_but_one_pair_is_refused(detailed_release):
+    with pytest.raises(FieldError, match=r"SceneViews .*got HorizontalFlip"):
+        SceneViews(detailed_release, transform=HorizontalFlip())
     pairs = StereoPairs(detailed_release, pairs="sweep", transform=HorizontalFlip(1.0))
-
     with pytest.raises(FieldError, match="one view and 5 others"):
         pairs[0]

@@ -6,7 +6,7 @@ from stereogenbench_data import EpochBatches, SceneViews, StereoPairs, StereoPai
 from stereogenbench_data.audit.geometry.audit import audit
 from stereogenbench_data.bridges.clips import export_clips
 from stereogenbench_data.bridges.export_views import export_views
-from stereogenbench_data.errors import FieldError, SelectionError, SynthesisError
+from stereogenbench_data.errors import SelectionError, SynthesisError
 from stereogenbench_data.evaluation.controls import score_controls
 from stereogenbench_data.evaluation.inputs import export_inputs
 from stereogenbench_data.synthesis.request import SynthRequest
@@ -56,12 +56,3 @@ def test_other_calls_list_their_own_options(small_shards, tmp_path):
 def test_a_misspelled_family_of_drawn_scenes_is_answered_with_the_nearest_one():
     with pytest.raises(SynthesisError, match="got 'Unifrom'; did you mean 'Uniform'"):
         SynthRequest(family="Unifrom")
-
-
-def test_a_misspelled_field_is_answered_with_the_nearest_one(small_shards):
-    for make, typed, meant in (
-        (StereoPairs, "dispairty", "disparity"),
-        (SceneViews, "img", "image"),
-    ):
-        with pytest.raises(FieldError, match=f"no field '{typed}'; did you mean '{meant}'. The"):
-            make(small_shards, split="train", fields=("depth", typed))
