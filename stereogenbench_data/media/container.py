@@ -210,14 +210,14 @@ def depth_coding(facts: StreamFacts) -> str:
 
 
 def open_container(
-    file: VideoFile, *, name: str, pixel_format: Literal["needed", "later"] = "needed"
+    file: VideoFile, *, name: str, pixel_format: Literal["needed", "later"] = "later"
 ) -> InputContainer:
     """Open a video file for reading.
 
     Args:
         file: A path, or a seekable binary file; the latter stays the caller's to close.
         name: What messages call the file.
-        pixel_format: With "later", the pixel format may be missing until a picture is decoded.
+        pixel_format: With "later", it may be missing until a picture is decoded.
 
     Raises:
         StorageError: If a path is missing, not a file or not readable.
@@ -274,7 +274,7 @@ def open_by_header(file: VideoFile, *, name: str) -> tuple[InputContainer, Place
                 container.close()
         finally:
             file.hides_packets = False
-    return open_container(file, name=name, pixel_format="later"), "at the first packet"
+    return open_container(file, name=name), "at the first packet"
 
 
 def _open(file: VideoFile, *, options: dict[str, str]) -> InputContainer:
@@ -321,28 +321,20 @@ def text_tags(metadata: Mapping[str, str]) -> dict[str, str]:
     return {text(key): text(value) for key, value in metadata.items()}
 
 
-def stream_facts(
-    container: InputContainer,
-    *,
-    name: str,
-    frames: int,
-    pixel_format: Literal["needed", "later"] = "needed",
-) -> StreamFacts:
+def stream_facts(container: InputContainer, *, name: str, frames: int) -> StreamFacts:
     """Return the header's facts; ``frames`` is what the caller knows of the number of pictures.
 
-    With pixel format "later", it is empty if the header does not give it.
+    The pixel format is empty if the header does not give it.
 
     Raises:
-        MediaError: If the codec cannot be decoded or the header lacks size or pixel format.
+        MediaError: If the header lacks the pictures' size.
     """
     stream = container.streams.video[0]
     context = stream.codec_context
-    is_known = context.pix_fmt is not None or pixel_format == "later"
-    if not (is_known and context.width > 0 and context.height > 0):
+    if not (context.width > 0 and context.height > 0):
         raise MediaError(
-            f"{name}: its header describes no picture (codec {context.name}, pixel format "
-            f"{context.pix_fmt}, {context.width}x{context.height}). The file is cut short or "
-            f"damaged: fetch it again."
+            f"{name}: its header describes no picture (codec {context.name}, {context.width}x"
+            f"{context.height}). The file is cut short or damaged: fetch it again."
         )
     coded = coded_picture(context.codec.canonical_name, context.extradata)
     is_colour = coded.has_chroma
@@ -454,7 +446,7 @@ def write_checksums(video: Path, *, packets: int) -> None:
         MediaError: If it has another number of packets, or no place is reserved.
         OSError: If it cannot be read or written.
     """
-    with open_container(video, name=str(video), pixel_format="later") as container:
+    with open_container(video, name=str(video)) as container:
         found = [_header_crc32(container)]
         stream = container.streams.video[0]
         found += [zlib.crc32(bytes(packet)) for packet in container.demux(stream) if packet.size]

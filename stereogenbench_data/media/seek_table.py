@@ -196,7 +196,7 @@ def read_seek_table(
             bounds = depth.chunk_bounds
         packed = SeekTable(bounds, tuple(range(depth.frames)))
         return _with_header(packed, file, file_bytes=bounds[-1])
-    with open_container(file, name=name, pixel_format="later") as container:
+    with open_container(file, name=name) as container:
         file_bytes, begins = container.size, container.streams.video[0].start_time
         try:
             if container.streams.video[0].frames:
@@ -218,7 +218,7 @@ def read_seek_table(
         # An MP4 file can be opened without a packet, unless it is tiny.
         with (
             suppress(MediaError),
-            open_container(HeaderFile(table), name=name, pixel_format="later") as container,
+            open_container(HeaderFile(table), name=name) as container,
         ):
             if container.streams.video[0].start_time == begins:
                 return table

@@ -87,11 +87,11 @@ def probe(
     with open_container(file, name=name, pixel_format=pixel_format) as container:
         require_whole_payload(container, name=name)
         frames = _frames_in_header(container)
-        facts = stream_facts(container, name=name, frames=frames, pixel_format=pixel_format)
+        facts = stream_facts(container, name=name, frames=frames)
     is_intra_only = codec_of(facts.codec).is_intra_only
     if frames and not (is_intra_only and isinstance(file, str | Path)):
         return facts
-    with open_container(file, name=name, pixel_format="later") as container:
+    with open_container(file, name=name) as container:
         times = table_clock(container, name=name).times
         frames = len(times)
         if frames and is_intra_only:
@@ -159,12 +159,12 @@ class VideoReader(FrameReader):
         try:
             require_whole_payload(container, name=name)
             self._crc32s = packet_checksums(container, frames=frames, name=name)
-            self.header = stream_facts(container, name=name, frames=frames, pixel_format="later")
+            self.header = stream_facts(container, name=name, frames=frames)
             self._siting = self.header.siting
             steady = steady_clock(container, frames=frames)
             if steady is None and placed == "anywhere":
                 container.close()
-                container = open_container(file, name=name, pixel_format="later")
+                container = open_container(file, name=name)
             self._clock: Clock = steady or self._survey(container)
         except MediaError:
             container.close()
