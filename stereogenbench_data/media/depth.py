@@ -542,12 +542,6 @@ def write_depth_video(packed: DepthFrames, target: Path) -> None:
 
 
 def grey_frame(units: UInt16[np.ndarray, "h w"], *, pixel_format: str) -> av.VideoFrame:
-    """Return depth in stored units as a frame, whose rows may be longer than the array's."""
-    height, width = units.shape
-    frame = av.VideoFrame(width, height, pixel_format)
-    plane = frame.planes[0]
-    numbers = units.astype("u1" if pixel_format == "gray" else "<u2")
-    rows = np.zeros((height, plane.line_size // numbers.itemsize), numbers.dtype)
-    rows[:, :width] = numbers
-    plane.update(rows.tobytes())
-    return frame
+    """Return depth in stored units as a frame of one grey plane."""
+    numbers = units.astype(np.uint8) if pixel_format == "gray" else units
+    return av.VideoFrame.from_ndarray(numbers, format=pixel_format)
