@@ -363,13 +363,10 @@ class Decoder:
             packet = next(self._packets, None)
             if packet is None:
                 raise UnexpectedPicture("the stream ends before it")
-            self._feed(packet)
+            if packet.size and not packet.is_discard:
+                self._register(packet)
+            self._pending.extend((self._index(frame), frame) for frame in packet.decode())
         return self._pending.popleft()
-
-    def _feed(self, packet: VideoPacket) -> None:
-        if packet.size and not packet.is_discard:
-            self._register(packet)
-        self._pending.extend((self._index(frame), frame) for frame in packet.decode())
 
     def _register(self, packet: VideoPacket) -> None:
         """Check a packet that is about to be decoded, and record its frame."""
