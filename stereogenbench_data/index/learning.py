@@ -146,8 +146,8 @@ def examine(root: str | Path, key: str, *, conventions: Conventions | None = Non
         problem = str(error)
     shape, notes, unknown = Shape(), Notes(), list[str]()
     with suppress(StereoGenBenchError, KeyError):  # `Description` has told the problem
-        seen = see_rig(folder.read(BASELINE_JSON), where=f"{key}/{BASELINE_JSON}")
-        shape, notes, unknown = seen.shape, seen.found, seen.unknown
+        text, where = folder.read(BASELINE_JSON), f"{key}/{BASELINE_JSON}"
+        shape, notes, unknown = see_rig(text, where=where)
     if scene is not None and described is not None:
         _note_camera(scene, notes)
         named, notes["poses"] = _learned_poses(scene, described.understood)
@@ -286,9 +286,7 @@ def _stated_depth(group: Sequence[Examined]) -> DepthAs | None:
             strict=True,
         )
     }  # fmt: skip
-    if len(stated) != 1:
-        return None
-    ((unit_m, offset_m, source),) = stated
+    unit_m, offset_m, source = stated.pop() if len(stated) == 1 else (1.0, 0.0, "default")
     if source in ("default", "unreadable"):
         return None
     encoding = DepthEncoding(unit_m=unit_m, offset_m=offset_m, source="conventions")

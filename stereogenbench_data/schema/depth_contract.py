@@ -392,7 +392,6 @@ class _Source:
 
     def _read(self, name: str, value: object, text: str) -> Iterator[Statement]:
         parts = name.split("_")
-        where = set((self.path or name).split("_"))
         if self.origin == "tag" and not _TECHNICAL.isdisjoint(parts):
             return
         is_kind = not _KINDS.isdisjoint(parts) and isinstance(value, str)
@@ -402,14 +401,14 @@ class _Source:
             return
         if _NORMALISED.search(self.path or name):
             yield self.make("normalised", (), text)
-        if not where.isdisjoint(_STATISTICS):
+        if not self._words(parts).isdisjoint(_STATISTICS):
             return
         number, rest = _number_of(value)
         if not _RANGES.isdisjoint(parts):
-            yield from self._range(re.findall(_NUMBER, text.lower()), parts, text)
+            yield from self._range(parts, text)
         elif number is not None and (not rest or words(rest) in UNITS_M):
             unit_m = UNITS_M[words(rest)] if rest else None
-            yield from self._number(parts, number, unit_m=unit_m, where=where, text=text)
+            yield from self._number(parts, number, unit_m, text)
         elif number is not None and re.fullmatch("[a-z]+", rest):
             yield self.make("unclear" if _SCALES.isdisjoint(parts) else "unit", (), text)
         elif isinstance(value, str):
@@ -417,14 +416,12 @@ class _Source:
             is_about_unit = number is not None or not _SCALES.isdisjoint(parts)
             yield from self._sentence(key + text.lower(), is_about_unit=is_about_unit)
 
+    def _words(self, parts: Sequence[str]) -> frozenset[str]:
+        """Return the words of the place of a key, or of a tag's key."""
+        return frozenset(self.path.split("_") if self.path else parts)
+
     def _number(
-        self,
-        parts: Sequence[str],
-        number: float,
-        *,
-        unit_m: float | None,
-        where: set[str],
-        text: str,
+        self, parts: Sequence[str], number: float, unit_m: float | None, text: str
     ) -> Iterator[Statement]:
         """Return what a number says by the words of its key, and the unit beside it."""
         metre = unit_m or (UNITS_M.get(parts[-1]) if len(parts) > 1 else None)
@@ -441,16 +438,15 @@ class _Source:
             yield self._unit(number, role, metre or 1.0, text)
         elif role == "scale" or (role == "step" and metre):
             yield self._unit(number, "metres" if metre else "either", metre or 1.0, text)
-        elif where.isdisjoint(_HARMLESS):
+        elif self._words(parts).isdisjoint(_HARMLESS):
             # What nobody understands may be a scale; of JSON, only fractions and powers of ten.
             is_power = number >= 10 and math.log10(number).is_integer()
             if self.origin == "tag" or (number > 0 and (number % 1 != 0 or is_power)):
                 yield self.make("unclear", (), text)
 
-    def _range(
-        self, numbers: Sequence[str], parts: Sequence[str], text: str
-    ) -> Iterator[Statement]:
-        ends = sorted(number for each in numbers if (number := _parsed(each)) is not None)
+    def _range(self, parts: Sequence[str], text: str) -> Iterator[Statement]:
+        numbers = map(_parsed, re.findall(_NUMBER, text.lower()))
+        ends = sorted(number for number in numbers if number is not None)
         unit = _METRES.search(text.lower())
         metre = UNITS_M.get(parts[-1]) if unit is None else UNITS_M[words(unit[0])]
         if len(ends) != len(_ENDS):

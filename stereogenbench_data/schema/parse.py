@@ -945,23 +945,13 @@ def _completed(best: dict[Pair, _Length]) -> dict[Pair, float]:
     return added_cm
 
 
-@dataclass(frozen=True, slots=True)
-class Seen:
-    """Where the quantities of a ``baseline.json`` stand.
-
-    Attributes:
-        shape: What conventions would state about the file.
-        found: For each table, the values that it means, and other places that state the same.
-        unknown: The places of numbers and texts, as `keys_of` names them, that nothing reads.
-    """
-
-    shape: Shape
-    found: dict[str, list[str]]
-    unknown: list[str]
-
-
-def see_rig(text: bytes, *, where: str) -> Seen:
+def see_rig(text: bytes, *, where: str) -> tuple[Shape, dict[str, list[str]], list[str]]:
     """Return where the quantities of a ``baseline.json`` stand, as `parse_rig` finds them.
+
+    Returns:
+        What conventions would state about the file; for each table, the values that it means, and
+        other places that state the same; and the places of numbers and texts, as `keys_of` names
+        them, that nothing reads.
 
     Raises:
         SchemaError: If it is not a JSON object.
@@ -1008,7 +998,7 @@ def see_rig(text: bytes, *, where: str) -> Seen:
         and not any(each.startswith(f"{key}[]") for each in keys)
         and not _NAMES_A_CAMERA.search(key.rpartition(".")[2])
     )  # fmt: skip
-    return Seen(Shape(at=at), found, unknown)
+    return Shape(at=at), found, unknown
 
 
 _USUAL_UNITS: Final = {

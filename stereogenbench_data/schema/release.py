@@ -56,32 +56,13 @@ SEEN_MAP_FOLDER: Final = "MapSeenInTrain"
 _UNSEEN_MAP_FOLDER: Final = re.compile(r"unseen|not_?seen", re.IGNORECASE)
 
 TRAIN_MAPS: Final = frozenset(
-    {
-        "AbandonedPowerPlant",
-        "AssetsvilleTown",
-        "Car_Dealer",
-        "Downtown_West",
-        "GangnyeongieonComplex",
-        "GeunjeongjeonComplex",
-        "JapaneseStyleRoom",
-        "JesuhabComplex",
-        "Light_Foliage",
-        "Modular_Scifi_Mechanic_Base",
-        "OWD_Yucca_Pack",
-        "ProceduralBuildingGenerator",
-        "ProceduralNtr_vol2",
-        "RestaurantScene",
-        "ROCKY_SAND_PACK",
-        "Scene_Bazaar_Vol1",
-        "Scene_Saloon",
-        "Scene_UnfinishedBuilding",
-        "Scene_Warehouse",
-        "SeyeonjeongPavilion",
-        "Stylized_Egypt",
-        "UndergroundSciFi",
-        "UtopianCity",
-    }
-)
+    {"AbandonedPowerPlant", "AssetsvilleTown", "Car_Dealer", "Downtown_West",
+     "GangnyeongieonComplex", "GeunjeongjeonComplex", "JapaneseStyleRoom", "JesuhabComplex",
+     "Light_Foliage", "Modular_Scifi_Mechanic_Base", "OWD_Yucca_Pack",
+     "ProceduralBuildingGenerator", "ProceduralNtr_vol2", "RestaurantScene", "ROCKY_SAND_PACK",
+     "Scene_Bazaar_Vol1", "Scene_Saloon", "Scene_UnfinishedBuilding", "Scene_Warehouse",
+     "SeyeonjeongPavilion", "Stylized_Egypt", "UndergroundSciFi", "UtopianCity"}
+)  # fmt: skip
 UNSEEN_MAPS: Final = frozenset({"DeepWaterStation_DemoMapScalabilityEpic", "STF_TestMap"})
 
 SCENE_COUNTS: Final[dict[tuple[str, str, str], int]] = {

@@ -11,7 +11,7 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -121,15 +121,14 @@ def record_poses(text: bytes, *, where: str) -> RecordedPoses:
                           "the release.")  # fmt: skip
     blocks, odd = [], []
     lists = [_of_list(place, *column) for place, column in columns.items()]
-    vectors = [each for each in lists if each is not None] + _of_components(columns)
-    for name, components, unit, values in vectors:
+    for block in (*filter(None, lists), *_of_components(columns)):
         try:
-            ordered = _ordered(name, values, columns)
+            ordered = _ordered(block.name, block.values, columns)
         except _Odd as error:
             odd.append(str(error))
             continue
         if ordered is not None:
-            blocks.append(Block(name, components, unit, ordered))
+            blocks.append(replace(block, values=ordered))
     if not blocks or odd:
         reason = "; ".join(dict.fromkeys(odd)) or (
             f"no numbers of {CAMERA_COUNT} cameras in each frame are in it; the keys are: "
@@ -161,14 +160,13 @@ def _head_of(node: Any) -> Any:
 
 def _unit_m(head: dict[str, Any], where: str) -> float | None:
     values = Values(head)
-    unit_m = values.length_unit_m
-    for each in values.stated("unit"):
-        if unit_m is None and isinstance(each.value, str):
-            raise SchemaError(
-                f"{where}: {each.path}: {brief(each.value)} is not a unit of length that is known "
-                f"(mm, cm, m). Correct it."
-            )
-    return unit_m
+    named = [each for each in values.stated("unit") if isinstance(each.value, str)]
+    if named and values.length_unit_m is None:
+        raise SchemaError(
+            f"{where}: {named[0].path}: {brief(named[0].value)} is not a unit of length that is "
+            f"known (mm, cm, m). Correct it."
+        )
+    return values.length_unit_m
 
 
 def _hints(document: dict[str, Any]) -> frozenset[str]:
@@ -273,26 +271,17 @@ def _by_frame(records: list[Any]) -> list[Any]:
     return [frames[frame] for frame in sorted(frames)]
 
 
-def _of_list(
-    place: Place, lengths: tuple[int, ...], values: list[Any]
-) -> tuple[Place, tuple[str, ...], str, np.ndarray] | None:
+def _of_list(place: Place, lengths: tuple[int, ...], values: list[Any]) -> Block | None:
     """Return the numbers of a list or of nested lists in each camera of each frame."""
-    if not place or place[-1] != "*" or len(lengths) < 3:
-        return None
     axes = len(lengths) - 2
-    if lengths[2:] not in _TRAILING:
+    if lengths[2:] not in _TRAILING or {*place[-axes:]} != {"*"}:
         return None
-    array = _as_numbers(values, lengths)
-    if {*place[-axes:]} != {"*"} or array is None:
-        return None
-    base, unit = place[:-axes], ""
-    if base and base[-1] != "*":
-        name, unit = without_unit(base[-1])
-        base = (*base[:-1], name)
-    return base, (), unit, array
+    array, (*base, last) = _as_numbers(values, lengths), place[:-axes]
+    name, unit = without_unit(last)
+    return None if array is None else Block((*base, name), (), unit, array)
 
 
-def _of_components(columns: Columns) -> list[tuple[Place, tuple[str, ...], str, np.ndarray]]:
+def _of_components(columns: Columns) -> list[Block]:
     """Return the numbers whose components are keys; a prefix (``location_x``) joins the place."""
     groups: dict[tuple[Place, tuple[int, ...]], dict[str, tuple[str, list[Any]]]] = {}
     for place, (lengths, values) in columns.items():
@@ -301,20 +290,19 @@ def _of_components(columns: Columns) -> list[tuple[Place, tuple[str, ...], str, 
             head, _, last = name.rpartition("_")
             base = (*place[:-1], head) if head else place[:-1]
             groups.setdefault((base, lengths), {}).setdefault(last, (unit, values))
-    found: list[tuple[Place, tuple[str, ...], str, np.ndarray]] = []
+    found: list[Block] = []
     for (base, lengths), components in groups.items():
         names_there = [names for names in _COMPONENTS if set(names) <= set(components)]
         if ("x", "y", "z", "w") in names_there:
             names_there.remove(("x", "y", "z"))
-        plain, own_unit = without_unit(base[-1]) if base and base[-1] != "*" else ("", "")
-        place = (*base[:-1], plain) if plain else base
+        last, own_unit = without_unit(base[-1])
         for names in names_there:
             parts = [_as_numbers(components[name][1], lengths) for name in names]
             numbers = [part for part in parts if part is not None]
             if len(numbers) == len(names):
                 unit = components[names[0]][0] or own_unit
                 names = _COMPONENTS[0] if names == ("p", "y", "r") else names
-                found.append((place, names, unit, np.stack(numbers, axis=-1)))
+                found.append(Block((*base[:-1], last), names, unit, np.stack(numbers, axis=-1)))
     return found
 
 

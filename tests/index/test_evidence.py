@@ -168,22 +168,23 @@ def understood(text, rig=RIG):
 TURNED = path([(-12.0, 33.0, 2.0), (-14.0, 37.0, 1.0), (-15.0, 44.0, -3.0)])
 
 
-@pytest.mark.parametrize("unit", ["cm", "m"])
-@pytest.mark.parametrize("form", FORMS)
-def test_each_form_is_read_in_each_unit(form, unit):
-    found = understood(written(form, *TURNED, unit=unit, coordinate_system="Unreal"))
-
+def assert_read(text, path=TURNED, atol=1e-9):
+    """One reading is left, and its poses are those of a path."""
+    found = understood(text)
     assert len(found.names) == 1
-    np.testing.assert_allclose(motions(found.poses), truth(*TURNED), atol=1e-9)
+    np.testing.assert_allclose(motions(found.poses), truth(*path), atol=atol)
 
 
-@pytest.mark.parametrize("axes", ["opencv", "opengl", "ros", "pytorch3d"])
-@pytest.mark.parametrize("form", sorted(set(FORMS) - ROTATORS_ONLY))
-def test_right_handed_worlds_are_read_and_never_mirrored(form, axes):
-    found = understood(written(form, *TURNED, axes=axes, unit="m", coordinate_system=axes))
-
-    assert len(found.names) == 1
-    np.testing.assert_allclose(motions(found.poses), truth(*TURNED), atol=1e-9)
+@pytest.mark.parametrize(
+    ("form", "axes", "unit"),
+    [
+        *((form, "unreal", unit) for form in FORMS for unit in ("cm", "m")),
+        *((form, axes, "m") for form in FORMS for axes in WORLDS
+          if form not in ROTATORS_ONLY and axes != "unreal"),
+    ],
+)  # fmt: skip
+def test_each_form_is_read_in_each_unit_and_world_and_never_mirrored(form, axes, unit):
+    assert_read(written(form, *TURNED, axes=axes, unit=unit, coordinate_system=axes))
 
 
 def test_rotators_of_a_world_that_is_called_right_handed_are_not_mirrored():
@@ -194,15 +195,12 @@ def test_rotators_of_a_world_that_is_called_right_handed_are_not_mirrored():
         coordinate_system="right-handed z-up",
     )  # fmt: skip
 
-    np.testing.assert_allclose(motions(understood(text).poses), truth(*TURNED), atol=1e-9)
+    assert_read(text)
 
 
 @pytest.mark.parametrize("form", sorted(set(FORMS) - ROTATORS_ONLY - {"R and t", "rvec", "colmap"}))
 def test_where_no_axes_are_named_cameras_stand_upright_in_a_world_whose_z_is_up(form):
-    found = understood(written(form, *TURNED, axes="opengl", unit="m"))
-
-    assert len(found.names) == 1
-    np.testing.assert_allclose(motions(found.poses), truth(*TURNED), atol=1e-9)
+    assert_read(written(form, *TURNED, axes="opengl", unit="m"))
 
 
 def test_a_form_that_nothing_names_must_be_the_only_one_to_pass():
@@ -258,18 +256,20 @@ def test_poses_beside_others_of_the_rig_alone_are_those_of_the_world():
             pose["relative_location"] = {"x": 0.0, "y": PLACES_CM[camera], "z": 0.0}
             pose["relative_rotation"] = {"pitch": 0.0, "yaw": 0.0, "roll": 0.0}
 
-    found = understood(json.dumps(document).encode())
-
-    np.testing.assert_allclose(motions(found.poses), truth(*TURNED), atol=1e-9)
+    assert_read(json.dumps(document).encode())
 
 
-@pytest.mark.parametrize("unit", ["m", "mm"])
-def test_a_unit_that_the_distances_contradict_is_refused(unit):
-    document = json.loads(written("rotator", *TURNED)) | {"unit": unit}
+@pytest.mark.parametrize(("factor", "unit"), [(1, "m"), (1, "mm"), (0.5, "cm"), (1.01, "cm")])
+def test_distances_in_one_ratio_to_the_baselines_are_stated_in_two_ways(factor, unit):
+    rotators, places_cm = TURNED
+    document = json.loads(written("rotator", rotators, places_cm * factor)) | {"unit": unit}
 
-    told = r"(?s)trajectory\.json: .* 66 cm apart, and by the poses.*in another unit"
-    with pytest.raises(SidesError, match=told):
+    told = r"(?s)trajectory\.json: .* 66 cm apart, and by the poses.*in another unit or scaled"
+    with pytest.raises(SidesError, match=told) as caught:
         understood(json.dumps(document).encode())
+
+    scale = factor * {"m": 100, "mm": 0.1, "cm": 1}[unit]
+    assert caught.value.scale == pytest.approx(scale, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -311,14 +311,6 @@ def test_the_poses_of_another_rig_are_refused():
 
     with pytest.raises(SchemaError, match=r"trajectory\.json: no reading of its poses fits"):
         understood(written("rotator", rotators, places_cm * np.linspace(1, 1.1, 6)[:, None]))
-
-
-@pytest.mark.parametrize("share", [0.5, 1.01])
-def test_distances_in_one_ratio_to_the_baselines_are_stated_in_two_ways(share):
-    rotators, places_cm = TURNED
-
-    with pytest.raises(SidesError, match="in another unit or scaled"):
-        understood(written("rotator", rotators, places_cm * share))
 
 
 def test_a_focal_length_that_changes_over_frames_is_refused():

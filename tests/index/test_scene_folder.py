@@ -89,26 +89,20 @@ def test_what_not_every_sample_needs_becomes_a_remark(make_scene, root):
     assert scene.pose_form is None
 
 
-def test_without_poses_the_rig_is_assumed_to_be_a_line(make_scene, root):
+@pytest.mark.parametrize(("pair", "sign"), [([0, 1], 1), ([3, 1], -1)])
+def test_without_poses_the_rig_is_a_line_and_the_primary_pair_tells_its_left_end(
+    make_scene, root, rewrite, pair, sign
+):
     folder = make_scene()
-    posed = describe_scene(root, KEY)
+    rewrite(folder / "baseline.json", lambda d: d.update(primary_stereo_pair=pair))
     (folder / "trajectory.json").write_text("{")
 
-    assumed = describe_scene(root, KEY)
+    scene = describe_scene(root, KEY)
 
-    assert assumed.lateral_m == pytest.approx(posed.lateral_m, abs=1e-12)
-    assert assumed.rig_residual_px == 0
-    assert "looks truncated" in assumed.remark("poses")
-
-
-def test_without_poses_the_left_end_follows_from_the_primary_pair(make_scene, root, rewrite):
-    folder = make_scene()
-    rewrite(folder / "baseline.json", lambda d: d.update(primary_stereo_pair=[3, 1]))
-    (folder / "trajectory.json").unlink()
-
-    assert describe_scene(root, KEY).lateral_m == pytest.approx(
-        (0.0, -0.1, -0.25, -0.31, -0.6, -0.725)
-    )
+    places_m = [sign * place_m for place_m in (0.0, 0.1, 0.25, 0.31, 0.6, 0.725)]
+    assert scene.lateral_m == pytest.approx(places_m, abs=1e-12)
+    assert scene.rig_residual_px == 0
+    assert "looks truncated" in scene.remark("poses")
 
 
 def test_cameras_whose_sides_are_contradicted_have_no_poses(make_scene, root, rewrite):
