@@ -350,23 +350,19 @@ class Description:
             told = f"{self.key}: none of its videos can be opened. Fetch the scene again."
             raise MediaError(told)
         counts = {name: fact.frames for name, fact in self.facts.items()}
-        told, odd = self.odd_ones(counts, "one number of frames")
-        if odd and max(counts.values()) - min(counts.values()) > MOST_EXTRA_FRAMES:
+        told, frames = self.odd_ones(counts, "one number of frames"), min(counts.values())
+        if max(counts.values()) - frames > MOST_EXTRA_FRAMES:
             raise StorageError(f"{told}. Fetch those again.")
-        frames = min(counts.values())
-        if odd:
+        if told:
             self.remark("frames", f"{told}. The first {frames} of all are used")
         return frames
 
-    def odd_ones(self, found: Mapping[str, object], what: str) -> tuple[str, list[str]]:
-        """Return that files do not have alike what most of them have, and the names of these."""
+    def odd_ones(self, found: Mapping[str, object], what: str) -> str:
+        """Return that files do not have alike what most of them have; "" where they do."""
         common = Counter(found.values()).most_common(1)[0][0]
-        odd = [name for name, value in found.items() if value != common]
-        listed = ", ".join(f"{name} has {found[name]}" for name in odd)
-        return (
-            f"{self.key}: its videos must have {what}: {len(found) - len(odd)} have {common}, but "
-            f"{listed}"
-        ), odd
+        odd = [f"{name} has {value}" for name, value in found.items() if value != common]
+        told = f"{len(found) - len(odd)} have {common}, but {', '.join(odd)}"
+        return f"{self.key}: its videos must have {what}: {told}" if odd else ""
 
     def common_key_frames(self, frames: int) -> tuple[int, ...]:
         """Return the frames at which all videos of pictures have a key frame."""
@@ -377,8 +373,7 @@ class Description:
     def require_one_size(self) -> None:
         """Refuse videos of different picture sizes."""
         sizes = {name: f"{fact.width_px}x{fact.height_px}" for name, fact in self.facts.items()}
-        told, odd = self.odd_ones(sizes, "one picture size in pixels")
-        if odd:
+        if told := self.odd_ones(sizes, "one picture size in pixels"):
             raise StorageError(f"{told}. Fetch those again.")
 
     def require_kinds(self, rig: Rig) -> None:
@@ -768,14 +763,14 @@ def metadata_differences(scene: Scene, texts: Mapping[str, bytes]) -> list[Diffe
     described = next((name for name in DESCRIPTIONS if name in texts), DESCRIPTION_JSON)
     place = parse_scene_key(scene.id.key)
     subset = scene.id.subset if place.split == "eval" else None
-    again: tuple[tuple[str, Callable[[], Scene]], ...] = (
-        ("", lambda: replace(scene, id=replace(place, subset=place.subset or subset))),
-        (BASELINE_JSON, lambda: _with_rig(scene, texts)),
-        (TRAINING_JSON, lambda: _derived(scene, texts[TRAINING_JSON])),
-        (TRAJECTORY_JSON, lambda: _posed(scene, texts[TRAJECTORY_JSON])),
-        (described, lambda: replace(scene, caption=caption_of(texts, key=scene.id.key)[0])),
-    )
-    for name, described_again in again:
+    again: dict[str, Callable[[], Scene]] = {
+        "": lambda: replace(scene, id=replace(place, subset=place.subset or subset)),
+        BASELINE_JSON: lambda: _with_rig(scene, texts),
+        TRAINING_JSON: lambda: _derived(scene, texts[TRAINING_JSON]),
+        TRAJECTORY_JSON: lambda: _posed(scene, texts[TRAJECTORY_JSON]),
+        described: lambda: replace(scene, caption=caption_of(texts, key=scene.id.key)[0]),
+    }
+    for name, described_again in again.items():
         if name and name not in texts:
             continue
         try:

@@ -316,7 +316,7 @@ def shape_of_text(text: str) -> Shape:
         SchemaError: If the text is not a shape.
     """
     where = "the conventions of a scene"
-    return _shape(parse_object(text.encode(errors="surrogatepass"), where=where), where=where)
+    return _shape(parse_object(text.encode(errors="surrogatepass"), where=where), where)
 
 
 def parse_conventions(text: bytes, *, where: str) -> Conventions:
@@ -348,18 +348,16 @@ def parse_conventions(text: bytes, *, where: str) -> Conventions:
             f"which scenes it concerns. Write it as [shape.{plain_line(shortened(other))}] below "
             f"its [[shape]]."
         )
-    if not isinstance(tables, list) or not 0 < len(tables) <= _MOST:
-        raise SchemaError(f"{where}: [[shape]] must be 1 to {_MOST} tables. Write [[shape]].")
-    shapes = []
-    for number, table in enumerate(tables, 1):
-        place = f"{where}: shape {number}" if len(tables) > 1 else where
-        if not isinstance(table, dict):
-            raise SchemaError(f"{place}: shape must be a table, found {_shown(table)}: [[shape]].")
-        shapes.append(_shape(table, where=place))
+    if not (isinstance(tables, list) and 0 < len(tables) <= _MOST
+            and all(isinstance(table, dict) for table in tables)):  # fmt: skip
+        rule = f"shape must be 1 to {_MOST} tables, written [[shape]]"
+        raise SchemaError(f"{where}: {rule}, found {_shown(tables)}.")
+    places = [f"{where}: shape {at}" for at in range(1, len(tables) + 1)]
+    shapes = map(_shape, tables, places if len(tables) > 1 else [where])
     return Conventions(tuple(shapes), where)
 
 
-def _shape(table: dict[str, Any], *, where: str) -> Shape:
+def _shape(table: dict[str, Any], where: str) -> Shape:
     _require_known(table, ("has", *_KEYS), where=where)
     tables: dict[str, dict[str, Any]] = {}
     for name in (each for each in table if each != "has"):
