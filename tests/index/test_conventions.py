@@ -185,10 +185,12 @@ def test_conventions_of_an_index_that_lacks_them_are_compared_with_its_files(mak
 
     with pytest.raises(StereoGenBenchError, match=r"(?s)scene_000001/baseline\.json.*50"):
         SceneIndex.open(root, conventions=stated(wrong))
-    index = SceneIndex.open(root, conventions=stated("[depth]\nunit_m = 0.001\nkind = 'ray'\n"))
+    right = "[depth]\nunit_m = 0.001\noffset_m = 0.5\nkind = 'ray'\ninstead_of_tag_m = 0.001\n"
+    index = SceneIndex.open(root, conventions=stated(right))
 
     assert index.shapes[0].depth.encoding.kind == "ray"
     assert index.scene(0).depth_unit_source == ("conventions",) * 6
+    assert index.scene(0).depth_offset_m == (0.5,) * 6
     assert index.digest != SceneIndex.open(root).digest
 
 
@@ -220,16 +222,3 @@ def test_opening_says_in_a_line_what_it_took_for_granted(make_scene, root, rewri
     (warning,) = told
     assert re.search(rf"{root}.*2 scenes.*conventions", str(warning.message))
     assert "\n" not in str(warning.message)
-
-
-def test_rows_of_an_index_take_over_the_offset_of_depth(make_scene, root):
-    make_scene()
-    SceneIndex.open(root).write(root / INDEX_NAME)
-
-    index = SceneIndex.open(
-        root,
-        conventions=stated("[depth]\nunit_m = 0.001\noffset_m = 0.5\ninstead_of_tag_m = 0.001\n"),
-    )
-
-    assert index.scene(0).depth_unit_source == ("conventions",) * 6
-    assert index.scene(0).depth_offset_m == (0.5,) * 6

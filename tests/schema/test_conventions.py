@@ -77,14 +77,6 @@ def test_all_that_can_be_stated_is_read_and_written_again():
     assert [shape_of_text(shape.text()) for shape in conventions.shapes] == [first, second]
 
 
-def test_a_file_without_shapes_is_one_shape_of_all_scenes():
-    (shape,) = read(b"[depth]\nunit_m = 0.001\n").shapes
-
-    assert shape.has == ()
-    assert shape.depth.encoding.unit_m == 0.001
-    assert shape.depth.encoding.source == "conventions"
-
-
 @pytest.mark.parametrize(
     ("text", "told"),
     [

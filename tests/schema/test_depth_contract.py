@@ -36,7 +36,7 @@ comment=multiply by 0.001 to get metres | comment={"depth_scale": 0.001, "unit":
 
 
 @pytest.mark.parametrize(
-    "tag", [each.strip() for line in MILLIMETRES.splitlines() for each in line.split("|") if each]
+    "tag", [each.strip() for line in MILLIMETRES.split("\n") for each in line.split("|") if each]
 )
 def test_a_tag_of_millimetres_is_understood(tag):
     key, _, value = tag.partition("=")
@@ -119,30 +119,24 @@ def test_a_range_gives_unit_and_offset(statements):
     assert (found.unit_m, found.offset_m) == (pytest.approx(80 / LARGEST), 0.5)
 
 
-@pytest.mark.parametrize(
-    "tags",
-    [
-        {"scale": ""}, {"scale": "0"}, {"scale": "-1"}, {"scale": "nan"}, {"scale": "x0.001"},
-        {"units_per_meter": "0.001"}, {"DEPTH_FOO": "0.001"}, {"DEPTH_UNIT": "m"},
-        {"unit": "furlong"}, {"scale": "0.03937 in"},
-        {"scale": "0.1", "DEPTH_UNIT": "mm"}, {"scale": "0.1", "unit": "cm"},
-        {"depth_scale": "0.1", "near": "0.5 m", "far": "80.5 m"},
-        {"depth_scale": "0.001", "near": "0.1", "far": "65.535"}, {"DEPTH_SCALE": "65.535"},
-        {"DEPTH_SCALE": "1"}, {"scale": "1.0"},
-        {"depth_encoding": "inverse", "scale": "655"}, {"encoding": "log", "scale": "0.001"},
-        {"depth_type": "euclidean", "scale": "0.001"}, {"disparity_scale": "16"},
-        {"scale": "0.001", "offset": "0.5"}, {"max_depth": "100"}, {"normalized": "1"},
-        {"near": "10", "far": "10000"}, {"unit": "mm", "depth_min": "312", "depth_max": "60000"},
-        {"comment": "depth clipped at 100 m"}, {"comment": "depth / 7 + 3"},
-        {"comment": "stored = (depth - 1.0) / 0.001", "scale": "0.001"},
-        {"comment": "uint16 mm, distance to camera"}, {"comment": "range image, mm"},
-        {"comment": "1/z", "scale": "0.001"},
-        {"projection": "distance_to_camera", "scale": "0.001"},
-        {"comment": "depth = 1.0 m + 0.001 m * value", "scale": "0.001"},
-    ],
-    ids=str,
-)  # fmt: skip
-def test_tags_that_do_not_tell_the_unit_are_refused_by_name(tags):
+UNCLEAR = """
+scale= | scale=0 | scale=-1 | scale=nan | scale=x0.001 | units_per_meter=0.001 | DEPTH_FOO=0.001
+DEPTH_UNIT=m | unit=furlong | scale=0.03937 in | scale=0.1; DEPTH_UNIT=mm | scale=0.1; unit=cm
+depth_scale=0.1; near=0.5 m; far=80.5 m | depth_scale=0.001; near=0.1; far=65.535
+DEPTH_SCALE=65.535 | DEPTH_SCALE=1 | scale=1.0 | depth_encoding=inverse; scale=655
+encoding=log; scale=0.001 | depth_type=euclidean; scale=0.001 | disparity_scale=16
+scale=0.001; offset=0.5 | max_depth=100 | normalized=1 | near=10; far=10000
+unit=mm; depth_min=312; depth_max=60000 | comment=depth clipped at 100 m | comment=depth / 7 + 3
+comment=stored = (depth - 1.0) / 0.001; scale=0.001 | comment=uint16 mm, distance to camera
+comment=range image, mm | comment=1/z; scale=0.001 | projection=distance_to_camera; scale=0.001
+comment=depth = 1.0 m + 0.001 m * value; scale=0.001
+"""
+
+
+@pytest.mark.parametrize("text", UNCLEAR.strip().replace("\n", " | ").split(" | "))
+def test_tags_that_do_not_tell_the_unit_are_refused_by_name(text):
+    tags = dict(each.split("=", 1) for each in text.split("; "))
+
     with pytest.raises(SchemaError, match=f"clip: tag ({'|'.join(tags)}) = "):
         of_tags(**tags)
 
