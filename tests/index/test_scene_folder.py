@@ -20,6 +20,17 @@ from tests.servers.videos import write_frames
 KEY = "train/Uniform/Car_Dealer/scene_000001"
 
 
+@pytest.fixture
+def described(make_scene, root, rewrite):
+    """From a change of one of its JSON files to the row of a scene."""
+
+    def describe(name, change):
+        rewrite(make_scene() / name, change)
+        return describe_scene(root, KEY)
+
+    return describe
+
+
 def test_a_row_says_what_the_files_say(make_scene, root):
     folder = make_scene()
 
@@ -105,10 +116,8 @@ def test_without_poses_the_rig_is_a_line_and_the_primary_pair_tells_its_left_end
     assert "looks truncated" in scene.remark("poses")
 
 
-def test_cameras_whose_sides_are_contradicted_have_no_poses(make_scene, root, rewrite):
-    rewrite(make_scene() / "baseline.json", lambda d: d.update(primary_stereo_pair=[1, 0]))
-
-    scene = describe_scene(root, KEY)
+def test_cameras_whose_sides_are_contradicted_have_no_poses(described):
+    scene = described("baseline.json", lambda d: d.update(primary_stereo_pair=[1, 0]))
 
     assert scene.pose_form is None
     assert "camera 1 is to the right of camera 0" in scene.remark("left")
@@ -122,10 +131,8 @@ def test_the_text_file_stands_in_for_the_description(make_scene, root):
     assert describe_scene(root, KEY).caption == "Cars."
 
 
-def test_frames_without_poses_at_the_end_are_not_used(make_scene, root, rewrite):
-    rewrite(make_scene() / "trajectory.json", lambda document: document["frames"].pop())
-
-    scene = describe_scene(root, KEY)
+def test_frames_without_poses_at_the_end_are_not_used(described):
+    scene = described("trajectory.json", lambda document: document["frames"].pop())
 
     assert (scene.frames, scene.remark("poses")) == (3, "")
     assert "poses of 3 frames, and the videos have 4. The first 3 are" in scene.remark("frames")
@@ -173,25 +180,19 @@ def test_a_unit_of_depth_in_a_file_of_its_own_is_read(make_scene, root, video, n
     ],
     ids=["all cameras turned", "three entries more", "numbers below 0", "one less"],
 )  # fmt: skip
-def test_poses_that_no_lateral_rig_of_these_frames_has_are_not_used(
-    make_scene, root, rewrite, edit
-):
-    rewrite(make_scene() / "trajectory.json", lambda document: edit(document["frames"]))
-
-    scene = describe_scene(root, KEY)
+def test_poses_that_no_lateral_rig_of_these_frames_has_are_not_used(described, edit):
+    scene = described("trajectory.json", lambda document: edit(document["frames"]))
 
     assert scene.remark("poses")
     assert scene.rig_residual_px == 0
 
 
-def test_objects_beside_the_cameras_are_no_poses(make_scene, root, rewrite):
+def test_objects_beside_the_cameras_are_no_poses(described):
     def add_lights(document):
         for frame in document["frames"]:
             frame["lights"] = frame["cameras"][:2]
 
-    rewrite(make_scene() / "trajectory.json", add_lights)
-
-    assert describe_scene(root, KEY).remark("poses") == ""
+    assert described("trajectory.json", add_lights).remark("poses") == ""
 
 
 @pytest.mark.parametrize(
@@ -216,10 +217,8 @@ def test_a_video_of_another_size_is_named(make_scene, root, video):
         describe_scene(root, KEY)
 
 
-def test_the_videos_tell_the_size_whatever_is_recorded(make_scene, root, rewrite):
-    rewrite(make_scene() / "baseline.json", lambda document: document.update(image_width=1280))
-
-    scene = describe_scene(root, KEY)
+def test_the_videos_tell_the_size_whatever_is_recorded(described):
+    scene = described("baseline.json", lambda document: document.update(image_width=1280))
 
     assert (scene.rig.image_width_px, scene.rig.image_height_px) == (32, 24)
     assert "pictures of 1280x24 pixels, and all videos have 32x24" in scene.remark("size")
@@ -278,16 +277,14 @@ def test_a_baseline_may_differ_by_a_millimetre_and_a_thousandth_and_no_more(
 
 @pytest.mark.parametrize(("scale", "is_left"), [(0.01, ""), (1.1, "scaled"), (100.0, "")])
 def test_poses_by_which_a_rig_would_be_of_no_scene_of_its_family_hold_up_poses_alone(
-    make_scene, root, rewrite, scale, is_left
+    described, scale, is_left
 ):
     def scaled(document):
         for frame in document["frames"]:
             for pose in frame["cameras"]:
                 pose["location"] = {axis: scale * cm for axis, cm in pose["location"].items()}
 
-    rewrite(make_scene() / "trajectory.json", scaled)
-
-    scene = describe_scene(root, KEY)
+    scene = described("trajectory.json", scaled)
 
     assert "in another unit or scaled" in scene.remark("poses")
     assert is_left in scene.remark("left")
@@ -306,11 +303,9 @@ def test_poses_by_which_a_rig_would_be_of_no_scene_of_its_family_hold_up_poses_a
     ],
 )
 def test_what_a_file_states_otherwise_is_told_with_its_place_and_does_not_count(
-    make_scene, root, rewrite, name, key, value, told
+    described, name, key, value, told
 ):
-    rewrite(make_scene() / name, lambda document: document.update({key: value}))
-
-    scene = describe_scene(root, KEY)
+    scene = described(name, lambda document: document.update({key: value}))
 
     assert re.search(told, scene.remark("stated"))
     assert (scene.frames, scene.rig.image_width_px) == (4, 32)
