@@ -82,28 +82,23 @@ def parse_document(text: bytes, *, where: str) -> Any:
             deep, or has a key twice.
     """
     decoded = parse_text(text, where=where)
-    if not decoded.strip():
-        raise SchemaError(f"{where}: the file is empty. Copy it from the release again.")
+    told = "the file is empty. Copy it"
     try:
-        return json.loads(decoded, object_pairs_hook=_unique)
-    except RecursionError as error:
-        raise SchemaError(
-            f"{where}: lists or objects are nested hundreds of levels deep; the release's files "
-            f"have six levels. Copy the file from the release again."
-        ) from error
+        if decoded.strip():
+            return json.loads(decoded, object_pairs_hook=_unique)
+    except RecursionError:
+        told = "lists or objects are nested hundreds of levels deep; the release's files have six "
+        told += "levels. Copy the file"
     except json.JSONDecodeError as error:
         length = len(decoded.rstrip())
-        truncated = error.pos >= length or error.msg.startswith("Unterminated")
-        guess = "The file looks truncated: c" if truncated else "C"
-        raise SchemaError(
-            f"{where}: not valid JSON: {error.msg} at line {error.lineno}, column {error.colno} "
-            f"(character {min(error.pos, length)} of {length}). {guess}opy it from the release "
-            f"again."
-        ) from error
+        is_cut = error.pos >= length or error.msg.startswith("Unterminated")
+        place = f"line {error.lineno}, column {error.colno}"
+        place += f" (character {min(error.pos, length)} of {length})"
+        cure = "The file looks truncated: copy it" if is_cut else "Copy it"
+        told = f"not valid JSON: {error.msg} at {place}. {cure}"
     except ValueError as error:
-        raise SchemaError(
-            f"{where}: not valid JSON: {error}. Copy the file from the release again."
-        ) from error
+        told = f"not valid JSON: {error}. Copy the file"
+    raise SchemaError(f"{where}: {told} from the release again.")
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

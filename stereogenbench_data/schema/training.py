@@ -144,9 +144,8 @@ def parse_training(text: bytes, *, where: str) -> TrainingDocument:
                 for name, file in document["files"].items()
             },
         )  # fmt: skip
-        odd = _odd_value(found)
-        if not odd and json.loads(found.text()) != document:
-            odd = "its keys"
+        is_ours = json.loads(found.text()) == document
+        odd = _odd_value(found) or ("" if is_ours else "one of its keys")
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         odd = f"a value ({error!r})"
     if odd:
