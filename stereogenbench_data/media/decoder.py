@@ -156,7 +156,15 @@ def table_clock(
     except av.FFmpegError as error:
         raise cut_short(error.strerror) from error
     if stream_codec(container).is_intra_only:
-        require_file_order(times, steady, name=name)
+        for number, pts in enumerate(times):
+            is_after = number == 0 or pts > times[number - 1]
+            if not is_after or (steady is not None and steady.index(pts) != number):
+                raise MediaError(
+                    f"{name}: its frame number {number} as stored is shown at {pts} ticks, and its "
+                    f"codec stores frames in the order in which they are shown, at the rate in the "
+                    f"header. A time was altered: compare the file with its checksum, or fetch it "
+                    f"again."
+                )
     times.sort()
     twice = next((a for a, b in pairwise(times) if a == b), None)
     if twice is not None:
@@ -165,23 +173,6 @@ def table_clock(
             f"not defined: write it again with one time for each frame."
         )
     return TableClock(times)
-
-
-def require_file_order(times: Sequence[int], steady: SteadyClock | None, *, name: str) -> None:
-    """Refuse times that do not ascend as frames are stored, or are not those of the rate.
-
-    Raises:
-        MediaError: Naming the first such frame.
-    """
-    for number, pts in enumerate(times):
-        is_after = number == 0 or pts > times[number - 1]
-        if not is_after or (steady is not None and steady.index(pts) != number):
-            raise MediaError(
-                f"{name}: its frame number {number} as stored is shown at {pts} ticks, and its "
-                f"codec stores frames in the order in which they are shown, at the rate in the "
-                f"header. A time was altered: compare the file with its checksum, or fetch it "
-                f"again."
-            )
 
 
 class UnexpectedPicture(Exception):

@@ -35,7 +35,6 @@ from stereogenbench_data.media.decoder import (
     Decoder,
     TableClock,
     UnexpectedPicture,
-    require_file_order,
     steady_clock,
     table_clock,
 )
@@ -92,11 +91,9 @@ def probe(
     if frames and not (is_intra_only and isinstance(file, str | Path)):
         return facts
     with open_container(file, name=name) as container:
-        times = table_clock(container, name=name).times
-        frames = len(times)
-        if frames and is_intra_only:
-            steady = steady_clock(container, frames=frames)
-            require_file_order(times, steady, name=name)
+        claimed = frames or frames_by_duration(container) or 0
+        steady = steady_clock(container, frames=claimed)
+        frames = len(table_clock(container, name=name, steady=steady).times)
     if frames == 0:
         raise MediaError(f"{name}: holds no frame (0 packets): fetch it again.")
     return replace(facts, frames=frames)
