@@ -9,7 +9,7 @@ import pytest
 from stereogenbench_data import SceneIndex, StereoGenBenchError, StereoPairs
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.shards.pack import pack
-from tests.media.test_altered_times import flipped, matroska_times
+from tests.media.test_altered_times import block_times, flipped
 
 FRAMES = 17
 DEPTH = "cam_00_depth.mkv"
@@ -24,9 +24,9 @@ def truth(drawn):
     return depths
 
 
-def block_times(content):
+def bits_of_times(content):
     """Return (place, bit) of some bits of the times, each of two bytes, of some blocks."""
-    places = matroska_times(content)[-2 * FRAMES :]
+    places = block_times(content)
     return [
         (places[2 * block + low], bit)
         for block in (0, 11, 12, 16)
@@ -58,7 +58,7 @@ def test_an_altered_time_in_a_folder_brings_no_other_frame_and_no_index(drawn, t
     content = (root / key / DEPTH).read_bytes()
     moved = SceneIndex.from_scenes([index.scene(0)], root)
     wrong, indexed = [], []
-    for place, bit in block_times(content):
+    for place, bit in bits_of_times(content):
         (root / key / DEPTH).write_bytes(flipped(content, place, bit))
         wrong += wrong_frames(moved, truth, check="read")
         described = describe_scene(root, key)
@@ -80,7 +80,7 @@ def test_an_altered_time_in_a_shard_brings_no_other_frame(drawn, truth, tmp_path
     whole = shard.read_bytes()
     content = whole[member.offset : member.offset + member.size]
     wrong = []
-    for place, bit in block_times(content)[:: 1 if check == "metadata" else 5]:
+    for place, bit in bits_of_times(content)[:: 1 if check == "metadata" else 5]:
         shard.write_bytes(flipped(whole, member.offset + place, bit))
         wrong += wrong_frames(index, truth, check=check)
 

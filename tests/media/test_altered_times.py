@@ -5,6 +5,7 @@ import random
 import re
 from contextlib import suppress
 
+import av
 import numpy as np
 import pytest
 
@@ -34,6 +35,15 @@ def flipped(content, place, bit):
     return bytes(altered)
 
 
+def block_times(content):
+    """Return where the time of each block of a Matroska file stands, two bytes each."""
+    with av.open(io.BytesIO(content)) as container:
+        packets = {bytes(packet) for packet in container.demux(video=0) if packet.size}
+    starts = sorted(content.index(packet) for packet in packets)
+    assert len(starts) == FRAMES
+    return [start - before for start in starts for before in (3, 2)]
+
+
 def test_no_flipped_bit_of_a_depth_videos_times_brings_another_frame(clips):
     pictures = np.zeros((FRAMES, 16, 16), "<u2") + 7 * np.arange(FRAMES, dtype="<u2")[:, None, None]
     path = clips.encode(
@@ -41,8 +51,7 @@ def test_no_flipped_bit_of_a_depth_videos_times_brings_another_frame(clips):
         pictures=pictures, pixel_format="gray16le",
     )  # fmt: skip
     content = path.read_bytes()
-    starts = [content.index(packet) for packet in clips.packets(path)]
-    places = [start - before for start in starts for before in (2, 3)]  # of blocks
+    places = block_times(content)
     for found in re.finditer(TIMES, content):
         places += range(found.end(), found.end() + found[1][0] % 16)
     rng = random.Random(4)
@@ -58,7 +67,6 @@ def test_no_flipped_bit_of_a_depth_videos_times_brings_another_frame(clips):
             found = shown(flipped(content, place, bit), order, number_of)
             wrong += [(place, bit, *each) for each in found if each[0] != each[1]]
 
-    assert len({*starts}) == FRAMES
     assert len(places) > 2 * FRAMES + 8
     assert wrong == []
 
