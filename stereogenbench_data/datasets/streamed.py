@@ -122,12 +122,10 @@ class StereoPairStream(IterableDataset[Sample]):
 
     def __len__(self) -> int:
         """Return how many samples this rank has in a whole epoch."""
-        batches = self.batches
-        share, size = batches.share(0), batches.rule.batch_size
-        short = len(self.pairs) % size
-        is_uneven = not (batches.drop_last or batches.is_padded)
-        has_short = is_uneven and short > 0 and len(self.pairs) // size in share
-        return len(share) * size - (size - short if has_short else 0)
+        share, size = self.batches.share(0), self.batches.batch_size
+        if not share or self.batches.is_padded:
+            return len(share) * size
+        return len(share) * size - max(0, (share[-1] + 1) * size - len(self.pairs))
 
     def __repr__(self) -> str:
         """Return a summary."""

@@ -314,22 +314,17 @@ class Eraser:
         if generator.random() >= self.probability:
             return views
         height, width = views.intrinsics.height_px, views.intrinsics.width_px
-        boxes = []
+        hit = np.zeros((height, width), dtype=bool)
         for _ in range(int(generator.integers(1, self.most_boxes + 1))):
             top, left = int(generator.integers(height)), int(generator.integers(width))
             tall, wide = (int(side) for side in generator.integers(self.low, self.high + 1, 2))
-            boxes.append((slice(top, top + tall), slice(left, left + wide)))
+            hit[top : top + tall, left : left + wide] = True
         pictures, erased = dict(views.pictures), dict(views.erased)
         for camera in views.targets:
-            erased[camera] = erased.get(camera, np.zeros((height, width), dtype=bool)).copy()
-            for box in boxes:
-                erased[camera][box] = True
-        for camera in set(views.targets) & set(pictures):
-            painted = pictures[camera].copy()
-            mean = _own(painted, views).mean(axis=(-2, -1), keepdims=True).round().astype(np.uint8)
-            for rows, columns in boxes:
-                painted[..., rows, columns] = mean
-            pictures[camera] = painted
+            erased[camera] = hit | erased.get(camera, False)
+            if camera in pictures:
+                mean = _own(pictures[camera], views).mean(axis=(-2, -1), keepdims=True)
+                pictures[camera] = np.where(hit, mean.round().astype(np.uint8), pictures[camera])
         return replace(views, pictures=pictures, erased=erased)
 
 

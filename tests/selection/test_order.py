@@ -18,7 +18,7 @@ from stereogenbench_data.selection.order import (
     rank_share,
 )
 
-WORLDS, WORKERS = range(1, 6), range(5)
+WORLDS = range(1, 6)
 
 
 def runs_of(lengths, *, pairs=1, key_distance=1):
@@ -45,18 +45,6 @@ def all_batches(order):
 
 def flat(batches):
     return list(itertools.chain.from_iterable(batches))
-
-
-def by_worker(numbers, *, workers):
-    """Deal a rank's batches as torch's DataLoader does: each worker's list of them."""
-    return [numbers[worker :: max(1, workers)] for worker in range(max(1, workers))]
-
-
-def rows_of(shares):
-    """Return what the ranks get step by step."""
-    return [
-        [number for number in row if number is not None] for row in itertools.zip_longest(*shares)
-    ]
 
 
 lengths_of_scenes = st.lists(st.integers(1, 30), min_size=1, max_size=40)
@@ -157,37 +145,18 @@ def test_a_small_number_of_open_runs_is_reached_and_never_exceeded(runs, open_sc
     assert (opened - closed).max() == min(runs, open_scenes)
 
 
-@pytest.mark.parametrize(
-    ("shuffle", "batch_size", "epoch"), [(True, 1, 5), (True, 8, 0), (False, 3, 1)]
-)
-def test_ranks_and_workers_share_the_same_global_batches_out(shuffle, batch_size, epoch):
-    order = order_of([5, 9, 2, 7, 7, 1, 12], batch_size=batch_size, epoch=epoch, shuffle=shuffle)
-    expected = all_batches(order)
-    for world, workers in itertools.product(WORLDS, WORKERS):
-        end = last_batch(43, batch_size=batch_size, drop_last=False, world_size=world)
-        seen = {}
-        for rank in range(world):
-            share = rank_share(0, end, rank=rank, world_size=world)
-            for numbers in by_worker(share, workers=workers):
-                for number in numbers:
-                    assert number not in seen
-                    seen[number] = order.batch(number).tolist()
+@pytest.mark.parametrize("batches", [1, 15, 40])
+def test_ranks_share_what_is_left_of_an_epoch_in_order_and_exactly_once(batches):
+    """Whichever world stopped before, after any of its steps."""
+    for before, world in itertools.product(WORLDS, WORLDS):
+        for start in range(0, batches + 1, before):
+            options = {"drop_last": False, "world_size": world, "start": start}
+            end = last_batch(3 * batches - 1, batch_size=3, **options)
+            shares = [rank_share(start, end, rank=rank, world_size=world) for rank in range(world)]
 
-        assert [seen[number] for number in sorted(seen)] == expected
-        assert sorted(flat(expected)) == list(range(43))
-
-
-def test_a_run_stopped_at_any_batch_goes_on_under_any_other_world():
-    order = order_of([5, 9, 2, 7, 7, 1, 12], batch_size=3)
-    unbroken = all_batches(order)
-    for before, after in itertools.product(WORLDS, WORLDS):
-        for steps in range(order.batches // before + 1):
-            start = steps * before
-            end = last_batch(43, batch_size=3, drop_last=False, world_size=after, start=start)
-            shares = [rank_share(start, end, rank=rank, world_size=after) for rank in range(after)]
-            steps_after = [sorted(row) for row in rows_of(shares)]
-
-            assert [order.batch(n).tolist() for n in flat(steps_after)] == unbroken[start:]
+            steps = itertools.zip_longest(*shares)
+            given = [sorted(n for n in step if n is not None) for step in steps]
+            assert flat(given) == list(range(start, batches))
 
 
 @pytest.mark.parametrize("start", [0, 13])
