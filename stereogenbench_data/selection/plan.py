@@ -579,28 +579,25 @@ def _plan(index: SceneIndex, pairs: PairList, *, windows: Windows, seed: int) ->
     keys = index.column("key")[scene_rows]
     pairs_of = np.diff(first_pair)
     kinds, kind_of_row = index.key_frames()
-    kind = kind_of_row[scene_rows]
-    per_scene, run_counts, key_distances = np.empty((3, len(scene_rows)), dtype=np.int64)
-    classes: list[tuple[np.ndarray, tuple[int, ...]]] = []
-    for frames, which in sorted(set(zip(frame_counts.tolist(), kind.tolist(), strict=True))):
-        same = (frame_counts == frames) & (kind == which)
+    alike = list(zip(frame_counts.tolist(), kind_of_row[scene_rows].tolist(), strict=True))
+    of_kind = {}
+    for frames, kind in sorted(set(alike)):
         try:
-            per_scene[same] = windows.count(frames)
+            count = windows.count(frames)
         except SelectionError as error:
-            others = f" and {same.sum() - 1} more" if same.sum() > 1 else ""
-            raise SelectionError(f"{keys[same][0]}{others}: {error}") from error
-        starts_of = run_starts(windows, frames=frames, key_frames=kinds[which], least=LEAST_RUN)
-        run_counts[same] = len(starts_of)
-        key_distances[same] = key_distance(windows, key_frames=kinds[which])
-        classes.append((same, starts_of))
-    first_sample = np.concatenate([[0], np.cumsum(pairs_of * per_scene)]).astype(np.int64)
-    first_run = np.concatenate([[0], np.cumsum(run_counts)])
-    first_of_run = np.empty(first_run[-1] + 1, dtype=np.int64)
-    first_of_run[-1] = first_sample[-1]
-    for same, starts_of in classes:
-        runs = first_run[:-1][same][:, None] + np.arange(len(starts_of))
-        samples = np.array(starts_of) * pairs_of[same][:, None]
-        first_of_run[runs] = first_sample[:-1][same][:, None] + samples
+            same = [key for key, each in zip(keys, alike, strict=True) if each == (frames, kind)]
+            others = f" and {len(same) - 1} more" if len(same) > 1 else ""
+            raise SelectionError(f"{same[0]}{others}: {error}") from error
+        of_kind[frames, kind] = (
+            count,
+            run_starts(windows, frames=frames, key_frames=kinds[kind], least=LEAST_RUN),
+            key_distance(windows, key_frames=kinds[kind]),
+        )
+    counts, starts_of, distances = zip(*(of_kind[each] for each in alike), strict=True)
+    first_sample = np.concatenate([[0], np.cumsum(pairs_of * counts)]).astype(np.int64)
+    runs = [len(each) for each in starts_of]
+    pairs_of_run = np.repeat(pairs_of, runs)
+    first_of_run = np.repeat(first_sample[:-1], runs) + np.concatenate(starts_of) * pairs_of_run
     return Plan(
         pairs=pairs,
         windows=windows,
@@ -608,7 +605,7 @@ def _plan(index: SceneIndex, pairs: PairList, *, windows: Windows, seed: int) ->
         first_pair=first_pair,
         first_sample=first_sample,
         runs=Runs(
-            first_of_run, np.repeat(pairs_of, run_counts), np.repeat(key_distances, run_counts)
+            np.append(first_of_run, first_sample[-1]), pairs_of_run, np.repeat(distances, runs)
         ),
         frame_counts=frame_counts,
         scene_seeds=np.array([zlib.crc32(str(key).encode()) for key in keys], dtype=np.int64),

@@ -76,7 +76,11 @@ def test_workers_that_persist_tell_the_older_of_two_passes_that_it_is_over(pairs
     assert whole == keys_of(pairs.loader(9))
     with pytest.raises(PassError, match=r"epoch 0 ended after 1 of 15 batches, as another one was"):
         next(older)
+    closed = iter(loader)
+    next(closed)
     loader.close()
+    with pytest.raises(PassError, match=r"epoch 1 ended after 1 of 15 batches, .* loader closed"):
+        next(closed)
     assert len(list(loader)) == 15
 
 

@@ -41,6 +41,8 @@ def test_right_to_left_turns_every_pair_round(index):
     found = chosen(index, {"subset": "seen_map"}, pairs="all", direction="right_to_left")
 
     assert [(*targets, source) for _, source, targets in found] == list(CAMERA_PAIRS)
+    sweep = chosen(index, {"subset": "seen_map"}, pairs="sweep", direction="right_to_left")
+    assert sweep == [(0, 5, [4, 3, 2, 1, 0])]
 
 
 def test_a_sweep_groups_what_stands_to_the_right_of_the_primary_view(index):
@@ -91,12 +93,6 @@ def test_several_bins_are_joined(index):
     assert len(found) == 4 * (5 + 1)
 
 
-def test_a_baseline_that_no_pair_has_says_which_there_are(index):
-    found = r"baseline_cm 50 to 60 .* 4 pairs; found 6 to 6 cm, in the bins \[1,10\)"
-    with pytest.raises(SelectionError, match=found):
-        chosen(index, {"family": "IPD_Gaussian"}, baseline_cm=(50, 60))
-
-
 @pytest.mark.parametrize(
     ("pairs", "message"),
     [
@@ -116,15 +112,13 @@ def test_a_pair_that_does_not_exist_is_refused(index, pairs, message):
         chosen(index, pairs=pairs)
 
 
-def test_a_sweep_from_the_right_groups_what_stands_to_the_left(index):
-    found = chosen(index, {"subset": "seen_map"}, pairs="sweep", direction="right_to_left")
-
-    assert found == [(0, 5, [4, 3, 2, 1, 0])]
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        (
+            {"filters": {"family": "IPD_Gaussian"}, "baseline_cm": (50, 60)},
+            r"baseline_cm 50 to 60 .* 4 pairs; found 6 to 6 cm, in the bins \[1,10\)",
+        ),
         ({"baseline_cm": 10}, "baseline_cm must be"),
         ({"baseline_cm": (5, 1)}, "baseline_cm: 5 to 1 "),
         ({"baseline_cm": "[1,11)"}, r"no baseline bin '\[1,11\)'; the bins are \[0,1\), "),
