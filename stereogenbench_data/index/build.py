@@ -6,7 +6,7 @@ A `Journal` keeps the described scenes, so a killed run continues where it stopp
 import json
 import re
 import warnings
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -76,18 +76,16 @@ class Journal:
         self._file: TextIO | None = None
         self._head = json.dumps({"journal": _JOURNAL_FORMAT, **work})
         what = f"{path}: the journal of an earlier run cannot be read"
-        lines: list[str] = []
+        self._known: dict[str, tuple[str, Any]] = {}
         with (
             explain_os_errors(what, "Remove it, or write the result to another folder."),
             suppress(FileNotFoundError, NotADirectoryError),
         ):
             lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-        self._is_same = bool(lines) and lines[0] == self._head
-        self._known: dict[str, tuple[str, Any]] = {}
-        for line in lines[1:] if self._is_same else ():
-            with suppress(ValueError, KeyError, TypeError):
-                entry: Any = json.loads(line)
-                self._known[str(entry["key"])] = (entry["stamp"], entry["value"])
+            for line in lines[1:] if lines[:1] == [self._head] else ():
+                with suppress(ValueError, KeyError, TypeError):
+                    entry: Any = json.loads(line)
+                    self._known[str(entry["key"])] = (entry["stamp"], entry["value"])
 
     def __len__(self) -> int:
         """The number of scenes that earlier runs have done."""
@@ -109,8 +107,8 @@ class Journal:
         with explain_os_errors(what, "Write the result to another folder."):
             if self._file is None:
                 self._path.parent.mkdir(parents=True, exist_ok=True)
-                self._file = self._path.open("a" if self._is_same else "w", encoding="utf-8")
-                self._file.write("\n" if self._is_same else f"{self._head}\n")
+                self._file = self._path.open("a" if self._known else "w", encoding="utf-8")
+                self._file.write("\n" if self._known else f"{self._head}\n")
             self._file.write(f"{line}\n")
             self._file.flush()
 
@@ -410,30 +408,27 @@ def report_of(
 
 def _remarks(scenes: list[Scene]) -> list[str]:
     """Return what is remarked about scenes, once for each kind, and what it holds up."""
-    first: dict[str, str] = {}
-    counts: Counter[str] = Counter()
+    texts: dict[str, list[str]] = defaultdict(list)
     for scene in scenes:
         for about in {remark.about for remark in scene.remarks}:
-            counts[about] += 1
-            first.setdefault(about, scene.remark(about))
+            texts[about].append(scene.remark(about))
     return [
-        f"{about} of {counted(counts[about], 'scene')} (holds up {REMARKS[about]}), such as {text}"
-        for about, text in sorted(first.items())
+        f"{about} of {counted(len(found), 'scene')} (holds up {REMARKS[about]}), such as {found[0]}"
+        for about, found in sorted(texts.items())
     ]
 
 
 def _depth_notes(scenes: list[Scene]) -> list[str]:
     """Describe depth that loading refuses unless the user's `DepthEncoding` accepts it."""
-    first: dict[tuple[str, str], tuple[Scene, int]] = {}
-    videos: Counter[tuple[str, str]] = Counter()
+    videos: dict[tuple[str, str], list[tuple[Scene, int]]] = defaultdict(list)
     for scene in scenes:
         stored = zip(scene.depth_codec, scene.depth_pixel_format, strict=True)
         for camera, kind in enumerate(stored):
-            videos[kind] += 1
-            first.setdefault(kind, (scene, camera))
+            videos[kind].append((scene, camera))
     notes = []
-    for (codec, pixel_format), (scene, camera) in first.items():
-        name, others = f"{scene.id.key}/{depth_name(camera)}", videos[codec, pixel_format] - 1
+    for (codec, pixel_format), found in videos.items():
+        (scene, camera), others = found[0], len(found) - 1
+        name = f"{scene.id.key}/{depth_name(camera)}"
         try:
             require_depth_stream(
                 codec=codec, pixel_format=pixel_format, encoding=depth_of(scene), name=name

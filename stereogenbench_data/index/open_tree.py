@@ -41,12 +41,10 @@ if TYPE_CHECKING:
 
 
 MOST_REMOTE_SCENES: Final = 64
-
 """The most scenes behind a URL that are described when a tree without an index is opened."""
 
 
 MOST_LEFT_OUT: Final = 0.05
-
 """The largest share of a tree's scenes that may be broken; one always may."""
 
 
@@ -57,7 +55,6 @@ _SHOWN: Final = 10
 
 
 _LOOKED_AT: Final = 64
-
 """How many scenes tell what opening a tree takes for granted."""
 
 
@@ -66,12 +63,10 @@ class IncompleteSceneWarning(UserWarning):
 
 
 Rows = Literal["presumed", "read"]
-
 """Whether the rows of many scenes without an index may be presumed; see `index.presumed`."""
 
 
 SeekTables: TypeAlias = pa.BinaryArray | Path | None
-
 """The packed seek tables of scenes, a row each, or the index file that holds them; None where there
 are none."""
 
@@ -120,33 +115,48 @@ def open_tree(
         opened = _open_presumed(tree, "read" if tree.remote is None else "when needed")
         if opened is not None:
             return opened
-    opened = None if tree is None else _kept(tree, "read")
-    if opened is None:
+
+    def read() -> Opened:
         if tree is not None and tree.remote is not None:
             _require_few(tree)
         # In this process: a script without `if __name__ == "__main__"` could start no others.
         how: Any = {"wanted": wanted, "conventions": conventions, "retry": retry}
-        opened = _of_report(walk(root, workers=1, if_none="all", **how))
-        if tree is not None:
-            _keep(tree, "read", opened)
-    return opened
+        return _of_report(walk(root, workers=1, if_none="all", **how))
+
+    return (None if tree is None else _once(tree, "read", read)) or read()
 
 
 def _open_presumed(tree: "ListedTree", baselines: "Baselines") -> Opened | None:
     """Return the scenes of a tree, most of them presumed; None where nothing can be presumed."""
     from stereogenbench_data.index.presumed import Presumption, presumed_report
 
-    name: Literal["presumed", "listed"] = "presumed" if baselines == "read" else "listed"
-    opened = _kept(tree, name)
-    if opened is None:
+    def presumed() -> Opened | None:
         with _no_collection():
             report = presumed_report(tree, baselines)
-            opened = None if report is None else _keep(tree, name, _of_report(report))
+            return None if report is None else _of_report(report)
+
+    opened = _once(tree, "presumed" if baselines == "read" else "listed", presumed)
     if opened is None:
         return None
     forms = opened.table.column("pose_form").drop_null().to_pylist()
     presumption = Presumption(tree, forms=forms, baselines=baselines)
     return opened._replace(presumption=presumption)
+
+
+def _once(tree: "ListedTree", name: str, find: Callable[[], Opened | None]) -> Opened | None:
+    """Return the rows of a tree that an earlier opening has kept, or find and keep them."""
+    name = f"{name}-{tree.stamp}"
+    kept = tree.cache.table(name)
+    if kept is not None:
+        table, head, tables = kept
+        # Without a digest: the user has made no index file.
+        head = replace(head, root=str(tree.root), digest="")
+        return Opened(table, head, seek_tables=tables, assumed=_assumed_of(table, where=head.root))
+    found = find()
+    if found is not None and not isinstance(found.seek_tables, Path):
+        head = replace(found.head, digest=table_digest(found.table))
+        tree.cache.keep_table(name, found.table, head, found.seek_tables)
+    return found
 
 
 def with_baselines(presumption: "Presumption", table: pa.Table) -> "tuple[pa.Table, Presumption]":
@@ -189,30 +199,6 @@ def _no_collection() -> Iterator[None]:
     finally:
         if was_on:
             gc.enable()
-
-
-def _kept(tree: "ListedTree", rows: Rows | Literal["listed"]) -> Opened | None:
-    """Return the rows of a tree that an earlier opening has kept."""
-    found = tree.cache.table(f"{rows}-{tree.stamp}")
-    if found is None:
-        return None
-    table, head, tables = found
-    # Without a digest: the user has made no index file.
-    return Opened(
-        table,
-        replace(head, root=str(tree.root), digest=""),
-        seek_tables=tables,
-        assumed=_assumed_of(table, where=str(tree.root)),
-    )
-
-
-def _keep(tree: "ListedTree", rows: Rows | Literal["listed"], opened: Opened) -> Opened:
-    """Keep the rows of a tree for later openings, and return them."""
-    if not isinstance(opened.seek_tables, Path):
-        head = replace(opened.head, digest=table_digest(opened.table))
-        name = f"{rows}-{tree.stamp}"
-        tree.cache.keep_table(name, opened.table, head, opened.seek_tables)
-    return opened
 
 
 def _of_report(report: "TreeReport") -> Opened:

@@ -6,7 +6,6 @@ refused.
 
 import itertools
 import json
-import math
 import os
 import re
 from collections.abc import Iterable
@@ -31,13 +30,11 @@ from stereogenbench_data.index.rows import (
     COLUMNS,
     SCHEMA,
     SEEK_COLUMN,
-    TRAINING_COLUMNS,
     row_of,
 )
 from stereogenbench_data.schema.conventions import shape_of_text
 from stereogenbench_data.schema.document import MOST_LETTERS
 from stereogenbench_data.schema.records import REMARKS, Scene, ShardFacts
-from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.sources.files import open_atomic
 from stereogenbench_data.sources.location import UNSAFE_PATH, is_remote, local_path, shown
@@ -361,7 +358,11 @@ def require_sound(table: pa.Table, *, where: str) -> None:
     ):
         for name, allowed in allowed_of.items():
             _require_allowed(name, pc.struct_field(values, name), allowed, where=where)
-    _require_whole(table, where=where)
+    for text in pc.unique(table.column("conventions")).drop_null().to_pylist():
+        try:
+            shape_of_text(text)
+        except (SchemaError, ValueError, RecursionError) as error:
+            raise _odd(where, "conventions", text, f"not understood ({error})") from error
 
 
 def _require_allowed(
@@ -371,9 +372,6 @@ def _require_allowed(
     values = one_array(values).drop_null()
     kind = values.type
     if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
-        is_of_cameras = pa.types.is_list(kind) and allowed is not None
-        if is_of_cameras and (as_numpy(pc.list_value_length(values)) != CAMERA_COUNT).any():
-            raise _odd(where, name, values[0].as_py(), "not a number for each camera")
         values = values.flatten()
     if pa.types.is_string(values.type):
         length = pc.max(pc.utf8_length(values)).as_py() or 0
@@ -396,34 +394,6 @@ def _require_allowed(
 _OF_BYTES: Final = (0, 2**61)
 _ABOUT: Final = f"^({'|'.join(REMARKS)})$"
 _MAY_BE_NAN: Final = ("depth_unit_m", "psnr_db", "worst_psnr_db")
-
-
-def _require_whole(table: pa.Table, *, where: str) -> None:
-    """Refuse texts that are not understood, and columns that contradict each other."""
-    for name, parse in (("conventions", shape_of_text), ("training_settings", json.loads)):
-        for text in pc.unique(table.column(name)).drop_null().to_pylist():
-            try:
-                parse(text)
-            except (SchemaError, ValueError, RecursionError) as error:
-                raise _odd(where, name, text, f"not understood ({error})") from error
-    if pc.any(pc.equal(table.column("primary_left"), table.column("primary_right"))).as_py():
-        raise _altered(where, "a primary pair has a camera twice")
-    unknown = np.isnan(as_numpy(table.column("depth_unit_m")))
-    if (unknown & (as_numpy(table.column("depth_unit_source")) != "unreadable")).any():
-        raise _odd(where, "depth_unit_m", math.nan, "not a unit, though files state one")
-    for what, names in (
-        ("a principal point has one number only", ("principal_x_px", "principal_y_px")),
-        ("a recorded size has one number only", ("recorded_width_px", "recorded_height_px")),
-        ("what training shards say of a scene is there in part only", TRAINING_COLUMNS),
-    ):
-        if len({tuple(pc.is_null(table.column(name)).to_pylist()) for name in names}) > 1:
-            raise _altered(where, what)
-    columns = (table.column(name).to_pylist() for name in ("frames", "key_frames"))
-    for frames, keys in zip(*columns, strict=True):
-        if keys is not None and (
-            [*keys[:1]] != [0] or keys != sorted({*keys}) or keys[-1] >= frames
-        ):
-            raise _odd(where, "key_frames", keys, "not frames of the scene, ascending from 0")
 
 
 def _odd(where: str, name: str, found: Any, why: str) -> StorageError:

@@ -65,11 +65,6 @@ class Column:
     allowed: tuple[float, float] | str | None = None
     is_nullable: bool = False
 
-    @property
-    def parts(self) -> list[str | int]:
-        """The steps of the place."""
-        return [int(part) if part.isdigit() else part for part in self.place.split(".")]
-
 
 _LARGEST: Final = sys.float_info.max
 _ABOVE: Final = (sys.float_info.min, _LARGEST)
@@ -132,15 +127,7 @@ COLUMNS: Final = {
 }
 """The columns by name. Nan is not allowed in numbers, but where a PSNR or a unit is not known."""
 
-TRAINING_COLUMNS: Final = tuple(
-    name for name, column in COLUMNS.items() if column.place.startswith("training.")
-)
-"""Columns of what training shards say; all are null for released scenes."""
-
-ADDED: Final = (
-    "key_frames", "recorded_width_px", "recorded_height_px", *TRAINING_COLUMNS, "remarks",
-    "pose_form", "depth_offset_m", "conventions",
-)  # fmt: skip
+ADDED: Final = tuple(COLUMNS)[[*COLUMNS].index("key_frames") : -1]
 """Columns that indexes of earlier versions lack: null means what these knew."""
 
 SCHEMA: Final = pa.schema(
@@ -179,7 +166,10 @@ def row_of(scene: Scene) -> dict[str, Any]:
 
 
 _OF_MEMBER: Final = tuple(field.name for field in fields(Member))
-_PARTS: Final = {name: column.parts for name, column in COLUMNS.items()}
+_PARTS: Final = {
+    name: [int(part) if part.isdigit() else part for part in column.place.split(".")]
+    for name, column in COLUMNS.items()
+}
 _FIELDS: Final[dict[str, dict[str, str]]] = {
     owner: {str(parts[-1]): name for name, parts in _PARTS.items() if parts[:-1] == owner.split()}
     for owner in ("", "id", "labels", "rig", "training")

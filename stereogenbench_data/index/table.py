@@ -43,8 +43,6 @@ _OF_BASELINES: Final = frozenset(
 )  # fmt: skip
 """Columns for which each ``baseline.json`` behind a URL is read."""
 
-_LISTS: Final = ("members", "remarks", "key_frames", "psnr_db", "worst_psnr_db")
-
 
 class SceneIndex:
     """The scenes of one root, by row; rows are sorted by key.
@@ -258,18 +256,18 @@ class SceneIndex:
         Raises:
             StorageError: If there is no such column.
         """
-        if name == "caption" and name not in self._columns and self.presumption is not None:
-            captions = self.presumption.captions(self.column("key"))
-            self._columns[name] = np.array(captions, dtype=object)
-            self._columns[name].setflags(write=False)
-        if name in _OF_BASELINES and self.presumption is not None:
-            self._table, self.presumption = with_baselines(self.presumption, self._table)
         if name not in self._columns:
-            columns = [each for each in SCHEMA.names if each not in _LISTS]
+            if name in _OF_BASELINES and self.presumption is not None:
+                self._table, self.presumption = with_baselines(self.presumption, self._table)
+            columns = [field.name for field in SCHEMA if not pa.types.is_list(field.type)]
             if name not in columns:
                 known = ", ".join(columns)
                 raise StorageError(f"the index has no column {name!r}; it has {known}.")
-            self._columns[name] = as_numpy(self._table.column(name))
+            if name == "caption" and self.presumption is not None:
+                captions = self.presumption.captions(self.column("key"))
+                self._columns[name] = np.array(captions, dtype=object)
+            else:
+                self._columns[name] = as_numpy(self._table.column(name))
             self._columns[name].setflags(write=False)
         return self._columns[name]
 

@@ -88,19 +88,19 @@ def cache_folder() -> Path | None:
 
 
 class TreeCache:
-    """What is kept of one tree; nothing where there is no cache folder."""
+    """What is kept of one tree; nothing of None, or where there is no cache folder."""
 
-    def __init__(self, root: str | Path, read_as: str = "") -> None:
+    def __init__(self, root: str | Path | None, read_as: str = "") -> None:
         """Name the tree, and the conventions it is read by; nothing is read or written yet."""
         # What another version understood of the same files may differ.
         made_by = ""
         with suppress(PackageNotFoundError):  # of a checkout that is not installed
             made_by = version("stereogenbench-data")
-        place = str(root) if is_remote(root) else os.path.realpath(root)
+        place = str(root) if root is None or is_remote(root) else os.path.realpath(root)
         what = [_FORMAT, made_by, SCHEMA.names, place, read_as]
         # Below a device nothing can be read or kept.
-        base = cache_folder() or Path(os.devnull)
-        self._folder = base / "trees" / _digest(json.dumps(what))
+        base = (root and cache_folder()) or os.devnull
+        self._folder = Path(base, "trees", _digest(json.dumps(what)))
 
     def table(self, name: str) -> tuple[pa.Table, IndexHead, pa.BinaryArray | None] | None:
         """Return the rows that were kept under a name, and what an index knows besides."""
@@ -136,6 +136,14 @@ class TreeCache:
             place.parent.mkdir(parents=True, exist_ok=True)
             write_atomic(place, zlib.compress(content, 1))
 
+    def once(self, kind: str, name: str, find: Callable[[], bytes]) -> bytes:
+        """Return what was kept under a kind and a name, or find it now and keep it."""
+        found = self.read(kind, name)
+        if found is None:
+            found = find()
+            self.keep(kind, name, found)
+        return found
+
     def _place(self, kind: str, name: str) -> Path:
         digest = _digest(name)
         return self._folder / kind / digest[:2] / digest
@@ -143,6 +151,9 @@ class TreeCache:
 
 def _digest(text: str) -> str:
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
+
+
+_NOTHING_KEPT: Final = TreeCache(None)
 
 
 _T = TypeVar("_T")
@@ -247,7 +258,7 @@ class RemoteFolder(SceneFolder):
         self.key = key
         self._folder = root.below(key)
         self._listed = files
-        self._kept = kept
+        self._kept = kept or _NOTHING_KEPT
         self._objects: dict[str, RemoteObject] = {}
         self._parts: dict[str, list[tuple[int, bytes]]] = {}
 
@@ -318,12 +329,7 @@ class RemoteFolder(SceneFolder):
         if name.startswith("cam_"):
             return self._objects[name].read(start, stop)
         version = f"{self.key}/{name} {self._files[name]}"
-        kept = None if self._kept is None else self._kept.read("files", version)
-        if kept is None:
-            kept = self._objects[name].read(start, stop)
-            if self._kept is not None:
-                self._kept.keep("files", version, kept)
-        return kept
+        return self._kept.once("files", version, lambda: self._objects[name].read(start, stop))
 
 
 _LAYOUT: Final = "train/<family>/<map>/<scene> or eval/<subset>/<family>/<map>/<scene>"
@@ -518,7 +524,7 @@ class RemoteTree:
         """
         self._root = root
         pinned = root.pinned()
-        self._kept = TreeCache(pinned) if pinned else None
+        self._kept = TreeCache(pinned) if pinned else _NOTHING_KEPT
 
     def scenes(self) -> FoundScenes:
         """Return the keys of all scenes.
@@ -558,13 +564,7 @@ class RemoteTree:
 
     def _once(self, name: str, ask: Callable[[], Any]) -> Any:
         """Return an answer as JSON holds it; that of a commit is kept."""
-        kept = None if self._kept is None else self._kept.read("listing", name)
-        if kept is not None:
-            return json.loads(kept)
-        found = ask()
-        if self._kept is not None:
-            self._kept.keep("listing", name, json.dumps(found).encode())
-        return found
+        return json.loads(self._kept.once("listing", name, lambda: json.dumps(ask()).encode()))
 
 
 def _number(version: str) -> int:
