@@ -6,8 +6,8 @@ one; one process fetches it under a lock while others wait. At the limit, the le
 items are deleted; a file that a reader has open stays readable. A read-only cache serves what it
 holds.
 
-The modification time of an item follows from its name, and its access time is its last use. Writing
-into an item changes the modification time; then its checksum decides whether it is still valid.
+All items have one modification time, and their access time is their last use. Writing into an item
+changes the modification time; then its checksum decides whether it is still valid.
 """
 
 import hashlib
@@ -16,11 +16,11 @@ import os
 import re
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.errors import NOT_WRITABLE, ShardError, StorageError, explain_os_errors
+from stereogenbench_data.errors import ShardError, StorageError, explain_os_errors
 from stereogenbench_data.schema.records import Member
 from stereogenbench_data.sources.files import copy_with_crc32, locked, try_locked, write_atomic
 from stereogenbench_data.sources.ranged_file import FileSlice
@@ -36,7 +36,8 @@ _OWN_FILE: Final = re.compile(r"([0-9a-f]{64})\.(member|part)")
 _FULL: Final = 0.9
 """The share of the limit to which a full cache is emptied, so it is not emptied for each item."""
 
-_FIRST_STAMP_S: Final = 1_000_000_000
+_STAMP_NS: Final = 1_000_000_000_000_000_000
+"""The modification time of items: even seconds, which every file system can store."""
 
 
 class ShardCache:
@@ -114,16 +115,17 @@ class ShardCache:
     def drop_damaged(self, member: Member, *, where: str, revision: str) -> bool:
         """Drop a member if its bytes have changed since they were stored; return whether so."""
         key = _key(member, where=where, revision=revision)
-        with _named_errors(self.folder), _where_writable(), locked(self._locks / key[:2]):
+        if member.crc32 is None or not os.access(self._items, os.W_OK):
+            return False
+        with _named_errors(self.folder), locked(self._locks / key[:2]):
             place = self._place(key)
-            if member.crc32 is None or not place.is_file():
+            if not place.is_file():
                 return False
             with FileSlice(place, Member(key, 0, place.stat().st_size)) as file:
                 if file.crc32() == member.crc32:
                     return False
             self._drop(place)
             return True
-        return False
 
     def used_bytes(self) -> int:
         """Return the bytes of all members stored."""
@@ -138,9 +140,9 @@ class ShardCache:
             return None
         status = found.status()
         if status.st_size == member.size and (
-            status.st_mtime_ns == _stamp_ns(key) or found.crc32() == member.crc32
+            status.st_mtime_ns == _STAMP_NS or found.crc32() == member.crc32
         ):
-            _mark_used(place, key)
+            _mark_used(place)
             return found
         found.close()
         return None
@@ -151,16 +153,21 @@ class ShardCache:
         self._drop(self._place(key))
         self._make_room(member.size, part=part)
         try:
-            crc32 = _fetch(part, member, remote=remote)
-            if member.crc32 not in (None, crc32):
-                crc32 = _fetch(part, member, remote=remote)
-            if member.crc32 not in (None, crc32):
+            for _ in range(2):
+                with part.open("r+b") as file:
+                    chunks = remote.chunks(member.offset, member.offset + member.size)
+                    crc32 = copy_with_crc32(chunks, file.write)
+                    file.flush()
+                    os.fsync(file.fileno())
+                if member.crc32 in (None, crc32):
+                    break
+            else:
                 raise ShardError(
                     f"{remote.where}: the {member.size} bytes from {member.offset} on have crc32 "
                     f"{crc32:08x}, and the index says {member.crc32:08x}, twice. The shard was "
                     f"damaged or replaced: use the index that was made with it."
                 )
-            _mark_used(part, key)
+            _mark_used(part)
             # Opened before others can see it, as they may evict it at once.
             found = FileSlice(part, Member(key, 0, member.size))
             with locked(self._ledger):
@@ -224,28 +231,13 @@ class ShardCache:
         return self._items / f"{key}.member"
 
 
-def _stamp_ns(key: str) -> int:
-    """Return an item's modification time: even seconds, which every file system can store."""
-    return (_FIRST_STAMP_S + 2 * int(key[:6], 16)) * 1_000_000_000
-
-
-def _mark_used(path: Path, key: str) -> None:
-    """Set an item's last use, and its own modification time.
+def _mark_used(path: Path) -> None:
+    """Set an item's last use, and the modification time of an item that nobody wrote into.
 
     Neither can be set of another user's item, or on a read-only disk: its last use stays unknown.
     """
-    with _where_writable():
-        os.utime(path, ns=(time.time_ns(), _stamp_ns(key)))
-
-
-@contextmanager
-def _where_writable() -> Iterator[None]:
-    """Ignore the errors of a read-only cache."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in NOT_WRITABLE:
-            raise
+    with suppress(OSError):
+        os.utime(path, ns=(time.time_ns(), _STAMP_NS))
 
 
 def _key(member: Member, *, where: str, revision: str) -> str:
@@ -256,17 +248,6 @@ def _key(member: Member, *, where: str, revision: str) -> str:
     where = where if member.crc32 is None else ""
     parts = [revision, where, member.path, member.offset, member.size, member.crc32]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
-
-
-def _fetch(part: Path, member: Member, *, remote: RemoteObject) -> int:
-    """Write a member's bytes to the disk and return their crc32."""
-    with part.open("r+b") as file:
-        crc32 = copy_with_crc32(
-            remote.chunks(member.offset, member.offset + member.size), file.write
-        )
-        file.flush()
-        os.fsync(file.fileno())
-    return crc32
 
 
 def _named_errors(folder: Path) -> AbstractContextManager[None]:

@@ -8,9 +8,9 @@ HF_HUB_OFFLINE ...), and fsspec's settings for ``hf`` go before them.
 """
 
 import re
-from collections.abc import Generator
-from dataclasses import dataclass
-from typing import Any, Final, Literal
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from typing import Any, Final, Literal, NamedTuple
 from urllib.parse import quote, unquote
 
 import urllib3
@@ -22,7 +22,7 @@ from stereogenbench_data.sources.retry import MISSING, MissingObject, ProcessLoc
 from stereogenbench_data.sources.web import WebTransport
 
 _ADDRESS: Final = re.compile(
-    r"hf://(datasets/|spaces/|models/)?(?!(?:datasets|spaces|models|buckets)/)([\w.-]+/[\w.-]+)"
+    r"hf://datasets/([\w.-]+/[\w.-]+)"
     r"(?:@(refs/convert/[\w.-]+|refs/pr/[0-9]+|[^/]+))?(?:/(.*))?",
     re.ASCII,
 )
@@ -36,39 +36,25 @@ _commits: Final[dict[tuple[str, str], str]] = {}
 them."""
 
 
-@dataclass(frozen=True, slots=True)
-class HubFile:
-    """What a URL of the Hub names.
+class HubFile(NamedTuple):
+    """What a URL of the Hub names: ORG/NAME, a branch, tag or commit, and the file's path there."""
 
-    Attributes:
-        kind: "datasets", "spaces" or "models".
-        repository: ORG/NAME.
-        revision: A branch, a tag or a commit.
-        path: The file's path in the repository.
-    """
-
-    kind: str
     repository: str
     revision: str
     path: str
 
     @classmethod
     def of_url(cls, url: str) -> "HubFile | None":
-        """Return what a URL names; None if that is not a repository, such as a bucket."""
+        """Return what a URL names; None if that is not a dataset, such as a bucket."""
         found = _ADDRESS.fullmatch(url)
         if found is None:
             return None
-        kind, repository, revision, path = found.groups(default="")
-        return cls(kind[:-1] or "models", repository, unquote(revision) or "main", path)
-
-    @property
-    def place(self) -> str:
-        """The repository's path on the Hub, and in URLs behind ``hf://``."""
-        return self.repository if self.kind == "models" else f"{self.kind}/{self.repository}"
+        repository, revision, path = found.groups(default="")
+        return cls(repository, unquote(revision) or "main", path)
 
 
 class HubTransport(WebTransport):
-    """One file of a repository of the Hub, in huggingface_hub's cache or by HTTP."""
+    """One file of a dataset of the Hub, in huggingface_hub's cache or by HTTP."""
 
     longest_whole_bytes = _LARGEST_IN_GIT
     is_versioned = False  # a commit keeps its files; a content network's servers differ in ETags
@@ -130,7 +116,7 @@ class HubTransport(WebTransport):
     def pinned(self, timeout_s: float) -> str:
         """Return the URL of a folder as of the commit that its branch is at now."""
         file, commit = self._file, self._commit(timeout_s)
-        return f"hf://{file.place}@{quote(commit, safe='')}/{file.path}".rstrip("/")
+        return f"hf://datasets/{file.repository}@{commit}/{file.path}".rstrip("/")
 
     def _tree(self, timeout_s: float, *, depth: Literal["one level", "all levels"]) -> list[Any]:
         """Return the entries of a folder, of which the Hub lists a thousand a request."""
@@ -139,17 +125,22 @@ class HubTransport(WebTransport):
                 f"{self._where}: HF_HUB_OFFLINE is set, and the Hub's cache does not hold whole "
                 f"folders. Unset it, or pass an index or a folder of this machine."
             )
-        with require_installed(self._where, extra="hub"):
-            from huggingface_hub import HfApi
-        file, (endpoint, token) = self._file, _settings()
-        commit = self._commit(timeout_s)
-        with FilesystemTransport(self._where).named_errors():
-            listed = HfApi(endpoint, token=token, library_name=_LIBRARY).list_repo_tree(
+        file, commit = self._file, self._commit(timeout_s)
+        with self._api() as api:
+            listed = api.list_repo_tree(
                 file.repository, file.path.strip("/") or None,
-                repo_type=file.kind.removesuffix("s"), revision=commit,
-                recursive=depth == "all levels",
+                repo_type="dataset", revision=commit, recursive=depth == "all levels",
             )  # fmt: skip
             return list(listed)
+
+    @contextmanager
+    def _api(self) -> Iterator[Any]:
+        """Yield the Hub's client; errors of the block are named."""
+        with require_installed(self._where, extra="hub"):
+            from huggingface_hub import HfApi
+        endpoint, token = _settings()
+        with FilesystemTransport(self._where).named_errors():
+            yield HfApi(endpoint, token=token, library_name=_LIBRARY)
 
     def _in_cache(self, timeout_s: float) -> FilesystemTransport | None:
         """Return what reads the file in the Hub's cache; None if it is read by HTTP."""
@@ -166,7 +157,7 @@ class HubTransport(WebTransport):
         file, offline = self._file, is_offline()
         revision = file.revision if offline else self._commit(timeout_s)
         cached = try_to_load_from_cache(
-            file.repository, file.path, revision=revision, repo_type=file.kind.removesuffix("s")
+            file.repository, file.path, revision=revision, repo_type="dataset"
         )
         if isinstance(cached, str):
             return FilesystemTransport(f"file://{cached}", expected_size=self._expected_size)
@@ -177,24 +168,23 @@ class HubTransport(WebTransport):
                 f"download`, or `stereogenbench download` and pass its folder."
             )
         endpoint, token = _settings()
-        self._headers |= build_hf_headers(token=token, library_name=_LIBRARY)
-        self._url = f"{endpoint}/{file.place}/resolve/{quote(revision, safe='')}/{quote(file.path)}"
+        login = build_hf_headers(token=token, library_name=_LIBRARY)
+        self._headers = {"Accept-Encoding": "identity", **login}
+        place = f"{quote(revision, safe='')}/{quote(file.path)}"
+        self._url = f"{endpoint}/datasets/{file.repository}/resolve/{place}"
         return None
 
     def _commit(self, timeout_s: float) -> str:
         """Return the commit of the revision, the same for all that this process reads."""
-        file, (endpoint, token) = self._file, _settings()
+        file = self._file
         if _COMMIT.fullmatch(file.revision):
             return file.revision
-        key = (endpoint, f"{file.place}@{file.revision}")
+        key = (_settings()[0], f"{file.repository}@{file.revision}")
         if key not in _commits:
-            with require_installed(self._where, extra="hub"):
-                from huggingface_hub import HfApi
-            with FilesystemTransport(self._where).named_errors():
-                found = HfApi(endpoint, token=token, library_name=_LIBRARY).repo_info(
-                    file.repository, revision=file.revision, timeout=timeout_s,
-                    repo_type=file.kind.removesuffix("s"),
-                )  # fmt: skip
+            with self._api() as api:
+                found = api.dataset_info(
+                    file.repository, revision=file.revision, timeout=timeout_s, expand=["sha"]
+                )
             _commits.setdefault(key, str(found.sha))
         return _commits[key]
 

@@ -25,7 +25,7 @@ from stereogenbench_data.sources.ranged_file import (
     require_crc32,
 )
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import RetryPolicy
+from stereogenbench_data.sources.retry import RetryPolicy, require_expected_size
 
 _KEPT_TABLES: Final = 256
 """Of how many scenes the seek tables are kept."""
@@ -264,43 +264,18 @@ def open_local(
     Raises:
         StorageError: If the file is missing, unreadable or not the one that was indexed.
     """
-    if shard is None and member.offset == 0:
-        return member_path(root, member)
     _require_safe(member)
-    path = local_path(root) / member.path
-    again = "Fetch the shard again, or use the index that was made with it."
+    path, end = local_path(root) / member.path, member.offset + member.size
+    is_whole = shard is None and member.offset == 0
+    again = f"By the index it has {end} bytes or more: fetch it again, or make the index again."
     with explain_os_errors(f"{path}: cannot be read", again, kind=ShardError):
-        file = FileSlice(path, member)
-    found, end = file.status().st_size, member.offset + member.size
-    if found < end or (shard is not None and found != shard.size):
-        file.close()
-        says = f"at least {end}" if shard is None else shard.size
-        raise ShardError(
-            f"{path}: has {found} bytes, and the index says {says}. The index is of another pack, "
-            f"or the shard was replaced or cut short. {again}"
-        )
-    return file
-
-
-def member_path(root: str | Path, member: Member) -> Path:
-    """Return where a member's file lies, having checked that it is the one that was indexed.
-
-    Raises:
-        StorageError: If the path leaves the root, or the file is missing, unreadable or has
-            another size than the index says.
-    """
-    _require_safe(member)
-    path = local_path(root) / member.path
-    cure = "fetch it again, or run `stereogenbench index` again."
-    expected = f"By the index it has {member.size} bytes: {cure}"
-    with explain_os_errors(f"{path}: cannot be read", expected):
-        size_bytes = path.stat().st_size
-    if size_bytes != member.offset + member.size:
-        raise StorageError(
-            f"{path}: has {size_bytes} bytes, and the index says "
-            f"{member.offset + member.size}. It was cut short or changed after its index: {cure}"
-        )
-    return path
+        opened = path if is_whole else FileSlice(path, member)
+        found = path.stat().st_size
+    expected = shard.size if shard is not None else end if is_whole else max(found, end)
+    if found != expected and isinstance(opened, FileSlice):
+        opened.close()
+    require_expected_size(found, expected=expected, where=str(path))
+    return opened
 
 
 def require_own_files(root: str | Path, paths: Iterable[str]) -> None:
@@ -318,20 +293,15 @@ def require_own_files(root: str | Path, paths: Iterable[str]) -> None:
         StorageError: It names the first such file, where it leads and what to do.
     """
     root = local_path(root)
-    real = os.path.realpath(root)
+    real = Path(os.path.realpath(root))
     own = [real] + [
-        str(each.parent.parent / "blobs")  # the Hub's cache, if the folder is one of its snapshots
-        for each in (Path(real), *Path(real).parents)
+        each.parent.parent / "blobs"  # the Hub's cache, if the folder is one of its snapshots
+        for each in (real, *real.parents)
         if each.parent.name == "snapshots" and each.parent.parent.name.startswith("datasets--")
     ]
-    folders: dict[str, str] = {}
     for path in paths:
-        folder, _, name = path.rpartition("/")
-        if folder not in folders:
-            folders[folder] = os.path.realpath(root / folder)
-        place = f"{folders[folder]}/{name}"
-        place = os.path.realpath(place) if Path(place).is_symlink() else place
-        if not any(place.startswith(f"{each.rstrip('/')}/") for each in own):
+        place = Path(os.path.realpath(root / path))
+        if not any(place.is_relative_to(each) for each in own):
             raise StorageError(
                 f"{root / path}: leads out of {root} by a link, to {place}, and would be passed on "
                 f"with the data. Copy the file into the folder if it may be (`cp -rL` copies what "

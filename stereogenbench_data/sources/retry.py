@@ -205,8 +205,9 @@ def require_expected_size(found: int, *, expected: int | None, where: str) -> No
     """
     if expected not in (None, found):
         raise ShardError(
-            f"{where}: has {found} bytes, and the index says {expected}. The index is of another "
-            f"pack, or the file was replaced or cut short: use the index that was made with it."
+            f"{where}: has {found} bytes, and the index says {expected}. It was replaced or "
+            f"cut short, or the index is of another: use the index that was made with it, or fetch "
+            f"the file again."
         )
 
 

@@ -3,7 +3,6 @@
 import re
 import socket
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -28,7 +27,8 @@ class Asked:
 class Answer:
     """What a server does differently, for one request.
 
-    ``stop_after`` cuts the connection after so many bytes; ``status`` answers with no content;
+    ``stop_after`` cuts the connection after so many bytes; ``pause_s`` is waited before each of
+    the pieces of ``piece_bytes``; ``status`` answers with no content;
     ``whole`` ignores the range; ``content_range`` and ``size`` lie; ``change`` alters the bytes.
     """
 
@@ -36,6 +36,8 @@ class Answer:
     headers: dict[str, str] = field(default_factory=dict)
     stop_after: int | None = None
     delay_s: float = 0.0
+    pause_s: float = 0.0
+    piece_bytes: int = 2**40
     whole: bool = False
     content_range: str | None = None
     size: int | None = None
@@ -63,6 +65,7 @@ class FailingServer(ThreadingHTTPServer):
         self.facts: dict[str, Any] = {}
         self.connections = 0
         self.alive: set[Any] = set()
+        self.stopped = threading.Event()
         self.lock = threading.Lock()
 
     @property
@@ -86,6 +89,7 @@ class FailingServer(ThreadingHTTPServer):
 
     def die(self) -> None:
         """Stop listening, and cut every connection."""
+        self.stopped.set()
         self.shutdown()
         self.server_close()
         for request in list(self.alive):
@@ -113,7 +117,7 @@ class FileHandler(BaseHTTPRequestHandler):
             answer = self.server.always.get(name) or (
                 self.server.answers.pop(0) if self.server.answers else Answer()
             )
-        time.sleep(answer.delay_s)
+        self.server.stopped.wait(answer.delay_s)
         if answer.status is not None:
             self._empty(answer.status, answer.headers, name)
             return
@@ -148,7 +152,9 @@ class FileHandler(BaseHTTPRequestHandler):
             self.send_header(key, value)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
-        self.wfile.write(cut)
+        for place in range(0, len(cut), answer.piece_bytes):
+            self.server.stopped.wait(answer.pause_s)
+            self.wfile.write(cut[place : place + answer.piece_bytes])
         self.close_connection = len(cut) < len(body)
 
     def _empty(self, status: int, headers: dict[str, str], name: str) -> None:

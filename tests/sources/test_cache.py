@@ -1,10 +1,9 @@
 """The cache: each member fetched once, whole, within its limit, and nobody else's files touched."""
 
 import errno
+import multiprocessing
 import os
-import signal
 import subprocess
-import sys
 import time
 import zlib
 
@@ -20,6 +19,7 @@ from stereogenbench_data.sources.remote import RemoteObject
 from tests.servers.failing_server import Answer
 from tests.servers.tools import small_disk
 
+FORK = multiprocessing.get_context("fork")
 DATA = bytes(number * 7 % 256 for number in range(100_000))
 
 
@@ -242,100 +242,68 @@ def test_it_never_holds_more_than_its_limit_and_never_lies(tmp_path_factory, ope
         assert cache.used_bytes() <= limit
 
 
-FILL = """
-import sys
-from stereogenbench_data.schema.records import Member
-from stereogenbench_data.sources.cache import ShardCache
-from stereogenbench_data.sources.remote import RemoteObject
-
-folder, url, limit, *numbers = sys.argv[1:]
-cache, remote = ShardCache(folder, limit_bytes=int(limit)), RemoteObject(url)
-print("ready", flush=True)
-sys.stdin.readline()
-for number in map(int, numbers):
-    with cache.open(Member("x.tar", 1000 * number, 5000), remote=remote, revision="1") as file:
-        data = file.read()
-    expected = bytes(place * 7 % 256 for place in range(1000 * number, 1000 * number + 5000))
-    assert data == expected, number
-print("done", flush=True)
-"""
-
-
-class Fillers:
-    """Processes that open members of a shard through one cache, all at once."""
-
-    def __init__(self, folder, url):
-        self.folder, self.url = folder, url
-        self.processes = []
-
-    def start(self, *numbers, limit=10**6):
-        command = [sys.executable, "-c", FILL, str(self.folder), self.url, str(limit)]
-        process = subprocess.Popen(
-            [*command, *map(str, numbers)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        self.processes.append(process)
-        return process
-
-    def go(self):
-        for process in self.processes:
-            assert process.stdout.readline() == "ready\n"
-        for process in self.processes:
-            process.stdin.write("\n")
-            process.stdin.flush()
-
-    def end(self):
-        return [process.communicate(timeout=60)[0] for process in self.processes]
+def fill(folder, url, limit, numbers, barrier):
+    """Open members of a shard through a cache, in a process of its own."""
+    cache, remote = ShardCache(folder, limit_bytes=limit), RemoteObject(url)
+    barrier.wait()
+    for number in numbers:
+        assert read(cache, member(1000 * number, 5000), remote) == DATA[1000 * number :][:5000]
 
 
 @pytest.fixture
 def fillers(tmp_path, web):
+    """Return a function that starts a process for each list of members, all at once."""
     (web.folder / "x.tar").write_bytes(DATA)
-    started = Fillers(tmp_path / "cache", f"{web.url}/x.tar")
-    yield started
-    for process in started.processes:
+    started = []
+
+    def start(*shares, limit=10**6):
+        barrier, url = FORK.Barrier(len(shares)), f"{web.url}/x.tar"
+        processes = [
+            FORK.Process(target=fill, args=(tmp_path / "cache", url, limit, share, barrier))
+            for share in shares
+        ]
+        for process in processes:
+            process.start()
+        started.extend(processes)
+        return processes
+
+    yield start
+    for process in started:
         process.kill()
-        process.communicate()
+        process.join()
+
+
+def exit_codes(processes):
+    for process in processes:
+        process.join(60)
+    return [process.exitcode for process in processes]
 
 
 def test_processes_that_fill_it_at_once_fetch_once(fillers, web):
     web.always["x.tar"] = Answer(delay_s=0.5)
-    for _ in range(3):
-        fillers.start(4)
-    fillers.go()
 
-    assert fillers.end() == ["done\n"] * 3
+    assert exit_codes(fillers([4], [4], [4])) == [0] * 3
     assert [(asked.start, asked.stop) for asked in web.asked] == [(4000, 9000)]
     assert web.sent == 5000
 
 
-def test_processes_that_need_more_than_fits_all_read_what_they_ask_for(fillers, web, tmp_path):
-    for first in range(3):
-        fillers.start(*[(first * 5 + each * 3) % 20 for each in range(20)], limit=22_000)
-    fillers.go()
+def test_processes_that_need_more_than_fits_all_read_what_they_ask_for(fillers, tmp_path):
+    shares = [[(first * 5 + each * 3) % 20 for each in range(20)] for first in range(3)]
 
-    assert fillers.end() == ["done\n"] * 3
+    assert exit_codes(fillers(*shares, limit=22_000)) == [0] * 3
     assert ShardCache(tmp_path / "cache", limit_bytes=22_000).used_bytes() <= 22_000
 
 
 def test_a_process_that_is_killed_while_it_fills_leaves_no_lock_and_no_half(fillers, web):
     web.answers = [Answer(stop_after=2000), Answer(delay_s=5.0)]
-    killed = fillers.start(4)
-    fillers.go()
+    (killed,) = fillers([4])
     deadline = time.monotonic() + 60
     while len(web.answers) > 0 and time.monotonic() < deadline:
         time.sleep(0.01)
-    killed.send_signal(signal.SIGKILL)
-    killed.wait()
-    fillers.processes.clear()
-    killed.stdin.close()
-    killed.stdout.close()
-    fillers.start(4)
-    fillers.go()
+    killed.kill()
+    killed.join()
 
-    assert fillers.end() == ["done\n"]
+    assert exit_codes(fillers([4])) == [0]
     assert web.asked[-1].start == 4000
 
 

@@ -4,7 +4,6 @@ import logging
 import multiprocessing
 import threading
 import time
-from contextlib import contextmanager
 
 import fsspec
 import pytest
@@ -13,7 +12,6 @@ from stereogenbench_data.errors import StorageError
 from stereogenbench_data.sources.remote import RemoteObject
 from tests.servers.failing_server import Answer, serving
 from tests.servers.hub import COMMIT, REPOSITORY
-from tests.servers.raw import raw_serving
 from tests.sources.policies import ended, retry_policy, waits_noted
 
 DATA = bytes(range(256)) * 1000
@@ -26,51 +24,24 @@ def served(web):
     return web
 
 
-def answering_head(start, stop):
-    told = f"bytes {start}-{stop - 1}/{len(DATA)}"
-    lines = ["HTTP/1.1 206 x", f"Content-Range: {told}", f"Content-Length: {stop - start}"]
-    return "\r\n".join([*lines, "", ""]).encode()
-
-
-def never(start, stop):
-    yield 60.0
-
-
-def after_its_head(start, stop):
-    yield answering_head(start, stop)
-    yield 60.0
-
-
-def trickling(start, stop):
-    yield answering_head(start, stop)
-    for place in range(start, stop):
-        yield DATA[place : place + 1]
-        yield 0.02
-
-
-def hanging_up(start, stop):
-    yield answering_head(start, stop) + DATA[start : start + 1]
-
-
-@contextmanager
-def refusing():
-    yield "http://127.0.0.1:1"
-
-
 DEAD = {
-    "refusing": refusing,
-    "never answering": lambda: raw_serving(never),
-    "hanging after its head": lambda: raw_serving(after_its_head),
-    "trickling": lambda: raw_serving(trickling),
-    "hanging up": lambda: raw_serving(hanging_up),
+    "refusing": None,
+    "never answering": Answer(delay_s=60.0),
+    "hanging after its head": Answer(pause_s=60.0),
+    "trickling": Answer(pause_s=0.02, piece_bytes=1),
+    "hanging up": Answer(stop_after=1),
 }
 
 
-@pytest.fixture(params=DEAD)
-def dead(request):
-    """The address of a server that is dead, in one way or another."""
-    with DEAD[request.param]() as url:
-        yield url
+@pytest.fixture
+def dead(served):
+    """Return the address of a server that is dead, in one way or another."""
+
+    def make(how):
+        served.answers = [DEAD[how]] * 1000
+        return "http://127.0.0.1:1" if DEAD[how] is None else served.url
+
+    return make
 
 
 def reason_of(url, policy):
@@ -81,40 +52,39 @@ def reason_of(url, policy):
     return "no error"
 
 
-def test_a_dead_server_is_a_named_error_within_the_longest_outage(dead):
-    policy = retry_policy(attempts=999, timeout_s=0.2, longest_outage_s=0.4)
+@pytest.mark.parametrize("how", DEAD)
+def test_a_dead_server_is_a_named_error_within_the_longest_outage(dead, how):
+    policy, url = retry_policy(attempts=999, timeout_s=0.2, longest_outage_s=0.4), dead(how)
 
-    text = ended(lambda: reason_of(dead, policy))
+    text = ended(lambda: reason_of(url, policy))
 
-    assert f"{dead}/x.tar : cannot be read, at byte" in text
+    assert f"{url}/x.tar : cannot be read, at byte" in text
     assert "slower than timeout_s=0.2: SceneIndex.open(..., retry=RetryPolicy(timeout_s=0" in text
 
 
-def test_a_slow_server_is_read_to_the_end_while_it_goes_on():
-    def steady(start, stop):
-        yield answering_head(start, stop)
-        for place in range(start, stop, 16_384):
-            yield DATA[place : min(place + 16_384, stop)]
-            yield 0.02
+def test_a_slow_server_is_read_to_the_end_while_it_goes_on(served):
+    served.always["x.tar"] = Answer(pause_s=0.02, piece_bytes=16_384)
+    remote = RemoteObject(f"{served.url}/x.tar", retry=retry_policy(attempts=3, timeout_s=0.2))
 
-    with raw_serving(steady) as url:
-        remote = RemoteObject(f"{url}/x.tar", retry=retry_policy(attempts=3, timeout_s=0.2))
-        assert remote.read(0, len(DATA)) == DATA
+    assert remote.read(0, len(DATA)) == DATA
 
 
 @pytest.mark.parametrize("how", ["refusing", "never answering"])
-@pytest.mark.parametrize("scheme", ["hf", "s3"])
-def test_a_dead_store_is_a_named_error_within_the_longest_outage(monkeypatch, scheme, how):
-    policy = retry_policy(attempts=999, timeout_s=0.2, longest_outage_s=0.4)
-    with DEAD[how]() as dead:
-        conf = {
-            "hf": {"endpoint": dead, "token": False},
-            "s3": {"key": "key", "secret": "word", "endpoint_url": dead},
-        }
-        monkeypatch.setitem(fsspec.config.conf, scheme, conf[scheme])
-        root = {"hf": f"hf://datasets/{REPOSITORY}@{COMMIT}", "s3": "s3://bucket/shards"}[scheme]
+@pytest.mark.parametrize(
+    ("root", "conf"),
+    [
+        (f"hf://datasets/{REPOSITORY}@{COMMIT}", {"token": False, "endpoint": ...}),
+        ("s3://bucket/shards", {"key": "key", "secret": "word", "endpoint_url": ...}),
+    ],
+)
+def test_a_dead_store_is_a_named_error_within_the_longest_outage(
+    monkeypatch, dead, root, conf, how
+):
+    policy, url = retry_policy(attempts=999, timeout_s=0.2, longest_outage_s=0.4), dead(how)
+    conf = {name: url if value is ... else value for name, value in conf.items()}
+    monkeypatch.setitem(fsspec.config.conf, root.partition(":")[0], conf)
 
-        text = ended(lambda: reason_of(root, policy))
+    text = ended(lambda: reason_of(root, policy))
 
     assert f"{root}/x.tar : cannot be read, at byte 0 of 65536" in text
 

@@ -4,9 +4,9 @@ import errno
 import fcntl
 import multiprocessing
 import os
-import subprocess
-import sys
 import threading
+import time
+from contextlib import contextmanager
 
 import pytest
 
@@ -19,39 +19,34 @@ from stereogenbench_data.sources.files import (
     write_atomic,
 )
 
-WRITER = """
-import sys, time
-from pathlib import Path
-from stereogenbench_data.sources.files import open_atomic
+FORK = multiprocessing.get_context("fork")
 
-with open_atomic(Path(sys.argv[1])) as file:
-    file.write(b"half of it")
-    file.flush()
-    print("begun", flush=True)
-    time.sleep(60)
-"""
+
+@contextmanager
+def process_in(block):
+    """A process that is inside a block, until it is killed."""
+    begun = FORK.Event()
+
+    def act():
+        with block:
+            begun.set()
+            time.sleep(60)
+
+    process = FORK.Process(target=act)
+    process.start()
+    assert begun.wait(60)
+    yield process
+    process.kill()
+    process.join()
 
 
 def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-@pytest.fixture
-def writer(tmp_path):
-    """A process that has half written ``notes.json``; ended at the end."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", WRITER, tmp_path / "notes.json"], stdout=subprocess.PIPE
-    )
-    assert process.stdout.readline() == b"begun\n"
-    yield process
-    process.kill()
-    process.wait()
-    process.stdout.close()
-
-
-def test_what_a_killed_writer_left_is_removed_by_the_next_one(writer, tmp_path):
-    writer.kill()
-    writer.wait()
+def test_what_a_killed_writer_left_is_removed_by_the_next_one(tmp_path):
+    with process_in(open_atomic(tmp_path / "notes.json")):
+        pass
     assert names(tmp_path) == [".notes.json.unfinished"]
 
     write_atomic(tmp_path / "notes.json", b"whole")
@@ -60,11 +55,12 @@ def test_what_a_killed_writer_left_is_removed_by_the_next_one(writer, tmp_path):
     assert (tmp_path / "notes.json").read_bytes() == b"whole"
 
 
-def test_what_a_living_writer_has_is_left_alone(writer, tmp_path):
-    write_atomic(tmp_path / "notes.json", b"whole")
+def test_what_a_living_writer_has_is_left_alone(tmp_path):
+    with process_in(open_atomic(tmp_path / "notes.json")) as writer:
+        write_atomic(tmp_path / "notes.json", b"whole")
 
-    assert names(tmp_path) == [".notes.json.unfinished", "notes.json"]
-    assert writer.poll() is None
+        assert names(tmp_path) == [".notes.json.unfinished", "notes.json"]
+        assert writer.is_alive()
 
 
 def test_an_error_leaves_the_file_as_it_was_and_names_it(tmp_path):
@@ -114,8 +110,7 @@ def _write_often(path, number):
 
 def test_writers_of_one_file_at_once_leave_one_whole_file(tmp_path):
     path = tmp_path / "notes.json"
-    context = multiprocessing.get_context("fork")
-    writers = [context.Process(target=_write_often, args=(path, number)) for number in range(4)]
+    writers = [FORK.Process(target=_write_often, args=(path, number)) for number in range(4)]
     for each in writers:
         each.start()
     for each in writers:
@@ -125,17 +120,6 @@ def test_writers_of_one_file_at_once_leave_one_whole_file(tmp_path):
     assert names(tmp_path) == ["notes.json"]
     assert len(path.read_bytes()) == 1000
     assert len(set(path.read_bytes())) == 1
-
-
-HOLDER = """
-import sys, time
-from pathlib import Path
-from stereogenbench_data.sources.files import locked
-
-with locked(Path(sys.argv[1])):
-    print("held", flush=True)
-    time.sleep(60)
-"""
 
 
 def _is_free(lock):
@@ -155,20 +139,19 @@ def test_a_lock_is_held_against_other_threads(tmp_path):
 
 
 def test_a_lock_is_freed_when_its_process_is_killed(tmp_path):
-    command = [sys.executable, "-c", HOLDER, tmp_path / "lock"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
-        assert process.stdout.readline() == b"held\n"
+    with process_in(locked(tmp_path / "lock")) as process:
         assert not _is_free(tmp_path / "lock")
         threading.Timer(0.2, process.kill).start()
 
         with locked(tmp_path / "lock"):
-            assert process.wait() != 0
+            process.join(60)
+            assert process.exitcode != 0
 
 
 def test_a_lock_is_freed_though_a_forked_process_has_its_file_open(tmp_path):
-    ended = multiprocessing.get_context("fork").Event()
+    ended = FORK.Event()
     with locked(tmp_path / "lock"):
-        child = multiprocessing.get_context("fork").Process(target=ended.wait)
+        child = FORK.Process(target=ended.wait)
         child.start()
     try:
         assert _is_free(tmp_path / "lock")

@@ -85,14 +85,14 @@ def test_what_is_no_file_in_a_shards_place_is_named_and_not_waited_for(root, in_
     (root / "x.tar").unlink()
     make(root / "x.tar")
 
-    with pytest.raises(ShardError, match=r"x.tar: cannot be read \(not a regular file\). Fetch"):
+    with pytest.raises(ShardError, match=r"x.tar: cannot be read \(not a regular file\). .*fetch"):
         MemberSource(root, shards=shards).open(scene, "b.json")
 
 
 def test_a_shard_of_which_no_size_is_known_must_hold_the_member(root):
     os.truncate(root / "x.tar", 10)
 
-    with pytest.raises(ShardError, match="has 10 bytes, and the index says at least 11"):
+    with pytest.raises(ShardError, match="has 10 bytes, and the index says 11"):
         open_local(root, Member("x.tar", 6, 5))
 
 
@@ -231,8 +231,3 @@ def test_too_many_open_files_are_reported_as_such(indexed_release):
     for line in told:
         assert "(Too many open files). Raise the limit of open files (`ulimit -n`)" in line
         assert "again" not in line
-
-
-def test_an_empty_text_is_no_folder():
-    with pytest.raises(StorageError, match="the path is empty: name a file or folder"):
-        local_path("")
