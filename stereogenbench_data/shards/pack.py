@@ -4,7 +4,6 @@ Any number of processes on any number of machines may pack parts of one plan int
 share nothing but the plan, which is a function of the release and the target size.
 """
 
-import base64
 import json
 import os
 import shutil
@@ -21,7 +20,7 @@ from stereogenbench_data.index.scene_folder import derived_scene
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import read_json
 from stereogenbench_data.media.depth_frames import CODEC_NAME, blosc2_module
-from stereogenbench_data.schema.records import Member, Scene, ShardFacts
+from stereogenbench_data.schema.records import Member, Scene
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
     PACKED_DEPTH_NAMES,
@@ -32,7 +31,7 @@ from stereogenbench_data.shards.plan import DEFAULT_SHARD_BYTES, DepthCodec, Sha
 from stereogenbench_data.shards.training import Derivation, TrainingSettings
 from stereogenbench_data.shards.writer import (
     PARTS,
-    ShardManifest,
+    PackedShard,
     ShardTask,
     derive_task,
     find_packed,
@@ -172,39 +171,31 @@ def _finish(tasks: Sequence[ShardTask], out: Path) -> PackReport:
         ShardError: If a shard was changed after it was packed.
     """
     found = {task.shard.name: find_packed(task) for task in tasks}
-    shards = [manifest for manifest in found.values() if manifest is not None]
-    missing = tuple(name for name, manifest in found.items() if manifest is None)
+    shards = {name: shard for name, shard in found.items() if shard is not None}
+    missing = tuple(name for name in found if name not in shards)
     report = PackReport((), (), missing, None, sum(len(task.shard.scenes) for task in tasks))
     if missing:
         return report
     for task in tasks:
         shutil.rmtree(task.derived, ignore_errors=True)  # of a run killed after its last shard
     index = SceneIndex.from_scenes(
-        [
-            scene
-            for task, manifest in zip(tasks, shards, strict=True)
-            for scene in _scenes_in(task, manifest)
-        ],
+        [scene for task in tasks for scene in _scenes_in(task, shards[task.shard.name])],
         out,
-        shards={
-            manifest.name: ShardFacts(manifest.size, manifest.sha256, len(manifest.members))
-            for manifest in shards
-        },
+        shards={name: shard.facts for name, shard in shards.items()},
     )
     # The index is written last: where it exists, every shard does, too.
     index.write(out / INDEX_NAME)
     return replace(report, index=out / INDEX_NAME)
 
 
-def _scenes_in(task: ShardTask, shard: ShardManifest) -> Iterator[Scene]:
+def _scenes_in(task: ShardTask, shard: PackedShard) -> Iterator[Scene]:
     """Yield scenes of the release with the places of their files in a shard, as they are there."""
     places: dict[str, dict[str, Member]] = {scene.id.key: {} for scene in task.shard.scenes}
     for member, place in shard.places.items():
         key, _, name = member.partition(".")
         places[key][name] = place
-    tables = {key: base64.b64decode(text) for key, text in shard.seek_tables.items()}
     for each in task.shard.scenes:
-        scene = replace(each, seek_tables=tables.get(each.id.key))
+        scene = replace(each, seek_tables=shard.seek_tables.get(each.id.key))
         members = places[scene.id.key]
         if task.derivation is not None:
             place = members[TRAINING_JSON]

@@ -8,10 +8,10 @@ import io
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
-from stereogenbench_data.errors import MediaError, ShardError, describe_os_error
+from stereogenbench_data.errors import MediaError, ShardError, explain_os_errors
 from stereogenbench_data.jobs import atomic_folder
 from stereogenbench_data.media.depth import write_depth_video
 from stereogenbench_data.media.depth_frames import DepthFrames
@@ -94,7 +94,8 @@ def unpack(
         for scene in scenes
     ]
     total = sum(member.size for scene in scenes for member in scene.members.values())
-    try:
+    cure = "Unpack into another folder."
+    with explain_os_errors(f"{out}: cannot be written", cure, kind=ShardError):
         out.mkdir(parents=True, exist_ok=True)
         with try_locked(out / _LOCK) as is_ours:
             if not is_ours:
@@ -103,33 +104,25 @@ def unpack(
                     f"unpack into another folder."
                 )
             try:
-                found = dict(
-                    engine.map(
-                        unpack_scene,
-                        tasks,
-                        name=lambda task: task.scene.id.key,
-                        workers=workers,
-                        advance=advance_of(progress, total=total),
-                    )
+                unpacked = engine.map(
+                    unpack_scene,
+                    tasks,
+                    name=lambda task: task.scene.id.key,
+                    workers=workers,
+                    advance=advance_of(progress, total=total),
                 )
+                now = {*unpacked} - {""}
             finally:
                 (out / _LOCK).unlink(missing_ok=True)
-    except OSError as error:
-        if error.errno is None:
-            raise
-        what = f"{error.filename or out}: cannot be written"
-        raise ShardError(describe_os_error(what, error, "Unpack into another folder.")) from error
-    return UnpackReport(
-        out,
-        tuple(sorted(key for key, work in found.items() if work == "unpacked")),
-        tuple(sorted(key for key, work in found.items() if work == "kept")),
-    )
+    kept = {scene.id.key for scene in scenes} - now
+    return UnpackReport(out, tuple(sorted(now)), tuple(sorted(kept)))
 
 
-def unpack_scene(
-    task: _UnpackTask, after_bytes: Advance
-) -> tuple[str, Literal["unpacked", "kept"]]:
+def unpack_scene(task: _UnpackTask, after_bytes: Advance) -> str:
     """Unpack one scene, unless it exists; a worker process calls this.
+
+    Returns:
+        Its key; "" if it was there.
 
     Raises:
         ShardError: As `unpack` says.
@@ -138,14 +131,14 @@ def unpack_scene(
     if task.folder.exists():
         _require_unpacked(task)
         after_bytes(sum(member.size for member in scene.members.values()))
-        return scene.id.key, "kept"
+        return ""
     try:
         with atomic_folder(task.folder) as folder:
             for name, member in sorted(scene.members.items(), key=lambda item: item[1].offset):
                 _unpack_file(task, name, member, folder, after_bytes)
     except MediaError as error:
         raise ShardError(str(error)) from error
-    return scene.id.key, "unpacked"
+    return scene.id.key
 
 
 def _unpack_file(

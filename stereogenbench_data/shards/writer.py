@@ -14,10 +14,10 @@ import shutil
 import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from io import FileIO
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, ShardError, explain_os_errors
@@ -26,7 +26,7 @@ from stereogenbench_data.index.scene_folder import derived_scene, metadata_diffe
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import packed_depth
 from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
-from stereogenbench_data.schema.records import Member, Scene
+from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES, TRAINING_JSON, VIDEO_FILES
 from stereogenbench_data.schema.training import parse_training
 from stereogenbench_data.shards.plan import (
@@ -89,30 +89,18 @@ class ShardTask:
         return self.target.parent / PARTS / f"{self.target.stem}.json"
 
 
-@dataclass(frozen=True, slots=True)
-class ShardManifest:
-    """A finished shard: its checksums and its members, in order.
+class PackedShard(NamedTuple):
+    """A finished shard, as its manifest tells it.
 
     Attributes:
-        plan: The digest of its plan.
-        seek_tables: Each scene's key, with its `Scene.seek_tables` as base64.
+        facts: What an index says of it.
+        places: Where each member lies in it, by its whole name, in order.
+        seek_tables: Each scene's `Scene.seek_tables`, by its key.
     """
 
-    name: str
-    size: int
-    sha256: str
-    members: tuple[str, ...]
-    offsets: tuple[int, ...]
-    sizes: tuple[int, ...]
-    crc32s: tuple[int, ...]
-    plan: str
-    seek_tables: dict[str, str] = field(default_factory=dict)
-
-    @property
-    def places(self) -> dict[str, Member]:
-        """Where each member lies in the shard, by its whole name."""
-        found = zip(self.members, self.offsets, self.sizes, self.crc32s, strict=True)
-        return {name: Member(self.name, *place) for name, *place in found}
+    facts: ShardFacts
+    places: dict[str, Member]
+    seek_tables: dict[str, bytes]
 
 
 def open_shards(data: str | Path, root: str | Path | None) -> SceneIndex:
@@ -142,8 +130,8 @@ def open_shards(data: str | Path, root: str | Path | None) -> SceneIndex:
     return index
 
 
-def find_packed(task: ShardTask) -> ShardManifest | None:
-    """Return the manifest of a finished shard; None if the shard is not there.
+def find_packed(task: ShardTask) -> PackedShard | None:
+    """Return what a finished shard holds; None if the shard is not there.
 
     Raises:
         ShardError: If a file has its name that this plan did not pack, or that was changed since.
@@ -154,19 +142,26 @@ def find_packed(task: ShardTask) -> ShardManifest | None:
         return None
     try:
         found = json.loads(task.manifest.read_bytes())
-        for name in ("members", "offsets", "sizes", "crc32s"):
-            found[name] = tuple(found[name])
-        manifest = ShardManifest(**found)
+        columns = (found[name] for name in ("members", "offsets", "sizes", "crc32s"))
+        rows = zip(*columns, strict=True)
+        places = {name: Member(task.shard.name, *place) for name, *place in rows}
+        tables = found.get("seek_tables", {}).items()
+        packed = PackedShard(
+            ShardFacts(found["size"], found["sha256"], len(places)),
+            places,
+            {key: base64.b64decode(text) for key, text in tables},
+        )
+        is_of_plan = (found["plan"], found["name"]) == (task.plan_digest, task.shard.name)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise not_of_plan(task.target) from error
-    if (manifest.plan, manifest.name) != (task.plan_digest, task.shard.name):
+    if not is_of_plan:
         raise not_of_plan(task.target)
-    if manifest.size != size:
+    if packed.facts.size != size:
         raise ShardError(
-            f"{task.target}: has {size} bytes, and had {manifest.size} when it was packed. Remove "
-            f"it, then run the same command again."
+            f"{task.target}: has {size} bytes, and had {packed.facts.size} when it was packed. "
+            f"Remove it, then run the same command again."
         )
-    return manifest
+    return packed
 
 
 def pack_task(task: ShardTask, after_bytes: Advance) -> str:
@@ -279,18 +274,18 @@ def _pack(task: ShardTask, after_bytes: Advance) -> None:
         file.flush()
         tables = _seek_tables(Path(file.name), places, task.shard.keys)
         offsets, sizes, crc32s = zip(*places.values(), strict=True)
-        manifest = ShardManifest(
-            name=task.shard.name,
-            size=size,
-            sha256=sha256.hexdigest(),
-            members=tuple(places),
-            offsets=offsets,
-            sizes=sizes,
-            crc32s=crc32s,
-            plan=task.plan_digest,
-            seek_tables=tables,
-        )
-        write_atomic(task.manifest, json.dumps(asdict(manifest)).encode())
+        manifest = {
+            "name": task.shard.name,
+            "size": size,
+            "sha256": sha256.hexdigest(),
+            "members": [*places],
+            "offsets": offsets,
+            "sizes": sizes,
+            "crc32s": crc32s,
+            "plan": task.plan_digest,
+            "seek_tables": tables,
+        }
+        write_atomic(task.manifest, json.dumps(manifest).encode())
 
 
 def _require_indexed(task: ShardTask, scene: Scene, texts: Mapping[str, bytes]) -> None:

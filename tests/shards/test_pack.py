@@ -25,7 +25,7 @@ from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.plan import PlannedShard, plan_shards
 from stereogenbench_data.shards.writer import ShardTask, pack_task
 from stereogenbench_data.sources.files import locked
-from tests.servers.tools import small_disk
+from tests.servers.tools import killed_fork, small_disk
 from tests.shards.shard_files import bytes_of
 
 ONE_EACH = 250_000
@@ -385,25 +385,24 @@ def test_a_part_that_is_not_written_as_one_is_a_usage_error(small_release, tmp_p
     assert all(word in result.stderr for word in ("--part", "I/N"))
 
 
-KILLED_PACK = """
-import os, signal, sys
-from stereogenbench_data.schema.records import Member
-from stereogenbench_data.shards.pack import pack
+def killed_pack(moment, release, out):
+    """Pack in a process that is killed at its n-th change of a file; return whether it was."""
+    left = moment
 
-left = int(sys.argv[3])
+    def after_event(event, arguments):
+        nonlocal left
+        mode = arguments[1] if event == "open" else None
+        writes = isinstance(mode, str) and mode[:1] in "wxa" and str(out) in str(arguments[0])
+        if writes or event in ("os.rename", "os.remove"):
+            left -= 1
+            if left == 0:
+                os.kill(os.getpid(), signal.SIGKILL)
 
-def after_event(event, arguments):
-    global left
-    mode = arguments[1] if event == "open" else None
-    writes = isinstance(mode, str) and mode[:1] in "wxa" and sys.argv[2] in str(arguments[0])
-    if writes or event in ("os.rename", "os.remove"):
-        left -= 1
-        if left == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
+    def act():
+        sys.addaudithook(after_event)
+        pack(release, out, target_bytes=ONE_EACH, workers=1)
 
-sys.addaudithook(after_event)
-pack(sys.argv[1], sys.argv[2], target_bytes=int(sys.argv[4]), workers=1)
-"""
+    return killed_fork(act)
 
 
 @pytest.mark.parametrize("moment", [5, 24])
@@ -411,14 +410,13 @@ def test_a_pack_killed_at_any_moment_leaves_nothing_behind_once_it_was_resumed(
     moment, small_release, release, packed, tmp_path
 ):
     out = tmp_path / "out"
-    command = [sys.executable, "-c", KILLED_PACK, small_release, out, str(moment), str(ONE_EACH)]
 
-    killed = subprocess.run(command, check=False)
+    was_killed = killed_pack(moment, small_release, out)
     had_index = (out / "index.parquet").is_file()
     had_shards = len(tars(out)) == 4
     pack(release, out, target_bytes=ONE_EACH, workers=1)
 
-    assert killed.returncode == -signal.SIGKILL
+    assert was_killed
     assert had_shards or not had_index
     assert sorted(path.relative_to(out) for path in out.rglob("*")) == sorted(
         path.relative_to(packed) for path in packed.rglob("*")

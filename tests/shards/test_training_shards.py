@@ -440,22 +440,6 @@ def test_an_altered_psnr_contradicts_the_shard(shards):
 
 
 @pytest.mark.parametrize(
-    ("facts", "found"),
-    [
-        ({"quality": "[small](http://x)"}, "training_quality"),
-        ({"settings": "[" * 9999}, "training_settings"),
-        ({"worst_psnr_db": (-math.inf,) * 6}, "worst_psnr_db"),
-    ],
-)
-def test_an_index_cannot_say_other_things_of_training_shards(packed, facts, found):
-    scene = SceneIndex.open(packed).scene(0)
-    altered = replace(scene, training=replace(scene.training, **facts))
-
-    with pytest.raises(StorageError, match=rf"{found} is .*altered"):
-        SceneIndex.from_scenes([altered], packed)
-
-
-@pytest.mark.parametrize(
     ("alter", "found"),
     [
         (lambda text: text[:-40], "not valid JSON"),
