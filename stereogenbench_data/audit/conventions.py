@@ -237,10 +237,16 @@ def _some(scenes: Sequence[Scene], count: int) -> list[Scene]:
 
 
 def _diagnosed(
-    root: str, scenes: Sequence[Scene], depth: DepthEncoding | None, how: dict[str, Any]
-) -> DoctorReport:
-    index = SceneIndex.from_scenes(scenes, root)
-    return diagnose(index, scenes=len(scenes), frames=FRAMES, depth=depth, **how)
+    surveyed: Survey, scenes: Sequence[Scene], depth: DepthEncoding | None, how: dict[str, Any]
+) -> DoctorReport | None:
+    """Return what pictures say of a contract; None, and why, where they cannot be compared."""
+    index = SceneIndex.from_scenes(scenes, surveyed.root)
+    try:
+        return diagnose(index, scenes=len(scenes), frames=FRAMES, depth=depth, **how)
+    except StereoGenBenchError as error:
+        surveyed.problems.append(str(error))
+        surveyed.verdicts.append(f"the pictures tell nothing: {error}")
+        return None
 
 
 def _with_measured_depth(
@@ -262,11 +268,8 @@ def _with_measured_depth(
         how: Where processes run.
     """
     stated = DepthEncoding(source="conventions") if shape.depth is None else shape.depth.encoding
-    try:
-        report = _diagnosed(surveyed.root, teaching, stated, how)
-    except StereoGenBenchError as error:
-        surveyed.problems.append(str(error))
-        surveyed.verdicts.append(f"the pictures tell nothing: {error}")
+    report = _diagnosed(surveyed, teaching, stated, how)
+    if report is None:
         return shape, None
     measured = _measured(report, stated, teaching)
     if measured == stated:
@@ -361,10 +364,8 @@ def _tested(
 
     ``known`` is what they are already known to say.
     """
-    try:
-        report = known or _diagnosed(surveyed.root, scenes, depth, how)
-    except StereoGenBenchError as error:
-        surveyed.problems.append(str(error))
+    report = known or _diagnosed(surveyed, scenes, depth, how)
+    if report is None:
         return None
     written = _changed(_measured(report, DepthEncoding(), scenes)) if depth is None else {}
     for verdict in report.verdicts:

@@ -95,13 +95,15 @@ def test_a_bin_that_is_none_leaves_nothing_and_says_why(catalogue):
     assert "no baseline bin '[1,2)'" in told["reason"]
 
 
-@pytest.mark.parametrize("pairs", ["sweep", "0-5"])
-def test_pairs_that_the_page_cannot_show_are_refused(pairs):
-    with pytest.raises(SelectionError, match=f"no choice '{pairs}'"):
-        parse_choice({"pairs": [pairs]})
-
-
-@pytest.mark.parametrize("number", ["wide", "inf", "nan"])
-def test_a_number_that_is_none_is_refused(number):
-    with pytest.raises(SelectionError, match=rf"focal must be of numbers, got \['{number}', ''\]"):
-        parse_choice({"focal_low": [number]})
+@pytest.mark.parametrize(
+    ("query", "told"),
+    [
+        ({"pairs": ["sweep"]}, "no choice 'sweep'"),
+        ({"pairs": ["0-5"]}, "no choice '0-5'"),
+        *(({"focal_low": [each]}, rf"focal must be of numbers, got \['{each}', ''\]")
+          for each in ("wide", "inf", "nan")),
+    ],
+)  # fmt: skip
+def test_what_the_page_cannot_choose_by_is_refused(query, told):
+    with pytest.raises(SelectionError, match=told):
+        parse_choice(query)

@@ -12,7 +12,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float64
@@ -327,7 +327,7 @@ def _better_depth(
     A reading explains the points at which it agrees with the other camera's depth: depth agrees
     more sharply with depth than with matches, some of which are wrong.
     """
-    hypothesis, subject = contract.hypothesis, f"depth of camera {camera}"
+    hypothesis = contract.hypothesis
     both = zip(matches[::2], matches[1::2], strict=True)
     sides = [pair if pair[0].left == camera else pair[::-1] for pair in both
              if camera in pair[0].pair]  # fmt: skip
@@ -348,20 +348,18 @@ def _better_depth(
                 found[place] = float((np.abs(away_px) < allowed_px).mean())
         return found
 
-    words = f"{subject} is {scale:.4g} x that of the others"
-    readings = [(words, shares(hypothesis, factor=scale))]  # the simplest first
-    for question, fits in _READINGS.items():
-        for other in hypothesis.alternatives(question):
-            words = f"{subject} fits better {fits.format(getattr(other, question))}"
-            readings.append((words, shares(other)))
-    for file in set(range(CAMERA_COUNT)) - {hypothesis.depth_file(camera)}:
-        words = f"{subject} fits worse than that of file {file} does in its place"
-        readings.append((words, shares(hypothesis, file=file)))
+    readings: list[tuple[str, Hypothesis, dict[str, Any]]] = [  # the simplest first
+        (f"is {scale:.4g} x that of the others", hypothesis, {"factor": scale}),
+        *((f"fits better {fits.format(getattr(other, question))}", other, {})
+          for question, fits in _READINGS.items() for other in hypothesis.alternatives(question)),
+        *((f"fits worse than that of file {file} does in its place", hypothesis, {"file": file})
+          for file in range(CAMERA_COUNT) if file != hypothesis.depth_file(camera)),
+    ]  # fmt: skip
     now, best, most = shares(hypothesis), "", 0.0
-    for words, explained in readings:
-        gain, is_clear = _gain(explained, now)
+    for words, read, how in readings:
+        gain, is_clear = _gain(shares(read, **how), now)
         if is_clear and gain > most + _LEAST_GAIN * bool(best):
-            best, most = words, gain
+            best, most = f"depth of camera {camera} {words}", gain
     return best
 
 

@@ -120,10 +120,8 @@ def _conclusion(verdict: Verdict) -> Iterator[str]:
         yield "Nothing to paste: no DepthEncoding is certain to correct this."
     elif verdict.fits:
         yield f"The declared contract fits: {encoding_line(verdict.declared)}"
-    elif math.isfinite(verdict.agreement):
-        yield f"Nothing contradicts the declared contract. Undecided: {', '.join(_open(verdict))}."
     else:
-        yield "The pictures do not decide about the declared contract."
+        yield f"Nothing contradicts the declared contract. Undecided: {', '.join(_open(verdict))}."
 
 
 def _tested(verdict: Verdict) -> Iterator[str]:

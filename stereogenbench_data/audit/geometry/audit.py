@@ -226,12 +226,8 @@ def _known(journal: Journal, stamps: Mapping[str, str]) -> dict[str, SceneAudit]
     """Return the results of earlier runs for scenes that have not changed since."""
     known: dict[str, SceneAudit] = {}
     for key, stamp in stamps.items():
-        value = journal.value(key, stamp=stamp)
-        try:
-            if value is not None:
-                known[key] = SceneAudit.revived(value)
-        except (KeyError, TypeError):
-            continue
+        with suppress(KeyError, TypeError):  # nothing is known, or it is of another form
+            known[key] = SceneAudit.revived(journal.value(key, stamp=stamp))
     return known
 
 
