@@ -4,7 +4,7 @@ import math
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import av
 import numpy as np
@@ -53,7 +53,7 @@ class SceneReader:
         """Prepare to read the data of an index; nothing is opened yet."""
         self.index = index
         self._lock = threading.Lock()
-        self._loaders: dict[tuple[str, ...], tuple[SampleLoader, threading.Lock, bool]] = {}
+        self._loaders: dict[Request, tuple[SampleLoader, threading.Lock]] = {}
 
     def pair(
         self, row: int, *, pair: tuple[int, int], frame: int, fields: tuple[str, ...]
@@ -67,25 +67,25 @@ class SceneReader:
                 a field needs is not known.
         """
         left, right = require_pairs([pair])[0]
-        return self._read("pairs", fields, Address(row, left, (right,), (frame,)))
+        request = Request(kind="pairs", fields=fields, layout="single")
+        return self._read(request, Address(row, left, (right,), (frame,)))
 
     def views(self, row: int, *, frame: int) -> UInt8[np.ndarray, "6 3 h w"]:
         """Return the pictures of all six cameras at a frame; raises as `pair` does."""
+        request = Request(kind="views", fields=("image",), layout="stacked")
         address = Address(row, 0, tuple(range(1, CAMERA_COUNT)), (frame,))
-        pictures: UInt8[np.ndarray, "6 3 h w"] = self._read("views", ("image",), address)["image"]
+        pictures: UInt8[np.ndarray, "6 3 h w"] = self._read(request, address)["image"]
         return pictures
 
     def close(self) -> None:
         """Close open videos; the reader can be used again."""
         with self._lock:
             loaders = list(self._loaders.values())
-        for loader, turn, _ in loaders:
+        for loader, turn in loaders:
             with turn:
                 loader.close()
 
-    def _read(
-        self, kind: Literal["pairs", "views"], fields: tuple[str, ...], address: Address
-    ) -> Sample:
+    def _read(self, request: Request, address: Address) -> Sample:
         scene, frame = self.index.scene(address.row), address.frames[0]
         if not 0 <= frame < scene.frames:
             raise SelectionError(
@@ -93,19 +93,16 @@ class SceneReader:
                 f"{scene.frames - 1}. Choose one of them."
             )
         with self._lock:
-            if fields not in self._loaders:
-                layout: Literal["single", "stacked"] = "stacked" if kind == "views" else "single"
-                request = Request(kind=kind, fields=fields, layout=layout)
+            if request not in self._loaders:
                 loader = SampleLoader(self.index, request)
                 loader.keep_open(OPEN_VIDEOS)
-                needs_depth = not request.streams.isdisjoint({"source_depth", "target_depth"})
-                self._loaders[fields] = (loader, threading.Lock(), needs_depth)
-            loader, turn, needs_depth = self._loaders[fields]
-        encodings = (
-            scene.depth_encoding(camera, depth_of(scene))
+                self._loaders[request] = loader, threading.Lock()
+            loader, turn = self._loaders[request]
+        needs_depth = not request.streams.isdisjoint({"source_depth", "target_depth"})
+        if needs_depth and any(
+            scene.depth_encoding(camera, depth_of(scene)).unit_m is None
             for camera in (address.source, *address.targets)
-        )
-        if needs_depth and any(encoding.unit_m is None for encoding in encodings):
+        ):
             raise MediaError(
                 scene.remark("depth") or f"{scene.id.key}: {NO_DEPTH_UNIT}. {DEPTH_CURES}"
             )
