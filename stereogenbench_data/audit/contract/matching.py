@@ -215,8 +215,6 @@ class SceneFrames:
         self._streams = streams
         self._bands: dict[tuple[int, int], Luma] = {}
         self._stored: dict[tuple[FrameMatch, int, int], dict[Flip, _Numbers]] = {}
-        self._predicted_by: Hypothesis | None = None
-        self._predictions: dict[tuple[FrameMatch, int], _Prediction | None] = {}
 
     @property
     def primary(self) -> tuple[int, int]:
@@ -359,19 +357,9 @@ class SceneFrames:
         """Return the disparity of matched pixels at the declared unit, and where it is known.
 
         None if the frame of depth does not exist. ``depth_file`` replaces the file that the
-        hypothesis names. The predictions of one hypothesis are kept, read-only, until another is
-        asked for, because it is fitted, scored and drawn at many scales.
+        hypothesis names.
         """
         file = hypothesis.depth_file(match.left) if depth_file is None else depth_file
-        if hypothesis != self._predicted_by:
-            self._predicted_by, self._predictions = hypothesis, {}
-        if (match, file) not in self._predictions:
-            self._predictions[match, file] = self._predict(match, hypothesis, file=file)
-        return self._predictions[match, file]
-
-    def _predict(
-        self, match: FrameMatch, hypothesis: Hypothesis, *, file: int
-    ) -> _Prediction | None:
         frame = match.frame + hypothesis.frame_lag
         if not 0 <= frame < self.scene.frames:
             return None
@@ -382,9 +370,7 @@ class SceneFrames:
         per_m = 1 / (offset_m + unit_m * number) if is_depth else number / unit_m
         if hypothesis.kind == "ray":
             per_m *= self.ray_per_planar[match.rows, match.columns]
-        disparity_px = self.intrinsics.fx_px * self.baseline_m(match, hypothesis) * per_m
-        disparity_px.flags.writeable = known.flags.writeable = False
-        return disparity_px, known
+        return self.intrinsics.fx_px * self.baseline_m(match, hypothesis) * per_m, known
 
     def baseline_m(self, match: FrameMatch, hypothesis: Hypothesis) -> float:
         """Return the signed baseline of a match's two files."""
