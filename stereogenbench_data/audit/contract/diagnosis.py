@@ -7,6 +7,7 @@ further change clearly improves. `diagnose_scene` reports how well that contract
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any, Final
 
 from stereogenbench_data.audit.contract.cameras import CameraCheck, check_cameras
@@ -132,8 +133,8 @@ class ContractSearch:
         self._matches = [match for match in matches if match.pair in near] or list(matches)
         self._bias = BIAS_PX / max(disparity_px(matches), 1e-6)
         self._fitted: dict[tuple[Hypothesis, bool], ScoredContract] = {}
-        self._likely: dict[Hypothesis, tuple[Hypothesis, ...]] = {}
-        self._powers: dict[Hypothesis, RayPower] = {}
+        self._promising = cache(self._find_promising)
+        self._power = cache(self._find_power)
         self.declared = self.candidate(Hypothesis.declared(views.encoding), is_scaled=False)
 
     def candidate(self, hypothesis: Hypothesis, *, is_scaled: bool = True) -> ScoredContract:
@@ -185,15 +186,12 @@ class ContractSearch:
             fitted = is_scaled or question == "form"
             yield from (self.candidate(hypothesis, is_scaled=fitted) for hypothesis in others)
 
-    def _promising(self, current: Hypothesis) -> tuple[Hypothesis, ...]:
+    def _find_promising(self, current: Hypothesis) -> tuple[Hypothesis, ...]:
         """Return the orders that explain most matches, at any scale."""
-        if current not in self._likely:
-            orders = current.alternatives("order")
-            few = [match for match in self._matches if match.frame == self._matches[0].frame]
-            shares = {order: voted(self._views, few, order)[1] for order in orders}
-            best = sorted(orders, key=lambda order: -shares[order])[:_PROMISING]
-            self._likely[current] = tuple(best)
-        return self._likely[current]
+        orders = current.alternatives("order")
+        few = [match for match in self._matches if match.frame == self._matches[0].frame]
+        shares = {order: voted(self._views, few, order)[1] for order in orders}
+        return tuple(sorted(orders, key=lambda order: -shares[order])[:_PROMISING])
 
     def _most_better(
         self, current: ScoredContract, others: Iterable[ScoredContract]
@@ -266,18 +264,14 @@ class ContractSearch:
         # Coarse depth has a shape of its own.
         is_fine = self._least_log_scale <= LEAST_LOG_SCALE
         if is_fine and only_kind and worse.is_scaled >= better.is_scaled:
-            shape_kind = self._power(better).kind
+            shape_kind = self._power(better.hypothesis.changed("kind", "planar")).kind
             if shape_kind is not None and (shape_kind != kind or found.mean_db > 0):
                 return replace(found, by_shape=shape_kind == kind)
         return found
 
-    def _power(self, candidate: ScoredContract) -> RayPower:
-        """Return the power of the ray's length for a contract of any kind and scale."""
-        planar = candidate.hypothesis.changed("kind", "planar")
-        if planar not in self._powers:
-            start = self.candidate(planar)
-            self._powers[planar] = ray_power(self._views, self._matches, start)
-        return self._powers[planar]
+    def _find_power(self, planar: Hypothesis) -> RayPower:
+        """Return the power of the ray's length for a hypothesis of any kind and scale."""
+        return ray_power(self._views, self._matches, self.candidate(planar))
 
     def _is_better(self, other: ScoredContract, current: ScoredContract) -> bool:
         """Tell whether a contract is clearly better, and a scale that only it has significant."""
