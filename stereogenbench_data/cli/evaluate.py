@@ -28,9 +28,8 @@ from stereogenbench_data.evaluation.columns import METRICS, OFFLINE_METRICS, req
 from stereogenbench_data.schema.text import counted
 
 if TYPE_CHECKING:
-    from stereogenbench_data.evaluation.aggregate import Scores
     from stereogenbench_data.evaluation.protocol import EvaluationProtocol
-    from stereogenbench_data.evaluation.tables import Table
+    from stereogenbench_data.evaluation.tables import Scores, Table
 
 
 _METRICS = "How metrics are computed"

@@ -16,7 +16,6 @@ import numpy as np
 
 from stereogenbench_data.datasets.mapped import Data
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.aggregate import CONTROL, Scores
 from stereogenbench_data.evaluation.evaluate import (
     EvaluationOptions,
     Run,
@@ -25,6 +24,7 @@ from stereogenbench_data.evaluation.evaluate import (
 )
 from stereogenbench_data.evaluation.predictions import PairFrames, Read, open_frames
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
+from stereogenbench_data.evaluation.tables import CONTROL, Scores
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.schema.conventions import Conventions

@@ -27,7 +27,6 @@ from stereogenbench_data.errors import (
     StorageError,
     explain_os_errors,
 )
-from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, tally
 from stereogenbench_data.evaluation.metrics.frechet import (
     FeatureStatistics,
     FrechetDistance,
@@ -51,6 +50,7 @@ from stereogenbench_data.evaluation.scene_scores import (
     score_scene,
     settings_of,
 )
+from stereogenbench_data.evaluation.tables import Labels, PairMeans, Scores, tally
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import JobKind, WorkOptions, do_items, job_folder
 from stereogenbench_data.schema.conventions import Conventions

@@ -11,19 +11,20 @@ from pathlib import Path
 from typing import Any, Final
 
 from stereogenbench_data.errors import EvaluationError, explain_os_errors, missing_extra
-from stereogenbench_data.evaluation.aggregate import (
-    CONTROL,
-    Cell,
-    PairMeans,
-    Scores,
-    cell,
-    group_by,
-)
 from stereogenbench_data.evaluation.columns import COLUMNS, HEAVY_TAILED
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.predictions import pair_name
 from stereogenbench_data.evaluation.protocol import PROTOCOL_VERSION, TIERS
-from stereogenbench_data.evaluation.tables import Table, Value
+from stereogenbench_data.evaluation.tables import (
+    CONTROL,
+    Cell,
+    PairMeans,
+    Scores,
+    Table,
+    Value,
+    cell,
+    group_by,
+)
 from stereogenbench_data.schema.release import BASELINE_BINS, baseline_bin
 from stereogenbench_data.schema.text import counted, markdown_table, markdown_text
 from stereogenbench_data.sources.files import open_atomic, write_atomic

@@ -7,9 +7,9 @@ import pytest
 from PIL import Image
 
 from stereogenbench_data import evaluate
-from stereogenbench_data.evaluation.aggregate import Scores
 from stereogenbench_data.evaluation.predictions import frame_name, item_name, open_frames
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
+from stereogenbench_data.evaluation.tables import Scores
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest

@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stereogenbench_data import EvaluationError, EvaluationProtocol, score_controls
-from stereogenbench_data.evaluation.aggregate import cell
 from stereogenbench_data.evaluation.columns import HEAVY_TAILED
 from stereogenbench_data.evaluation.controls import CONTROLS, derangement, wrong_camera
 from stereogenbench_data.evaluation.models.opencv import Sgbm
 from stereogenbench_data.evaluation.predictions import open_frames
 from stereogenbench_data.evaluation.protocol import PROTOCOL_VERSION
+from stereogenbench_data.evaluation.tables import cell
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from tests.evaluation.conftest import SIZE, numbers, scored
 

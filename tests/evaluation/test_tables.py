@@ -1,18 +1,26 @@
-"""Tables: groups in order, the paper's rows of the same tier beside, no nan, nothing mixed."""
+"""Scores: averages, intervals by hand, tables in order, the paper's rows beside, no nan."""
 
 import csv
 import io
 import json
+import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from stereogenbench_data import EvaluationError, EvaluationProtocol, tables_of, write_report
-from stereogenbench_data.evaluation.aggregate import PairMeans, Scores, tally
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.report import document, latex, markdown
-from stereogenbench_data.evaluation.tables import release_difference, table_of
+from stereogenbench_data.evaluation.tables import (
+    PairMeans,
+    Scores,
+    cell,
+    release_difference,
+    strata,
+    table_of,
+    tally,
+)
 
 PAPERS = EvaluationProtocol()
 INF, NAN = float("inf"), float("nan")
@@ -220,3 +228,58 @@ def test_latex_has_its_signs_escaped_and_its_columns_counted(scores):
     assert r"$\pm$" in text
     assert len({line.replace(r"\&", "").count("&") for line in rows_of_text}) == 1
     assert text.count(r"\begin{") == text.count(r"\end{") == 2
+
+
+def pair(scene, numbers, *, cameras=(0, 1)):
+    return PairMeans(
+        row=0, scene=scene, pair=cameras, is_primary=cameras == (0, 1), baseline_cm=6.0,
+        frames=len(numbers), tallies={"psnr": tally(numbers)},
+    )  # fmt: skip
+
+
+def test_frames_are_averaged_before_pairs_and_these_before_scenes():
+    pairs = [pair("a", [0, 20]), pair("a", [30], cameras=(0, 2)), pair("b", [50])]
+
+    found = cell(pairs, "psnr")
+
+    assert found.mean == 35
+    assert found.scenes == 2
+
+
+def test_identical_frames_are_counted_and_not_averaged():
+    found = cell([pair("a", [10, math.inf]), pair("b", [math.inf, math.inf])], "psnr")
+
+    assert (found.mean, found.infinite, found.scenes) == (10, 3, 1)
+    assert found.ci95 is None
+
+
+def test_frames_without_a_score_are_counted():
+    found = cell([pair("a", [10, math.nan]), pair("b", [math.nan]), pair("c", [20])], "psnr")
+
+    assert (found.mean, found.undefined, found.scenes) == (15, 2, 2)
+
+
+def test_the_interval_of_three_scenes_is_the_hand_worked_one():
+    found = cell([pair("a", [1]), pair("b", [2]), pair("c", [3])], "psnr")
+
+    # t of 0.975 with 2 degrees of freedom is 4.302653, s is 1.
+    assert found.ci95 == pytest.approx(4.302653 / math.sqrt(3), rel=1e-6)
+    assert found.median == 2
+
+
+def test_texts_and_few_numbers_are_strata_themselves():
+    assert strata(["Town", "", "Egypt"], name="map_name") == ["Town", "not recorded", "Egypt"]
+    assert strata([24, 50.5, 24], name="focal_mm") == ["24", "50.5", "24"]
+
+
+def test_many_numbers_fall_into_quarters():
+    found = strata([float(number) for number in range(101)], name="focal_mm")
+
+    assert {each: found.count(each) for each in dict.fromkeys(found)} == {
+        "[0,25)": 25, "[25,50)": 25, "[50,75)": 25, "[75,100]": 26,
+    }  # fmt: skip
+
+
+def test_a_column_that_is_not_known_is_refused():
+    with pytest.raises(EvaluationError, match="valid_depth_ratio is not known for any scene"):
+        strata([math.nan, math.nan], name="valid_depth_ratio")
