@@ -397,15 +397,12 @@ def tables_of(results: Sequence[Scores], *, by: Sequence[str] = ()) -> list[Tabl
     require_comparable(results)
     has_others = any(not pair.is_primary for one in results for pair in one.pairs)
     names = ["branches", "bins_primary", *(["bins_all"] if has_others else [])]
+    forms = {each: TableForm(f"By {each}, primary pairs", (*_BRANCH, each)) for each in by}
     return [
         *(table_of(results, name) for name in names),
-        *(table_of(results, f"by_{column}", form=_form_by(column)) for column in by),
+        *(table_of(results, f"by_{column}", form=form) for column, form in forms.items()),
         table_of(results, "explanations"),
     ]
-
-
-def _form_by(column: str) -> TableForm:
-    return TableForm(f"By {column}, primary pairs", (*_BRANCH, column))
 
 
 def table_of(results: Sequence[Scores], name: str, *, form: TableForm | None = None) -> Table:
