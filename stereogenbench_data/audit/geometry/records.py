@@ -197,9 +197,14 @@ class Check:
 
     def text(self, value: float) -> str:
         """Return a figure with its unit, a dash for nan."""
-        if math.isnan(value):
-            return "-"
-        return f"{value * 100:.4g} %" if self.unit == "%" else f"{value:.3g} {self.unit}".rstrip()
+        return with_unit(value, self.unit)
+
+
+def with_unit(value: float, unit: str = "") -> str:
+    """Return a number with its unit, a share in per cent, a dash for nan."""
+    if math.isnan(value):
+        return "-"
+    return f"{value * 100:.4g} %" if unit == "%" else f"{value:.3g} {unit}".rstrip()
 
 
 _DOCTOR: Final = "; `stereogenbench doctor` looks for the cause"

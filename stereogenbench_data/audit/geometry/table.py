@@ -13,6 +13,7 @@ from stereogenbench_data.audit.geometry.records import (
     AuditRow,
     Finding,
     SceneAudit,
+    with_unit,
 )
 from stereogenbench_data.audit.geometry.reprojection import TOLERANCES
 from stereogenbench_data.audit.geometry.scene_audit import LONG_PAIR
@@ -65,9 +66,9 @@ def _reprojection_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
             counts = [pair.kept[place] for pair in pairs]
             errors_px = [pair.errors_px[place] for pair in pairs]
             median_px, p95_px = (
-                _number(pooled_px(counts, errors_px, share)) for share in (0.5, 0.95)
+                with_unit(pooled_px(counts, errors_px, share)) for share in (0.5, 0.95)
             )
-            kept = _percent(_ratio(sum(counts), comparable))
+            kept = with_unit(_ratio(sum(counts), comparable), "%")
             yield AuditRow(
                 "reprojection",
                 f"{name}, {tolerance.name}: median / 95th percentile (pixels kept)",
@@ -79,7 +80,7 @@ def _reprojection_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
         yield AuditRow(
             "agreement",
             f"{name}: pixels that nothing hides whose two depths agree (least of a scene)",
-            f"{_percent(agreement)} ({_percent(least)})",
+            f"{with_unit(agreement, '%')} ({with_unit(least, '%')})",
         )
 
 
@@ -106,7 +107,7 @@ def _frame_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
 
 
 def _depth_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
-    valid = _percent(_over(np.mean, _values(scenes, "mean_valid_depth")))
+    valid = with_unit(_over(np.mean, _values(scenes, "mean_valid_depth")), "%")
     quantity = "mean valid-depth ratio over audited frames and cameras"
     yield AuditRow("depth validity", quantity, valid, AUDIT["valid_depth"])
     units = sorted({float(f"{each:.6g}") for each in _values(scenes, "depth_unit_m")})
@@ -192,12 +193,3 @@ def _over(which: Callable[[list[float]], Any], values: Iterable[float]) -> float
 
 def _ratio(part: int, whole: int) -> float:
     return part / whole if whole else math.nan
-
-
-def _number(value: float) -> str:
-    """Return three significant digits; a dash for nan."""
-    return "-" if math.isnan(value) else f"{value:.3g}"
-
-
-def _percent(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value * 100:.4g} %"
