@@ -15,7 +15,7 @@ from stereogenbench_data.errors import MediaError, ShardError, explain_os_errors
 from stereogenbench_data.jobs import atomic_folder
 from stereogenbench_data.media.depth import write_depth_video
 from stereogenbench_data.media.depth_frames import DepthFrames
-from stereogenbench_data.schema.records import Member, Scene, ShardFacts
+from stereogenbench_data.schema.records import Member, Scene
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
 from stereogenbench_data.shards.tar import read_chunks
 from stereogenbench_data.shards.writer import open_shards
@@ -38,12 +38,11 @@ class UnpackReport:
 
 @dataclass(frozen=True, slots=True)
 class _UnpackTask:
-    """A scene to unpack; ``shards`` are those that hold its files."""
+    """A scene to unpack."""
 
     root: str
     out: str
     scene: Scene
-    shards: dict[str, ShardFacts]
 
     @property
     def folder(self) -> Path:
@@ -84,15 +83,7 @@ def unpack(
     out = Path(out)
     if out.resolve() == Path(index.root).resolve():
         raise ShardError(f"{out}: holds the shards themselves. Unpack into another folder.")
-    tasks = [
-        _UnpackTask(
-            index.root,
-            str(out),
-            scene,
-            {path: index.shards[path] for path in {each.path for each in scene.members.values()}},
-        )
-        for scene in scenes
-    ]
+    tasks = [_UnpackTask(index.root, str(out), scene) for scene in scenes]
     total = sum(member.size for scene in scenes for member in scene.members.values())
     cure = "Unpack into another folder."
     with explain_os_errors(f"{out}: cannot be written", cure, kind=ShardError):
@@ -146,7 +137,7 @@ def _unpack_file(
 ) -> None:
     where = f"{Path(task.root, member.path)}: {task.scene.id.key}.{name}"
     target = folder / _RELEASED_NAMES.get(name, name)
-    opened = open_local(task.root, member, shard=task.shards[member.path])
+    opened = open_local(task.root, member)
     with opened.open("rb") if isinstance(opened, Path) else opened as file:
         if name in _RELEASED_NAMES:
             content = file.read()
