@@ -17,7 +17,6 @@ from stereogenbench_data.cli.options import (
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.release import FAMILIES, FRAME_COUNT, IMAGE_SIZE_PX, Split, Subset
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
 if TYPE_CHECKING:
     from stereogenbench_data.synthesis.renderer import Renderer
@@ -71,6 +70,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.synthesis.planning import acceptance_markdown
     from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
     from stereogenbench_data.synthesis.render import RAY_CASTING
+    from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
     if map_name is not None and "all" in map_name and len(map_name) > 1:
         raise typer.BadParameter(
