@@ -6,7 +6,7 @@ decisions are made in float64.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -202,31 +202,6 @@ _AROUND: Final = np.array(
 """Unit directions to the faces and corners of a cube."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseChecks:
-    """The result of filters on n poses.
-
-    Attributes:
-        reasons: The first filter that refuses a pose; "" for none.
-        values: What that filter measured; nan where none refuses.
-        limits: What it allows.
-    """
-
-    reasons: Array
-    values: Float64[np.ndarray, " n"]
-    limits: Float64[np.ndarray, " n"]
-
-    @property
-    def passed(self) -> Bool[np.ndarray, " n"]:
-        """Which poses no filter refuses."""
-        return np.asarray(self.reasons == "")
-
-    def refusal(self, frame: int) -> Refusal:
-        """Return why the pose of a frame is refused."""
-        value, limit = float(self.values[frame]), float(self.limits[frame])
-        return Refusal(str(self.reasons[frame]), value, limit)
-
-
 def check_poses(
     centres_m: Float64[np.ndarray, "n 3"],
     rotators_deg: Float64[np.ndarray, "n 3"],
@@ -234,8 +209,10 @@ def check_poses(
     body_m: Float64[np.ndarray, "n p 3"],
     rig: Rig,
     world: World,
-) -> PoseChecks:
-    """Ask all filters of poses about all six cameras of a rig.
+) -> Array:
+    """Return the first filter that refuses each of n poses of a rig, as (n,) texts; "" for none.
+
+    All filters are asked about all six cameras.
 
     Args:
         centres_m: The middle of the rig.
@@ -244,26 +221,21 @@ def check_poses(
         rig: The cameras.
         world: The map.
     """
-    count = len(centres_m)
-    result = PoseChecks(np.full(count, "", object), np.full(count, np.nan), np.full(count, np.nan))
+    reasons = np.full(len(centres_m), "", object)
     axes = rotation_from_rotator_deg(rotators_deg)
     eyes = rig.eyes(centres_m, axes)
     for measure in (_framing, _collision, _visibility, _depth):
-        left = np.flatnonzero(result.passed)
+        left = np.flatnonzero(reasons == "")
         if not len(left):
             break
         poses = _Poses(eyes[left], axes[left], body_m[left], rig)
-        for reason, measured, allowed, sense in measure(poses, world):
-            refused = (measured < allowed) if sense == "least" else (measured > allowed)
-            refused &= result.passed[left]
-            result.reasons[left[refused]] = reason
-            result.values[left[refused]] = measured[refused]
-            result.limits[left[refused]] = allowed
-    return result
+        for reason, is_refused in measure(poses, world):
+            reasons[left[is_refused & (reasons[left] == "")]] = reason
+    return reasons
 
 
-Measured = tuple[str, Array, float, Literal["least", "most"]]
-"""A filter, what it measured for each pose, its limit, and which side of it is allowed."""
+Refused = list[tuple[str, Array]]
+"""Filters, each with the poses that it refuses."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -290,17 +262,15 @@ class _Poses:
         return (ahead > 1e-6) & (np.abs(across) <= 1) & (np.abs(up) <= 1)
 
 
-def _framing(poses: _Poses, world: World) -> list[Measured]:
+def _framing(poses: _Poses, world: World) -> Refused:
     height = np.ptp(poses.projected()[2], axis=2) / 2
-    share = poses.framed().mean(axis=2).min(axis=1)
-    return [
-        ("framing", share, LIMITS.framed_share, "least"),
-        ("framing", height.min(axis=1), LIMITS.least_height, "least"),
-        ("framing", height.max(axis=1), LIMITS.largest_height, "most"),
-    ]
+    is_refused = poses.framed().mean(axis=2).min(axis=1) < LIMITS.framed_share
+    is_refused |= height.min(axis=1) < LIMITS.least_height
+    is_refused |= height.max(axis=1) > LIMITS.largest_height
+    return [("framing", is_refused)]
 
 
-def _collision(poses: _Poses, world: World) -> list[Measured]:
+def _collision(poses: _Poses, world: World) -> Refused:
     low, high = world.bounds_m
     margin = np.minimum(poses.eyes - low, high - poses.eyes).min(axis=(1, 2))
     apart = poses.body_m[:, None] - poses.eyes[:, :, None]
@@ -312,20 +282,17 @@ def _collision(poses: _Poses, world: World) -> list[Measured]:
     met = world.cast(origins, np.broadcast_to(_AROUND, shape).reshape(-1, 3))
     clearance = np.full(len(inside), np.inf)
     clearance[inside] = met.reshape(len(eyes), shape[1] * shape[2]).min(axis=1)
-    return [
-        ("collision", margin, LIMITS.clearance_m, "least"),
-        ("collision", clearance, LIMITS.clearance_m, "least"),
-        ("collision", to_subject, LIMITS.subject_clearance_m, "least"),
-    ]
+    is_refused = np.minimum(margin, clearance) < LIMITS.clearance_m
+    return [("collision", is_refused | (to_subject < LIMITS.subject_clearance_m))]
 
 
-def _visibility(poses: _Poses, world: World) -> list[Measured]:
+def _visibility(poses: _Poses, world: World) -> Refused:
     points = poses.body_m.shape[1]
     chosen = np.unique(np.arange(_SIGHT_POINTS) * (points - 1) // (_SIGHT_POINTS - 1))
     # From the subject to the camera, so that a camera inside a solid sees nothing.
     seen = _sight(world, poses.body_m[:, None, chosen], poses.eyes[:, :, None])
     seen &= poses.framed()[:, :, chosen]
-    return [("visibility", seen.mean(axis=2).min(axis=1), LIMITS.visible_share, "least")]
+    return [("visibility", seen.mean(axis=2).min(axis=1) < LIMITS.visible_share)]
 
 
 def _grid_directions(rig: Rig) -> tuple[Array, Array]:
@@ -337,7 +304,7 @@ def _grid_directions(rig: Rig) -> tuple[Array, Array]:
     return np.column_stack([np.ones(_GRID**2), across * width / 2, up * height / 2]), at_border
 
 
-def _depth(poses: _Poses, world: World) -> list[Measured]:
+def _depth(poses: _Poses, world: World) -> Refused:
     rays, at_border = _grid_directions(poses.rig)
     length = np.sqrt((rays * rays).sum(axis=1))
     directions = np.einsum("nij,rj->nri", poses.axes, rays / length[:, None])
@@ -350,8 +317,8 @@ def _depth(poses: _Poses, world: World) -> list[Measured]:
     subject_m = poses.projected()[0].mean(axis=2)
     near = depth_m[..., at_border] < LIMITS.near_share * subject_m[..., None]
     return [
-        ("valid_depth", valid, LIMITS.valid_share, "least"),
-        ("border_occluder", near.mean(axis=2).max(axis=1), LIMITS.border_share, "most"),
+        ("valid_depth", valid < LIMITS.valid_share),
+        ("border_occluder", near.mean(axis=2).max(axis=1) > LIMITS.border_share),
     ]
 
 

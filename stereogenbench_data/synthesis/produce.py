@@ -249,7 +249,7 @@ class _Tree:
             plan, before = plan_scene(
                 self.request, index=index, renderer=self.renderer, before=refused
             )
-            folder = unfinished / plan.key
+            folder = unfinished / plan.proposal.key
             folder.mkdir(parents=True)
             refusal = check_pictures(self._rendered(plan, folder, after_frames))
             if refusal is None:
@@ -286,7 +286,7 @@ class _Tree:
 
         The completion marker is written last, and the scene appears whole, by one renaming.
         """
-        target = self.out / plan.key
+        target = self.out / plan.proposal.key
         description = self.renderer.description(plan)
         texts = metadata_texts(plan, renderer=self.drawn_by, description=description)
         for name, text in texts.items():

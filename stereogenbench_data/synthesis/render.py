@@ -389,7 +389,7 @@ class RayCasting(Renderer):
         """See `Renderer.views`."""
         world = open_map(plan.proposal)
         light = static_light(world.scene)
-        for frame in range(plan.request.frames):
+        for frame in range(plan.proposal.request.frames):
             state = SceneState(
                 world.scene,
                 walker=world.figure.limbs(plan.spawn, slope=world.scene.slope, frame=frame),

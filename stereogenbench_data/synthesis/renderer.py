@@ -16,7 +16,6 @@ from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.selection.filters import did_you_mean
 from stereogenbench_data.synthesis.proposal import Proposal
-from stereogenbench_data.synthesis.request import SynthRequest
 
 Array = Any
 
@@ -127,16 +126,6 @@ class ScenePlan:
     rotators_deg: Float64[np.ndarray, "frames 3"]
     subject_m: Float64[np.ndarray, " frames"]
 
-    @property
-    def request(self) -> SynthRequest:
-        """The request that the scene belongs to."""
-        return self.proposal.request
-
-    @property
-    def key(self) -> str:
-        """The scene's whole path below the root."""
-        return self.proposal.key
-
     def view(self, *, camera: int, frame: int) -> View:
         """Return a camera's view, in map axes."""
         axes = rotation_from_rotator_deg(self.rotators_deg[frame])
@@ -144,7 +133,7 @@ class ScenePlan:
             eye=self.centres_m[frame] + self.proposal.rig.lateral_m[camera] * axes[:, 1],
             axes=axes,
             focal_px=self.proposal.focal_px,
-            size_px=self.request.picture_px,
+            size_px=self.proposal.request.picture_px,
         )
 
     def steps(self) -> tuple[Float64[np.ndarray, " s"], Float64[np.ndarray, " s"]]:

@@ -65,7 +65,7 @@ def write_cameras(
         By camera, at each frame: the share of pixels without depth, the mean and the standard
         deviation of brightness (of 255), and the share of the border that near things cover.
     """
-    contract = plan.request.contract
+    contract = plan.proposal.request.contract
     measured: dict[int, list[tuple[float, ...]]] = {camera: [] for camera in cameras}
     tag = contract.depth_tag
     tags = None if tag is None else {tag: repr(contract.depth_unit_m)}
@@ -225,7 +225,7 @@ def _baseline(proposal: Proposal) -> dict[str, Any]:
 
 def _trajectory(plan: ScenePlan) -> dict[str, Any]:
     proposal, names = plan.proposal, _camera_names(plan.proposal)
-    form = plan.request.contract.rotation
+    form = proposal.request.contract.rotation
     frames = []
     for frame, rotator_deg in enumerate(plan.rotators_deg):
         rotation = recorded_rotation(rotator_deg, form=form)

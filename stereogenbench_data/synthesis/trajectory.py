@@ -19,7 +19,6 @@ from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import FRAME_RATE_HZ
 from stereogenbench_data.synthesis.filters import (
     LIMITS,
-    PoseChecks,
     Refusal,
     check_poses,
     check_spawn,
@@ -66,19 +65,16 @@ def examine(proposal: Proposal, *, world: World) -> ScenePlan | Refusal:
     ahead = rotation_from_rotator_deg(rotators_deg)[..., 0]
     subject_m = ((body_m.mean(axis=1) - centres_m) * ahead).sum(axis=1)
     plan = ScenePlan(proposal, spawn, centres_m, rotators_deg, subject_m)
-    refusal = _check_motion(plan)
-    checks = search.checks(centres_m, rotators_deg, frames=slice(None))
-    if refusal is None and not checks.passed.all():
-        refusal = checks.refusal(int(checks.passed.argmin()))
-    return refusal or plan
+    return _check_motion(plan) or plan
 
 
 class _Knot(NamedTuple):
-    """A place of the path from which it can go on: the frame, the viewpoint and its speed."""
+    """A place of the path: the frame, the viewpoint, its speed, and viewpoints yet to be tried."""
 
     frame: int
     viewpoint: Array
     speed: Array
+    targets: Iterator[Array]
 
 
 class _Search:
@@ -135,16 +131,16 @@ class _Search:
         for frame in sorted({0, self.frames // 2, self.frames - 1}):
             at = np.full(len(pool), frame)
             centres_m, rotators_deg = self.poses(pool, at)
-            checks = self.checks(centres_m, rotators_deg, frames=at)
-            refused.update(checks.reasons[~checks.passed].tolist())
-            pool = pool[checks.passed]
+            reasons = self.checks(centres_m, rotators_deg, frames=at)
+            refused.update(reasons[reasons != ""].tolist())
+            pool = pool[reasons == ""]
             if len(pool) < LIMITS.viewpoints:
                 ((reason, _),) = refused.most_common(1)
                 return Refusal(reason, len(pool), LIMITS.viewpoints)
         return pool
 
-    def checks(self, centres_m: Array, rotators_deg: Array, *, frames: Any) -> PoseChecks:
-        """Ask all filters about poses at frames."""
+    def checks(self, centres_m: Array, rotators_deg: Array, *, frames: Array) -> Array:
+        """Ask all filters about poses at frames, as `check_poses`."""
         body_m = self.body_m[frames]
         return check_poses(centres_m, rotators_deg, body_m=body_m, rig=self.rig, world=self.world)
 
@@ -162,22 +158,21 @@ class _Search:
         speed = np.round(
             self.rng.choice([-1.0, 1.0], 3) * self.rng.uniform(0.5, 1.0, 3) * fastest, _DIGITS
         )
-        knots = [_Knot(0, start, speed * np.array([1.0, 1.0, start[2]]))]
+        speed = speed * np.array([1.0, 1.0, start[2]])
+        knots = [_Knot(0, start, speed, self._targets(pool, start))]
         path = np.empty((self.frames, 3))
         path[0] = start
-        tried: list[Iterator[Array]] = [self._targets(pool, start)]
         reached = 1
         for _ in range(_TRANSITIONS):
             knot = knots[-1]
             if knot.frame == self.frames - 1:
-                return np.round(path, _DIGITS)
-            target = next(tried[-1], None)
+                break
+            target = next(knot.targets, None)
             if target is None:
                 # All ways on from here fail: go back beyond it.
                 if len(knots) == 1:
                     break
                 knots.pop()
-                tried.pop()
                 continue
             length = int(self.rng.integers(*_SEGMENT_FRAMES))
             viewpoints, speed = _pulled(
@@ -189,8 +184,7 @@ class _Search:
                 continue
             last = knot.frame + held
             path[knot.frame + 1 : last + 1] = viewpoints[1:]
-            knots.append(_Knot(last, viewpoints[-1], speed))
-            tried.append(self._targets(pool, viewpoints[-1]))
+            knots.append(_Knot(last, viewpoints[-1], speed, self._targets(pool, viewpoints[-1])))
         if knots[-1].frame == self.frames - 1:
             return np.round(path, _DIGITS)
         return Refusal("transition", reached, self.frames)
@@ -210,9 +204,9 @@ class _Search:
         """Return how many of the viewpoints after the first hold, with the ways between them."""
         frames = np.arange(first, first + len(viewpoints))
         centres_m, rotators_deg = self.poses(np.round(viewpoints, _DIGITS), frames)
-        checks = self.checks(centres_m, rotators_deg, frames=frames)
+        reasons = self.checks(centres_m, rotators_deg, frames=frames)
         eyes = self.rig.eyes(centres_m, rotation_from_rotator_deg(rotators_deg))
-        held = checks.passed[1:] & ~obstructed(eyes, world=self.world)
+        held = (reasons[1:] == "") & ~obstructed(eyes, world=self.world)
         return len(held) if held.all() else int(held.argmin())
 
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.synthesis.produce import synthesise
-from stereogenbench_data.synthesis.render import RAY_CASTING
 from stereogenbench_data.synthesis.request import SynthRequest
 
 UNIT_M = 0.001
@@ -63,13 +62,13 @@ def draw(tmp_path_factory):
     """Draw one scene, once for all tests: by default 96 px wide, 3 frames."""
     drawn = {}
 
-    def draw_scene(*, renderer=RAY_CASTING, **request):
+    def draw_scene(**request):
         asked = SynthRequest(**{"size_px": 96, "frames": 3, "seed": 2} | request)
-        if (renderer, asked) not in drawn:
+        if asked not in drawn:
             out = tmp_path_factory.mktemp("synth")
-            (key,) = synthesise(out, asked, renderer=renderer)
-            drawn[renderer, asked] = Drawn(out / key)
-        return drawn[renderer, asked]
+            (key,) = synthesise(out, asked)
+            drawn[asked] = Drawn(out / key)
+        return drawn[asked]
 
     return draw_scene
 

@@ -110,38 +110,33 @@ HOLLOW = [
 
 
 POSES = [
-    ("a free view", yard(), {}, "", np.nan),
-    ("a free view of a wide rig", yard(), {"rig": WIDE}, "", np.nan),
-    ("a low wall", yard(((1.9, -3, 0), (2, 3, 0.6))), {}, "", np.nan),
-    ("a wall 25 cm behind the cameras", yard(((4.25, -5, 0), (5, 5, 3))), {}, "", np.nan),
-    ("a wall 15 cm behind them", yard(((4.15, -5, 0), (5, 5, 3))), {}, "collision", 0.15),
-    ("a block beside a narrow rig", yard(BESIDE), {}, "", np.nan),
-    ("a block in the outermost camera", yard(BESIDE), {"rig": WIDE}, "collision", 0),
-    ("outside the map", yard(size_m=((-3, -3, 0), (3, 3, 3))), {}, "collision", -1),
-    ("in the subject", yard(), {"eye": (0.45, 0, 0.9), "rig": CLOSE}, "collision", None),
-    ("a wall before the subject", yard(((1.9, -3, 0), (2, 3, 3))), {}, "visibility", 0),
-    ("a wall before half of it", yard(((1.9, -3, 0), (2, 3, 1.2))), {}, "visibility", None),
-    ("a post before one camera", yard(POST), {"rig": WIDE}, "visibility", None),
-    ("a roomy box around the cameras", yard(*HOLLOW), {}, "visibility", 0),
-    ("behind the cameras", yard(), {"yaw": 0.0}, "framing", 0),
-    ("beside the picture", yard(), {"yaw": 150.0}, "framing", 0),
-    ("larger than the picture", yard(), {"eye": (1, 0, 0.9)}, "framing", None),
-    ("small", yard(), {"eye": (18.9, 0, 1.0)}, "framing", None),
-    ("a picture full of sky", Blocks([FLOOR]), {"pitch": 8.0}, "valid_depth", None),
-    ("a near slab on the right", yard(SLAB), {"rig": NARROW}, "border_occluder", None),
+    ("a free view", yard(), {}, ""),
+    ("a free view of a wide rig", yard(), {"rig": WIDE}, ""),
+    ("a low wall", yard(((1.9, -3, 0), (2, 3, 0.6))), {}, ""),
+    ("a wall 25 cm behind the cameras", yard(((4.25, -5, 0), (5, 5, 3))), {}, ""),
+    ("a wall 15 cm behind them", yard(((4.15, -5, 0), (5, 5, 3))), {}, "collision"),
+    ("a block beside a narrow rig", yard(BESIDE), {}, ""),
+    ("a block in the outermost camera", yard(BESIDE), {"rig": WIDE}, "collision"),
+    ("outside the map", yard(size_m=((-3, -3, 0), (3, 3, 3))), {}, "collision"),
+    ("in the subject", yard(), {"eye": (0.45, 0, 0.9), "rig": CLOSE}, "collision"),
+    ("a wall before the subject", yard(((1.9, -3, 0), (2, 3, 3))), {}, "visibility"),
+    ("a wall before half of it", yard(((1.9, -3, 0), (2, 3, 1.2))), {}, "visibility"),
+    ("a post before one camera", yard(POST), {"rig": WIDE}, "visibility"),
+    ("a roomy box around the cameras", yard(*HOLLOW), {}, "visibility"),
+    ("behind the cameras", yard(), {"yaw": 0.0}, "framing"),
+    ("beside the picture", yard(), {"yaw": 150.0}, "framing"),
+    ("larger than the picture", yard(), {"eye": (1, 0, 0.9)}, "framing"),
+    ("small", yard(), {"eye": (18.9, 0, 1.0)}, "framing"),
+    ("a picture full of sky", Blocks([FLOOR]), {"pitch": 8.0}, "valid_depth"),
+    ("a near slab on the right", yard(SLAB), {"rig": NARROW}, "border_occluder"),
 ]
 
 
 @pytest.mark.parametrize(
-    ("world", "pose", "reason", "value"), [row[1:] for row in POSES], ids=[row[0] for row in POSES]
+    ("world", "pose", "reason"), [row[1:] for row in POSES], ids=[row[0] for row in POSES]
 )
-def test_a_pose_is_refused_for_what_is_in_its_way(world, pose, reason, value):
-    checks = looking(world, **pose)
-
-    assert checks.reasons.tolist() == [reason]
-    assert value is None or checks.values[0] == pytest.approx(value, nan_ok=True)
-    if reason in ("visibility", "valid_depth"):
-        assert 0 <= checks.values[0] < checks.limits[0]
+def test_a_pose_is_refused_for_what_is_in_its_way(world, pose, reason):
+    assert looking(world, **pose).tolist() == [reason]
 
 
 def test_a_thin_wall_between_two_frames_is_an_obstruction():
@@ -198,6 +193,7 @@ def test_a_yard_that_walls_cut_has_a_path_all_of_which_passes():
     plan = examine(drawn, world=world)
 
     body_m = np.stack([world.subject_points_m(plan.spawn, frame=t) for t in range(81)])
-    assert check_poses(
+    reasons = check_poses(
         plan.centres_m, plan.rotators_deg, body_m=body_m, rig=drawn.rig, world=world
-    ).passed.all()
+    )
+    assert (reasons == "").all()

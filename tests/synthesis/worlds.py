@@ -1,6 +1,6 @@
 """Maps with known answers for filters: boxes on floors that may have holes, made without ours."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,12 +14,9 @@ class Blocks:
 
     blocks: list
     size_m: tuple = ((-20.0, -20.0, 0.0), (20.0, 20.0, 12.0))
-    spawn_m: tuple = ((-0.01, -0.01, 0.0), (0.01, 0.01, 2.5))
     walk_m: float = 0.0
     jump_m: float = 0.0
-    height_m: float = 1.75
     sunk_m: float = 0.0
-    asked: list = field(default_factory=list)
 
     @property
     def bounds_m(self):
@@ -27,12 +24,11 @@ class Blocks:
 
     @property
     def spawn_bounds_m(self):
-        return np.array(self.spawn_m)
+        return np.array([[-0.01, -0.01, 0.0], [0.01, 0.01, 2.5]])
 
     def cast(self, origins_m, directions):
         assert origins_m.shape == directions.shape
         np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-9)
-        self.asked.append(len(origins_m))
         nearest = np.full(len(origins_m), np.inf)
         with np.errstate(divide="ignore", invalid="ignore"):
             for low, high in self.blocks:
@@ -53,7 +49,7 @@ class Blocks:
     def subject_points_m(self, spawn, *, frame):
         yaw = np.radians(spawn.yaw_deg)
         ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
-        heights = np.linspace(-self.sunk_m, self.height_m - self.sunk_m, 12)
+        heights = np.linspace(-self.sunk_m, 1.75 - self.sunk_m, 12)
         middle = spawn.place_m + ahead * (self.walk_m * frame / 80 + self.jump_m * (frame >= 4))
         post = middle + heights[:, None] * np.array([0.0, 0.0, 1.0])
         return np.concatenate([post, post[::4] + 0.15 * ahead])

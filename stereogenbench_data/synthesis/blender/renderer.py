@@ -81,11 +81,11 @@ class BlenderRenderer(Renderer):
     def views(self, plan: ScenePlan, *, cameras: tuple[int, ...]) -> Iterator[RenderedView]:
         """Yield the views of cameras; see `Renderer.views`."""
         proposal, settings = plan.proposal, self.assets.settings
-        seed = zlib.crc32(f"{plan.request.seed}/{plan.key}".encode()) >> 1
+        seed = zlib.crc32(f"{proposal.request.seed}/{proposal.key}".encode()) >> 1
         for frame in range(len(plan.centres_m)):
             seen = [plan.view(camera=camera, frame=frame) for camera in cameras]
             process = blender(self.map_of(proposal).file)
-            what = f"{plan.key}, frame {frame}"
+            what = f"{proposal.key}, frame {frame}"
             shot = Shot(frame, plan.spawn, seen, seed, settings, process.folder)
             depths_m = process.call("render", self.asked(proposal), shot, what=what)
             for number, depth_m in enumerate(depths_m):
