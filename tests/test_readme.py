@@ -34,7 +34,7 @@ def folder_with_scenes(tmp_path_factory):
     """A folder with ``scenes/``, as a reader of the README makes it."""
     folder = tmp_path_factory.mktemp("readme")
     (folder / "shards").symlink_to(README.parent / "shards")
-    for split, scenes in (("train", 3), ("eval", 1)):
+    for split, scenes in (("train", 2), ("eval", 1)):
         request = SynthRequest(
             family="Uniform", split=split, scenes=scenes, size_px=96, frames=5, seed=11
         )

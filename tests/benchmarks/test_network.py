@@ -49,14 +49,15 @@ def bodies_of_two_responses(folder, network):
     return asyncio.run(ask()).count(DATA)
 
 
-def test_the_delayed_server_waits_before_each_response(folder, waits_s):
-    assert bodies_of_two_responses(folder, Network(0.05)) == 2
-    assert waits_s == [0.05, 0.05]
-
-
-def test_the_delayed_server_limits_the_bandwidth(folder, waits_s):
-    assert bodies_of_two_responses(folder, Network(connection_mb_s=4.0)) == 2
-    assert sum(waits_s) == pytest.approx(2 * len(DATA) / 4e6)
+@pytest.mark.parametrize(
+    ("network", "waited_s"),
+    [(Network(0.05), 2 * 0.05), (Network(connection_mb_s=4.0), 2 * len(DATA) / 4e6)],
+)
+def test_the_server_waits_before_each_response_and_for_its_bytes(
+    folder, waits_s, network, waited_s
+):
+    assert bodies_of_two_responses(folder, network) == 2
+    assert sum(waits_s) == pytest.approx(waited_s)
 
 
 @pytest.fixture(scope="module")
