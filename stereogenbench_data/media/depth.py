@@ -151,16 +151,13 @@ def require_depth_stream(
     """
     layout = _layout(pixel_format)
     stored = f"{name}: depth is stored by codec {codec} as {pixel_format}"
-    if layout is None:
-        raise MediaError(
-            f"{stored}, which is not one number of 8 to 16 bits a pixel: no DepthEncoding accepts "
-            f"it. Store depth as gray16le with FFV1."
-        )
     is_lossy = not codec_of(codec).is_lossless and not codec.endswith(LOSSLESS_SUFFIX)
-    if layout.channels and is_lossy:
+    if layout is None or (layout.channels and is_lossy):
+        why = "which is not one number of 8 to 16 bits a pixel"
+        if layout is not None:
+            why = "lossy, and depth in channels of colours survives only without loss"
         raise MediaError(
-            f"{stored} (lossy), and depth in channels of colours survives only without loss: no "
-            f"DepthEncoding accepts it. Store depth as gray16le with FFV1."
+            f"{stored}, {why}: no DepthEncoding accepts it. Store depth as gray16le with FFV1."
         )
     risks = {
         f"{layout.bits}-bit": layout.bits < 16,

@@ -231,9 +231,8 @@ def _listed(container: InputContainer) -> SeekTable | None:
     entries = list(stream.index_entries)
     begins = stream.start_time or 0
     before = sum(entry.timestamp < begins for entry in entries)
-    if not entries or any(entry.is_discard for entry in entries):
-        return None
-    if any(a.pos + a.size > b.pos for a, b in pairwise(entries)):
+    is_in_order = all(a.pos + a.size <= b.pos for a, b in pairwise(entries))
+    if not entries or not is_in_order or any(entry.is_discard for entry in entries):
         return None
     return SeekTable(
         (*(entry.pos for entry in entries), entries[-1].pos + entries[-1].size),
