@@ -33,7 +33,7 @@ from stereogenbench_data.media.encoder import (
     write_pictures,
 )
 from stereogenbench_data.media.video import VideoReader, probe, read_rgb, require_indexed_picture
-from stereogenbench_data.schema.records import DepthEncoding, Scene, ShardFacts
+from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
     FRAME_RATE_HZ,
@@ -47,7 +47,6 @@ from stereogenbench_data.schema.training import DerivedFile, TrainingDocument, p
 from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.sources.members import MemberSource
 from stereogenbench_data.sources.ranged_file import require_crc32
-from stereogenbench_data.sources.retry import RetryPolicy
 
 _LARGEST_DENOMINATOR: Final = 100_000
 _DEPTH_BITS_A_PIXEL: Final = 1.5
@@ -102,13 +101,11 @@ class TrainingSettings:
 
 @dataclass(frozen=True, slots=True)
 class Derivation:
-    """All that a worker needs to derive scenes: the settings, and how the source is read."""
+    """What a worker needs to derive scenes: settings, the source's digest, and its reader."""
 
     settings: TrainingSettings
-    root: str
     digest: str
-    shards: Mapping[str, ShardFacts] = field(default_factory=dict)
-    retry: RetryPolicy | None = None
+    source: MemberSource
 
     @classmethod
     def of_index(
@@ -117,11 +114,8 @@ class Derivation:
         """Return the derivation of some scenes of an index."""
         used = {member.path for scene in scenes for member in scene.members.values()}
         shards = {path: facts for path, facts in index.shards.items() if path in used}
-        return cls(settings, index.root, index.digest, shards, index.retry)
-
-    def source(self) -> MemberSource:
-        """Return the reader of the source's files."""
-        return MemberSource(self.root, shards=self.shards, revision=self.digest, retry=self.retry)
+        source = MemberSource(index.root, shards=shards, revision=index.digest, retry=index.retry)
+        return cls(settings, index.digest, source)
 
 
 def derived_names(scene: Scene, settings: TrainingSettings) -> list[str]:
@@ -212,7 +206,7 @@ def derive_scene(
         return found
     folder.mkdir(parents=True, exist_ok=True)
     (folder / TRAINING_JSON).unlink(missing_ok=True)
-    source = derivation.source()
+    source = derivation.source
     files: dict[str, DerivedFile] = {}
     key_frames: set[int] | None = None
     try:
