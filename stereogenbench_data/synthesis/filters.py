@@ -295,17 +295,13 @@ def _visibility(poses: _Poses, world: World) -> Refused:
     return [("visibility", seen.mean(axis=2).min(axis=1) < LIMITS.visible_share)]
 
 
-def _grid_directions(rig: Rig) -> tuple[Array, Array]:
-    """Return rays (ahead, right, up; 1 ahead) over the picture, and which are at its border."""
+def _depth(poses: _Poses, world: World) -> Refused:
+    # Rays (ahead, right, up; 1 ahead) over the picture, and which are at its border.
     place = np.linspace(-_BORDER, _BORDER, _GRID)
     across, up = (each.ravel() for each in np.meshgrid(place, place))
-    width, height = rig.picture_at_1m
+    width, height = poses.rig.picture_at_1m
+    rays = np.column_stack([np.ones(_GRID**2), across * width / 2, up * height / 2])
     at_border = np.maximum(np.abs(across), np.abs(up)) >= _BORDER
-    return np.column_stack([np.ones(_GRID**2), across * width / 2, up * height / 2]), at_border
-
-
-def _depth(poses: _Poses, world: World) -> Refused:
-    rays, at_border = _grid_directions(poses.rig)
     length = np.sqrt((rays * rays).sum(axis=1))
     directions = np.einsum("nij,rj->nri", poses.axes, rays / length[:, None])
     count, cameras, _ = poses.eyes.shape

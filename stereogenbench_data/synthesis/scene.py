@@ -57,28 +57,6 @@ class Shape:
         return corners
 
 
-def limb(
-    start: Float64[np.ndarray, "3"],
-    end: Float64[np.ndarray, "3"],
-    *,
-    radius_m: float,
-    side: Float64[np.ndarray, "3"],
-    material: Material,
-) -> Shape:
-    """Return an ellipsoid along the line between two joints, a little longer than the line.
-
-    ``side`` is a unit direction that is not along the line.
-    """
-    along = end - start
-    length = float(np.linalg.norm(along))
-    first = along / length
-    second = np.cross(first, side)
-    second /= np.linalg.norm(second)
-    axes = np.stack([first, second, np.cross(first, second)])
-    half_m = np.array([length / 2 + 0.5 * radius_m, radius_m, radius_m])
-    return Shape("ellipsoid", (start + end) / 2, axes, half_m, material)
-
-
 def entry_depth(shape: Shape, *, origin: Sequence[Array], direction: Sequence[Array]) -> Array:
     """Return the t at which rays enter a shape from outside, infinity where they miss it.
 
@@ -198,17 +176,23 @@ class Figure:
             slope: Rise of the ground per metre along x and y.
             frame: The frame, at 15 Hz.
         """
-        first, second, radii_m = self._bones(spawn, slope, frame)
+        starts, ends, radii_m = self._bones(spawn, slope, frame)
         yaw = np.radians(spawn.yaw_deg)
         side = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
         skin, upper, lower = self.clothes
         materials = (upper, lower, skin, *(lower, lower, skin, upper, skin) * 2)
-        return [
-            limb(start, end, radius_m=radius_m, side=side, material=material)
-            for start, end, radius_m, material in zip(
-                first, second, radii_m, materials, strict=True
-            )
-        ]
+        shapes = []
+        for start, end, radius_m, material in zip(starts, ends, radii_m, materials, strict=True):
+            # An ellipsoid along the line between two joints, a little longer than the line.
+            along = end - start
+            length = float(np.linalg.norm(along))
+            first = along / length
+            second = np.cross(first, side)
+            second /= np.linalg.norm(second)
+            axes = np.stack([first, second, np.cross(first, second)])
+            half_m = np.array([length / 2 + 0.5 * radius_m, radius_m, radius_m])
+            shapes.append(Shape("ellipsoid", (start + end) / 2, axes, half_m, material))
+        return shapes
 
     def points_m(
         self, spawn: Spawn, *, slope: Float64[np.ndarray, "2"], frame: int

@@ -65,7 +65,15 @@ def examine(proposal: Proposal, *, world: World) -> ScenePlan | Refusal:
     ahead = rotation_from_rotator_deg(rotators_deg)[..., 0]
     subject_m = ((body_m.mean(axis=1) - centres_m) * ahead).sum(axis=1)
     plan = ScenePlan(proposal, spawn, centres_m, rotators_deg, subject_m)
-    return _check_motion(plan) or plan
+    step_m, turn_deg = plan.steps()
+    for values, limit in (
+        (step_m, LIMITS.step_m),
+        (turn_deg, LIMITS.turn_deg),
+        (np.abs(np.diff(turn_deg)), LIMITS.jerk_deg),
+    ):
+        if values.max(initial=0) > limit:
+            return Refusal("motion", float(values.max()), limit)
+    return plan
 
 
 class _Knot(NamedTuple):
@@ -208,19 +216,6 @@ class _Search:
         eyes = self.rig.eyes(centres_m, rotation_from_rotator_deg(rotators_deg))
         held = (reasons[1:] == "") & ~obstructed(eyes, world=self.world)
         return len(held) if held.all() else int(held.argmin())
-
-
-def _check_motion(plan: ScenePlan) -> Refusal | None:
-    """Refuse a path with a jump."""
-    step_m, turn_deg = plan.steps()
-    for values, limit in (
-        (step_m, LIMITS.step_m),
-        (turn_deg, LIMITS.turn_deg),
-        (np.abs(np.diff(turn_deg)), LIMITS.jerk_deg),
-    ):
-        if values.max(initial=0) > limit:
-            return Refusal("motion", float(values.max()), limit)
-    return None
 
 
 def _pulled(knot: _Knot, *, target: Array, frames: int) -> tuple[Array, Array]:
