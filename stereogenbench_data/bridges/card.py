@@ -258,7 +258,10 @@ def _head(index: SceneIndex, facts: dataset_facts.Facts, configs: _Configs) -> d
     """
     licence = _LICENCES.get(facts["license"])
     other = {"license": "other", "license_name": "other", "license_link": facts["license"]}
-    features = {name: FEATURES if name == _SCENES else _features(index) for name in configs}
+    members = index.scene(0).members
+    videos = sorted(name for name in members if name.startswith("cam_"))
+    own = columns(videos, of_training=TRAINING_JSON in members)
+    features = {name: FEATURES if name == _SCENES else own for name in configs}
     return {
         "pretty_name": facts["name"],
         **(other if licence is None else {"license": licence}),
@@ -284,12 +287,6 @@ def _head(index: SceneIndex, facts: dataset_facts.Facts, configs: _Configs) -> d
             for config, kinds in features.items()
         ],
     }
-
-
-def _features(index: SceneIndex) -> dict[str, str]:
-    members = index.scene(0).members
-    videos = sorted(name for name in members if name.startswith("cam_"))
-    return columns(videos, of_training=TRAINING_JSON in members)
 
 
 def _configs(index: SceneIndex) -> _Configs:

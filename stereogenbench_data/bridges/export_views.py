@@ -401,8 +401,11 @@ def export_views(
             total=len(cameras) * len(folders),
         )
         if layout == "moge":
+            # All that are there, and not what a killed run left.
+            found = (path.parent.relative_to(root).as_posix() for path in root.rglob("meta.json"))
+            whole = sorted(folder for folder in found if ".unfinished" not in folder)
             with named_errors(root):
-                _list_pictures(root)
+                write_atomic(root / INDEX_TXT, "".join(f"{each}\n" for each in whole).encode())
     return [*folders]
 
 
@@ -443,10 +446,3 @@ def _export_scene(work: _SceneWork, advance: Advance) -> None:
             with named_errors(folder), atomic_folder(folder) as unfinished:
                 WRITERS[work.layout](unfinished, images, work.points)
                 advance(len(images))
-
-
-def _list_pictures(root: Path) -> None:
-    """Write MoGe's list of folders: all that are there, and not what a killed run left."""
-    folders = (path.parent.relative_to(root) for path in root.rglob("meta.json"))
-    whole = sorted(each.as_posix() for each in folders if ".unfinished" not in each.as_posix())
-    write_atomic(root / INDEX_TXT, "".join(f"{folder}\n" for folder in whole).encode())

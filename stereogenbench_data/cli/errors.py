@@ -56,7 +56,8 @@ class ErrorsReported:
         """Turn an exception into a message and an exit status."""
         warnings.formatwarning = self._formatwarning
         error = _flush_error() or error
-        if error is None or _is_typers(error):
+        by_typer = isinstance(error, typer.Exit | typer.Abort | SystemExit | EOFError)
+        if error is None or by_typer or type(error).__module__.startswith(("typer.", "click.")):
             return
         if isinstance(error, BrokenPipeError):
             _discard(sys.stdout)
@@ -66,11 +67,6 @@ class ErrorsReported:
         except OSError:  # Only the exit status is left.
             _discard(sys.stderr)
         raise SystemExit(STOPPED if isinstance(error, KeyboardInterrupt) else NOT_DONE) from None
-
-
-def _is_typers(error: BaseException) -> bool:
-    by_typer = isinstance(error, typer.Exit | typer.Abort | SystemExit | EOFError)
-    return by_typer or type(error).__module__.startswith(("typer.", "click."))
 
 
 def _message(error: BaseException) -> str:
