@@ -668,7 +668,7 @@ def _without_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> Plan
                 reasons.setdefault(row, f"{name!r} needs {text}")
     for row in selected.intersection(index.remarked("videos").tolist()):
         if _missing_videos(index, plan, request, int(np.searchsorted(plan.scene_rows, row))):
-            reasons.setdefault(row, index.indexed_scene(row).remark("videos"))
+            reasons.setdefault(row, index.indexed_scene(row).remark("videos").rstrip("."))
     if not reasons:
         return plan
     first = min(reasons)

@@ -28,6 +28,7 @@ from stereogenbench_data.index.scene_folder import (
     ValidDepth,
     as_agreed,
     describe_scene,
+    missing_video,
     unfinished,
 )
 from stereogenbench_data.index.tree import (
@@ -42,7 +43,7 @@ from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.schema.conventions import Conventions, depth_of
 from stereogenbench_data.schema.document import brief
 from stereogenbench_data.schema.parse import parse_scene_key
-from stereogenbench_data.schema.records import REMARKS, Scene, SceneId
+from stereogenbench_data.schema.records import REMARKS, Remark, Scene, SceneId
 from stereogenbench_data.schema.release import (
     COMPLETE_JSON,
     METADATA_FILES,
@@ -376,7 +377,7 @@ def report_of(
     maps = {scene.map_name for scene in ids if scene.split == "train"} | TRAIN_MAPS
     found = [out.found for out in outcomes if isinstance(out.found, Scene)]
     agreed = agreed_forms(scene.pose_form for scene in found if scene.pose_form)
-    found = [as_agreed(scene, agreed) for scene in found]
+    found = _without_unfetched([as_agreed(scene, agreed) for scene in found])
     scenes, unnamed, labels = [], set(), []
     for scene in found:
         if scene.id.split == "eval" and scene.id.subset is None:
@@ -404,6 +405,33 @@ def report_of(
         notes=(*subsets, *named, *_remarks(found), *_depth_notes(found)),
         is_part=is_part,
     )
+
+
+def _without_unfetched(scenes: list[Scene]) -> list[Scene]:
+    """Return scenes without remarks on the cameras, or on the pictures or depth, that all lack.
+
+    These were not fetched, as in the part that a download writes. What one scene lacks is told.
+    """
+    if not all(scene.remark("videos") for scene in scenes):
+        return scenes
+    told = [scene.remark("videos").split("; ") for scene in scenes]
+    absent = {
+        name for name in VIDEO_FILES
+        if all(missing_video(scene.id.key, name) in each
+               for scene, each in zip(scenes, told, strict=True))
+    }  # fmt: skip
+    there = [name for name in VIDEO_FILES if name not in absent]
+    cameras, streams = {name[:6] for name in there}, {name[6:] for name in there}
+    if len(there) != len(cameras) * len(streams):
+        return scenes
+    kept = []
+    for scene, each in zip(scenes, told, strict=True):
+        left = [text for text in each
+                if text not in {missing_video(scene.id.key, name) for name in absent}]  # fmt: skip
+        remarks = [remark for remark in scene.remarks if remark.about != "videos"]
+        remarks += [Remark("videos", "; ".join(left))] if left else []
+        kept.append(replace(scene, remarks=tuple(remarks)))
+    return kept
 
 
 def _remarks(scenes: list[Scene]) -> list[str]:

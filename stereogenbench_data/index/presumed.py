@@ -698,10 +698,8 @@ def _differences(presumed: Scene, found: Scene, *, baselines: Baselines) -> Iter
     for what, value in before.items():
         if repr(now[what]) != repr(value):
             yield f"{what} presumed {value}, found {now[what]}"
-    if found.remark("videos") != presumed.remark("videos"):
-        yield found.remark("videos") or "videos that were missing are there"
-    elif found.members != presumed.members:
-        yield "its files have changed since it was opened"
+    if found.members != presumed.members:
+        yield found.remark("videos") or "its files have changed since it was opened"
     if found.remark("left") and not presumed.remark("left"):
         yield found.remark("left")
     if baselines == "read":
