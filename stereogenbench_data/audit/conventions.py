@@ -377,7 +377,9 @@ def _tested(
         if verdict.is_wrong:
             surveyed.problems.append(f"depth, {', '.join(verdict.scenes[:3])}: {line}")
     if report.left_out:
-        surveyed.verdicts.append(f"{len(report.left_out)} scenes have rigs that are not rectified")
+        key, reason = next(iter(report.left_out.items()))
+        count = counted(len(report.left_out), "scene")
+        surveyed.verdicts.append(f"{count} not compared with pictures, such as {key}: {reason}")
     return report
 
 

@@ -33,7 +33,7 @@ from stereogenbench_data.samples.picture import (
 )
 from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
-from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.schema.release import CAMERA_COUNT, rgb_name
 from stereogenbench_data.selection.filters import require_pairs
 from stereogenbench_data.selection.plan import Address
 from stereogenbench_data.sources.files import open_output
@@ -70,12 +70,13 @@ class SceneReader:
         request = Request(kind="pairs", fields=fields, layout="single")
         return self._read(request, Address(row, left, (right,), (frame,)))
 
-    def views(self, row: int, *, frame: int) -> UInt8[np.ndarray, "6 3 h w"]:
-        """Return the pictures of all six cameras at a frame; raises as `pair` does."""
+    def views(self, row: int, *, frame: int) -> dict[int, UInt8[np.ndarray, "3 h w"]]:
+        """Return the picture of each camera at a frame, if there is one; raises as `pair` does."""
+        members = self.index.scene(row).members
+        cameras = [camera for camera in range(CAMERA_COUNT) if rgb_name(camera) in members]
         request = Request(kind="views", fields=("image",), layout="stacked")
-        address = Address(row, 0, tuple(range(1, CAMERA_COUNT)), (frame,))
-        pictures: UInt8[np.ndarray, "6 3 h w"] = self._read(request, address)["image"]
-        return pictures
+        address = Address(row, cameras[0], tuple(cameras[1:]), (frame,))
+        return dict(zip(cameras, self._read(request, address)["image"], strict=True))
 
     def close(self) -> None:
         """Close open videos; the reader can be used again."""
@@ -189,14 +190,14 @@ def derived_text(scene: Scene) -> str:
     )
 
 
-def _view_tiles(scene: Scene, views: Any, pair: tuple[int, int]) -> list[Tile]:
+def _view_tiles(scene: Scene, views: dict[int, Any], pair: tuple[int, int]) -> list[Tile]:
     tiles = []
-    for camera in range(CAMERA_COUNT):
+    for camera, picture in views.items():
         side, frame = {pair[1]: (": right", RIGHT), pair[0]: (": left", LEFT)}.get(
             camera, ("", FRAME)
         )
         caption = f"camera {camera}, at {scene.lateral_m[camera] * 100:.1f} cm{side}"
-        tiles.append(Tile(caption, channels_last(views[camera]), frame=frame))
+        tiles.append(Tile(caption, channels_last(picture), frame=frame))
     return tiles
 
 

@@ -1,6 +1,8 @@
 """``stereogenbench doctor`` as a user runs it."""
 
 import json
+import re
+import shutil
 
 import pytest
 from PIL import Image
@@ -67,3 +69,19 @@ def test_a_picture_of_no_known_kind_is_refused_before_anything_is_read(tmp_path)
 
     assert result.exit_code == 2
     assert "name a picture" in result.stderr
+
+
+def test_a_scene_that_lacks_a_video_is_left_out_and_the_others_are_judged(
+    detailed_release, tmp_path
+):
+    (scene,) = detailed_release.glob("*/*/*/scene_*")
+    copied(scene, tmp_path)
+    cut = tmp_path.joinpath(*scene.parts[-4:-1], "scene_009999")
+    shutil.copytree(scene, cut)
+    (cut / "cam_02_rgb.mp4").write_bytes((cut / "cam_02_rgb.mp4").read_bytes()[:2000])
+
+    result = run(tmp_path)
+
+    assert result.exit_code == 0, result.output
+    assert "1 scene," in result.stdout
+    assert re.search(r"left out: \S+/scene_009999: .*cam_02_rgb.mp4", result.stdout)

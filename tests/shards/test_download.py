@@ -56,6 +56,25 @@ def test_a_camera_that_was_not_fetched_is_named(shards_on_the_web, tmp_path):
         StereoPairs(tmp_path / "part", pairs=[(2, 3)], fields=("left", "right"))
 
 
+def test_a_part_can_be_indexed_anew_packed_shown_and_audited(
+    shards_on_the_web, tmp_path, monkeypatch
+):
+    part = tmp_path / "part"
+    fetched(shards_on_the_web, part)
+    (part / "index.parquet").unlink()
+    monkeypatch.chdir(tmp_path)
+
+    for command in (
+        ["index", part], ["pack", part, "shards"], ["show", part, "-o", "sheet.png"],
+        ["audit", part], ["conventions", part],
+    ):  # fmt: skip
+        result = CliRunner().invoke(app, list(map(str, command)))
+        assert result.exit_code == 0, result.output
+    for data in (part, "shards"):
+        assert len(StereoPairs(data, pairs=[(0, 1)])) == 2
+        assert not SceneIndex.open(data).remarked("videos").size
+
+
 def test_a_stopped_run_goes_on_where_it_was(shards_on_the_web, web, tmp_path):
     dest = tmp_path / "part"
     fetched(shards_on_the_web, dest)

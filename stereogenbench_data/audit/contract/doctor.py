@@ -33,7 +33,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import Streams
 from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
-from stereogenbench_data.schema.release import TRAJECTORY_JSON
+from stereogenbench_data.schema.release import CAMERA_COUNT, TRAJECTORY_JSON
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.sources.members import MemberSource
 
@@ -120,12 +120,17 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
     index.require_released("The doctor")
     rows = filter_scenes(index, filters or {})
     residual_px = index.column("rig_residual_px")[rows]
+    is_whole = index.video_counts()[rows] == 2 * CAMERA_COUNT
     left_out = {
-        str(index.column("key")[row]): f"its rig is not rectified (by {residual:.3g} px)"
-        for row, residual in zip(rows, residual_px, strict=True)
-        if not residual <= MOST_RESIDUAL_PX
-    }
-    usable = rows[residual_px <= MOST_RESIDUAL_PX]
+        str(index.column("key")[row]): (
+            f"its rig is not rectified (by {residual:.3g} px)" if whole
+            else index.scene(int(row)).remark("videos").partition("; ")[0]
+            or "not all videos of its six cameras are there, and the doctor compares all"
+        )
+        for row, residual, whole in zip(rows, residual_px, is_whole, strict=True)
+        if not (whole and residual <= MOST_RESIDUAL_PX)
+    }  # fmt: skip
+    usable = rows[is_whole & (residual_px <= MOST_RESIDUAL_PX)]
     chosen = usable[list(spread(len(usable), scenes))]
     tasks = [
         DiagnosisTask(scene, source_of(index, scene), frames, depth or depth_of(scene))

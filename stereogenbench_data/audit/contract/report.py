@@ -43,6 +43,7 @@ _DB_NOTE: Final = (
     "dB of the quotient and the kind count small differences under a tight cap: they "
     "are not comparable with dB of flips, lags and orders."
 )
+_NAMED: Final = 6
 _READINGS: Final = (
     "Several readings of the poses fit the rigs; pixels whose depth is found in other frames:"
 )
@@ -56,7 +57,8 @@ def doctor_lines(report: DoctorReport) -> list[str]:
         _headline(report),
         f"{report.data}: {counted(len(report.scenes), 'scene')}, {counted(views, 'view')}, "
         f"{matches:,} pixels found in both pictures",
-        *(f"left out: {key}: {reason}" for key, reason in report.left_out.items()),
+        *(f"left out: {key}: {reason}" for key, reason in [*report.left_out.items()][:_NAMED]),
+        *([f"left out: {more} more"] if (more := len(report.left_out) - _NAMED) > 0 else []),
     ]
     silent = [scene for scene in report.scenes if scene.problem]
     if len(silent) < len(report.scenes):

@@ -67,6 +67,7 @@ class AuditedFiles:
 
     Attributes:
         problems: Maps the name of a file that cannot be read to the reason; it is not tried again.
+        not_fetched: The videos that only a whole release has: nothing is remarked about them.
     """
 
     def __init__(self, scene: Scene, source: MemberSource) -> None:
@@ -75,12 +76,16 @@ class AuditedFiles:
         self.scene, self.source = scene, source
         self.streams = Streams(self.source)
         self.intrinsics = rig_intrinsics(self.scene.rig)
+        self.not_fetched = {
+            name for name in VIDEO_FILES
+            if scene.held_name(name) not in scene.members and name not in scene.remark("videos")
+        }  # fmt: skip
 
     def attempt(
         self, name: str, read: Callable[..., Result], *args: Any, **kwargs: Any
     ) -> Result | None:
         """Return what ``read`` returns for a file, None if it or an earlier attempt failed."""
-        if name in self.problems:
+        if name in self.problems or name in self.not_fetched:
             return None
         try:
             return read(*args, **kwargs)
