@@ -126,6 +126,7 @@ def _write(index: SceneIndex, rows: list[int], path: Path, *, advance: Advance) 
     size = (round(rig.image_height_px * width / rig.image_width_px), width)
     pairs = StereoPairs(
         index, frames=[0], size=size, check="metadata",
+        split=sorted(set(index.column("split").tolist())),
         fields=("left", "right", "disparity", "valid", "baseline_m"),
     )  # fmt: skip
     options: dict[str, Any] = {"format": tarfile.PAX_FORMAT, "pax_headers": {_MARK: index.digest}}

@@ -6,6 +6,7 @@ Workers see the epoch through shared memory, and those that are spawned the rows
 """
 
 import copy
+import itertools
 import math
 import sys
 import warnings
@@ -90,6 +91,8 @@ class SharedEpoch:
         """Begin at an epoch that was never set, with no sample watched."""
         self._numbers = SharedNumbers([epoch, 0])
         self._watched = SharedNumbers([-1, -1, 0])  # epoch and sample, and whether it was told
+        self._ended: tuple[OrderRule, int, int] | None = None
+        self._ended_by, self._was_told = 0, False
 
     @property
     def value(self) -> int:
@@ -130,6 +133,24 @@ class SharedEpoch:
                 "every pass is of the next epoch.",
                 RepeatedEpochWarning,
                 stacklevel=3,
+            )
+
+    def mark_ended(self, rule: OrderRule, *, loader: int) -> None:
+        """Take a pass of the dataset's epoch as ended: its order, and the number of its loader."""
+        self._ended, self._ended_by = (rule, self.value, self.times_set), loader
+
+    def mark_begun(self, rule: OrderRule, *, loader: int) -> None:
+        """Warn, once, where another loader has ended the same pass of the dataset's epoch."""
+        is_again = self._ended == (rule, self.value, self.times_set)
+        if is_again and self._ended_by != loader and not self._was_told:
+            self._was_told = True
+            warnings.warn(
+                f"a new loader repeats epoch {self.value} of the loader before it: the same order, "
+                "random frames and transforms. Make the loader once, before the loop over epochs: "
+                "each of its passes is of the next epoch. Or call set_epoch(epoch) of the dataset, "
+                "or of the new loader, before each pass.",
+                RepeatedEpochWarning,
+                stacklevel=5,
             )
 
 
@@ -180,7 +201,7 @@ class EpochOptions(TypedDict, total=False):
     """How an epoch is ordered and divided among ranks.
 
     Attributes:
-        seed: The seed of the order; that of the dataset if left out.
+        seed: The seed of the order, the same on all ranks; that of the dataset if left out.
         rank: Whose batches these are, from 0. By default torch.distributed's rank, or 0 where it is
             not initialised.
         world_size: How many ranks there are. By default torch.distributed's world size, or 1.
@@ -288,6 +309,9 @@ class Pass:
         return self.epoch, min(self.start + self.taken * self.world_size, self.end)
 
 
+_numbers: Final = itertools.count(1)
+
+
 class Passes:
     """The passes over a rank's batches, one after another, or one within another.
 
@@ -302,15 +326,23 @@ class Passes:
 
     latest: Pass | None
 
-    def __init__(self, epoch: SharedEpoch, *, then: Literal["same epoch", "next epoch"]) -> None:
+    def __init__(
+        self,
+        epoch: SharedEpoch,
+        *,
+        then: Literal["same epoch", "next epoch"],
+        watched: OrderRule | None = None,
+    ) -> None:
         """Begin with the epoch of a dataset.
 
         Args:
             epoch: The dataset's. A sampler sets it, too. A loader follows it until an epoch of its
                 own is set.
             then: Which epoch follows a pass.
+            watched: A loader's order, if another loader of this order would repeat something.
         """
         self._dataset_epoch = epoch
+        self._watched, self._number = watched, next(_numbers)
         self._then = then
         self._follows = True
         self.go_to(epoch.value, 0)
@@ -364,6 +396,8 @@ class Passes:
         """Record that a pass begins."""
         if self._is_behind:
             self.go_to(begun.epoch, 0)
+        if self._watched and self._is_of_dataset(begun):
+            self._dataset_epoch.mark_begun(self._watched, loader=self._number)
         self._next = begun.epoch, 0
         self._running.append(begun)
         self.latest = begun
@@ -373,10 +407,16 @@ class Passes:
         if ended not in self._running:
             return
         self._running.remove(ended)
+        if self._watched and self._is_of_dataset(ended) and ended.taken > 1:  # no mere look
+            self._dataset_epoch.mark_ended(self._watched, loader=self._number)
         if self._running:
             self.latest = self._running[-1]
         elif self._then == "next epoch":
             self._next = ended.epoch + 1, 0
+
+    def _is_of_dataset(self, each: Pass) -> bool:
+        """Whether a pass is of the whole epoch that the dataset is at."""
+        return self._follows and (each.epoch, each.start) == (self._dataset_epoch.value, 0)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy needs: none of these passes is its own."""

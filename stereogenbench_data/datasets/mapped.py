@@ -436,7 +436,8 @@ class _MappedScenes(Dataset[Sample]):
         own = self.with_own_videos()
         own._is_watched = False  # a loader's passes are each of the next epoch
         batches = EpochBatches(own, batch_size, **ordering)
-        batches.passes = Passes(self.shared_epoch, then="next epoch")
+        repeats = batches.rule if batches.rule.shuffle or self.is_random else None
+        batches.passes = Passes(self.shared_epoch, then="next epoch", watched=repeats)
         return PairsLoader(own, batches, num_workers=num_workers, **others)
 
     def with_own_videos(self, *, epoch: int | None = None) -> Self:

@@ -235,9 +235,9 @@ def _claim_folder(plan: ShardPlan, out: Path) -> None:
             name for name in plan.settings | found if found.get(name) != plan.settings.get(name)
         ]
         raise ShardError(
-            f"{place}: this folder is for another plan ({', '.join(differing)} differ): of another "
-            f"release, size of the shards, depth codec or training settings. Pack into an empty "
-            f"folder, or remove what is in {out}."
+            f"{place}: this folder is for another plan ({', '.join(differing)} differ): of other "
+            f"scenes or cameras, size of the shards, depth codec or training settings. Pack into "
+            f"an empty folder, or remove what is in {out}."
         )
     known = {shard.name for shard in plan.shards} if is_claimed else set()
     for path in sorted(out.iterdir()) if out.exists() else []:

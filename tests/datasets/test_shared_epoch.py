@@ -171,3 +171,20 @@ def test_an_epoch_that_was_set_again_may_be_repeated(small_index, ordered_by):
     with pytest.warns(RepeatedEpochWarning, match="4 samples of 4 scenes.* epoch 0 come a second"):
         list(loader)
     assert keys_of(loader) == keys_of(loader)
+
+
+def test_a_loader_made_in_each_epoch_is_warned_of_once_where_it_would_repeat(small_index):
+    pairs = StereoPairs(small_index, frames="all", fields=("__key__",))
+    in_order = pairs.loader(2, shuffle=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RepeatedEpochWarning)
+        both = pairs.loader(2), pairs.loader(2)  # side by side
+        assert all(keys_of([a]) == keys_of([b]) for a, b in zip(*both, strict=True))
+        assert keys_of(in_order) == keys_of(pairs.loader(2, shuffle=False))
+        for epoch in range(3):
+            pairs.set_epoch(epoch)
+            list(pairs.loader(2))
+    with pytest.warns(RepeatedEpochWarning, match="repeats epoch 2 .* before the loop") as told:
+        orders = [keys_of(pairs.loader(2)) for _ in range(3)]
+    assert orders[0] == orders[1] == orders[2]
+    assert len(told) == 1
