@@ -295,9 +295,6 @@ if sys.platform != "win32":
         """A forked process that is sure to have begun once it was started."""
 
         _begun_signal: Any
-        _target: Any
-        _args: Any
-        _kwargs: Any
 
         def run(self) -> None:
             self._begun_signal.send_bytes(b"begun")
@@ -309,9 +306,9 @@ if sys.platform != "win32":
             Raises:
                 WorkerError: If it never does.
             """
-            work = (self._target, self._args, self._kwargs)
+            before = dict(self.__dict__)
             for _ in range(_MOST_FORKS):
-                self._target, self._args, self._kwargs = work  # a start drops them
+                self.__dict__.update(before)  # a start drops what it is to run
                 begun, self._begun_signal = connection.Pipe(duplex=False)
                 with begun, self._begun_signal:
                     super().start()
@@ -319,7 +316,6 @@ if sys.platform != "win32":
                         return
                 self.kill()
                 self.join()
-                self._popen = None  # as before the start
             raise WorkerError(
                 f"a DataLoader worker did not begin within {_BEGUN_WITHIN_S:g} s of its fork, in "
                 f"{_MOST_FORKS} attempts: a thread of this process holds a lock. Use "
