@@ -142,11 +142,6 @@ class Trajectory:
     rotations: Float64[np.ndarray, "frames 6 ..."]
     rotation_kind: RotationKind
 
-    @property
-    def frame_count(self) -> int:
-        """The number of frames that have poses."""
-        return len(self.locations)
-
 
 def _is_length(value: object, *, least: float) -> bool:
     return isinstance(value, int | float) and least <= value <= sys.float_info.max
