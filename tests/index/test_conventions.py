@@ -54,6 +54,7 @@ def test_a_scene_is_the_same_by_the_file_it_taught(elsewhere, shared_scenes):
         ('"$.camera_intrinsics.focal_length_mm"\nunit = "mm"',
          '"$.camera_intrinsics.focal_length_mm"\nunit = "cm"', r"45\.0 cm"),
         ("$.camera_intrinsics.focal_length_mm", "$.camera_intrinsics.flange", r"flange"),
+        ("$.camera_intrinsics.focal_length_mm", "$camera_intrinsics", r"\$camera_int.* is not in"),
         ("$.image_width", "$.camera_count", r"6x320.*320x320"),
         ('"$.pairwise_pairs"\nunit = "cm"', '"$.pairwise_pairs"\nunit = "m"', r"pairwise_pairs"),
         ("pair.left_camera", "pair.right_camera", r"Cam_01.*Cam_01"),

@@ -86,7 +86,10 @@ def test_a_caption_is_the_detailed_one(text):
     assert parse_caption(text, where="d.json") == ("A yard with a wall.", ())
 
 
-@pytest.mark.parametrize("text", [b"{}", b'{"short_caption": true}', b'{"tags": [3]}', b"[]", b""])
+LONG = b'{"caption": "%s"}' % (b"x" * 70_000)
+
+
+@pytest.mark.parametrize("text", [b"{}", b'{"caption": true}', b'{"tags": [3]}', b"[]", b"", LONG])
 def test_a_description_without_texts_has_no_caption_and_stops_nothing(text):
     caption, remarks = parse_caption(text, where="d.json")
 
