@@ -34,9 +34,12 @@ def test_a_right_tree_ends_with_0_and_says_what_was_tested(detailed_release, tmp
 def test_a_wrong_quotient_ends_with_1_and_no_unit_to_paste(detailed_release, tmp_path):
     stated = tmp_path / "stated.toml"
     stated.write_text("[depth]\nunit_m = 0.1\ninstead_of_tag_m = 0.001\n")
+    text = run(detailed_release, "--conventions", stated)
     result = run(detailed_release, "--json", "--conventions", stated)
 
-    assert result.exit_code == 1
+    assert text.exit_code == result.exit_code == 1
+    assert "One of these explains the quotient; the pictures cannot tell which:" in text.stdout
+    assert "better than the declared one" in text.stdout
     document = json.loads(result.stdout)
     assert "unit / (focal length x baseline)" in document["quotient_means"]
     assert document["is_wrong"]

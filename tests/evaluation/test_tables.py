@@ -246,17 +246,12 @@ def test_frames_are_averaged_before_pairs_and_these_before_scenes():
     assert found.scenes == 2
 
 
-def test_identical_frames_are_counted_and_not_averaged():
-    found = cell([pair("a", [10, math.inf]), pair("b", [math.inf, math.inf])], "psnr")
+def test_identical_frames_and_those_without_a_score_are_counted_and_not_averaged():
+    same = cell([pair("a", [10, INF]), pair("b", [INF, INF])], "psnr")
+    none = cell([pair("a", [10, NAN]), pair("b", [NAN]), pair("c", [20])], "psnr")
 
-    assert (found.mean, found.infinite, found.scenes) == (10, 3, 1)
-    assert found.ci95 is None
-
-
-def test_frames_without_a_score_are_counted():
-    found = cell([pair("a", [10, math.nan]), pair("b", [math.nan]), pair("c", [20])], "psnr")
-
-    assert (found.mean, found.undefined, found.scenes) == (15, 2, 2)
+    assert (same.mean, same.infinite, same.scenes, same.ci95) == (10, 3, 1, None)
+    assert (none.mean, none.undefined, none.scenes) == (15, 2, 2)
 
 
 def test_the_interval_of_three_scenes_is_the_hand_worked_one():
