@@ -376,6 +376,8 @@ def _parsed(described: Any, content: bytes) -> dict[str, SeekTable]:
     at, spans_at = 0, sum(int(row[7]) + int(row[8]) for row in described)
     for name, packets, keys, *reads in described:
         delay, has_neighbours, opening, blind_jump, head, tail, first = map(int, reads)
+        if packets > _MOST_PACKETS:
+            return {}
         spans = np.frombuffer(content, dtype=">u4", count=packets, offset=spans_at)
         tables[str(name)] = table = SeekTable(
             (first, *(first + np.cumsum(spans, dtype=np.int64)).tolist()),

@@ -8,8 +8,7 @@ HF_HUB_OFFLINE ...), and fsspec's settings for ``hf`` go before them.
 """
 
 import re
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Generator
 from typing import Any, Final, Literal, NamedTuple
 from urllib.parse import quote, unquote
 
@@ -57,7 +56,6 @@ class HubTransport(WebTransport):
     """One file of a dataset of the Hub, in huggingface_hub's cache or by HTTP."""
 
     longest_whole_bytes = _LARGEST_IN_GIT
-    is_versioned = False  # a commit keeps its files; a content network's servers differ in ETags
 
     def __init__(self, url: str, *, expected_size: int | None = None) -> None:
         """Name a file; nothing is requested yet.
@@ -115,7 +113,7 @@ class HubTransport(WebTransport):
 
     def pinned(self, timeout_s: float) -> str:
         """Return the URL of a folder as of the commit that its branch is at now."""
-        file, commit = self._file, self._commit(timeout_s)
+        file, commit = self._file, quote(self._commit(timeout_s, of="folder"), safe="")
         return f"hf://datasets/{file.repository}@{commit}/{file.path}".rstrip("/")
 
     def _tree(self, timeout_s: float, *, depth: Literal["one level", "all levels"]) -> list[Any]:
@@ -125,22 +123,16 @@ class HubTransport(WebTransport):
                 f"{self._where}: HF_HUB_OFFLINE is set, and the Hub's cache does not hold whole "
                 f"folders. Unset it, or pass an index or a folder of this machine."
             )
-        file, commit = self._file, self._commit(timeout_s)
-        with self._api() as api:
-            listed = api.list_repo_tree(
+        with require_installed(self._where, extra="hub"):
+            from huggingface_hub import HfApi
+        file, commit = self._file, self._commit(timeout_s, of="folder")
+        endpoint, token = _settings()
+        with FilesystemTransport(self._where).named_errors():
+            listed = HfApi(endpoint, token=token, library_name=_LIBRARY).list_repo_tree(
                 file.repository, file.path.strip("/") or None,
                 repo_type="dataset", revision=commit, recursive=depth == "all levels",
             )  # fmt: skip
             return list(listed)
-
-    @contextmanager
-    def _api(self) -> Iterator[Any]:
-        """Yield the Hub's client; errors of the block are named."""
-        with require_installed(self._where, extra="hub"):
-            from huggingface_hub import HfApi
-        endpoint, token = _settings()
-        with FilesystemTransport(self._where).named_errors():
-            yield HfApi(endpoint, token=token, library_name=_LIBRARY)
 
     def _in_cache(self, timeout_s: float) -> FilesystemTransport | None:
         """Return what reads the file in the Hub's cache; None if it is read by HTTP."""
@@ -153,7 +145,6 @@ class HubTransport(WebTransport):
     def _find(self, timeout_s: float) -> FilesystemTransport | None:
         with require_installed(self._where, extra="hub"):
             from huggingface_hub import constants, try_to_load_from_cache
-            from huggingface_hub.utils import build_hf_headers
         file, offline = self._file, is_offline()
         revision = file.revision if offline else self._commit(timeout_s)
         cached = try_to_load_from_cache(
@@ -167,26 +158,38 @@ class HubTransport(WebTransport):
                 f"({constants.HF_HUB_CACHE}). Unset it, or fetch the file while online: `hf "
                 f"download`, or `stereogenbench download` and pass its folder."
             )
+        self._point_at(revision, file.path)
+        return None
+
+    def _point_at(self, revision: str, path: str) -> None:
+        """Take the address of a file by HTTP, and the login."""
+        with require_installed(self._where, extra="hub"):
+            from huggingface_hub.utils import build_hf_headers
         endpoint, token = _settings()
         login = build_hf_headers(token=token, library_name=_LIBRARY)
         self._headers = {"Accept-Encoding": "identity", **login}
-        place = f"{quote(revision, safe='')}/{quote(file.path)}"
-        self._url = f"{endpoint}/datasets/{file.repository}/resolve/{place}"
-        return None
+        place = f"{quote(revision, safe='')}/{quote(path)}"
+        self._url = f"{endpoint}/datasets/{self._file.repository}/resolve/{place}"
+        # A commit does not change; ETags and dates of a content network's servers may differ.
+        self.is_versioned = _COMMIT.fullmatch(revision) is None
 
-    def _commit(self, timeout_s: float) -> str:
-        """Return the commit of the revision, the same for all that this process reads."""
-        file = self._file
-        if _COMMIT.fullmatch(file.revision):
-            return file.revision
-        key = (_settings()[0], f"{file.repository}@{file.revision}")
-        if key not in _commits:
-            with self._api() as api:
-                found = api.dataset_info(
-                    file.repository, revision=file.revision, timeout=timeout_s, expand=["sha"]
-                )
-            _commits.setdefault(key, str(found.sha))
-        return _commits[key]
+    def _commit(self, timeout_s: float, *, of: Literal["file", "folder"] = "file") -> str:
+        """Return the commit of the revision, the same for all that this process reads.
+
+        The branch itself where the Hub does not say.
+        """
+        branch = self._file.revision
+        key = (_settings()[0], f"{self._file.repository}@{branch}")
+        if not _COMMIT.fullmatch(branch) and key not in _commits:
+            # Of a folder, which has no such URL, a file is asked for that every repository has.
+            self._point_at(branch, self._file.path if of == "file" else ".gitattributes")
+            response = self._ask(self._url, {"Range": "bytes=0-0"}, timeout_s, follow=False)
+            response.close()
+            found = response.headers.get("X-Repo-Commit", "")
+            if response.status >= 400 and not _COMMIT.fullmatch(found):
+                raise self.refusal(response)
+            _commits.setdefault(key, found if _COMMIT.fullmatch(found) else branch)
+        return _commits.get(key, branch)
 
     def refusal(self, response: urllib3.BaseHTTPResponse) -> Exception:
         """Return the error of a response without content, as the Hub names it."""

@@ -7,16 +7,22 @@ Errors do not chain urllib3's own, whose messages hold the whole URL with its se
 """
 
 import functools
+import http.client
+import io
 import logging
 import os
 import re
+import socket
+import time
 from collections.abc import Generator, Mapping
 from contextlib import nullcontext
-from typing import Final, NamedTuple
+from contextvars import ContextVar
+from typing import Any, Final, NamedTuple
 from urllib.parse import unquote, urljoin, urlunsplit
 from urllib.request import getproxies, proxy_bypass
 
 import urllib3
+import urllib3.connection
 from urllib3.exceptions import HTTPError, MaxRetryError, ResponseError
 
 from stereogenbench_data.errors import StorageError
@@ -62,6 +68,53 @@ _RATE_LIMIT: Final = re.compile(r";r=0;t=([0-9]{1,6})(?:[;,]|$)")
 _MOST_ADDRESSES: Final = 50_000
 _addresses: Final[dict[tuple[str, str], str]] = {}
 """Where URLs led to, by URL and login, as servers have redirected this process."""
+
+
+_until_s: Final[ContextVar[float | None]] = ContextVar("_until_s", default=None)
+"""Until when, on the monotonic clock, the request that this thread makes may be answered."""
+
+
+class _LimitedStream(io.RawIOBase):
+    """The bytes of a response; all waits for them together have the time of one, as for trickles.
+
+    urllib3 limits each wait alone. A response that takes longer is resumed by another request.
+    """
+
+    def __init__(self, stream: io.RawIOBase, connection: socket.socket, until_s: float) -> None:
+        super().__init__()
+        self._stream, self._connection, self._until_s = stream, connection, until_s
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any, /) -> int | None:
+        left_s = self._until_s - time.monotonic()
+        if left_s <= 0:
+            raise TimeoutError("the answer is not whole in time")
+        self._connection.settimeout(left_s)
+        return self._stream.readinto(buffer)
+
+    def close(self) -> None:
+        self._stream.close()
+        super().close()
+
+
+class _LimitedResponse(http.client.HTTPResponse):
+    def __init__(self, sock: socket.socket, *args: Any, **how: Any) -> None:
+        super().__init__(sock, *args, **how)
+        until_s = _until_s.get()
+        if until_s is not None:
+            self.fp = io.BufferedReader(_LimitedStream(self.fp.detach(), sock, until_s))
+
+
+class _Pool(urllib3.HTTPConnectionPool):
+    class ConnectionCls(urllib3.connection.HTTPConnection):
+        response_class = _LimitedResponse
+
+
+class _SecurePool(urllib3.HTTPSConnectionPool):
+    class ConnectionCls(urllib3.connection.HTTPSConnection):
+        response_class = _LimitedResponse
 
 
 class _Stated(NamedTuple):
@@ -187,7 +240,9 @@ class WebTransport:
     def _address_key(self) -> tuple[str, str]:
         return self._url, self._headers.get("authorization", "")
 
-    def _ask(self, url: str, part: Mapping[str, str], timeout_s: float) -> urllib3.BaseHTTPResponse:
+    def _ask(
+        self, url: str, part: Mapping[str, str], timeout_s: float, *, follow: bool = True
+    ) -> urllib3.BaseHTTPResponse:
         """Return a server's response, of which nothing but the head is read yet."""
         sent = {**self._headers, **part}
         etag = self._first_seen.get("version", {}).get("ETag", "")
@@ -195,10 +250,12 @@ class WebTransport:
             sent["If-Range"] = etag
         if split_url(url)[:2] != split_url(self._url)[:2]:
             sent.pop("authorization", None)
+        token = _until_s.set(time.monotonic() + timeout_s)
         try:
             response = _pool(url).request(
                 "GET", url,
-                headers=sent, timeout=timeout_s, retries=_REDIRECTS_ONLY, preload_content=False,
+                headers=sent, timeout=timeout_s, retries=_REDIRECTS_ONLY, redirect=follow,
+                preload_content=False,
             )  # fmt: skip
         except (ValueError, UnicodeError):
             raise self._error(
@@ -210,6 +267,8 @@ class WebTransport:
                     f"is redirected more than {_MOST_REDIRECTS} times: check the URL."
                 ) from None
             raise TransientError(_reason(error)) from None
+        finally:
+            _until_s.reset(token)
         hops = response.retries.history if response.retries is not None else ()
         for hop in hops:
             url = urljoin(url, hop.redirect_location or "")
@@ -305,8 +364,11 @@ def _pool(url: str) -> urllib3.PoolManager:
 def pool_of(process: int, proxy: str) -> urllib3.PoolManager:
     """Return the connections of a process through a proxy, "" for none."""
     if proxy:
-        return urllib3.ProxyManager(proxy, maxsize=_MOST_CONNECTIONS)
-    return urllib3.PoolManager(maxsize=_MOST_CONNECTIONS)
+        pool: urllib3.PoolManager = urllib3.ProxyManager(proxy, maxsize=_MOST_CONNECTIONS)
+    else:
+        pool = urllib3.PoolManager(maxsize=_MOST_CONNECTIONS)
+    pool.pool_classes_by_scheme = {"http": _Pool, "https": _SecurePool}
+    return pool
 
 
 def _reason(error: BaseException) -> str:

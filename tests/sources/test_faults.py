@@ -1,7 +1,9 @@
 """Servers that are dead, busy or slow: named errors in bounded time, reads that end at once."""
 
+import contextlib
 import logging
 import multiprocessing
+import socketserver
 import threading
 import time
 
@@ -60,6 +62,35 @@ def test_a_dead_server_is_a_named_error_within_the_longest_outage(dead, how):
 
     assert f"{url}/x.tar : cannot be read, at byte" in text
     assert "slower than timeout_s=0.2: SceneIndex.open(..., retry=RetryPolicy(timeout_s=0" in text
+
+
+class Trickling(socketserver.BaseRequestHandler):
+    def handle(self):
+        self.request.recv(65536)
+        with contextlib.suppress(OSError):
+            for letter in self.server.answer + b"x" * 5000:
+                self.request.sendall(bytes([letter]))
+                time.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"HTTP/1.1 206 x\r\nX: ",
+        b"HTTP/1.1 302 x\r\nLocation: /y\r\nContent-Length: 5000\r\n\r\n",
+    ],
+    ids=["its head", "a redirect"],
+)
+def test_a_server_that_trickles_is_a_named_error_within_the_longest_outage(answer):
+    policy = retry_policy(attempts=999, timeout_s=0.2, longest_outage_s=0.4)
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Trickling) as server:
+        server.answer, server.daemon_threads = answer, True
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+
+        text = ended(lambda: reason_of(f"http://127.0.0.1:{server.server_address[1]}", policy))
+        server.shutdown()
+
+    assert "cannot be read, at byte 0" in text
 
 
 def test_a_slow_server_is_read_to_the_end_while_it_goes_on(served):

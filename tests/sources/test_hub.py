@@ -140,7 +140,8 @@ def test_what_is_read_of_a_branch_is_of_one_commit(hub):
     first, second = RemoteObject(BRANCH), RemoteObject(BRANCH)
     assert first.read(0, 9) + second.read(9, 18) == DATA[:18]
 
-    assert resolved(hub) == [(COMMIT, "x.tar")]
+    # The branch is asked for once in a process, and only for its commit.
+    assert resolved(hub) == [("main", "x.tar"), (COMMIT, "x.tar")]
 
 
 def test_a_small_file_that_the_hub_sends_whole_is_read_in_parts(hub):
