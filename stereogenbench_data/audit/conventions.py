@@ -39,6 +39,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import PAIR_FIELDS, VIEW_FIELDS
 from stereogenbench_data.schema.conventions import Conventions, DepthAs, PosesAs, Shape, write_toml
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
+from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.location import is_remote, shown
 
@@ -240,6 +241,10 @@ def _diagnosed(
     surveyed: Survey, scenes: Sequence[Scene], depth: DepthEncoding | None, how: dict[str, Any]
 ) -> DoctorReport | None:
     """Return what pictures say of a contract; None, and why, where they cannot be compared."""
+    scenes = [scene for scene in scenes if len(scene.held_videos) == 2 * CAMERA_COUNT]
+    if not scenes:
+        surveyed.verdicts.append("not compared with pictures: no scene has all six cameras' videos")
+        return None
     index = SceneIndex.from_scenes(scenes, surveyed.root)
     try:
         return diagnose(index, scenes=len(scenes), frames=FRAMES, depth=depth, **how)

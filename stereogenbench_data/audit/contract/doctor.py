@@ -28,6 +28,7 @@ from stereogenbench_data.audit.contract.worlds import (
 )
 from stereogenbench_data.audit.scene_access import source_of, spread
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
+from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.evidence import shape_of
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import Streams
@@ -130,6 +131,12 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
         for row, residual, whole in zip(rows, residual_px, is_whole, strict=True)
         if not (whole and residual <= MOST_RESIDUAL_PX)
     }  # fmt: skip
+    if not is_whole.any():
+        key, reason = next(iter(left_out.items()))
+        raise StorageError(
+            f"{index.where}: no scene has all videos of its six cameras, and the doctor compares "
+            f"all. The first: {key}: {reason}. Fetch them again, or download the other cameras too."
+        )
     usable = rows[is_whole & (residual_px <= MOST_RESIDUAL_PX)]
     chosen = usable[list(spread(len(usable), scenes))]
     tasks = [
