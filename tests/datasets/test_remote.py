@@ -41,7 +41,7 @@ def root_of(request, small_shards):
         server = request.getfixturevalue("shards_served" if kind == "web" else kind)
         if kind == "hub":
             return f"hf://datasets/{REPOSITORY}"
-        return server if kind == "s3" else server.url
+        return server.url if kind == "web" else server
 
     return find
 

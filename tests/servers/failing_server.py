@@ -119,10 +119,10 @@ class FileHandler(BaseHTTPRequestHandler):
             )
         self.server.stopped.wait(answer.delay_s)
         if answer.status is not None:
-            self._empty(answer.status, answer.headers, name)
+            self._empty(answer.status, name, answer.headers)
             return
         if not path.is_file():
-            self._empty(404, {}, name)
+            self._empty(404, name)
             return
         whole = path.read_bytes()
         found = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
@@ -135,38 +135,38 @@ class FileHandler(BaseHTTPRequestHandler):
             stop = min(stop, int(found[2]) + 1 if found[2] else stop)
         size = len(whole) if answer.size is None else answer.size
         if start >= size:
-            self._empty(416, {"Content-Range": f"bytes */{size}"}, name)
+            self._empty(416, name, {"Content-Range": f"bytes */{size}"})
             return
         body = whole[start:stop]
         cut = answer.change(body) if answer.change else body
         cut = cut if answer.stop_after is None else cut[: answer.stop_after]
-        # Counted first: who asked may look at the count as soon as it has the headers.
-        headers = {key.lower(): value for key, value in self.headers.items()}
-        with self.server.lock:
-            self.server.asked.append(Asked(name, start, stop, headers, sent=len(cut)))
-        self.send_response(206 if found and not answer.whole else 200)
+        self._note(name, start, stop, sent=len(cut))
+        headers = dict(self.server.validators)
         if found and not answer.whole:
             told = answer.content_range or f"bytes {start}-{start + len(body) - 1}/{size}"
-            self.send_header("Content-Range", told)
-        for key, value in self.server.validators.items():
-            self.send_header(key, value)
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
+            headers["Content-Range"] = told
+        self.send_head(206 if found and not answer.whole else 200, headers, length=len(body))
         for place in range(0, len(cut), answer.piece_bytes):
             self.server.stopped.wait(answer.pause_s)
             self.wfile.write(cut[place : place + answer.piece_bytes])
         self.close_connection = len(cut) < len(body)
 
-    def _empty(self, status: int, headers: dict[str, str], name: str) -> None:
-        with self.server.lock:
-            self.server.asked.append(
-                Asked(name, 0, 0, {key.lower(): value for key, value in self.headers.items()})
-            )
+    def send_head(self, status: int, headers: dict[str, str], *, length: int = 0) -> None:
+        """Send all of an answer but its body."""
         self.send_response(status)
-        for key, value in headers.items():
+        for key, value in (headers | {"Content-Length": str(length)}).items():
             self.send_header(key, value)
-        self.send_header("Content-Length", "0")
         self.end_headers()
+
+    def _note(self, name: str, start: int = 0, stop: int = 0, *, sent: int = 0) -> None:
+        """Count a request: before its answer, as who has that may look at the count."""
+        headers = {key.lower(): value for key, value in self.headers.items()}
+        with self.server.lock:
+            self.server.asked.append(Asked(name, start, stop, headers, sent=sent))
+
+    def _empty(self, status: int, name: str, headers: dict[str, str] | None = None) -> None:
+        self._note(name)
+        self.send_head(status, headers or {})
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import pytest
 from stereogenbench_data.shards.pack import pack
 from tests.servers.failing_server import FailingServer, serving
 from tests.servers.hub import hub_serving
-from tests.servers.nginx import Nginx, nginx_serving
+from tests.servers.nginx import nginx_serving
 from tests.servers.tools import made_once, require_module, require_tool
 from tests.servers.videos import write_depth, write_rgb
 
@@ -67,11 +67,11 @@ def web(tmp_path: Path) -> Iterator[FailingServer]:
 
 
 @pytest.fixture
-def nginx(tmp_path: Path, small_shards: Path) -> Iterator[Nginx]:
-    """An nginx that serves `small_shards`."""
+def nginx(tmp_path: Path, small_shards: Path) -> Iterator[str]:
+    """The URL at which an nginx serves `small_shards`."""
     program = require_tool("nginx")
-    with nginx_serving(small_shards, home=tmp_path / "nginx", program=program) as server:
-        yield server
+    with nginx_serving(small_shards, home=tmp_path / "nginx", program=program) as url:
+        yield url
 
 
 @pytest.fixture
@@ -85,21 +85,16 @@ def hub(small_shards: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Failing
 def s3_endpoint(small_shards: Path) -> Iterator[str]:
     """The address of an S3 endpoint with `small_shards` in the folder shards of `BUCKET`."""
     require_module("s3fs")
-    boto = require_module("boto3")
     moto = require_module("moto.server")
     server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
     host, port = server.get_host_and_port()
     url = f"http://{host}:{port}"
-    store = boto.client(
-        "s3", endpoint_url=url, region_name="us-east-1",
-        aws_access_key_id="key", aws_secret_access_key="word",
-    )  # fmt: skip
-    store.create_bucket(Bucket=BUCKET)
+    store = fsspec.filesystem("s3", key="key", secret="word", endpoint_url=url)
+    store.mkdir(BUCKET)
     for path in sorted(small_shards.iterdir()):
         if path.is_file():
-            store.upload_file(str(path), BUCKET, f"shards/{path.name}")
-    store.close()
+            store.put_file(str(path), f"{BUCKET}/shards/{path.name}")
     yield url
     server.stop()
 

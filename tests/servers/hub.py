@@ -33,6 +33,10 @@ _REVISIONS: Final = ("main", COMMIT)
 _numbers = itertools.count()
 
 
+def _etag(path: Path) -> str:
+    return f'"{zlib.crc32(path.read_bytes()):08x}"'
+
+
 class HubHandler(FileHandler):
     """Answers as the Hub does, below the server's folder."""
 
@@ -42,10 +46,7 @@ class HubHandler(FileHandler):
         """Answer a question for a file's facts, which need no signature."""
         path = self.server.folder / unquote(urlsplit(self.path).path).removeprefix("/files/")
         if self.path.startswith("/files/") and path.is_file():
-            self.send_response(200)
-            self.send_header("Content-Length", str(path.stat().st_size))
-            self.send_header("ETag", f'"{zlib.crc32(path.read_bytes()):08x}"')
-            self.end_headers()
+            self.send_head(200, {"ETag": _etag(path)}, length=path.stat().st_size)
         else:
             self.do_GET()
 
@@ -115,7 +116,7 @@ class HubHandler(FileHandler):
         facts.setdefault("resolved", []).append((revision, name, dict(self.headers.items())))
         if refusal := next(iter(facts.get("refusals", ())), None):
             facts["refusals"].pop(0)
-            self._empty(*refusal, name)
+            self._empty(refusal[0], name, refusal[1])
             return
         if revision not in _REVISIONS:
             self._refuse(404, "RevisionNotFound")
@@ -127,56 +128,41 @@ class HubHandler(FileHandler):
             self._refuse(403, "GatedRepo")
             return
         if name in facts.get("in_git", ()):
-            whole = path.read_bytes()
-            self.send_response(200)
-            self.send_header("ETag", '"git"')
-            self.send_header("X-Repo-Commit", COMMIT)
-            self.send_header("Content-Length", str(len(whole)))
-            self.end_headers()
-            self.wfile.write(whole)
+            headers = {"ETag": '"git"', "X-Repo-Commit": COMMIT}
+            self.send_head(200, headers, length=path.stat().st_size)
+            self.wfile.write(path.read_bytes())
             return
         signature, signed_for_s = f"secret{next(_numbers)}", facts.get("signed_for_s", 3600)
         facts.setdefault("signatures", {})[signature] = time.time() + signed_for_s
         now = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         signed = f"X-Amz-Date={now}&X-Amz-Expires={signed_for_s}&X-Amz-Signature={signature}"
         content_network = f"http://{self.headers['Host'].replace('127.0.0.1', 'localhost')}"
-        self.send_response(302)
-        self.send_header("Location", f"{content_network}/files/{name}?{signed}")
-        self.send_header("X-Repo-Commit", COMMIT)
-        self.send_header("X-Linked-Size", str(path.stat().st_size))
-        self.send_header("X-Linked-ETag", f'"{zlib.crc32(path.read_bytes()):08x}"')
-        self.send_header("Content-Length", "0")
-        self.end_headers()
+        headers = {"X-Linked-Size": str(path.stat().st_size), "X-Linked-ETag": _etag(path)}
+        headers |= {"Location": f"{content_network}/files/{name}?{signed}", "X-Repo-Commit": COMMIT}
+        self.send_head(302, headers)
 
     def _send_signed(self, path: str) -> None:
         """Send a file to who knows a signature that is valid now."""
         found = parse_qs(urlsplit(self.path).query).get("X-Amz-Signature", [""])[0]
         until_s = self.server.facts.get("signatures", {}).get(found, 0.0)
         if "Authorization" in self.headers:
-            self._empty(400, {}, path)
+            self._empty(400, path)
         elif time.time() >= until_s:
-            self._empty(403, {}, path)
+            self._empty(403, path)
         else:
             self.path = path
             super().do_GET()
 
     def _refuse(self, status: int, code: str) -> None:
-        self.send_response(status)
-        self.send_header("X-Error-Code", code)
-        if code == "EntryNotFound":
-            self.send_header("X-Repo-Commit", COMMIT)
-        self.send_header("Content-Length", "0")
-        self.end_headers()
+        commit = {"X-Repo-Commit": COMMIT} if code == "EntryNotFound" else {}
+        self.send_head(status, {"X-Error-Code": code} | commit)
 
     def _json(self, document: object) -> None:
         text = json.dumps(document).encode()
-        self.send_response(200)
-        self.send_header("Content-Type", "application/json")
+        headers = {"Content-Type": "application/json"}
         if self.next_page:
-            self.send_header("Link", f'<{self.next_page}>; rel="next"')
-            self.next_page = ""
-        self.send_header("Content-Length", str(len(text)))
-        self.end_headers()
+            headers["Link"], self.next_page = f'<{self.next_page}>; rel="next"', ""
+        self.send_head(200, headers, length=len(text))
         self.wfile.write(text)
 
 

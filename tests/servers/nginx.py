@@ -5,7 +5,6 @@ import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 _CONFIG = """
@@ -29,17 +28,9 @@ http {{
 """
 
 
-@dataclass
-class Nginx:
-    """A running nginx."""
-
-    url: str
-    home: Path
-
-
 @contextmanager
-def nginx_serving(folder: Path, *, home: Path, program: str) -> Iterator[Nginx]:
-    """Serve a folder with nginx on a free port of this machine."""
+def nginx_serving(folder: Path, *, home: Path, program: str) -> Iterator[str]:
+    """Serve a folder with nginx on a free port of this machine, at the URL that is yielded."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -49,7 +40,7 @@ def nginx_serving(folder: Path, *, home: Path, program: str) -> Iterator[Nginx]:
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as server:
         try:
             _wait_for(port, server, home=home)
-            yield Nginx(f"http://127.0.0.1:{port}", home)
+            yield f"http://127.0.0.1:{port}"
         finally:
             server.terminate()
 

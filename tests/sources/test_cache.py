@@ -107,10 +107,7 @@ def test_wrong_bytes_are_fetched_again_once(cache, shard):
 def test_bytes_that_stay_wrong_are_an_error_and_are_not_kept(cache, shard, tmp_path):
     shard.wrong = [bytes(2000), bytes(2000)]
 
-    with pytest.raises(
-        ShardError,
-        match=r"https://h/x.tar : the 2000 bytes from 1000 on .* [0-9a-f]{8}, twice.*use the",
-    ):
+    with pytest.raises(ShardError, match=r"h/x.tar : the 2000 bytes from 1000 .*, twice"):
         cache.open(member(1000, 2000), remote=shard, revision="1")
     assert items(tmp_path) == []
     assert cache.used_bytes() == 0
@@ -125,9 +122,7 @@ def test_an_item_that_was_written_into_is_fetched_again(cache, shard, tmp_path):
 
 
 @pytest.mark.parametrize(("crc32", "fetched"), [(zlib.crc32(DATA[1000:3000]), 1), (None, 2)])
-def test_an_item_of_another_time_is_kept_if_its_checksum_is_right(
-    cache, shard, tmp_path, crc32, fetched
-):
+def test_an_item_of_another_time_is_kept_by_its_checksum(cache, shard, tmp_path, crc32, fetched):
     wanted = member(1000, 2000, crc32=crc32)
     read(cache, wanted, shard)
     os.utime(items(tmp_path)[0])
@@ -181,9 +176,7 @@ def test_a_reader_keeps_what_was_evicted_under_it(cache, shard):
 
 
 def test_an_item_above_the_limit_is_refused_with_both_sizes(cache, shard):
-    with pytest.raises(
-        StorageError, match=r"limit of 10000 bytes is below the 10001 bytes of a member of https"
-    ):
+    with pytest.raises(StorageError, match="limit of 10000 bytes is below the 10001 bytes"):
         cache.open(member(0, 10_001), remote=shard, revision="1")
     assert shard.fetched == []
     assert len(read(cache, member(0, 10_000), shard)) == 10_000

@@ -6,6 +6,7 @@ import multiprocessing
 import socketserver
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import fsspec
 import pytest
@@ -73,13 +74,11 @@ class Trickling(socketserver.BaseRequestHandler):
                 time.sleep(0.02)
 
 
+REDIRECT = b"HTTP/1.1 302 x\r\nLocation: /y\r\nContent-Length: 5000\r\n\r\n"
+
+
 @pytest.mark.parametrize(
-    "answer",
-    [
-        b"HTTP/1.1 206 x\r\nX: ",
-        b"HTTP/1.1 302 x\r\nLocation: /y\r\nContent-Length: 5000\r\n\r\n",
-    ],
-    ids=["its head", "a redirect"],
+    "answer", [b"HTTP/1.1 206 x\r\nX: ", REDIRECT], ids=["its head", "a redirect"]
 )
 def test_a_server_that_trickles_is_a_named_error_within_the_longest_outage(answer):
     policy = retry_policy(attempts=999, timeout_s=0.2, longest_outage_s=0.4)
@@ -108,9 +107,7 @@ def test_a_slow_server_is_read_to_the_end_while_it_goes_on(served):
         ("s3://bucket/shards", {"key": "key", "secret": "word", "endpoint_url": ...}),
     ],
 )
-def test_a_dead_store_is_a_named_error_within_the_longest_outage(
-    monkeypatch, dead, root, conf, how
-):
+def test_a_dead_store_is_an_error_within_the_longest_outage(monkeypatch, dead, root, conf, how):
     policy, url = retry_policy(attempts=999, timeout_s=0.2, longest_outage_s=0.4), dead(how)
     conf = {name: url if value is ... else value for name, value in conf.items()}
     monkeypatch.setitem(fsspec.config.conf, root.partition(":")[0], conf)
@@ -121,9 +118,7 @@ def test_a_dead_store_is_a_named_error_within_the_longest_outage(
 
 
 @pytest.mark.parametrize("status", [429, 503])
-def test_a_busy_server_is_left_alone_by_all_reads_of_a_process_until_it_said(
-    served, monkeypatch, status
-):
+def test_a_busy_server_is_left_alone_by_all_reads_of_a_process(served, monkeypatch, status):
     served.answers = [Answer(status=status, headers={"Retry-After": "30"})]
     waits = waits_noted(monkeypatch)
     url = f"{served.url}/x.tar"
@@ -144,35 +139,20 @@ def test_a_wait_longer_than_the_policy_allows_is_an_error_and_not_kept(served):
 
 
 def test_many_threads_keep_their_connections(served, caplog):
-    remote, wrong = RemoteObject(f"{served.url}/x.tar"), []
+    remote, starts = RemoteObject(f"{served.url}/x.tar"), range(0, 160_000, 1000)
 
-    def read(first):
-        for start in range(first, first + 5000, 1000):
-            if remote.read(start, start + 500) != DATA[start : start + 500]:
-                wrong.append(start)
+    with caplog.at_level(logging.WARNING), ThreadPoolExecutor(32) as threads:
+        found = list(threads.map(lambda start: remote.read(start, start + 500), starts))
 
-    with caplog.at_level(logging.WARNING):
-        threads = [threading.Thread(target=read, args=(1000 * each,)) for each in range(32)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-
-    assert wrong == []
+    assert found == [DATA[start : start + 500] for start in starts]
     assert "pool is full" not in caplog.text
     assert served.connections <= 32
 
 
 def test_a_forked_process_reads_over_a_connection_of_its_own(served):
     RemoteObject(f"{served.url}/x.tar").read(0, 9)
-    here, there = FORK.Pipe(duplex=False)
-    worker = FORK.Process(
-        target=lambda: there.send(RemoteObject(f"{served.url}/x.tar").read(9, 18))
-    )
-    worker.start()
-    worker.join()
-
-    assert here.recv() == DATA[9:18]
+    with FORK.Pool(1) as pool:
+        assert pool.apply(RemoteObject(f"{served.url}/x.tar").read, (9, 18)) == DATA[9:18]
     assert RemoteObject(f"{served.url}/x.tar").read(18, 27) == DATA[18:27]
     assert served.connections == 2
 

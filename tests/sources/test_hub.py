@@ -2,7 +2,7 @@
 
 import logging
 import pickle
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import fsspec
 import pytest
@@ -78,30 +78,21 @@ def test_a_signed_url_that_is_refused_at_once_is_an_error_that_does_not_show_it(
     hub.facts["signed_for_s"] = 0
     remote = RemoteObject(PINNED, retry=retry_policy(attempts=1))
 
-    with pytest.raises(
-        StorageError, match=r"x.tar : the server answers 403 .*check access"
-    ) as error:
+    with pytest.raises(StorageError, match=r"x.tar : the server answers 403 ") as error:
         remote.read(0, 9)
     assert "secret" not in str(error.value)
 
 
 def test_threads_resolve_a_signed_url_that_was_refused_once(hub):
-    remote, wrong = RemoteObject(PINNED), []
+    remote = RemoteObject(PINNED)
     remote.read(0, 9)
     hub.facts["signatures"].clear()
     hub.facts["resolved"].clear()
 
-    def read(start):
-        if remote.read(start, start + 9) != DATA[start : start + 9]:
-            wrong.append(start)
+    with ThreadPoolExecutor(8) as threads:
+        found = list(threads.map(lambda start: remote.read(start, start + 9), range(8)))
 
-    threads = [threading.Thread(target=read, args=(start,)) for start in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-
-    assert wrong == []
+    assert found == [DATA[start : start + 9] for start in range(8)]
     assert len(resolved(hub)) == 1
 
 
@@ -115,9 +106,7 @@ def test_the_login_goes_to_the_hub_and_not_to_its_content_network(hub, monkeypat
     assert all("authorization" not in asked.headers for asked in hub.asked)
 
 
-def test_nothing_that_is_logged_shown_or_sent_to_a_process_holds_a_signature(
-    hub, caplog, monkeypatch
-):
+def test_nothing_logged_shown_or_sent_to_a_process_holds_a_signature(hub, caplog, monkeypatch):
     conf = fsspec.config.conf["hf"] | {"token": "hf_mine"}
     monkeypatch.setitem(fsspec.config.conf, "hf", conf)
     monkeypatch.setattr(RetryPolicy, "attempts", 2)
@@ -156,9 +145,7 @@ def test_a_small_file_that_the_hub_sends_whole_is_read_in_parts(hub):
 def test_a_repository_that_asks_for_consent_says_so(hub):
     hub.facts["gated"] = True
 
-    with pytest.raises(
-        StorageError, match=r"x.tar : its repository asks for consent. .*hf auth lo"
-    ):
+    with pytest.raises(StorageError, match=r"x.tar : .*asks for consent. .*hf auth login"):
         RemoteObject(PINNED).read(0, 9)
 
 
@@ -190,9 +177,7 @@ def test_offline_the_cache_is_read_and_nothing_is_requested(hub, own_cache, monk
     monkeypatch.setattr(hub_transport, "is_offline", lambda: True)
 
     assert RemoteObject(BRANCH).read(5, 9) == DATA[5:9]
-    with pytest.raises(
-        StorageError, match=r"y.tar : HF_HUB_OFFLINE is set, and the file is not in"
-    ):
+    with pytest.raises(StorageError, match=r"y.tar : HF_HUB_OFFLINE is set, and the file"):
         RemoteObject(BRANCH.replace("x.tar", "y.tar")).read(0, 9)
     with pytest.raises(StorageError, match=r"HF_HUB_OFFLINE is set, and the Hub's cache does not"):
         RemoteObject(BRANCH).entries()

@@ -153,9 +153,7 @@ def test_a_pass_over_all_bytes_compares_them_with_their_checksum(size):
     passed_over(RangedFile(store.fetch, size=size, name="a.mp4"))
     wrong = RangedFile(store.fetch, size=size, name="a.mp4", crc32=right ^ 1)
 
-    with pytest.raises(
-        ShardError, match=f"a.mp4: has crc32 {right:08x}, and the index says {right ^ 1:08x}. It"
-    ):
+    with pytest.raises(ShardError, match=f"a.mp4: has crc32 {right:08x}, .* {right ^ 1:08x}"):
         passed_over(wrong)
     assert isinstance(wrong.failure, ShardError)
 

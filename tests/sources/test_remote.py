@@ -50,15 +50,11 @@ def test_waits_double_up_to_a_limit_while_nothing_is_gained(served, waits):
     served.always["x.tar"] = Answer(status=503)
     remote = RemoteObject(f"{served.url}/x.tar", retry=retry_policy(longest_wait_s=3.0))
 
-    with pytest.raises(
-        StorageError,
-        match=r"x.tar : .* byte 0 of 9 \(the server answers 503 .*; 10 tries\). Check the network",
-    ):
+    with pytest.raises(StorageError, match=r"x.tar : .* byte 0 of 9 \(.* 503 .*; 10 tries\)"):
         remote.read(0, 9)
     longest_s = [0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28, 2.56, 3.0]
-    assert all(
-        most_s / 2 <= wait_s <= most_s for wait_s, most_s in zip(waits, longest_s, strict=True)
-    )
+    for wait_s, most_s in zip(waits, longest_s, strict=True):
+        assert most_s / 2 <= wait_s <= most_s
 
 
 def test_silence_is_retried(served, waits):
@@ -72,18 +68,12 @@ def test_silence_is_retried(served, waits):
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
-        (
-            Answer(404),
-            r"404 .*\. Check the URL, and that the index and its shards lie in one folder",
-        ),
+        (Answer(404), r"404 .*\. Check the URL, and that the index and its shards lie in one"),
         (Answer(403), r"403 .*\. It may not be read with what the URL says: check access"),
         (Answer(401), r"401 .*\. It asks for a login"),
         (Answer(400), r"400 .*\. Check the URL and the server"),
         (Answer(whole=True), r"whole file \(256000 bytes\) .* 5 to 8.* use a server that honours"),
-        (
-            Answer(content_range="bytes 6-8/256000"),
-            "sends bytes 6 to 8 when asked for bytes 5 to 8",
-        ),
+        (Answer(content_range="bytes 6-8/256000"), "sends bytes 6 to 8 .* asked for bytes 5 to 8"),
         (Answer(content_range="pages 5-8/256000"), r"206 .*which part .*\('?.*'pages 5-8/256000'"),
         (Answer(content_range=f"bytes 5-8/{'9' * 5000}"), "206 and does not state which part"),
         (Answer(content_range="bytes 5-8/*"), "206 and does not state .* the size of the whole"),
@@ -119,10 +109,7 @@ def test_a_file_of_another_size_than_the_index_says_is_reported(served, start, s
     remote = RemoteObject(f"{served.url}/x.tar", expected_size=256_010)
 
     for _ in range(2):
-        with pytest.raises(
-            ShardError,
-            match=r"x.tar : has 256000 bytes, and the index says 256010. .*use the index that was",
-        ):
+        with pytest.raises(ShardError, match=r"x.tar : has 256000 bytes, .* says 256010"):
             remote.read(start, stop)
 
 
@@ -155,15 +142,11 @@ MONDAY, TUESDAY = "Mon, 02 Feb 2026 07:28:00 GMT", "Tue, 03 Feb 2026 07:28:00 GM
     [
         ({"ETag": '"a"'}, {"ETag": '"b"'}, r'its ETag was "a" and is "b"', True),
         ({"ETag": 'W/"a"'}, {"ETag": 'W/"b"'}, r'its ETag was W/"a" and is W/"b"', False),
-        (
-            {"ETag": '"a"', "Last-Modified": MONDAY},
-            {"Last-Modified": TUESDAY},
-            f"its Last-Modified was {MONDAY} and is {TUESDAY}",
-            True,
-        ),
+        ({"ETag": '"a"', "Last-Modified": MONDAY}, {"Last-Modified": TUESDAY},
+         f"its Last-Modified was {MONDAY} and is {TUESDAY}", True),
     ],
-)
-def test_a_file_that_is_replaced_between_two_ranges_is_reported(
+)  # fmt: skip
+def test_a_file_replaced_between_ranges_is_reported(
     served, before, after, message, honours_if_range
 ):
     served.validators, served.honours_if_range = before, honours_if_range
@@ -173,9 +156,7 @@ def test_a_file_that_is_replaced_between_two_ranges_is_reported(
     served.validators = after
 
     for _ in range(2):
-        with pytest.raises(
-            ShardError, match=rf"x.tar : was replaced on its server while it was read: {message}. "
-        ):
+        with pytest.raises(ShardError, match=rf"x.tar : was replaced on its server .*{message}\. "):
             remote.read(9, 18)
 
 

@@ -60,7 +60,7 @@ class TestReleasedFolderOverHttp(TestReleasedFolder):
 class TestNginx(SourceTests):
     @pytest.fixture
     def root(self, nginx):
-        return nginx.url
+        return nginx
 
 
 class TestHub(SourceTests):
