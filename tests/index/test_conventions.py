@@ -144,9 +144,7 @@ def test_files_of_no_shape_are_refused(make_scene, root):
         SceneIndex.open(root, conventions=stated(text))
 
 
-def test_what_a_scene_could_not_be_used_for_is_told_and_its_keys_are_listed(
-    make_scene, root, rewrite
-):
+def test_what_a_scene_cannot_be_used_for_is_told_with_its_keys(make_scene, root, rewrite):
     rewrite(make_scene() / "baseline.json", lambda d: d.update(camera_intrinsics={"zoom": 30.0}))
 
     learned, text = learned_of(root)

@@ -17,11 +17,11 @@ from stereogenbench_data.geometry.pose import (
 from stereogenbench_data.index.evidence import (
     SidesError,
     agreed_forms,
-    shape_of,
     understood_poses,
 )
 from stereogenbench_data.schema.parse import contradictions
 from stereogenbench_data.schema.records import Rig, SceneLabels
+from tests.servers.scene_fixtures import frames_of
 
 PLACES_CM = np.array([0.0, 6.5, 19.0, 26.5, 60.0, 66.0])
 RIG = Rig(
@@ -128,32 +128,18 @@ class Written:
 
 
 def written(form, rotators, places_cm, *, axes="unreal", unit="cm", **said):
-    frames = [
-        {
-            "frame_index": frame,
-            "cameras": [
-                {"camera_index": camera}
-                | FORMS[form](
-                    Written(rotators[frame, camera], places_cm[frame, camera], axes, unit)
-                )
-                for camera in range(6)
-            ],
-        }
-        for frame in range(len(rotators))
-    ]
+    def pose(frame, camera):
+        return FORMS[form](Written(rotators[frame, camera], places_cm[frame, camera], axes, unit))
+
+    frames = frames_of(len(rotators), pose)
     return json.dumps({"unit": unit, "frames": frames} | said).encode()
 
 
 def motions(poses):
     """The motions between cameras, and of each camera from its first place."""
     first = np.linalg.inv(poses.world_from_cam(0, 0))
-    return np.array(
-        [
-            first @ poses.world_from_cam(frame, camera)
-            for frame in range(poses.frame_count)
-            for camera in range(6)
-        ]
-    )
+    places = np.ndindex(poses.frame_count, 6)
+    return np.array([first @ poses.world_from_cam(frame, camera) for frame, camera in places])
 
 
 def truth(rotators, places_cm):
@@ -341,12 +327,3 @@ def test_scenes_of_one_shape_decide_together():
 
     assert agreed == {"a": ("a: x @ 1.0",), "b": ("b: z @ 1.0",)}
     assert agreed_forms(["a: x @ 1.0", "a: y @ 1.0"]) == {"a": ()}
-
-
-def test_the_shape_of_a_form_is_its_keys():
-    first = understood(written("rotator", *TURNED)).names[0]
-    again = understood(written("rotator", *TURNED, unit="m")).names[0]
-    other = understood(written("quaternion", *TURNED)).names[0]
-
-    assert shape_of(first) == shape_of(again) != first
-    assert shape_of(other) == shape_of(first)  # the keys are alike: location and rotation

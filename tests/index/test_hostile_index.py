@@ -1,6 +1,5 @@
 """Index files that somebody made to take time or memory."""
 
-import json
 import shutil
 
 import pyarrow as pa
@@ -10,7 +9,7 @@ import pytest
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.table import SceneIndex
 from tests.hostile import run_bounded
-from tests.index.test_table import METADATA, scene_of
+from tests.index.test_table import altered, scene_of, written
 
 OPEN = """
 import sys
@@ -27,10 +26,7 @@ for file in sys.argv[1:]:
 
 @pytest.fixture
 def file(tmp_path):
-    SceneIndex.from_scenes([scene_of(number) for number in range(3)], tmp_path).write(
-        tmp_path / "index.parquet"
-    )
-    return tmp_path / "index.parquet"
+    return written([scene_of(number) for number in range(3)], tmp_path)
 
 
 def rewritten(file, table):
@@ -96,10 +92,8 @@ def test_a_long_text_is_refused_with_its_length_alone(file):
 
 
 def test_reasons_of_any_length_are_listed_by_their_start(file):
-    table = pq.read_table(file)
-    head = json.loads(table.schema.metadata[METADATA])
-    head["broken"] = {f"scene {number}": "x" * 100_000 for number in range(50)}
-    pq.write_table(table.replace_schema_metadata({METADATA: json.dumps(head)}), file)
+    reasons = {f"scene {number}": "x" * 100_000 for number in range(50)}
+    altered(file, lambda table, head: head.update(broken=reasons))
 
     with pytest.warns(UserWarning, match="50 scenes cannot be used") as told:
         SceneIndex.open(file)

@@ -5,13 +5,11 @@ import json
 import os
 
 import pytest
-from typer.testing import CliRunner
 
-from stereogenbench_data.cli.commands import app
 from stereogenbench_data.index import build as walk_module
 from stereogenbench_data.index.open_tree import IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex
-from tests.cli.command import invoke
+from tests.cli.command import invoke, one_line
 
 
 @pytest.fixture
@@ -35,10 +33,9 @@ def test_an_index_may_lie_elsewhere(make_scene, root, run, tmp_path):
 def test_commands_take_the_root_of_an_index_elsewhere(small_release, tmp_path):
     kept = tmp_path / "kept.parquet"
     SceneIndex.open(small_release).write(kept)
-    told = ["stats", str(kept), "--json"]
 
-    refused = CliRunner().invoke(app, told)
-    taken = CliRunner().invoke(app, [*told, "--root", str(small_release)])
+    refused = invoke("stats", kept, "--json")
+    taken = invoke("stats", kept, "--json", "--root", small_release)
 
     assert refused.exit_code == 2
     assert "or --root with a command" in refused.stderr
@@ -84,9 +81,7 @@ def test_a_contradiction_that_is_not_fatal_is_reported(make_scene, root, run):
     assert "such as train/Uniform/Downtown_West/scene_000000: 'Car_Dealer'" in result.stderr
 
 
-def test_a_tree_that_cannot_be_written_asks_for_a_file_elsewhere(
-    make_scene, root, run, tmp_path, monkeypatch
-):
+def test_a_read_only_tree_asks_for_a_file_elsewhere(make_scene, root, run, tmp_path, monkeypatch):
     make_scene()
 
     journal = walk_module.scene_journal
@@ -100,16 +95,13 @@ def test_a_tree_that_cannot_be_written_asks_for_a_file_elsewhere(
     refused, elsewhere = run(root), run(root, "-o", tmp_path / "elsewhere.parquet")
 
     assert refused.exit_code == 2
-    said = " ".join(refused.stderr.replace("│", " ").split())
-    assert "(Read-only file system)" in said
-    assert "place that can be written" in said
+    assert "(Read-only file system)" in one_line(refused.stderr)
+    assert "place that can be written" in one_line(refused.stderr)
     assert elsewhere.exit_code == 0
     assert len(SceneIndex.open(tmp_path / "elsewhere.parquet", root=root)) == 1
 
 
-def test_a_stopped_run_keeps_its_journal_and_a_second_one_uses_it(
-    make_scene, root, run, monkeypatch
-):
+def test_a_second_run_uses_the_journal_of_a_stopped_one(make_scene, root, run, monkeypatch):
     for number in range(3):
         make_scene(f"train/Uniform/Car_Dealer/scene_{number:06d}")
     describe = walk_module.describe_scene

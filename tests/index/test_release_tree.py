@@ -66,10 +66,8 @@ def test_a_root_inside_the_release_or_above_it_is_answered_with_the_right_one(tr
 def test_a_folder_without_scenes_says_what_was_looked_for(tmp_path):
     (tmp_path / "pictures").mkdir()
 
-    with pytest.raises(
-        StorageError,
-        match=r"looked for folders train/<family>/<map>/<scene> or eval/.*found pictures in it",
-    ):
+    told = r"looked for folders train/<family>/<map>/<scene> or eval/.*found pictures in it"
+    with pytest.raises(StorageError, match=told):
         find_scene_folders(tmp_path)
 
 

@@ -14,9 +14,8 @@ from stereogenbench_data.index.tree import CACHE_VARIABLE
 from tests.servers.hub import REPOSITORY, hub_serving
 
 HUB = f"hf://datasets/{REPOSITORY}@main"
-KEYS = [f"train/Uniform/Map_{number % 2}/scene_{number:06d}" for number in range(10)] + [
-    f"eval/MapSeenInTrain/Uniform/Map_0/scene_{number:06d}" for number in range(40)
-]
+KEYS = [f"train/Uniform/Map_{number % 2}/scene_{number:06d}" for number in range(10)]
+KEYS += [f"eval/MapSeenInTrain/Uniform/Map_0/scene_{number:06d}" for number in range(40)]
 ODD = "eval/MapSeenInTrain/Uniform/Map_0/scene_000007"
 """A scene that opening the tree does not look at."""
 UNREAD = "eval/MapSeenInTrain/Uniform/Map_0/scene_000008"
@@ -132,17 +131,15 @@ def test_a_second_opening_asks_for_the_commit_alone(hub):
 
 @pytest.mark.parametrize("how", ["another pair", "no video"])
 def test_a_scene_that_contradicts_what_was_presumed_is_named(hub, release, how):
-    name = "baseline.json" if how == "another pair" else "cam_00_rgb.mp4"
-    place = release / ODD / name
-    text = place.read_bytes()
-    place.unlink()
+    place = release / ODD / ("baseline.json" if how == "another pair" else "cam_00_rgb.mp4")
+    text = "no video"
     if how == "another pair":
-        document = json.loads(text)
+        document = json.loads(place.read_bytes())
         pair = document["primary_stereo_pair"]
         pair["left_camera"], pair["right_camera"] = pair["right_camera"], pair["left_camera"]
-        place.write_text(json.dumps(document))
-    else:
-        place.write_bytes(b"no video")
+        text = json.dumps(document)
+    place.unlink()
+    place.write_text(text)
     pairs = StereoPairs(HUB, split="eval", fields=["left"], frames=[0])
     number = pairs.index.column("key").tolist().index(ODD)
 

@@ -62,14 +62,6 @@ def test_the_scene_rendered_elsewhere_is_described(shared_scenes):
     assert len(scene.members) == 17
 
 
-def test_the_share_of_measured_depth_is_known_where_it_is_requested(make_scene, root):
-    make_scene()
-
-    scene = describe_scene(root, KEY, valid_depth="sample")
-
-    assert scene.valid_depth_ratio == pytest.approx(23 / 24)
-
-
 @pytest.mark.parametrize(
     ("keep", "match"),
     [
@@ -101,9 +93,7 @@ def test_what_not_every_sample_needs_becomes_a_remark(make_scene, root):
 
 
 @pytest.mark.parametrize(("pair", "sign"), [([0, 1], 1), ([3, 1], -1)])
-def test_without_poses_the_rig_is_a_line_and_the_primary_pair_tells_its_left_end(
-    make_scene, root, rewrite, pair, sign
-):
+def test_without_poses_the_primary_pair_tells_the_left_end(make_scene, root, rewrite, pair, sign):
     folder = make_scene()
     rewrite(folder / "baseline.json", lambda d: d.update(primary_stereo_pair=pair))
     (folder / "trajectory.json").write_text("{")
@@ -199,9 +189,7 @@ def test_objects_beside_the_cameras_are_no_poses(described):
     ("tags", "told"),
     [({"DEPTH_SCALE": "0.01"}, "0.01, 0.001"), ({}, "0.1 by default, 0.001")],
 )
-def test_units_of_depth_that_differ_by_a_scale_within_a_rig_are_not_used(
-    make_scene, root, video, tags, told
-):
+def test_units_of_depth_that_differ_in_a_rig_are_not_used(make_scene, root, video, tags, told):
     shutil.copy(video("depth.mkv", tags=tags), make_scene() / "cam_00_depth.mkv")
 
     scene = describe_scene(root, KEY)
@@ -225,9 +213,7 @@ def test_the_videos_tell_the_size_whatever_is_recorded(described):
 
 
 @pytest.mark.parametrize("size", [{}, {"resolution": "32x24"}, {"resolution": {"a": 32}}])
-def test_a_focal_length_in_pixels_is_one_of_the_videos_where_the_file_has_no_size(
-    make_scene, root, rewrite, size
-):
+def test_without_a_size_a_focal_length_in_pixels_is_of_the_videos(make_scene, root, rewrite, size):
     def in_pixels(document):
         del document["image_width"], document["image_height"]
         document["camera_intrinsics"] = {"fx_px": 40, "sensor_width_mm": 24.0, "cx_px": 15.5}
@@ -243,9 +229,7 @@ def test_a_focal_length_in_pixels_is_one_of_the_videos_where_the_file_has_no_siz
     assert metadata_differences(scene, texts) == []
 
 
-def test_a_sensor_of_another_shape_than_the_pictures_is_remarked_with_both(
-    make_scene, root, rewrite
-):
+def test_a_sensor_of_another_shape_than_the_pictures_is_told(make_scene, root, rewrite):
     folder = make_scene()
     assert describe_scene(root, KEY).remark("pixels") == ""
 
@@ -259,9 +243,7 @@ def test_a_sensor_of_another_shape_than_the_pictures_is_remarked_with_both(
     assert "32x24" in assumptions([scene], where="ROOT")
 
 
-def test_a_baseline_may_differ_by_a_millimetre_and_a_thousandth_and_no_more(
-    make_scene, root, rewrite
-):
+def test_a_baseline_may_differ_by_a_millimetre_and_a_thousandth(make_scene, root, rewrite):
     def widened(baseline_cm):
         return lambda document: document["pairwise_pairs"][7].update(baseline_cm=baseline_cm)
 
@@ -276,7 +258,7 @@ def test_a_baseline_may_differ_by_a_millimetre_and_a_thousandth_and_no_more(
 
 
 @pytest.mark.parametrize(("scale", "is_left"), [(0.01, ""), (1.1, "scaled"), (100.0, "")])
-def test_poses_by_which_a_rig_would_be_of_no_scene_of_its_family_hold_up_poses_alone(
+def test_poses_of_a_rig_that_no_scene_of_its_family_has_hold_up_poses_alone(
     described, scale, is_left
 ):
     def scaled(document):
@@ -302,9 +284,7 @@ def test_poses_by_which_a_rig_would_be_of_no_scene_of_its_family_hold_up_poses_a
         ("baseline.json", "animations", {"frame_count": 99}, r"\A\Z"),
     ],
 )
-def test_what_a_file_states_otherwise_is_told_with_its_place_and_does_not_count(
-    described, name, key, value, told
-):
+def test_what_a_file_states_otherwise_is_told_and_does_not_count(described, name, key, value, told):
     scene = described(name, lambda document: document.update({key: value}))
 
     assert re.search(told, scene.remark("stated"))

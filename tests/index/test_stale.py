@@ -6,10 +6,8 @@ import tarfile
 import warnings
 
 import pytest
-from typer.testing import CliRunner
 
 from stereogenbench_data import StereoPairs
-from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.open import StaleIndexWarning
 from stereogenbench_data.index.open_tree import IncompleteSceneWarning
@@ -18,14 +16,11 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import COMPLETE_JSON
 from stereogenbench_data.selection.filters import filter_scenes, find_scene
 from stereogenbench_data.shards.pack import pack
+from tests.cli.command import invoke
 
 MAP = "train/Uniform/SynthStage"
 OLD = r"index\.parquet: is older than the folder "
 CURE = r"Run `stereogenbench index /\S+`\."
-
-
-def invoke(*arguments):
-    return CliRunner().invoke(app, [str(each) for each in arguments])
 
 
 @pytest.fixture(scope="module")

@@ -74,11 +74,9 @@ def scenes():
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32), count=st.integers(1, 6))
 def test_a_scene_comes_back_from_the_file_as_it_was(tmp_path_factory, seed, count):
-    root = tmp_path_factory.mktemp("root")
     scenes = [scene_of(number, seed=seed) for number in range(count)]
-    SceneIndex.from_scenes(scenes, root).write(root / "index.parquet")
 
-    index = SceneIndex.open(root)
+    index = SceneIndex.open(written(scenes, tmp_path_factory.mktemp("root")))
 
     assert len(index) == count
     assert [index.scene(row) for row in range(count)] == scenes
@@ -86,8 +84,7 @@ def test_a_scene_comes_back_from_the_file_as_it_was(tmp_path_factory, seed, coun
 
 def test_the_digest_is_the_same_in_any_order_and_in_parts_of_a_table(scenes, tmp_path):
     index = SceneIndex.from_scenes(reversed(scenes), tmp_path)
-    index.write(tmp_path / "index.parquet")
-    table = pq.read_table(tmp_path / "index.parquet")
+    table = pq.read_table(written(reversed(scenes), tmp_path))
     pq.write_table(table, tmp_path / "parts.parquet", row_group_size=2)
 
     assert index.column("key").tolist() == sorted(scene.id.key for scene in scenes)
@@ -168,6 +165,7 @@ def test_a_path_or_a_name_that_could_leave_its_folder_is_refused(scenes, tmp_pat
 
 
 def written(scenes, root):
+    """Write the index of some scenes at their root."""
     SceneIndex.from_scenes(scenes, root).write(root / "index.parquet")
     return root / "index.parquet"
 
@@ -189,26 +187,20 @@ def with_path(path):
     return edit
 
 
+def with_shard(name, *, size):
+    facts = {name: {"size": size, "sha256": "", "members": 1}}
+    return lambda table, head: head["shards"].update(facts)
+
+
 @pytest.mark.parametrize(
     ("edit", "match"),
     [
         (lambda table, head: head.update(format=2), "of format 2, and this version .* reads fo"),
         (lambda table, head: head.update(broken=3), "description of itself was altered"),
-        (
-            lambda table, head: head["shards"].update(x={"size": "1", "sha256": "", "members": 1}),
-            "description of itself was altered",
-        ),
-        (
-            lambda table, head: head["shards"].update(
-                {"../x.tar": {"size": 1, "sha256": "", "members": 1}}
-            ),
-            "description of itself was altered",
-        ),
+        (with_shard("x.tar", size="1"), "description of itself was altered"),
+        (with_shard("../x.tar", size=1), "description of itself was altered"),
         (lambda table, head: table.drop_columns(["frames"]), r"not those of an index \(see frames"),
-        (
-            lambda table, head: table.set_column(0, "key", pa.array([1, 2, 3, 4, 5])),
-            r"not those of an index \(see key",
-        ),
+        (lambda table, head: table.set_column(0, "key", pa.array(range(5))), r"index \(see key"),
         (lambda table, head: table.take([1, 0, 2, 3, 4]), "is listed twice or out of order"),
         (with_path("train/other"), "its rows were changed"),
         (with_path("../../etc/passwd"), "'../../etc/passwd' is not a path inside the data's root"),
@@ -299,10 +291,8 @@ def test_an_index_elsewhere_opens_once_the_user_says_where_its_data_are(scenes, 
     kept = tmp_path / "a" / "index.parquet"
     SceneIndex.from_scenes(scenes, tmp_path / "data").write(kept)
 
-    with pytest.raises(
-        StorageError,
-        match=rf"{kept}: .*{tmp_path}/data.* SceneIndex.open\('{kept}', root=...\), or --root",
-    ):
+    told = rf"{kept}: .*{tmp_path}/data.* SceneIndex.open\('{kept}', root=...\), or --root"
+    with pytest.raises(StorageError, match=told):
         SceneIndex.open(kept)
     for root in (tmp_path / "data", str(tmp_path / "data"), (tmp_path / "data").as_uri()):
         assert SceneIndex.open(kept, root=root).root == str(tmp_path / "data")
@@ -347,9 +337,7 @@ def recording(scenes, path, root):
         "a\0b",
     ],
 )
-def test_a_root_elsewhere_than_beside_the_index_is_the_users_own_word(
-    scenes, tmp_path, monkeypatch, root
-):
+def test_a_root_not_beside_the_index_is_the_users_own_word(scenes, tmp_path, monkeypatch, root):
     monkeypatch.setattr(fsspec.core, "url_to_fs", None)
     (tmp_path / "other").mkdir()
     path = recording(scenes, tmp_path / "a" / "index.parquet", root)
@@ -396,9 +384,7 @@ def with_row(**values):
         (lambda rows: rows[1]["members"][0].update(offset=2**62), "offset is 4611686018427387904"),
     ],
 )
-def test_a_value_that_no_scene_has_is_refused_though_the_digest_is_right(
-    scenes, tmp_path, change, match
-):
+def test_a_value_that_no_scene_has_is_refused_by_itself(scenes, tmp_path, change, match):
     def edit(table, head):
         rows = table.to_pylist()
         change(rows)
@@ -475,11 +461,8 @@ def test_seek_tables_are_kept_apart_and_change_no_digest(tmp_path):
     assert opened.digest == other.digest == index.digest
     assert opened.seek_tables(1) is None
     assert opened.load_seek_tables()
-    for each in (
-        opened,
-        SceneIndex.of_parts(*opened.parted()),
-        pickle.loads(pickle.dumps(opened)),
-    ):
+    parts, copy = SceneIndex.of_parts(*opened.parted()), pickle.loads(pickle.dumps(opened))
+    for each in (opened, parts, copy):
         assert [each.seek_tables(row) for row in range(3)] == [b"\0", b"\1", b"\2"]
     assert not other.load_seek_tables()
     assert other.seek_tables(1) is None
@@ -488,8 +471,7 @@ def test_seek_tables_are_kept_apart_and_change_no_digest(tmp_path):
 
 @pytest.mark.parametrize("column", [pa.array(["a", "b"]), pa.array([1, 2])])
 def test_seek_tables_of_another_kind_are_as_good_as_none(column, tmp_path):
-    SceneIndex.from_scenes([scene_of(0), scene_of(1)], tmp_path).write(tmp_path / "i.parquet")
-    table = pq.read_table(tmp_path / "i.parquet").append_column("seek_tables", column)
-    pq.write_table(table, tmp_path / "i.parquet")
+    path = written([scene_of(0), scene_of(1)], tmp_path)
+    altered(path, lambda table, head: table.append_column("seek_tables", column))
 
-    assert not SceneIndex.open(tmp_path / "i.parquet", root=tmp_path).load_seek_tables()
+    assert not SceneIndex.open(path).load_seek_tables()

@@ -1,13 +1,15 @@
 """Metadata files as the release writes them, to be changed by each test."""
 
-import itertools
 import json
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
+from tests.servers.scene_fixtures import frames_of, pairs_at
+
 PLACES_CM = (0.0, 6.5, 13.25, 19.0, 26.0, 32.5)
+LENS_MM = {"focal_length_mm": 32.5, "sensor_width_mm": 23.76, "sensor_height_mm": 17.82}
 
 
 @pytest.fixture
@@ -21,43 +23,26 @@ def rig_document() -> dict[str, Any]:
         "camera_count": 6,
         "image_width": 640,
         "image_height": 480,
-        "camera_intrinsics": {
-            "focal_length_mm": 32.5,
-            "sensor_width_mm": 23.76,
-            "sensor_height_mm": 17.82,
-        },
+        "camera_intrinsics": dict(LENS_MM),
         "primary_stereo_pair": {
             "left_camera": "Town_scene_1166_Cam_00",
             "right_camera": "Town_scene_1166_Cam_01",
         },
-        "pairwise_pairs": [
-            {"camera_index_a": a, "camera_index_b": b, "baseline_cm": PLACES_CM[b] - PLACES_CM[a]}
-            for a, b in itertools.combinations(range(6), 2)
-        ],
+        "pairwise_pairs": pairs_at(PLACES_CM),
     }
 
 
 @pytest.fixture
 def trajectory_document() -> dict[str, Any]:
     """A trajectory.json of three frames; camera c of frame f stands at (100 f, c, -5)."""
-    return {
-        "unit": "cm",
-        "rotation_representation": "unreal_rotator_degrees",
-        "frames": [
-            {
-                "frame_index": frame,
-                "cameras": [
-                    {
-                        "camera_index": camera,
-                        "location": {"x": 100.0 * frame, "y": float(camera), "z": -5.0},
-                        "rotation": {"pitch": 1.5, "yaw": 10.0 * frame, "roll": -camera / 4},
-                    }
-                    for camera in range(6)
-                ],
-            }
-            for frame in range(3)
-        ],
-    }
+
+    def pose(frame: int, camera: int) -> dict[str, Any]:
+        location = {"x": 100.0 * frame, "y": float(camera), "z": -5.0}
+        rotation = {"pitch": 1.5, "yaw": 10.0 * frame, "roll": -camera / 4}
+        return {"location": location, "rotation": rotation}
+
+    how = {"unit": "cm", "rotation_representation": "unreal_rotator_degrees"}
+    return how | {"frames": frames_of(3, pose)}
 
 
 @pytest.fixture

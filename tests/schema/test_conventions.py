@@ -147,9 +147,7 @@ def test_quantities_under_unknown_names_are_read_where_conventions_say(rig_docum
     assert parse_rig(dumped(rig_document), where="b", shape=shape)[0] == expected
 
 
-def test_the_only_number_beside_two_cameras_is_a_baseline_where_conventions_say(
-    rig_document, dumped
-):
+def test_the_only_number_beside_two_cameras_may_be_called_a_baseline(rig_document, dumped):
     expected = parse_rig(dumped(rig_document), where="b")[0]
     pairs = rig_document.pop("pairwise_pairs")
     rig_document["gaps"] = [

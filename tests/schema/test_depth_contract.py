@@ -160,19 +160,15 @@ def test_json_that_does_not_tell_the_unit_is_refused_by_its_path(document):
 
 
 def test_a_contradiction_of_two_files_names_both_places():
-    statements = [
-        *stated_in_tags({"DEPTH_SCALE": "0.001"}, name="cam_00_depth.mkv"),
-        *stated_in_json({"depth_scale": 0.1}, name="baseline.json"),
-    ]
+    tags = stated_in_tags({"DEPTH_SCALE": "0.001"}, name="cam_00_depth.mkv")
+    document = stated_in_json({"depth_scale": 0.1}, name="baseline.json")
 
     with pytest.raises(SchemaError, match=r"cam_00_depth\.mkv: tag .*baseline\.json: \$\.depth_"):
-        agreed(statements, largest=LARGEST)
+        agreed([*tags, *document], largest=LARGEST)
 
 
 def test_what_is_stated_twice_agrees_within_its_rounding():
-    statements = [
-        *stated_in_tags({"scale": "0.00152587890625"}, name="clip"),
-        *stated_in_json({"depth_units_per_meter": 655.36, "depth_max_m": 100}, name="j"),
-    ]
+    tags = stated_in_tags({"scale": "0.00152587890625"}, name="clip")
+    document = stated_in_json({"depth_units_per_meter": 655.36, "depth_max_m": 100}, name="j")
 
-    assert agreed(statements, largest=LARGEST).unit_m == 0.00152587890625
+    assert agreed([*tags, *document], largest=LARGEST).unit_m == 0.00152587890625

@@ -39,13 +39,11 @@ def test_a_path_of_another_form_is_refused(key, match):
 
 
 def test_the_completion_marker_is_read():
-    text = json.dumps(
-        {"scene_label": "A_1", "scene_index": 1, "map_name": "A", "map_path": "/Game/A"}
-    )
+    told = {"scene_label": "A_1", "scene_index": 1, "map_name": "A", "map_path": "/Game/A"}
 
-    labels, remarks = parse_complete(text.encode(), where="m.json")
+    labels, remarks = parse_complete(json.dumps(told).encode(), where="m.json")
 
-    assert labels == SceneLabels(scene_label="A_1", scene_index=1, map_name="A", map_path="/Game/A")
+    assert labels == SceneLabels(**told)
     assert remarks == ()
 
 

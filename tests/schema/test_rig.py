@@ -137,10 +137,7 @@ def test_without_a_sensor_that_of_the_release_is_assumed(rig_document, intrinsic
 @pytest.mark.parametrize(
     ("matrix", "told"),
     [
-        (
-            [[1750.84, 0, 640], [0, 1750.84, 480], [0, 0, 1]],
-            "of other pictures than these, of 640x480",
-        ),
+        ([[1750.84, 0, 640], [0, 1750.84, 480], [0, 0, 1]], "other pictures than .*, of 640x480"),
         ([[437.71, 0, 160], [0, 437.71, 120], [0, 0, 1]], "of other pictures than these"),
         ([[875.42, 3, 320], [0, 875.42, 240], [0, 0, 1]], "focal_length_mm is missing"),
     ],
@@ -155,9 +152,7 @@ def test_a_camera_matrix_of_other_pictures_is_refused(rig_document, matrix, told
 
 
 @pytest.mark.parametrize(("unit_cm", "unit"), [(100, "m"), (0.1, "mm")])
-def test_baselines_that_fit_their_family_in_another_unit_alone_are_refused(
-    rig_document, unit_cm, unit
-):
+def test_baselines_that_fit_their_family_in_another_unit_are_refused(rig_document, unit_cm, unit):
     for entry in rig_document["pairwise_pairs"]:
         entry["baseline_cm"] /= unit_cm
     rig, _, _ = read(rig_document)
@@ -178,9 +173,7 @@ def test_baselines_outside_of_their_family_are_told(rig_document):
 
 def test_baselines_below_a_unit_that_is_not_known_are_refused(rig_document):
     pairs = rig_document.pop("pairwise_pairs")
-    rows = [
-        {"a": each["camera_index_a"], "b": each["camera_index_b"], "value": 1} for each in pairs
-    ]
+    rows = [{"a": p["camera_index_a"], "b": p["camera_index_b"], "value": 1} for p in pairs]
 
     with pytest.raises(SchemaError, match=r"value: is in a unit of length that is not known"):
         read(rig_document | {"baseline": {"unit": "ell", "pairs": rows}})
@@ -205,9 +198,7 @@ def test_baselines_below_a_unit_that_is_not_known_are_refused(rig_document):
         ),
     ],
 )  # fmt: skip
-def test_a_principal_point_is_found_or_the_centre_and_what_is_not_understood_stops_nothing(
-    rig_document, written, point_px, about
-):
+def test_a_principal_point_is_found_or_told_and_the_centre(rig_document, written, point_px, about):
     lens(**written)(rig_document)
 
     rig, _, remarks = read(rig_document)
@@ -216,32 +207,28 @@ def test_a_principal_point_is_found_or_the_centre_and_what_is_not_understood_sto
     assert [remark.about for remark in remarks] == about
 
 
+MATRIX = [[875.4208754, 0, 320], [0, 875.4208754, 240], [0, 0, 1]]
+
+
 @pytest.mark.parametrize(
     ("intrinsics", "size"),
     [
         ({"focal_length_mm": "32.5 mm", "sensor_width_cm": 2.376, "sensor_height_cm": 1.782}, {}),
         ({"focal_length_mm": 32.5, "sensor": {"width_mm": 23.76, "height_mm": 17.82}}, {}),
         ({"focal_length_mm": 32.5, "sensor_width_mm": 23.76, "fov_deg": 40.16}, {}),
-        (
-            {"fx_px": 875.4208754, "sensor_width_mm": 23.76, "sensor_height_mm": 17.82},
-            {"render_width": 640, "render_height": 480},
-        ),
-        (
-            {"K": [[875.4208754, 0, 320], [0, 875.4208754, 240], [0, 0, 1]],
-             "sensor_width_mm": 23.76},
-            {},
-        ),
+        ({"fx_px": 875.4208754, "sensor_width_mm": 23.76, "sensor_height_mm": 17.82},
+         {"render_width": 640, "render_height": 480}),
+        ({"K": MATRIX, "sensor_width_mm": 23.76}, {}),
         ({"focal_length_mm": [32.5] * 6, "sensor_width_mm": 23.76}, {}),
         ({"FOVAngle": 40.15832, "sensor_width_mm": 23.76}, {}),
         ({"camera.focal_length_mm": 32.5, "sensor_mm": [23.76, 17.82], "fov": 40.2}, {}),
-        ({"camera_matrix": {"rows": 3, "data": [875.4208754, 0, 320, 0, 875.4208754, 240, 0, 0, 1]},
+        ({"camera_matrix": {"rows": 3, "data": [*MATRIX[0], *MATRIX[1], *MATRIX[2]]},
           "sensor_width_mm": 23.76}, {}),
         ({"vertical_fov_degrees": 30.66233813, "sensor_width_mm": 23.76}, {}),
         ({"focal_length": {"value": 3.25, "unit": "cm"}, "sensor_width_mm": 23.76}, {}),
         ({"model": "PINHOLE", "params": [875.4208754, 875.4208754, 320, 240],
           "sensor_width_mm": 23.76}, {}),
-        ({"K": {f"cam_{camera:02d}": [[875.4208754, 0, 320], [0, 875.4208754, 240], [0, 0, 1]]
-                for camera in range(6)}, "sensor_width_mm": 23.76}, {}),
+        ({"K": {f"cam_{camera:02d}": MATRIX for camera in range(6)}, "sensor_width_mm": 23.76}, {}),
     ],
 )  # fmt: skip
 def test_a_lens_is_found_under_likely_keys(rig_document, intrinsics, size):
@@ -280,6 +267,17 @@ def pairs_as(document, write):
     return document | write(entries)
 
 
+def entry(a, b, length_cm):
+    """A pair of a baseline.json."""
+    return {"camera_index_a": a, "camera_index_b": b, "baseline_cm": length_cm}
+
+
+FIGURES = {
+    "fx_px": 875.4, "baseline_bin": "[1,10)", "focal_length_mm": 32.5, "baseline_error_cm": 3e-12,
+    "target_baseline_cm": 7.0, "fx_times_baseline": 9.0,
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(
     "write",
     [
@@ -289,16 +287,11 @@ def pairs_as(document, write):
                 for a, b, cm in pairs
             ]}, id="names in a list, metres"),
         pytest.param(
-            lambda pairs: {"pairwise_pairs": [
-                {"camera_index_a": a + 1, "camera_index_b": b + 1, "baseline_cm": cm}
-                for a, b, cm in pairs
-            ], "primary_stereo_pair": [1, 2]}, id="cameras from 1"),
+            lambda pairs: {"pairwise_pairs": [entry(a + 1, b + 1, cm) for a, b, cm in pairs],
+                           "primary_stereo_pair": [1, 2]}, id="cameras from 1"),
         pytest.param(
             lambda pairs: {"pairwise_pairs": [
-                {"camera_index_a": b, "camera_index_b": a, "baseline_cm": -cm}
-                for a, b, cm in reversed(pairs)
-            ] + [
-                {"camera_index_a": a, "camera_index_b": b, "baseline_cm": cm} for a, b, cm in pairs
+                *(entry(b, a, -cm) for a, b, cm in reversed(pairs)), *(entry(*p) for p in pairs)
             ]}, id="both directions, signed"),
         pytest.param(
             lambda pairs: {"adjacent_baselines_cm": [cm for a, b, cm in pairs if b == a + 1]},
@@ -312,23 +305,17 @@ def pairs_as(document, write):
             id="places along the rig"),
         pytest.param(lambda pairs: {"pairwise_pairs": [*pairs]}, id="two cameras and a length"),
         pytest.param(
-            lambda pairs: {"pairwise_pairs": dict(zip(
-                ("camera_index_a", "camera_index_b", "baseline_cm"),
-                map(list, zip(*pairs, strict=True)),
-                strict=True,
-            ))}, id="columns"),
+            lambda pairs: {"pairwise_pairs": {
+                key: [entry(*pair)[key] for pair in pairs] for key in entry(0, 1, 0.0)
+            }}, id="columns"),
         pytest.param(
             lambda pairs: {"pairwise_pairs": [
                 {"camera_index_a": a, "camera_index_b": b, "baseline": cm / 2.54, "unit": "inch"}
                 for a, b, cm in pairs
             ]}, id="a unit beside the number"),
         pytest.param(
-            lambda pairs: {"pairwise_pairs": [
-                {"camera_index_a": a, "camera_index_b": b, "baseline_cm": cm, "fx_px": 875.4,
-                 "baseline_bin": "[1,10)", "focal_length_mm": 32.5, "baseline_error_cm": 3e-12,
-                 "target_baseline_cm": 7.0, "fx_times_baseline": 9.0}
-                for a, b, cm in pairs
-            ]}, id="figures beside the baseline"),
+            lambda pairs: {"pairwise_pairs": [entry(*pair) | FIGURES for pair in pairs]},
+            id="figures beside the baseline"),
         pytest.param(
             lambda pairs: {"baseline_matrix_cm": [[abs(a - b) for b in PLACES_CM]
                                                   for a in PLACES_CM]}, id="a matrix"),
@@ -393,16 +380,9 @@ lengths = st.floats(0.5, 5000)
 def test_every_number_of_a_rig_is_read_exactly(baselines):
     intrinsics = {"focal_length_mm": 45.0, "sensor_width_mm": 23.76, "sensor_height_mm": 13.3}
     pairs = zip(itertools.combinations(range(6), 2), baselines, strict=True)
-    document = {
-        "camera_intrinsics": intrinsics,
-        "image_width": 640,
-        "image_height": 360,
-        "primary_stereo_pair": [1, 2],
-        "pairwise_pairs": [
-            {"camera_index_a": a, "camera_index_b": b, "baseline_cm": length}
-            for (a, b), length in pairs
-        ],
-    }
+    entries = [entry(a, b, length) for (a, b), length in pairs]
+    document = {"camera_intrinsics": intrinsics, "image_width": 640, "image_height": 360}
+    document |= {"primary_stereo_pair": [1, 2], "pairwise_pairs": entries}
 
     rig, _, _ = read(document)
 

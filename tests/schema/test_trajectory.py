@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.schema.trajectory import record_poses
+from tests.servers.scene_fixtures import frames_of
 
 
 def recorded(document):
@@ -147,10 +148,7 @@ def change(path, value):
         (change(["frames", 2, "frame_index"], 5), "frames must be .*, and there are 3 of 0 to 5"),
         (change(["frames", 1, "cameras", 3, "camera_index"], 2), "cameras must .*, and 2 is there"),
         (change(["frames", 1, "cameras", 3, "camera_index"], 6), "there are 6 of 0 to 6"),
-        (
-            change(["unit"], "furlongs"),
-            r"\$\.unit: 'furlongs' is not a unit of length that is known",
-        ),
+        (change(["unit"], "furlongs"), r"\$\.unit: 'furlongs' is not a unit of length"),
     ],
 )
 def test_poses_that_cannot_be_put_in_order_are_refused(trajectory_document, changes, reason):
@@ -190,18 +188,13 @@ def test_nan_under_a_key_that_nobody_reads_is_ignored(trajectory_document):
 @given(numbers=st.lists(st.floats(-1e6, 1e6), min_size=36, max_size=36))
 def test_every_number_of_a_pose_is_read_exactly(numbers):
     names = ("x", "y", "z", "pitch", "yaw", "roll")
-    poses = []
-    for camera in range(6):
-        values = dict(zip(names, numbers[6 * camera : 6 * camera + 6], strict=True))
-        poses.append(
-            {
-                "camera_index": camera,
-                "location": {name: values[name] for name in "xyz"},
-                "rotation": {name: values[name] for name in ("roll", "yaw", "pitch")},
-            }
-        )
-    document = {"frames": [{"cameras": poses}]}
 
+    def pose(_, camera):
+        values = dict(zip(names, numbers[6 * camera : 6 * camera + 6], strict=True))
+        location = {name: values[name] for name in "xyz"}
+        return {"location": location, "rotation": {n: values[n] for n in ("roll", "yaw", "pitch")}}
+
+    document = {"frames": frames_of(1, pose)}
     expected = np.array(numbers).reshape(1, 6, 6)
     np.testing.assert_array_equal(block(document, "location").values, expected[..., :3])
     np.testing.assert_array_equal(block(document, "rotation").values, expected[..., 3:])

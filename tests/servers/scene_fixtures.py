@@ -3,7 +3,7 @@
 import itertools
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,47 +30,46 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     return write
 
 
+def pairs_at(places_cm: Sequence[float]) -> list[dict[str, Any]]:
+    """The baselines of a baseline.json whose cameras stand on a line."""
+    return [
+        {"camera_index_a": a, "camera_index_b": b, "baseline_cm": places_cm[b] - places_cm[a]}
+        for a, b in itertools.combinations(range(6), 2)
+    ]
+
+
+def frames_of(count: int, pose: Callable[[int, int], dict[str, Any]]) -> list[dict[str, Any]]:
+    """The frames of a trajectory.json, each pose a function of frame and camera."""
+    return [
+        {
+            "frame_index": frame,
+            "cameras": [{"camera_index": camera} | pose(frame, camera) for camera in range(6)],
+        }
+        for frame in range(count)
+    ]
+
+
 def documents(frames: int = FRAMES) -> dict[str, Any]:
     """The metadata files of a scene whose six cameras stand on a line and look along x."""
     names = {"scene_label": "Town_scene_7", "scene_index": 7, "map_name": "Car_Dealer"}
+    lens_mm = {"focal_length_mm": 30.0, "sensor_width_mm": 24.0, "sensor_height_mm": 18.0}
+    level = {"pitch": 0.0, "yaw": 0.0, "roll": 0.0}
+
+    def pose(frame: int, camera: int) -> dict[str, Any]:
+        location = {"x": 500.0 + frame, "y": PLACES_CM[camera], "z": 160.0}
+        return {"location": location, "rotation": dict(level)}
+
     return {
         "baseline.json": {
             **names,
             "image_width": SIZE[1],
             "image_height": SIZE[0],
-            "camera_intrinsics": {
-                "focal_length_mm": 30.0,
-                "sensor_width_mm": 24.0,
-                "sensor_height_mm": 18.0,
-            },
+            "camera_intrinsics": lens_mm,
             "primary_stereo_pair": [0, 1],
-            "pairwise_pairs": [
-                {
-                    "camera_index_a": a,
-                    "camera_index_b": b,
-                    "baseline_cm": PLACES_CM[b] - PLACES_CM[a],
-                }
-                for a, b in itertools.combinations(range(6), 2)
-            ],
+            "pairwise_pairs": pairs_at(PLACES_CM),
             "character_mesh": "SK_Ch13",
         },
-        "trajectory.json": {
-            "unit": "cm",
-            "frames": [
-                {
-                    "frame_index": frame,
-                    "cameras": [
-                        {
-                            "camera_index": camera,
-                            "location": {"x": 500.0 + frame, "y": place, "z": 160.0},
-                            "rotation": {"pitch": 0.0, "yaw": 0.0, "roll": 0.0},
-                        }
-                        for camera, place in enumerate(PLACES_CM)
-                    ],
-                }
-                for frame in range(frames)
-            ],
-        },
+        "trajectory.json": {"unit": "cm", "frames": frames_of(frames, pose)},
         "_scene_complete.json": {**names, "map_path": "/Game/Car_Dealer"},
         "scene_description_qwen_dataset_level.json": {"detailed_caption": "Cars behind glass."},
     }
