@@ -39,9 +39,8 @@ def test_a_sensor_that_is_not_square_gives_each_axis_its_own_focal_length():
 
 
 def test_the_evaluators_resize_scales_each_axis_by_its_own_factor():
-    resized = Intrinsics(1756.0, 1756.0, 640.0, 640.0, 1280, 1280).resized(
-        width_px=832, height_px=480
-    )
+    released = Intrinsics(1756.0, 1756.0, 640.0, 640.0, 1280, 1280)
+    resized = released.resized(width_px=832, height_px=480)
 
     assert resized.fx_px == pytest.approx(1756 * 0.65, rel=1e-15)
     assert resized.fy_px == pytest.approx(1756 * 0.375, rel=1e-15)

@@ -41,21 +41,15 @@ def depth_of(disparity_px: np.ndarray) -> np.ndarray:
     ],
 )
 def test_visibility_is_the_occlusion_map_of_cones(ground_truth, judge, least):
-    left_px, right_px = (
-        read(ground_truth / "cones" / f"disp_{side}.tif") for side in ("left", "right")
-    )
-    visible_there = read(ground_truth / "cones" / "occlusion.png").astype(bool)
+    cones = ground_truth / "cones"
+    left_px, right_px = read(cones / "disp_left.tif"), read(cones / "disp_right.tif")
+    visible_there = read(cones / "occlusion.png").astype(bool)
     known = left_px > 0
     projection = project_rectified(depth_of(left_px), left_px)
 
     if judge == "target":
-        visible = visible_in_target(
-            projection,
-            measured=known,
-            target_depth_m=depth_of(right_px),
-            target_measured=right_px > 0,
-            quantum_m=0.0,
-        )
+        target = {"target_depth_m": depth_of(right_px), "target_measured": right_px > 0}
+        visible = visible_in_target(projection, measured=known, **target, quantum_m=0.0)
     else:
         visible = visible_from_source(projection, measured=known, quantum_m=0.0)
 
@@ -71,14 +65,9 @@ def test_cloth_warps_back_onto_itself(ground_truth, psnr_db):
 
     warped, inside = backward_warp(right, projection)
 
-    visible = visible_in_target(
-        projection,
-        measured=left_px > 0,
-        target_depth_m=right_px,
-        target_measured=right_px > 0,
-        quantum_m=0.5,
-        tolerance=0.0,
-    )
+    target = {"target_depth_m": right_px, "target_measured": right_px > 0}
+    how = {"measured": left_px > 0, "quantum_m": 0.5, "tolerance": 0.0}
+    visible = visible_in_target(projection, **target, **how)
     assert psnr_db(warped, left, visible & inside) == pytest.approx(34.94, abs=0.02)
 
 
@@ -86,9 +75,8 @@ def test_cloth_warps_back_onto_itself(ground_truth, psnr_db):
 def motorcycle(ground_truth):
     """The two pictures, disparity in pixels, and where it is known."""
     folder = ground_truth / "motorcycle"
-    left, right = (
-        read(folder / f"motorcycle_{side}.png").transpose(2, 0, 1) for side in ("left", "right")
-    )
+    files = (folder / f"motorcycle_{side}.png" for side in ("left", "right"))
+    left, right = (read(file).transpose(2, 0, 1) for file in files)
     with np.load(folder / "motorcycle_disp.npz") as archive:
         disparity_px = archive["arr_0"]
     known = np.isfinite(disparity_px)

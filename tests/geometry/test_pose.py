@@ -108,9 +108,7 @@ def test_the_world_has_x_right_y_down_and_z_forward_of_an_unturned_camera(make_r
 
 
 @given(rotator_deg=rotators_deg, offset_cm=offsets_cm, gaps=gaps_cm)
-def test_pose_baselines_match_the_recorded_ones_at_any_offset(
-    make_rig, rotator_deg, offset_cm, gaps
-):
+def test_pose_baselines_are_the_recorded_ones_anywhere(make_rig, rotator_deg, offset_cm, gaps):
     lateral_cm = np.concatenate([[0.0], np.cumsum(gaps)])
     rotation = scipy_rotation(*rotator_deg).as_matrix()
 

@@ -15,6 +15,11 @@ def row(library, *values, dtype=np.float32):
     return library.array(np.array([values], dtype=dtype))
 
 
+def seen_by_target(projection, measured, target_m, *, quantum_m):
+    target = {"target_depth_m": target_m, "target_measured": target_m > 0}
+    return visible_in_target(projection, measured=measured, **target, quantum_m=quantum_m)
+
+
 def pair(library, depth_m, *, shift_px_m):
     """Return the projection and the mask of a source row, for B f in px m."""
     depth = row(library, *depth_m)
@@ -39,15 +44,8 @@ def pair(library, depth_m, *, shift_px_m):
 )
 def test_a_target_sees_points_that_agree_with_its_own_depth(library, source_m, target_m, expected):
     projection, measured = pair(library, [source_m], shift_px_m=1e-3)
-    target = row(library, target_m)
 
-    visible = visible_in_target(
-        projection,
-        measured=measured,
-        target_depth_m=target,
-        target_measured=target > 0,
-        quantum_m=0.1,
-    )
+    visible = seen_by_target(projection, measured, row(library, target_m), quantum_m=0.1)
 
     assert library.numpy(visible).tolist() == [[expected]]
 
@@ -61,13 +59,7 @@ def test_only_the_target_depth_shows_an_occluder_outside_the_source_view(library
     projection, measured = pair(library, [2.0] * 6, shift_px_m=2.0)
     target = row(library, 2.0, 2.0, 0.5, 2.0, 2.0, 2.0)
 
-    by_target = visible_in_target(
-        projection,
-        measured=measured,
-        target_depth_m=target,
-        target_measured=target > 0,
-        quantum_m=0.001,
-    )
+    by_target = seen_by_target(projection, measured, target, quantum_m=0.001)
     by_source = visible_from_source(projection, measured=measured, quantum_m=0.001)
 
     assert library.numpy(by_target).tolist() == [[False, True, True, False, True, True]]

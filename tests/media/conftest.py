@@ -2,7 +2,7 @@
 
 import io
 import subprocess
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import av
@@ -15,11 +15,23 @@ FRAMES, HEIGHT, WIDTH = 48, 64, 96
 BLOCK = 8  # a painted bit is a square of so many pixels
 
 
+def texture(height: int, width: int, *, sigmas_px: Sequence[int]) -> np.ndarray:
+    """Return a picture (height, width, 3) with detail at some scales."""
+    noise = np.random.default_rng(5).normal(size=(height, width, 3))
+    layers = sum(ndimage.gaussian_filter(noise, (s, s, 0)) * s for s in sigmas_px)
+    return np.uint8((layers - layers.min()) / np.ptp(layers) * 255)
+
+
+def flipped(content: bytes, place: int, bit: int) -> bytes:
+    """Return bytes of which one bit is another."""
+    altered = bytearray(content)
+    altered[place] ^= 1 << bit
+    return bytes(altered)
+
+
 def painted(frames: int = FRAMES) -> np.ndarray:
     """Return a moving texture, (frames, h, w, 3), with the frame's number in blocks at the top."""
-    rng = np.random.default_rng(0)
-    wide = ndimage.gaussian_filter(rng.normal(size=(HEIGHT, WIDTH + 2 * frames, 3)), (1, 1, 0))
-    wide = np.uint8((wide - wide.min()) / np.ptp(wide) * 255)
+    wide = texture(HEIGHT, WIDTH + 2 * frames, sigmas_px=[1])
     pictures = np.stack([wide[:, 2 * i : 2 * i + WIDTH] for i in range(frames)])
     for index, picture in enumerate(pictures):
         for bit in range(8):
@@ -50,13 +62,8 @@ class Clips:
 
     def ffmpeg(self, *arguments: object, stdin: bytes = b"") -> bytes:
         """Run ffmpeg; return what it writes."""
-        command = [
-            imageio_ffmpeg.get_ffmpeg_exe(),
-            "-loglevel",
-            "error",
-            "-y",
-            *map(str, arguments),
-        ]
+        quiet = (imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y")
+        command = [*quiet, *map(str, arguments)]
         return subprocess.run(command, input=stdin, capture_output=True, check=True).stdout
 
     def encode(

@@ -13,6 +13,7 @@ from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.depth import read_depth_units
 from stereogenbench_data.media.video import VideoReader, read_rgb
 from stereogenbench_data.schema.records import DepthEncoding
+from tests.media.conftest import flipped
 
 FRAMES = 17
 TIMES = rb"(?:\xe7|\x2a\xd7\xb1|\x44\x89)([\x81-\x88])"  # of a cluster, of a tick, of the whole
@@ -27,12 +28,6 @@ def shown(content, order, number_of):
             with suppress(MediaError):
                 found.append((index, number_of(clip, index)))
     return found
-
-
-def flipped(content, place, bit):
-    altered = bytearray(content)
-    altered[place] ^= 1 << bit
-    return bytes(altered)
 
 
 def block_times(content):

@@ -17,7 +17,8 @@ from stereogenbench_data.media.depth_frames import (
     compressed_chunk,
     require_chunk,
 )
-from stereogenbench_data.media.video import VideoReader, probe
+from stereogenbench_data.media.video import probe
+from tests.media.conftest import flipped
 from tests.servers.tools import require_module
 
 SHAPE = (40, 56)
@@ -27,14 +28,8 @@ def pictures(largest=65535):
     """Noise, nothing, one number everywhere, the largest number, a slope, noise of few levels."""
     noise = np.random.default_rng(3)
     slope = np.arange(SHAPE[0] * SHAPE[1]).reshape(SHAPE) % (largest + 1)
-    maps = [
-        noise.integers(0, largest + 1, SHAPE),
-        np.zeros(SHAPE),
-        np.full(SHAPE, 7),
-        np.full(SHAPE, largest),
-        slope,
-        noise.integers(0, 3, SHAPE),
-    ]
+    flat = [np.full(SHAPE, number) for number in (0, 7, largest)]
+    maps = [noise.integers(0, largest + 1, SHAPE), *flat, slope, noise.integers(0, 3, SHAPE)]
     return [each.astype(np.uint16) for each in maps]
 
 
@@ -99,10 +94,8 @@ def test_its_facts_are_those_of_the_video(packed, video):
 def test_a_flipped_byte_of_a_frame_is_reported_with_its_number_and_others_are_read(packed, index):
     with opened(packed) as depth:
         place = packed.index(depth.chunk(index))
-    content = bytearray(packed)
-    content[place + 40] ^= 1
 
-    with opened(bytes(content)) as depth:
+    with opened(flipped(packed, place + 40, 0)) as depth:
         with pytest.raises(MediaError, match=f"b2frame: frame {index}: has crc32 .* is damaged"):
             depth.units(index)
 
@@ -113,10 +106,8 @@ def test_a_flipped_byte_of_the_header_is_refused_or_changes_nothing(packed):
     facts, told = opened(packed).facts, []
 
     for at in range(2, 500, 3):
-        content = bytearray(packed)
-        content[at] ^= 0x11
         try:
-            depth = opened(bytes(content))
+            depth = opened(flipped(flipped(packed, at, 0), at, 4))
         except MediaError as error:
             told.append(str(error))
             continue
@@ -180,33 +171,21 @@ def test_packed_depth_becomes_the_same_video_again(clips, tmp_path, pixel_format
     assert other.tags.pop("encoder", "") != ""
     one.tags.pop("encoder")
     assert one == other
-    with (
-        VideoReader(first, name="first", frames=6) as before,
-        VideoReader(tmp_path / "second.mkv", name="second", frames=6) as after,
-    ):
-        for index in range(6):
-            assert before.frame(index).time == after.frame(index).time
-            np.testing.assert_array_equal(
-                before.frame(index).to_ndarray(), after.frame(index).to_ndarray()
-            )
     again = packed_depth(tmp_path / "second.mkv", name="second.mkv", frames=6)
-    clips = [opened(each).clip for each in (content, again)]
+    clips = [opened(each).clip for each in (content, again)]  # with times and checksums of frames
     for clip in clips:
         del clip.tags[next(key for key in clip.tags if key.lower() == "encoder")]
     assert clips[0] == clips[1]
 
 
 @pytest.mark.parametrize(
-    ("codec", "found"),
-    [
-        (("libx264", "-pix_fmt", "yuv420p"), "codec h264 as yuv420p"),
-        (("ffv1", "-pix_fmt", "yuv420p10le"), "codec ffv1 as yuv420p10le"),
-    ],
+    ("encoder", "codec", "form"), [("libx264", "h264", "yuv420p"), ("ffv1", "ffv1", "yuv420p10le")]
 )
-def test_what_cannot_come_back_whole_is_not_packed(clips, codec, found):
-    path = write_depth(clips, f"unpackable {codec[0]}.mkv", pictures(1000)[:2], codec=codec)
+def test_what_cannot_come_back_whole_is_not_packed(clips, encoder, codec, form):
+    how = (encoder, "-pix_fmt", form)
+    path = write_depth(clips, f"unpackable {encoder}.mkv", pictures(1000)[:2], codec=how)
 
-    with pytest.raises(MediaError, match=f"depth is stored by {found}"):
+    with pytest.raises(MediaError, match=f"depth is stored by codec {codec} as {form}"):
         packed_depth(path, name="x.mkv", frames=2)
 
 

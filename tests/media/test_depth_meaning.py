@@ -24,15 +24,11 @@ USERS = DepthEncoding(unit_m=0.02, kind="ray", source="tag")
     [
         pytest.param({"encoder": "Lavf"}, None, (0.1, 0, "default", "planar"), id="no unit"),
         pytest.param({"depth_scale": "0.001"}, None, (0.001, 0, "tag", "planar"), id="millimetres"),
-        pytest.param(
-            {"depth_near": "0.5 m", "depth_far": "4095.5 m"},
-            None,
-            (1.0, 0.5, "tag", "planar"),
-            id="a range over the format's largest number",
-        ),
+        pytest.param({"depth_near": "0.5 m", "depth_far": "4095.5 m"}, None,
+                     (1.0, 0.5, "tag", "planar"), id="a range over the format's largest number"),
         pytest.param({"depth_scale": "mm"}, USERS, (0.02, 0, "user", "ray"), id="the user's"),
     ],
-)
+)  # fmt: skip
 def test_the_unit_is_the_users_or_the_tags_or_the_releases(tags, override, expected):
     facts = StreamFacts("ffv1", "gray12le", 8, 8, 1, 15.0, tags)
 
@@ -87,9 +83,8 @@ def test_numbers_become_metres_and_0_where_depth_was_not_measured(encoding, expe
 
 
 def test_a_ray_becomes_depth_along_the_optical_axis():
-    camera = Intrinsics(
-        fx_px=1.5, fy_px=2.0, cx_px=0.5, cy_px=0.5, width_px=3, height_px=1
-    )  # the last pixel's ray is (2 / 1.5, 0, 1), 5/3 long
+    """The last pixel's ray is (2 / 1.5, 0, 1), 5/3 long."""
+    camera = Intrinsics(1.5, 2.0, 0.5, 0.5, 3, 1)
     units = np.array([[10, 0, 10]], dtype=np.uint16)
     encoding = DepthEncoding(unit_m=1.0, kind="ray")
 

@@ -10,6 +10,7 @@ from stereogenbench_data.media.video import VideoReader, probe
 from stereogenbench_data.schema.records import DepthEncoding
 
 HEIGHT, WIDTH = 30, 54  # rows that FFmpeg pads
+HEVC = ("libx265", "-x265-params")
 
 
 def noise(bits, dtype):
@@ -46,10 +47,7 @@ REFUSED = {
     "ffv1 as gray": (["8-bit"], "-c:v", "ffv1"),
     "ffv1 as gray12le": (["12-bit"], "-c:v", "ffv1", "-pix_fmt", "gray12le"),
     "ffv1 as yuv420p10le": (["10-bit", "chroma"], "-c:v", "ffv1", "-pix_fmt", "yuv420p10le"),
-    "hevc as gray10le": (
-        ["10-bit", "lossy"], "-c:v", "libx265", "-pix_fmt", "gray10le", "-x265-params",
-        "log-level=0",
-    ),
+    "hevc as gray10le": (["10-bit", "lossy"], "-pix_fmt", "gray10le", "-c:v", *HEVC, "log-level=0"),
     "mpeg4 as yuv420p": (["8-bit", "lossy", "chroma"], "-c:v", "mpeg4"),
 }  # fmt: skip
 
@@ -117,30 +115,22 @@ def read_first(path, accept=(), frames=1):
 BYTES = {
     "red and green": (("high", "low", "none"), "bgr0", "ffv1"),
     "blue and green": (("none", "low", "high"), "bgr0", "ffv1"),
+    "three equal ones of 16 bits": (("both", "both", "both"), "gbrp16le", "ffv1"),
     "lossless H.264": (("high", "low", "none"), "bgr24", "libx264rgb", "-qp", "0"),
-    "lossless HEVC": (
-        ("none", "high", "low"), "gbrp", "libx265", "-x265-params", "lossless=1:log-level=0",
-    ),
+    "lossless HEVC": (("none", "high", "low"), "gbrp", *HEVC, "lossless=1:log-level=0"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", BYTES)
-def test_high_and_low_byte_are_found_in_channels_of_colours(clips, case):
+def test_depth_is_found_in_channels_of_colours(clips, case):
     places, *stored = BYTES[case]
     depth = smooth_depth()
-    parts = {"high": depth >> 8, "low": depth & 255, "none": 0 * depth}
-    channels = [parts[place].astype(np.uint8) for place in places]
+    parts = {"high": depth >> 8, "low": depth & 255, "none": 0 * depth, "both": depth}
+    channels = [parts[each].astype(np.uint16 if each == "both" else np.uint8) for each in places]
 
     found = read_first(written_colours(clips, f"bytes {case}.mkv", channels, *stored))
 
     np.testing.assert_array_equal(found, depth)
-
-
-def test_three_equal_channels_of_16_bits_are_depth(clips):
-    depth = smooth_depth()
-    path = written_colours(clips, "three equal.mkv", [depth] * 3, "gbrp16le", "ffv1")
-
-    np.testing.assert_array_equal(read_first(path), depth)
 
 
 @pytest.mark.parametrize("case", ["other numbers", "colours", "grey", "one byte", "noise"])

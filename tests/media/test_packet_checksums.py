@@ -12,6 +12,7 @@ from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.container import packet_checksums
 from stereogenbench_data.media.encoder import write_pictures
 from stereogenbench_data.media.video import VideoReader, read_rgb
+from tests.media.conftest import flipped
 
 FRAMES = 9
 
@@ -34,12 +35,6 @@ def packets_of(content):
     """Where the packets lie, by FFmpeg's own list."""
     with av.open(io.BytesIO(content)) as container:
         return [(each.pos, each.size) for each in container.streams.video[0].index_entries]
-
-
-def flipped(content, place, bit):
-    changed = bytearray(content)
-    changed[place] ^= 1 << bit
-    return bytes(changed)
 
 
 def test_a_bit_that_flips_in_the_packet_of_a_frame_is_named(written):

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy import ndimage
 
 from stereogenbench_data.media.video import VideoReader, read_rgb
+from tests.media.conftest import texture
 
 X264 = ("-c:v", "libx264", "-crf", "10")
 COLOURS = {
@@ -55,20 +55,16 @@ def test_odd_sizes_and_other_formats_are_ffmpegs_too(clips, pixel_format):
 
 
 @pytest.fixture(scope="module")
-def texture(clips):
+def detailed(clips):
     """A clip of one large picture with detail at every scale, and that picture as decoded."""
-    rng = np.random.default_rng(5)
-    noise = rng.normal(size=(320, 320, 3))
-    layers = [ndimage.gaussian_filter(noise, (s, s, 0)) * s for s in (1, 2, 4, 8)]
-    picture = sum(layers)
-    picture = np.uint8((picture - picture.min()) / np.ptp(picture) * 255)
+    picture = texture(320, 320, sigmas_px=[1, 2, 4, 8])
     path = clips.encode("texture.mp4", *X264, "-pix_fmt", "yuv444p", pictures=picture[None])
     with VideoReader(path, name="clip", frames=1) as reader:
         return path, read_rgb(reader, 0)
 
 
-def test_scaling_by_whole_factors_averages_areas(texture):
-    path, stored = texture
+def test_scaling_by_whole_factors_averages_areas(detailed):
+    path, stored = detailed
     areas = stored.reshape(3, 80, 4, 80, 4).mean(axis=(2, 4))
 
     with VideoReader(path, name="clip", frames=1) as reader:
@@ -79,8 +75,8 @@ def test_scaling_by_whole_factors_averages_areas(texture):
     assert difference.std() < 0.7
 
 
-def test_a_given_array_is_written_and_returned(texture):
-    path, stored = texture
+def test_a_given_array_is_written_and_returned(detailed):
+    path, stored = detailed
     batch = np.zeros((2, 3, 320, 320), np.uint8)
 
     with VideoReader(path, name="clip", frames=1) as reader:

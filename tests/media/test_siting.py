@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from scipy import ndimage
 
 from stereogenbench_data.media.video import VideoReader, read_rgb
+from tests.media.conftest import texture
 
 X264 = ("-c:v", "libx264", "-crf", "10", "-pix_fmt", "yuv420p")
 HEVC = ("-c:v", "libx265", "-crf", "10", "-pix_fmt", "yuv420p", "-x265-params")
@@ -27,15 +27,12 @@ FILES = {
 """By name: the file, where its chroma lies, and how it is encoded."""
 
 
-def texture():
-    noise = np.random.default_rng(5).normal(size=(256, 256, 3))
-    layers = sum(ndimage.gaussian_filter(noise, (s, s, 0)) * s for s in (2, 4, 8))
-    return np.uint8((layers - layers.min()) / np.ptp(layers) * 255)
+PICTURE = texture(256, 256, sigmas_px=[2, 4, 8])
 
 
 def read(clips, name, *, size=None):
     file, _, codec = FILES[name]
-    path = clips.encode(f"siting {file}", *codec, pictures=texture()[None])
+    path = clips.encode(f"siting {file}", *codec, pictures=PICTURE[None])
     with VideoReader(path, name="clip", frames=1) as reader:
         return read_rgb(reader, 0, size=size).astype(float)
 
@@ -43,11 +40,8 @@ def read(clips, name, *, size=None):
 def shifts_px(picture, reference):
     """Return how far Y, Cb and Cr of a picture lie from those of another, as (3, 2): x and y."""
     found = []
-    for values, expected in zip(
-        np.einsum("ij,jhw->ihw", TO_YCC, picture),
-        np.einsum("ij,jhw->ihw", TO_YCC, reference),
-        strict=True,
-    ):
+    channels = (np.einsum("ij,jhw->ihw", TO_YCC, each) for each in (picture, reference))
+    for values, expected in zip(*channels, strict=True):
         down, right = np.gradient(expected)
         slopes = np.stack([right.ravel(), down.ravel(), np.ones(right.size)], axis=1)
         found.append(np.linalg.lstsq(slopes, (expected - values).ravel(), rcond=None)[0][:2])
@@ -67,7 +61,7 @@ def test_colour_is_where_brightness_is_at_any_size(clips, name, size):
 
 @pytest.mark.parametrize("name", [name for name in FILES if name != "odd"])
 def test_chroma_at_the_stored_size_lies_where_the_file_is_tagged_to_have_it(clips, name):
-    reference = texture().transpose(2, 0, 1).astype(float)
+    reference = PICTURE.transpose(2, 0, 1).astype(float)
     centred = shifts_px(read(clips, "ffv1 untagged"), reference)
 
     moved = shifts_px(read(clips, name), reference) - centred
