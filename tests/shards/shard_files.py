@@ -1,8 +1,11 @@
 """Tars, folders of shards and their damage, for tests."""
 
 import os
+from collections.abc import Callable
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Scene
@@ -40,3 +43,11 @@ def flip_byte(path: Path, at: int | None = None) -> bytes:
     path.write_bytes(content)
     os.utime(path, ns=(0, path.stat().st_mtime_ns + 10**9))
     return bytes(content)
+
+
+def alter_scene(folder: Path, key: str, change: Callable[[Scene], dict[str, Any]]) -> None:
+    """Write the index of shards again with other values of a scene."""
+    index, scenes = SceneIndex.open(folder), scenes_of(folder)
+    scenes[key] = replace(scenes[key], **change(scenes[key]))
+    altered = SceneIndex.from_scenes(scenes.values(), folder, shards=index.shards)
+    altered.write(folder / "index.parquet")

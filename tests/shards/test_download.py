@@ -3,24 +3,23 @@
 import os
 import shutil
 import subprocess
-import sys
 import time
 
 import pytest
-from typer.testing import CliRunner
 
 from stereogenbench_data import SceneIndex, StereoPairs
-from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.open import StaleIndexWarning
+from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.shards.download import download, download_sizes, plan_download
-from stereogenbench_data.shards.pack import pack
+from tests.cli.command import COMMAND, invoke
 from tests.servers.failing_server import Answer
+from tests.shards.shard_files import bytes_of
 
 
 @pytest.fixture
-def shards_on_the_web(web, small_release):
-    pack(small_release, web.folder / "shards", workers=1)
+def shards_on_the_web(web, small_shards):
+    shutil.copytree(small_shards, web.folder / "shards")
     return f"{web.url}/shards"
 
 
@@ -29,9 +28,7 @@ def fetched(url, dest, *, cameras=(0, 1), streams=("rgb", "depth"), rows=(0, 1))
     return download(index, plan_download(index, rows, cameras=cameras, streams=streams), dest)
 
 
-def test_only_the_files_of_the_cameras_are_fetched_and_are_the_released_ones(
-    shards_on_the_web, web, small_release, tmp_path
-):
+def test_only_the_files_of_the_cameras_are_fetched(shards_on_the_web, web, small_release, tmp_path):
     dest = tmp_path / "part"
 
     index = fetched(shards_on_the_web, dest)
@@ -56,9 +53,7 @@ def test_a_camera_that_was_not_fetched_is_named(shards_on_the_web, tmp_path):
         StereoPairs(tmp_path / "part", pairs=[(2, 3)], fields=("left", "right"))
 
 
-def test_a_part_can_be_indexed_anew_packed_shown_and_audited(
-    shards_on_the_web, tmp_path, monkeypatch
-):
+def test_a_part_can_be_indexed_packed_shown_and_audited(shards_on_the_web, tmp_path, monkeypatch):
     part = tmp_path / "part"
     fetched(shards_on_the_web, part)
     (part / "index.parquet").unlink()
@@ -68,7 +63,7 @@ def test_a_part_can_be_indexed_anew_packed_shown_and_audited(
         ["index", part], ["pack", part, "shards"], ["show", part, "-o", "sheet.png"],
         ["audit", part], ["conventions", part],
     ):  # fmt: skip
-        result = CliRunner().invoke(app, list(map(str, command)))
+        result = invoke(*command)
         assert result.exit_code == 0, result.output
     for data in (part, "shards"):
         assert len(StereoPairs(data, pairs=[(0, 1)])) == 2
@@ -101,9 +96,7 @@ def test_a_damaged_file_is_refused_and_leaves_nothing_behind(shards_on_the_web, 
     assert [path for path in (tmp_path / "part").rglob("*") if path.is_file()] == []
 
 
-def test_a_full_disk_is_reported_before_anything_is_fetched(
-    shards_on_the_web, tmp_path, monkeypatch
-):
+def test_a_full_disk_is_reported_before_a_fetch(shards_on_the_web, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=0))
 
@@ -121,11 +114,9 @@ def test_the_folder_of_the_data_is_refused(small_release):
 
 def test_the_command_says_the_size_first_and_reports(small_release, tmp_path):
     dest = tmp_path / "part"
-    arguments = ["download", str(small_release), "-o", str(dest), "--split", "eval"]
-    arguments += ["--cameras", "0,5"]
+    words = ["download", small_release, "-o", dest, "--split", "eval", "--cameras", "0,5"]
 
-    said = CliRunner().invoke(app, [*arguments, "--dry-run"])
-    done = CliRunner().invoke(app, arguments)
+    said, done = invoke(*words, "--dry-run"), invoke(*words)
 
     assert said.exit_code == done.exit_code == 0, done.output
     assert "1 scene, 9 files" in said.stderr
@@ -158,7 +149,7 @@ def test_a_metadata_file_of_another_revision_is_fetched_again(shards_on_the_web,
     assert changed.read_bytes() == text
 
 
-def test_a_killed_download_goes_on_and_leaves_no_file_that_is_not_whole(
+def test_a_killed_download_leaves_whole_files_and_goes_on(
     shards_on_the_web, small_release, web, tmp_path
 ):
     """The process is killed while a server that answers slowly has sent some files."""
@@ -166,10 +157,8 @@ def test_a_killed_download_goes_on_and_leaves_no_file_that_is_not_whole(
     command = ["download", shards_on_the_web, "-o", str(dest)]
     for name in sorted(path.relative_to(web.folder) for path in web.folder.rglob("*.tar")):
         web.always[str(name)] = Answer(delay_s=0.1)
-    killed = subprocess.Popen(
-        [sys.executable, "-m", "stereogenbench_data.cli.main", *command],
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    killed = subprocess.Popen([*COMMAND, *command], **quiet)
     deadline = time.monotonic() + 60
     while not list(dest.rglob("cam_00_rgb.mp4")) and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -178,7 +167,7 @@ def test_a_killed_download_goes_on_and_leaves_no_file_that_is_not_whole(
     there = [path for path in dest.rglob("*.*") if not path.name.startswith(".") and path.is_file()]
     web.always.clear()
 
-    done = CliRunner().invoke(app, command)
+    done = invoke(*command)
 
     assert 0 < len(there) < 4 * 17
     for path in there:
@@ -188,18 +177,14 @@ def test_a_killed_download_goes_on_and_leaves_no_file_that_is_not_whole(
     assert not list(dest.rglob(".*"))
 
 
-def test_downloads_into_one_folder_add_up(shards_on_the_web, small_release, tmp_path):
+def test_downloads_into_one_folder_add_up(shards_on_the_web, tmp_path):
     fetched(shards_on_the_web, tmp_path / "part", rows=(0, 1), streams=("rgb",))
     fetched(shards_on_the_web, tmp_path / "part", rows=(1, 2), cameras=(1, 2))
 
     index = SceneIndex.open(tmp_path / "part")
-    videos = [
-        {name for name in index.scene(row).members if name.startswith("cam_")} for row in range(3)
-    ]
-    first = {"cam_00_rgb.mp4", "cam_01_rgb.mp4"}
-    second = {
-        f"cam_{camera}_{kind}" for camera in ("01", "02") for kind in ("rgb.mp4", "depth.mkv")
-    }
+    videos = [set(index.scene(row).held_videos) for row in range(3)]
+    first = {rgb_name(0), rgb_name(1)}
+    second = {name(camera) for camera in (1, 2) for name in (rgb_name, depth_name)}
     assert not index.stale
     assert videos == [first, first | second, second]
 
@@ -216,12 +201,9 @@ def test_what_was_removed_since_an_earlier_download_is_not_listed(shards_on_the_
     assert set(keys) == {first.scene(1).id.key, fetched_key}
 
 
-def test_a_folder_with_the_index_of_other_data_is_refused(
-    shards_on_the_web, small_release, tmp_path
-):
-    pack(small_release, tmp_path / "shards", workers=1)
-    before = (tmp_path / "shards" / "index.parquet").read_bytes()
+def test_a_folder_with_an_index_of_other_data_is_refused(shards_on_the_web, small_shards, tmp_path):
+    shards = shutil.copytree(small_shards, tmp_path / "shards")
 
     with pytest.raises(StorageError, match="shards: has the index of other data"):
-        fetched(shards_on_the_web, tmp_path / "shards")
-    assert (tmp_path / "shards" / "index.parquet").read_bytes() == before
+        fetched(shards_on_the_web, shards)
+    assert bytes_of(shards) == bytes_of(small_shards)

@@ -13,18 +13,16 @@ from hashlib import sha256
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from stereogenbench_data.cli.commands import app
-from stereogenbench_data.engine import no_advance
 from stereogenbench_data.errors import ShardError
 from stereogenbench_data.index.open_tree import IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Member
 from stereogenbench_data.shards.pack import pack
-from stereogenbench_data.shards.plan import PlannedShard, plan_shards
+from stereogenbench_data.shards.plan import PlannedShard
 from stereogenbench_data.shards.writer import ShardTask, pack_task
 from stereogenbench_data.sources.files import locked
+from tests.cli.command import invoke
 from tests.servers.tools import killed_fork, small_disk
 from tests.shards.shard_files import bytes_of
 
@@ -62,17 +60,6 @@ def tars(folder):
     return sorted(path.name for path in folder.iterdir() if ".tar" in path.name)
 
 
-def names_in(shard):
-    with tarfile.open(shard) as tar:
-        return tar.getnames()
-
-
-def pack_shard(plan, number, out):
-    """Pack one shard of a plan in this process."""
-    task = ShardTask(plan.shards[number], plan.root, str(out), plan.digest)
-    return pack_task(task, no_advance)
-
-
 def test_shards_hold_the_bytes_of_the_release_and_nothing_else(packed, small_release):
     found = {}
     for name in NAMES:
@@ -99,17 +86,12 @@ def test_the_index_places_every_file(packed, release):
             content = (packed / member.path).read_bytes()[member.offset :][: member.size]
             assert content == Path(release.root, before.members[name].path).read_bytes()
             assert member.crc32 == zlib.crc32(content)
-    facts = {
-        name: (facts.size, facts.sha256, facts.members) for name, facts in index.shards.items()
-    }
-    assert facts == {
-        name: (
-            (packed / name).stat().st_size,
-            sha256((packed / name).read_bytes()).hexdigest(),
-            len(names_in(packed / name)),
-        )
-        for name in NAMES
-    }
+    assert list(index.shards) == NAMES
+    for name, facts in index.shards.items():
+        content = (packed / name).read_bytes()
+        with tarfile.open(packed / name) as tar:
+            assert facts.members == len(tar.getnames())
+        assert (facts.size, facts.sha256) == (len(content), sha256(content).hexdigest())
 
 
 def test_packing_again_gives_the_same_bytes_with_two_workers(packed, release, tmp_path):
@@ -122,17 +104,12 @@ def test_packing_again_gives_the_same_bytes_with_two_workers(packed, release, tm
 
 def test_packing_in_parts_gives_the_same_bytes(packed, release, tmp_path):
     out = tmp_path / "out"
-    reports = [
-        pack(release, out, target_bytes=ONE_EACH, part=(number, 3), workers=1)
-        for number in (3, 1, 2)
-    ]
+    how = {"target_bytes": ONE_EACH, "workers": 1}
+    reports = [pack(release, out, part=(number, 3), **how) for number in (3, 1, 2)]
 
     assert bytes_of(out) == bytes_of(packed)
-    assert [report.part for report in reports] == [
-        (NAMES[2],),
-        (NAMES[0], NAMES[3]),
-        (NAMES[1],),
-    ]
+    expected = [(NAMES[2],), (NAMES[0], NAMES[3]), (NAMES[1],)]
+    assert [report.part for report in reports] == expected
     assert [len(report.missing) for report in reports] == [3, 1, 0]
     assert [report.index is None for report in reports] == [True, True, False]
 
@@ -253,7 +230,7 @@ def test_a_shard_that_another_process_packs_is_left_to_it(release, tmp_path):
         locked(tmp_path / ".parts" / f"{NAMES[0]}.lock"),
         pytest.raises(ShardError, match=rf"{NAMES[0]}: another process is packing it"),
     ):
-        pack_shard(plan_shards(release, ONE_EACH), 0, tmp_path)
+        pack(release, tmp_path, target_bytes=ONE_EACH, workers=1)
     assert tars(tmp_path) == []
 
 
@@ -292,32 +269,24 @@ def test_shards_are_not_packed_again(packed, tmp_path):
         pack(packed, tmp_path)
 
 
-@pytest.fixture(name="small_disk")
-def small_disk_of_600_kb(tmp_path):
-    """A disk of 600 kB."""
+def test_packing_goes_on_once_there_is_room(release, packed, tmp_path):
     with small_disk(tmp_path / "disk", size="600k") as place:
-        yield place
+        with pytest.raises(ShardError, match="Make room"):
+            pack(release, place, target_bytes=ONE_EACH, workers=1)
+        subprocess.run(["mount", "-o", "remount,size=10M", place], check=True)
 
+        pack(release, place, target_bytes=ONE_EACH, workers=1)
 
-def test_packing_goes_on_once_there_is_room(release, packed, small_disk):
-    with pytest.raises(ShardError, match="Make room"):
-        pack(release, small_disk, target_bytes=ONE_EACH, workers=1)
-    subprocess.run(["mount", "-o", "remount,size=10M", small_disk], check=True)
-
-    pack(release, small_disk, target_bytes=ONE_EACH, workers=1)
-
-    assert bytes_of(small_disk) == bytes_of(packed)
-
-
-def command(*words):
-    return CliRunner().invoke(app, ["pack", *map(str, words)])
+        assert bytes_of(place) == bytes_of(packed)
 
 
 def test_the_command_packs_a_share_that_fits(small_release, tmp_path):
     folder = tmp_path / "share"
     whole = sum(path.stat().st_size for path in small_release.rglob("scene_*/*"))
 
-    done = command(small_release, folder, "--max-bytes", str(whole * 2 // 3), "--workers", "1")
+    done = invoke(
+        "pack", small_release, folder, "--max-bytes", str(whole * 2 // 3), "--workers", "1"
+    )
 
     assert done.exit_code == 0, done.output
     packed_bytes = sum(path.stat().st_size for path in folder.glob("*.tar"))
@@ -326,8 +295,8 @@ def test_the_command_packs_a_share_that_fits(small_release, tmp_path):
 
 
 def test_the_command_packs_and_reports_what_there_is(small_release, tmp_path, packed):
-    first = command(small_release, tmp_path, "--shard-size", "250kB", "--part", "1/2")
-    second = command(small_release, tmp_path, "--shard-size", "250kB", "--workers", "1")
+    first = invoke("pack", small_release, tmp_path, "--shard-size", "250kB", "--part", "1/2")
+    second = invoke("pack", small_release, tmp_path, "--shard-size", "250kB", "--workers", "1")
 
     assert (first.exit_code, second.exit_code) == (0, 0)
     packed_line, remaining_line = first.stdout.splitlines()
@@ -347,7 +316,7 @@ def test_the_command_packs_the_others_and_names_one_scene_that_lacks_a_file(tree
     (lacking / name).unlink()
 
     with pytest.warns(IncompleteSceneWarning, match=rf"1 of 4 lacks .*scene_000001/{name}: is mis"):
-        result = command(tree, tmp_path / "out", "--workers", "1")
+        result = invoke("pack", tree, tmp_path / "out", "--workers", "1")
 
     assert result.exit_code == 0, result.output
     assert "index.parquet: 3 scenes" in result.stdout
@@ -360,7 +329,7 @@ def test_the_command_refuses_a_release_where_many_scenes_lack_a_file(tree, tmp_p
     for place in list(tree.glob("train/*/*/scene_*/trajectory.json"))[:2]:
         place.unlink()
 
-    result = command(tree, tmp_path / "out")
+    result = invoke("pack", tree, tmp_path / "out")
 
     assert result.exit_code == 2
     assert "2 of 4 lack a file" in result.stderr
@@ -372,14 +341,14 @@ def test_the_command_packs_a_release_without_poses(tree, tmp_path):
     for place in list(tree.rglob("trajectory.json")):
         place.unlink()
 
-    result = command(tree, tmp_path / "out", "--workers", "1")
+    result = invoke("pack", tree, tmp_path / "out", "--workers", "1")
 
     assert result.exit_code == 0, result.output
     assert len(SceneIndex.open(tmp_path / "out")) == 4
 
 
 def test_a_part_that_is_not_written_as_one_is_a_usage_error(small_release, tmp_path):
-    result = command(small_release, tmp_path, "--part", "a/b")
+    result = invoke("pack", small_release, tmp_path, "--part", "a/b")
 
     assert result.exit_code == 2
     assert all(word in result.stderr for word in ("--part", "I/N"))
@@ -406,7 +375,7 @@ def killed_pack(moment, release, out):
 
 
 @pytest.mark.parametrize("moment", [5, 24])
-def test_a_pack_killed_at_any_moment_leaves_nothing_behind_once_it_was_resumed(
+def test_a_killed_pack_goes_on_and_leaves_nothing_behind(
     moment, small_release, release, packed, tmp_path
 ):
     out = tmp_path / "out"
@@ -418,7 +387,6 @@ def test_a_pack_killed_at_any_moment_leaves_nothing_behind_once_it_was_resumed(
 
     assert was_killed
     assert had_shards or not had_index
-    assert sorted(path.relative_to(out) for path in out.rglob("*")) == sorted(
-        path.relative_to(packed) for path in packed.rglob("*")
-    )
+    one, other = ({each.relative_to(d) for each in d.rglob("*")} for d in (out, packed))
+    assert one == other
     assert bytes_of(out) == bytes_of(packed)

@@ -49,9 +49,8 @@ def test_shards_are_filled_in_the_order_of_keys_with_whole_scenes(index_of):
         (key(4),),
     ]
     assert [shard.size for shard in plan.shards] == [3072, 3072, 2048]
-    assert [shard.name for shard in plan.shards] == [
-        f"train-Uniform-{number:06d}.tar" for number in range(3)
-    ]
+    names = [f"train-Uniform-{number:06d}.tar" for number in range(3)]
+    assert [shard.name for shard in plan.shards] == names
 
 
 def test_a_scene_larger_than_the_target_has_a_shard_of_its_own(index_of):
@@ -92,9 +91,8 @@ def test_a_plan_is_the_same_each_time_and_wherever_the_release_lies(index_of):
     sizes = {key(number): 512 for number in range(5)}
     plan = plan_shards(index_of(sizes), 3072)
 
-    assert plan_shards(index_of(dict(reversed(sizes.items())), root="/moved"), 3072) == replace(
-        plan, root="/moved"
-    )
+    moved = index_of(dict(reversed(sizes.items())), root="/moved")
+    assert plan_shards(moved, 3072) == replace(plan, root="/moved")
 
 
 @pytest.mark.parametrize(

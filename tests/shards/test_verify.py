@@ -11,18 +11,17 @@ from dataclasses import replace
 from hashlib import sha256
 
 import pytest
-from typer.testing import CliRunner
 
 from stereogenbench_data import StereoPairs
-from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Member, ShardFacts
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.verify import verify
+from tests.cli.command import invoke
 from tests.servers.videos import write_video
-from tests.shards.shard_files import flip_byte, scenes_of, tar_of
+from tests.shards.shard_files import alter_scene, flip_byte, scenes_of, tar_of
 
 PAIR = "train-Uniform-000000.tar"
 SINGLE = "train-IPD_Gaussian-000000.tar"
@@ -89,12 +88,11 @@ def test_a_cut_shard_is_reported_with_its_size_and_what_is_lost(shards, place, w
     }[where]
     os.truncate(shards / PAIR, cut)
 
-    lost = [] if "end" in where else [
-        (f"{PAIR}: {SCENES[1]}: 8 of its files ", "(cam_02_depth.mkv, cam_02_rgb.mp4, ", FETCH)
-    ]  # fmt: skip
-    assert_lines(
-        lines(shards), (f"{PAIR}: has {cut} bytes", f"{size}: it is cut short", FETCH), *lost
-    )
+    told = [(f"{PAIR}: has {cut} bytes", f"{size}: it is cut short", FETCH)]
+    if "end" not in where:
+        lost = "(cam_02_depth.mkv, cam_02_rgb.mp4, "
+        told.append((f"{PAIR}: {SCENES[1]}: 8 of its files ", lost, FETCH))
+    assert_lines(lines(shards), *told)
 
 
 def test_a_flipped_payload_byte_is_reported_with_its_member(shards, place):
@@ -189,19 +187,11 @@ def test_a_file_that_the_index_does_not_name_is_reported_though_the_checksums_ar
     assert_lines(reported, ("x.tar: a/x: txt: its header", "does not name it", FETCH))
 
 
-def test_a_missing_shard_is_reported_with_what_it_held(shards):
-    (shards / PAIR).unlink()
-
-    assert_lines(lines(shards, mode="decode"), (f"{PAIR}: is missing", "2 scenes", FETCH))
-
-
 def test_shards_that_the_index_does_not_know_are_reported(shards):
     shutil.copy(shards / PAIR, shards / "train-Uniform-000001.tar")
 
-    assert_lines(
-        lines(shards),
-        ("train-Uniform-000001.tar: is not in the index", "Put the index beside the shards"),
-    )
+    told = ("train-Uniform-000001.tar: is not in the index", "Put the index beside the shards")
+    assert_lines(lines(shards), told)
 
 
 def test_all_problems_are_listed_whatever_the_workers(shards, place):
@@ -224,15 +214,12 @@ def repacked(small_release, tmp_path):
 
     def make(name, content):
         tree = shutil.copytree(small_release, tmp_path / "tree")
-        index = SceneIndex.open(tree)
-        row = [index.scene(row).id.key for row in range(len(index))].index(SCENES[0])
+        scenes, out = scenes_of(tree), tmp_path / "repacked"
         (tree / SCENES[0] / name).write_bytes(content)
-        scenes = [index.scene(number) for number in range(len(index))]
-        members = dict(scenes[row].members)
-        members[name] = replace(members[name], size=len(content))
-        scenes[row] = replace(scenes[row], members=members)
-        out = tmp_path / "repacked"
-        pack(SceneIndex.from_scenes(scenes, tree), out, workers=1)
+        member = replace(scenes[SCENES[0]].members[name], size=len(content))
+        members = scenes[SCENES[0]].members | {name: member}
+        scenes[SCENES[0]] = replace(scenes[SCENES[0]], members=members)
+        pack(SceneIndex.from_scenes(scenes.values(), tree), out, workers=1)
         assert lines(out) == []
         return lines(out, mode="decode")
 
@@ -249,9 +236,8 @@ def test_a_video_with_fewer_frames_is_reported_by_decoding(repacked, tmp_path):
 
 
 def test_depth_of_another_unit_than_the_index_says_is_reported_by_decoding(repacked, tmp_path):
-    other = write_video(
-        tmp_path / "o_depth.mkv", frames=7, size=(64, 64), tags={"DEPTH_SCALE": "0.5"}
-    )
+    how = {"frames": 7, "size": (64, 64), "tags": {"DEPTH_SCALE": "0.5"}}
+    other = write_video(tmp_path / "o_depth.mkv", **how)
 
     (reported,) = repacked("cam_05_depth.mkv", other.read_bytes())
 
@@ -288,12 +274,7 @@ def test_remote_shards_must_be_downloaded_first(tmp_path):
     ],
 )  # fmt: skip
 def test_an_index_that_contradicts_a_shards_metadata_is_reported(shards, member, change, found):
-    index = SceneIndex.open(shards)
-    scenes = [index.scene(row) for row in range(len(index))]
-    row = [scene.id.key for scene in scenes].index(SCENES[1])
-    scenes[row] = replace(scenes[row], **change(scenes[row]))
-    altered = SceneIndex.from_scenes(scenes, shards, shards=index.shards)
-    altered.write(shards / "index.parquet")
+    alter_scene(shards, SCENES[1], change)
 
     (reported,) = lines(shards)
 
@@ -312,9 +293,7 @@ def test_shards_beside_which_an_earlier_version_wrote_files_for_other_readers_ar
 
 
 def test_a_damaged_index_of_shards_is_to_be_fetched_or_packed_again(shards):
-    content = bytearray((shards / "index.parquet").read_bytes())
-    content[len(content) // 2 :] = b""
-    (shards / "index.parquet").write_bytes(content)
+    os.truncate(shards / "index.parquet", (shards / "index.parquet").stat().st_size // 2)
 
     with pytest.raises(StorageError, match="the index of shards: fetch it again or, where"):
         verify(shards)
@@ -329,20 +308,17 @@ def test_an_index_that_contradicts_itself_is_refused(shards):
         verify(shards)
 
 
-def command(*words):
-    return CliRunner().invoke(app, ["verify", *map(str, words), "--workers", "1"])
-
-
-def test_the_command_reports_as_json(shards):
+def test_a_missing_shard_is_reported_with_what_it_held_as_json_too(shards):
     (shards / PAIR).unlink()
 
-    result = command(shards, "--json")
+    result = invoke("verify", shards, "--workers", "1", "--json")
 
     reported = json.loads(result.stdout)
     assert result.exit_code == 1
     assert (reported["shards"], reported["scenes"]) == (3, 4)
     (problem,) = reported["problems"]
     assert (problem["shard"], problem["found"]) == (PAIR, "is missing, with 2 scenes")
+    assert_lines(lines(shards, mode="decode"), (f"{PAIR}: is missing", "2 scenes", FETCH))
 
 
 def test_a_released_folder_is_not_shards(small_release, tmp_path):
