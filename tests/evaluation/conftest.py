@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from skimage.metrics import structural_similarity
 
 from stereogenbench_data import evaluate
 from stereogenbench_data.evaluation.predictions import frame_name, item_name, open_frames
@@ -73,6 +74,14 @@ def numbers(scores):
         (pair.scene, pair.pair, pair.problem, repr(sorted(pair.tallies.items())))
         for pair in scores.pairs
     ]
+
+
+def true_ssim(one: np.ndarray, two: np.ndarray) -> float:
+    """Return the SSIM of two pictures (3, h, w) by scikit-image."""
+    return structural_similarity(
+        one, two, data_range=255, channel_axis=0, gaussian_weights=True, sigma=1.5,
+        use_sample_covariance=False,
+    )  # fmt: skip
 
 
 def photograph(path: Path) -> np.ndarray:

@@ -82,7 +82,7 @@ def test_an_evaluation_that_scored_nothing_does_not_hinder_another_one(
         ("--by", "nope", "has no column 'nope'"),
         ("--metrics", "mse", "there is no metric 'mse'"),
         ("--stereo-matcher", "eyes", "'eyes'"),
-        ("--tier", "G9", "there is no tier 'G9'"),
+        ("--tier", "G9", "there is no tier 'G9': choose one of G0 (oracle geometry"),
     ],
 )
 def test_an_option_that_is_off_is_reported(scenes, right_views, tmp_path, option, value, message):
@@ -107,16 +107,3 @@ def test_controls_stand_beside_the_papers(scenes, tmp_path):
 
     assert shown.exit_code == 0, shown.output
     assert "rendered target (paper, other scenes)" in shown.stdout
-
-
-def test_a_stop_says_how_to_go_on(scenes, right_views, tmp_path, monkeypatch):
-    from stereogenbench_data.evaluation import evaluate
-
-    def stopped(*arguments, **options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(evaluate, "evaluate", stopped)
-    shown = run("eval", "score", scenes, right_views, "--tier", "G0", "--out", tmp_path, *SMALL)
-
-    assert shown.exit_code == 130
-    assert "run the same command again to go on" in shown.stderr

@@ -13,14 +13,22 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from skimage.metrics import peak_signal_noise_ratio
 
 from stereogenbench_data import EvaluationError, EvaluationProtocol
 from stereogenbench_data.errors import FieldError, PredictionError, StorageError
 from stereogenbench_data.evaluation.models import i3d, inception
 from stereogenbench_data.evaluation.predictions import frame_name, item_name
 from stereogenbench_data.schema.release import rgb_name
-from tests.evaluation.conftest import FRAMES, SIZE, numbers, rendered, scored, write_pngs
+from tests.evaluation.conftest import (
+    FRAMES,
+    SIZE,
+    numbers,
+    rendered,
+    scored,
+    true_ssim,
+    write_pngs,
+)
 from tests.servers.tools import killed_fork
 
 
@@ -36,21 +44,14 @@ def copied(right_views, tmp_path):
 
 def test_scores_are_those_of_scikit_image_averaged_over_frames(scored_index, other_views, protocol):
     pair = scored(scored_index, other_views, protocol).pairs[0]
-    psnr, ssim = [], []
-    for frame in range(FRAMES):
-        views = [
-            rendered(scored_index, pair.scene, camera, frame).transpose(1, 2, 0)
-            for camera in (1, 2)
-        ]
-        psnr.append(peak_signal_noise_ratio(*views, data_range=255))
-        ssim.append(
-            structural_similarity(
-                *views, data_range=255, channel_axis=2, gaussian_weights=True, sigma=1.5,
-                use_sample_covariance=False,
-            )
-        )  # fmt: skip
+    views = [
+        [rendered(scored_index, pair.scene, camera, frame) for camera in (1, 2)]
+        for frame in range(FRAMES)
+    ]
+    psnr = [peak_signal_noise_ratio(*both, data_range=255) for both in views]
 
     assert pair.tallies["psnr"].mean == pytest.approx(np.mean(psnr), abs=1e-9)
+    ssim = [true_ssim(*both) for both in views]
     assert pair.tallies["ssim"].mean == pytest.approx(np.mean(ssim), abs=1e-6)
 
 
@@ -90,15 +91,12 @@ def test_a_callable_gets_its_tiers_inputs_in_batches_and_scores_as_if_written(
 
 
 def test_floats_of_0_to_1_are_rounded_to_8_bits(scored_index, protocol):
-    def lefts(inputs):
-        return inputs["left"]
-
-    def float_lefts(inputs):
-        return inputs["left"].float() / 255
-
-    assert numbers(scored(scored_index, lefts, protocol)) == numbers(
-        scored(scored_index, float_lefts, protocol)
+    lefts, floats = (
+        scored(scored_index, method, protocol)
+        for method in (lambda inputs: inputs["left"], lambda inputs: inputs["left"].float() / 255)
     )
+
+    assert numbers(lefts) == numbers(floats)
 
 
 @pytest.mark.parametrize(
@@ -119,27 +117,28 @@ def test_what_a_callable_returns_is_checked(scored_index, protocol, method, mess
         scored(scored_index, method, protocol)
 
 
-def test_a_video_as_released_is_a_prediction_of_the_stored_size(scored_index, tmp_path):
-    root = Path(scored_index.root)
-    for key in keys(scored_index):
-        target = tmp_path / key / "00-01.mp4"
+def released_videos(folder, index, *, size):
+    for key in keys(index):
+        target = folder / key / "00-01.mp4"
         target.parent.mkdir(parents=True)
-        shutil.copy(root / key / rgb_name(1), target)
-    protocol = EvaluationProtocol(metrics=("psnr",), size=SIZE)
-    scores = scored(scored_index, tmp_path, protocol)
-
-    assert [pair.tallies["psnr"].infinite for pair in scores.pairs] == [FRAMES] * 3
+        shutil.copy(Path(index.root, key, rgb_name(1)), target)
 
 
 @pytest.mark.parametrize(
-    ("evaluated", "written"), [((96, 128), (96, 128)), ((96, 128), None), ((33, 47), None)]
+    ("write", "evaluated", "written"),
+    [
+        (write_pngs, (96, 128), (96, 128)),
+        (write_pngs, (96, 128), None),
+        (write_pngs, (33, 47), None),
+        (released_videos, SIZE, None),
+    ],
 )
-def test_a_png_identical_to_the_rendered_view_scores_infinitely(
-    scored_index, tmp_path, evaluated, written
+def test_pictures_and_videos_identical_to_the_rendered_view_score_infinitely(
+    scored_index, tmp_path, write, evaluated, written
 ):
-    folder = write_pngs(tmp_path, scored_index, size=written)
+    write(tmp_path, scored_index, size=written)
     protocol = EvaluationProtocol(metrics=("psnr", "ssim", "p_psnr"), size=evaluated)
-    scores = scored(scored_index, folder, protocol)
+    scores = scored(scored_index, tmp_path, protocol)
 
     assert [pair.tallies["psnr"].infinite for pair in scores.pairs] == [FRAMES] * 3
     assert [pair.tallies["ssim"].mean for pair in scores.pairs] == [1.0] * 3
@@ -315,18 +314,12 @@ def test_distances_between_sets_are_of_branches(
         ({"frames": ("clips", 2)}, "frames must be 'all', 'first', numbers of frames"),
         ({"pairs": "sweep"}, r"right view .* choose pairs='primary', 'adjacent'"),
         ({"direction": "right_to_left"}, r"right view .* choose pairs='primary', 'adjacent'"),
+        ({"predictions": Path("nowhere")}, r"nowhere: is not a folder\. Pass "),
     ],
 )
-def test_frames_and_pairs_that_have_no_right_view_are_refused(
-    scored_index, right_views, protocol, options, message
-):
+def test_what_cannot_be_scored_is_refused(scored_index, right_views, protocol, options, message):
     with pytest.raises(EvaluationError, match=message):
-        scored(scored_index, right_views, protocol, **options)
-
-
-def test_a_folder_that_is_none_is_refused(scored_index, protocol, tmp_path):
-    with pytest.raises(EvaluationError, match=r"nowhere: is not a folder\. Pass "):
-        scored(scored_index, tmp_path / "nowhere", protocol)
+        scored(scored_index, **({"predictions": right_views, "protocol": protocol} | options))
 
 
 def test_scores_are_the_same_on_one_thread_and_on_three_whose_number_is_left_as_it_was(

@@ -6,28 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
-from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from skimage.metrics import peak_signal_noise_ratio
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.metrics.pixels import (
-    psnr_db,
-    ssim,
-)
-from tests.evaluation.conftest import photograph
+from stereogenbench_data.evaluation.metrics.pixels import psnr_db, ssim
+from tests.evaluation.conftest import photograph, true_ssim
 
 pictures = arrays(np.uint8, (3, 13, 17))
-
-
-def true_ssim(one: np.ndarray, two: np.ndarray) -> float:
-    return structural_similarity(
-        one,
-        two,
-        channel_axis=0,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        data_range=255,
-    )
 
 
 def noisy(picture: np.ndarray, *, sigma: float) -> np.ndarray:

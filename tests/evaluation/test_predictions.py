@@ -71,16 +71,12 @@ def test_pictures_are_found_by_item_and_by_scene_and_cameras(tmp_path, place):
     assert levels(find_prediction(tmp_path, WANTED)) == [10, 12]
 
 
-def test_a_video_of_the_whole_scene_is_read_by_frame_number(item, tmp_path):
-    write_video(item.with_name(f"{item.name}.mkv"), [10, 20, 30])
+@pytest.mark.parametrize("place", [item_name(SCENE, (0, 1)), f"{SCENE}/00-01"])
+@pytest.mark.parametrize(("written", "found"), [([10, 20, 30], [10, 30]), ([10, 20], [10, 20])])
+def test_a_video_is_of_the_whole_scene_or_of_the_evaluated_frames(tmp_path, place, written, found):
+    write_video(tmp_path / f"{place}.mkv", written)
 
-    assert levels(find_prediction(tmp_path, WANTED)) == [10, 30]
-
-
-def test_a_video_of_the_evaluated_frames_is_read_in_order(tmp_path):
-    write_video(tmp_path / SCENE / "00-01.mkv", [10, 20])
-
-    assert levels(find_prediction(tmp_path, WANTED)) == [10, 20]
+    assert levels(find_prediction(tmp_path, WANTED)) == found
 
 
 def test_pictures_of_the_stored_size_are_read_as_they_are_and_scaled_by_area(item):

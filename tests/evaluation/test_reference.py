@@ -35,13 +35,6 @@ def test_a_cell_is_as_printed(table, where, column, printed):
     assert row[column] == printed
 
 
-def test_every_table_has_all_its_rows_and_names_its_source():
-    counts = {name: len(paper_table(name)) for name in SOURCES}
-
-    assert counts == {"main": 22, "unseen": 22, "bins": 55, "controls": 4}
-    assert all(source.startswith("tab:") for source in SOURCES.values())
-
-
 def test_the_bins_of_every_method_cover_the_281_scenes():
     for method in {row["method"] for row in paper_table("bins")}:
         rows = reference_rows("bins", method=method)
@@ -61,14 +54,10 @@ def printed(label):
 def test_every_number_stands_in_the_paper():
     for name, source in SOURCES.items():
         there = re.findall(r"\d+\.\d+", printed(source.partition(",")[0]))
-        ours = [
-            value
-            for row in paper_table(name)
-            for value in row.values()
-            if re.fullmatch(r"\d+\.\d+", value)
-        ]
+        cells = (value for row in paper_table(name) for value in row.values())
+        ours = [value for value in cells if re.fullmatch(r"\d+\.\d+", value)]
 
-        assert sorted(there) == sorted(ours)
+        assert sorted(there) == sorted(ours) != []
 
 
 @pytest.mark.parametrize(

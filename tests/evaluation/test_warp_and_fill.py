@@ -1,26 +1,19 @@
 """The shipped example: right in its filling, and worse the wider the baseline."""
 
-import importlib.util
+import runpy
 from pathlib import Path
 
-import pytest
 import torch
 
 from stereogenbench_data import EvaluationProtocol, evaluate, tables_of
 
 ROOT = Path(__file__).resolve().parents[2]
-EXAMPLE = ROOT / "examples" / "warp_and_fill.py"
 
 
-@pytest.fixture(scope="module")
-def warp_and_fill():
-    spec = importlib.util.spec_from_file_location("warp_and_fill", EXAMPLE)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.warp_and_fill
+warp_and_fill = runpy.run_path(str(ROOT / "examples" / "warp_and_fill.py"))["warp_and_fill"]
 
 
-def test_holes_take_the_next_pixel_to_the_right_else_to_the_left(warp_and_fill):
+def test_holes_take_the_next_pixel_to_the_right_else_to_the_left():
     row = torch.tensor([0, 5, 0, 0, 7, 0], dtype=torch.uint8)
     inputs = {
         "warped_right": row.expand(1, 3, 1, 6).clone(),
@@ -30,7 +23,7 @@ def test_holes_take_the_next_pixel_to_the_right_else_to_the_left(warp_and_fill):
     assert warp_and_fill(inputs)[0, :, 0].tolist() == [[5, 5, 7, 7, 7, 7]] * 3
 
 
-def test_scores_fall_from_bin_to_bin_of_baseline(warp_and_fill):
+def test_scores_fall_from_bin_to_bin_of_baseline():
     scores = evaluate(
         ROOT / "shards", warp_and_fill, tier="G0", split="eval", family="Uniform", pairs="all",
         frames=[0, 40], protocol=EvaluationProtocol(metrics=("psnr", "ssim"), size=(72, 72)),
