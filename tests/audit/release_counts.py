@@ -5,11 +5,13 @@ median) fixes a list of numbers up to its shape; that shape is two power laws, f
 Pairwise_Uniform it tells them of all pairs, too: cameras there stand on no line.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.optimize import brentq, fsolve
 
 from stereogenbench_data.audit.paper_numbers import paper_table
-from stereogenbench_data.schema.records import Member, Rig, Scene, SceneId, SceneLabels
+from stereogenbench_data.schema.records import Member, SceneId
 
 ADJACENT = [0, 5, 9, 12, 14]
 OTHERS = [place for place in range(15) if place not in ADJACENT]
@@ -47,8 +49,8 @@ def apart(adjacent):
     return spread_out(*rest, brentq(misses, 100.0, 110.0))
 
 
-def paper_scenes():
-    """Return the 8,493 scenes."""
+def paper_scenes(like):
+    """Return the 8,493 scenes, in all that no table counts like another one."""
     rng = np.random.default_rng(0)
     scenes = []
     for row in paper_table("adjacent"):
@@ -65,7 +67,9 @@ def paper_scenes():
             for each in paper_table(f"{split}_maps") for _ in range(int(each.get(family, 0)))
         ]  # fmt: skip
         scenes += [
-            _scene(split, family, subset, name, number, rows[number], far[number])
+            _scene(
+                like, SceneId("", split, subset, family, name), number, rows[number], far[number]
+            )
             for number, (subset, name) in enumerate(sorted(places, key=lambda each: each[0] or ""))
         ]
     return scenes
@@ -89,30 +93,16 @@ def gaps_between(gaps):
     return [gaps[a:b].sum() for a in range(5) for b in range(a + 2, 6)]
 
 
-def _scene(split, family, subset, name, number, gaps, far):
+def _scene(like, place, number, gaps, far):
     baselines = np.empty(15)
     baselines[ADJACENT] = gaps
     baselines[OTHERS] = far
-    folder = {None: "", "seen_map": "MapSeenInTrain/", "unseen_map": "MapUnseen/"}[subset]
-    key = f"{split}/{folder}{family}/{name}/scene_{number:06d}"
+    folder = {None: "", "seen_map": "MapSeenInTrain/", "unseen_map": "MapUnseen/"}[place.subset]
+    key = f"{place.split}/{folder}{place.family}/{place.map_name}/scene_{number:06d}"
     focal_mm = 18.0 + 67.0 * (number % 100) / 99
-    return Scene(
-        id=SceneId(key, split, subset, family, name),
-        labels=SceneLabels(),
-        caption="",
-        rig=Rig(
-            focal_mm=focal_mm, sensor_width_mm=23.76, sensor_height_mm=23.76,
-            image_width_px=1280, image_height_px=1280, principal_point_px=None,
-            baselines_cm=tuple(baselines.tolist()), primary_pair=(0, 1),
-        ),
-        frames=81,
-        frame_rate_hz=15.0,
-        lateral_m=(0.0,) * 6,
-        rig_residual_px=0.0,
-        depth_unit_m=(0.1,) * 6,
-        depth_unit_source=("default",) * 6,
-        depth_codec=("ffv1",) * 6,
-        depth_pixel_format=("gray16le",) * 6,
-        valid_depth_ratio=None,
-        members={"baseline.json": Member(f"{key}/baseline.json", 0, 7070)},
+    rig = replace(
+        like.rig, focal_mm=focal_mm, image_width_px=1280, image_height_px=1280,
+        baselines_cm=tuple(baselines.tolist()), primary_pair=(0, 1),
     )  # fmt: skip
+    members = {"baseline.json": Member(f"{key}/baseline.json", 0, 7070)}
+    return replace(like, id=replace(place, key=key), rig=rig, frames=81, members=members)

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from stereogenbench_data.shards.pack import pack
+from stereogenbench_data.shards.training import TrainingSettings
 from tests.servers.tools import made_once, require_module
 
 
@@ -21,6 +22,18 @@ def packed_depth_shards(small_release, tmp_path_factory):
         tmp_path_factory,
         "packed_depth_shards",
         lambda out: pack(small_release, out, workers=1, depth_codec="blosc2"),
+    )
+
+
+@pytest.fixture(scope="session")
+def derived_shards(small_release, tmp_path_factory):
+    """Two cameras of the scenes of `small_release` in training shards."""
+    require_module("blosc2")
+    settings = TrainingSettings((32, 48), "small", (0, 3))
+    return made_once(
+        tmp_path_factory,
+        "derived_shards",
+        lambda out: pack(small_release, out, training=settings, workers=1),
     )
 
 

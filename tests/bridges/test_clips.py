@@ -308,29 +308,23 @@ def test_a_folder_of_another_export_is_refused_by_what_differs(indexed_release, 
 
 
 @pytest.mark.parametrize(
-    ("form", "error", "said"),
+    ("options", "error", "said"),
     [
         ({"size": (33, 64)}, MediaError, r"64x33 pixels .* yuv420p .* yuv444p"),
         ({"length": 81}, SelectionError, r"81 frames .* spans 81 frames; a scene has 7"),
         ({"length": 0}, SelectionError, r"give 1 or 5"),
         ({"stride": 0}, SelectionError, r"at least 1, got 0"),
         ({"step": 0}, SelectionError, r"at least 1, got 0"),
+        ({"layout": "sora"}, SelectionError, r"must be one of diffsynth, .*, got 'sora'"),
+        ({"frames": "all"}, SelectionError, "export_clips has no option 'frames'"),
+        ({"direction": "right_to_left"}, SelectionError, "choose pairs='primary'"),
+        ({"pairs": "sweep"}, SelectionError, "choose pairs='primary'"),
     ],
 )
-def test_a_form_that_cannot_be_is_refused(indexed_release, tmp_path, form, error, said):
+def test_what_cannot_be_exported_is_refused(indexed_release, tmp_path, options, error, said):
     with pytest.raises(error, match=said):
-        exported(indexed_release, tmp_path, **form)
+        exported(indexed_release, tmp_path, **options)
     assert not list(tmp_path.rglob("*.mp4"))
-
-
-def test_what_no_layout_has_is_refused(indexed_release, tmp_path):
-    with pytest.raises(SelectionError, match=r"layout must be one of diffsynth, .*, got 'sora'"):
-        exported(indexed_release, tmp_path, "sora")
-    with pytest.raises(SelectionError, match="export_clips has no option 'frames'"):
-        exported(indexed_release, tmp_path, frames="all")
-    for wrong in ({"direction": "right_to_left"}, {"pairs": "sweep"}):
-        with pytest.raises(SelectionError, match="choose pairs='primary'"):
-            exported(indexed_release, tmp_path, **wrong)
 
 
 def test_a_full_disk_is_named_and_leaves_whole_files(indexed_release, tmp_path):

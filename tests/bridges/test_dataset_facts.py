@@ -45,9 +45,12 @@ def test_scenes_that_synth_drew_are_drawn(small_shards):
     assert facts_of(SceneIndex.open(small_shards)) == DRAWN
 
 
-def test_scenes_on_the_papers_maps_are_the_papers_only_if_the_user_says_so(tmp_path):
+def test_scenes_on_the_papers_maps_are_the_papers_only_if_the_user_says_so(
+    indexed_release, tmp_path
+):
     """Others may render on maps of these names, at this size and length."""
-    index = SceneIndex.from_scenes(paper_scenes()[::100], tmp_path)
+    scenes = paper_scenes(SceneIndex.open(indexed_release).scene(0))
+    index = SceneIndex.from_scenes(scenes[::100], tmp_path)
 
     with pytest.raises(DescriptorError, match=r"is not known.*creator.*--about release"):
         facts_of(index)

@@ -54,12 +54,14 @@ def moment(detailed_release):
 def test_what_dust3r_unprojects_at_whole_pixels_are_the_points_of_the_scene(moment):
     sample, truth = moment
 
-    for view, points, valid in zip(dust3r_views(sample), truth, sample["valid"][:, 0], strict=True):
-        found = moved(
-            points_at(0.0, view["depthmap"], view["camera_intrinsics"]), view["camera_pose"]
-        )
-        assert np.abs(found - points)[valid.numpy()].max() < 1e-5
-        np.testing.assert_array_equal(view["depthmap"] > 0, valid.numpy())
+    away = dict(sample) | {"world_from_cam": sample["world_from_cam"].clone()}
+    away["world_from_cam"][:, :3, 3] += 1e6  # which float32 would round to 0.06 m
+    for given in (sample, away):
+        for view, points, valid in zip(dust3r_views(given), truth, sample["valid"], strict=True):
+            cam = points_at(0.0, view["depthmap"], view["camera_intrinsics"])
+            apart = np.abs(moved(cam, view["camera_pose"]) - points)
+            assert apart[valid[0].numpy()].max() < 1e-5
+            np.testing.assert_array_equal(view["depthmap"] > 0, valid[0].numpy())
 
 
 def test_a_view_of_dust3r_is_its_picture_with_the_types_that_its_base_class_demands(moment):
@@ -94,18 +96,6 @@ def test_a_point_of_the_left_view_lands_a_disparity_to_the_left_in_the_right_one
     assert np.abs(pixels[rows, columns, 1] - rows).max() < 0.01
 
 
-def test_a_scene_far_from_the_origin_keeps_its_points_in_float32(moment):
-    sample, truth = moment
-    away = dict(sample) | {"world_from_cam": sample["world_from_cam"].clone()}
-    away["world_from_cam"][:, :3, 3] += 1e6
-
-    for view, points, valid in zip(dust3r_views(away), truth, sample["valid"][:, 0], strict=True):
-        found = moved(
-            points_at(0.0, view["depthmap"], view["camera_intrinsics"]), view["camera_pose"]
-        )
-        assert np.abs(found - points)[valid.numpy()].max() < 1e-5
-
-
 def test_a_single_view_is_taken_and_samples_of_other_forms_are_refused(indexed_release):
     single = SceneViews(indexed_release, cameras="each", fields=VIEW_FIELDS)[3]
     (image,) = posed_images(single)
@@ -136,15 +126,19 @@ def example(monkeypatch, name, module, base):
 
 
 class BaseStereoViewDataset:
-    """What the example uses of DUSt3R's base class: keyword options, and a method that crops."""
+    """What the example uses of DUSt3R's base class: keyword options, and a method that crops.
 
-    def __init__(self, *, split=None, resolution=None):
-        self.split, self.num_views = split, 2
+    Of CUT3R's besides: a number of views, which each item may ask for, and masks.
+    """
+
+    def __init__(self, *, split=None, resolution=None, num_views=2):
+        self.split, self.num_views = split, num_views
         self._resolution = resolution
 
-    def __getitem__(self, number):
-        views = self._get_views(number, self._resolution, np.random.default_rng(0))
-        assert len(views) == self.num_views
+    def __getitem__(self, item):
+        number, *count = item if isinstance(item, tuple) else (item,)
+        views = self._get_views(number, self._resolution, np.random.default_rng(number), *count)
+        assert len(views) == (count or [self.num_views])[0]
         return views
 
     def _crop_resize_if_necessary(self, image, depthmap, intrinsics, resolution, rng, info):
@@ -154,6 +148,10 @@ class BaseStereoViewDataset:
         cropped[:2, 2] -= 4
         box = (4, 4, 4 + width, 4 + height)
         return image.crop(box), depthmap[4 : 4 + height, 4 : 4 + width], cropped
+
+    def get_img_and_ray_masks(self, is_metric, number, rng):
+        assert is_metric
+        return number == 0, number > 0
 
 
 @pytest.fixture
@@ -177,29 +175,11 @@ def test_dust3rs_base_class_crops_the_views(indexed_release, trained_on_dust3r):
         assert after["camera_intrinsics"][0, 2] == before["camera_intrinsics"][0, 2] - 4
 
 
-class CUT3RBase(BaseStereoViewDataset):
-    """What the example uses of CUT3R's base class besides: the number of views, and masks."""
-
-    def __init__(self, *, num_views=None, **options):
-        super().__init__(**options)
-        self.num_views = num_views
-
-    def __getitem__(self, item):
-        number, count = item
-        return self._get_views(number, self._resolution, np.random.default_rng(number), count)
-
-    def get_img_and_ray_masks(self, is_metric, number, rng):
-        assert is_metric
-        return number == 0, number > 0
-
-
-def test_cut3r_is_given_as_many_views_of_a_moment_as_it_asks_for(indexed_release, monkeypatch):
+def test_cut3r_is_given_as_many_views_of_a_moment_as_it_asks_for(
+    indexed_release, trained_on_dust3r
+):
     views = SceneViews(indexed_release, frames="all", fields=VIEW_FIELDS, **TRAIN)
-    base = type("BaseStereoViewDataset", (CUT3RBase,), {})
-    module = "dust3r.datasets.base.base_stereo_view_dataset"
-    dataset = example(monkeypatch, "dust3r_dataset.py", module, base)(
-        views, num_views=4, resolution=(16, 16)
-    )
+    dataset = trained_on_dust3r(views, num_views=4, resolution=(16, 16))
     drawn = [dataset[number, 3] for number in range(8)]
 
     assert dataset.num_views == 4
@@ -285,18 +265,12 @@ class BaseDataset:
         return picture, depth, extri_opencv, intri_opencv, world, cam, depth > 0, track
 
 
-@pytest.fixture
-def trained_on_vggt(monkeypatch):
-    return example(monkeypatch, "vggt_dataset.py", "data.base_dataset", BaseDataset)
-
-
-def configuration(**changed):
-    usual = {"img_size": 32, "training": True, "inside_random": False, "allow_duplicate_img": True}
-    return SimpleNamespace(**(usual | changed))
-
-
-def test_vggts_base_class_crops_the_views(indexed_release, trained_on_vggt):
-    dataset = trained_on_vggt(configuration(), indexed_release, len_train=100)
+def test_vggts_base_class_crops_the_views(indexed_release, monkeypatch):
+    trained = example(monkeypatch, "vggt_dataset.py", "data.base_dataset", BaseDataset)
+    usual = SimpleNamespace(
+        img_size=32, training=True, inside_random=False, allow_duplicate_img=True
+    )
+    dataset = trained(usual, indexed_release, len_train=100)
     record = dataset[17, 3, 0.5]
     moment = SceneViews(indexed_release, fields=VIEW_FIELDS, **TRAIN)[17 % 3]
     plain = vggt_record(moment, ids=record["ids"])
