@@ -18,18 +18,13 @@ def shown(*arguments):
     return one_line(invoke(*arguments, env={"COLUMNS": "200", "TERMINAL_WIDTH": "200"}).output)
 
 
-def test_help_groups_the_commands_in_the_order_of_use():
+def test_help_groups_the_commands_in_the_order_of_use_and_says_what_each_exit_status_means():
     text = shown("--help")
     panels = ("Have scenes", "Look at them", "Pack them", "Check them", "Take them elsewhere")
     places = [text.index(f"─ {panel} ─") for panel in panels]
 
     assert places == sorted(places)
     assert text.index("synth scenes/") < text.index("show scenes/") < text.index("browse scenes/")
-
-
-def test_help_says_what_each_exit_status_means():
-    text = shown("--help")
-
     for status in ("0 done", "1 something is wrong with the data", "2 it could", "130 stopped"):
         assert status in text
 
@@ -50,9 +45,8 @@ def test_the_help_of_every_command_has_an_example_that_parses(path):
     command.make_context(path[-1], words[len(path) :], resilient_parsing=False)
 
 
-@pytest.mark.parametrize("path", CALLS, ids=" ".join)
-def test_every_option_says_what_it_is_and_a_flag_takes_no_value(path):
-    for parameter in CALLS[path].params:
+def test_every_option_says_what_it_is_and_a_flag_takes_no_value():
+    for parameter in (each for call in CALLS.values() for each in call.params):
         assert getattr(parameter, "help", ""), parameter.name
         if getattr(parameter, "is_flag", False):
             assert parameter.metavar == "", parameter.name

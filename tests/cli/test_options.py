@@ -35,6 +35,7 @@ def refused(*words):
         (["eval", "controls", "d"], "--pairs", "5-2", "write it as 2-5"),
         (["download", "d", "-o", "o"], "--cameras", "6", "0 to 5"),
         (["pack", "d", "o"], "--part", "first", "I/N"),
+        (["synth", "o"], "--part", "3/2", "I/N"),
     ],
 )
 def test_a_refused_option_is_named_with_its_value_and_what_it_may_be(words, option, value, cure):

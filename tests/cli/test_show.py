@@ -63,31 +63,6 @@ def test_what_cannot_be_shown_is_refused(small_shards, tmp_path, monkeypatch, op
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_tree_with_a_broken_scene_shows_the_others(small_release, tmp_path):
-    shutil.copytree(small_release, tmp_path / "data")
-    (tmp_path / "data" / SCENE / "baseline.json").write_text("{}")
-
-    good = invoke("show", tmp_path / "data", "IPD_Gaussian", "-o", tmp_path / "sheet.png")
-    bad = invoke("show", tmp_path / "data", SCENE, "-o", tmp_path / "sheet.png")
-    assert (good.exit_code, bad.exit_code) == (0, 2)
-    assert f"'{SCENE}' is not a key of 3 scenes" in bad.stderr
-    assert f"{SCENE}/baseline.json: " in good.stderr
-
-
-def test_a_part_that_is_whole_folders_of_one_key_is_that_scene(small_release, tmp_path):
-    for family in ("Uniform", "Pairwise_Uniform"):
-        folder = tmp_path / "data" / "train" / family / "Stage" / "scene_000000"
-        shutil.copytree(small_release / SCENE, folder)
-    out = tmp_path / "sheet.png"
-
-    whole = invoke("show", tmp_path / "data", "uniform", "-o", out)
-    part = invoke("show", tmp_path / "data", "niform", "-o", out)
-
-    assert whole.stdout == f"{out}: train/Uniform/Stage/scene_000000\n"
-    assert part.exit_code == 2
-    assert "'niform' is a part of 2 keys: " in part.stderr
-
-
 def test_an_index_as_json_is_one_document_and_a_broken_scene_gives_exit_status_1(
     small_release, tmp_path
 ):

@@ -1,5 +1,7 @@
 """One scene by its key, or by a part of it."""
 
+from dataclasses import replace
+
 import pytest
 
 from stereogenbench_data import SceneIndex, SelectionError
@@ -18,6 +20,13 @@ def keys(index):
 @pytest.mark.parametrize("text", ["scene_000001", "SCENE_000001", "/scene_000001/", "000001"])
 def test_a_part_that_one_key_alone_has_finds_it(index, text):
     assert keys(index)[find_scene(index, text)] == "train/Uniform/SynthStage/scene_000001"
+
+
+def test_whole_folders_of_one_key_win_over_a_part_of_others(index):
+    scene, keys = index.scene(0), [f"train/{name}/A/b" for name in ("Pairwise_Uniform", "Uniform")]
+    both = [replace(scene, id=replace(scene.id, key=key)) for key in keys]
+
+    assert find_scene(SceneIndex.from_scenes(both, index.root), "uniform") == 1
 
 
 def test_a_part_of_several_keys_names_them(index):
