@@ -40,36 +40,22 @@ def test_a_finding_ends_with_exit_code_1_and_json_is_all_that_stdout_gets(
     assert f"- {SCENE}/cam_00_rgb.mp4: too dark: " in (tmp_path / "a.md").read_text()
 
 
-def test_conventions_replace_the_depth_contract(small_shards, run, tmp_path):
-    stated = tmp_path / "stated.toml"
-    stated.write_text("[depth]\nunit_m = 0.002\ninstead_of_tag_m = 0.001\nkind = 'ray'\n")
-
-    shown = run(small_shards, *FEW, "--conventions", stated, "--json")
-
-    figures = json.loads(shown.stdout)["scenes"][0]["figures"]
-    assert {each["value"] for each in figures if each["quantity"] == "depth_unit_m"} == {0.002}
-
-
 def test_a_stopped_audit_keeps_its_journal_and_the_next_run_uses_it(
     small_shards, run, monkeypatch, tmp_path
 ):
-    plain = geometry_audit.audit_scene
-    audited = []
+    plain, audited = geometry_audit.audit_scene, []
 
-    def stop_at_the_second(task, after_bytes):
-        if audited:
+    def audit_some(task, after_bytes):
+        if len(audited) == limit:
             raise KeyboardInterrupt
         audited.append(task.scene.id.key)
         return plain(task, after_bytes)
 
-    monkeypatch.setattr(geometry_audit, "audit_scene", stop_at_the_second)
+    monkeypatch.setattr(geometry_audit, "audit_scene", audit_some)
+    limit = 1
     stopped = run(small_shards, "--workers", "1", "--per-scene", "1")
     kept = [*(tmp_path / "home").rglob("audit-*.journal")]
-    monkeypatch.setattr(
-        geometry_audit,
-        "audit_scene",
-        lambda task, told: audited.append(task.scene.id.key) or plain(task, told),
-    )
+    limit = 4
     again = run(small_shards, "--workers", "1", "--per-scene", "1")
 
     assert stopped.exit_code == 130
