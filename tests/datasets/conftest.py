@@ -1,7 +1,11 @@
 """Samples that cost nothing to load: their keys, which tell them all apart."""
 
 import itertools
+import os
+import signal
+import subprocess
 
+import imageio_ffmpeg
 import pytest
 import torch
 
@@ -57,6 +61,34 @@ def in_turn(shares):
     return [batch for row in rows for batch in row if batch is not None]
 
 
+def fork_and(act):
+    """Run a function in a fork of this process, which then ends; return its exit status."""
+    child = os.fork()
+    if child == 0:
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(60)  # ends a fork that hangs
+        status = 1
+        try:
+            act()
+            status = 0
+        finally:
+            os._exit(status)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def ffmpeg(*arguments):
+    """Run ffmpeg, which may write over files."""
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y", *map(str, arguments)]
+    subprocess.run(command, check=True, capture_output=True)
+
+
+def write_again(path, *codec, source=None, before=()):
+    """Write a video anew by options of ffmpeg, from itself or from another one."""
+    aside = path.with_name(f"aside{path.suffix}")
+    ffmpeg(*before, "-i", source or path, *codec, aside)
+    aside.replace(path)
+
+
 def same(one, other):
     """Return whether two samples or batches with the same fields are equal, bit for bit."""
     assert one.keys() == other.keys()
@@ -64,20 +96,6 @@ def same(one, other):
         torch.equal(value, other[name]) if isinstance(value, torch.Tensor) else value == other[name]
         for name, value in one.items()
     )
-
-
-class RefuseFrame:
-    """A transform that fails at a frame."""
-
-    swaps_views = False
-
-    def __init__(self, number):
-        self.number = number
-
-    def __call__(self, views, generator):
-        if self.number in views.frames:
-            raise ArithmeticError(f"frame {self.number}")
-        return views
 
 
 @pytest.fixture(scope="session")

@@ -18,18 +18,14 @@ def pairs(small_index):
     return StereoPairs(small_index, fields=FIELDS, pairs="adjacent", frames="all")
 
 
-def tensors(batch):
-    return {name: value for name, value in batch.items() if isinstance(value, torch.Tensor)}
-
-
 def test_a_batch_is_its_samples_where_they_were_written(pairs):
     samples = pairs.__getitems__([7, 3, 9])
     batch = collate(samples)
 
     assert same(batch, default_collate(samples))
-    for name, value in tensors(batch).items():
-        assert value.is_contiguous()
-        assert value.data_ptr() == samples[0][name].data_ptr()
+    for name in set(FIELDS) - {"__key__"}:
+        assert batch[name].is_contiguous()
+        assert batch[name].data_ptr() == samples[0][name].data_ptr()
 
 
 def test_samples_from_elsewhere_are_copied_as_torch_does(pairs):
@@ -55,21 +51,10 @@ def test_a_sample_that_comes_twice_in_a_batch_is_there_twice(pairs):
 def test_every_field_of_a_batch_is_that_of_single_samples(small_index, fields):
     for selection in ({"pairs": "adjacent"}, {"pairs": "sweep"}, {"frames": ("clips", 3)}):
         pairs = StereoPairs(small_index, fields=fields, **selection)
-        batch = collate(pairs.__getitems__([0, 2]))
+        batch = collate(pairs.__getitems__([3, 0, 2]))
 
-        assert same(batch, default_collate([pairs[0], pairs[2]]))
+        assert same(batch, default_collate([pairs[3], pairs[0], pairs[2]]))
         pairs.close()
-
-
-@pytest.mark.parametrize("workers", [0, 2])
-def test_batches_that_a_loop_keeps_are_never_written_again(pairs, workers):
-    expected = {sample["__key__"]: sample for sample in pairs}
-    kept = list(pairs.loader(9, num_workers=workers, drop_last=False))
-
-    assert len(kept) == 16
-    for batch in kept:
-        samples = [expected[key] for key in batch["__key__"]]
-        assert same(batch, default_collate(samples))
 
 
 @pytest.mark.parametrize("workers", [0, 1])
@@ -112,18 +97,15 @@ def test_passes_broken_off_cost_workers_that_persist_no_memory(pairs):
     assert len(set(places(loader))) <= 2 * SLOTS
 
 
-def test_fresh_buffers_give_each_batch_memory_of_its_own(small_index):
+def test_fresh_buffers_give_each_batch_memory_of_its_own(pairs, small_index):
     """While a batch is held its memory is not another's; so hold one and look at the others."""
-    pairs = StereoPairs(small_index, fields=FIELDS, pairs="adjacent", frames="all", buffers="fresh")
-    held = list(pairs.loader(9, num_workers=1, drop_last=False))
-    expected = StereoPairs(small_index, fields=FIELDS, pairs="adjacent", frames="all")
+    fresh = StereoPairs(small_index, fields=FIELDS, pairs="adjacent", frames="all", buffers="fresh")
+    held = list(fresh.loader(9, num_workers=1, drop_last=False))
     starts = [batch["left"].untyped_storage().data_ptr() for batch in held]
 
     assert len(set(starts)) == len(held) == 16
-    assert all(
-        same(one, other)
-        for one, other in zip(held, expected.loader(9, drop_last=False), strict=True)
-    )
+    expected = pairs.loader(9, drop_last=False)
+    assert all(same(one, other) for one, other in zip(held, expected, strict=True))
 
 
 def test_a_position_is_not_guessed_where_another_loader_reads_the_batches(pairs):

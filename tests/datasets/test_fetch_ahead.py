@@ -2,12 +2,13 @@
 
 import contextlib
 import gc
-import os
 import shutil
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -20,7 +21,7 @@ from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.retry import RetryPolicy
 from stereogenbench_data.sources.web import pool_of
-from tests.datasets.conftest import same
+from tests.datasets.conftest import fork_and, same
 from tests.servers.failing_server import Answer, serving
 from tests.sources.policies import LONGEST_S, ended
 
@@ -132,25 +133,16 @@ def test_a_fork_in_the_middle_of_a_pass_reads_for_itself(served, large_shards, a
     loader = pairs.loader(1, drop_last=False)
     batches = iter(loader)
     next(batches)
-    pid = os.fork()
-    if pid == 0:
-        code = 1
-        try:
-            # In numpy: torch's own threads do not survive a fork.
-            code = 0 if (pairs[3]["left"].numpy() == expected).all() else 2
-        finally:
-            os._exit(code)
-    _, status = os.waitpid(pid, 0)
 
-    assert os.waitstatus_to_exitcode(status) == 0
+    # In numpy: torch's own threads do not survive a fork.
+    assert fork_and(lambda: np.testing.assert_array_equal(pairs[3]["left"], expected)) == 0
     assert len([*batches]) == len(loader) - 1
     loader.close()
     pairs.close()
 
 
 def test_an_error_comes_at_the_sample_that_needs_the_bytes(small_shards, tmp_path, alone):
-    folder = tmp_path / "shards"
-    shutil.copytree(small_shards, folder)
+    folder = shutil.copytree(small_shards, tmp_path / "shards")
     index = SceneIndex.open(folder)
     scenes = [index.scene(row) for row in range(len(index))]
     first, shard = scenes[0], scenes[-1].members[rgb_name(0)].path
@@ -181,9 +173,9 @@ def test_what_is_fetched_ahead_fills_a_cache(served, large_shards, tmp_path, alo
     assert cache.used_bytes() > 0
 
 
-def index_with(folder, change):
-    """Replace the seek tables of an index file."""
-    path = folder / "index.parquet"
+def with_tables(shards, folder, change):
+    """Return a copy of shards whose index has other seek tables, or none."""
+    path = shutil.copytree(shards, folder) / "index.parquet"
     table = pq.read_table(path)
     place = table.schema.get_field_index("seek_tables")
     if change is None:
@@ -192,6 +184,7 @@ def index_with(folder, change):
         packed = [change(each) for each in table.column("seek_tables").to_pylist()]
         table = table.set_column(place, "seek_tables", pa.array(packed, type=pa.binary()))
     pq.write_table(table, path)
+    return folder
 
 
 def shifted(packed):
@@ -219,9 +212,7 @@ def swapped(packed):
 )
 @pytest.mark.filterwarnings("ignore::stereogenbench_data.datasets.mapped.SeekTableWarning")
 def test_a_wrong_seek_table_gives_the_right_frames(change, large_shards, tmp_path, alone):
-    folder = tmp_path / "shards"
-    shutil.copytree(large_shards, folder)
-    index_with(folder, change)
+    folder = with_tables(large_shards, tmp_path / "shards", change)
     options = {"fields": FIELDS, "frames": [0, 2, 4, 6], "check": "metadata"}
     expected = StereoPairs(large_shards, **options)
     with serving(folder) as server:
@@ -231,9 +222,7 @@ def test_a_wrong_seek_table_gives_the_right_frames(change, large_shards, tmp_pat
 
 
 def test_an_index_of_an_earlier_version_reads_with_a_hint(large_shards, tmp_path, alone):
-    folder = tmp_path / "shards"
-    shutil.copytree(large_shards, folder)
-    index_with(folder, None)
+    folder = with_tables(large_shards, tmp_path / "shards", None)
     with serving(folder) as server:
         with pytest.warns(SeekTableWarning, match=rf"{server.url}.*stereogenbench index"):
             pairs = StereoPairs(server.url, fields=("left",))
@@ -247,20 +236,12 @@ def test_closing_does_not_wait_for_requests_that_hang_and_they_end(served):
     pairs = StereoPairs(index, fields=("left",), frames="all")
     shards = {member.path for member in pairs.index.scene(0).members.values()}
     served.always = {path: Answer(delay_s=2 * LONGEST_S) for path in shards}
-    batches, failures = iter(pairs.loader(1)), []
-
-    def failure_of(batches):
-        with pytest.raises(StorageError) as caught:
-            next(batches)
-        return caught.type
-
-    waiting = threading.Thread(target=lambda: failures.append(failure_of(batches)))
-    waiting.start()
-    while not fetching():
-        time.sleep(0.01)
-    ended(pairs.close)
-    waiting.join()
-    assert len(failures) == 1
+    with ThreadPoolExecutor(1) as threads:
+        waiting = threads.submit(next, iter(pairs.loader(1)))
+        while not fetching():
+            time.sleep(0.01)
+        ended(pairs.close)
+        assert isinstance(waiting.exception(), StorageError)
 
     ended(lambda: [thread.join() for thread in threading.enumerate() if "fetch" in thread.name])
     assert fetching() == []

@@ -1,7 +1,6 @@
 """StereoPairs and SceneViews as torch sees them."""
 
 import gc
-import os
 import pickle
 import re
 import subprocess
@@ -34,7 +33,7 @@ from stereogenbench_data import (
     StorageError,
     collate,
 )
-from tests.datasets.conftest import same
+from tests.datasets.conftest import fork_and, same
 
 EVERY_FIELD = tuple(PAIR_FIELDS)
 
@@ -140,15 +139,6 @@ def test_workers_of_every_kind_give_what_the_main_process_gives(indexed_release,
     assert all(same(one, other) for one, other in zip(alone, loader, strict=True))
 
 
-def test_a_batch_comes_in_the_order_requested_though_it_is_read_forwards(indexed_release):
-    pairs = StereoPairs(indexed_release, frames="all", fields=("frame_index", "__key__"))
-    numbers = [9, 2, 20, 2, 0]
-
-    found = [sample["__key__"] for sample in pairs.__getitems__(numbers)]
-
-    assert found == [pairs[number]["__key__"] for number in numbers]
-
-
 def test_transforms_draw_anew_each_epoch_and_the_same_for_the_same_seed(indexed_release):
     def crops(seed, epoch):
         pairs = StereoPairs(
@@ -176,14 +166,12 @@ def test_a_forked_child_reads_on_without_disturbing_its_parent(indexed_release):
     pairs = StereoPairs(indexed_release, frames="all", fields=("left",))
     expected = [pairs[number]["left"] for number in range(7)]
     pairs[0]
-    child = os.fork()
-    if child == 0:
-        right = all(torch.equal(pairs[number]["left"], expected[number]) for number in (3, 1, 6))
-        os._exit(0 if right else 1)
-    parent_right = all(torch.equal(pairs[n]["left"], expected[n]) for n in range(7))
 
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-    assert parent_right
+    def read(numbers):
+        assert all(torch.equal(pairs[number]["left"], expected[number]) for number in numbers)
+
+    assert fork_and(lambda: read((3, 1, 6))) == 0
+    read(range(7))
 
 
 def test_a_batch_of_scenes_of_two_sizes_says_how_to_mend_it():
