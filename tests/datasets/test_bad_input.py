@@ -1,10 +1,10 @@
 """Damaged data, as a user of StereoPairs meets them: each is named with its file and the cure."""
 
 import json
+import os
+import re
 import shutil
-import subprocess
 
-import imageio_ffmpeg
 import numpy as np
 import pytest
 
@@ -12,7 +12,6 @@ from stereogenbench_data import (
     DepthEncoding,
     MediaError,
     SceneIndex,
-    SchemaError,
     StereoGenBenchError,
     StereoPairs,
     StorageError,
@@ -21,6 +20,7 @@ from stereogenbench_data.index.open_tree import AssumptionWarning, IncompleteSce
 from stereogenbench_data.samples.fields import OddSceneWarning
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
+from tests.datasets.conftest import write_again
 from tests.servers.videos import write_rgb
 
 NEEDING_ALL_VIDEOS = [(0, 1), (2, 3), (4, 5)]
@@ -47,67 +47,49 @@ def rewrite(path, change):
     path.write_text(json.dumps(document))
 
 
-def damage_json(name, change):
-    return lambda scene: rewrite(scene / name, change)
-
-
-def cut(name, share):
-    def damage(scene):
-        whole = (scene / name).read_bytes()
-        (scene / name).write_bytes(whole[: int(len(whole) * share)])
-
-    return damage
-
-
 DAMAGES = {
     "a missing camera": (
-        lambda scene: (scene / "cam_03_rgb.mp4").unlink(),
-        r"cam_03_rgb\.mp4: is missing, and the scene is marked as complete",
+        "cam_03_rgb.mp4", None, "is missing, and the scene is marked as complete",
     ),
-    "an mp4 cut short": (cut("cam_01_rgb.mp4", 0.5), r"cam_01_rgb\.mp4"),
-    "a text for a video": (
-        lambda scene: (scene / "cam_05_rgb.mp4").write_text("not a video"),
-        r"cam_05_rgb\.mp4",
-    ),
+    "an mp4 cut short": ("cam_01_rgb.mp4", 2000, ""),
+    "a text for a video": ("cam_05_rgb.mp4", "not a video", ""),
+    "a text for a trajectory": ("trajectory.json", "{", ""),
+    "a bomb of brackets": ("baseline.json", "[" * 200_000, "nest"),
     "a NaN baseline": (
-        damage_json(
-            "baseline.json", lambda doc: doc["pairwise_pairs"][3].update(baseline_cm=float("nan"))
-        ),
-        r"baseline\.json.*\$\.pairwise_pairs\[3\]\.baseline_cm.*nan",
-    ),
-    "a text for a trajectory": (
-        lambda scene: (scene / "trajectory.json").write_text("{"),
-        r"trajectory\.json",
+        "baseline.json",
+        lambda doc: doc["pairwise_pairs"][3].update(baseline_cm=float("nan")),
+        r"\$\.pairwise_pairs\[3\]\.baseline_cm.*nan",
     ),
     "a trajectory of other frames": (
-        damage_json("trajectory.json", lambda doc: doc.update(frames=doc["frames"][:4])),
-        r"trajectory\.json: has poses of 4 frames, and the videos have 7",
+        "trajectory.json", lambda doc: doc.update(frames=doc["frames"][:4]),
+        "has poses of 4 frames, and the videos have 7",
     ),
     "a pose without a camera": (
-        damage_json("trajectory.json", lambda doc: doc["frames"][2]["cameras"].pop(1)),
-        r"trajectory\.json: no numbers of 6 cameras in each frame",
+        "trajectory.json", lambda doc: doc["frames"][2]["cameras"].pop(1),
+        "no numbers of 6 cameras in each frame",
     ),
     "poses that contradict the baselines": (
-        damage_json(
-            "baseline.json",
-            lambda doc: [pair.update(baseline_cm=pair["baseline_cm"] * 2)
-                         for pair in doc["pairwise_pairs"] + doc.get("adjacent_pairs", [])],
-        ),
+        "baseline.json",
+        lambda doc: [pair.update(baseline_cm=pair["baseline_cm"] * 2)
+                     for pair in doc["pairwise_pairs"] + doc.get("adjacent_pairs", [])],
         r"cameras \d and \d are .* cm apart, and by the poses",
-    ),
-    "a file for a folder": (
-        lambda scene: (shutil.rmtree(scene), scene.write_text("")),
-        r"no scene|holds no|found",
     ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("what", DAMAGES)
 def test_a_damaged_scene_is_refused_when_the_tree_is_opened(scene, what):
-    damage, message = DAMAGES[what]
-    damage(scene)
+    name, damage, found = DAMAGES[what]
+    if damage is None:
+        (scene / name).unlink()
+    elif isinstance(damage, int):
+        os.truncate(scene / name, damage)
+    elif isinstance(damage, str):
+        (scene / name).write_text(damage)
+    else:
+        rewrite(scene / name, damage)
 
-    with pytest.raises(StereoGenBenchError, match=f"(?s){message}"):
+    with pytest.raises(StereoGenBenchError, match=f"(?s){re.escape(name)}.*{found}"):
         StereoPairs(root_of(scene), fields=FIELDS, pairs=NEEDING_ALL_VIDEOS)
 
 
@@ -171,13 +153,6 @@ def test_a_depth_stream_with_fewer_frames_is_told_or_refused(tmp_path, missing):
             StereoPairs(tmp_path / "long")
 
 
-def test_a_metadata_bomb_of_brackets_is_refused(scene):
-    (scene / "baseline.json").write_text("[" * 200_000)
-
-    with pytest.raises((SchemaError, StorageError), match=r"baseline\.json.*nest"):
-        StereoPairs(root_of(scene))
-
-
 def test_depth_that_cannot_be_whole_is_refused_unless_it_is_meant(scene):
     generator = np.random.default_rng(0)
     for camera in range(6):
@@ -194,10 +169,7 @@ def test_depth_that_cannot_be_whole_is_refused_unless_it_is_meant(scene):
 def retagged(scene, camera, *options):
     """Write a depth video again with other tags."""
     path = scene / f"cam_{camera:02d}_depth.mkv"
-    aside = path.with_name("aside.mkv")
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", path, "-c", "copy"]
-    subprocess.run([*command, "-map_metadata", "-1", *options, aside], check=True)
-    aside.replace(path)
+    write_again(path, "-c", "copy", "-map_metadata", "-1", *options)
 
 
 def test_a_tag_that_is_no_number_needs_the_users_unit(scene):
@@ -277,8 +249,3 @@ def test_a_principal_point_outside_the_picture_holds_up_the_intrinsics_alone(sce
 def test_data_that_are_not_there_say_where_they_were_looked_for(tmp_path):
     with pytest.raises(StorageError, match="nowhere: does not exist"):
         StereoPairs(tmp_path / "nowhere")
-
-
-def test_a_folder_inside_the_tree_is_answered_with_the_right_one(scene):
-    with pytest.raises(StorageError, match=str(root_of(scene))):
-        StereoPairs(root_of(scene) / "train")

@@ -2,10 +2,8 @@
 
 import re
 import shutil
-import subprocess
 from dataclasses import replace
 
-import imageio_ffmpeg
 import pytest
 
 from stereogenbench_data import MediaError, SceneIndex, StereoPairs
@@ -13,24 +11,16 @@ from stereogenbench_data.errors import StereoGenBenchError
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.verify import verify
+from tests.datasets.conftest import ffmpeg, write_again
 
 RGB, DEPTH = "cam_00_rgb.mp4", "cam_00_depth.mkv"
 
 
-def ffmpeg(*arguments):
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y", *map(str, arguments)]
-    subprocess.run(command, check=True, capture_output=True)
-
-
 def written(name, *codec, source=None, before=()):
     """Return what writes a video of a scene anew, from itself or from another one."""
-
-    def alter(folder):
-        aside = folder / f"aside.{name[-3:]}"
-        ffmpeg(*before, "-i", folder / (source or name), *codec, aside)
-        aside.replace(folder / name)
-
-    return alter
+    return lambda folder: write_again(
+        folder / name, *codec, source=folder / (source or name), before=before
+    )
 
 
 def copied(source, name):
@@ -39,16 +29,14 @@ def copied(source, name):
 
 def of_two_sizes(folder):
     """Write H.264 that changes to 48x48 after nine frames."""
-    parts = [folder / "first.h264", folder / "second.h264"]
-    ffmpeg("-i", folder / RGB, "-frames:v", 9, "-c:v", "libx264", "-g", 1, parts[0])
-    ffmpeg(
-        "-i", folder / RGB, "-vf", r"select=gte(n\,9),scale=48:48", "-fps_mode", "passthrough",
-        "-c:v", "libx264", "-g", 1, parts[1],
-    )  # fmt: skip
-    parts[0].write_bytes(parts[0].read_bytes() + parts[1].read_bytes())
-    ffmpeg("-r", 15, "-i", parts[0], "-c", "copy", folder / RGB)
-    for part in parts:
-        part.unlink()
+    part, whole = folder / "part.h264", b""
+    for side_px, frames in ((72, 9), (48, 8)):
+        size = ("-frames:v", frames, "-vf", f"scale={side_px}:{side_px}")
+        ffmpeg("-i", folder / RGB, *size, "-c:v", "libx264", "-g", 1, part)
+        whole += part.read_bytes()
+    part.write_bytes(whole)
+    ffmpeg("-r", 15, "-i", part, "-c", "copy", folder / RGB)
+    part.unlink()
 
 
 QUIET_HEVC = ("-c:v", "libx265", "-x265-params", "log-level=none")
@@ -113,17 +101,13 @@ def index_of_the_unaltered(drawn, scene):
     return SceneIndex.from_scenes([replace(row, members=members)], root_of(scene))
 
 
-def frames_of(index, order, *, fields):
-    pairs = StereoPairs(index, frames="all", fields=fields)
-    return [pairs[frame] for frame in order]
-
-
 def require_refused(index, name, found):
     """Every frame of an altered scene is read, in order and each afresh, and is refused by name."""
-    fields = ("left",) if name == RGB else ("depth",)
+    field = "left" if name == RGB else "depth"
     for order in ((0, 12), (16, 11)):
+        pairs = StereoPairs(index, frames="all", fields=(field,))
         with pytest.raises(MediaError, match=rf"{name}: .*({found})"):
-            frames_of(index, order, fields=fields)
+            [pairs[frame] for frame in order]
 
 
 @pytest.mark.parametrize("case", OTHERS)
