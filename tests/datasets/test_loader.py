@@ -10,31 +10,19 @@ import pytest
 import torch
 
 from stereogenbench_data import (
+    ColorJitter,
+    Compose,
+    HorizontalFlip,
+    RandomCrop,
     SceneIndex,
     StereoPairs,
 )
-from stereogenbench_data.datasets.batches import (
-    OpenVideosWarning,
-    RepeatedDecodingWarning,
-)
+from stereogenbench_data.datasets.batches import OpenVideosWarning, RepeatedDecodingWarning
 from stereogenbench_data.selection.order import OrderRule
 from tests.datasets.conftest import flat, in_turn, keys_of
 
 # More workers than this machine has cores are no matter here.
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
-
-
-@pytest.mark.parametrize(("world", "workers"), [(1, 3), (3, 2)])
-def test_ranks_and_workers_load_the_same_epoch(keyed, world, workers):
-    keyed.set_epoch(1)
-    alone = keys_of(keyed.loader(9, drop_last=False))
-    shares = [
-        keys_of(keyed.loader(9, num_workers=workers, rank=r, world_size=world, drop_last=False))
-        for r in range(world)
-    ]
-
-    assert in_turn(shares) == alone
-    assert len(set(flat(alone))) == 140
 
 
 def test_epochs_and_seeds_differ_and_repeat(keyed):
@@ -97,31 +85,25 @@ def test_loaders_of_one_dataset_have_their_own_videos(small_index):
 
 
 @pytest.mark.parametrize(
-    ("before", "after"),
-    [((2, 2), (4, 1)), ((3, 0), (2, 0))],
-    ids=str,
+    ("before", "after"), [((2, 2), (4, 1)), ((3, 0), (2, 0)), ((1, 3), (3, 2))], ids=str
 )
 @pytest.mark.parametrize("steps", [0, 3])
 def test_a_run_goes_on_under_other_ranks_and_workers(keyed, before, after, steps):
+    def loaders(ranks, workers):
+        options = {"num_workers": workers, "world_size": ranks, "drop_last": False}
+        return [keyed.loader(9, rank=rank, **options) for rank in range(ranks)]
+
     keyed.set_epoch(4)
     unbroken = keys_of(keyed.loader(9, drop_last=False))
-    taken, texts = [], set()
-    for rank in range(before[0]):
-        loader = keyed.loader(
-            9, num_workers=before[1], rank=rank, world_size=before[0], drop_last=False
-        )
-        taken.append(keys_of(itertools.islice(loader, steps)))
-        texts.add(json.dumps(loader.state_dict()))
-    assert len(texts) == 1
+    assert len(set(flat(unbroken))) == 140
+    first = loaders(*before)
+    taken = [keys_of(itertools.islice(loader, steps)) for loader in first]
+    (text,) = {json.dumps(loader.state_dict()) for loader in first}
 
-    left = []
-    for rank in range(after[0]):
-        loader = keyed.loader(
-            9, num_workers=after[1], rank=rank, world_size=after[0], drop_last=False
-        )
-        loader.load_state_dict(json.loads(next(iter(texts))))
+    left = loaders(*after)
+    for loader in left:
+        loader.load_state_dict(json.loads(text))
         assert loader.epoch == 4
-        left.append(loader)
     start = steps * before[0]
     turned = [left[(start + step) % after[0]] for step in range(after[0])]
 
@@ -194,10 +176,7 @@ def test_ranks_that_save_are_in_one_epoch_though_one_has_no_more(
 
 @pytest.mark.parametrize("options", [{}, {"num_workers": 2, "persistent_workers": True}], ids=str)
 def test_the_epochs_after_a_resumed_one_are_whole(keyed, options):
-    first, second = [], []
-    for epoch, found in ((0, first), (1, second)):
-        keyed.set_epoch(epoch)
-        found += keys_of(keyed.loader(9))
+    first, second = (keyed.set_epoch(epoch) or keys_of(keyed.loader(9)) for epoch in (0, 1))
     loader = keyed.loader(9, **options)
     loader.set_epoch(0)
     next(iter(loader))
@@ -210,17 +189,7 @@ def test_the_epochs_after_a_resumed_one_are_whole(keyed, options):
     assert keys_of(loader) == first
 
 
-def test_what_workers_read_ahead_does_not_count(keyed):
-    loader = keyed.loader(9, num_workers=2, prefetch_factor=3)
-    batches = iter(loader)
-    for taken in range(1, 4):
-        next(batches)
-        assert loader.state_dict()["batches_consumed"] == taken
-
-
 def test_samples_of_a_resumed_run_are_the_same_to_the_bit(small_index):
-    from stereogenbench_data import ColorJitter, Compose, HorizontalFlip, RandomCrop
-
     pairs = StereoPairs(
         small_index,
         fields=("left", "disparity", "__key__"),
@@ -244,12 +213,9 @@ def test_padding_is_flagged_and_ranks_are_even(keyed):
         for rank in range(3)
     ]
     batches = in_turn(shares)
-    own = [
-        key
-        for batch in batches
-        for key, padding in zip(batch["__key__"], batch["is_padding"].tolist(), strict=True)
-        if not padding
-    ]
+    paddings = flat(batch["is_padding"].tolist() for batch in batches)
+    keys = zip(flat(keys_of(batches)), paddings, strict=True)
+    own = [key for key, is_padding in keys if not is_padding]
 
     assert [len(share) for share in shares] == [6, 6, 6]
     assert batches[0]["is_padding"].dtype == torch.bool
@@ -343,14 +309,6 @@ def test_too_many_open_videos_are_warned_of(small_index, monkeypatch):
     assert loader.stats().videos_limit == 32
 
 
-def _of_many_scenes(index):
-    scene = index.scene(0)
-    numbered = [
-        replace(scene, id=replace(scene.id, key=f"{scene.id.key}{number}")) for number in range(16)
-    ]
-    return SceneIndex.from_scenes(numbered, index.root)
-
-
 @pytest.mark.parametrize(
     ("workers", "options", "said"),
     [
@@ -359,7 +317,10 @@ def _of_many_scenes(index):
     ],
 )
 def test_workers_that_decode_the_same_videos_are_warned_of(small_index, workers, options, said):
-    pairs = StereoPairs(_of_many_scenes(small_index), frames=range(2), fields=("left",))
+    scene = small_index.scene(0)
+    ids = (replace(scene.id, key=f"{scene.id.key}{number}") for number in range(16))
+    index = SceneIndex.from_scenes([replace(scene, id=each) for each in ids], small_index.root)
+    pairs = StereoPairs(index, frames=range(2), fields=("left",))
 
     with pytest.warns(RepeatedDecodingWarning, match=said):
         pairs.loader(1, num_workers=workers, **options)

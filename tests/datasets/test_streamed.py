@@ -60,9 +60,8 @@ def test_its_batches_are_those_of_the_loader(keyed, stream_of, world, workers, d
 def test_batches_made_in_place_are_those_of_the_loader_and_stay_while_held(
     small_index, loader, context
 ):
-    options = {"pairs": "adjacent", "frames": range(3), "drop_last": "pad"}
-    stream = StereoPairStream(small_index, 4, **options)
-    del options["drop_last"]
+    options = {"pairs": "adjacent", "frames": range(3)}
+    stream = StereoPairStream(small_index, 4, drop_last="pad", **options)
     expected = list(StereoPairs(small_index, **options).loader(4, drop_last="pad"))
     held = {}
     found = loader(
@@ -70,7 +69,6 @@ def test_batches_made_in_place_are_those_of_the_loader_and_stay_while_held(
         multiprocessing_context=context,
     )  # fmt: skip
     for number, batch in enumerate(found):
-        assert batch.keys() == expected[number].keys()
         assert same(batch, expected[number])
         if number in (3, 4, 8):
             held[number] = batch
