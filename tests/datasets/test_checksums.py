@@ -25,10 +25,11 @@ def selected(root, **options):
     return StereoPairs(root, scenes=SCENE, fields=("left", "right"), **options)
 
 
-def flip(path, member, *, place=0.5):
-    """Flip the lowest bit of a byte within a member, in place."""
-    with path.open("r+b") as file:
-        file.seek(member.offset + int(member.size * place))
+def flip(root, pairs, *, place):
+    """Flip the lowest bit of a byte of the first view's video, at 0 the first, at 1 the last."""
+    member = pairs.index.scene(pairs.plan.locate(0, epoch=0).row).members[rgb_name(0)]
+    with (root / SHARD).open("r+b") as file:
+        file.seek(member.offset + int((member.size - 1) * place))
         byte = file.read(1)[0]
         file.seek(-1, 1)
         file.write(bytes([byte ^ 1]))
@@ -38,9 +39,8 @@ def harmless_flip(root):
     """Flip a bit of the first view's video after which all its frames decode, some differently."""
     pairs = selected(root, frames="all", check="metadata")
     before = [sample["left"] for sample in pairs]
-    member = pairs.index.scene(pairs.plan.locate(0, epoch=0).row).members[rgb_name(0)]
     for step in range(20, 90):
-        flip(root / SHARD, member, place=step / 100)
+        flip(root, pairs, place=step / 100)
         pairs.close()
         try:
             after = [sample["left"] for sample in pairs]
@@ -49,26 +49,20 @@ def harmless_flip(root):
         if not all(map(torch.equal, before, after)):
             pairs.close()
             return
-        flip(root / SHARD, member, place=step / 100)
+        flip(root, pairs, place=step / 100)
     raise AssertionError("no flipped bit decodes to another picture")
 
 
 @pytest.mark.parametrize(
-    "options",
-    [
-        {"frames": ("clips", 4)},
-        {"frames": "first", "check": "opened"},
-    ],
-    ids=str,
+    "options", [{"frames": ("clips", 4)}, {"frames": "first", "check": "opened"}], ids=str
 )
 def test_a_flipped_bit_that_decodes_is_found_when_most_frames_are_read(shards, options):
     harmless_flip(shards)
 
     with pytest.raises(ShardError, match=WRONG):
         selected(shards, **options)[0]
-    views = {name: value for name, value in options.items() if name != "pairs"}
     with pytest.raises(ShardError, match=WRONG):
-        SceneViews(shards, scenes=SCENE, fields=("image",), **views)[0]
+        SceneViews(shards, scenes=SCENE, fields=("image",), **options)[0]
 
 
 def test_it_is_found_in_workers_and_by_the_loader(shards):
@@ -84,9 +78,7 @@ def test_it_is_found_in_workers_and_by_the_loader(shards):
 @pytest.mark.parametrize("options", [{"frames": "first"}, {"frames": "all", "check": "metadata"}])
 def test_single_frames_are_given_without_reading_the_rest(shards, options, small_shards):
     pairs = selected(shards, **options)
-    member = pairs.index.scene(pairs.plan.locate(0, epoch=0).row).members[rgb_name(0)]
-    # The very last byte: of the MP4's table behind the pictures, in a text.
-    flip(shards / SHARD, member, place=1 - 1 / member.size)
+    flip(shards, pairs, place=1)  # in a text of the MP4's table behind the pictures
 
     assert torch.equal(pairs[0]["left"], selected(small_shards)[0]["left"])
 
@@ -95,8 +87,7 @@ def test_a_video_is_compared_once_a_process(shards):
     pairs = selected(shards, frames="all")
     assert pairs[0]["left"].shape == (3, 64, 64)
     pairs.close()
-    member = pairs.index.scene(pairs.plan.locate(0, epoch=0).row).members[rgb_name(0)]
-    flip(shards / SHARD, member, place=1 - 1 / member.size)
+    flip(shards, pairs, place=1)
 
     assert pairs[0]["left"].shape == (3, 64, 64)
     pairs.close()

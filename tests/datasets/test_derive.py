@@ -275,48 +275,35 @@ def test_a_gpu_gives_what_the_processor_gives(contract):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("fields", "changes", "message"),
     [
-        ({"fields": ("disparity", "right_from_left")}, "cannot make 'right_from_left'.*left, ri"),
-        ({"fields": ()}, "no field"),
+        (("disparity", "right_from_left"), {}, "cannot make 'right_from_left'.*left, ri"),
+        ((), {}, "no field"),
+        (("left",), {"image": None}, "no image: .*fields=DERIVE_FIELDS"),
+        (("left",), {"stored_depth": None}, "no stored_depth: .*fields=DERIVE_FIELDS"),
+        (
+            ("valid",), {"stored_depth": lambda depth: depth.int()},
+            r"stored_depth is torch\.int32 \(1, 6, 2, 1, 12, 40\), not uint16",
+        ),
+        (
+            ("valid",), {"stored_depth": lambda depth: depth[0, 0]},
+            r"stored_depth is torch\.uint16 \(2, 1, 12, 40\), not uint16",
+        ),
+        (
+            ("left",), {"image": lambda image: image.repeat_interleave(2, dim=-1)},
+            r"image is \(1, 6, 2, 3, 12, 80\).*\(1, 6, 2, 1, 12, 40\)",
+        ),
     ],
-)
-def test_a_field_that_cannot_be_made_is_named(options, message):
+)  # fmt: skip
+def test_what_no_pair_can_be_made_of_is_named_with_what_was_found(fields, changes, message):
+    batch = plain_batch()
+    for name, changed in changes.items():
+        values = batch.pop(name)
+        if changed is not None:
+            batch[name] = changed(values)
+
     with pytest.raises(FieldError, match=message):
-        derive(plain_batch(), **options)
-
-
-@pytest.mark.parametrize("name", ["stored_depth", "image"])
-def test_a_missing_field_of_the_batch_is_named_with_the_cure(name):
-    batch = plain_batch()
-    del batch[name]
-
-    with pytest.raises(FieldError, match=f"no {name}: .*fields=DERIVE_FIELDS"):
-        derive(batch, fields=("left",))
-
-
-@pytest.mark.parametrize(
-    ("change", "found"),
-    [
-        (lambda depth: depth.to(torch.int32), r"torch\.int32 \(1, 6, 2, 1, 12, 40\)"),
-        (lambda depth: depth[0, 0], r"torch\.uint16 \(2, 1, 12, 40\)"),
-    ],
-)
-def test_depth_of_another_dtype_or_without_a_batch_is_refused(change, found):
-    batch = plain_batch()
-
-    with pytest.raises(FieldError, match=f"stored_depth is {found}, not uint16"):
-        derive(batch | {"stored_depth": change(batch["stored_depth"])})
-
-
-def test_pictures_of_another_size_than_their_depth_are_refused():
-    batch = plain_batch()
-    batch["image"] = batch["image"].repeat_interleave(2, dim=-1)
-
-    with pytest.raises(
-        FieldError, match=r"image is \(1, 6, 2, 3, 12, 80\).*\(1, 6, 2, 1, 12, 40\)"
-    ):
-        derive(batch, fields=("left",))
+        derive(batch, fields=fields)
 
 
 @pytest.mark.parametrize("pairs", [[(1, 1)], [(0, 6)], [(-1, 2)], "some", []])

@@ -1,7 +1,6 @@
 """The same samples from shards, beside you or behind a URL, with few bytes and through faults."""
 
 import shutil
-from pathlib import Path
 
 import pytest
 from torch.utils.data import DataLoader
@@ -80,20 +79,11 @@ def test_workers_read_over_connections_of_their_own(context, place, root_of, ind
 def test_a_server_that_fails_now_and_then_changes_nothing(
     shards_served, indexed_release, impatient
 ):
-    expected = StereoPairs(
-        indexed_release, frames="all", scenes="train/Uniform/SynthStage/scene_000000"
-    )
-    pairs = StereoPairs(
-        shards_served.url, frames="all", scenes="train/Uniform/SynthStage/scene_000000"
-    )
-    shards_served.answers = [
-        Answer(status=503),
-        Answer(stop_after=0),
-        Answer(stop_after=1500),
-        Answer(status=429),
-        Answer(stop_after=2000),
-        Answer(stop_after=100),
-    ]
+    chosen = {"frames": "all", "scenes": "train/Uniform/SynthStage/scene_000000"}
+    expected = StereoPairs(indexed_release, **chosen)
+    pairs = StereoPairs(shards_served.url, **chosen)
+    cut_short = [Answer(stop_after=count) for count in (0, 1500, 2000, 100)]
+    shards_served.answers = [Answer(status=503), *cut_short[:2], Answer(status=429), *cut_short[2:]]
 
     assert all(same(pairs[number], expected[number]) for number in range(len(pairs)))
     assert shards_served.answers == []
@@ -132,14 +122,6 @@ def test_bytes_that_never_come_are_no_damaged_video(video, shards_served, impati
     assert "disparity" in pairs[0]
 
 
-def damage(path: Path) -> None:
-    """Change bytes in the middle of a file and leave its size."""
-    data = bytearray(path.read_bytes())
-    middle = len(data) // 2
-    data[middle : middle + 400] = bytes(400)
-    path.write_bytes(data)
-
-
 def test_a_cache_that_was_damaged_on_disk_is_filled_again(shards_served, indexed_release, tmp_path):
     cache = ShardCache(tmp_path / "cache", limit_bytes=10**8)
     expected = StereoPairs(indexed_release, frames="all", family="IPD_Gaussian")
@@ -147,7 +129,10 @@ def test_a_cache_that_was_damaged_on_disk_is_filled_again(shards_served, indexed
     assert same(pairs[0], expected[0])
     pairs.close()
     for item in (tmp_path / "cache").rglob("*.member"):
-        damage(item)
+        data = bytearray(item.read_bytes())
+        middle = len(data) // 2
+        data[middle : middle + 400] = bytes(400)
+        item.write_bytes(data)
 
     assert all(same(pairs[number], expected[number]) for number in range(len(pairs)))
 
