@@ -58,13 +58,18 @@ class _StopAt(Callback):
             raise _Stopped
 
 
+def _trainer(**options):
+    return LightningTrainer(
+        accelerator="cpu", logger=False, enable_checkpointing=False, enable_model_summary=False,
+        enable_progress_bar=False, **options,
+    )  # fmt: skip
+
+
 def lightning(loader, folder, *, stop_at=None, resume=False, devices=1, **options):
     """Train with Lightning; stop after a step's checkpoint, or go on from it."""
     module, checkpoint = _Module(), Path(folder) / "lightning.ckpt"
-    trainer = LightningTrainer(
-        max_epochs=EPOCHS, accelerator="cpu", devices=devices, logger=False,
-        strategy="ddp" if devices > 1 else "auto", enable_checkpointing=False,
-        enable_model_summary=False, enable_progress_bar=False,
+    trainer = _trainer(
+        max_epochs=EPOCHS, devices=devices, strategy="ddp" if devices > 1 else "auto",
         callbacks=[_StopAt(stop_at, checkpoint)] if stop_at else [], **options,
     )  # fmt: skip
     try:
@@ -82,11 +87,7 @@ def predicted(loader):
         def predict_step(self, batch, number):
             return batch["__key__"]
 
-    trainer = LightningTrainer(
-        accelerator="cpu", devices=1, logger=False, enable_checkpointing=False,
-        enable_model_summary=False, enable_progress_bar=False,
-    )  # fmt: skip
-    return [key for keys in trainer.predict(Keys(), loader) for key in keys]
+    return [key for keys in _trainer(devices=1).predict(Keys(), loader) for key in keys]
 
 
 class _Model(_Scalar):

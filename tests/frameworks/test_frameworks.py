@@ -81,19 +81,20 @@ def test_shares_are_not_shared_again(ranks):
         assert "Prepare pairs.loader(...) instead" in stream
 
 
+def run(name, data, folder, **options):
+    pairs = runs.random_frames(data)
+    loader = pairs.loader(4, num_workers=1)
+    if name == "lightning":
+        return runs.lightning(loader, folder, **options)
+    own = loader if name == "loader" else None
+    return runs.hugging_face(pairs, folder / "run", loader=own, **options)
+
+
 @pytest.fixture(scope="module")
 def whole_runs(indexed_release, tmp_path_factory):
     """The steps of a run that is not stopped, by the trainer and what it was given."""
     folder = tmp_path_factory.mktemp("whole")
-
-    def pairs():
-        return runs.random_frames(indexed_release)
-
-    return {
-        "lightning": runs.lightning(pairs().loader(4, num_workers=1), folder),
-        "loader": runs.hugging_face(pairs(), folder, loader=pairs().loader(4, num_workers=1)),
-        "dataset": runs.hugging_face(pairs(), folder),
-    }
+    return {name: run(name, indexed_release, folder) for name in ("lightning", "loader", "dataset")}
 
 
 @pytest.mark.parametrize(
@@ -102,16 +103,9 @@ def whole_runs(indexed_release, tmp_path_factory):
 )
 def test_a_run_goes_on_as_if_it_had_not_stopped(whole_runs, indexed_release, tmp_path, name, stop):
     """After the last batch of an epoch, and in the second one."""
-
-    def run(**options):
-        pairs = runs.random_frames(indexed_release)
-        loader = pairs.loader(4, num_workers=1)
-        if name == "lightning":
-            return runs.lightning(loader, tmp_path, **options)
-        options["loader"] = loader if name == "loader" else None
-        return runs.hugging_face(pairs, tmp_path / "run", **options)
-
-    whole, before, after = whole_runs[name], run(stop_at=stop), run(resume=True)
+    before = run(name, indexed_release, tmp_path, stop_at=stop)
+    after = run(name, indexed_release, tmp_path, resume=True)
+    whole = whole_runs[name]
 
     epochs = of_epochs(whole, epochs=runs.EPOCHS)
     assert len({tuple(sorted(keys)) for keys in epochs}) == runs.EPOCHS

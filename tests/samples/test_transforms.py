@@ -1,6 +1,6 @@
 """Transforms keep a pair a pair: warping the right view by disparity still gives the left one."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -135,21 +135,18 @@ def white_views():
     return replace(views, pictures=pictures, depths=depths)
 
 
+@dataclass
 class CropPart:
     """Cut a random window that has these parts of the picture's height and width."""
 
+    height: float
+    width: float
     swaps_views = False
 
-    def __init__(self, *parts):
-        self.parts = parts
-
-    def __repr__(self):
-        return f"CropPart{self.parts}"
-
     def __call__(self, views, generator):
-        size = (views.intrinsics.height_px, views.intrinsics.width_px)
-        window = [max(1, int(side * part)) for side, part in zip(size, self.parts, strict=True)]
-        return RandomCrop(*window)(views, generator)
+        height_px = max(1, int(views.intrinsics.height_px * self.height))
+        width_px = max(1, int(views.intrinsics.width_px * self.width))
+        return RandomCrop(height_px, width_px)(views, generator)
 
 
 sides = st.integers(1, 70)

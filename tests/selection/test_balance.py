@@ -43,19 +43,14 @@ def test_a_limit_is_met_exactly_and_shared_out(crowded_cm):
     assert max(shares.values()) - min(shares.values()) <= 1
 
 
-def test_a_limit_beyond_the_poorest_stratum_names_it(crowded_cm):
-    with pytest.raises(
-        SelectionError,
-        match=r"500 pairs are wanted of the bin \[30,60\) cm, which has 318; the most .* is 785",
-    ):
-        balanced(crowded_cm, by="bins", limit=2500, seed=0)
-
-
-def test_a_limit_below_the_number_of_strata_is_refused(crowded_cm):
-    with pytest.raises(SelectionError, match="less than one pair for each of 5 strata"):
-        balanced(crowded_cm, by="bins", limit=3, seed=0)
-
-
-def test_an_unknown_balance_is_refused():
-    with pytest.raises(SelectionError, match="must be 'bins' or 'log_baseline', got 'log'"):
-        balanced(np.ones(3), by="log", limit=None, seed=0)
+@pytest.mark.parametrize(
+    ("by", "limit", "message"),
+    [
+        ("bins", 2500, r"500 pairs .* of the bin \[30,60\) cm, which has 318; the most .* is 785"),
+        ("bins", 3, "less than one pair for each of 5 strata"),
+        ("log", None, "must be 'bins' or 'log_baseline', got 'log'"),
+    ],
+)
+def test_a_balance_that_cannot_be_had_is_refused(crowded_cm, by, limit, message):
+    with pytest.raises(SelectionError, match=message):
+        balanced(crowded_cm, by=by, limit=limit, seed=0)

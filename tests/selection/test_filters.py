@@ -1,10 +1,14 @@
 """Filters keep what they say and name themselves where nothing is left."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.selection.filters import filter_scenes
+from tests.selection.conftest import made_scene
 
 
 def keys(index, **filters):
@@ -53,17 +57,9 @@ def test_a_filter_keeps_the_scenes_that_match(index, filters, expected):
         ({"family": ["Uniform", "Nope"]}, "family Nope matches none of 9 scenes of the index"),
         ({"focal_mm": (80, 90)}, "focal_mm 80 to 90 .* found 20 to 35"),
         ({"valid_depth_ratio": (0.9, 1.0)}, "does not know it .* --valid-depth"),
-    ],
-    ids=str,
-)
-def test_a_filter_that_leaves_nothing_is_named_with_what_there_is(index, filters, message):
-    with pytest.raises(SelectionError, match=message):
-        keys(index, **filters)
-
-
-@pytest.mark.parametrize(
-    ("filters", "message"),
-    [
+        ({"scenes": "scene_000000"}, r"'scene_000000' is a part of 4 keys: eval/.*Give"),
+        ({"scenes": "Town/scene_00001"}, r"is not a key .* Did you mean .*Town/scene_000001"),
+        # What no filter takes.
         ({"min_frames": 0}, "min_frames must be a whole number from 1"),
         ({"min_frames": True}, "min_frames must be a whole number from 1"),
         ({"family": 3}, "family must be a text or a sequence of texts"),
@@ -75,7 +71,7 @@ def test_a_filter_that_leaves_nothing_is_named_with_what_there_is(index, filters
     ],
     ids=str,
 )
-def test_a_value_that_no_filter_takes_is_refused(index, filters, message):
+def test_a_filter_that_leaves_nothing_or_means_nothing_is_named(index, filters, message):
     with pytest.raises(SelectionError, match=message):
         keys(index, **filters)
 
@@ -83,5 +79,13 @@ def test_a_value_that_no_filter_takes_is_refused(index, filters, message):
 def test_a_part_of_a_key_that_one_scene_has_is_enough(index):
     whole = "train/Uniform/Town/scene_000001"
 
-    assert keys(index, scenes="Uniform/Town/scene_000001", split="train") == [whole]
+    for text in ("Uniform/Town/scene_000001", "TOWN/scene_000001", "/town/scene_000001/"):
+        assert keys(index, scenes=text, split="train") == [whole]
     assert keys(index, scenes=[whole, "train/uniform/town/scene_000000"])[1] == whole
+
+
+def test_whole_folders_of_one_key_win_over_a_part_of_others():
+    both = [f"train/{family}/Town/scene_000000" for family in ("Pairwise_Uniform", "Uniform")]
+    index = SceneIndex.from_scenes(map(made_scene, both), Path("release"))
+
+    assert keys(index, scenes="uniform") == both[1:]

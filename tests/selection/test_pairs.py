@@ -94,27 +94,17 @@ def test_several_bins_are_joined(index):
 
 
 @pytest.mark.parametrize(
-    ("pairs", "message"),
-    [
-        ([(2, 2)], r"there is no pair \(2, 2\)"),
-        ([(3, 1)], r"write \(1, 3\), .* direction='right_to_left'"),
-        ([(0, 1), (0, 1)], "each only once"),
-        ("every", "must be 'primary'"),
-        ("1-0", r"write \(0, 1\), .* direction='right_to_left'"),
-        ([], "at least one"),
-        (5, "camera pairs such as .* got 5"),
-        ([(0, 1, 2)], r"got \(0, 1, 2\)"),
-        ([("0", "1")], "got"),
-    ],
-)
-def test_a_pair_that_does_not_exist_is_refused(index, pairs, message):
-    with pytest.raises(SelectionError, match=message):
-        chosen(index, pairs=pairs)
-
-
-@pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"pairs": [(2, 2)]}, r"there is no pair \(2, 2\)"),
+        ({"pairs": [(3, 1)]}, r"write \(1, 3\), .* direction='right_to_left'"),
+        ({"pairs": [(0, 1), (0, 1)]}, "each only once"),
+        ({"pairs": "every"}, "must be 'primary'"),
+        ({"pairs": "1-0"}, r"write \(0, 1\), .* direction='right_to_left'"),
+        ({"pairs": []}, "at least one"),
+        ({"pairs": 5}, "camera pairs such as .* got 5"),
+        ({"pairs": [(0, 1, 2)]}, r"got \(0, 1, 2\)"),
+        ({"pairs": [("0", "1")]}, "got"),
         (
             {"filters": {"family": "IPD_Gaussian"}, "baseline_cm": (50, 60)},
             r"baseline_cm 50 to 60 .* 4 pairs; found 6 to 6 cm, in the bins \[1,10\)",
