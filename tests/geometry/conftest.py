@@ -1,4 +1,4 @@
-"""Both array libraries, six-camera rigs whose true numbers are known, and how pictures compare."""
+"""Both array libraries, and six-camera rigs whose true numbers are known."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -58,24 +58,8 @@ def make_rig():
         rotation = np.eye(3) if rotation is None else np.asarray(rotation)
         recorded = np.array(rotation if recorded is None else recorded, dtype=np.float64)
         locations = np.array(offset_cm, float) + np.outer(lateral_cm, rotation[:, 1])
-        return CameraPoses.from_trajectory(
-            Trajectory(
-                locations=np.tile(locations, (frames, 1, 1)),
-                unit_m=0.01,
-                rotations=np.tile(recorded, (frames, 6, *[1] * recorded.ndim)),
-                rotation_kind=kind,
-            )
-        )
+        locations = np.tile(locations, (frames, 1, 1))
+        rotations = np.tile(recorded, (frames, 6, *[1] * recorded.ndim))
+        return CameraPoses.from_trajectory(Trajectory(locations, 0.01, rotations, kind))
 
     return make
-
-
-@pytest.fixture(scope="session")
-def psnr_db():
-    """Return the PSNR in dB of two images (c, h, w) over the pixels of a mask, peak 255."""
-
-    def measure(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> float:
-        error = (image.astype(np.float64) - reference)[..., mask]
-        return float(10 * np.log10(255**2 / np.mean(error**2)))
-
-    return measure
