@@ -13,6 +13,7 @@ from stereogenbench_data.shards.download import download, plan_download
 from stereogenbench_data.shards.pack import pack
 
 SCENE = "train/Uniform/SynthStage/scene_000000"
+TEXT = f"{SCENE}/{DESCRIPTION_TXT}"
 
 
 @pytest.fixture
@@ -38,10 +39,7 @@ PASSED_ON = {"pack": lambda tree, out: pack(tree, out, workers=1), "download": f
 
 
 @pytest.mark.parametrize("what", PASSED_ON)
-@pytest.mark.parametrize(
-    "linked",
-    [f"{SCENE}/{DESCRIPTION_TXT}", f"{SCENE}/cam_00_rgb.mp4", SCENE, "train"],
-)
+@pytest.mark.parametrize("linked", [TEXT, f"{SCENE}/cam_00_rgb.mp4", SCENE, "train"])
 def test_what_a_link_leads_out_to_is_not_passed_on(what, linked, tree, tmp_path):
     link_away(tree, linked, to=tmp_path / "elsewhere" / "secret")
     out = tmp_path / "out"
@@ -56,7 +54,7 @@ def test_what_a_link_leads_out_to_is_not_passed_on(what, linked, tree, tmp_path)
 
 @pytest.mark.parametrize("what", PASSED_ON)
 def test_a_name_that_begins_alike_is_another_folder(what, tree, tmp_path):
-    link_away(tree, f"{SCENE}/{DESCRIPTION_TXT}", to=tree.with_name("tree2") / "secret")
+    link_away(tree, TEXT, to=tree.with_name("tree2") / "secret")
 
     with pytest.raises(StorageError, match="leads out of"):
         PASSED_ON[what](tree, tmp_path / "out")

@@ -15,7 +15,6 @@ from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import COMPLETE_JSON
 from stereogenbench_data.selection.filters import filter_scenes, find_scene
-from stereogenbench_data.shards.pack import pack
 from tests.cli.command import invoke
 
 MAP = "train/Uniform/SynthStage"
@@ -23,26 +22,16 @@ OLD = r"index\.parquet: is older than the folder "
 CURE = r"Run `stereogenbench index /\S+`\."
 
 
-@pytest.fixture(scope="module")
-def indexed(small_release, tmp_path_factory):
-    """A tree with its index, and shards of it with a scene each, which nobody changes."""
-    root = tmp_path_factory.mktemp("indexed")
-    shutil.copytree(small_release, root / "tree")
-    SceneIndex.open(root / "tree").write(root / "tree" / INDEX_NAME)
-    pack(small_release, root / "shards", target_bytes=250_000, workers=1)
-    return root
-
-
 @pytest.fixture
-def tree(indexed, tmp_path):
+def tree(indexed_release, tmp_path):
     """A tree with its index: scenes 0 and 1 of Uniform in train, and others."""
-    return shutil.copytree(indexed / "tree", tmp_path / "tree")
+    return shutil.copytree(indexed_release, tmp_path / "tree")
 
 
 @pytest.fixture
-def shards(indexed, tmp_path):
-    """The same scenes, each in a shard of its own."""
-    return shutil.copytree(indexed / "shards", tmp_path / "shards")
+def shards(small_shards, tmp_path):
+    """The same scenes in shards."""
+    return shutil.copytree(small_shards, tmp_path / "shards")
 
 
 def add_scene(tree, key=f"{MAP}/scene_000009"):
@@ -159,11 +148,11 @@ def test_an_index_alone_and_one_of_a_part_are_not_old(tree, tmp_path):
 
 
 def test_a_shard_beside_an_old_index_is_named_and_one_that_is_gone(shards):
-    (shards / "train-Uniform-000001.tar").rename(shards / "train-Uniform-000007.tar")
+    (shards / "train-Uniform-000000.tar").rename(shards / "train-Uniform-000007.tar")
 
     told = (
         r"1 shard not in the index \(train-Uniform-000007\.tar\); 1 shard of the index, and not "
-        r"there \(train-Uniform-000001\.tar\)\. Fetch the index that belongs"
+        r"there \(train-Uniform-000000\.tar\)\. Fetch the index that belongs"
     )
     with pytest.warns(StaleIndexWarning, match=told):
         SceneIndex.open(shards)
