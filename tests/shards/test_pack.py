@@ -29,12 +29,8 @@ from tests.shards.shard_files import bytes_of
 ONE_EACH = 250_000
 """A target that holds one of the small release's scenes, not two."""
 
-NAMES = [
-    "eval-seen_map-Uniform-000000.tar",
-    "train-IPD_Gaussian-000000.tar",
-    "train-Uniform-000000.tar",
-    "train-Uniform-000001.tar",
-]
+UNIFORM = [f"train-Uniform-{number:06d}.tar" for number in range(2)]
+NAMES = ["eval-seen_map-Uniform-000000.tar", "train-IPD_Gaussian-000000.tar", *UNIFORM]
 
 
 @pytest.fixture(scope="session")
@@ -66,10 +62,9 @@ def test_shards_hold_the_bytes_of_the_release_and_nothing_else(packed, small_rel
         with tarfile.open(packed / name) as tar:
             found |= {info.name: tar.extractfile(info).read() for info in tar}
 
-    files = list(small_release.rglob("scene_*/*"))
+    names = {path: path.relative_to(small_release) for path in small_release.rglob("scene_*/*")}
     released = {
-        f"{path.parent.relative_to(small_release).as_posix()}.{path.name}": path.read_bytes()
-        for path in files
+        f"{name.parent.as_posix()}.{name.name}": p.read_bytes() for p, name in names.items()
     }
     assert found == released
 
@@ -125,9 +120,8 @@ def test_finished_shards_are_kept_and_progress_counts_them(release, tmp_path):
     before = {name: (tmp_path / name).stat().st_mtime_ns for name in tars(tmp_path)}
     seen = []
 
-    report = pack(
-        release, tmp_path, target_bytes=ONE_EACH, workers=1, progress=lambda *now: seen.append(now)
-    )
+    how = {"target_bytes": ONE_EACH, "progress": lambda *now: seen.append(now)}
+    report = pack(release, tmp_path, workers=1, **how)
 
     assert len(before) == 2
     assert report.packed == (NAMES[1], NAMES[3])
@@ -282,16 +276,14 @@ def test_packing_goes_on_once_there_is_room(release, packed, tmp_path):
 
 def test_the_command_packs_a_share_that_fits(small_release, tmp_path):
     folder = tmp_path / "share"
-    whole = sum(path.stat().st_size for path in small_release.rglob("scene_*/*"))
+    most = 2 * sum(path.stat().st_size for path in small_release.rglob("scene_*/*")) // 3
 
-    done = invoke(
-        "pack", small_release, folder, "--max-bytes", str(whole * 2 // 3), "--workers", "1"
-    )
+    done = invoke("pack", small_release, folder, "--max-bytes", most, "--workers", "1")
 
     assert done.exit_code == 0, done.output
     packed_bytes = sum(path.stat().st_size for path in folder.glob("*.tar"))
     assert 1 <= len(SceneIndex.open(folder)) < 4
-    assert packed_bytes <= whole * 2 // 3
+    assert packed_bytes <= most
 
 
 def test_the_command_packs_and_reports_what_there_is(small_release, tmp_path, packed):
@@ -304,9 +296,8 @@ def test_the_command_packs_and_reports_what_there_is(small_release, tmp_path, pa
     assert remaining_line.startswith("2 shards ")
     assert NAMES[1] in remaining_line
     assert "index" in remaining_line
-    assert second.stdout == (
-        f"{tmp_path}: 2 shards packed, 2 kept\n{tmp_path / 'index.parquet'}: 4 scenes\n"
-    )
+    told = f"{tmp_path}: 2 shards packed, 2 kept\n{tmp_path / 'index.parquet'}: 4 scenes\n"
+    assert second.stdout == told
     assert bytes_of(tmp_path) == bytes_of(packed)
 
 

@@ -54,26 +54,18 @@ def assert_lines(found, *expected):
         assert re.match(".*".join(map(re.escape, texts)), line), line
 
 
-def test_sound_shards_have_no_problem(small_shards):
-    report = verify(small_shards, workers=1)
+@pytest.mark.parametrize(("mode", "videos"), [("bytes", 0), ("decode", 4 * 12)])
+def test_sound_shards_have_no_problem_and_progress_ends_at_the_end(small_shards, mode, videos):
+    seen, index = [], small_shards / "index.parquet"
+
+    report = verify(index, mode=mode, workers=1, progress=lambda *now: seen.append(now))
 
     assert report.problems == ()
     assert (report.shards, report.scenes, report.members) == (3, 4, 4 * 17)
     assert report.bytes == sum(path.stat().st_size for path in small_shards.glob("*.tar"))
-    assert report.videos_decoded == 0
-
-
-def test_decoding_counts_every_video_and_progress_ends_at_the_end(small_shards):
-    seen = []
-
-    report = verify(
-        small_shards / "index.parquet", mode="decode", workers=1,
-        progress=lambda *now: seen.append(now),
-    )  # fmt: skip
-
-    assert report.problems == ()
-    assert report.videos_decoded == 4 * 12
-    assert seen[-1][0] == seen[-1][1] > report.bytes
+    assert report.videos_decoded == videos
+    assert seen[-1][0] == seen[-1][1]
+    assert (seen[-1][1] > report.bytes) == (mode == "decode")
     assert seen == sorted(seen)
 
 
@@ -201,11 +193,8 @@ def test_all_problems_are_listed_whatever_the_workers(shards, place):
 
     reported = verify(shards, workers=2).problems
 
-    assert [(each.shard, each.scene, each.member) for each in reported] == [
-        (SINGLE, "", ""),
-        (PAIR, SCENES[0], "trajectory.json"),
-        (PAIR, SCENES[1], "trajectory.json"),
-    ]
+    expected = [(SINGLE, "", ""), *((PAIR, scene, "trajectory.json") for scene in SCENES)]
+    assert [(each.shard, each.scene, each.member) for each in reported] == expected
 
 
 @pytest.fixture
@@ -229,10 +218,9 @@ def repacked(small_release, tmp_path):
 def test_a_video_with_fewer_frames_is_reported_by_decoding(repacked, tmp_path):
     short = write_video(tmp_path / "short.mp4", frames=6, size=(64, 64), tags={})
 
-    assert_lines(
-        repacked("cam_01_rgb.mp4", short.read_bytes()),
-        (f"{PAIR}: {SCENES[0]}: cam_01_rgb.mp4: ", "6 frames of 64x64", "7 of 64x64", "Pack the"),
-    )
+    place = f"{PAIR}: {SCENES[0]}: cam_01_rgb.mp4: "
+    told = (place, "6 frames of 64x64", "7 of 64x64", "Pack the")
+    assert_lines(repacked("cam_01_rgb.mp4", short.read_bytes()), told)
 
 
 def test_depth_of_another_unit_than_the_index_says_is_reported_by_decoding(repacked, tmp_path):
