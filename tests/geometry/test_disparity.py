@@ -34,7 +34,8 @@ def disparity_of(library, units, shift_units, *, form):
     """Return the disparity of stored numbers, a number of 0 not measured."""
     stored = np.where(units == 0, np.inf if form == "depth" else 0, units)
     shift = library.array(np.array(shift_units))
-    return disparity_from_shifts(library.array(stored.astype(np.float64)), shift, form=form)
+    stored = library.array(stored.astype(np.float64))
+    return library.numpy(disparity_from_shifts(stored, shift, form=form))
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -63,9 +64,8 @@ def test_float32_disparity_is_the_float64_one_rounded(library, focal_px, baselin
     depth_m = (ALL_UNITS[:, 1:] * unit_m).astype(np.float32)
     exact = focal_px * baseline_m / depth_m.astype(np.float64)
 
-    disparity_px = library.numpy(
-        disparity_from_depth(library.array(depth_m), focal_px=focal_px, baseline_m=baseline_m)
-    )
+    pair = {"focal_px": focal_px, "baseline_m": baseline_m}
+    disparity_px = library.numpy(disparity_from_depth(library.array(depth_m), **pair))
 
     np.testing.assert_array_equal(disparity_px, exact.astype(np.float32))
 
@@ -79,9 +79,7 @@ def test_disparity_of_any_stored_number_is_within_an_ulp(
     units = ALL_UNITS.astype(np.int32)
     depth_m = {"depth": units[:, 1:] * unit_m, "inverse": unit_m / units[:, 1:]}[form]
 
-    disparity_px = library.numpy(
-        disparity_of(library, units, focal_px * baseline_m / unit_m, form=form)
-    )
+    disparity_px = disparity_of(library, units, focal_px * baseline_m / unit_m, form=form)
 
     assert disparity_px.dtype == np.float32
     assert disparity_px[0, 0] == 0.0
@@ -170,5 +168,5 @@ def test_written_disparity_is_the_same_or_0(library, seed, shift_units, form, ro
     with mock.patch.object(disparity_module, "_BLOCK_PIXELS", rows * 5):
         write_disparity(out, units, measured=measured, shift_units=shift_units, form=form)
 
-    returned = library.numpy(disparity_of(library, units, shift_units, form=form))
+    returned = disparity_of(library, units, shift_units, form=form)
     np.testing.assert_array_equal(out, np.where(measured, returned, 0))

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import pytest
@@ -110,13 +111,9 @@ def _write_often(path, number):
 
 def test_writers_of_one_file_at_once_leave_one_whole_file(tmp_path):
     path = tmp_path / "notes.json"
-    writers = [FORK.Process(target=_write_often, args=(path, number)) for number in range(4)]
-    for each in writers:
-        each.start()
-    for each in writers:
-        each.join()
+    with FORK.Pool(4) as pool:
+        pool.starmap(_write_often, [(path, number) for number in range(4)], chunksize=1)
 
-    assert [each.exitcode for each in writers] == [0] * 4
     assert names(tmp_path) == ["notes.json"]
     assert len(path.read_bytes()) == 1000
     assert len(set(path.read_bytes())) == 1
@@ -128,13 +125,9 @@ def _is_free(lock):
 
 
 def test_a_lock_is_held_against_other_threads(tmp_path):
-    found = []
-    with locked(tmp_path / "lock"):
-        thread = threading.Thread(target=lambda: found.append(_is_free(tmp_path / "lock")))
-        thread.start()
-        thread.join()
+    with locked(tmp_path / "lock"), ThreadPoolExecutor(1) as thread:
+        assert not thread.submit(_is_free, tmp_path / "lock").result()
 
-    assert found == [False]
     assert _is_free(tmp_path / "lock")
 
 

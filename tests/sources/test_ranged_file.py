@@ -73,11 +73,23 @@ def test_ranged_files_and_slices_read_as_a_file_of_their_bytes_does(tmp_path_fac
             assert [do(file, *step) for step in steps] == expected
 
 
-def test_a_pass_forwards_fetches_every_byte_once_in_blocks_that_grow():
-    store = Store(9 * MIB + 17)
-    file = store.open()
+def passed_over(file):
+    """Read a file as FFmpeg reads MP4: the start, the table at the end, then all between."""
+    file.read(100)
+    file.seek(-500, io.SEEK_END)
+    file.read()
+    file.seek(100)
+    read_on(file)
+
+
+def read_on(file):
     while file.read(32768):
         pass
+
+
+def test_a_pass_forwards_fetches_every_byte_once_in_blocks_that_grow():
+    store = Store(9 * MIB + 17)
+    read_on(store.open())
 
     assert store.fetched == len(store.data)
     sizes = [stop - start for start, stop in store.asked]
@@ -89,13 +101,7 @@ def test_a_pass_forwards_fetches_every_byte_once_in_blocks_that_grow():
 def test_a_visit_to_the_end_and_back_fetches_no_byte_twice():
     """MP4 may hold its table behind the pictures."""
     store = Store(1 * MIB)
-    file = store.open()
-    file.read(100)
-    file.seek(-500, io.SEEK_END)
-    file.read()
-    file.seek(100)
-    while file.read(32768):
-        pass
+    passed_over(store.open())
 
     assert store.fetched == len(store.data)
 
@@ -103,8 +109,7 @@ def test_a_visit_to_the_end_and_back_fetches_no_byte_twice():
 def test_what_is_kept_is_bounded():
     store = Store(9 * MIB)
     file = store.open()
-    while file.read(32768):
-        pass
+    read_on(file)
     asked = len(store.asked)
     for start in (9 * MIB - KEPT_BYTES // 2, 9 * MIB - KEPT_BYTES - LARGEST_BLOCK, 0):
         file.seek(start)
@@ -129,20 +134,6 @@ def test_a_failure_is_reported_again_without_being_fetched_again():
 
     assert len(tries) == 1
     assert str(file.failure) == "the server is gone"
-
-
-def passed_over(file):
-    """Read a file as FFmpeg reads MP4: the start, the table at the end, then all between."""
-    file.read(100)
-    file.seek(-500, io.SEEK_END)
-    file.read()
-    file.seek(100)
-    read_on(file)
-
-
-def read_on(file):
-    while file.read(32768):
-        pass
 
 
 @pytest.mark.parametrize("size", [700, 5 * MIB + 3])
