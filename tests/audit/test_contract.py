@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -43,38 +44,36 @@ from tests.audit.corruption import (
 
 UNIT_M = 0.001
 FULL_FRAME = RayCasting(sensors_mm=((36, 24),))
+RIGHT = SynthRequest(
+    family="IPD_Gaussian", size_px=160, height_px=104, frames=9, seed=22, focal_mm=20
+)
+"""A scene with nothing wrong: wide-angle, oblong, 9 frames."""
+LONG_LENS = SynthRequest(family="Uniform", size_px=128, frames=3, seed=109, focal_mm=75)
+"""A scene in whose corners a ray is 2.5 % longer than depth along the axis."""
+FINE = ExportContract(depth_unit_m=0.0005)
 
 
 @pytest.fixture(scope="module")
-def right_scene(tmp_path_factory):
-    """The folder of a scene with nothing wrong: wide-angle, oblong, 9 frames."""
-    root = tmp_path_factory.mktemp("right")
-    (key,) = synthesise(
-        root,
-        SynthRequest(
-            family="IPD_Gaussian", size_px=160, height_px=104, frames=9, seed=22, focal_mm=20
-        ),
-    )
-    return root / key
+def drawn(tmp_path_factory):
+    """Return the folder of a scene that is drawn once for all tests; not to be changed."""
 
+    @cache
+    def drawn(request, renderer=RAY_CASTING):
+        root = tmp_path_factory.mktemp("drawn")
+        (key,) = synthesise(root, request, renderer=renderer)
+        return root / key
 
-@pytest.fixture(scope="module")
-def long_lens(tmp_path_factory):
-    """The folder of a scene in whose corners a ray is 2.5 % longer than depth along the axis."""
-    root = tmp_path_factory.mktemp("long_lens")
-    (key,) = synthesise(
-        root, SynthRequest(family="Uniform", size_px=128, frames=3, seed=109, focal_mm=75)
-    )
-    return root / key
+    return drawn
 
 
 @pytest.fixture
-def verdict_on(right_scene, tmp_path):
-    """Make one thing wrong, and return the verdict."""
+def verdict_on(drawn, tmp_path_factory):
+    """Make one thing wrong in a scene, and return the verdict."""
 
-    def verdict_on(corrupt, **options):
-        corrupt(copied(right_scene, tmp_path))
-        (verdict,) = diagnose(tmp_path, workers=1, **({"frames": 1} | options)).verdicts
+    def verdict_on(corrupt, *, of=(RIGHT,), **options):
+        root = tmp_path_factory.mktemp("corrupt")
+        corrupt(copied(drawn(*of), root))
+        (verdict,) = diagnose(root, workers=1, **({"frames": 1} | options)).verdicts
         return verdict
 
     return verdict_on
@@ -108,15 +107,14 @@ def test_a_right_contract_is_confirmed_question_by_question(verdict_on):
     assert verdict.quotient == pytest.approx(1, rel=0.005)
 
 
-def test_ray_depth_behind_a_long_lens_is_distinguished_from_a_unit_that_is_a_little_off(
-    long_lens, tmp_path
-):
-    folder = copied(long_lens, tmp_path)
-    rewrite_depth(folder, as_ray(folder))
-
-    (ray,) = diagnose(tmp_path, frames=2, workers=1).verdicts
-    rewrite_depth(copied(long_lens, tmp_path / "unit"), tags=1.013)
-    (unit,) = diagnose(tmp_path / "unit", frames=2, workers=1).verdicts
+def test_ray_depth_behind_a_long_lens_is_distinguished_from_a_unit_that_is_a_little_off(verdict_on):
+    ray, unit = (
+        verdict_on(corrupt, of=(LONG_LENS,), frames=2)
+        for corrupt in (
+            lambda folder: rewrite_depth(folder, as_ray(folder)),
+            lambda folder: rewrite_depth(folder, tags=1.013),
+        )
+    )
 
     assert ray.encoding == DepthEncoding(kind="ray")
     assert ray.quotient == pytest.approx(1, rel=0.005)
@@ -205,10 +203,9 @@ def test_a_lag_whose_neighbours_no_frame_could_test_is_left_open(best, tested, s
     assert ("beyond" in lag.note) == (abs(best) == 3)
 
 
-def test_a_scene_of_one_frame_does_not_tell_the_lag(tmp_path):
-    synthesise(tmp_path, SynthRequest(family="Uniform", size_px=96, frames=1, seed=3, focal_mm=35))
-
-    (verdict,) = diagnose(tmp_path, workers=1).verdicts
+def test_a_scene_of_one_frame_does_not_tell_the_lag(verdict_on):
+    one_frame = SynthRequest(family="Uniform", size_px=96, frames=1, seed=3, focal_mm=35)
+    verdict = verdict_on(lambda folder: None, of=(one_frame,))
 
     assert not verdict.is_wrong
     assert answer(verdict, "frame lag").status == "cannot tell"
@@ -358,28 +355,27 @@ def test_what_is_wrong_is_found_and_no_unit_stands_for_it(verdict_on, corrupt, t
 
 
 @pytest.mark.parametrize(
-    ("corrupt", "choice", "factor"),
+    ("corrupt", "quotient"),
     [
-        (lambda folder: rewrite_depth(folder, tags=0.97), 0, 1 / 0.97),
-        (lambda folder: scale_camera(folder, focal_length_mm=0.95), 1, 1 / 0.95),
+        (lambda folder: rewrite_depth(folder, tags=0.97), 1 / 0.97),
+        (lambda folder: scale_camera(folder, focal_length_mm=0.95), 0.95),
     ],
     ids=["unit", "focal length"],
 )
-def test_a_wrong_quotient_is_measured_and_no_unit_is_pasted(verdict_on, corrupt, choice, factor):
+def test_a_wrong_quotient_is_measured_and_no_unit_is_pasted(verdict_on, corrupt, quotient):
     verdict = verdict_on(corrupt)
 
     assert wrong_topics(verdict) == {QUOTIENT}
-    assert verdict.quotient == pytest.approx(factor if choice == 0 else 1 / factor, rel=0.005)
+    assert verdict.quotient == pytest.approx(quotient, rel=0.005)
     assert verdict.gain.low_db > 0
     assert verdict.encoding is None
-    if choice == 0:
-        right = encoding_line(DepthEncoding(unit_m=UNIT_M))
-        assert verdict.choices[0] == f"if focal length and baselines are right: {right}"
-    else:
-        told = verdict.choices[1].removeprefix(
-            "if unit and baselines are right: a focal length of "
-        )
-        assert float(told.partition(" x ")[0]) == pytest.approx(factor, rel=0.005)
+    unit, focal = (choice.partition(": ") for choice in verdict.choices[:2])
+    assert (unit[0], focal[0]) == (
+        "if focal length and baselines are right", "if unit and baselines are right",
+    )  # fmt: skip
+    factor = float(focal[2].removeprefix("a focal length of ").partition(" x ")[0])
+    assert factor == pytest.approx(1 / quotient, rel=0.005)
+    assert quotient < 1 or unit[2] == encoding_line(DepthEncoding(unit_m=UNIT_M))
 
 
 def test_inverse_depth_is_found_with_its_unit(verdict_on):
@@ -490,52 +486,39 @@ def test_pictures_that_show_no_disparity_and_files_without_depth_decide_nothing(
     assert note in verdict.answers[0].note
 
 
-@pytest.fixture(scope="module")
-def small_parallax(tmp_path_factory):
-    """A function to a scene of two-pixel disparities, whose errors look like other mistakes."""
-
-    def small_parallax(*, renderer=RAY_CASTING, **changes):
-        root = tmp_path_factory.mktemp("small_parallax")
-        request = SynthRequest(
-            family="IPD_Gaussian", frames=7, seed=905311003, focal_mm=79.7,
-            contract=ExportContract(depth_unit_m=0.0005), **changes,
-        )  # fmt: skip
-        (key,) = synthesise(root, request, renderer=renderer)
-        return root, root / key
-
-    return small_parallax
+LITTLE = SynthRequest(
+    family="IPD_Gaussian", size_px=130, height_px=98, frames=7, seed=905311003, focal_mm=79.7,
+    contract=FINE,
+)  # fmt: skip
+"""Disparities of two pixels, whose errors look like other mistakes."""
 
 
-def test_a_shift_where_little_is_seen_does_not_make_the_unit_wrong(small_parallax):
-    root, folder = small_parallax(size_px=130, height_px=98)
-    rewrite_rgb(folder, 1, lambda pictures: np.roll(pictures, 2, axis=2))
-
-    (verdict,) = diagnose(root, frames=1, workers=1).verdicts
+def test_a_shift_where_little_is_seen_does_not_make_the_unit_wrong(verdict_on):
+    shifted = pictures_of(1, lambda pictures: np.roll(pictures, 2, axis=2))
+    verdict = verdict_on(shifted, of=(LITTLE,))
 
     (problem,) = verdict.problems
     assert problem.startswith("pictures of camera 1 do not fit those of the others")
     assert wrong_topics(verdict) == set()
 
 
-def test_a_unit_where_little_is_seen_is_not_taken_for_a_lag(small_parallax):
-    root, folder = small_parallax(size_px=128, height_px=84, renderer=FULL_FRAME)
-    rewrite_depth(folder, tags=0.976)
-
-    (verdict,) = diagnose(root, frames=1, workers=1).verdicts
+def test_a_unit_where_little_is_seen_is_not_taken_for_a_lag(verdict_on):
+    flatter = replace(LITTLE, size_px=128, height_px=84)
+    verdict = verdict_on(lambda folder: rewrite_depth(folder, tags=0.976), of=(flatter, FULL_FRAME))
 
     assert answer(verdict, "frame lag").status == "cannot tell"
     assert verdict.encoding is None
 
 
-def test_ray_depth_is_not_taken_for_what_explains_few_of_the_matches(tmp_path):
+def test_ray_depth_is_not_taken_for_what_explains_few_of_the_matches(verdict_on):
     request = SynthRequest(
         family="Uniform", size_px=170, height_px=128, frames=1, seed=905311007, focal_mm=92.2,
-        contract=ExportContract(depth_unit_m=0.0005),
+        contract=FINE,
     )  # fmt: skip
-    (key,) = synthesise(tmp_path, request, renderer=FULL_FRAME)
-    rewrite_depth(tmp_path / key, lambda units: np.flip(units, 1))
-
-    (verdict,) = diagnose(tmp_path, workers=1).verdicts
+    verdict = verdict_on(
+        lambda folder: rewrite_depth(folder, lambda units: np.flip(units, 1)),
+        of=(request, FULL_FRAME),
+    )
 
     assert wrong_topics(verdict) <= {"flip of depth"}
     assert answer(verdict, "flip of depth").status != "confirmed"
@@ -568,12 +551,12 @@ def test_the_contract_requested_about_may_be_given(verdict_on):
     assert verdict.choices[0].endswith(encoding_line(DepthEncoding(unit_m=UNIT_M)))
 
 
-def test_scenes_with_different_contracts_get_verdicts_of_their_own(right_scene, tmp_path):
+def test_scenes_with_different_contracts_get_verdicts_of_their_own(drawn, tmp_path):
     for number, change, factor in ((7, scaled(1 / 23.9), 23.9), (8, scaled(1), 10.0)):
-        folder = copied(right_scene, tmp_path)
+        folder = copied(drawn(RIGHT), tmp_path)
         rewrite_depth(folder, change, tags=factor)
         folder.rename(folder.with_name(f"scene_{number:06d}"))
-    copied(right_scene, tmp_path)
+    copied(drawn(RIGHT), tmp_path)
 
     report = diagnose(tmp_path, frames=1, workers=1)
 
