@@ -80,22 +80,6 @@ def test_what_no_picture_can_test_is_told_beside_the_verdict(tmp_path):
     assert re.search(rf"{file}: .*no picture could test .*frame_lag = 2", result.stderr)
 
 
-def test_baselines_in_another_unit_than_the_poses_are_told_with_both_lengths(
-    detailed_release, tmp_path
-):
-    file = tmp_path / "edited.toml"
-    file.write_text('[baselines]\nplace = "$.pairwise_pairs"\nunit = "mm"\n')
-    root = tmp_path / "bare"
-    shutil.copytree(detailed_release, root, copy_function=shutil.copyfile)
-    for path in root.rglob("baseline.json"):
-        path.write_text(path.read_text().replace("baseline_cm", "baseline"))
-
-    result = invoke("conventions", root, "--check", file, "--pictures", 0)
-
-    assert result.exit_code == 1
-    assert re.search(r"[0-9.]+ cm apart.* [0-9.]+ cm", result.stderr)
-
-
 def test_the_range_of_tags_is_learned_with_its_offset(detailed_release, tmp_path):
     root, out = tmp_path / "ranged", tmp_path / "conventions.toml"
     shutil.copytree(detailed_release, root, copy_function=shutil.copyfile)

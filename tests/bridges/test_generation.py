@@ -111,9 +111,9 @@ def test_clips_have_time_and_channels_in_the_order_asked(indexed_release, layout
         name: clip[name].transpose(0, 1) if layout == "cthw" else clip[name]
         for name in ("source", "target", "warped", "mask", "correspondence")
     }
-    assert torch.equal(as_stored["source"], in_unit_range(plain["left"]))
-    assert torch.equal(as_stored["target"], in_unit_range(plain["right"]))
-    assert torch.equal(as_stored["warped"], in_unit_range(plain["warped_right"]))
+    views = {"source": "left", "target": "right", "warped": "warped_right"}
+    for name, field in views.items():
+        assert torch.equal(as_stored[name], in_unit_range(plain[field]))
     assert torch.equal(as_stored["mask"], plain["hole"].float())
     assert torch.equal(as_stored["correspondence"], plain["disparity"])
     assert all(clip[name].is_contiguous() for name in as_stored)
