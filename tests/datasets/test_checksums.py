@@ -29,7 +29,7 @@ def flip(root, pairs, *, place):
     """Flip the lowest bit of a byte of the first view's video, at 0 the first, at 1 the last."""
     member = pairs.index.scene(pairs.plan.locate(0, epoch=0).row).members[rgb_name(0)]
     with (root / SHARD).open("r+b") as file:
-        file.seek(member.offset + int((member.size - 1) * place))
+        file.seek(member.offset + min(int(member.size * place), member.size - 1))
         byte = file.read(1)[0]
         file.seek(-1, 1)
         file.write(bytes([byte ^ 1]))

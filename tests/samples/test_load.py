@@ -1,6 +1,7 @@
 """The pool of open videos."""
 
 import gc
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,10 +34,8 @@ def open_files():
     gc.collect()
     links = []
     for link in Path("/proc/self/fd").iterdir():
-        try:
+        with suppress(OSError):
             links.append(str(link.readlink()))
-        except OSError:
-            continue
     return sorted(link for link in links if link.endswith((".mp4", ".mkv", ".tar")))
 
 
