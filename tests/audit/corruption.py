@@ -1,14 +1,14 @@
 """Scenes with one thing made wrong, by rewriting their files with PyAV and json alone."""
 
 import json
+import math
 import shutil
 from pathlib import Path
 
 import av
 import numpy as np
 
-from tests.servers.videos import write_depth as write_maps
-from tests.servers.videos import write_rgb
+from tests.servers.videos import write_depth, write_rgb
 
 CAMERAS = range(6)
 
@@ -30,13 +30,6 @@ def read_depth(folder: Path, camera: int) -> tuple[np.ndarray, dict[str, str]]:
         return np.stack([f.to_ndarray() for f in container.decode(video=0)]), container.metadata
 
 
-def write_depth(folder: Path, camera: int, units: np.ndarray, tags: dict[str, str]) -> None:
-    """Write (t, h, w) as FFV1 gray16le."""
-    path = folder / f"cam_{camera:02d}_depth.mkv"
-    options = {"level": "3", "slicecrc": "1"}
-    write_maps(path, np.asarray(units, np.uint16), tags=tags, options=options)
-
-
 def rewrite_depth(folder: Path, change=lambda units: units, *, cameras=CAMERAS, tags=None) -> None:
     """Replace cameras' depth by change(units), and the tags; a number multiplies what they say."""
     for camera in cameras:
@@ -44,8 +37,12 @@ def rewrite_depth(folder: Path, change=lambda units: units, *, cameras=CAMERAS, 
         scales = {key: each for key, each in told.items() if "scale" in key.lower()}
         if isinstance(tags, float):
             scales = {key: repr(float(each) * tags) for key, each in scales.items()}
-        new_tags = tags if isinstance(tags, dict) else scales
-        write_depth(folder, camera, change(units), new_tags)
+        write_depth(
+            folder / f"cam_{camera:02d}_depth.mkv",
+            np.asarray(change(units), np.uint16),
+            tags=tags if isinstance(tags, dict) else scales,
+            options={"level": "3", "slicecrc": "1"},
+        )
 
 
 def as_range(near_m: float, far_m: float, *, unit_m: float):
@@ -115,34 +112,26 @@ def place_cameras(folder: Path, factors: dict[int, float]) -> None:
             for axis in "xyz":
                 location[axis] = first[axis] + factor * (location[axis] - first[axis])
     path.write_text(json.dumps(document))
-    places = [
-        np.array([camera["location"][axis] for axis in "xyz"])
-        for camera in document["frames"][0]["cameras"]
-    ]
+    places = [[*camera["location"].values()] for camera in document["frames"][0]["cameras"]]
 
     def change(pair):
         a, b = pair["camera_index_a"], pair["camera_index_b"]
-        pair["baseline_cm"] = float(np.linalg.norm(places[a] - places[b]))
+        pair["baseline_cm"] = math.dist(places[a], places[b])
 
     edit_pairs(folder, change)
 
 
-def ray_lengths(folder: Path, *, shape: tuple[int, int]) -> np.ndarray:
-    """Return |(x, y, 1)| of each pixel's ray, by the scene's baseline.json."""
-    camera = json.loads((folder / "baseline.json").read_text())["camera_intrinsics"]
-    height, width = shape
-    x = (np.arange(width) + 0.5 - width / 2) / width * camera["sensor_width_mm"]
-    y = (np.arange(height) + 0.5 - height / 2) / height * camera["sensor_height_mm"]
-    return np.sqrt(1 + (x**2 + y[:, None] ** 2) / camera["focal_length_mm"] ** 2)
-
-
 def as_ray(folder: Path):
-    """Return the change from depth along the axis to depth along the ray."""
+    """Return the change from depth along the axis to depth along the ray, by baseline.json."""
+    camera = json.loads((folder / "baseline.json").read_text())["camera_intrinsics"]
 
     def change(units):
         known = (units > 0) & (units < 65535)
-        rays = np.rint(units * ray_lengths(folder, shape=units.shape[1:]))
-        return np.where(known, np.minimum(rays, 65534), units)
+        height, width = units.shape[1:]
+        x = (np.arange(width) + 0.5 - width / 2) / width * camera["sensor_width_mm"]
+        y = (np.arange(height) + 0.5 - height / 2) / height * camera["sensor_height_mm"]
+        lengths = np.sqrt(1 + (x**2 + y[:, None] ** 2) / camera["focal_length_mm"] ** 2)
+        return np.where(known, np.minimum(np.rint(units * lengths), 65534), units)
 
     return change
 

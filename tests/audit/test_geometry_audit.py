@@ -9,11 +9,7 @@ import fsspec
 import numpy as np
 import pytest
 
-from stereogenbench_data.audit.geometry.audit import (
-    audit,
-    audit_journal,
-    open_for_audit,
-)
+from stereogenbench_data.audit.geometry.audit import audit, audit_journal, open_for_audit
 from stereogenbench_data.audit.geometry.table import audit_markdown, pooled_px
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.synthesis.produce import synthesise
@@ -29,7 +25,6 @@ from tests.audit.corruption import (
     rewrite_rgb,
     scale_camera,
     scaled,
-    write_depth,
 )
 
 SCENE = "train/Uniform/SynthStage/scene_000000"
@@ -143,20 +138,11 @@ def depth(camera, change):
     return lambda folder: rewrite_depth(folder, change, cameras=[camera])
 
 
-def flat(folder):
-    rewrite_rgb(folder, 4, lambda pictures: np.full_like(pictures, 128))
-
-
 def one_view_twice(folder):
     shutil.copy(folder / "cam_02_rgb.mp4", folder / "cam_03_rgb.mp4")
 
 
-def along_the_ray(folder):
-    rewrite_depth(folder, as_ray(folder))
-
-
-def lower_sensor(folder):
-    scale_camera(folder, sensor_height_mm=3 / 4)
+flat = pictures(4, lambda seen: np.full_like(seen, 128))
 
 
 def without_depth(units):
@@ -170,15 +156,7 @@ def hidden(units):
 
 
 def tags(camera, told):
-    return lambda folder: write_depth(folder, camera, read_depth(folder, camera)[0], told)
-
-
-def rounded(folder):
-    rewrite_depth(folder, lambda units: np.where(units < 65535, units // 20 * 20, units))
-
-
-def longer_baseline(folder):
-    lengthen_label(folder, (2, 3), by_cm=0.05)
+    return lambda folder: rewrite_depth(folder, cameras=[camera], tags=told)
 
 
 def edit_trajectory(folder, change):
@@ -189,11 +167,8 @@ def edit_trajectory(folder, change):
     path.write_text(json.dumps(document))
 
 
-def turned(folder):
-    def turn(frame, _):
-        frame["cameras"][1]["rotation"]["yaw"] += 1.0
-
-    edit_trajectory(folder, turn)
+def turn(frame, _):
+    frame["cameras"][1]["rotation"]["yaw"] += 1.0
 
 
 def other_lens(folder):
@@ -224,13 +199,17 @@ def other_lens(folder):
         (depth(0, lambda units: np.roll(units, 1, 2)), "", "depth residual",
          "most in 0-5 (limit 0.05 %); `stereogenbench doctor` looks for the cause"),
         (depth(4, scaled(1.02)), "cam_04_depth.mkv", "depth residual", "is 2.011 %, most"),
-        (along_the_ray, "", "depth residual", ", most in "),
-        (lower_sensor, "", "motion residual", "; `stereogenbench doctor` looks for the cause"),
+        (lambda folder: rewrite_depth(folder, as_ray(folder)), "", "depth residual", ", most in "),
+        (lambda folder: scale_camera(folder, sensor_height_mm=3 / 4), "", "motion residual",
+         "; `stereogenbench doctor` looks for the cause"),
         (tags(3, {"DEPTH_SCALE": "0.002"}), "cam_03_depth.mkv", "depth consistency", ", most in "),
-        (rounded, "cam_00_depth.mkv", "depth quantum", "distance of stored numbers is 20 units"),
+        (lambda folder: rewrite_depth(folder, lambda u: np.where(u < 65535, u // 20 * 20, u)),
+         "cam_00_depth.mkv", "depth quantum", "distance of stored numbers is 20 units"),
         (lambda folder: exchange(folder, {1: 4, 4: 1}), "", "depth consistency", ", most in "),
-        (longer_baseline, "", "pose/baseline", "is 0.05 cm (limit 0.001 cm)"),
-        (turned, "", "rig rotation", "turn of a camera against camera 0 moves is "),
+        (lambda folder: lengthen_label(folder, (2, 3), by_cm=0.05), "", "pose/baseline",
+         "is 0.05 cm (limit 0.001 cm)"),
+        (lambda folder: edit_trajectory(folder, turn), "", "rig rotation",
+         "turn of a camera against camera 0 moves is "),
         (tags(5, {"DEPTH_SCALE": "0.001", "other_scale": "0.1"}), "cam_05_depth.mkv", "unreadable",
          "contradict each other"),
     ],

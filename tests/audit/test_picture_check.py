@@ -8,8 +8,6 @@ import pytest
 from stereogenbench_data.audit.geometry.picture_check import (
     border_occluder,
     light_figures,
-    payload_figures,
-    stored_figures,
     stored_step,
     subject_m,
 )
@@ -31,20 +29,6 @@ def test_light_is_that_of_a_picture_and_change_that_from_the_one_before():
         Figure("contrast", "a.mp4", pytest.approx(182, abs=0.01), "frame 15"),
         Figure("change", "a.mp4", pytest.approx(1.0, abs=0.01), "frame 10"),
     ]
-
-
-def test_a_payload_has_its_share_of_depth_its_change_and_the_numbers_that_it_stores():
-    units = np.arange(48, dtype=np.uint16).reshape(6, 8) * 10
-    seen = np.zeros(1 << 16, bool)
-    seen[units[units > 0]] = True
-
-    found = payload_figures("a.mkv", 3, units, units > 0, before=(1, np.roll(units, 1)))
-    alone = payload_figures("a.mkv", 3, units, units > 0, before=None)
-
-    valid = Figure("valid_depth", "a.mkv", pytest.approx(47 / 48), "frame 3")
-    assert list(found) == [valid, Figure("depth_change", "a.mkv", 1.0, "frame 1")]
-    assert list(alone) == [valid]
-    assert list(stored_figures("a.mkv", seen)) == [Figure("depth_levels", "a.mkv", 47.0)]
 
 
 def test_numbers_that_were_stretched_from_10_bits_are_64_apart():
