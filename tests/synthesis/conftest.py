@@ -26,7 +26,7 @@ class Drawn:
         return decoded(self.folder / f"cam_{camera:02d}_rgb.mp4", "rgb24").astype(np.float64)
 
     def units(self, camera):
-        return decoded(self.folder / f"cam_{camera:02d}_depth.mkv", None)
+        return decoded(self.folder / f"cam_{camera:02d}_depth.mkv", "gray16le")
 
     @property
     def focal_px(self):
@@ -43,18 +43,11 @@ class Drawn:
 
 
 def decoded(path, pixel_format):
-    """All frames of a video; a None format keeps the stream's own, 16 bits a sample."""
+    """All frames of a video."""
     with av.open(str(path)) as container:
-        frames = list(container.decode(video=0))
-    if pixel_format is not None:
-        return np.stack([frame.to_ndarray(format=pixel_format) for frame in frames])
-    return np.stack([luma(frame) for frame in frames])
-
-
-def luma(frame):
-    plane = frame.planes[0]
-    rows = np.frombuffer(plane, np.dtype("<u2")).reshape(plane.height, plane.line_size // 2)
-    return rows[:, : plane.width].copy()
+        return np.stack(
+            [each.to_ndarray(format=pixel_format) for each in container.decode(video=0)]
+        )
 
 
 @pytest.fixture(scope="session")

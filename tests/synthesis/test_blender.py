@@ -14,9 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.synthesis.blender.process import blender
@@ -26,6 +24,7 @@ from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.proposal import Proposal, Rig
 from stereogenbench_data.synthesis.renderer import ScenePlan, Spawn
 from stereogenbench_data.synthesis.request import SENSOR_MM, SynthRequest
+from tests.cli.command import invoke
 from tests.synthesis.conftest import Drawn
 from tests.synthesis.test_pictures import psnr_db
 
@@ -319,13 +318,9 @@ def test_the_command_renders_all_maps_of_the_assets(assets, tmp_path):
     text = (quick / "assets.toml").read_text()
     (quick / "assets.toml").write_text(text.replace("= 32", "= 1\ndenoise = false"))
     options = ["--size", "32", "--frames", "1", "--scenes", "2", "--seed", "5", "--workers", "1"]
-    of_blender = ["--assets", str(quick / "assets.toml")]
+    of_blender = ["--assets", quick / "assets.toml"]
 
-    result = CliRunner().invoke(
-        app,
-        ["synth", str(tmp_path / "out"), *options, *of_blender],
-        catch_exceptions=False,
-    )
+    result = invoke("synth", tmp_path / "out", *options, *of_blender)
 
     assert result.exit_code == 0, result.output
     markers = (tmp_path / "out").rglob("_scene_complete.json")
@@ -443,8 +438,8 @@ def test_visible_pixels_agree_when_warped_by_depth(scenes):
 def test_the_doctor_confirms_the_contract_and_the_audit_finds_nothing(rendered):
     few = ("--per-scene", "2", "--workers", "1")
 
-    doctor = CliRunner().invoke(app, ["doctor", str(rendered), *few, "--scenes", "2", "--json"])
-    audit = CliRunner().invoke(app, ["audit", str(rendered), *few])
+    doctor = invoke("doctor", rendered, *few, "--scenes", "2", "--json")
+    audit = invoke("audit", rendered, *few)
 
     assert doctor.exit_code == 0, doctor.output
     assert audit.exit_code == 0, audit.output

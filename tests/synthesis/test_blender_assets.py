@@ -8,39 +8,6 @@ from stereogenbench_data.errors import ExtraError, SynthesisError
 from stereogenbench_data.synthesis.blender.assets import read_assets
 from stereogenbench_data.synthesis.blender.renderer import BlenderRenderer
 
-COMPLETE = """\
-[maps.Yard]
-file = "maps/yard.blend"
-scale = 0.01
-light = "sky"
-bounds_m = [[-5, -5, 0], [5, 5.5, 3]]
-
-[maps.Room]
-file = "room.gltf"
-
-[characters.Figure]
-file = "figure.fbx"
-forward = "+x"
-
-[animations.Walk]
-file = "figure.fbx"
-take = "Walk"
-
-[animations.Wave]
-file = "figure.fbx"
-take = "Wave"
-rate_hz = 30
-
-[sensors]
-full_frame = [36.0, 24.0]
-square = [23.76, 23.76]
-
-[render]
-samples_per_pixel = 8
-device = "GPU"
-denoise = false
-threads = 2
-"""
 LEAST = """\
 [maps.Room]
 file = "room.gltf"
@@ -48,6 +15,28 @@ file = "room.gltf"
 file = "figure.fbx"
 [animations.Walk]
 file = "figure.fbx"
+"""
+COMPLETE = f"""{LEAST}
+[maps.Yard]
+file = "maps/yard.blend"
+scale = 0.01
+light = "sky"
+bounds_m = [[-5, -5, 0], [5, 5.5, 3]]
+[characters.Other]
+file = "figure.fbx"
+forward = "+x"
+[animations.Wave]
+file = "figure.fbx"
+take = "Wave"
+rate_hz = 30
+[sensors]
+full_frame = [36.0, 24.0]
+square = [23.76, 23.76]
+[render]
+samples_per_pixel = 8
+device = "GPU"
+denoise = false
+threads = 2
 """
 
 
@@ -75,25 +64,15 @@ def test_everything_that_a_file_can_name_is_read(folder):
     assert yard.file == str(folder / "maps" / "yard.blend")
     assert (yard.scale, yard.light) == (0.01, "sky")
     assert yard.bounds_m == ((-5.0, -5.0, 0.0), (5.0, 5.5, 3.0))
-    assert assets.characters["Figure"].forward == "+x"
-    assert assets.animations["Wave"].take == "Wave"
-    assert assets.animations["Wave"].rate_hz == 30
+    assert [each.forward for each in assets.characters.values()] == ["-y", "+x"]
+    wave = assets.animations["Wave"]
+    assert (wave.take, wave.rate_hz, assets.animations["Walk"].take) == ("Wave", 30, None)
     assert assets.sensors_mm == ((36.0, 24.0), (23.76, 23.76))
-    settings = assets.settings
-    assert (settings.samples_per_pixel, settings.device) == (8, "GPU")
-    assert (settings.denoise, settings.threads) == (False, 2)
-
-
-def test_what_is_not_said_has_a_default(folder):
-    assets = read(folder, LEAST)
-
-    assert assets.maps["Room"].scale == 1.0
-    assert assets.maps["Room"].light == "own"
-    assert assets.maps["Room"].bounds_m is None
-    assert assets.characters["Figure"].forward == "-y"
-    assert assets.animations["Walk"].take is None
-    assert assets.sensors_mm == ()
-    assert assets.settings.device == "CPU"
+    found = assets.settings
+    told = (found.samples_per_pixel, found.device, found.denoise, found.threads)
+    assert told == (8, "GPU", False, 2)
+    room = assets.maps["Room"]  # of which nothing but the file is said
+    assert (room.scale, room.light, room.bounds_m) == (1.0, "own", None)
 
 
 @pytest.mark.parametrize(

@@ -169,12 +169,10 @@ def test_the_report_counts_acceptance_by_map_and_reason_and_wide_rigs_are_refuse
     )
     planned = plan_scenes(tmp_path, request).values()
     refused = [each for scene in planned for each in scene.refused]
+    accepted = [scene.plan.proposal for scene in planned]
     proposed_cm, realised_cm = (
         np.median([np.diff(proposal.places_cm) for proposal in proposals])
-        for proposals in (
-            [proposal for proposal, _ in refused] + [scene.plan.proposal for scene in planned],
-            [scene.plan.proposal for scene in planned],
-        )
+        for proposals in ([proposal for proposal, _ in refused] + accepted, accepted)
     )
 
     *_, hall, yard, everything = acceptance_markdown(planned).splitlines()

@@ -14,17 +14,17 @@ def gaps_cm(family, *, rigs=800):
     return np.array([random_gaps_cm(family, rng=rng) for _ in range(rigs)])
 
 
-def test_ipd_gaussian_gaps_follow_the_truncated_normal_of_the_paper():
-    mean, sd, low, high = 6.38, 0.5, 4.5, 8.5
-    truncated = stats.truncnorm((low - mean) / sd, (high - mean) / sd, loc=mean, scale=sd)
-
-    assert stats.kstest(gaps_cm("IPD_Gaussian").ravel(), truncated.cdf).pvalue > 0.01
-
-
-def test_uniform_gaps_are_proposed_uniformly():
-    proposed = gaps_cm("Uniform").ravel()
-
-    assert stats.kstest(proposed, stats.uniform(1, 149).cdf).pvalue > 0.01
+@pytest.mark.parametrize(
+    ("family", "papers"),
+    [
+        ("IPD_Gaussian", stats.truncnorm(-1.88 / 0.5, 2.12 / 0.5, loc=6.38, scale=0.5)),
+        ("Uniform", stats.uniform(1, 149)),
+    ],
+    ids=["IPD_Gaussian", "Uniform"],
+)
+def test_gaps_follow_the_distribution_of_the_paper(family, papers):
+    """Of IPD_Gaussian a normal one of 6.38 and 0.5 cm, cut at 4.5 and 8.5 cm."""
+    assert stats.kstest(gaps_cm(family).ravel(), papers.cdf).pvalue > 0.01
 
 
 def test_pairwise_uniform_spreads_all_pairs_up_to_two_metres():

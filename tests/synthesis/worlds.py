@@ -30,20 +30,12 @@ class Blocks:
         assert origins_m.shape == directions.shape
         np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-9)
         nearest = np.full(len(origins_m), np.inf)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            for low, high in self.blocks:
-                first = (np.array(low, float) - origins_m) / directions
-                second = (np.array(high, float) - origins_m) / directions
-                within = (origins_m >= low) & (origins_m <= high)
-                entry = np.where(
-                    directions == 0, np.where(within, -np.inf, np.inf), np.minimum(first, second)
-                )
-                leave = np.where(
-                    directions == 0, np.where(within, np.inf, -np.inf), np.maximum(first, second)
-                )
-                near, far = entry.max(axis=1), leave.min(axis=1)
-                met = np.where((near <= far) & (far > 0), np.maximum(near, 0), np.inf)
-                nearest = np.minimum(nearest, met)
+        steps = np.where(directions == 0, 1e-30, directions)
+        for block in np.array(self.blocks, float):
+            sides = (block[:, None] - origins_m) / steps
+            near, far = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
+            met = np.where((near <= far) & (far > 0), np.maximum(near, 0), np.inf)
+            nearest = np.minimum(nearest, met)
         return nearest
 
     def subject_points_m(self, spawn, *, frame):
