@@ -1,4 +1,4 @@
-"""``stereogenbench export`` of several views, and ``show -o KEY.rrd``, as a user calls them."""
+"""``stereogenbench export`` of several views, as a user calls it."""
 
 import json
 
