@@ -146,6 +146,8 @@ class Position:
         if self._end and 0 < gap <= READ_THROUGH:
             start = self._end
         self._is_open, self._next, self._end = True, frame + 1, max(start, stop)
+        if start < stop and table.bounds[start] == table.bounds[stop]:
+            start = table.key_before(start)  # it lies somewhere behind its key frame: keep all that
         parts = [(0, min(opened, start)), (start, max(stop, looked_through))]
         return [(table.bounds[a], table.bounds[b]) for a, b in parts if a < b]
 

@@ -130,6 +130,11 @@ def test_far_away_the_packets_of_a_cluster_count_as_one(videos):
     assert one == other
     assert abs(table.bounds[-1] - whole.bounds[-1]) <= 32
     assert table.fits(file_bytes=videos["depth.mkv"].stat().st_size)
+    # A later frame lies somewhere in its cluster: all of that is kept until the last one is read.
+    position = Position(table)
+    needed = [position.needed(frame) for frame in range(FRAMES)][2:]
+    starts = [table.bounds[table.key_before(frame)] for frame in range(2, FRAMES)]
+    assert [ranges[-1][0] for ranges in needed] == starts
 
 
 def test_tables_come_back_as_they_were_packed(videos):
