@@ -197,7 +197,7 @@ class Streams:
                 read_rgb(stream.reader, index, size=shape, out=out, content="colour")
                 return out
 
-            def read() -> UInt8[np.ndarray, "3 h w"]:
+            def read() -> np.ndarray:  # its shape in words would be parsed at each call
                 place = stream.picture(height=height, width=width, most=most)
                 read_rgb(stream.reader, index, size=size, out=place, content="colour")
                 place.flags.writeable = False
