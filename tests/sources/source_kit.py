@@ -46,12 +46,10 @@ def bytes_of(opened):
 
 
 class SourceTests:
-    """The contract of `MemberSource` and what it reads through, for one kind of place."""
+    """The contract of `MemberSource` and what it reads through, for one kind of place.
 
-    @pytest.fixture
-    def root(self):
-        """Where the data are: a folder or a URL."""
-        raise NotImplementedError
+    Each kind gives a fixture ``root``: where the data are, a folder or a URL.
+    """
 
     @pytest.fixture
     def index(self, small_shards):

@@ -1,6 +1,6 @@
 """``assets.toml``, without Blender: what is read, and what is refused in which words."""
 
-import importlib.util
+import sys
 
 import pytest
 
@@ -127,8 +127,8 @@ def test_the_digest_follows_every_file(folder):
     assert read(folder, LEAST).digest != before
 
 
-@pytest.mark.skipif(importlib.util.find_spec("bpy") is not None, reason="bpy is installed here")
-def test_a_python_without_blender_names_the_extra(folder):
+def test_a_python_without_blender_names_the_extra(folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "bpy", None)
     (folder / "assets.toml").write_text(LEAST)
 
     with pytest.raises(ExtraError, match=r"Python 3\.13.*'stereogenbench-data\[blender\]'"):
