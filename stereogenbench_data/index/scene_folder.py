@@ -822,7 +822,7 @@ def _derived(scene: Scene, text: bytes) -> Scene:
     document = parse_training(text, where=f"{scene.id.key}/{TRAINING_JSON}")
     members = {
         name: replace(
-            member, size=file.size, crc32=None if member.crc32 is None else file.crc32
+            member, size=file[0], crc32=None if member.crc32 is None else file[1]
         ) if (file := document.files.get(name)) else member
         for name, member in scene.members.items()
     }  # fmt: skip

@@ -8,9 +8,10 @@ needs no source any more. The files of a scene are made in a folder beside the s
 
 import importlib.metadata
 import io
+import json
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import asdict, dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
@@ -33,6 +34,7 @@ from stereogenbench_data.media.encoder import (
     write_pictures,
 )
 from stereogenbench_data.media.video import VideoReader, probe, read_rgb, require_indexed_picture
+from stereogenbench_data.schema.document import parse_object
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
@@ -43,7 +45,7 @@ from stereogenbench_data.schema.release import (
     depth_name,
     rgb_name,
 )
-from stereogenbench_data.schema.training import DerivedFile, TrainingDocument, parse_training
+from stereogenbench_data.schema.training import FORMAT
 from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.sources.members import MemberSource
 from stereogenbench_data.sources.ranged_file import require_crc32
@@ -181,17 +183,16 @@ def expected_bytes(scene: Scene, name: str, settings: TrainingSettings) -> int:
 
 def derive_scene(
     derivation: Derivation, scene: Scene, folder: Path, *, advance: Advance = no_advance
-) -> TrainingDocument:
+) -> None:
     """Make the derived files of a scene in a folder, unless they are there and whole.
+
+    ``training.json`` is the last of them.
 
     Args:
         derivation: What to make of which source.
         scene: The scene's row of the source's index.
         folder: Where to write; created if it does not exist.
         advance: Called with how many bytes of the source were done since the last call.
-
-    Returns:
-        What ``training.json`` says, which is the last of the files.
 
     Raises:
         ShardError: If a source file is missing, damaged or cannot be derived from, or what was
@@ -200,14 +201,13 @@ def derive_scene(
     """
     settings = derivation.settings
     names = derived_names(scene, settings)
-    found = _finished(derivation, scene, folder, names)
-    if found is not None:
+    if _is_finished(derivation, scene, folder, names):
         advance(source_bytes(scene, names))
-        return found
+        return
     folder.mkdir(parents=True, exist_ok=True)
     (folder / TRAINING_JSON).unlink(missing_ok=True)
     source = derivation.source
-    files: dict[str, DerivedFile] = {}
+    files: dict[str, dict[str, Any]] = {}
     key_frames: set[int] | None = None
     try:
         for name in names:
@@ -244,17 +244,16 @@ def derive_scene(
                         encoding=settings.depth,
                     )
                 )
-            made = target.read_bytes()
-            measured = () if error is None else astuple(error)
-            files[name] = DerivedFile(len(made), zlib.crc32(made), *measured)
+            measured = {} if error is None else asdict(error)
+            files[name] = _size_and_crc32(target) | measured
             advance(source_bytes(scene, [name]))
     except ShardError:
         raise
     except (MediaError, SchemaError, StorageError) as error:
         raise ShardError(f"{scene.id.key}: {error}") from error
-    document = _document(derivation, scene, files, tuple(sorted(key_frames or {0})))
-    write_atomic(folder / TRAINING_JSON, document.text())
-    return document
+    document = _document(derivation, scene, files, sorted(key_frames or {0}))
+    text = json.dumps(document, allow_nan=False).encode() + b"\n"
+    write_atomic(folder / TRAINING_JSON, text)
 
 
 def _open_source(source: MemberSource, scene: Scene, name: str) -> VideoFile:
@@ -284,21 +283,35 @@ def _source_pictures(
 def _document(
     derivation: Derivation,
     scene: Scene,
-    files: Mapping[str, DerivedFile],
-    key_frames: tuple[int, ...],
-) -> TrainingDocument:
-    settings = derivation.settings
-    return TrainingDocument(
-        key=scene.id.key,
-        source_digest=derivation.digest,
-        source_size_px=(scene.rig.image_width_px, scene.rig.image_height_px),
-        size_px=(settings.size[1], settings.size[0]),
-        quality=settings.quality,
-        key_frames=key_frames,
-        pictures=QUALITIES[settings.quality].description(),
-        versions=_versions(settings.quality),
-        files=dict(files),
-    )
+    files: Mapping[str, Mapping[str, Any]],
+    key_frames: Sequence[int],
+) -> dict[str, Any]:
+    """Return what ``training.json`` says, as `schema.training` describes it."""
+    settings, rig = derivation.settings, scene.rig
+    height, width = settings.size
+    return {
+        "format": FORMAT,
+        "source": {
+            "key": scene.id.key,
+            "index_digest": derivation.digest,
+            "width_px": rig.image_width_px,
+            "height_px": rig.image_height_px,
+        },
+        "derived": {
+            "width_px": width,
+            "height_px": height,
+            "quality": settings.quality,
+            "key_frames": key_frames,
+        },
+        "pictures": QUALITIES[settings.quality].description(),
+        "versions": _versions(settings.quality),
+        "files": dict(sorted(files.items())),
+    }
+
+
+def _size_and_crc32(path: Path) -> dict[str, Any]:
+    content = path.read_bytes() if path.exists() else b""
+    return {"bytes": len(content), "crc32": f"{zlib.crc32(content):08x}"}
 
 
 def _versions(quality: Quality) -> dict[str, str]:
@@ -316,26 +329,22 @@ def _versions(quality: Quality) -> dict[str, str]:
     return versions
 
 
-def _finished(
-    derivation: Derivation, scene: Scene, folder: Path, names: Sequence[str]
-) -> TrainingDocument | None:
-    """Return what an earlier run made, None unless this run would make the same.
+def _is_finished(derivation: Derivation, scene: Scene, folder: Path, names: Sequence[str]) -> bool:
+    """Return whether an earlier run made the files, and this run would make the same.
 
-    ``training.json`` is the last of the files. What it says of the others is compared, as the
-    system may have gone down before it wrote them to the disk.
+    What ``training.json``, the last of the files, says of the others is compared, as the system may
+    have gone down before it wrote them to the disk.
     """
+    videos = {name for name in names if name not in (*METADATA_FILES, TRAINING_JSON)}
     try:
         text = (folder / TRAINING_JSON).read_bytes()
-        document = parse_training(text, where=str(folder / TRAINING_JSON))
-    except (OSError, SchemaError):
-        return None
-    expected = _document(derivation, scene, document.files, document.key_frames)
-    videos = {name for name in names if name not in (*METADATA_FILES, TRAINING_JSON)}
-    if document.text() != expected.text() or set(document.files) != videos:
-        return None
-    for name, file in document.files.items():
-        path = folder / name
-        content = path.read_bytes() if path.exists() else b""
-        if (len(content), zlib.crc32(content)) != (file.size, file.crc32):
-            return None
-    return document
+        found = parse_object(text, where=TRAINING_JSON)
+        files, key_frames = found["files"], found["derived"]["key_frames"]
+        return (
+            found == _document(derivation, scene, files, key_frames)
+            and {*files} == videos
+            and all(file.items() >= _size_and_crc32(folder / name).items()
+                    for name, file in files.items())
+        )  # fmt: skip
+    except (OSError, SchemaError, AttributeError, KeyError, TypeError):
+        return False
