@@ -14,9 +14,8 @@ from stereogenbench_data.geometry.disparity import (
     disparity_from_shifts,
     write_disparity,
 )
-from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.geometry.pose import CameraPoses, rotation_from_rotator_deg
 from stereogenbench_data.geometry.projection import homography, project_by_homography
-from stereogenbench_data.schema.records import Trajectory
 
 
 @dataclass(frozen=True)
@@ -40,19 +39,11 @@ class Pair:
     @cached_property
     def poses(self) -> CameraPoses:
         """The poses of both cameras, as cameras 0 and 1 of a rig."""
-        from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
-
         rotation = rotation_from_rotator_deg(np.array(self.rotator_deg))
         apart_cm = np.arange(6)[:, None] * self.baseline_m * 100 * rotation[:, 1]
         locations = np.array(self.offset_cm) + apart_cm
-        return CameraPoses.from_trajectory(
-            Trajectory(
-                locations=locations[None],
-                unit_m=0.01,
-                rotations=np.broadcast_to(np.array(self.rotator_deg), (1, 6, 3)).copy(),
-                rotation_kind="rotator_deg",
-            )
-        )
+        rotations = np.tile(rotation, (1, 6, 1, 1))
+        return CameraPoses.from_unreal(locations[None], rotations, unit_m=0.01)
 
     def intrinsics(self, units: np.ndarray) -> Intrinsics:
         """Return the intrinsics of a map of this size."""

@@ -12,9 +12,6 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from stereogenbench_data.errors import GeometryError
-from stereogenbench_data.schema.records import Trajectory
-
 OPENCV_FROM_UNREAL: Final = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """A mirror (determinant -1), so a rotation R becomes S R S^T."""
 
@@ -53,18 +50,9 @@ def rotation_from_quaternion_xyzw(
 
     Quaternions are normalised: a length that is off by 1e-3 would distort angles by as much.
 
-    Raises:
-        GeometryError: If a quaternion has no direction (length 0 or not finite).
-
     Source: Shoemake, Animating rotation with quaternion curves, 1985.
     """
     length = np.linalg.norm(quaternion_xyzw, axis=-1, keepdims=True)
-    if not (np.isfinite(length) & (length > 0)).all():
-        bad = quaternion_xyzw[~(np.isfinite(length) & (length > 0))[..., 0]][0]
-        raise GeometryError(
-            f"quaternion {bad.tolist()} (x, y, z, w) has no direction: "
-            "correct the recorded rotation."
-        )
     x, y, z, w = np.moveaxis(quaternion_xyzw / length, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -79,20 +67,12 @@ def nearest_rotation(
 ) -> Float64[np.ndarray, "*batch 3 3"]:
     """Return the rotations nearest to recorded matrices, which are not exact due to rounding.
 
-    Raises:
-        GeometryError: If the nearest orthogonal matrix is a reflection.
+    Of matrices with a negative determinant these are reflections.
 
     Source: Kabsch; the orthogonal Procrustes problem, solved by the SVD.
     """
     left, _, right = np.linalg.svd(matrices)
-    rotations: Float64[np.ndarray, "*batch 3 3"] = left @ right
-    mirrored = np.linalg.det(rotations) < 0
-    if mirrored.any():
-        raise GeometryError(
-            f"rotation matrix {matrices[mirrored][0].tolist()} is a reflection: its columns must "
-            "be the camera's forward, right and up axes in Unreal's world axes."
-        )
-    return rotations
+    return np.asarray(left @ right)
 
 
 def invert_rigid(a_from_b: Float64[np.ndarray, "*batch 4 4"]) -> Float64[np.ndarray, "*batch 4 4"]:
@@ -125,23 +105,15 @@ class CameraPoses:
     world_from_cam_rotations: Float64[np.ndarray, "frames 6 3 3"]
 
     @classmethod
-    def from_trajectory(cls, trajectory: Trajectory) -> "CameraPoses":
-        """Return the poses of a trajectory in any of its rotation representations.
-
-        Raises:
-            GeometryError: If a recorded rotation is a reflection or a quaternion of length 0.
-        """
-        convert = {
-            "rotator_deg": rotation_from_rotator_deg,
-            "quaternion_xyzw": rotation_from_quaternion_xyzw,
-            "matrix": nearest_rotation,
-        }[trajectory.rotation_kind]
-        unreal = convert(trajectory.rotations)
-        return cls(
-            centres=trajectory.locations,
-            unit_m=trajectory.unit_m,
-            world_from_cam_rotations=OPENCV_FROM_UNREAL @ unreal @ OPENCV_FROM_UNREAL.T,
-        )
+    def from_unreal(
+        cls,
+        centres: Float64[np.ndarray, "frames 6 3"],
+        rotations: Float64[np.ndarray, "frames 6 3 3"],
+        *,
+        unit_m: float,
+    ) -> "CameraPoses":
+        """Return the poses of cameras whose rotations, too, are in Unreal's axes."""
+        return cls(centres, unit_m, OPENCV_FROM_UNREAL @ rotations @ OPENCV_FROM_UNREAL.T)
 
     @property
     def frame_count(self) -> int:

@@ -17,12 +17,12 @@ from jaxtyping import Float64
 
 from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry.pose import (
+    CameraPoses,
     nearest_rotation,
     rotation_from_quaternion_xyzw,
     rotation_from_rotator_deg,
 )
 from stereogenbench_data.schema.quantities import UNITS_M
-from stereogenbench_data.schema.records import RotationKind, Trajectory
 from stereogenbench_data.schema.trajectory import Block, RecordedPoses
 
 TOLERANCE: Final = 1e-3
@@ -77,13 +77,13 @@ class Reading:
         tier: 0 if it is what the file names, 1 if it fits what it names, 2 for the other forms;
             3 more for axes that it does not name.
         is_named: Whether the file names the camera's axes; pitch, yaw and roll are Unreal's words.
-        trajectory: The poses, with the unit that the file states, else nan metres.
+        poses: The poses, with the unit that the file states, else nan metres.
     """
 
     name: str
     tier: int
     is_named: bool
-    trajectory: Trajectory
+    poses: CameraPoses
 
 
 def readings(recorded: RecordedPoses, *, only: str | None = None) -> Iterator[Reading]:
@@ -114,49 +114,42 @@ def readings(recorded: RecordedPoses, *, only: str | None = None) -> Iterator[Re
         if unit in UNITS_M:
             name, unit_m = f"{name}, {unit}", UNITS_M[unit]
         if only is None or name == only:
-            trajectory = _read(turn, place, kind.split(), axes, unit_m)
-            if trajectory is not None:
+            poses = _read(turn, place, kind.split(), axes, unit_m)
+            if poses is not None:
                 own_axes = named_axes or ({"unreal"} if turn.components == _ROTATOR else ())
-                yield Reading(name, tier, axes in own_axes, trajectory)
+                yield Reading(name, tier, axes in own_axes, poses)
 
 
 def _read(
     turn: Block, place: Block | None, kind: list[str], axes: str, unit_m: float
-) -> Trajectory | None:
+) -> CameraPoses | None:
     """Return the poses of a form, None where the numbers are not such rotations."""
     values = turn.values
     places = values[..., 3] if place is None else place.values
-    recorded: RotationKind = "matrix"
+    is_exact = kind[0] in ("quaternion", "rotator") and axes == "unreal" and "w2c" not in kind
     try:
         if kind[0] == "matrix":
             values, places = _parted(values, kind, places)
-            turns = values = _rotations(values)
+            turns = _rotations(values)
         elif kind[0] == "quaternion":
-            values = _unit_quaternions(values[..., [kind[1].index(each) for each in "xyzw"]])
-            turns, recorded = rotation_from_quaternion_xyzw(values), "quaternion_xyzw"
+            values = values[..., [kind[1].index(each) for each in "xyzw"]]
+            turns = rotation_from_quaternion_xyzw(_unit_quaternions(values))
         else:
-            values = _degrees(values, kind, turn.components)
-            turns = _ANGLES[kind[0]](values)
-            recorded = "rotator_deg" if kind[0] == "rotator" else "matrix"
+            turns = _ANGLES[kind[0]](_degrees(values, kind, turn.components))
     except GeometryError:
         return None
-    if recorded == "matrix" or axes != "unreal" or "w2c" in kind:
-        if "w2c" in kind:
-            turns = np.swapaxes(turns, -1, -2)
-            places = -(turns @ places[..., None])[..., 0]
-        columns = [sign * turns[..., :, column] for column, sign in AXES[axes]]
-        values, recorded = np.stack(columns, axis=-1), "matrix"
-        hands = np.linalg.det(values)
-        if not (hands.flat[0] * hands > 0).all():
-            return None
-        if hands.flat[0] < 0:  # The world has the other hand: all is mirrored, the cameras too.
-            values, places = values * _MIRROR[:, None], places * _MIRROR
-    if not (np.isfinite(values).all() and np.isfinite(places).all()):
+    if "w2c" in kind:
+        turns = np.swapaxes(turns, -1, -2)
+        places = -(turns @ places[..., None])[..., 0]
+    turns = np.stack([sign * turns[..., :, column] for column, sign in AXES[axes]], axis=-1)
+    hands = np.linalg.det(turns)
+    if not (np.isfinite(places).all() and (hands.flat[0] * hands > 0).all()):
         return None
-    values, places = np.ascontiguousarray(values), np.ascontiguousarray(places)
-    for numbers in (values, places):
-        numbers.setflags(write=False)
-    return Trajectory(places, unit_m, values, recorded)
+    if hands.flat[0] < 0:  # The world has the other hand: all is mirrored, the cameras too.
+        turns, places = turns * _MIRROR[:, None], places * _MIRROR
+    if not is_exact:
+        turns = nearest_rotation(turns)
+    return CameraPoses.from_unreal(np.ascontiguousarray(places), turns, unit_m=unit_m)
 
 
 _ROTATOR: Final = ("pitch", "yaw", "roll")

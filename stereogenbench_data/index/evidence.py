@@ -133,9 +133,9 @@ def _readings_as(recorded: RecordedPoses, named: PosesAs) -> Iterator[Reading]:
     """Yield the readings that conventions name, in the unit that they name."""
     for reading in readings(recorded):
         if named.fits(reading.name):
-            unit_m = reading.trajectory.unit_m if named.unit is None else UNITS_M[named.unit]
-            trajectory = replace(reading.trajectory, unit_m=unit_m)
-            yield replace(reading, tier=0, is_named=True, trajectory=trajectory)
+            unit_m = reading.poses.unit_m if named.unit is None else UNITS_M[named.unit]
+            poses = replace(reading.poses, unit_m=unit_m)
+            yield replace(reading, tier=0, is_named=True, poses=poses)
 
 
 def _fitting(
@@ -196,7 +196,7 @@ def _fitting(
     names = tuple(
         f"{each.reading.name} @ {each.poses.unit_m!r}".replace("|", "/") for each in worlds
     )
-    own_units_m = (taken.reading.trajectory.unit_m, _UNREAL_M)
+    own_units_m = (taken.reading.poses.unit_m, _UNREAL_M)
     is_own = taken.reading is first and len(names) == 1 and taken.poses.unit_m in own_units_m
     return Understood(
         taken.poses,
@@ -268,12 +268,10 @@ def poses_as(text: bytes, form: str | None, *, where: str) -> CameraPoses:
     recorded = record_poses(text, where=where)
     name, _, unit_m = (form or "").split("|")[0].rpartition(" @ ")
     for reading in readings(recorded, only=name or None):
-        trajectory = reading.trajectory
         if name:
-            trajectory = replace(trajectory, unit_m=float(unit_m))
-        elif not np.isfinite(trajectory.unit_m):
-            trajectory = replace(trajectory, unit_m=_UNREAL_M)
-        return CameraPoses.from_trajectory(trajectory)
+            return replace(reading.poses, unit_m=float(unit_m))
+        is_stated = np.isfinite(reading.poses.unit_m)
+        return reading.poses if is_stated else replace(reading.poses, unit_m=_UNREAL_M)
     raise SchemaError(
         f"{where}: has no poses {f'of the form {shortened(name, 200)}' if name else 'at all'}. "
         f"Run `stereogenbench index` again."
@@ -284,17 +282,17 @@ def _checked(reading: Reading, rig: Rig) -> _Passed:
     """Return a reading that fits a rig.
 
     Raises:
-        GeometryError: If its rotations are none.
+        GeometryError: If the rig has no intrinsics.
         SchemaError: If it does not fit; `SidesError` if all distances differ by one scale.
     """
-    poses = CameraPoses.from_trajectory(reading.trajectory)
+    poses = reading.poses
     steps = poses.centres[:, _RIGHT] - poses.centres[:, _LEFT]
     baselines_cm = np.array(rig.baselines_cm)
     distances = np.linalg.norm(steps, axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = float(np.median(baselines_cm / 100 / distances))
         scaled_cm = distances * ratio * 100
-    stated_m = reading.trajectory.unit_m
+    stated_m = poses.unit_m
     # A stated unit must be that of the distances.
     units_m = [stated_m] if np.isfinite(stated_m) else sorted(set(UNITS_M.values()))
     other_m = stated_m if np.isfinite(stated_m) else _UNREAL_M

@@ -1,17 +1,12 @@
 """The typed, frozen records that the rest of the package uses.
 
-A record contains the values of a file, with units in the names and nothing derived. Poses stay in
-the recorded world axes and rotation representation, so that relative poses can be computed before
-anything is rounded.
+A record contains the values of a file, with units in the names and nothing derived.
 """
 
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal, get_args
-
-import numpy as np
-from jaxtyping import Float64
 
 from stereogenbench_data.errors import SchemaError, StorageError
 from stereogenbench_data.schema.release import (
@@ -22,7 +17,6 @@ from stereogenbench_data.schema.release import (
     Subset,
 )
 
-RotationKind = Literal["rotator_deg", "quaternion_xyzw", "matrix"]
 DepthKind = Literal["planar", "ray"]
 DepthForm = Literal["depth", "inverse"]
 DepthRisk = Literal["8-bit", "9-bit", "10-bit", "12-bit", "14-bit", "lossy", "chroma"]
@@ -119,28 +113,6 @@ class SceneLabels:
     character: str | None = None
     animation: str | None = None
     aperture_fstop: float | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
-    """The poses of six cameras over the frames of a scene, as recorded in ``trajectory.json``.
-
-    World axes are Unreal's: left-handed, x forward, y right, z up. A rotation takes camera axes
-    (x forward, y right, z up) to world axes.
-
-    Attributes:
-        locations: (frames, 6, 3) float64, camera centres in the recorded unit.
-        unit_m: Metres in one recorded unit (0.01 for centimetres).
-        rotations: (frames, 6, 3) pitch, yaw, roll in degrees; or (frames, 6, 4) unit
-            quaternions x, y, z, w; or (frames, 6, 3, 3) matrices whose columns are the
-            camera's forward, right and up axes in the world.
-        rotation_kind: Which of these three ``rotations`` has.
-    """
-
-    locations: Float64[np.ndarray, "frames 6 3"]
-    unit_m: float
-    rotations: Float64[np.ndarray, "frames 6 ..."]
-    rotation_kind: RotationKind
 
 
 def _is_length(value: object, *, least: float) -> bool:

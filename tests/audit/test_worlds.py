@@ -8,7 +8,6 @@ import torch
 
 from stereogenbench_data.audit.contract.worlds import judge_worlds
 from stereogenbench_data.datasets.mapped import SceneViews
-from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.pose_forms import readings
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.trajectory import record_poses
@@ -67,8 +66,7 @@ def write_matrices(root, *, still=False):
     """Write the poses of a tree's only scene as matrices, OpenCV's, which nothing says."""
     (path,) = root.rglob("trajectory.json")
     document = json.loads(path.read_text())
-    reading = next(readings(record_poses(path.read_bytes(), where="trajectory.json")))
-    as_unreal = CameraPoses.from_trajectory(reading.trajectory)
+    as_unreal = next(readings(record_poses(path.read_bytes(), where="trajectory.json"))).poses
     for frame, poses in enumerate(document["frames"]):
         for camera, pose in enumerate(poses["cameras"]):
             pose.pop("rotation"), pose.pop("location")

@@ -25,10 +25,9 @@ from stereogenbench_data import (
 )
 from stereogenbench_data.datasets.batch_buffers import to_tensors
 from stereogenbench_data.geometry.camera import Intrinsics
-from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.geometry.pose import CameraPoses, rotation_from_rotator_deg
 from stereogenbench_data.samples.derive import StoredDepth, Views
 from stereogenbench_data.samples.fields import Request, SampleWriter, new_array
-from stereogenbench_data.schema.records import Trajectory
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from stereogenbench_data.selection.plan import Address
 from tests.samples.test_derive import facts
@@ -61,7 +60,7 @@ def scene(encoding, *, rig="rectified", seed=0, size=SIZE):
     turns = rng.normal(0, 0.5, locations.shape)
     if rig == "turned apart":
         turns[:, :, 1] += np.linspace(0, 85, 6)
-    poses = CameraPoses.from_trajectory(Trajectory(locations, 0.01, turns, "rotator_deg"))
+    poses = CameraPoses.from_unreal(locations, rotation_from_rotator_deg(turns), unit_m=0.01)
     units_m = [float(encoding.known_unit_m * ratio) for ratio in rng.choice([1.0, 2.5], 6)]
     known = replace(
         known,
@@ -186,9 +185,8 @@ def test_points_on_the_edge_between_two_pixels_land_on_the_same_one(cx_px):
     views, known = scene(CONTRACTS["planar depth"], rig="posed")
     centres = np.zeros((len(FRAMES), 6, 3))
     centres[:, :, 1] = 100 * np.asarray(known.scene.lateral_m)
-    poses = CameraPoses.from_trajectory(
-        Trajectory(centres, 0.01, np.zeros((len(FRAMES), 6, 3)), "rotator_deg")
-    )
+    turns = rotation_from_rotator_deg(np.zeros_like(centres))
+    poses = CameraPoses.from_unreal(centres, turns, unit_m=0.01)
     known = replace(known, poses=poses, encodings=dict.fromkeys(range(6), DepthEncoding(0.1)))
     halves_px = np.random.default_rng(0).choice([0.5, 1.5, 3.5, 4.5], (6, len(FRAMES), *SIZE))
     units = np.rint(63.0 * 0.2 / halves_px * 10).astype(np.uint16)

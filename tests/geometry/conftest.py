@@ -11,7 +11,6 @@ import torch
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.projection import Projection
-from stereogenbench_data.schema.records import Trajectory
 
 
 @dataclass(frozen=True)
@@ -52,14 +51,11 @@ def make_rig():
     Camera k stands ``lateral_cm[k]`` along the right axis of ``rotation`` from ``offset_cm``.
     """
 
-    def make(
-        lateral_cm, *, rotation=None, recorded=None, kind="matrix", offset_cm=(0, 0, 0), frames=1
-    ) -> CameraPoses:
+    def make(lateral_cm, *, rotation=None, offset_cm=(0, 0, 0), frames=1) -> CameraPoses:
         rotation = np.eye(3) if rotation is None else np.asarray(rotation)
-        recorded = np.array(rotation if recorded is None else recorded, dtype=np.float64)
         locations = np.array(offset_cm, float) + np.outer(lateral_cm, rotation[:, 1])
         locations = np.tile(locations, (frames, 1, 1))
-        rotations = np.tile(recorded, (frames, 6, *[1] * recorded.ndim))
-        return CameraPoses.from_trajectory(Trajectory(locations, 0.01, rotations, kind))
+        rotations = np.tile(rotation, (frames, 6, 1, 1))
+        return CameraPoses.from_unreal(locations, rotations, unit_m=0.01)
 
     return make

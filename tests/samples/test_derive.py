@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.geometry.camera import Intrinsics
-from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.geometry.pose import CameraPoses, rotation_from_rotator_deg
 from stereogenbench_data.samples.derive import (
     PairGeometry,
     PairSample,
@@ -14,7 +14,7 @@ from stereogenbench_data.samples.derive import (
     StoredDepth,
     Views,
 )
-from stereogenbench_data.schema.records import DepthEncoding, Trajectory
+from stereogenbench_data.schema.records import DepthEncoding
 from tests.selection.conftest import made_scene
 
 GAP_CM = 20.0
@@ -32,7 +32,7 @@ def facts(encoding, *, residual_px=0.0, order=1.0, yaw_deg=(0.0,) * 6):
     centres, rotations = np.zeros((1, 6, 3)), np.zeros((1, 6, 3))
     centres[0, :, 1] = 100 * np.array(scene.lateral_m)
     rotations[0, :, 1] = yaw_deg
-    poses = CameraPoses.from_trajectory(Trajectory(centres, 0.01, rotations, "rotator_deg"))
+    poses = CameraPoses.from_unreal(centres, rotation_from_rotator_deg(rotations), unit_m=0.01)
     return SceneFacts(scene, dict.fromkeys(range(6), encoding), poses, lambda: "url", (0,))
 
 

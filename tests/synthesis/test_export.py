@@ -1,7 +1,5 @@
 """The written files, read by other means: json, PyAV, scipy, and the release's parser."""
 
-from dataclasses import replace
-
 import av
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial.transform import Rotation
 
 from stereogenbench_data.errors import SynthesisError
-from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.geometry.pose import CameraPoses, rotation_from_rotator_deg
 from stereogenbench_data.geometry.pose_forms import readings
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.schema.parse import parse_rig
@@ -25,9 +23,9 @@ def small(**changes):
     return {"size_px": 32, "frames": 2, "seed": 3} | changes
 
 
-def trajectory_of(scene):
+def poses_of(scene):
     recorded = record_poses((scene.folder / "trajectory.json").read_bytes(), where="trajectory")
-    return next(iter(readings(recorded))).trajectory
+    return next(readings(recorded)).poses
 
 
 def rig_of(scene):
@@ -77,7 +75,7 @@ def test_videos_are_encoded_as_the_release_is(draw):
 def test_recorded_baselines_are_the_distances_of_the_recorded_poses(draw, family):
     """At world offsets of up to 1e6 cm, where a coordinate is rounded to 1.2e-10 cm."""
     scene = draw(family=family, **small(frames=5))
-    rig, locations = rig_of(scene), trajectory_of(scene).locations
+    rig, locations = rig_of(scene), poses_of(scene).centres
 
     assert np.abs(locations).max() > 1e4
     for (left, right), recorded_cm in zip(CAMERA_PAIRS, rig.baselines_cm, strict=True):
@@ -89,7 +87,7 @@ def test_every_rotation_form_records_the_same_poses(draw):
     found = []
     for form in ("rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"):
         scene = draw(contract=ExportContract(rotation=form), **small())
-        found.append(CameraPoses.from_trajectory(trajectory_of(scene)).world_from_cam(1, 2))
+        found.append(poses_of(scene).world_from_cam(1, 2))
         raw = scene.json("trajectory.json")["frames"][1]["cameras"][2]["rotation"]
         if form == "quaternion_wxyz":
             raw = [*raw[1:], raw[0]]
@@ -122,11 +120,15 @@ def share_found(units_m, *, focal_px, later_from_first):
 def test_the_recorded_poses_carry_depth_from_frame_to_frame(draw):
     """All but the walker and what it and the poles come to hide; a roll with a wrong sign shows."""
     scene = draw(size_px=128, frames=13, seed=8, family="IPD_Gaussian", focal_mm=30.0)
-    trajectory = trajectory_of(scene)
-    mirrored = replace(trajectory, rotations=trajectory.rotations * [1, 1, -1])
-    found = []
-    for recorded in (trajectory, mirrored):
-        poses = CameraPoses.from_trajectory(recorded)
+    recorded, found = poses_of(scene), []
+    mirrored_deg = [
+        [[turn["pitch"], turn["yaw"], -turn["roll"]] for turn in (p["rotation"] for p in poses)]
+        for poses in (frame["cameras"] for frame in scene.json("trajectory.json")["frames"])
+    ]
+    mirrored = CameraPoses.from_unreal(
+        recorded.centres, rotation_from_rotator_deg(np.array(mirrored_deg)), unit_m=recorded.unit_m
+    )
+    for poses in (recorded, mirrored):
         first, later = poses.world_from_cam(0, 1), poses.world_from_cam(12, 1)
         found.append(
             share_found(
