@@ -14,7 +14,6 @@ from typing import Any, Final, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Integer
 
-from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry.arrays import (
     array_namespace,
     as_float64,
@@ -205,17 +204,10 @@ def planar_from_ray(
 ) -> Float[Any, "*batch h w"]:
     """Return depth along the optical axis from distances to the camera's centre, both in metres.
 
-    Raises:
-        GeometryError: If the map does not have the image size of the intrinsics.
+    The intrinsics are those of an image of this size.
 
     Source: Roberts et al., Hypersim, 2021, whose depth_meters is the length of the ray.
     """
-    size_px = (intrinsics.width_px, intrinsics.height_px)
-    if ray_m.shape[:-3:-1] != size_px:
-        raise GeometryError(
-            f"the depth map is {ray_m.shape[-1]}x{ray_m.shape[-2]} px but its intrinsics are for "
-            f"{size_px[0]}x{size_px[1]} px: resize or crop both together."
-        )
     return ray_m / ray_per_planar(
         ray_m,
         focal_px=(intrinsics.fx_px, intrinsics.fy_px),

@@ -17,7 +17,6 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64, Shaped
 
-from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry.arrays import (
     Array,
     array_namespace,
@@ -148,18 +147,12 @@ def lands_inside(
 ) -> Bool[Any, "*batch h w"]:
     """Return which source pixels land inside a target image of this size.
 
-    Raises:
-        GeometryError: If rows do not change but the two images differ in height.
+    Where rows do not change, both images have one height.
     """
     u_px, v_px = projection.u_px, projection.v_px
     inside = (u_px >= 0) & (u_px < width_px)
     if v_px is not None:
         inside &= (v_px >= 0) & (v_px < height_px)
-    elif u_px.shape[-2] != height_px:
-        raise GeometryError(
-            f"a rectified projection of {u_px.shape[-2]} rows cannot land in an image of "
-            f"{height_px} rows: resize or crop both views alike."
-        )
     return inside
 
 
@@ -170,9 +163,6 @@ def landing_pixels(
 
     The pixel is an index into flattened target maps (..., height_px, width_px). For a source pixel
     that lands outside, it is an arbitrary valid index.
-
-    Raises:
-        GeometryError: If rows do not change but the two images differ in height.
     """
     inside = lands_inside(projection, height_px=height_px, width_px=width_px)
     pixel = whole_where(inside, projection.u_px)
@@ -216,9 +206,6 @@ def visible_in_target(
 
     Returns:
         True where visible.
-
-    Raises:
-        GeometryError: If a rectified projection's rows are not the target's.
 
     Source: the StereoGenBench paper, appendix on the geometry audit, which compares projected
     points with the target's depth buffer; the tolerance is our choice.
@@ -360,9 +347,6 @@ def backward_warp(
     Returns:
         The image in the source view, in its own dtype if that is a float and else float32,
         0 outside; and True where a source pixel lands inside the target image.
-
-    Raises:
-        GeometryError: If a rectified projection's rows are not the image's.
     """
 
     def sampled(here: Projection, image: Any) -> tuple[Any, Any]:

@@ -356,7 +356,7 @@ def depth_m_from_units(
     *,
     measured: Bool[np.ndarray, "*batch h w"],
     encoding: DepthEncoding,
-    intrinsics: Intrinsics | None = None,
+    intrinsics: Intrinsics,
 ) -> Float32[np.ndarray, "*batch h w"]:
     """Return depth along the optical axis in metres, 0 where it was not measured.
 
@@ -364,19 +364,11 @@ def depth_m_from_units(
         units: Stored numbers.
         measured: Where depth was measured, see `measured`.
         encoding: The depth contract.
-        intrinsics: The camera of this picture; needed and used only for ``kind="ray"``.
+        intrinsics: The camera of this picture, used for ``kind="ray"``.
 
     Returns:
         float32, the float64 result rounded once. With ``form="inverse"`` a measured 0 is inf.
-
-    Raises:
-        MediaError: If ray lengths are to be converted without intrinsics.
     """
-    if encoding.kind == "ray" and intrinsics is None:
-        raise MediaError(
-            "depth of kind 'ray' becomes depth along the optical axis by the camera's intrinsics, "
-            "got None: pass intrinsics=... of this picture."
-        )
     unit_m = encoding.known_unit_m
     depth_m = np.empty(units.shape, dtype=np.float32)
     if encoding.form == "depth" and encoding.offset_m:
@@ -389,7 +381,7 @@ def depth_m_from_units(
         with np.errstate(divide="ignore"):
             np.divide(unit_m, units, out=depth_m, dtype=np.float64, casting="same_kind")
         depth_m[~measured] = 0
-    if encoding.kind == "ray" and intrinsics is not None:
+    if encoding.kind == "ray":
         planar_m: Float32[np.ndarray, "*batch h w"] = planar_from_ray(depth_m, intrinsics)
         return planar_m
     return depth_m

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry import disparity as disparity_module
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import (
@@ -144,11 +143,6 @@ def test_the_ray_to_the_corner_is_longer_than_its_depth(library):
     assert library.numpy(depth_m).dtype == np.float32
     assert library.numpy(depth_m)[0, 0] == pytest.approx(4 / np.sqrt(1 + 2.5**2 + 0.5**2))
     assert library.numpy(depth_m)[1, 3] == pytest.approx(4 / np.sqrt(1 + 0.5**2 + 0.5**2))
-
-
-def test_rays_of_an_image_of_another_size_are_refused():
-    with pytest.raises(GeometryError, match="is 8x2 px but its intrinsics are for 6x2 px"):
-        planar_from_ray(np.ones((2, 8)), Intrinsics(1.0, 1.0, 3.0, 1.0, 6, 2))
 
 
 @settings(max_examples=50)

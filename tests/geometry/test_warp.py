@@ -1,10 +1,8 @@
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
-from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry import projection as projection_module
 from stereogenbench_data.geometry.projection import (
     backward_warp,
@@ -90,13 +88,6 @@ def test_a_backward_warp_is_scipys_interpolation_between_pixel_centres(library, 
         )
         expected = np.where(expected_inside[item], sampled, 0.0)
         np.testing.assert_allclose(library.numpy(warped)[item, channel], expected, atol=1e-4)
-
-
-def test_a_rectified_warp_of_an_image_with_other_rows_is_refused():
-    projection = project_rectified(np.ones((4, 6)), np.ones((4, 6)))
-
-    with pytest.raises(GeometryError, match="of 4 rows cannot land in an image of 5 rows"):
-        backward_warp(np.ones((3, 5, 6)), projection)
 
 
 def test_blocks_of_rows_give_the_result_of_one_block(monkeypatch):

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stereogenbench_data.errors import MediaError
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.media.depth import (
@@ -16,6 +15,7 @@ from stereogenbench_data.media.depth import (
 )
 from stereogenbench_data.schema.records import DepthEncoding
 
+CAMERA = Intrinsics(1.5, 2.0, 0.5, 0.5, 3, 1)
 USERS = DepthEncoding(unit_m=0.02, kind="ray", source="tag")
 
 
@@ -57,7 +57,7 @@ def test_metres_are_the_exact_product_rounded_once(unit_m):
     encoding = DepthEncoding(unit_m=unit_m)
     everywhere = np.ones(units.shape, dtype=bool)
 
-    depth_m = depth_m_from_units(units, measured=everywhere, encoding=encoding)
+    depth_m = depth_m_from_units(units, measured=everywhere, encoding=encoding, intrinsics=CAMERA)
 
     assert depth_m.dtype == np.float32
     np.testing.assert_array_equal(depth_m, (units.astype(float) * unit_m).astype(np.float32))
@@ -77,28 +77,20 @@ def test_numbers_become_metres_and_0_where_depth_was_not_measured(encoding, expe
     units = np.array([[0, 4, 65535, 4]], dtype=np.uint16)
     where = np.array([[not encoding.no_depth, True, True, False]])
 
-    depth_m = depth_m_from_units(units, measured=where, encoding=encoding)
+    depth_m = depth_m_from_units(units, measured=where, encoding=encoding, intrinsics=CAMERA)
 
     np.testing.assert_array_equal(depth_m, np.float32([[*expected_m, 0]]))
 
 
 def test_a_ray_becomes_depth_along_the_optical_axis():
     """The last pixel's ray is (2 / 1.5, 0, 1), 5/3 long."""
-    camera = Intrinsics(1.5, 2.0, 0.5, 0.5, 3, 1)
     units = np.array([[10, 0, 10]], dtype=np.uint16)
     encoding = DepthEncoding(unit_m=1.0, kind="ray")
 
-    depth_m = depth_m_from_units(units, measured=units > 0, encoding=encoding, intrinsics=camera)
+    depth_m = depth_m_from_units(units, measured=units > 0, encoding=encoding, intrinsics=CAMERA)
 
     assert depth_m.dtype == np.float32
     np.testing.assert_allclose(depth_m, [[10, 0, 6]], rtol=1e-6)
-
-
-def test_a_ray_without_a_camera_is_refused():
-    units = np.ones((1, 1), dtype=np.uint16)
-
-    with pytest.raises(MediaError, match=r"kind 'ray' .* got None: pass intrinsics="):
-        depth_m_from_units(units, measured=units > 0, encoding=DepthEncoding(kind="ray"))
 
 
 @pytest.mark.parametrize(
