@@ -111,10 +111,10 @@ def merged_records(root: RemoteObject, keys: Sequence[str]) -> Iterator[dict[str
     """
     folder = root.below(FOLDER)
     try:
-        sizes = folder.entries()
+        listed = folder.listed()
     except MissingObject:
         return
-    for name, size in sorted(sizes.items()):
+    for name, (size, _) in sorted(listed.items()):
         if size is None or size > _LARGEST_BYTES or PurePosixPath(name).suffix not in _KINDS:
             continue
         text = folder.below(name, expected_size=size).read(0, size)

@@ -265,9 +265,11 @@ class RemoteFolder(SceneFolder):
     @property
     def _files(self) -> Files:
         if self._listed is None:
-            found = self._folder.entries()
-            sizes = {name: found[name] for name in sorted(found) if is_read(name)}
-            self._listed = {name: (size, 0) for name, size in sizes.items() if size is not None}
+            self._listed = {
+                name: (size, 0)
+                for name, (size, _) in sorted(self._folder.listed().items())
+                if size is not None and is_read(name)
+            }
         return self._listed
 
     def stamps(self) -> dict[str, tuple[int, int]]:
@@ -469,8 +471,8 @@ def find_remote_scenes(root: RemoteObject) -> FoundScenes:
     """
 
     def folders(path: str) -> list[str]:
-        entries = (root.below(path) if path else root).entries()
-        return [name for name, size in entries.items() if size is None and name[0] != "."]
+        listed = (root.below(path) if path else root).listed()
+        return [name for name, (size, _) in listed.items() if size is None and name[0] != "."]
 
     keys = _keys_below([name for name in folders("") if name in _SCENE_DEPTH], folders)
     if not keys:
@@ -557,8 +559,11 @@ class RemoteTree:
 
     def _listed(self, folder: str) -> dict[str, tuple[int, int]]:
         def listed() -> dict[str, tuple[int, int]]:
-            files = self._root.below(folder).files()
-            return {path: (size, _number(version)) for path, (size, version) in files.items()}
+            return {
+                path: (size, _number(version))
+                for path, (size, version) in self._root.below(folder).listed("all levels").items()
+                if size is not None
+            }
 
         return {path: (size, number) for path, (size, number) in self._once(folder, listed).items()}
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import Any, Final
 
 from stereogenbench_data.errors import ExtraError, StorageError, missing_extra
-from stereogenbench_data.sources.location import shown
+from stereogenbench_data.sources.location import Depth, Listing, shown
 from stereogenbench_data.sources.retry import (
     CHUNK_BYTES,
     MISSING,
@@ -85,31 +85,22 @@ class FilesystemTransport:
             raise StorageError(f"{self._where}: has no size ({size!r}): is it a folder?")
         return size
 
-    def entries(self, timeout_s: float) -> dict[str, int | None]:
-        """List a folder: name to size in bytes, None for a folder."""
+    def listed(self, timeout_s: float, depth: Depth) -> Listing:
+        """List a folder."""
         with self.named_errors():
             files, path, limit = self._open(timeout_s)
-            listed = files.ls(path, detail=True, **limit)
-        found: dict[str, int | None] = {}
-        for entry in listed:
-            name = str(entry["name"]).strip("/")
-            if name not in ("", path.strip("/")):
-                is_folder = entry["type"] == "directory"
-                found[name.rpartition("/")[2]] = None if is_folder else int(entry["size"] or 0)
-        return found
-
-    def files(self, timeout_s: float) -> dict[str, tuple[int, str]]:
-        """List all files below a folder: path to size in bytes and version."""
-        with self.named_errors():
-            files, path, _ = self._open(timeout_s)
-            listed = files.find(path, detail=True)
-        return {
-            name.removeprefix(path).strip("/"): (
-                int(entry["size"] or 0),
-                str(entry.get("ETag") or entry.get("LastModified") or entry.get("mtime") or ""),
-            )
-            for name, entry in listed.items()
-        }
+            if depth == "all levels":
+                found = files.find(path, detail=True)
+            else:
+                found = {str(each["name"]): each for each in files.ls(path, detail=True, **limit)}
+        listing: Listing = {}
+        for place, each in found.items():
+            name = place.strip("/").removeprefix(path.strip("/")).strip("/")
+            version = each.get("ETag") or each.get("LastModified") or each.get("mtime") or ""
+            if name:
+                size = None if each["type"] == "directory" else int(each["size"] or 0)
+                listing[name] = size, str(version)
+        return listing
 
     def part(self, start: int, stop: int, timeout_s: float) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop, or the first of them."""

@@ -16,7 +16,7 @@ import urllib3
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.sources.filesystems import FilesystemTransport, require_installed
-from stereogenbench_data.sources.location import shown
+from stereogenbench_data.sources.location import Depth, Listing, shown
 from stereogenbench_data.sources.retry import MISSING, MissingObject, ProcessLock
 from stereogenbench_data.sources.web import WebTransport
 
@@ -95,29 +95,13 @@ class HubTransport(WebTransport):
         else:
             yield from cached.part(start, stop, timeout_s)
 
-    def entries(self, timeout_s: float) -> dict[str, int | None]:
-        """List a folder: name to size in bytes, None for a folder."""
-        return {
-            entry.path.rpartition("/")[2]: getattr(entry, "size", None)
-            for entry in self._tree(timeout_s, depth="one level")
-        }
-
-    def files(self, timeout_s: float) -> dict[str, tuple[int, str]]:
-        """List all files below a folder: path to size in bytes and digest of the content."""
-        above = len(self._file.path.strip("/")) + 1 if self._file.path.strip("/") else 0
-        return {
-            entry.path[above:]: (entry.size, entry.lfs.sha256 if entry.lfs else entry.blob_id)
-            for entry in self._tree(timeout_s, depth="all levels")
-            if hasattr(entry, "size")
-        }
-
     def pinned(self, timeout_s: float) -> str:
         """Return the URL of a folder as of the commit that its branch is at now."""
         file, commit = self._file, quote(self._commit(timeout_s, of="folder"), safe="")
         return f"hf://datasets/{file.repository}@{commit}/{file.path}".rstrip("/")
 
-    def _tree(self, timeout_s: float, *, depth: Literal["one level", "all levels"]) -> list[Any]:
-        """Return the entries of a folder, of which the Hub lists a thousand a request."""
+    def listed(self, timeout_s: float, depth: Depth) -> Listing:
+        """List a folder, of which the Hub lists a thousand files a request."""
         if is_offline():
             raise StorageError(
                 f"{self._where}: HF_HUB_OFFLINE is set, and the Hub's cache does not hold whole "
@@ -125,14 +109,21 @@ class HubTransport(WebTransport):
             )
         with require_installed(self._where, extra="hub"):
             from huggingface_hub import HfApi
-        file, commit = self._file, self._commit(timeout_s, of="folder")
+        folder, commit = self._file.path.strip("/"), self._commit(timeout_s, of="folder")
         endpoint, token = _settings()
         with FilesystemTransport(self._where).named_errors():
-            listed = HfApi(endpoint, token=token, library_name=_LIBRARY).list_repo_tree(
-                file.repository, file.path.strip("/") or None,
+            found: Any = HfApi(endpoint, token=token, library_name=_LIBRARY).list_repo_tree(
+                self._file.repository, folder or None,
                 repo_type="dataset", revision=commit, recursive=depth == "all levels",
             )  # fmt: skip
-            return list(listed)
+            return {
+                each.path.removeprefix(folder).strip("/"): (
+                    (each.size, each.lfs.sha256 if each.lfs else each.blob_id)
+                    if hasattr(each, "size")
+                    else (None, "")
+                )
+                for each in found
+            }
 
     def _in_cache(self, timeout_s: float) -> FilesystemTransport | None:
         """Return what reads the file in the Hub's cache; None if it is read by HTTP."""

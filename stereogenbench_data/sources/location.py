@@ -2,13 +2,19 @@
 
 import os
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 from urllib.parse import SplitResult, quote, unquote, urlsplit, urlunsplit
 
 from stereogenbench_data.errors import StorageError, url_without_secrets
 from stereogenbench_data.schema.text import shortened
 
 WEB_SCHEMES: Final = ("http", "https")
+
+Depth = Literal["one level", "all levels"]
+"""How deep below a folder it is listed."""
+Listing = dict[str, tuple[int | None, str]]
+"""Path below a folder to size in bytes, None for a folder, and what changes with the content: an
+ETag or the Hub's digest, "" if the store has none."""
 
 UNSAFE_PATH: Final = r"^/|\\|:|(?:^|/)\.{0,2}(?:/|$)|[\x00-\x1f]"
 """What a member's path may not hold: a root, a drive, a backslash, an empty part, '.' or '..'."""

@@ -8,10 +8,11 @@ server takes longer than its ``timeout_s``, and threads may make requests at the
 
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.sources.location import is_web, joined, shown
+from stereogenbench_data.sources.location import Depth, Listing, is_web, joined, shown
 from stereogenbench_data.sources.retry import Attempts, RetryPolicy, TransientError
 
 if TYPE_CHECKING:
@@ -74,25 +75,13 @@ class RemoteObject:
         """
         return self._retried(self._transport.size, doing="requesting its size")
 
-    def entries(self) -> dict[str, int | None]:
-        """List a folder: name to size in bytes, None for a folder.
+    def listed(self, depth: Depth = "one level") -> Listing:
+        """List a folder, in few requests.
 
         Raises:
             StorageError: If it cannot be listed; plain web servers have no listings.
         """
-        return self._retried(self._transport.entries, doing="requesting its entries")
-
-    def files(self) -> dict[str, tuple[int, str]]:
-        """List all files below a folder, in few requests.
-
-        Returns:
-            Path below the folder to size in bytes, and what changes with the content (an ETag or
-            the digest of the Hub), "" if the store has none.
-
-        Raises:
-            StorageError: If it cannot be listed; plain web servers have no listings.
-        """
-        return self._retried(self._transport.files, doing="requesting its files")
+        return self._retried(partial(self._transport.listed, depth=depth), doing="listing it")
 
     def pinned(self) -> str:
         """Return the URL of a folder that keeps its content: of the Hub, with its commit; else "".

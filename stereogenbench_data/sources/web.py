@@ -26,7 +26,7 @@ import urllib3.connection
 from urllib3.exceptions import HTTPError, MaxRetryError, ResponseError
 
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.sources.location import shown, split_url
+from stereogenbench_data.sources.location import Depth, Listing, shown, split_url
 from stereogenbench_data.sources.retry import (
     CHUNK_BYTES,
     MISSING,
@@ -161,17 +161,12 @@ class WebTransport:
         response.close()
         return stated.size
 
-    def entries(self, timeout_s: float) -> dict[str, int | None]:
+    def listed(self, timeout_s: float, depth: Depth) -> Listing:
         """Refuse to list a folder: plain web servers have no listings."""
         raise StorageError(
             f"{self._where}: a web server does not list its folders. Pass a folder with an "
             f"index.parquet, or an index and this URL as its root."
         )
-
-    def files(self, timeout_s: float) -> dict[str, tuple[int, str]]:
-        """Refuse to list a folder, as `entries`."""
-        self.entries(timeout_s)
-        return {}
 
     def part(self, start: int, stop: int, timeout_s: float) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop, or the first of them."""

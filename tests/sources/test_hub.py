@@ -180,7 +180,7 @@ def test_offline_the_cache_is_read_and_nothing_is_requested(hub, own_cache, monk
     with pytest.raises(StorageError, match=r"y.tar : HF_HUB_OFFLINE is set, and the file"):
         RemoteObject(BRANCH.replace("x.tar", "y.tar")).read(0, 9)
     with pytest.raises(StorageError, match=r"HF_HUB_OFFLINE is set, and the Hub's cache does not"):
-        RemoteObject(BRANCH).entries()
+        RemoteObject(BRANCH).listed()
     assert resolved(hub) == []
 
 
