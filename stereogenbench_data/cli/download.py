@@ -1,5 +1,6 @@
 """``stereogenbench download``: copy the part of a release that a selection needs to this disk."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -38,24 +39,31 @@ def download(  # noqa: PLR0913 - one parameter an option
 
     Example: `stereogenbench download hf://datasets/ORG/NAME --split eval --cameras 0,1 -o data/`
     """
+    from stereogenbench_data.errors import StorageError
     from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.selection.filters import filter_scenes
     from stereogenbench_data.shards.download import download as fetched
-    from stereogenbench_data.shards.download import download_sizes, plan_download
+    from stereogenbench_data.shards.download import size_bytes, wanted_files
 
-    numbers = list(cameras or range(CAMERA_COUNT))
     filters: Any = chosen.filters()
     index = SceneIndex.open(source.data, root=source.data_root, conventions=source.stated())
     rows = filter_scenes(index, filters).tolist()
-    kinds = ("rgb", "depth") if streams == "both" else (streams,)
+    files: Any = {
+        "cameras": list(cameras or range(CAMERA_COUNT)),
+        "streams": ("rgb", "depth") if streams == "both" else (streams,),
+    }
     if share.is_given:
-        sizes = download_sizes(index, rows, cameras=numbers, streams=kinds)
-        rows = share.rows(index, [*sizes], [*sizes.values()])
-    wanted = plan_download(index, rows, cameras=numbers, streams=kinds)
-    size = wanted.size_bytes / 1e6
-    scenes, files = counted(len(rows), "scene"), counted(len(wanted.files), "file")
-    typer.echo(f"{scenes}, {files}, {size:,.1f} MB", err=True)
+        sizes: dict[int, int] = {}
+        for row in rows:
+            with suppress(StorageError):  # it lacks a wanted file
+                sizes[row] = size_bytes(wanted_files(index.indexed_scene(row), **files))
+        rows = share.rows(index, [*sizes], [*sizes.values()]) if sizes else rows
+    wanted = [wanted_files(index.scene(row), **files) for row in rows]
+    size = f"{size_bytes(*wanted) / 1e6:,.1f} MB"
+    scenes = counted(len(wanted), "scene")
+    count = counted(sum(len(scene.members) for scene in wanted), "file")
+    typer.echo(f"{scenes}, {count}, {size}", err=True)
     if not dry_run:
         with progress_bar("downloading", unit="MB") as progress:
             fetched(index, wanted, out, progress=progress)
-        typer.echo(f"{out}: {scenes}, {size:,.1f} MB")
+        typer.echo(f"{out}: {scenes}, {size}")

@@ -160,19 +160,18 @@ def verify(
         raise typer.Exit(FINDINGS)
 
 
-@grouped
-def unpack(shards: ShardsArgument, out: OutArgument, *, work: WorkOptions) -> None:
+def unpack(shards: ShardsArgument, out: OutArgument) -> None:
     """Turn shards back into scenes.
 
     Each file is checked against the index. Files that were packed unchanged come out byte for byte.
     Depth that blosc2 packed becomes FFV1 video again, with the same numbers, times and tags.
-    Nothing is overwritten. To continue a stopped run, run it again: it keeps the scenes that exist.
+    Nothing is overwritten. To continue a stopped run, run it again: it keeps the files that exist.
 
     Example: `stereogenbench unpack shards/ scenes/`
     """
     from stereogenbench_data.shards.unpack import unpack as unpacked
 
     with progress_bar("unpacking", unit="MB") as progress:
-        report = unpacked(shards, out, **work.options(), progress=progress)
+        report = unpacked(shards, out, progress=progress)
     unpacked_now = counted(len(report.unpacked), "scene")
     typer.echo(f"{out}: {unpacked_now} unpacked, {len(report.kept)} kept")

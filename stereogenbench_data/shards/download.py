@@ -1,15 +1,17 @@
-"""Download a part of a release: only the files that a selection needs, each one checked.
+"""Copy scenes into a folder in the released layout: only the files that are wanted, each checked.
 
-Files are laid out as they were released, whether they come from shards or not. The index beside
-them lists only what is there. Whole files are kept, so a run that was stopped continues.
+A file gets its name once it is whole, so a run that was stopped continues. The marks of complete
+scenes come last. The index beside downloaded files lists only what is there; `unpack` copies all
+scenes of shards in the same way.
 """
 
+import io
 import shutil
 import zlib
 from collections.abc import Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from typing import Final
@@ -18,64 +20,35 @@ from stereogenbench_data.engine import Progress, advance_of
 from stereogenbench_data.errors import StorageError, explain_os_errors
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.media.depth import write_depth_video
+from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.schema.records import Member, Scene
+from stereogenbench_data.schema.release import COMPLETE_JSON
 from stereogenbench_data.shards.plan import SCENE_TEXTS
 from stereogenbench_data.shards.tar import read_chunks
 from stereogenbench_data.sources.files import copy_with_crc32, open_atomic
 from stereogenbench_data.sources.location import is_remote, joined, local_path
-from stereogenbench_data.sources.members import open_local, require_own_files
+from stereogenbench_data.sources.members import MemberSource, open_local, require_own_files
 from stereogenbench_data.sources.ranged_file import require_crc32
 from stereogenbench_data.sources.remote import RemoteObject
 
 _SPARE_BYTES: Final = 16 * 1024 * 1024
 
-
-@dataclass(frozen=True, slots=True)
-class Download:
-    """What to download: scenes, each with only the members that are wanted."""
-
-    scenes: tuple[Scene, ...]
-
-    @property
-    def files(self) -> dict[str, Member]:
-        """The files: the path that each will have, KEY/NAME, to where it is now."""
-        return {
-            f"{scene.id.key}/{name}": member
-            for scene in self.scenes
-            for name, member in scene.members.items()
-        }
-
-    @property
-    def size_bytes(self) -> int:
-        """The size of all files."""
-        return sum(member.size for member in self.files.values())
+Copies = Mapping[Path, tuple[Scene, str]]
+"""The path of each copy to the scene of the file and the file's name there."""
 
 
-def plan_download(
-    index: SceneIndex, rows: Sequence[int], *, cameras: Sequence[int], streams: Sequence[str]
-) -> Download:
-    """Return what to download.
+def wanted_files(scene: Scene, *, cameras: Sequence[int], streams: Sequence[str]) -> Scene:
+    """Return a scene with only the files that are wanted.
 
     Args:
-        index: The index of the data.
-        rows: The rows of the scenes.
+        scene: The scene, as the index of the data has it.
         cameras: Numbers of the cameras whose videos are wanted.
         streams: "rgb", "depth" or both.
 
     Raises:
         StorageError: If the index lacks a wanted file.
     """
-    return Download(
-        tuple(
-            replace(scene, members=_wanted_members(scene, cameras=cameras, streams=streams))
-            for scene in (index.scene(int(row)) for row in rows)
-        )
-    )
-
-
-def _wanted_members(
-    scene: Scene, *, cameras: Sequence[int], streams: Sequence[str]
-) -> dict[str, Member]:
     stems = [f"cam_{camera:02d}_{stream}" for camera in cameras for stream in streams]
     videos = {name.partition(".")[0]: name for name in scene.members}
     missing = [stem for stem in stems if stem not in videos]
@@ -86,35 +59,17 @@ def _wanted_members(
         )
     names = [name for name in SCENE_TEXTS if name in scene.members]
     names += [videos[stem] for stem in stems]
-    return {name: scene.members[name] for name in names}
+    return replace(scene, members={name: scene.members[name] for name in names})
 
 
-def download_sizes(
-    index: SceneIndex, rows: Sequence[int], *, cameras: Sequence[int], streams: Sequence[str]
-) -> dict[int, int]:
-    """Return the rows of scenes that have all wanted files, with the bytes of these.
-
-    Raises:
-        StorageError: If no scene has them.
-    """
-    sizes: dict[int, int] = {}
-    lacking: StorageError | None = None
-    for row in rows:
-        scene = index.indexed_scene(int(row))
-        try:
-            members = _wanted_members(scene, cameras=cameras, streams=streams)
-        except StorageError as error:
-            lacking = error
-            continue
-        sizes[int(row)] = sum(member.size for member in members.values())
-    if lacking is not None and not sizes:
-        raise lacking
-    return sizes
+def size_bytes(*scenes: Scene) -> int:
+    """Return the size of all files of some scenes."""
+    return sum(member.size for scene in scenes for member in scene.members.values())
 
 
 def download(
     index: SceneIndex,
-    wanted: Download,
+    wanted: Sequence[Scene],
     dest: str | Path,
     *,
     workers: int = 8,
@@ -124,7 +79,7 @@ def download(
 
     Args:
         index: The index of the data.
-        wanted: What to download, from `plan_download`.
+        wanted: Scenes, each with only the files to download (`wanted_files`).
         dest: The folder; created if it does not exist.
         workers: How many files are fetched at the same time.
         progress: Called repeatedly with the bytes done, and all of them.
@@ -140,10 +95,18 @@ def download(
     if not is_remote(index.root):
         if dest == local_path(index.root):
             raise StorageError(f"{dest}: is the folder of the data. Choose another folder.")
-        require_own_files(index.root, sorted({member.path for member in wanted.files.values()}))
+        paths = {member.path for scene in wanted for member in scene.members.values()}
+        require_own_files(index.root, sorted(paths))
     scenes = _scenes_before(dest)
-    _fetch_missing(index, wanted, dest, workers=workers, progress=progress)
-    for scene in wanted.scenes:
+    missing = {
+        path: (scene, name)
+        for scene in wanted
+        for name, member in scene.members.items()
+        if not is_whole(path := dest / scene.id.key / name, member)
+    }
+    _require_room(dest, sum(scene.members[name].size for scene, name in missing.values()))
+    copy_files(index, missing, workers=workers, progress=progress, total=size_bytes(*wanted))
+    for scene in wanted:
         members = {
             name: replace(member, path=f"{scene.id.key}/{name}", offset=0)
             for name, member in scene.members.items()
@@ -170,7 +133,7 @@ def _scenes_before(dest: Path) -> dict[str, Scene]:
     return {
         scene.id.key: scene
         for scene in map(index.scene, range(len(index)))
-        if all(_is_whole(dest / member.path, member) for member in scene.members.values())
+        if all(is_whole(dest / member.path, member) for member in scene.members.values())
     }
 
 
@@ -179,32 +142,43 @@ def _texts(members: Mapping[str, Member]) -> dict[str, tuple[int, int | None]]:
     return {name: (each.size, each.crc32) for name, each in members.items() if name in SCENE_TEXTS}
 
 
-def _fetch_missing(
-    index: SceneIndex, wanted: Download, dest: Path, *, workers: int, progress: Progress | None
+def copy_files(
+    index: SceneIndex, missing: Copies, *, workers: int, progress: Progress | None, total: int
 ) -> None:
-    files = {dest / path: member for path, member in wanted.files.items()}
-    missing = {place: member for place, member in files.items() if not _is_whole(place, member)}
-    needed = sum(member.size for member in missing.values())
-    _require_room(dest, needed)
-    total = wanted.size_bytes
-    advance = advance_of(progress, done=total - needed, total=total)
+    """Copy files of an index's scenes, each whole or not at all, on several threads.
+
+    Args:
+        index: The index of the data.
+        missing: What to copy. Packed depth whose copy has the released name becomes a video again.
+        workers: How many files are copied at the same time.
+        progress: Called repeatedly with the bytes done, and all of them.
+        total: How many bytes there are with the copies that are there already.
+
+    Raises:
+        StorageError: If a file cannot be read or written, or its checksum differs.
+        ExtraError: If blosc2 is needed and not installed.
+    """
+    sizes = {path: scene.members[name].size for path, (scene, name) in missing.items()}
+    advance = advance_of(progress, done=total - sum(sizes.values()), total=total)
     advance(0)
-    stop = Event()
+    source, stop = MemberSource(index.root, shards=index.shards), Event()
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
-        futures = {
-            pool.submit(_fetch, index, member, place, stop): member.size
-            for place, member in missing.items()
-        }
         try:
-            for future in as_completed(futures):
-                future.result()
-                advance(futures[future])
+            for are_marks in (False, True):
+                futures = {
+                    pool.submit(_copy, index, source, path, of, stop): path
+                    for path, of in missing.items()
+                    if (path.name == COMPLETE_JSON) == are_marks
+                }
+                for future in as_completed(futures):
+                    future.result()
+                    advance(sizes[futures[future]])
         finally:
             stop.set()
             pool.shutdown(cancel_futures=True)
 
 
-def _is_whole(path: Path, member: Member) -> bool:
+def is_whole(path: Path, member: Member) -> bool:
     """Return whether a file was fetched before; files get their name only once they are checked.
 
     Metadata files of another revision may have the same size, so their bytes are compared.
@@ -231,17 +205,27 @@ def _named_errors(place: Path) -> AbstractContextManager[None]:
     return explain_os_errors(f"{place}: cannot be written", "Choose another folder.")
 
 
-def _fetch(index: SceneIndex, member: Member, place: Path, stop: Event) -> None:
+def _copy(
+    index: SceneIndex, source: MemberSource, path: Path, of: tuple[Scene, str], stop: Event
+) -> None:
+    scene, name = of
+    member, where = scene.members[name], f"{source.url(*of)}: {scene.id.key}.{name}"
+
     def write(chunk: bytes) -> None:
         if stop.is_set():
-            raise StorageError(f"{place}: is not fetched any further.")
-        file.write(chunk)
+            raise StorageError(f"{path}: is not copied any further.")
+        content.write(chunk)
 
-    with _named_errors(place):
-        place.parent.mkdir(parents=True, exist_ok=True)
-        with open_atomic(place) as file, closing(_chunks(index, member)) as chunks:
+    with _named_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open_atomic(path) as file, closing(_chunks(index, member)) as chunks:
+            packed = io.BytesIO()
+            content = file if path.name == name else packed
             crc32 = copy_with_crc32(chunks, write)
-            require_crc32(crc32, expected=member.crc32, name=str(place))
+            require_crc32(crc32, expected=member.crc32, name=where)
+            if content is packed:
+                with DepthFrames(packed, name=where, frames=scene.frames) as depth:
+                    write_depth_video(depth, Path(file.name))
 
 
 def _chunks(index: SceneIndex, member: Member) -> Generator[bytes, None, None]:

@@ -16,7 +16,7 @@ from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.croissant.check import check_descriptor
 from stereogenbench_data.bridges.croissant.descriptor import write_descriptor
 from stereogenbench_data.errors import DescriptorError
-from stereogenbench_data.shards.download import download, plan_download
+from stereogenbench_data.shards.download import download, wanted_files
 from stereogenbench_data.shards.pack import pack
 from tests.cli.command import invoke
 from tests.servers.tools import require_tool
@@ -192,7 +192,8 @@ def test_shards_of_packed_depth_are_described_by_its_suffix(packed_depth_shards,
 
 def test_a_partial_download_is_described_by_its_videos(small_shards, tmp_path):
     whole = SceneIndex.open(small_shards)
-    part = plan_download(whole, [0, 1], cameras=(2, 3), streams=("depth",))
+    scenes = map(whole.scene, [0, 1])
+    part = [wanted_files(scene, cameras=(2, 3), streams=("depth",)) for scene in scenes]
     download(whole, part, tmp_path / "tree")
     pack(tmp_path / "tree", tmp_path / "shards", workers=1)
     path = tmp_path / "data.json"

@@ -9,7 +9,7 @@ from stereogenbench_data.bridges.upload import upload
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import DESCRIPTION_TXT
-from stereogenbench_data.shards.download import download, plan_download
+from stereogenbench_data.shards.download import download, wanted_files
 from stereogenbench_data.shards.pack import pack
 
 SCENE = "train/Uniform/SynthStage/scene_000000"
@@ -31,7 +31,8 @@ def link_away(tree, path, *, to):
 
 def fetch(tree, dest):
     index = SceneIndex.open(tree)
-    wanted = plan_download(index, range(len(index)), cameras=[0], streams=["rgb"])
+    scenes = map(index.scene, range(len(index)))
+    wanted = [wanted_files(scene, cameras=[0], streams=["rgb"]) for scene in scenes]
     return download(index, wanted, dest)
 
 

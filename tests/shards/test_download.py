@@ -11,7 +11,7 @@ from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.open import StaleIndexWarning
 from stereogenbench_data.schema.release import depth_name, rgb_name
-from stereogenbench_data.shards.download import download, download_sizes, plan_download
+from stereogenbench_data.shards.download import download, wanted_files
 from tests.cli.command import COMMAND, invoke
 from tests.servers.failing_server import Answer
 from tests.shards.shard_files import bytes_of
@@ -23,9 +23,10 @@ def shards_on_the_web(web, small_shards):
     return f"{web.url}/shards"
 
 
-def fetched(url, dest, *, cameras=(0, 1), streams=("rgb", "depth"), rows=(0, 1)):
+def fetched(url, dest, *, cameras=(0, 1), streams=("rgb", "depth"), rows=(0, 1), **how):
     index = SceneIndex.open(url)
-    return download(index, plan_download(index, rows, cameras=cameras, streams=streams), dest)
+    scenes = [wanted_files(index.scene(row), cameras=cameras, streams=streams) for row in rows]
+    return download(index, scenes, dest, **how)
 
 
 def test_only_the_files_of_the_cameras_are_fetched(shards_on_the_web, web, small_release, tmp_path):
@@ -85,13 +86,12 @@ def test_a_stopped_run_goes_on_where_it_was(shards_on_the_web, web, tmp_path):
 
 
 def test_a_damaged_file_is_refused_and_leaves_nothing_behind(shards_on_the_web, web, tmp_path):
-    index = SceneIndex.open(shards_on_the_web)
-    wanted = plan_download(index, [0], cameras=[0], streams=["rgb"])
-    shard = f"shards/{[*wanted.files.values()][-1].path}"
-    web.always[shard] = Answer(change=lambda data: bytes([data[0] ^ 1]) + data[1:])
+    shard = SceneIndex.open(shards_on_the_web).scene(0).members["baseline.json"].path
+    web.always[f"shards/{shard}"] = Answer(change=lambda data: bytes([data[0] ^ 1]) + data[1:])
 
-    with pytest.raises(StorageError, match=r"baseline\.json: has crc32 [0-9a-f]{8}, and .* fetch"):
-        download(index, wanted, tmp_path / "part", workers=1)
+    match = rf"{shard} ?: .*\.baseline\.json: has crc32 [0-9a-f]{{8}}, and .* fetch"
+    with pytest.raises(StorageError, match=match):
+        fetched(shards_on_the_web, tmp_path / "part", rows=(0,), workers=1)
 
     assert [path for path in (tmp_path / "part").rglob("*") if path.is_file()] == []
 
@@ -105,11 +105,8 @@ def test_a_full_disk_is_reported_before_a_fetch(shards_on_the_web, tmp_path, mon
 
 
 def test_the_folder_of_the_data_is_refused(small_release):
-    index = SceneIndex.open(small_release)
-    wanted = plan_download(index, [0], cameras=[0], streams=["rgb"])
-
     with pytest.raises(StorageError, match=r"is the folder of the data"):
-        download(index, wanted, small_release)
+        fetched(small_release, small_release)
 
 
 def test_the_command_says_the_size_first_and_reports(small_release, tmp_path):
@@ -129,12 +126,23 @@ def test_a_share_passes_over_scenes_without_the_wanted_videos(small_release, tmp
     root = shutil.copytree(small_release, tmp_path / "part", copy_function=os.link)
     lacking = sorted(root.rglob("cam_05_rgb.mp4"))[0]
     lacking.unlink()
-    index = SceneIndex.open(root)
 
-    sizes = download_sizes(index, range(4), cameras=[5], streams=["rgb"])
+    words = ["download", root, "-o", "unused", "--streams", "rgb", "--dry-run", "--cameras", "5"]
+    all_that_have_it = invoke(*words, "--scenes", 3)
+    more = invoke(*words, "--scenes", 4)
 
-    assert list(sizes) == [1, 2, 3]
-    assert sizes[1] == plan_download(index, [1], cameras=[5], streams=["rgb"]).size_bytes
+    assert "3 scenes, " in all_that_have_it.stderr
+    assert (more.exit_code, "3" in more.stderr) == (2, True)
+
+
+def test_a_share_of_scenes_that_all_lack_a_wanted_video_names_it(shards_on_the_web, tmp_path):
+    fetched(shards_on_the_web, tmp_path / "part", streams=("rgb",))
+
+    words = ["download", tmp_path / "part", "-o", tmp_path / "not", "--scenes", 1]
+    refused = invoke(*words, "--cameras", "0", "--streams", "depth")
+
+    assert refused.exit_code == 2
+    assert "the index has no cam_00_depth" in refused.stderr
 
 
 def test_a_metadata_file_of_another_revision_is_fetched_again(shards_on_the_web, tmp_path):

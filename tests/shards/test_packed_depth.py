@@ -39,7 +39,7 @@ def packed(small_release, tmp_path_factory):
 def unpacked(packed, tmp_path_factory):
     """The tree that unpacking makes of them, with the report; not to be changed."""
     tree = tmp_path_factory.mktemp("unpacked") / "tree"
-    return tree, unpack(packed, tree, workers=1)
+    return tree, unpack(packed, tree)
 
 
 @pytest.fixture
@@ -133,12 +133,13 @@ def test_unpacking_gives_the_release_back(unpacked, small_release):
 
 def test_unpacking_goes_on_where_it_was(small_shards, small_release, tmp_path):
     tree = tmp_path / "tree"
-    unpack(small_shards, tree, workers=1)
-    shutil.rmtree(tree / KEY)
-    (tree / KEY).with_name(".scene_000001.unfinished").mkdir()
+    unpack(small_shards, tree)
+    (tree / KEY / "_scene_complete.json").unlink()
+    (tree / KEY / "cam_00_rgb.mp4").unlink()
+    (tree / KEY / ".cam_00_rgb.mp4.unfinished").write_bytes(b"of a killed run")
     seen = []
 
-    report = unpack(small_shards, tree, workers=1, progress=lambda *now: seen.append(now))
+    report = unpack(small_shards, tree, progress=lambda *now: seen.append(now))
 
     assert report.unpacked == (KEY,)
     assert len(report.kept) == 3
@@ -148,15 +149,20 @@ def test_unpacking_goes_on_where_it_was(small_shards, small_release, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "change"),
-    [("notes.txt", lambda path: path.write_text("")), ("cam_00_rgb.mp4", lambda p: p.unlink())],
+    [
+        ("baseline.json", flip_byte),
+        ("cam_00_rgb.mp4", lambda path: path.write_text("mine")),
+        ("cam_03_depth.mkv", lambda path: (path.unlink(), path.mkdir())),
+    ],
 )
-def test_a_scene_that_is_there_and_differs_is_left_alone(packed, unpacked, tmp_path, name, change):
+def test_a_file_that_is_there_and_differs_is_left_alone(packed, unpacked, tmp_path, name, change):
     tree = shutil.copytree(unpacked[0], tmp_path / "tree")
     change(tree / KEY / name)
+    (tree / KEY / "trajectory.json").unlink()
     before = bytes_of(tree)
 
-    with pytest.raises(ShardError, match=rf"scene_000001: already exists, .*\({name} differ"):
-        unpack(packed, tree, workers=1)
+    with pytest.raises(ShardError, match=rf"scene_000001/{name}: already exists, .*Move it away"):
+        unpack(packed, tree)
 
     assert bytes_of(tree) == before
 
@@ -167,9 +173,11 @@ def test_a_damaged_member_is_not_unpacked(shards, tmp_path, name):
     flip_byte(shards / PAIR, member.offset + 100)
 
     with pytest.raises(ShardError, match=rf"{PAIR}: {KEY}\.{name}: has crc32"):
-        unpack(shards, tmp_path / "tree", workers=1)
+        unpack(shards, tmp_path / "tree")
 
-    assert not (tmp_path / "tree" / KEY).exists()
+    scene = tmp_path / "tree" / KEY
+    assert not (scene / name.replace("b2frame", "mkv")).exists()
+    assert not (scene / "_scene_complete.json").exists()
     assert not list((tmp_path / "tree").rglob("*.unfinished"))
 
 
@@ -187,7 +195,7 @@ def test_where_there_are_no_shards_nothing_is_unpacked(packed, small_release, tm
 def test_the_commands_pack_and_unpack(small_release, packed, tmp_path):
     out, tree = tmp_path / "shards", tmp_path / "tree"
     first = invoke("pack", small_release, out, "--depth-codec", "blosc2", "--workers", "1")
-    second, third = (invoke("unpack", out, tree, "--workers", "1") for _ in range(2))
+    second, third = (invoke("unpack", out, tree) for _ in range(2))
 
     assert (first.exit_code, second.exit_code, third.exit_code) == (0, 0, 0)
     assert bytes_of(out) == bytes_of(packed)

@@ -395,7 +395,7 @@ def test_what_needs_released_pictures_refuses_derived_ones(packed, tmp_path, wor
 
 
 def test_unpacked_training_shards_are_a_folder_of_derived_scenes(packed, tmp_path):
-    unpack(packed, tmp_path, workers=1)
+    unpack(packed, tmp_path)
     (tmp_path / "index.parquet").unlink(missing_ok=True)
     folder, index = SceneIndex.open(tmp_path), SceneIndex.open(packed)
 
