@@ -34,7 +34,6 @@ from stereogenbench_data.index.scene_folder import (
 from stereogenbench_data.index.tree import (
     FoundScenes,
     SceneFolder,
-    find_remote_scenes,
     find_scene_folders,
     folder_of,
     stamp_of,
@@ -278,10 +277,9 @@ def find_scenes(
     retry: RetryPolicy | None = None,
 ) -> tuple[FoundScenes, bool]:
     """Return the wanted scenes of a tree, and whether they are a part of it; see `walk`."""
-    if folders is None and is_remote(root):
-        folders = find_remote_scenes(RemoteObject(str(root), retry=retry))
-    elif folders is None:
-        folders = find_scene_folders(root)
+    if folders is None:
+        place = RemoteObject(str(root), retry=retry) if is_remote(root) else Path(root)
+        folders = find_scene_folders(place)
     if wanted is None:
         return folders, False
     keys = tuple(key for key in folders.keys if wanted(parse_scene_key(key)))

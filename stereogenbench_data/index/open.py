@@ -299,8 +299,6 @@ def stale_message(table: pa.Table, head: IndexHead, *, index_file: Path) -> str:
         head: What is known besides them; its root is a folder of this machine.
         index_file: Where the index is.
     """
-    from stereogenbench_data.index.tree import placed_folders  # slow to import
-
     root, shards = Path(head.root), set(head.shards)
     if shards:
         what, known = "shard", shards
@@ -311,13 +309,13 @@ def stale_message(table: pa.Table, head: IndexHead, *, index_file: Path) -> str:
             "all scenes into an empty folder."
         )
     else:
-        from stereogenbench_data.index.tree import placed_folders  # slow to import
+        from stereogenbench_data.index.tree import SPLITS, search  # slow to import
 
         members = one_array(table.column("members"))
         first = pc.struct_field(members.values, "path").take(members.offsets[:-1])
         # Folders of scenes may have other names than the scenes' keys.
         known = {path.rpartition("/")[0] for path in first.to_pylist()}
-        what, placed = "scene", placed_folders(root)
+        what, placed = "scene", {*search(root, SPLITS)[0]}
         left_out = head.broken.keys() - head.incomplete.keys()
         added = set() if head.is_part else placed - known - left_out
         new = {key for key in added if _is_finished(root, key)}

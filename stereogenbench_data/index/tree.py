@@ -3,10 +3,11 @@
     ROOT/train/<family>/<map>/<scene>/
     ROOT/eval/<subset>/<family>/<map>/<scene>/
 
-`find_scene_folders` searches a folder of this machine and says where misplaced scenes belong;
-`find_remote_scenes` and `placed_folders` list only folders where scenes belong. The Hub lists a
-thousand files a request, so `RemoteTree` lists a whole release in some hundred. A `SceneFolder`
-reads the files of one scene; behind a URL several at a time, and of large videos both ends alone.
+`find_scene_folders` lists folders down to where scenes belong, here or behind a URL, and says where
+misplaced ones should be; one that is too deep is told when the files of the folder above it are
+listed. The Hub lists a thousand files a request, so `RemoteTree` lists a release in some hundred. A
+`SceneFolder` reads one scene's files; behind a URL several at a time, and of large videos both
+ends alone.
 
 What was found out about trees without an index is kept in the user's cache:
 
@@ -27,7 +28,7 @@ import os
 import re
 import sys
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -40,7 +41,6 @@ import pyarrow as pa
 from stereogenbench_data.errors import (
     SchemaError,
     StorageError,
-    describe_os_error,
     explain_os_errors,
 )
 from stereogenbench_data.index.parquet import (
@@ -71,7 +71,7 @@ from stereogenbench_data.sources.retry import RetryPolicy
 CACHE_VARIABLE: Final = "STEREOGENBENCH_CACHE"
 """The environment variable that names another folder for the cache, or is "off"."""
 
-_FORMAT: Final = 3
+_FORMAT: Final = 4
 _MOST_TABLES: Final = 8
 """So many selections of a tree are kept: each has a table of its own."""
 
@@ -212,7 +212,7 @@ class SceneFolder:
         """Return the size in bytes and the modification time in ns of each file.
 
         Raises:
-            StorageError: If the folder cannot be read.
+            StorageError: If the folder cannot be read, or scenes are below it instead.
         """
         folder = Path(self._root, self.key)
         with (
@@ -220,6 +220,9 @@ class SceneFolder:
             os.scandir(folder) as entries,
         ):
             found = {entry.name: entry.stat() for entry in entries if is_read(entry.name)}
+        if not found and (deeper := next(folder.rglob(BASELINE_JSON), None)):
+            path = deeper.parent.relative_to(self._root).as_posix()
+            raise StorageError(refusal(str(self._root), path))
         return {name: (found[name].st_size, found[name].st_mtime_ns) for name in sorted(found)}
 
     def fetch(self, names: Iterable[str]) -> None:
@@ -336,7 +339,7 @@ class RemoteFolder(SceneFolder):
 
 _LAYOUT: Final = "train/<family>/<map>/<scene> or eval/<subset>/<family>/<map>/<scene>"
 _SCENE_FILES: Final = frozenset({BASELINE_JSON, TRAJECTORY_JSON, COMPLETE_JSON, *VIDEO_FILES})
-_SCENE_DEPTH: Final = {"train": 4, "eval": 5}
+SPLITS: Final = {"train": 4, "eval": 5}
 """How many parts a scene's path has, by its split."""
 _LISTERS: Final = 16
 """Folders of a server that are listed at a time."""
@@ -358,161 +361,120 @@ class FoundScenes:
     is_marked: bool = False
 
 
-def find_scene_folders(root: str | Path) -> FoundScenes:
+def find_scene_folders(root: Path | RemoteObject) -> FoundScenes:
     """Return the scenes below a root, sorted by key, and the folders that hold misplaced ones.
 
-    A folder is a scene if it holds one of a scene's files, or if it is where a scene belongs and
-    has no subfolder. Folders whose names start with a dot are ignored. A scene's folder is not
-    searched further, and a link to a folder above itself is not followed.
-
     Raises:
-        StorageError: If the root is not a readable folder, or no scene is where it belongs.
+        StorageError: If the root is not a folder that can be listed, or no scene is where it
+            belongs.
     """
-    root = Path(root)
-    if not root.is_dir():
-        found = "is a file" if root.exists() else "does not exist"
-        raise StorageError(
-            f"{root}: {found}; expected a folder that holds train/ or eval/ of the release, "
-            f"or an index.parquet."
-        )
-    keys: list[str] = []
-    refused: dict[str, str] = {}
-    is_marked = False
-    for folder, complaint, names in _search(root):
-        key = folder.relative_to(root).as_posix()
-        if complaint:
-            refused[key] = complaint
-            continue
-        try:
-            keys.append(parse_scene_key(key).key)
-            is_marked = is_marked or COMPLETE_JSON in names
-        except SchemaError as error:
-            refused[key] = f"{error}{_where_to_point(folder, root=root)}"
+    where = root.where if isinstance(root, RemoteObject) else os.path.abspath(root)  # noqa: PTH100
+    places, others = search(root, SPLITS if isinstance(root, RemoteObject) else ())
+    refused = {path: why or refusal(where, path) for path, why in others.items()}
+    refused |= {path: why for path in places if (why := refusal(where, path))}
+    keys = tuple(sorted({*places} - refused.keys()))
     if not keys:
-        raise StorageError(_nothing_found(root, refused))
-    return FoundScenes(tuple(sorted(keys)), dict(sorted(refused.items())), is_marked)
+        looked = f"{where}: holds no scene; looked for folders {_LAYOUT}"
+        roots = {_release_root_of(f"{where}/{path}") for path in refused} - {"", where}
+        if roots:
+            raise StorageError(f"{looked}. Point at {' or '.join(sorted(roots)[:3])} instead.")
+        first = [f"{path}: {refused[path]}" for path in sorted(refused)[:1]]
+        found = ", ".join(first or sorted(_names(root, ""))[:8]) or "nothing"
+        raise StorageError(f"{looked}, and found {found}. Point at what holds train/ or eval/.")
+    is_marked = isinstance(root, Path) and any(
+        (root / key / COMPLETE_JSON).exists() for key in keys
+    )
+    return FoundScenes(keys, dict(sorted(refused.items())), is_marked)
 
 
-def _search(root: Path) -> Iterator[tuple[Path, str, set[str]]]:
-    """Yield each scene's folder and its files, and each folder that cannot be searched and why."""
-    waiting: list[tuple[Path, tuple[str, ...], frozenset[tuple[int, int]]]] = [
-        (root, (), frozenset())
-    ]
-    while waiting:
-        folder, parts, above = waiting.pop()
-        is_place_of_scene = bool(parts) and _SCENE_DEPTH.get(parts[0]) == len(parts)
-        try:
-            status = folder.stat()
-            identity = (status.st_dev, status.st_ino)
-            if identity in above:
-                yield folder, "is a link to a folder above itself. Remove the link.", set()
-                continue
-            with os.scandir(folder) as entries:
-                listed = list(entries)
-            files = {entry.name for entry in listed}
-            folders = [e.name for e in listed if not e.name.startswith(".") and _is_folder(e)]
-        except OSError as error:
-            cure = "Check the disk, then run it again."
-            yield folder, describe_os_error("cannot be searched", error, cure), set()
-            continue
-        if files & _SCENE_FILES or (is_place_of_scene and not folders):
-            yield folder, "", files
-        elif len(parts) < _DEEPEST:
-            below = above | {identity}
-            waiting += [(folder / name, (*parts, name), below) for name in folders]
+def search(
+    root: Path | RemoteObject, only: Collection[str] = ()
+) -> tuple[list[str], dict[str, str]]:
+    """Return the paths where scenes belong, and other folders that hold files of scenes.
 
-
-def _is_folder(entry: os.DirEntry[str]) -> bool:
-    try:
-        return entry.is_dir()
-    except OSError:
-        return True
-
-
-def release_root_of(folder: Path) -> Path | None:
-    """Return the root below which a folder would be a scene of the release, None if none is."""
-    parts = _absolute(folder).parts
-    for name, depth in _SCENE_DEPTH.items():
-        if len(parts) > depth and parts[-depth] == name:
-            return Path(*parts[:-depth])
-    return None
-
-
-def _absolute(path: Path) -> Path:
-    return Path(os.path.abspath(path))  # noqa: PTH100 (resolve would follow links)
-
-
-def _where_to_point(folder: Path, *, root: Path) -> str:
-    other = release_root_of(folder)
-    if other == _absolute(root):
-        return ""  # the folder's name is wrong, and the error says so
-    return f" Move it, or point at {other} instead." if other else " Move it to such a path."
-
-
-def _nothing_found(root: Path, refused: dict[str, str]) -> str:
-    roots = {release_root_of(root / path) for path in refused}
-    suggested = {str(found) for found in roots if found not in (None, _absolute(root))}
-    looked = f"{root}: holds no scene; looked for folders {_LAYOUT}"
-    if suggested:
-        return f"{looked}. Point at {' or '.join(sorted(suggested)[:3])} instead."
-    if refused:
-        first = next(iter(sorted(refused.items())))
-        return f"{looked}, and found {len(refused)} elsewhere, such as {first[0]}: {first[1]}"
-    there = sorted(path.name for path in root.iterdir())[:8]
-    return f"{looked}, and found {', '.join(there) or 'nothing'} in it. Point at another folder."
-
-
-def find_remote_scenes(root: RemoteObject) -> FoundScenes:
-    """Return the keys of all scenes behind a URL, sorted; scenes' own folders are not listed.
-
-    Raises:
-        StorageError: If it cannot be listed, or no scene is where it belongs.
-        SchemaError: If a folder where a scene belongs has a name that no scene can have.
-    """
-
-    def folders(path: str) -> list[str]:
-        listed = (root.below(path) if path else root).listed()
-        return [name for name, (size, _) in listed.items() if size is None and name[0] != "."]
-
-    keys = _keys_below([name for name in folders("") if name in _SCENE_DEPTH], folders)
-    if not keys:
-        raise StorageError(
-            f"{root.where}: holds no scene and no index.parquet; looked for folders {_LAYOUT}. "
-            "Point at the folder that holds train/ or eval/, or at one of shards."
-        )
-    return FoundScenes(tuple(sorted(parse_scene_key(key).key for key in keys)), {})
-
-
-def _keys_below(splits: Iterable[str], folders: Callable[[str], list[str]]) -> list[str]:
-    """Return the paths where scenes belong, listed level by level; several wait at a time.
+    Folders are listed level by level, several at a time; where a scene belongs, nothing is listed.
+    Names that start with a dot are ignored.
 
     Args:
-        splits: "train" and "eval", or one of them.
-        folders: Called with a path below the root; returns the names of the folders there.
+        root: The root.
+        only: The folders in it to search; () is all.
+
+    Returns:
+        The paths, and others: path to why it cannot be listed, "" where files of a scene are.
+
+    Raises:
+        StorageError: If the root, or a folder behind a URL, cannot be listed.
     """
-    keys: list[str] = []
+    places: list[str] = []
+    odd: dict[str, str] = {}
+
+    def below(path: str) -> list[str]:
+        try:
+            names = _names(root, path)
+        except StorageError as error:
+            if isinstance(root, RemoteObject) or not path:
+                raise
+            odd[path] = str(error)
+            return []
+        if not _SCENE_FILES.isdisjoint(names):
+            odd[path or "."] = ""
+            return []
+        return [
+            f"{path}/{name}".removeprefix("/")
+            for name, is_folder in names.items()
+            if is_folder and name[0] != "." and (path or not only or name in only)
+        ]
+
+    paths = [""]
     with ThreadPoolExecutor(_LISTERS) as pool:
-        for split in splits:
-            paths = [split]
-            for _ in range(_SCENE_DEPTH[split] - 1):
-                listed = zip(paths, pool.map(folders, paths), strict=True)
-                paths = [f"{path}/{name}" for path, names in listed for name in names]
-            keys += paths
-    return keys
+        for depth in range(1, _DEEPEST + 2):
+            found = [path for listed in pool.map(below, paths) for path in listed]
+            paths = []
+            for path in found:
+                is_place = SPLITS.get(path.partition("/")[0]) == depth
+                (places if is_place else paths).append(path)
+    return places, odd
 
 
-def placed_folders(root: Path) -> set[str]:
-    """Return the paths where scenes belong below a folder of this machine, finished or not.
+def _names(root: Path | RemoteObject, path: str) -> dict[str, bool]:
+    """Return the names in a folder, and whether each is a folder.
 
-    Folders that may not be listed are ignored.
+    Raises:
+        StorageError: If it cannot be listed.
     """
+    if isinstance(root, RemoteObject):
+        listed = (root.below(path) if path else root).listed()
+        return {name: size is None for name, (size, _) in listed.items()}
+    folder = root / path
+    with explain_os_errors(f"{folder}: cannot be searched", "Check that it is a readable folder."):
+        above = folder.parents[: len(Path(path).parts)] if folder.is_symlink() else ()
+        if any(map(folder.samefile, above)):
+            raise StorageError(f"{folder}: is a link to a folder above itself. Remove the link.")
+        with os.scandir(folder) as there:
+            return {each.name: each.is_dir(follow_symlinks=False) or Path(each).is_dir()
+                    for each in there}  # fmt: skip
 
-    def folders(path: str) -> list[str]:
-        with suppress(OSError), os.scandir(root / path) as entries:
-            return [each.name for each in entries if each.name[0] != "." and each.is_dir()]
-        return []
 
-    return set(_keys_below(_SCENE_DEPTH, folders))
+def refusal(root: str, path: str) -> str:
+    """Return why a folder cannot be a scene of the release, and the cure; "" if it can."""
+    try:
+        parse_scene_key(path)
+    except SchemaError as error:
+        other = _release_root_of(f"{root}/{path}")
+        if other == root:
+            return str(error)  # the folder's name is wrong, and the error says so
+        cure = f"Move it, or point at {other} instead." if other else "Move it to such a path."
+        return f"{error} {cure}"
+    return ""
+
+
+def _release_root_of(place: str) -> str:
+    """Return the root below which a folder would be a scene of the release; "" if none is."""
+    parts = place.removesuffix("/.").split("/")
+    for name, depth in SPLITS.items():
+        if len(parts) > depth and parts[-depth] == name:
+            return "/".join(parts[:-depth])
+    return ""
 
 
 class RemoteTree:
@@ -534,8 +496,13 @@ class RemoteTree:
         Raises:
             StorageError: If the tree cannot be listed, or no scene is where it belongs.
         """
-        keys = self._once("scenes", lambda: find_remote_scenes(self._root).keys)
-        return FoundScenes(tuple(keys), {})
+
+        def found() -> list[Any]:
+            scenes = find_scene_folders(self._root)
+            return [scenes.keys, scenes.refused]
+
+        keys, refused = self._once("scenes", found)
+        return FoundScenes(tuple(keys), refused)
 
     def files(self, keys: Sequence[str]) -> dict[str, Files]:
         """Return the files of scenes.

@@ -6,6 +6,7 @@ import re
 import pytest
 
 from stereogenbench_data.errors import StorageError
+from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.tree import find_scene_folders
 
 KEYS = (
@@ -42,7 +43,7 @@ def test_other_folders_and_hidden_ones_are_passed_over(tree):
     ("key", "told"),
     [
         ("copy/train/Uniform/Car_Dealer/scene_000000", "Move it, or point at .*/copy instead"),
-        ("train/more/Uniform/Car_Dealer/scene_000000", "found 5 folders"),
+        ("train/Uniform/scene_000000", "found 3 folders"),
         ("train/Uniform/Car_Dealer/scene_1.5", "not a valid folder"),
     ],
 )
@@ -57,6 +58,16 @@ def test_a_misplaced_scene_is_listed_with_the_cure(tree, key, told):
     assert re.search(told, reason)
 
 
+@pytest.mark.parametrize("cure", ["Move it to such a path", "Move it, or point at .*/more instead"])
+def test_a_scene_that_is_too_deep_is_told_with_the_cure(tree, cure):
+    below = "more/train" if "point at" in cure else "more"
+    add(tree, f"train/{below}/Uniform/Car_Dealer/scene_000000")
+
+    (told,) = (text for key, text in walk(tree).broken.items() if "more" in key)
+
+    assert re.search(f"Car_Dealer/scene_000000': .* folders that start with 'train'.*{cure}", told)
+
+
 @pytest.mark.parametrize("place", ["train", "eval/MapSeenInTrain", KEYS[3], ".."])
 def test_a_root_inside_the_release_or_above_it_is_answered_with_the_right_one(tree, place):
     with pytest.raises(StorageError, match=f"Point at {tree} instead"):
@@ -66,7 +77,7 @@ def test_a_root_inside_the_release_or_above_it_is_answered_with_the_right_one(tr
 def test_a_folder_without_scenes_says_what_was_looked_for(tmp_path):
     (tmp_path / "pictures").mkdir()
 
-    told = r"looked for folders train/<family>/<map>/<scene> or eval/.*found pictures in it"
+    told = r"looked for folders train/<family>/<map>/<scene> or eval/.*found pictures"
     with pytest.raises(StorageError, match=told):
         find_scene_folders(tmp_path)
 
@@ -85,9 +96,9 @@ def test_a_link_to_a_folder_above_itself_is_listed_and_not_followed(tree):
     folders = find_scene_folders(tree)
 
     assert folders.keys == KEYS
-    assert folders.refused == {
-        "train/Uniform/loop": "is a link to a folder above itself. Remove the link."
-    }
+    place = "train/Uniform/loop"
+    told = f"{tree / place}: is a link to a folder above itself. Remove the link."
+    assert folders.refused == {place: told}
 
 
 def test_a_folder_that_may_not_be_read_is_listed(tree, monkeypatch):
@@ -104,6 +115,6 @@ def test_a_folder_that_may_not_be_read_is_listed(tree, monkeypatch):
 
     assert len(folders.keys) == 3
     assert folders.refused == {
-        "train/IPD_Gaussian": "cannot be searched (Permission denied). Give permission, or choose "
-        "another place."
+        "train/IPD_Gaussian": f"{tree}/train/IPD_Gaussian: cannot be searched (Permission denied). "
+        f"Give permission, or choose another place."
     }

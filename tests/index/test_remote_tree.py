@@ -11,7 +11,7 @@ from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import build
 from stereogenbench_data.index.scene_folder import describe_scene
-from stereogenbench_data.index.tree import find_remote_scenes, folder_of, stamp_of
+from stereogenbench_data.index.tree import find_scene_folders, folder_of, stamp_of
 from stereogenbench_data.sources.remote import RemoteObject
 from tests.cli.command import invoke, one_line
 from tests.servers.fixtures import BUCKET
@@ -97,8 +97,8 @@ def test_a_part_is_indexed_under_a_name_of_its_own(small_release):
 
 @pytest.mark.usefixtures("hub")
 def test_a_repository_without_a_scene_says_what_was_looked_for():
-    with pytest.raises(StorageError, match=r"holds no scene and no index\.parquet; looked for"):
-        find_remote_scenes(RemoteObject(HUB))
+    with pytest.raises(StorageError, match=r"holds no scene; looked for"):
+        find_scene_folders(RemoteObject(HUB))
 
 
 def test_a_unit_of_depth_in_a_file_of_its_own_counts_afar(small_release, tmp_path, monkeypatch):
@@ -120,4 +120,4 @@ def test_a_plain_web_server_cannot_be_listed(web):
     (web.folder / "train").mkdir()
 
     with pytest.raises(StorageError, match=r"a web server does not list its folders"):
-        find_remote_scenes(RemoteObject(web.url))
+        find_scene_folders(RemoteObject(web.url))
