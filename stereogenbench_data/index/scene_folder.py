@@ -94,7 +94,6 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.schema.training import TrainingDocument, parse_training
-from stereogenbench_data.sources.ranged_file import MemberFile
 
 _T = TypeVar("_T")
 
@@ -320,7 +319,7 @@ class Description:
                 except MediaError as error:
                     self.unread[held] = str(error)
                 finally:
-                    if isinstance(video, MemberFile):
+                    if not isinstance(video, Path):
                         video.close()
 
     def rig(self, conventions: Conventions | None) -> tuple[Rig, SceneLabels]:

@@ -50,6 +50,7 @@ from stereogenbench_data.index.parquet import (
     write_index_file,
 )
 from stereogenbench_data.index.rows import SCHEMA
+from stereogenbench_data.media.container import SeekableFile
 from stereogenbench_data.schema.document import MAX_TEXT_BYTES, require_text_size
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import (
@@ -64,7 +65,7 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.sources.location import is_remote
 from stereogenbench_data.sources.members import read_text_file
-from stereogenbench_data.sources.ranged_file import FIRST_BLOCK, MemberFile, RangedFile
+from stereogenbench_data.sources.ranged_file import FIRST_BLOCK, RangedFile
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy
 
@@ -238,7 +239,7 @@ class SceneFolder:
         where = f"{self.key}/{name}"
         return read_text_file(Path(self._root, where), where=where)
 
-    def video(self, name: str) -> Path | MemberFile:
+    def video(self, name: str) -> Path | SeekableFile:
         """Return a video: its path, or an open file that the caller closes.
 
         Raises:

@@ -7,6 +7,7 @@ containers of the release are allowed, and a path is never read as an address.
 import errno
 import io
 import zlib
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -63,6 +64,19 @@ class SeekableFile(io.RawIOBase):
             raise ValueError(f"a file has no position {start + offset}: seek to 0 or later.")
         self._position = start + offset
         return self._position
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Return the next bytes, all the rest for -1; fewer at the end, or at that of a packet."""
+        stop = self.size if size is None or size < 0 else min(self._position + size, self.size)
+        if stop <= self._position:
+            return b""
+        data = self._bytes(self._position, stop)
+        self._position += len(data)
+        return data
+
+    @abstractmethod
+    def _bytes(self, start: int, stop: int) -> bytes:
+        """Return the bytes from start to stop, which lie within the file, or the first of them."""
 
 
 class FrameReader:

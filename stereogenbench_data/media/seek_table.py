@@ -98,11 +98,10 @@ class SeekTable:
         """Return where the packet ends that holds a byte."""
         return self.bounds[min(bisect_right(self.bounds, byte), self.packets)]
 
-    def header_bytes(self, start: int, size: int | None) -> bytes:
-        """Return bytes of the header from a place on, none where packets lie."""
-        size = LARGEST_HEADER if size is None or size < 0 else size
-        after = start - self.bounds[-1]
-        return self.head[start : start + size] if after < 0 else self.tail[after : after + size]
+    def header_bytes(self, start: int, stop: int) -> bytes:
+        """Return the bytes of the header between two places, none where packets lie."""
+        end = self.bounds[-1]
+        return self.head[start:stop] if start < end else self.tail[start - end : stop - end]
 
     def fits(self, *, file_bytes: int) -> bool:
         """Return whether it can be the table of a file of this size in bytes."""
@@ -169,11 +168,8 @@ class HeaderFile(SeekableFile):
         super().__init__(table.bounds[-1] + len(table.tail))
         self._table = table
 
-    def read(self, size: int | None = -1, /) -> bytes:
-        """Return the next bytes of the header, none at a packet."""
-        data = self._table.header_bytes(self._position, size)
-        self._position += len(data)
-        return data
+    def _bytes(self, start: int, stop: int) -> bytes:
+        return self._table.header_bytes(start, stop)
 
 
 def read_seek_table(

@@ -32,6 +32,7 @@ from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.media.container import SeekableFile
 from stereogenbench_data.media.depth import (
     depth_frame_index,
     measured,
@@ -63,7 +64,7 @@ from stereogenbench_data.selection.plan import Address, Step
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.fetch_ahead import FetchAhead
 from stereogenbench_data.sources.members import MemberSource
-from stereogenbench_data.sources.ranged_file import MemberFile, RangedFile
+from stereogenbench_data.sources.ranged_file import RangedFile
 
 T = TypeVar("T")
 
@@ -112,7 +113,7 @@ class _Stream:
     """
 
     reader: Any
-    file: Path | MemberFile
+    file: Path | SeekableFile
     kept: OrderedDict[Any, Any] = field(default_factory=OrderedDict)
     memories: list[tuple[memoryview, Callable[[], object]]] = field(default_factory=list)
 
@@ -138,7 +139,7 @@ class _Stream:
 
     def close(self) -> None:
         self.reader.close()
-        if isinstance(self.file, MemberFile):
+        if not isinstance(self.file, Path):
             self.file.close()
 
 
@@ -305,12 +306,12 @@ class Streams:
 
 
 @contextmanager
-def _cause_raised(file: Path | MemberFile) -> Iterator[None]:
+def _cause_raised(file: Path | SeekableFile) -> Iterator[None]:
     """Raise the failed fetch that made a video fail, if there was one, and close the file."""
     try:
         yield
     except (MediaError, StorageError) as error:
-        if isinstance(file, MemberFile):
+        if not isinstance(file, Path):
             file.close()
         failure = file.failure if isinstance(file, RangedFile) else None
         if failure is None or failure is error:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from stereogenbench_data.errors import ShardError, StorageError, explain_os_errors
+from stereogenbench_data.media.container import SeekableFile
 from stereogenbench_data.media.seek_table import Position, SeekTable, parse_tables
 from stereogenbench_data.schema.document import require_text_size
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
@@ -20,7 +21,6 @@ from stereogenbench_data.sources.fetch_ahead import FetchAhead, Wanted
 from stereogenbench_data.sources.location import UNSAFE_PATH, is_remote, joined, local_path, shown
 from stereogenbench_data.sources.ranged_file import (
     FileSlice,
-    MemberFile,
     RangedFile,
     require_crc32,
 )
@@ -74,7 +74,7 @@ class MemberSource:
         self._sound: set[tuple[str, int]] = set()
         self._objects: dict[str, RemoteObject] = {}
 
-    def open(self, scene: Scene, name: str) -> Path | MemberFile:
+    def open(self, scene: Scene, name: str) -> Path | SeekableFile:
         """Return one of a scene's files: its path, or an open file that is the caller's to close.
 
         Raises:

@@ -4,7 +4,6 @@ import errno
 import os
 import stat
 import zlib
-from abc import abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -24,33 +23,7 @@ KEPT_BYTES: Final = 2 * LARGEST_BLOCK
 """Bytes of a member that are kept for reading again: a file's header, nearby frames."""
 
 
-class MemberFile(SeekableFile):
-    """A file of the bytes of one member; subclasses read them.
-
-    Attributes:
-        failure: The error of the first fetch that failed, of a file that fetches.
-    """
-
-    def __init__(self, size: int) -> None:
-        """Begin at the start of a file of ``size`` bytes."""
-        super().__init__(size)
-        self.failure: StorageError | None = None
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        """Return the next bytes, all the rest for -1; fewer at the end, or at that of a packet."""
-        stop = self.size if size is None or size < 0 else min(self._position + size, self.size)
-        if stop <= self._position:
-            return b""
-        data = self._bytes(self._position, stop)
-        self._position += len(data)
-        return data
-
-    @abstractmethod
-    def _bytes(self, start: int, stop: int) -> bytes:
-        """Return the bytes from start to stop, which lie within the member, or the first."""
-
-
-class FileSlice(MemberFile):
+class FileSlice(SeekableFile):
     """A member of a local shard or of the cache; it stays readable if the file is replaced."""
 
     def __init__(self, path: Path, member: Member) -> None:
@@ -99,7 +72,7 @@ class FileSlice(MemberFile):
         return data
 
 
-class RangedFile(MemberFile):
+class RangedFile(SeekableFile):
     """A member whose bytes are fetched in blocks as they are read, ahead of the reader.
 
     Blocks start small and double while reading continues where one ended, so a first frame costs
@@ -136,6 +109,7 @@ class RangedFile(MemberFile):
                 be before the member, and end behind it; None if nothing was.
         """
         super().__init__(size)
+        self.failure: StorageError | None = None
         self._fetch = fetch
         self._table = table
         self._ahead = ahead
@@ -155,7 +129,7 @@ class RangedFile(MemberFile):
     def _bytes(self, start: int, stop: int) -> bytes:
         table = self._table
         if table is not None:
-            header = table.header_bytes(start, stop - start)
+            header = table.header_bytes(start, stop)
             if header or self.hides_packets:
                 return header
             first, data = self._piece(start, table.packet_end(start))
