@@ -1,7 +1,7 @@
 """Stored depth: which streams keep it whole, its numbers, what they mean, and how it is packed.
 
-A depth picture is read in the pixel format in which it is stored. No conversion is ever asked of
-FFmpeg: its conversion to 8 bits drops the low byte, and one between 10, 12 and 16 bits rescales.
+A depth picture is read in the pixel format in which it is stored. FFmpeg converts no number: its
+conversion to 8 bits drops the low byte, and one between 10, 12 and 16 bits rescales.
 
 Only FFV1 of one grey plane is packed as it is: of such a video the stored numbers are all there is.
 """
@@ -41,7 +41,7 @@ from stereogenbench_data.media.depth_frames import (
     compressed_chunk,
     frame_file,
 )
-from stereogenbench_data.media.video import VideoReader, plane_numbers
+from stereogenbench_data.media.video import RED_GREEN_BLUE, VideoReader, plane_numbers
 from stereogenbench_data.schema.depth_contract import Statement, agreed, stated_in_tags
 from stereogenbench_data.schema.records import DepthEncoding, DepthRisk
 from stereogenbench_data.schema.release import DEFAULT_DEPTH_UNIT_M
@@ -63,9 +63,8 @@ _NUMBER_FORMAT: Final = re.compile(
 )
 _COLOUR_FORMAT: Final = re.compile(
     r"(?P<planes>gbrp|gbrap)(?P<bits>9|10|12|14|16)?(?P<order>le|be)?|"
-    r"(?P<packed>[rgba0]{3,4})(?:24|(?P<wide>48|64)(?P<wide_order>le|be))?"
+    r"(?P<packed>[rgba0]{3,4})(?:24|(?P<wide>48|64)(?:le|be))?"
 )
-_PLANES_OF_GBR: Final = ((2, 0), (0, 0), (1, 0))
 _DECIDED: Final = 4.0
 """By how much the smoother of two orders of bytes must be smoother, to be the right one."""
 
@@ -77,17 +76,14 @@ class DepthLayout:
     Attributes:
         bits: Bits of a stored number.
         has_chroma: Whether there are chroma planes, which are not read.
-        dtype: The type of a channel as it is stored.
-        channels: Of colours, where red, green and blue stand: (plane, place in the pixel); () for
-            one channel of numbers.
-        per_pixel: How many numbers a pixel has in a plane.
+        dtype: The type of a channel in a plane of its own.
+        is_colour: Whether there are channels of red, green and blue.
     """
 
     bits: int
     has_chroma: bool
     dtype: str
-    channels: tuple[tuple[int, int], ...] = ()
-    per_pixel: int = 1
+    is_colour: bool = False
 
 
 @cache
@@ -103,13 +99,11 @@ def _layout(pixel_format: str) -> DepthLayout | None:
     if match["planes"]:
         bits = int(match["bits"] or 16)  # two channels of 8
         dtype = _dtype(match["bits"], match["order"])
-        return DepthLayout(bits, has_chroma=False, dtype=dtype, channels=_PLANES_OF_GBR)
+        return DepthLayout(bits, has_chroma=False, dtype=dtype, is_colour=True)
     packed = match["packed"]
     if not {"r", "g", "b"} <= set(packed) or len(set(packed)) != len(packed):
         return None
-    channels = tuple((0, packed.index(letter)) for letter in "rgb")
-    dtype = _dtype(match["wide"], match["wide_order"])
-    return DepthLayout(16, has_chroma=False, dtype=dtype, channels=channels, per_pixel=len(packed))
+    return DepthLayout(16, has_chroma=False, dtype=_dtype(match["wide"], "le"), is_colour=True)
 
 
 def _dtype(bits: str | None, order: str | None) -> str:
@@ -129,7 +123,7 @@ def grey_format(pixel_format: str) -> str:
     ('gray12be', 'gray10le', 'gray16le')
     """
     layout = _layout(pixel_format)
-    if layout is None or not (layout.channels or layout.has_chroma):
+    if layout is None or not (layout.is_colour or layout.has_chroma):
         return pixel_format
     return "gray" if layout.bits == 8 else f"gray{layout.bits}le"
 
@@ -152,7 +146,7 @@ def require_depth_stream(
     layout = _layout(pixel_format)
     stored = f"{name}: depth is stored by codec {codec} as {pixel_format}"
     is_lossy = not codec_of(codec).is_lossless and not codec.endswith(LOSSLESS_SUFFIX)
-    if layout is None or (layout.channels and is_lossy):
+    if layout is None or (layout.is_colour and is_lossy):
         why = "which is not one number of 8 to 16 bits a pixel"
         if layout is not None:
             why = "lossy, and depth in channels of colours survives only without loss"
@@ -221,7 +215,7 @@ def read_depth_units(
     )
     if isinstance(reader, DepthFrames):
         return reader.units(index)
-    if layout.channels:
+    if layout.is_colour:
         units = _units_of_channels(reader, index, layout)
     else:
         numbers = plane_numbers(reader.frame(index), 0, dtype=layout.dtype)
@@ -255,12 +249,10 @@ def _channels(
 ) -> tuple[Shaped[np.ndarray, "h w"], ...]:
     """Return the red, green and blue channel of a frame."""
     frame = reader.frame(index)
-    return tuple(
-        plane_numbers(frame, plane, dtype=layout.dtype, per_pixel=layout.per_pixel)[
-            :, place :: layout.per_pixel
-        ]
-        for plane, place in layout.channels
-    )
+    if len(frame.planes) == 1:  # the numbers are moved to planes, and stay as they are
+        planar = "gbrp" if layout.dtype == "u1" else "gbrp16le"
+        frame = reader.scaler.reformat(frame, format=planar, threads=1)
+    return tuple(plane_numbers(frame, plane, dtype=layout.dtype) for plane in RED_GREEN_BLUE)
 
 
 def _byte_order(channels: tuple[Shaped[np.ndarray, "h w"], ...], *, name: str) -> tuple[int, int]:

@@ -56,7 +56,7 @@ NO_COLOUR: Final = (
 _ASPECT_SHARE: Final = 0.01
 """How far a tagged pixel aspect, which is stored as a small fraction, may be off the rig's."""
 
-_RED_GREEN_BLUE: Final = (2, 0, 1)
+RED_GREEN_BLUE: Final = (2, 0, 1)
 """Where the planes of FFmpeg's gbrp are."""
 
 
@@ -404,7 +404,7 @@ def read_rgb(
         pixels = plane_numbers(picture, 0, dtype="u1", per_pixel=3)
         out[...] = pixels.reshape(height, width, 3).transpose(2, 0, 1)
         return out
-    for channel, plane in enumerate(_RED_GREEN_BLUE):
+    for channel, plane in enumerate(RED_GREEN_BLUE):
         out[channel] = plane_numbers(picture, plane, dtype="u1")
     return out
 

@@ -103,7 +103,9 @@ def written_colours(clips, name, channels, pixel_format, *codec):
         pictures = np.stack([green, blue, red])
     else:
         order = {"r": red, "g": green, "b": blue, "0": 0 * red}
-        pictures = np.stack([order[each] for each in pixel_format.removesuffix("24")], -1)[None]
+        letters = pixel_format.removesuffix("24").removesuffix("48be")
+        pictures = np.stack([order[each] for each in letters], -1)[None]
+        pictures = pictures.astype(">u2") if pixel_format.endswith("be") else pictures
     return clips.encode(name, "-c:v", *codec, pictures=pictures, pixel_format=pixel_format)
 
 
@@ -116,6 +118,7 @@ BYTES = {
     "red and green": (("high", "low", "none"), "bgr0", "ffv1"),
     "blue and green": (("none", "low", "high"), "bgr0", "ffv1"),
     "three equal ones of 16 bits": (("both", "both", "both"), "gbrp16le", "ffv1"),
+    "three equal ones of 16 bits by pixel": (("both", "both", "both"), "rgb48be", "png"),
     "lossless H.264": (("high", "low", "none"), "bgr24", "libx264rgb", "-qp", "0"),
     "lossless HEVC": (("none", "high", "low"), "gbrp", *HEVC, "lossless=1:log-level=0"),
 }  # fmt: skip
