@@ -42,7 +42,7 @@ from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.schema.conventions import Conventions, depth_of
 from stereogenbench_data.schema.document import brief
 from stereogenbench_data.schema.parse import parse_scene_key
-from stereogenbench_data.schema.records import REMARKS, Remark, Scene, SceneId
+from stereogenbench_data.schema.records import Remark, Scene, SceneId, remarks_told
 from stereogenbench_data.schema.release import (
     COMPLETE_JSON,
     METADATA_FILES,
@@ -400,7 +400,7 @@ def report_of(
         scenes=tuple(scenes),
         incomplete=incomplete,
         broken=dict(sorted((folders.refused | broken).items())),
-        notes=(*subsets, *named, *_remarks(found), *_depth_notes(found)),
+        notes=(*subsets, *named, *remarks_told(found), *_depth_notes(found)),
         is_part=is_part,
     )
 
@@ -430,18 +430,6 @@ def _without_unfetched(scenes: list[Scene]) -> list[Scene]:
         remarks += [Remark("videos", "; ".join(left))] if left else []
         kept.append(replace(scene, remarks=tuple(remarks)))
     return kept
-
-
-def _remarks(scenes: list[Scene]) -> list[str]:
-    """Return what is remarked about scenes, once for each kind, and what it holds up."""
-    texts: dict[str, list[str]] = defaultdict(list)
-    for scene in scenes:
-        for about in {remark.about for remark in scene.remarks}:
-            texts[about].append(scene.remark(about))
-    return [
-        f"{about} of {counted(len(found), 'scene')} (holds up {REMARKS[about]}), such as {found[0]}"
-        for about, found in sorted(texts.items())
-    ]
 
 
 def _depth_notes(scenes: list[Scene]) -> list[str]:

@@ -27,7 +27,7 @@ from stereogenbench_data.index.parquet import (
 )
 from stereogenbench_data.index.rows import scene_of
 from stereogenbench_data.schema.conventions import Conventions
-from stereogenbench_data.schema.records import Scene, SceneId
+from stereogenbench_data.schema.records import Scene, SceneId, remarks_told
 from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.sources.location import (
     is_remote,
@@ -249,17 +249,10 @@ def listed(left_out: Mapping[str, str]) -> str:
     return "\n  ".join([f"{counted(len(left_out), 'scene')} cannot be used:", *lines])
 
 
-_PHRASES: Final = {
-    "size": "the videos' picture size counts, where baseline.json has another",
-    "stated": "the videos and baseline.json count, where files state otherwise",
-    "baselines": "baselines that are not recorded are sums of their neighbours",
-    "pair": "the primary pair of baseline.json counts, where another file has another",
-    "frames": "the frames that all videos have are used",
-    "lens": "a pinhole lens is assumed, where baseline.json states another model",
-    "marker": "no scene has _scene_complete.json, so it is not known which were finished",
-    "world": "several readings of the poses fit the baselines, and fields that depend on the "
-    "reading are refused",
-}
+_ASSUMED: Final = (
+    "size", "stated", "baselines", "pair", "frames", "lens", "marker", "world", "pixels",
+)  # fmt: skip
+"""Remarks that are told when a tree is opened."""
 
 
 _PLAIN: Final = "unreal axes"
@@ -271,29 +264,19 @@ class AssumptionWarning(UserWarning):
 
 def assumptions(scenes: Iterable[Scene], *, where: str) -> str:
     """Return what was taken for granted about scenes and what was measured; "" if nothing."""
-    counts: Counter[str] = Counter()
-    firsts: dict[str, str] = {}
-    for scene in scenes:
-        if scene.conventions is not None:
-            continue
-        found = {_PHRASES[each.about]: each for each in scene.remarks if each.about in _PHRASES}
-        counts.update(found.keys())
-        for phrase, each in found.items():
-            if each.about in ("size", "pair", "stated"):
-                firsts.setdefault(phrase, f", such as {each.text}")
-        pixels = scene.remark("pixels").partition(": ")[2]
-        counts.update([f"{pixels}; disparity follows from the sensor's width"] if pixels else [])
-        form = (scene.pose_form or "").split("|")[0].partition(" @ ")[0]
-        if form and _PLAIN not in form and not scene.remark("world"):
-            counts[f"poses are read as {shortened(form, 200)}: measured, the cameras' distances "
-                   "are the baselines"] += 1  # fmt: skip
-    if not counts:
+    scenes = [scene for scene in scenes if scene.conventions is None]
+    forms = Counter(
+        (scene.pose_form or _PLAIN).split("|")[0].partition(" @ ")[0]
+        for scene in scenes if not scene.remark("world")
+    )  # fmt: skip
+    told = remarks_told(scenes, _ASSUMED) + [
+        f"poses are read as {shortened(form, 200)}: measured, the cameras' distances are the "
+        f"baselines ({counted(count, 'scene')})"
+        for form, count in forms.items() if _PLAIN not in form
+    ]  # fmt: skip
+    if not told:
         return ""
-    told = "; ".join(
-        f"{phrase} ({counted(count, 'scene')}{firsts.get(phrase, '')})"
-        for phrase, count in counts.items()
-    )
     return (
-        f"{where}: {told}. `stereogenbench conventions {where} -o conventions.toml` writes down "
-        f"how its files are read, for conventions=."
+        f"{where}: {'; '.join(told)}. `stereogenbench conventions {where} -o conventions.toml` "
+        f"writes down how its files are read, for conventions=."
     )

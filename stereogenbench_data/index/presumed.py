@@ -541,9 +541,7 @@ class Presumption:
         baselines: Whether each ``baseline.json`` was read.
     """
 
-    def __init__(
-        self, tree: ListedTree, *, forms: Sequence[str], baselines: Baselines = "read"
-    ) -> None:
+    def __init__(self, tree: ListedTree, *, forms: Sequence[str], baselines: Baselines) -> None:
         """Name the tree, and how the poses are read of the scenes that were read."""
         self.was_told = False
         self.is_remote = tree.remote is not None

@@ -4,7 +4,7 @@ A record contains the values of a file, with units in the names and nothing deri
 """
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal, get_args
 
@@ -16,6 +16,7 @@ from stereogenbench_data.schema.release import (
     Split,
     Subset,
 )
+from stereogenbench_data.schema.text import counted
 
 DepthKind = Literal["planar", "ray"]
 DepthForm = Literal["depth", "inverse"]
@@ -79,27 +80,28 @@ class Remark:
 
 
 REMARKS: Final = {
-    "poses": "fields and rigs that need poses; without them the rig is assumed rectified",
-    "world": "poses in the world: several readings fit",
-    "principal point": "the intrinsics; the image's centre is assumed",
-    "left": "disparity, and all that needs poses: the rig is stated in two ways",
-    "primary pair": "nothing: cameras are taken to be numbered from left to right",
-    "pair": "nothing: the primary pair of baseline.json counts",
-    "sensor": "the focal length in mm: the release's sensor is assumed",
-    "videos": "pairs of cameras whose videos are missing",
-    "frames": "nothing: frames that all files have are used",
-    "depth": "depth, unless you pass a DepthEncoding with its unit_m",
-    "size": "nothing: the videos' size is used",
-    "stated": "nothing: the videos and baseline.json count",
-    "lens": "nothing: models of lenses are not applied",
-    "pixels": "nothing: disparity follows from the sensor's width",
-    "marker": "nothing: no scene of the tree has its completion mark",
-    "baselines": "nothing",
-    "unit": "nothing: baselines lie outside of the family's range",
-    "labels": "nothing",
-    "caption": "nothing",
+    "poses": "fields and rigs that need poses are refused, and the rig is assumed rectified",
+    "world": "several readings of the poses fit the baselines, and fields that depend on the "
+    "reading are refused",
+    "principal point": "intrinsics are refused; for all else the image's centre is assumed",
+    "left": "disparity, and all that needs poses, is refused: the rig is stated in two ways",
+    "primary pair": "cameras are taken to be numbered from left to right",
+    "pair": "the primary pair of baseline.json counts, where another file has another",
+    "sensor": "the release's sensor is assumed, so the focal length in mm is not known",
+    "videos": "pairs of cameras whose videos are missing are refused",
+    "frames": "the frames that all videos have are used",
+    "depth": "depth is refused, unless you pass a DepthEncoding with its unit_m",
+    "size": "the videos' picture size counts, where baseline.json has another",
+    "stated": "the videos and baseline.json count, where files state otherwise",
+    "lens": "a pinhole lens is assumed, where baseline.json states another model",
+    "pixels": "disparity follows from the sensor's width, where pixels would not be square",
+    "marker": "no scene has _scene_complete.json, so it is not known which were finished",
+    "baselines": "baselines that are not recorded are sums of their neighbours",
+    "unit": "baselines lie outside of the family's range",
+    "labels": "labels that are not understood are left out",
+    "caption": "captions that are not understood are left out",
 }
-"""What a remark may be about, and what it holds up."""
+"""What a remark may be about, and what follows from it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,3 +353,15 @@ class Scene:
     def held_videos(self) -> tuple[str, ...]:
         """The names in ``members`` of the videos and packed depth files that the data have."""
         return tuple(name for name in map(self.held_name, VIDEO_FILES) if name in self.members)
+
+
+def remarks_told(scenes: Iterable[Scene], about: Collection[str] = REMARKS.keys()) -> list[str]:
+    """Return what follows from remarks about scenes, once for each kind, with the first of them."""
+    texts: dict[str, list[str]] = {}
+    for scene in scenes:
+        for each in {remark.about for remark in scene.remarks}.intersection(about):
+            texts.setdefault(each, []).append(scene.remark(each))
+    return [
+        f"{REMARKS[each]} ({counted(len(found), 'scene')}, such as {found[0]})"
+        for each, found in sorted(texts.items())
+    ]
