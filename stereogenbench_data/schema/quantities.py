@@ -310,8 +310,11 @@ def steps_of(path: str) -> list[str | int]:
     steps = [*_STEP.finditer(path)]
     if "$" + "".join(step[0] for step in steps) != path:
         raise LookupError(path)
-    return [int(number) if number else json.loads(quoted) if quoted else plain
-            for plain, number, quoted in (step.groups() for step in steps)]  # fmt: skip
+    try:
+        return [int(number) if number else json.loads(quoted) if quoted else plain
+                for plain, number, quoted in (step.groups() for step in steps)]  # fmt: skip
+    except json.JSONDecodeError as error:  # an escape that JSON does not have
+        raise LookupError(path) from error
 
 
 def value_at(document: Any, path: str) -> Any:

@@ -1,5 +1,7 @@
 """Files of conventions: what they may state, and what is refused with file, key, value and cure."""
 
+import re
+
 import pytest
 
 from stereogenbench_data.errors import SchemaError, StorageError
@@ -145,6 +147,14 @@ def test_quantities_under_unknown_names_are_read_where_conventions_say(rig_docum
     ).shapes
 
     assert parse_rig(dumped(rig_document), where="b", shape=shape)[0] == expected
+
+
+@pytest.mark.parametrize("place", ["$.none", "$.pairwise_pairs[99]", r'$["\x"]', r'$["\u12"]'])
+def test_a_place_that_a_file_does_not_have_is_named(rig_document, dumped, place):
+    (shape,) = read(f"[focal_length]\nplace = '{place}'\n".encode()).shapes
+
+    with pytest.raises(SchemaError, match=rf"{re.escape(place)} is not in the file.*focal_length"):
+        parse_rig(dumped(rig_document), where="b", shape=shape)
 
 
 def test_the_only_number_beside_two_cameras_may_be_called_a_baseline(rig_document, dumped):
