@@ -5,7 +5,6 @@ and stay inside it, links followed. Keys that are not known are refused.
 """
 
 import hashlib
-import math
 import os
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, get_args
 
 from stereogenbench_data.errors import SynthesisError
+from stereogenbench_data.schema.document import is_number
 from stereogenbench_data.synthesis.renderer import Spawn, View
 
 Device = Literal["CPU", "GPU"]
@@ -206,12 +206,8 @@ _KINDS: Final[dict[str, Callable[..., Any]]] = {
 }
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
 def _is_positive(value: Any) -> bool:
-    return _is_number(value) and value > 0
+    return is_number(value) and value > 0
 
 
 def _is_size(value: Any) -> bool:
@@ -221,7 +217,7 @@ def _is_size(value: Any) -> bool:
 def _is_box(value: Any) -> bool:
     match value:
         case [[_, _, _] as low, [_, _, _] as high]:
-            return all(map(_is_number, (*low, *high))) and all(map(lt, low, high))
+            return all(map(is_number, (*low, *high))) and all(map(lt, low, high))
     return False
 
 
