@@ -15,7 +15,6 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry.pose import (
     CameraPoses,
     nearest_rotation,
@@ -126,17 +125,10 @@ def _read(
     """Return the poses of a form, None where the numbers are not such rotations."""
     values = turn.values
     places = values[..., 3] if place is None else place.values
-    is_exact = kind[0] in ("quaternion", "rotator") and axes == "unreal" and "w2c" not in kind
-    try:
-        if kind[0] == "matrix":
-            values, places = _parted(values, kind, places)
-            turns = _rotations(values)
-        elif kind[0] == "quaternion":
-            values = values[..., [kind[1].index(each) for each in "xyzw"]]
-            turns = rotation_from_quaternion_xyzw(_unit_quaternions(values))
-        else:
-            turns = _ANGLES[kind[0]](_degrees(values, kind, turn.components))
-    except GeometryError:
+    if kind[0] == "matrix":
+        values, places = _parted(values, kind, places)
+    turns = _rotations(values, kind, turn.components)
+    if turns is None:
         return None
     if "w2c" in kind:
         turns = np.swapaxes(turns, -1, -2)
@@ -147,8 +139,8 @@ def _read(
         return None
     if hands.flat[0] < 0:  # The world has the other hand: all is mirrored, the cameras too.
         turns, places = turns * _MIRROR[:, None], places * _MIRROR
-    if not is_exact:
-        turns = nearest_rotation(turns)
+    is_exact = kind[0] in ("quaternion", "rotator") and axes == "unreal" and "w2c" not in kind
+    turns = turns if is_exact else nearest_rotation(turns)
     return CameraPoses.from_unreal(np.ascontiguousarray(places), turns, unit_m=unit_m)
 
 
@@ -168,35 +160,29 @@ def _parted(
     return values[..., :3, :3], values[..., :3, 3] if values.shape[-1] == 4 else place
 
 
-def _degrees(
-    values: np.ndarray, names: list[str], components: tuple[str, ...]
-) -> Float64[np.ndarray, "*n 3"]:
-    """Return angles in degrees: of rotators pitch, yaw, roll; of others in the order written."""
-    if names[0] == "rotator" and components != _ROTATOR:
-        values = values[..., [names.index(each) - 1 for each in _ROTATOR]]
-    degrees = np.rad2deg(values) if "rad" in names else values
-    if not np.abs(degrees).max(initial=0) <= _MOST_TURNS_DEG:
-        raise GeometryError("no angles")
-    return degrees
+def _rotations(
+    values: np.ndarray, kind: list[str], components: tuple[str, ...]
+) -> Float64[np.ndarray, "*n 3 3"] | None:
+    """Return the rotations, or of matrices reflections, that numbers are in a form; else None."""
+    if kind[0] == "matrix":
+        products = values @ np.swapaxes(values, -1, -2)
+        if not (np.abs(products - np.eye(3)) <= TOLERANCE).all():
+            return None
+        signs = np.sign(np.linalg.det(values))[..., None, None]
+        return np.asarray(nearest_rotation(values * signs) * signs)
+    if kind[0] == "quaternion":
+        values = values[..., [kind[1].index(each) for each in "xyzw"]]
+        norms = np.sqrt(np.sum(np.square(values), axis=-1, keepdims=True))
+        is_unit = (np.abs(norms - 1) <= TOLERANCE).all()
+        return rotation_from_quaternion_xyzw(values / norms) if is_unit else None
+    if kind[0] == "rotator" and components != _ROTATOR:
+        values = values[..., [kind.index(each) - 1 for each in _ROTATOR]]
+    degrees = np.rad2deg(values) if "rad" in kind else values
+    is_angle = np.abs(degrees).max(initial=0) <= _MOST_TURNS_DEG
+    return _ANGLES[kind[0]](degrees) if is_angle else None
 
 
 _MOST_TURNS_DEG: Final = 1e5
-
-
-def _unit_quaternions(values: Float64[np.ndarray, "*n 4"]) -> Float64[np.ndarray, "*n 4"]:
-    norms = np.sqrt(np.sum(np.square(values), axis=-1, keepdims=True))
-    if not (np.abs(norms - 1) <= TOLERANCE).all():
-        raise GeometryError("no unit quaternions")
-    return np.asarray(values / norms)
-
-
-def _rotations(matrices: Float64[np.ndarray, "*n 3 3"]) -> Float64[np.ndarray, "*n 3 3"]:
-    """Return the nearest rotations or reflections of matrices that are nearly such."""
-    products = matrices @ np.swapaxes(matrices, -1, -2)
-    if not (np.abs(products - np.eye(3)) <= TOLERANCE).all():
-        raise GeometryError("no rotation matrices")
-    signs = np.sign(np.linalg.det(matrices))[..., None, None]
-    return np.asarray(nearest_rotation(matrices * signs) * signs)
 
 
 def _from_vectors_deg(vectors_deg: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3 3"]:
