@@ -33,7 +33,7 @@ from stereogenbench_data.errors import (
 )
 from stereogenbench_data.evaluation.protocol import Tier
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.media.video import VideoReader, plane_numbers, probe, read_rgb
+from stereogenbench_data.media.video import VideoReader, probe, read_rgb
 from stereogenbench_data.samples.fields import Request, Sample
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.schema.records import DepthEncoding
@@ -46,8 +46,6 @@ VIDEO_SUFFIXES: Final = (".mp4", ".mkv")
 _ITEM_DIGITS: Final = 16
 _PNG_BITS_AT: Final = 24
 """Where a PNG's header has the bits of a channel, which Pillow reduces from 16 to 8 unasked."""
-_RED_GREEN_BLUE: Final = (2, 0, 1)
-"""Where the planes of FFmpeg's gbrp are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,7 +275,7 @@ def scaled_rgb(picture: Any, *, size: Size, scaler: VideoReformatter) -> Any:
         interpolation=Interpolation.AREA if shrinks else Interpolation.BICUBIC,
         threads=1,
     )
-    return np.stack([plane_numbers(frame, plane, dtype="u1") for plane in _RED_GREEN_BLUE])
+    return np.ascontiguousarray(frame.to_ndarray().transpose(2, 0, 1))
 
 
 Method = Callable[[dict[str, Any]], Any]

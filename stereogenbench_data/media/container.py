@@ -407,8 +407,8 @@ def merged_tags(container: Mapping[str, str], stream: Mapping[str, str]) -> dict
     return tags
 
 
-def frames_by_duration(container: InputContainer) -> int | None:
-    """Return how many frames fill the time from start to end, None if it is not a whole number.
+def frames_by_duration(container: InputContainer) -> int:
+    """Return how many frames fill the time from start to end, 0 if it is not a whole number.
 
     Matroska's duration, as FFmpeg writes it, is the time at which the last frame ends.
     """
@@ -416,10 +416,10 @@ def frames_by_duration(container: InputContainer) -> int | None:
     rate, time_base = exact(stream.average_rate), exact(stream.time_base)
     start = stream.start_time
     if container.duration is None or start is None or rate is None or time_base is None:
-        return None
+        return 0
     count = rate * (Fraction(container.duration, 1_000_000) - start * time_base)
     whole = round(count)
-    return whole if whole > 0 and abs(count - whole) <= Fraction(1, 10) else None
+    return whole if whole > 0 and abs(count - whole) <= Fraction(1, 10) else 0
 
 
 def require_whole_payload(container: InputContainer, *, name: str) -> None:

@@ -109,7 +109,7 @@ def steady_clock(container: InputContainer, *, frames: int) -> SteadyClock | Non
         return None
     step = 1 / (rate * time_base)
     if stream.frames == 0:
-        agrees = 0 <= (frames_by_duration(container) or 0) - frames <= MOST_EXTRA_FRAMES
+        agrees = 0 <= frames_by_duration(container) - frames <= MOST_EXTRA_FRAMES
     else:
         entries = list(stream.index_entries)
         agrees = (

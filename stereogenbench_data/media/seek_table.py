@@ -279,7 +279,7 @@ def _by_clusters(container: InputContainer, file: VideoFile) -> SeekTable | None
     The frames behind a key frame lie somewhere in its part.
     """
     stream = container.streams.video[0]
-    frames = frames_by_duration(container) or 0
+    frames = frames_by_duration(container)
     clock = steady_clock(container, frames=frames)
     if clock is None:
         return None

@@ -91,7 +91,7 @@ def probe(
     if frames and not (is_intra_only and isinstance(file, str | Path)):
         return facts
     with open_container(file, name=name) as container:
-        claimed = frames or frames_by_duration(container) or 0
+        claimed = frames or frames_by_duration(container)
         steady = steady_clock(container, frames=claimed)
         frames = len(table_clock(container, name=name, steady=steady).times)
     if frames == 0:
@@ -105,7 +105,7 @@ def _frames_in_header(container: InputContainer) -> int:
     if stream.frames:
         is_cut = any(entry.is_discard for entry in stream.index_entries)
         return 0 if is_cut else stream.frames
-    frames = frames_by_duration(container) or 0
+    frames = frames_by_duration(container)
     clock = steady_clock(container, frames=frames)
     if clock is None:
         return 0
@@ -339,23 +339,19 @@ def require_pixel_aspect(pixel_aspect: float, rig: Rig, *, name: str) -> None:
 
 
 def plane_numbers(
-    frame: VideoFrame, plane: int, *, dtype: str, per_pixel: int = 1
+    frame: VideoFrame, plane: int, *, dtype: str
 ) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]:
-    """Return a plane that is as high as the picture, as a view of the frame's own memory.
+    """Return a plane (h, w) as high as the picture, as a view of the frame's own memory.
 
     Args:
         frame: A picture, whose rows may be padded.
         plane: Which plane, from 0.
         dtype: "u1", "<u2" or ">u2", as the numbers are stored.
-        per_pixel: How many numbers stand in the plane for each pixel.
-
-    Returns:
-        (h, w * per_pixel), of the dtype as stored.
     """
     source = frame.planes[plane]
     row_length = source.line_size // np.dtype(dtype).itemsize
     numbers = np.frombuffer(memoryview(source), dtype=dtype, count=frame.height * row_length)
-    return numbers.reshape(frame.height, row_length)[:, : frame.width * per_pixel]
+    return numbers.reshape(frame.height, row_length)[:, : frame.width]
 
 
 def read_rgb(
@@ -401,8 +397,7 @@ def read_rgb(
             f"cannot be converted to RGB of {width}x{height} ({error.strerror}): write it again."
         ) from error
     if picture.format.name == "rgb24":
-        pixels = plane_numbers(picture, 0, dtype="u1", per_pixel=3)
-        out[...] = pixels.reshape(height, width, 3).transpose(2, 0, 1)
+        out[...] = picture.to_ndarray().transpose(2, 0, 1)
         return out
     for channel, plane in enumerate(RED_GREEN_BLUE):
         out[channel] = plane_numbers(picture, plane, dtype="u1")
