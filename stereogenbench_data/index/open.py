@@ -49,10 +49,8 @@ from stereogenbench_data.index.rows import SCHEMA, scene_of
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import SceneId
 from stereogenbench_data.schema.release import (
-    BASELINE_JSON,
     CAMERA_COUNT,
     COMPLETE_JSON,
-    TRAJECTORY_JSON,
     VIDEO_FILES,
 )
 from stereogenbench_data.schema.text import counted, shortened
@@ -237,7 +235,7 @@ def restated(
     Raises:
         StorageError: If the rows were described by other conventions, or files contradict these.
     """
-    from stereogenbench_data.index.scene_folder import metadata_differences
+    from stereogenbench_data.index.scene_folder import described_again
     from stereogenbench_data.sources.members import MemberSource
 
     texts = [shape.text() for shape in conventions.shapes]
@@ -254,13 +252,13 @@ def restated(
     rows = np.unique(np.linspace(0, table.num_rows - 1, _READ_AGAIN).astype(int))
     for row in rows.tolist():
         scene = replace(scene_of(table.slice(row, 1).to_pylist()[0]), conventions=texts[0])
-        names = [name for name in (BASELINE_JSON, TRAJECTORY_JSON) if name in scene.members]
-        found = metadata_differences(scene, {name: source.read(scene, name) for name in names})
-        if found:
-            name, difference = found[0]
+        videos = [name for name in VIDEO_FILES if scene.held_name(name) in scene.members][:1]
+        _, found = described_again(scene, source, videos=videos)
+        for name, difference in found[:1]:
+            by = f"; so it is by {conventions.where}. Correct the conventions" if name else ""
             raise StorageError(
-                f"{where}: {scene.id.key}/{name}: {difference}; so it is by {conventions.where}. "
-                f"Correct the conventions. If the index is wrong: {made_again(where)}"
+                f"{where}: {scene.id.key}/{name}: {difference}{by}. If the index is wrong: "
+                f"{made_again(where)}"
             )
     replaced: dict[str, Any] = {"conventions": texts[0]}
     encoding = None if shape.depth is None else shape.depth.encoding

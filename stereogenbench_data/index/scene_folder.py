@@ -1,14 +1,14 @@
 """One scene's folder: whether it is finished, whole and consistent, and its row of the index.
 
 Everything that an index says of a scene comes from its JSON files and the headers of its videos. No
-picture is decoded unless the share of measured depth is asked for. `metadata_differences` compares
-the same files with an existing row.
+picture is decoded unless the share of measured depth is asked for. `described_again` compares files
+with an existing row.
 """
 
 import functools
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -29,12 +29,11 @@ from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_re
 from stereogenbench_data.index.evidence import (
     SidesError,
     Understood,
-    poses_as,
     shape_of,
     understood_poses,
 )
 from stereogenbench_data.index.tree import FILES, Files, SceneFolder, folder_of
-from stereogenbench_data.media.container import StreamFacts, depth_coding
+from stereogenbench_data.media.container import SeekableFile, StreamFacts, depth_coding
 from stereogenbench_data.media.decoder import MOST_EXTRA_FRAMES
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
@@ -94,6 +93,8 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.schema.training import TrainingDocument, parse_training
+from stereogenbench_data.sources.members import MemberSource
+from stereogenbench_data.sources.ranged_file import RangedFile
 
 _T = TypeVar("_T")
 
@@ -299,7 +300,9 @@ class Description:
                 self.unread[name] = missing_video(self.key, name)
             elif opened is None or name in opened:
                 video, where = self.folder.video(held), self.where(held)
-                reads: Literal["all", "little"] = "all" if isinstance(video, Path) else "little"
+                reads: Literal["all", "little"] = "all"
+                if isinstance(video, RangedFile):
+                    reads = "little"
                 try:
                     is_picture = name.endswith(".mp4")
                     facts = probe(
@@ -527,9 +530,12 @@ class Description:
         """Return the row, which in training shards must be what their document says."""
         if self.document is None:
             return scene
-        some = next(iter(self.facts.values()))
+        some, files = next(iter(self.facts.values())), self.document.files
+        here = [name for name in files if name in self.files]
+        sizes = (tuple(each[name][0] for name in here) for each in (self.files, files))
         for what, found, said in (
             ("key", self.key, self.document.key),
+            ("sizes of files", *sizes),
             ("size", (some.width_px, some.height_px), self.document.size_px),
             ("key frames", scene.key_frames, self.document.key_frames),
         ):
@@ -748,102 +754,113 @@ def derived_scene(scene: Scene, document: TrainingDocument) -> Scene:
     )
 
 
-def metadata_differences(scene: Scene, texts: Mapping[str, bytes]) -> list[Difference]:
-    """Return where a scene's metadata files differ from its row of an index.
+class MemberFolder(SceneFolder):
+    """The files of a scene that an index lists: members of shards, or of a folder."""
 
-    Compared are path, split, family, map, rig, baselines, labels, caption, number of frames, the
-    cameras' places and the rig's residual; not what is known from the videos alone.
+    def __init__(self, source: MemberSource, scene: Scene) -> None:
+        """Name the scene, and what opens its files; nothing is read yet."""
+        self.key = scene.id.key
+        self._source, self._scene = source, scene
+
+    def stamps(self) -> dict[str, tuple[int, int]]:
+        """Return the size in bytes of each file."""
+        return {name: (each.size, 0) for name, each in sorted(self._scene.members.items())}
+
+    def read(self, name: str) -> bytes:
+        """Return a metadata file, whole and compared with its checksum."""
+        return self._source.read(self._scene, name)
+
+    def video(self, name: str) -> Path | SeekableFile:
+        """Return a video: its path, or an open file that the caller closes."""
+        return self._source.open(self._scene, name)
+
+
+def described_again(
+    scene: Scene, source: MemberSource, *, videos: Collection[str] | None = None
+) -> tuple[Scene, list[Difference]]:
+    """Return what the files in a scene's row of an index say, and how the row differs from that.
+
+    Files are read by the row's conventions. Not compared are remarks, what the row does not know,
+    and what may depend on files that are no members, such as a unit of depth stated elsewhere.
 
     Args:
         scene: The row.
-        texts: File name to bytes; missing files are not compared.
+        source: Opens its files.
+        videos: Names of the videos to open; None is all.
+
+    Returns:
+        The scene, or the row itself if its files cannot be used; and for each difference the
+        file's name, empty for the scene's own path, and what it tells.
     """
-    found: list[Difference] = []
-    described = next((name for name in DESCRIPTIONS if name in texts), DESCRIPTION_JSON)
-    place = parse_scene_key(scene.id.key)
-    subset = scene.id.subset if place.split == "eval" else None
-    again: dict[str, Callable[[], Scene]] = {
-        "": lambda: replace(scene, id=replace(place, subset=place.subset or subset)),
-        BASELINE_JSON: lambda: _with_rig(scene, texts),
-        TRAINING_JSON: lambda: _derived(scene, texts[TRAINING_JSON]),
-        TRAJECTORY_JSON: lambda: _posed(scene, texts[TRAJECTORY_JSON]),
-        described: lambda: replace(scene, caption=caption_of(texts, key=scene.id.key)[0]),
+    shape, conventions = Shape(), None
+    if scene.conventions is not None:
+        shape = replace(shape_of_text(scene.conventions), has=())
+        conventions = Conventions((shape,))
+    folder = MemberFolder(source, scene)
+    try:
+        now = describe_scene("", folder.key, conventions=conventions, folder=folder, videos=videos)
+    except (SchemaError, MediaError, StorageError) as error:
+        return scene, [_placed(folder.key, str(error))]
+    if now.id.split == "eval" and not now.id.subset:
+        now = replace(now, id=replace(now.id, subset=scene.id.subset))
+    forms, forms_now = ((each.pose_form or "").split("|") for each in (scene, now))
+    if shape.poses is not None or {*forms} <= {*forms_now}:
+        now = replace(now, pose_form=scene.pose_form)
+    by_videos = videos is None and {*scene.depth_unit_source} <= {"tag", "default"}
+    new = [
+        about
+        for about in ("frames", "poses", *(["depth"] if by_videos else []))
+        if now.remark(about) and not scene.remark(about)
+    ]
+    new += ["videos"] if scene.members.keys() != now.members.keys() else []
+    found = [_placed(folder.key, now.remark(about)) for about in new]
+    is_cut = now.frames > scene.frames and scene.remark("frames")
+    skipped = {
+        "key_frames": scene.training is None,
+        "frames": is_cut or "frames" in new,
+        **dict.fromkeys(_OF_POSES, scene.remark("poses") or "poses" in new),
+        **dict.fromkeys(_UNITS, not by_videos or "depth" in new),
     }
-    for name, described_again in again.items():
-        if name and name not in texts:
-            continue
-        try:
-            differences = _changed(scene, described_again())
-            where = "" if name else "its path "
-            found += [(name, f"{where}{difference}") for difference in differences]
-        except SchemaError as error:
-            file, _, reason = str(error).removeprefix(f"{scene.id.key}/").partition(": ")
-            found.append((file, reason.rstrip(".")) if name else ("", str(error).rstrip(".")))
-    return list(dict.fromkeys(found))
+    for part, name in _COMPARED.items():
+        if not skipped.get(part):
+            told = _changed(part, getattr(scene, part), getattr(now, part))
+            name = name if name in scene.members else ""
+            found += [(name, f"its path {each}" if part == "id" else each) for each in told]
+    for part in (*_STORED, *_UNITS) if videos is None else ():
+        cameras = zip(getattr(scene, part), getattr(now, part), strict=True)
+        for camera, (before, after) in enumerate(cameras):
+            name = scene.held_name(depth_name(camera))
+            if name in scene.members and not skipped.get(part):
+                found += [(name, told) for told in _changed(part, before, after)]
+    return now, found
 
 
-def _changed(indexed: Any, now: Any) -> Iterator[str]:
-    """Yield how fields of a record differ from those of the index."""
-    for each in fields(now):
-        before, after = getattr(indexed, each.name, None), getattr(now, each.name)
-        if is_dataclass(after):
-            yield from _changed(before, after)
-        elif not _same(after, before, within=_ROUNDING.get(each.name, 0.0)):
-            yield f"tells {each.name} {brief(after)}, and by the index it is {brief(before)}"
+_OF_POSES: Final = ("lateral_m", "rig_residual_px", "pose_form")
+_STORED: Final = ("depth_codec", "depth_pixel_format")
+_UNITS: Final = ("depth_unit_m", "depth_offset_m")
+_COMPARED: Final = {
+    "id": "", "rig": BASELINE_JSON, "labels": BASELINE_JSON, "caption": DESCRIPTION_JSON,
+    "training": TRAINING_JSON, "key_frames": TRAINING_JSON,
+    **dict.fromkeys(("frames", *_OF_POSES), TRAJECTORY_JSON),
+}  # fmt: skip
+"""The parts of a row that are compared, and the files that tell them."""
 
 
-def _with_rig(scene: Scene, texts: Mapping[str, bytes]) -> Scene:
-    """Return a scene as its ``baseline.json`` and its completion mark say."""
-    key, size_px = scene.id.key, (scene.rig.image_width_px, scene.rig.image_height_px)
-    recorded_px = scene.rig.recorded_size_px or size_px
-    text, where = texts[BASELINE_JSON], f"{key}/{BASELINE_JSON}"
-    rig, labels, _ = parse_rig(text, where=where, shape=_stated_of(scene), size_px=recorded_px)
-    if rig.image_size_source == "default" or scene.remark("size"):
-        rig = sized_as_videos(key, rig, recorded_px, remarks=[], shape=None)
-    if (rig.image_width_px, rig.image_height_px) == recorded_px:
-        recorded = scene.rig.recorded_size_px
-        rig = replace(
-            rig, image_width_px=size_px[0], image_height_px=size_px[1], recorded_size_px=recorded
-        )
-    marked = scene.labels
-    if COMPLETE_JSON in texts:
-        marked, _ = parse_complete(texts[COMPLETE_JSON], where=f"{key}/{COMPLETE_JSON}")
-    return replace(scene, rig=rig, labels=merged_labels(labels, marked))
+def _placed(key: str, told: str) -> Difference:
+    """Return a message about a scene as the name of its file and the rest."""
+    name, _, rest = told.removeprefix(key).partition(": ")
+    return (name[1:], rest.rstrip(".")) if told.startswith(key) else ("", told.rstrip("."))
 
 
-def _stated_of(scene: Scene) -> Shape | None:
-    """Return what conventions state about a scene's files, by its row."""
-    return None if scene.conventions is None else shape_of_text(scene.conventions)
-
-
-def _derived(scene: Scene, text: bytes) -> Scene:
-    """Return a scene as its ``training.json`` says."""
-    document = parse_training(text, where=f"{scene.id.key}/{TRAINING_JSON}")
-    members = {
-        name: replace(
-            member, size=file[0], crc32=None if member.crc32 is None else file[1]
-        ) if (file := document.files.get(name)) else member
-        for name, member in scene.members.items()
-    }  # fmt: skip
-    again = replace(derived_scene(scene, document), members=members)
-    return replace(again, id=replace(scene.id, key=document.key))
-
-
-def _posed(scene: Scene, text: bytes) -> Scene:
-    """Return a scene with the cameras' places and the residual that its ``trajectory.json`` has."""
-    where, shape = f"{scene.id.key}/{TRAJECTORY_JSON}", _stated_of(scene)
-    if scene.remark("poses"):
-        return scene
-    poses = poses_as(text, scene.pose_form, where=where)
-    if shape is not None and shape.poses is not None:
-        poses = understood_poses(text, scene.rig, where=where, named=shape.poses).poses
-    is_longer = poses.frame_count > scene.frames and scene.remark("frames")
-    return replace(
-        scene,
-        frames=scene.frames if is_longer else poses.frame_count,
-        lateral_m=_places_m(poses),
-        rig_residual_px=rectification_residual_px(poses, recorded_intrinsics(scene.rig)),
-    )
+def _changed(name: str, indexed: Any, now: Any) -> Iterator[str]:
+    """Yield how a value or the fields of a record differ from those of the index."""
+    if is_dataclass(now):
+        for each in fields(now):
+            yield from _changed(
+                each.name, getattr(indexed, each.name, None), getattr(now, each.name)
+            )
+    elif not _same(now, indexed, within=_ROUNDING.get(name, 0.0)):
+        yield f"tells {name} {brief(now)}, and by the index it is {brief(indexed)}"
 
 
 def _same(found: Any, indexed: Any, *, within: float = 0.0) -> bool:

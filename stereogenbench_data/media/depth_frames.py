@@ -242,12 +242,10 @@ class DepthFrames(FrameReader):
             frames: How many frames it must have; "any" trusts the header.
 
         Raises:
-            ExtraError: If blosc2 is not installed.
             OSError: If the file cannot be read.
             MediaError: If it is not such a file, is damaged or has another number of frames.
         """
         self.name = name
-        self._blosc2: Any = blosc2_module()
         self._own = FileIO(file) if isinstance(file, str | Path) else None
         self._file: Any = self._own or file
         try:
@@ -276,15 +274,17 @@ class DepthFrames(FrameReader):
         """Return the stored numbers of a frame, in a new array.
 
         Raises:
+            ExtraError: If blosc2 is not installed.
             MediaError: If there is no such frame, or it does not decompress.
         """
+        blosc2 = blosc2_module()
         shape = (self.clip.height_px, self.clip.width_px)
         chunk = self.chunk(index)
         if not chunk:
             return np.zeros(shape, dtype=np.uint16)
         units = np.empty(shape, dtype=np.uint16)
         try:
-            self._blosc2.decompress2(chunk, dst=units, nthreads=1)
+            blosc2.decompress2(chunk, dst=units, nthreads=1)
         except (RuntimeError, ValueError) as error:
             raise MediaError(
                 f"{self.name}: frame {index} does not decompress ({error}). The file is damaged: "

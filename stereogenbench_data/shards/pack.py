@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -16,22 +16,13 @@ from typing import Final
 from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of, no_advance
 from stereogenbench_data.errors import ShardError, explain_os_errors
 from stereogenbench_data.index.parquet import INDEX_NAME
-from stereogenbench_data.index.scene_folder import derived_scene
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import read_json
-from stereogenbench_data.media.depth_frames import CODEC_NAME, blosc2_module
-from stereogenbench_data.schema.records import Member, Scene
-from stereogenbench_data.schema.release import (
-    CAMERA_COUNT,
-    PACKED_DEPTH_NAMES,
-    TRAINING_JSON,
-)
-from stereogenbench_data.schema.training import parse_training
+from stereogenbench_data.media.depth_frames import blosc2_module
 from stereogenbench_data.shards.plan import DEFAULT_SHARD_BYTES, DepthCodec, ShardPlan, plan_shards
 from stereogenbench_data.shards.training import Derivation, TrainingSettings
 from stereogenbench_data.shards.writer import (
     PARTS,
-    PackedShard,
     ShardTask,
     derive_task,
     find_packed,
@@ -171,43 +162,27 @@ def _finish(tasks: Sequence[ShardTask], out: Path) -> PackReport:
         ShardError: If a shard was changed after it was packed.
     """
     found = {task.shard.name: find_packed(task) for task in tasks}
-    shards = {name: shard for name, shard in found.items() if shard is not None}
-    missing = tuple(name for name in found if name not in shards)
+    packed = {name: index for name, index in found.items() if index is not None}
+    missing = tuple(name for name in found if name not in packed)
     report = PackReport((), (), missing, None, sum(len(task.shard.scenes) for task in tasks))
     if missing:
         return report
     for task in tasks:
         shutil.rmtree(task.derived, ignore_errors=True)  # of a run killed after its last shard
+    for each in packed.values():
+        each.load_seek_tables()
     index = SceneIndex.from_scenes(
-        [scene for task in tasks for scene in _scenes_in(task, shards[task.shard.name])],
+        [
+            replace(each.scene(row), seek_tables=each.seek_tables(row))
+            for each in packed.values()
+            for row in range(len(each))
+        ],
         out,
-        shards={name: shard.facts for name, shard in shards.items()},
+        shards={name: each.shards[name] for name, each in packed.items()},
     )
     # The index is written last: where it exists, every shard does, too.
     index.write(out / INDEX_NAME)
     return replace(report, index=out / INDEX_NAME)
-
-
-def _scenes_in(task: ShardTask, shard: PackedShard) -> Iterator[Scene]:
-    """Yield scenes of the release with the places of their files in a shard, as they are there."""
-    places: dict[str, dict[str, Member]] = {scene.id.key: {} for scene in task.shard.scenes}
-    for member, place in shard.places.items():
-        key, _, name = member.partition(".")
-        places[key][name] = place
-    for each in task.shard.scenes:
-        scene = replace(each, seek_tables=shard.seek_tables.get(each.id.key))
-        members = places[scene.id.key]
-        if task.derivation is not None:
-            place = members[TRAINING_JSON]
-            with task.target.open("rb") as file:
-                file.seek(place.offset)
-                text = file.read(place.size)
-            where = f"{task.target}: {scene.id.key}.{TRAINING_JSON}"
-            yield replace(derived_scene(scene, parse_training(text, where=where)), members=members)
-            continue
-        is_packed = not members.keys().isdisjoint(PACKED_DEPTH_NAMES.values())
-        codec = (CODEC_NAME,) * CAMERA_COUNT if is_packed else scene.depth_codec
-        yield replace(scene, members=members, depth_codec=codec)
 
 
 # The folder of the shards: which plan it is for, and that it holds nothing else.

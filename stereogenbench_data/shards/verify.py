@@ -4,7 +4,6 @@ A damaged shard does not stop the others: all problems are listed, each with its
 """
 
 import hashlib
-import io
 import tarfile
 import warnings
 from collections import defaultdict
@@ -17,25 +16,19 @@ from typing import Final, Literal
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
 from stereogenbench_data.errors import MediaError, ShardError, cure_of
 from stereogenbench_data.index.open import StaleIndexWarning
-from stereogenbench_data.index.scene_folder import metadata_differences
+from stereogenbench_data.index.scene_folder import described_again
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.media.container import StreamFacts, depth_coding
-from stereogenbench_data.media.decoder import MOST_EXTRA_FRAMES
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
     open_video,
     read_depth_units,
-    resolve_encoding,
 )
-from stereogenbench_data.media.video import VideoReader, probe, require_pixel_aspect
-from stereogenbench_data.schema.conventions import depth_of
+from stereogenbench_data.media.video import VideoReader
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
-from stereogenbench_data.schema.release import CAMERA_COUNT, depth_name
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.shards.plan import SCENE_TEXTS
 from stereogenbench_data.shards.tar import read_chunks
 from stereogenbench_data.shards.writer import open_shards
-from stereogenbench_data.sources.files import copy_with_crc32
+from stereogenbench_data.sources.members import MemberSource
 from stereogenbench_data.sources.ranged_file import FileSlice
 
 _FETCH_AGAIN: Final = "Fetch the shard again, or pack it again."
@@ -208,60 +201,53 @@ def _folder_problems(index: SceneIndex, expected: dict[str, _ExpectedShard]) -> 
 
 def _check_shard(expected: _ExpectedShard, after_bytes: Advance) -> tuple[list[Problem], set[str]]:
     """Return what is wrong with a shard, and its sound members; a worker process calls this."""
-    facts = expected.facts
+    facts, sha256 = expected.facts, hashlib.sha256()
+    problems, sound = list[Problem](), {*expected.members}
     try:
         with expected.path.open("rb", buffering=0) as file:
             size = expected.path.stat().st_size
-            problems, sound, sha256 = _check_contents(expected, file, size, after_bytes)
-            problems += _misindexed(expected, file, sound)
+            for chunk in read_chunks(file, size, after_bytes=after_bytes):
+                sha256.update(chunk)
+        found = sha256.hexdigest()
+        if (size, found) != (facts.size, facts.sha256):
+            problems, sound = _check_members(expected, size)
         if not problems and size == facts.size:
             problems += _check_places(expected)
+        misindexed = [*_misindexed(expected, sound)]
     except OSError as error:
-        found = f"cannot be read ({error.strerror or error})"
-        return [expected.problem("", found, cure_of(error, _FETCH_AGAIN))], set()
+        reason = f"cannot be read ({error.strerror or error})"
+        return [expected.problem("", reason, cure_of(error, _FETCH_AGAIN))], set()
     if size != facts.size:
         what = "it is cut short" if size < facts.size else "something was added"
         text = f"has {size} bytes, and the index says {facts.size}: {what}"
         problems.append(expected.problem("", text))
-    elif not problems and sha256 != facts.sha256:
-        text = f"has sha256 {sha256[:16]}..., and the index says {facts.sha256[:16]}..., though"
+    elif not problems and found != facts.sha256:
+        text = f"has sha256 {found[:16]}..., and the index says {facts.sha256[:16]}..., though"
         problems.append(expected.problem("", f"{text} its files are sound"))
-    return problems, sound
+    return problems + misindexed, sound
 
 
-def _check_contents(
-    expected: _ExpectedShard, file: io.FileIO, size: int, after_bytes: Advance
-) -> tuple[list[Problem], set[str], str]:
-    """Read a shard once, from its start to its end."""
-    sha256, at = hashlib.sha256(), 0
+def _check_members(expected: _ExpectedShard, size: int) -> tuple[list[Problem], set[str]]:
+    """Return which files of a shard of some bytes are not what was packed, and the others."""
     problems: list[Problem] = []
-    sound: set[str] = set()
     lost = defaultdict(list)
-
-    def crc32_up_to(end: int) -> int:
-        nonlocal at
-        chunks = read_chunks(file, end - at, after_bytes=after_bytes)
-        at = end
-        return copy_with_crc32(chunks, sha256.update)
-
-    for name, member in sorted(expected.members.items(), key=lambda item: item[1].offset):
-        if member.offset < at or member.offset + member.size > size:
+    for name, member in expected.members.items():
+        if member.offset + member.size > size:
             scene, _, file_name = name.partition(".")
             lost[scene].append(file_name)
             continue
-        crc32_up_to(member.offset)
-        crc32 = crc32_up_to(member.offset + member.size)
-        if crc32 == member.crc32:
-            sound.add(name)
-            continue
-        indexed = "has none" if member.crc32 is None else f"says {member.crc32:08x}"
-        text = f"its bytes have crc32 {crc32:08x}, and the index {indexed}"
-        problems.append(expected.problem(name, text))
-    crc32_up_to(size)
+        with FileSlice(expected.path, member) as file:
+            crc32 = file.crc32()
+        if crc32 != member.crc32:
+            indexed = "has none" if member.crc32 is None else f"says {member.crc32:08x}"
+            text = f"its bytes have crc32 {crc32:08x}, and the index {indexed}"
+            problems.append(expected.problem(name, text))
     for scene, names in lost.items():
         text = f"{len(names)} of its files are not whole ({_few(sorted(names))})"
         problems.append(expected.problem(scene, text))
-    return problems, sound, sha256.hexdigest()
+    damaged = {f"{each.scene}.{each.member}" for each in problems}
+    lost_names = {f"{scene}.{name}" for scene, names in lost.items() for name in names}
+    return problems, expected.members.keys() - damaged - lost_names
 
 
 def _check_places(expected: _ExpectedShard) -> Iterator[Problem]:
@@ -276,17 +262,14 @@ def _check_places(expected: _ExpectedShard) -> Iterator[Problem]:
         yield expected.problem(name, text)
 
 
-def _misindexed(expected: _ExpectedShard, file: io.FileIO, sound: set[str]) -> Iterator[Problem]:
-    """Yield where the index contradicts the metadata in the shard."""
+def _misindexed(expected: _ExpectedShard, sound: set[str]) -> Iterator[Problem]:
+    """Yield where the index contradicts files in the shard, of scenes whose files are sound."""
+    source = MemberSource(expected.path.parent, shards={})
     for scene in expected.scenes:
-        texts = {}
-        for name in SCENE_TEXTS:
-            member = scene.members.get(name)
-            if member is not None and f"{scene.id.key}.{name}" in sound:
-                file.seek(member.offset)
-                texts[name] = file.read(member.size)
-        for name, difference in metadata_differences(scene, texts):
-            yield Problem(expected.shard, scene.id.key, name, difference, _FETCH_BOTH)
+        if sound.issuperset(f"{scene.id.key}.{name}" for name in scene.members):
+            _, differences = described_again(scene, source)
+            for name, difference in differences:
+                yield Problem(expected.shard, scene.id.key, name, difference, _FETCH_BOTH)
 
 
 def _few(names: list[str]) -> str:
@@ -314,12 +297,10 @@ def _check_scene(task: _SceneTask, after_bytes: Advance) -> list[Problem]:
 
 
 def _decode(task: _SceneTask, name: str) -> None:
-    """Decode all frames of a video in a shard, and compare its header with the index."""
+    """Decode all frames of a video in a shard."""
     scene = task.scene
     where = scene.members[name]
     with FileSlice(Path(task.root, where.path), where) as file:
-        _require_indexed(scene, name, probe(file, name=name))
-        file.seek(0)
         if name.endswith("_rgb.mp4"):
             with VideoReader(file, name=name, frames=scene.frames) as pictures:
                 for index in range(scene.frames):
@@ -328,27 +309,3 @@ def _decode(task: _SceneTask, name: str) -> None:
         with open_video(file, name=name, frames=scene.frames) as depth:
             for index in range(scene.frames):
                 read_depth_units(depth, index, encoding=ANY_DEPTH)
-
-
-def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
-    """Compare a video's header with the index."""
-    size = (scene.rig.image_width_px, scene.rig.image_height_px)
-    is_long_enough = 0 <= facts.frames - scene.frames <= MOST_EXTRA_FRAMES
-    if not is_long_enough or (facts.width_px, facts.height_px) != size:
-        raise MediaError(
-            f"{name}: has {facts.frames} frames of {facts.width_px}x{facts.height_px} pixels, and "
-            f"the index says {scene.frames} of {size[0]}x{size[1]}."
-        )
-    require_pixel_aspect(facts.pixel_aspect, scene.rig, name=name)
-    depth_names = [scene.held_name(depth_name(camera)) for camera in range(CAMERA_COUNT)]
-    if name not in depth_names:
-        return
-    camera = depth_names.index(name)
-    found: tuple[object, ...] = (depth_coding(facts), facts.pixel_format)
-    indexed: tuple[object, ...] = (scene.depth_codec[camera], scene.depth_pixel_format[camera])
-    if scene.depth_unit_source[camera] in ("tag", "default"):
-        encoding = resolve_encoding(facts, name=name, override=depth_of(scene))
-        found = (*found, encoding.known_unit_m, encoding.offset_m)
-        indexed = (*indexed, scene.depth_unit_m[camera], scene.depth_offset_m[camera])
-    if found != indexed:
-        raise MediaError(f"{name}: is stored as {found}, and the index says {indexed}.")

@@ -1,36 +1,34 @@
 """One shard on disk, whole or absent: written beside its place, then renamed.
 
-The manifest of a shard, ``OUT/.parts/<shard>.json``, is written just before the rename. A shard
-under its final name is finished, and later runs keep it. Source files must be as they were when
-the plan was made, and must not change while they are read.
+The index of a shard, ``OUT/.parts/<shard>-<plan>.parquet``, is written just before the rename. A
+shard under its final name is finished, and later runs keep it. Source files must be as they were
+when the plan was made, and must not change while they are read.
 """
 
-import base64
 import hashlib
 import io
-import json
 import os
 import shutil
 import stat
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from io import FileIO
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from stereogenbench_data.engine import Advance
-from stereogenbench_data.errors import MediaError, ShardError, explain_os_errors
-from stereogenbench_data.index.parquet import INDEX_NAME
-from stereogenbench_data.index.scene_folder import derived_scene, metadata_differences
+from stereogenbench_data.errors import MediaError, ShardError, StorageError, explain_os_errors
+from stereogenbench_data.index.open_tree import Opened
+from stereogenbench_data.index.parquet import INDEX_NAME, read_index_file
+from stereogenbench_data.index.scene_folder import derived_scene, described_again
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import packed_depth
-from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
+from stereogenbench_data.media.depth_frames import CODEC_NAME
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
-from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES, TRAINING_JSON, VIDEO_FILES
+from stereogenbench_data.schema.release import CAMERA_COUNT, PACKED_DEPTH_NAMES, TRAINING_JSON
 from stereogenbench_data.schema.training import parse_training
 from stereogenbench_data.shards.plan import (
-    SCENE_TEXTS,
     DepthCodec,
     PlannedMember,
     PlannedShard,
@@ -43,15 +41,12 @@ from stereogenbench_data.shards.training import (
     derived_names,
     source_bytes,
 )
-from stereogenbench_data.sources.files import copy_with_crc32, open_atomic, try_locked, write_atomic
+from stereogenbench_data.sources.files import copy_with_crc32, open_atomic, try_locked
 from stereogenbench_data.sources.location import is_remote, shown
-from stereogenbench_data.sources.ranged_file import FileSlice
-
-_SEEKABLE: Final = frozenset({*VIDEO_FILES, *PACKED_DEPTH_NAMES.values()})
-"""The files of a scene of which single frames are read."""
+from stereogenbench_data.sources.members import MemberSource
 
 PARTS: Final = ".parts"
-"""The folder beside the shards that holds their manifests and locks."""
+"""The folder beside the shards that holds the index of each, and locks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,23 +79,10 @@ class ShardTask:
         return Path(self.out, self.shard.name)
 
     @property
-    def manifest(self) -> Path:
-        """The path of its manifest."""
-        return self.target.parent / PARTS / f"{self.target.stem}.json"
-
-
-class PackedShard(NamedTuple):
-    """A finished shard, as its manifest tells it.
-
-    Attributes:
-        facts: What an index says of it.
-        places: Where each member lies in it, by its whole name, in order.
-        seek_tables: Each scene's `Scene.seek_tables`, by its key.
-    """
-
-    facts: ShardFacts
-    places: dict[str, Member]
-    seek_tables: dict[str, bytes]
+    def index(self) -> Path:
+        """The path of its index, which no other plan has."""
+        name = f"{self.target.stem}-{self.plan_digest[:16]}.parquet"
+        return self.target.parent / PARTS / name
 
 
 def open_shards(data: str | Path, root: str | Path | None) -> SceneIndex:
@@ -130,8 +112,8 @@ def open_shards(data: str | Path, root: str | Path | None) -> SceneIndex:
     return index
 
 
-def find_packed(task: ShardTask) -> PackedShard | None:
-    """Return what a finished shard holds; None if the shard is not there.
+def find_packed(task: ShardTask) -> SceneIndex | None:
+    """Return the index of a finished shard; None if the shard is not there.
 
     Raises:
         ShardError: If a file has its name that this plan did not pack, or that was changed since.
@@ -141,27 +123,16 @@ def find_packed(task: ShardTask) -> PackedShard | None:
     except FileNotFoundError:
         return None
     try:
-        found = json.loads(task.manifest.read_bytes())
-        columns = (found[name] for name in ("members", "offsets", "sizes", "crc32s"))
-        rows = zip(*columns, strict=True)
-        places = {name: Member(task.shard.name, *place) for name, *place in rows}
-        tables = found.get("seek_tables", {}).items()
-        packed = PackedShard(
-            ShardFacts(found["size"], found["sha256"], len(places)),
-            places,
-            {key: base64.b64decode(text) for key, text in tables},
-        )
-        is_of_plan = (found["plan"], found["name"]) == (task.plan_digest, task.shard.name)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        table, head = read_index_file(task.index, where=f"{task.index}")
+        packed_bytes = head.shards[task.shard.name].size
+    except (StorageError, KeyError) as error:
         raise not_of_plan(task.target) from error
-    if not is_of_plan:
-        raise not_of_plan(task.target)
-    if packed.facts.size != size:
+    if packed_bytes != size:
         raise ShardError(
-            f"{task.target}: has {size} bytes, and had {packed.facts.size} when it was packed. "
+            f"{task.target}: has {size} bytes, and had {packed_bytes} when it was packed. "
             f"Remove it, then run the same command again."
         )
-    return packed
+    return SceneIndex(Opened(table, head, seek_tables=task.index))
 
 
 def pack_task(task: ShardTask, after_bytes: Advance) -> str:
@@ -174,7 +145,7 @@ def pack_task(task: ShardTask, after_bytes: Advance) -> str:
         ShardError: If a source is missing, unreadable, changes meanwhile or contradicts the index;
             the disk is full; another file has its name; or another process is packing it.
     """
-    with _alone(task, task.manifest.with_name(f"{task.target.name}.lock"), f"{task.target}"):
+    with _alone(task, task.index.with_name(f"{task.target.name}.lock"), f"{task.target}"):
         if find_packed(task) is not None:
             return ""
         if task.derivation is None:
@@ -242,9 +213,9 @@ def not_of_plan(path: Path) -> ShardError:
 
 
 def _pack(task: ShardTask, after_bytes: Advance) -> None:
-    """Write a shard and its manifest, from files that are as the plan says."""
+    """Write a shard and its index, from files that are as the plan says."""
     sha256, size = hashlib.sha256(), 0
-    places: dict[str, tuple[int, int, int]] = {}
+    rows: list[Scene] = []
     with open_atomic(task.target) as file:
 
         def write(content: bytes) -> None:
@@ -254,69 +225,46 @@ def _pack(task: ShardTask, after_bytes: Advance) -> None:
             size += len(content)
 
         for scene in task.shard.scenes:
-            texts: dict[str, bytes] = {}
+            members: dict[str, Member] = {}
             for member in _members(task, scene):
-                name, length = member.name.partition(".")[2], member.size
-                source = Path(task.root, member.source)
+                source, length = Path(task.root, member.source), member.size
                 chunks = _source_chunks(source, length, after_bytes)
-                if name in SCENE_TEXTS:
-                    texts[name] = b"".join(chunks)
-                    chunks = iter([texts[name]])
-                elif member.form != "released":
+                if member.form != "released":
                     packed = _packed_depth(source, chunks, frames=scene.frames)
                     length, chunks = len(packed), iter([packed])
                 write(member_header(member.name, length))
                 crc32 = copy_with_crc32(chunks, write)
-                places[member.name] = (size - length, length, crc32)
+                name = member.name.partition(".")[2]
+                members[name] = Member(Path(file.name).name, size - length, length, crc32)
                 write(bytes(padded(length) - length))
-            _require_indexed(task, scene, texts)
+            file.flush()
+            rows.append(_row_of(task, replace(scene, members=members)))
         write(END_OF_ARCHIVE)
-        file.flush()
-        tables = _seek_tables(Path(file.name), places, task.shard.keys)
-        offsets, sizes, crc32s = zip(*places.values(), strict=True)
-        manifest = {
-            "name": task.shard.name,
-            "size": size,
-            "sha256": sha256.hexdigest(),
-            "members": [*places],
-            "offsets": offsets,
-            "sizes": sizes,
-            "crc32s": crc32s,
-            "plan": task.plan_digest,
-            "seek_tables": tables,
-        }
-        write_atomic(task.manifest, json.dumps(manifest).encode())
+        facts = ShardFacts(size, sha256.hexdigest(), sum(len(row.members) for row in rows))
+        shards = {task.shard.name: facts}
+        SceneIndex.from_scenes(rows, task.out, shards=shards).write(task.index)
 
 
-def _require_indexed(task: ShardTask, scene: Scene, texts: Mapping[str, bytes]) -> None:
-    """Refuse metadata that are not what the index was made from."""
+def _row_of(task: ShardTask, scene: Scene) -> Scene:
+    """Return the row of a scene in a shard that is being written.
+
+    Raises:
+        ShardError: If its files are not what the index was made from.
+    """
+    source = MemberSource(task.out, shards={})
     if task.derivation is not None:
-        where = f"{scene.id.key}/{TRAINING_JSON}"
-        document = parse_training(texts[TRAINING_JSON], where=where)
-        scene = replace(derived_scene(scene, document), members={})
-    for name, difference in metadata_differences(scene, texts)[:1]:
+        text, where = source.read(scene, TRAINING_JSON), source.label(scene, TRAINING_JSON)
+        scene = derived_scene(scene, parse_training(text, where=where))
+    elif not scene.members.keys().isdisjoint(PACKED_DEPTH_NAMES.values()):
+        scene = replace(scene, depth_codec=(CODEC_NAME,) * CAMERA_COUNT)
+    now, differences = described_again(scene, source)
+    for name, difference in differences[:1]:
         raise ShardError(
             f"{Path(task.root, scene.id.key, name)}: {difference}. The index is older than the "
             f"file: run `stereogenbench index` on the release again, then the same command."
         )
-
-
-def _seek_tables(
-    shard: Path, places: Mapping[str, tuple[int, int, int]], keys: Sequence[str]
-) -> dict[str, str]:
-    """Return each scene's `Scene.seek_tables` as base64, from a shard that is written.
-
-    A video that cannot be read has none; whoever reads it is told why.
-    """
-    tables: dict[str, dict[str, SeekTable]] = {key: {} for key in keys}
-    for member, place in places.items():
-        key, _, name = member.partition(".")
-        if name in _SEEKABLE:
-            with suppress(MediaError), FileSlice(shard, Member("", *place)) as video:
-                table = read_seek_table(video, name=name)
-                if table is not None:
-                    tables[key][name] = table
-    return {key: base64.b64encode(packed_tables(found)).decode() for key, found in tables.items()}
+    members = {name: replace(each, path=task.shard.name) for name, each in scene.members.items()}
+    return replace(scene, members=members, seek_tables=now.seek_tables)
 
 
 def _source_chunks(source: Path, size: int, after_bytes: Advance) -> Iterator[bytes]:

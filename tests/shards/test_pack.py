@@ -24,7 +24,8 @@ from stereogenbench_data.shards.writer import ShardTask, pack_task
 from stereogenbench_data.sources.files import locked
 from tests.cli.command import invoke
 from tests.servers.tools import killed_fork, small_disk
-from tests.shards.shard_files import bytes_of
+from tests.servers.videos import write_video
+from tests.shards.shard_files import bytes_of, scenes_of
 
 ONE_EACH = 250_000
 """A target that holds one of the small release's scenes, not two."""
@@ -163,13 +164,34 @@ def test_a_release_that_was_edited_after_a_shard_is_another_plan(tree, tmp_path)
     assert not (out / "index.parquet").exists()
 
 
-def test_metadata_that_the_index_does_not_know_are_not_packed(tree, tmp_path):
-    SceneIndex.open(tree).write(tree / "index.parquet")
-    focal_changed(next(tree.glob("train/Uniform/*/scene_000001")))
+def video_of(name, *, frames=7, unit_m=0.001):
+    """Exchange a video of a scene."""
+    tags = {"DEPTH_SCALE": str(unit_m)} if name.endswith("mkv") else {}
+    return lambda folder: write_video(folder / name, frames=frames, size=(64, 64), tags=tags)
 
-    match = r"scene_000001/baseline\.json: .* focal_mm .* run `stereogenbench index` on the release"
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (focal_changed, r"/baseline\.json: .* focal_mm "),
+        (video_of("cam_01_rgb.mp4", frames=6), "11 have 7, but cam_01_rgb.mp4 has 6"),
+        (video_of("cam_05_depth.mkv", unit_m=0.0015), r"/cam_05_depth\.mkv: tells .* 0\.0015, .*"),
+        (video_of("cam_05_depth.mkv", unit_m=0.5), ": its cameras' units of depth differ"),
+    ],
+)
+def test_files_that_the_index_does_not_know_are_not_packed(tree, tmp_path, change, told):
+    SceneIndex.open(tree).write(tree / "index.parquet")
+    change(next(tree.glob("train/Uniform/*/scene_000001")))
+    sized = [
+        replace(scene, members={name: replace(each, size=(tree / each.path).stat().st_size)
+                                for name, each in scene.members.items()})
+        for scene in scenes_of(tree).values()
+    ]  # fmt: skip
+    index = SceneIndex.from_scenes(sized, tree)
+
+    match = rf"scene_000001.*{told}.* run `stereogenbench index` on the release"
     with pytest.raises(ShardError, match=match):
-        pack(tree, tmp_path / "out", target_bytes=ONE_EACH, workers=1)
+        pack(index, tmp_path / "out", target_bytes=ONE_EACH, workers=1)
 
     assert NAMES[3] not in tars(tmp_path / "out")
 
@@ -178,11 +200,11 @@ def test_metadata_that_the_index_does_not_know_are_not_packed(tree, tmp_path):
     "content",
     ["cut", "of another shard", "missing"],
 )
-def test_a_shard_without_a_usable_manifest_is_refused(packed, release, tmp_path, content):
+def test_a_shard_without_a_usable_index_is_refused(packed, release, tmp_path, content):
     out = shutil.copytree(packed, tmp_path / "out")
-    place, other = (out / ".parts" / name.replace(".tar", ".json") for name in NAMES[:2])
-    made = {"cut": place.read_text()[:-5], "of another shard": other.read_text()}
-    place.write_text(made.get(content, content))
+    place, other = (next((out / ".parts").glob(f"{name[:-4]}-*.parquet")) for name in NAMES[:2])
+    made = {"cut": place.read_bytes()[:-5], "of another shard": other.read_bytes()}
+    place.write_bytes(made.get(content, b""))
     if content == "missing":
         place.unlink()
 
