@@ -1,13 +1,10 @@
 """``stereogenbench audit``: are these data right? The paper's geometry table for any data."""
 
-import hashlib
 import json
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from stereogenbench_data.cli.data import full_place
 from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import (
     DataOptions,
@@ -19,7 +16,7 @@ from stereogenbench_data.cli.options import (
     option,
 )
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.writing import write_report, writing
+from stereogenbench_data.cli.writing import write_report
 
 _ALL = "all"
 
@@ -69,24 +66,13 @@ def audit(  # noqa: PLR0913 - one parameter an option
             conventions=source.stated(),
             **options,
         )
-    notes = _journal(out, source.data, frames)
-    kept = geometry_audit.audit_journal(notes, index, frames=frames)
-    with writing(notes), kept, progress_bar("auditing", unit="frames") as progress:
+    with progress_bar("auditing", unit="frames") as progress:
         report = geometry_audit.audit(
-            index, sample=scenes, frames=frames, journal=kept, progress=progress, **options
+            index, sample=scenes, frames=frames, progress=progress, **options
         )
     document, markdown = json.dumps(report.to_json(), indent=1), audit_markdown(report)
+    typer.echo(document if as_json else markdown.rstrip())
     if out is not None:
         write_report(out, document if out.suffix == ".json" else markdown)
-    typer.echo(document if as_json else markdown.rstrip())
-    kept.delete()
     if report.findings:
         raise typer.Exit(FINDINGS)
-
-
-def _journal(out: Path | None, data: str, frames: int) -> Path:
-    if out is not None:
-        return out.with_name(f"{out.name}.journal")
-    audited = repr((full_place(data), frames)).encode(errors="replace")
-    name = f"audit-{hashlib.sha256(audited).hexdigest()[:16]}.journal"
-    return Path.home() / ".cache" / "stereogenbench" / name

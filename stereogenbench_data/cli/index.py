@@ -4,6 +4,7 @@ import json
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Annotated, Literal
 
 import typer
@@ -51,7 +52,7 @@ def index(  # noqa: PLR0913 - one parameter an option
 
     Example: `stereogenbench index scenes/`
     """
-    from stereogenbench_data.index.build import ManyRequestsWarning, scene_journal, walk
+    from stereogenbench_data.index.build import ManyRequestsWarning, walk
     from stereogenbench_data.index.parquet import recorded_root
     from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.schema.conventions import Conventions
@@ -69,30 +70,25 @@ def index(  # noqa: PLR0913 - one parameter an option
             f"{target} is not a regular file: name one, such as {target / _INDEX_NAME}.",
             param_hint="--out",
         )
-    recorded_root(root, beside=target.parent)  # Refuses a root before hours of work.
+    # A root or a folder that cannot be used is refused before hours of work.
+    recorded_root(root, beside=target.parent)
+    there = next(folder for folder in target.absolute().parents if folder.is_dir())
+    with writing(target):
+        TemporaryFile(dir=there).close()
     stated = None if conventions is None else Conventions.read(conventions)
-    how = f"valid_depth={mode} {'' if stated is None else [each.text() for each in stated.shapes]}"
-    done_before = target.with_name(f"{target.name}.journal")
-    with (
-        warnings.catch_warnings(),
-        writing(done_before),
-        scene_journal(done_before, walk=f"{full_place(root)} {how.strip()}") as journal,
-        progress_bar("indexing", unit="scenes") as progress,
-    ):
+    with warnings.catch_warnings(), progress_bar("indexing", unit="scenes") as progress:
         warnings.simplefilter("always", ManyRequestsWarning)
         warnings.showwarning = lambda told, *_: _tell(str(told))
         report = walk(
             root,
             **work.options(),
             progress=progress,
-            journal=journal,
             valid_depth=mode,
             wanted=wanted,
             conventions=stated,
         )
         if report.scenes:
             SceneIndex.from_report(report).write(target)
-            journal.delete()
     status = FINDINGS if report.broken or not report.scenes else 0
     if as_json:
         document = {

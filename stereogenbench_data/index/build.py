@@ -1,45 +1,46 @@
 """From a released tree to its scenes: each one is described, or listed with what is wrong.
 
-A `Journal` keeps the described scenes, so a killed run continues where it stopped.
+The user's cache keeps the described scenes, so a killed run continues where it stopped.
 """
 
+import hashlib
 import json
 import re
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal, TextIO
+from typing import Any, Final, Literal
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, no_advance, require_workers
-from stereogenbench_data.errors import (
-    MediaError,
-    StereoGenBenchError,
-    StorageError,
-    explain_os_errors,
-)
+from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
 from stereogenbench_data.index.evidence import agreed_forms
 from stereogenbench_data.index.parquet import IndexHead
-from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, json_of, scene_of_json
+from stereogenbench_data.index.rows import json_of, scene_of_json
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
     ValidDepth,
     as_agreed,
     describe_scene,
     missing_video,
+    require_finished,
     unfinished,
 )
 from stereogenbench_data.index.tree import (
-    FoundScenes,
+    Files,
+    RemoteFolder,
+    RemoteTree,
     SceneFolder,
+    TreeCache,
     find_scene_folders,
-    folder_of,
+    in_parallel,
     stamp_of,
 )
 from stereogenbench_data.media.depth import require_depth_stream
-from stereogenbench_data.schema.conventions import Conventions, depth_of
+from stereogenbench_data.schema.conventions import Conventions, Shape, depth_of
 from stereogenbench_data.schema.document import brief
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Remark, Scene, SceneId, remarks_told
@@ -55,77 +56,6 @@ from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.location import is_remote, shown
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy
-
-_JOURNAL_FORMAT: Final = 2
-
-
-class Journal:
-    """JSON values by scene, on disk; leaving its block keeps the file, `delete` removes it."""
-
-    def __init__(self, path: Path, *, work: Mapping[str, Any]) -> None:
-        """Read a journal; that of other work is ignored, and replaced by the first new value.
-
-        Args:
-            path: The journal's file.
-            work: What the work is, as JSON: runs of the same work share their values.
-
-        Raises:
-            StorageError: If the file exists and cannot be read.
-        """
-        self._path = path
-        self._file: TextIO | None = None
-        self._head = json.dumps({"journal": _JOURNAL_FORMAT, **work})
-        what = f"{path}: the journal of an earlier run cannot be read"
-        self._known: dict[str, tuple[str, Any]] = {}
-        with (
-            explain_os_errors(what, "Remove it, or write the result to another folder."),
-            suppress(FileNotFoundError, NotADirectoryError),
-        ):
-            lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-            for line in lines[1:] if lines[:1] == [self._head] else ():
-                with suppress(ValueError, KeyError, TypeError):
-                    entry: Any = json.loads(line)
-                    self._known[str(entry["key"])] = (entry["stamp"], entry["value"])
-
-    def __len__(self) -> int:
-        """The number of scenes that earlier runs have done."""
-        return len(self._known)
-
-    def value(self, key: str, *, stamp: str) -> Any:
-        """Return a scene's value; None if there is none, or its files have changed."""
-        known = self._known.get(key)
-        return known[1] if known is not None and known[0] == stamp else None
-
-    def record(self, key: str, value: Any, *, stamp: str) -> None:
-        """Write a scene's value, any JSON but null.
-
-        Raises:
-            StorageError: If the file cannot be written.
-        """
-        line = json.dumps({"key": key, "stamp": stamp, "value": value})
-        what = f"{self._path}: the journal cannot be written"
-        with explain_os_errors(what, "Write the result to another folder."):
-            if self._file is None:
-                self._path.parent.mkdir(parents=True, exist_ok=True)
-                self._file = self._path.open("a" if self._known else "w", encoding="utf-8")
-                self._file.write("\n" if self._known else f"{self._head}\n")
-            self._file.write(f"{line}\n")
-            self._file.flush()
-
-    def delete(self) -> None:
-        """Remove the file, whose values were written elsewhere."""
-        self.__exit__()
-        self._path.unlink(missing_ok=True)
-
-    def __enter__(self) -> "Journal":
-        """Return the journal itself."""
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Close the file, and keep it."""
-        if self._file is not None:
-            self._file.close()
-
 
 _NAMED: Final = 6
 ALIKE: Final = 20
@@ -179,19 +109,152 @@ class Outcome:
     Attributes:
         key: The scene.
         found: Its row, or why it has none: `IncompleteScene` where it was never finished.
-        stamp: A digest of its files.
         has_mark: Whether it has its completion mark.
     """
 
     key: str
     found: Scene | StereoGenBenchError
-    stamp: str = ""
     has_mark: bool = True
 
 
-def scene_journal(path: Path, *, walk: str) -> Journal:
-    """Return the journal of the scenes that a walk has described; see `Journal`."""
-    return Journal(path, work={"walk": walk, "columns": [*SCHEMA.names, SEEK_COLUMN]})
+@dataclass(frozen=True, slots=True)
+class Tree:
+    """The scenes of a folder or URL in the released layout, and how their files are read.
+
+    Attributes:
+        root: The folder, or the URL.
+        keys: The wanted scenes, sorted.
+        refused: Path to reason and cure, for folders of misplaced scenes.
+        is_part: Whether the user chose only some of the scenes.
+        is_marked: Whether some scene, wanted or not, is known to have its completion mark.
+        cache: Where what is found out is kept.
+        remote: What lists the files behind the URL; None on this machine.
+        conventions: Where quantities stand in the files; what they do not state is found.
+        valid_depth: Whether depth pictures are decoded, see `walk`.
+        files: Key to files, of scenes whose files are listed.
+        stamp: A digest of all this, which changes when a file is added, removed or changed.
+    """
+
+    root: Path | str
+    keys: tuple[str, ...]
+    refused: dict[str, str]
+    is_part: bool
+    is_marked: bool
+    cache: TreeCache
+    remote: RemoteTree | None = None
+    conventions: Conventions | None = None
+    valid_depth: ValidDepth = "skip"
+    files: Mapping[str, Files] = field(default_factory=dict)
+    stamp: str = ""
+
+    def listed(self) -> "Tree":
+        """Return the tree with the files of its scenes; where they cannot be listed, without."""
+
+        def stamps(key: str) -> Files | None:
+            with suppress(StorageError):
+                return self.folder(key).stamps()
+            return None
+
+        if self.remote is None:
+            found = zip(self.keys, self.of_each(stamps, self.keys), strict=True)
+            files = {key: each for key, each in found if each is not None}
+        else:
+            files = self.remote.files(self.keys)
+        is_marked = self.is_marked or any(COMPLETE_JSON in each for each in files.values())
+        digest = hashlib.sha256(repr((self.is_part, is_marked, self.refused, self.keys)).encode())
+        for item in files.items():
+            digest.update(repr(item).encode())
+        return replace(self, files=files, is_marked=is_marked, stamp=digest.hexdigest()[:32])
+
+    def folder(self, key: str) -> SceneFolder:
+        """Return a scene's folder; on this machine its files are listed anew."""
+        if self.remote is None:
+            return SceneFolder(self.root, key)
+        return RemoteFolder(self.remote.root, key, self.files.get(key), self.cache)
+
+    def stamps(self, key: str) -> Files:
+        """Return a scene's files as they were listed, or list them now.
+
+        Raises:
+            StorageError: If they cannot be listed.
+        """
+        return self.files[key] if key in self.files else self.folder(key).stamps()
+
+    def finished(self, key: str) -> Files:
+        """Return a scene's files, by whose names it is finished.
+
+        Raises:
+            StorageError: If they cannot be listed, or the scene cannot be used.
+        """
+        files = self.stamps(key)
+        require_finished(key, files)
+        if self.is_marked and COMPLETE_JSON not in files:
+            raise unfinished(key)
+        return files
+
+    @property
+    def stated(self) -> Shape | None:
+        """What conventions state of all scenes."""
+        return None if self.conventions is None else self.conventions.shapes[0]
+
+    def of_each(self, read: Callable[[str], Any], keys: Sequence[str]) -> Iterator[Any]:
+        """Yield what is read of each scene, in order; several wait at a time."""
+        return _of_each(read, keys) if self.remote is None else in_parallel(read, keys)
+
+    def kept(self, name: str) -> Scene | None:
+        """Return the scene that the user's cache holds by its `name_of`; None if there is none."""
+        text = self.cache.read("scenes", name)
+        with suppress(ValueError, KeyError, TypeError, IndexError, AttributeError):
+            return None if text is None else scene_of_json(json.loads(text))
+        return None
+
+    def name_of(self, folder: SceneFolder, videos: Collection[str] | None = None) -> str:
+        """Return what a scene that is described is kept under.
+
+        Raises:
+            StorageError: If its files cannot be listed.
+        """
+        opened = "all" if videos is None else sorted(videos)
+        return repr((folder.key, opened, self.valid_depth, stamp_of(folder.stamps())))
+
+    def describe(self, folder: SceneFolder, videos: Collection[str] | None = None) -> Scene:
+        """Return a scene as its files say, or as the user's cache holds it; see `describe_scene`.
+
+        Raises:
+            StorageError: If it cannot be used.
+        """
+        name = self.name_of(folder, videos)
+        scene = self.kept(name)
+        if scene is None:
+            scene = describe_scene(
+                self.root, folder.key, valid_depth=self.valid_depth, conventions=self.conventions,
+                folder=folder, videos=videos,
+            )  # fmt: skip
+            self.cache.keep("scenes", name, json.dumps(json_of(scene)).encode())
+        return scene
+
+    def outcome(self, folder: SceneFolder, advance: Advance = no_advance) -> Outcome:
+        """Return what becomes of a scene whose files are all read, in a worker process too."""
+        advance(0)
+        files: Files = {}
+        try:
+            files = folder.stamps()
+            return Outcome(folder.key, self.describe(folder), has_mark=COMPLETE_JSON in files)
+        except StereoGenBenchError as error:
+            has_mark = not files or COMPLETE_JSON in files
+            return Outcome(folder.key, error, has_mark=has_mark)
+
+
+_READERS: Final = 8
+_AT_A_TIME: Final = 128
+
+
+def _of_each(read: Callable[[str], Any], keys: Sequence[str]) -> Iterator[Any]:
+    """Yield what is read of each scene, in order; several wait for a slow disk at a time."""
+    parts = [keys[start : start + _AT_A_TIME] for start in range(0, len(keys), _AT_A_TIME)]
+    with ThreadPoolExecutor(_READERS) as pool:
+        for part in pool.map(lambda part: [read(key) for key in part], parts):
+            yield from part
 
 
 def walk(  # noqa: PLR0913 - each is an option of the command
@@ -200,7 +263,6 @@ def walk(  # noqa: PLR0913 - each is an option of the command
     workers: int | None = None,
     engine: Engine = LOCAL,
     progress: Progress | None = None,
-    journal: Journal | None = None,
     valid_depth: ValidDepth = "skip",
     wanted: Callable[[SceneId], bool] | None = None,
     if_none: Literal["refuse", "all"] = "refuse",
@@ -216,7 +278,6 @@ def walk(  # noqa: PLR0913 - each is an option of the command
             process reads them all.
         engine: Where these processes run: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called after each scene with the number of scenes done and that of all.
-        journal: Where described scenes are kept for a later walk.
         valid_depth: "sample" decodes some depth pictures of each scene, for the share of pixels
             that have a depth.
         wanted: Returns whether to describe the scene of a path; None is all.
@@ -229,27 +290,46 @@ def walk(  # noqa: PLR0913 - each is an option of the command
             first `ALIKE` scenes are broken for one reason, so that it is the format of the files.
     """
     require_workers(workers)
-    folders, is_part = find_scenes(root, wanted=wanted, if_none=if_none, retry=retry)
-    task = DescribeTask(str(root), valid_depth, conventions, retry)
-    outcomes = _reused(task, folders.keys, journal)
-    total = len(folders.keys)
+    tree = find_tree(root, wanted=wanted, if_none=if_none, conventions=conventions, retry=retry)
+    tree = replace(tree, valid_depth=valid_depth)
+    return walk_tree(tree, workers=workers, engine=engine, progress=progress)
+
+
+def walk_tree(
+    tree: Tree,
+    *,
+    workers: int | None = None,
+    engine: Engine = LOCAL,
+    progress: Progress | None = None,
+) -> TreeReport:
+    """Return every scene of a tree, and what is wrong with the others; see `walk`."""
+    tree = tree if tree.remote is None or tree.files else tree.listed()
+    outcomes: dict[str, Outcome] = {}
+    total, pending = len(tree.keys), list[SceneFolder]()
+    for folder in map(tree.folder, tree.keys):
+        scene = None
+        with suppress(StorageError):  # of its folder: that is found again
+            scene = tree.kept(tree.name_of(folder))
+        if scene is None:
+            pending.append(folder)
+        else:
+            outcomes[folder.key] = Outcome(folder.key, scene, COMPLETE_JSON in scene.members)
     if progress is not None:
         progress(len(outcomes), total)
-    pending = [key for key in folders.keys if key not in outcomes]
     if engine is LOCAL and len(pending) < POOL_FROM:
         workers = 1
-    if is_remote(root):
-        tell_requests(root, len(pending), each=_REQUESTS, what="all files")
-    for outcome in engine.map(task, pending, name=str, workers=workers):
+    if tree.remote is not None:
+        tell_requests(tree.root, len(pending), each=_REQUESTS, what="all files")
+    bare = replace(tree, keys=(), refused={}, files={})
+    for outcome in engine.map(
+        bare.outcome, pending, name=lambda folder: folder.key, workers=workers
+    ):
         outcomes[outcome.key] = outcome
         if len(outcomes) == ALIKE:
-            require_not_all_alike(root, outcomes.values())
-        if journal is not None and isinstance(outcome.found, Scene):
-            journal.record(outcome.key, json_of(outcome.found), stamp=outcome.stamp)
+            require_not_all_alike(tree.root, outcomes.values())
         if progress is not None:
             progress(len(outcomes), total)
-    in_order = [outcomes[key] for key in folders.keys]
-    return report_of(root, folders, in_order, is_part=is_part)
+    return report_of(tree, outcomes)
 
 
 class ManyRequestsWarning(UserWarning):
@@ -268,30 +348,36 @@ def tell_requests(root: str | Path, scenes: int, *, each: int, what: str) -> Non
         warnings.warn(message, ManyRequestsWarning, stacklevel=2)
 
 
-def find_scenes(
+def find_tree(
     root: str | Path,
     *,
     wanted: Callable[[SceneId], bool] | None,
     if_none: Literal["refuse", "all"] = "refuse",
-    folders: FoundScenes | None = None,
+    conventions: Conventions | None = None,
     retry: RetryPolicy | None = None,
-) -> tuple[FoundScenes, bool]:
-    """Return the wanted scenes of a tree, and whether they are a part of it; see `walk`."""
-    if folders is None:
-        place = RemoteObject(str(root), retry=retry) if is_remote(root) else Path(root)
-        folders = find_scene_folders(place)
-    if wanted is None:
-        return folders, False
-    keys = tuple(key for key in folders.keys if wanted(parse_scene_key(key)))
-    if keys:
-        return replace(folders, keys=keys), True
-    if if_none == "all":
-        return folders, False
-    there = sorted({key.rpartition("/")[0] for key in folders.keys})
-    more = f" and {len(there) - _NAMED} folders more" if len(there) > _NAMED else ""
-    raise StorageError(
-        f"{shown(root)}: none of its {counted(len(folders.keys), 'scene')} matches; there are "
-        f"scenes in {', '.join(there[:_NAMED])}{more}. Check the filters' spelling."
+) -> Tree:
+    """Return the wanted scenes of a folder or URL, whose files are not listed yet; see `walk`."""
+    remote = RemoteTree(RemoteObject(str(root), retry=retry)) if is_remote(root) else None
+    keys, refused = find_scene_folders(Path(root)) if remote is None else remote.scenes()
+    is_marked = remote is None and any(Path(root, key, COMPLETE_JSON).exists() for key in keys)
+    chosen = [key for key in keys if wanted is None or wanted(parse_scene_key(key))]
+    if not chosen and if_none == "refuse":
+        there = sorted({key.rpartition("/")[0] for key in keys})
+        more = f" and {len(there) - _NAMED} folders more" if len(there) > _NAMED else ""
+        raise StorageError(
+            f"{shown(root)}: none of its {counted(len(keys), 'scene')} matches; there are scenes "
+            f"in {', '.join(there[:_NAMED])}{more}. Check the filters' spelling."
+        )
+    shapes = () if conventions is None else conventions.shapes
+    return Tree(
+        root,
+        tuple(chosen or keys),
+        refused,
+        is_part=wanted is not None and bool(chosen),
+        is_marked=is_marked,
+        cache=TreeCache(root, " ".join(shape.text() for shape in shapes)),
+        remote=remote,
+        conventions=conventions,
     )
 
 
@@ -311,67 +397,22 @@ def require_not_all_alike(root: str | Path, outcomes: Collection[Outcome]) -> No
         )
 
 
-@dataclass(frozen=True, slots=True)
-class DescribeTask:
-    """Describes a scene by its key, in a worker process."""
-
-    root: str
-    valid_depth: ValidDepth = "skip"
-    conventions: Conventions | None = None
-    retry: RetryPolicy | None = None
-
-    def folder(self, key: str) -> SceneFolder:
-        """Return a scene's folder; nothing is read yet."""
-        return folder_of(self.root, key, retry=self.retry)
-
-    def __call__(self, key: str, advance: Advance = no_advance) -> Outcome:
-        """Return what the scene is."""
-        advance(0)
-        folder = self.folder(key)
-        files: dict[str, tuple[int, int]] = {}
-        try:
-            files = folder.stamps()
-            scene = describe_scene(
-                self.root, key, valid_depth=self.valid_depth, conventions=self.conventions,
-                folder=folder,
-            )  # fmt: skip
-        except StereoGenBenchError as error:
-            return Outcome(key, error, has_mark=not files or COMPLETE_JSON in files)
-        return Outcome(key, scene, stamp_of(files), has_mark=COMPLETE_JSON in files)
-
-
-def _reused(task: DescribeTask, keys: Iterable[str], journal: Journal | None) -> dict[str, Outcome]:
-    """Return the scenes that a journal holds and whose files have not changed."""
-    outcomes: dict[str, Outcome] = {}
-    for key in keys if journal is not None and len(journal) else ():
-        with suppress(
-            StorageError, ValueError, KeyError, TypeError, IndexError, AttributeError
-        ):  # of the folder, or of a damaged row: the scene is described again
-            stamp = stamp_of(task.folder(key).stamps())
-            row = None if journal is None else journal.value(key, stamp=stamp)
-            if row is not None:
-                scene = scene_of_json(row)
-                outcomes[key] = Outcome(key, scene, stamp, COMPLETE_JSON in scene.members)
-    return outcomes
-
-
-def report_of(
-    root: str | Path, folders: FoundScenes, outcomes: list[Outcome], *, is_part: bool
-) -> TreeReport:
-    """Return the report of a walk that had these outcomes, one a scene in the order of keys.
+def report_of(tree: Tree, of_keys: Mapping[str, Outcome]) -> TreeReport:
+    """Return the report of a walk that had these outcomes, one a scene.
 
     Scenes without their completion mark are not finished, unless no scene of the tree has one.
     """
+    outcomes = [of_keys[key] for key in tree.keys]
     is_incomplete = [isinstance(out.found, IncompleteScene) for out in outcomes]
     marked = (out.has_mark for out, lacks in zip(outcomes, is_incomplete, strict=True) if not lacks)
-    if folders.is_marked or any(marked):
+    if tree.is_marked or any(marked):
         outcomes = [out if out.has_mark else Outcome(out.key, unfinished(out.key))
                     for out in outcomes]  # fmt: skip
     left_out = {out.key: out.found for out in outcomes if not isinstance(out.found, Scene)}
     incomplete = {key: str(error) for key, error in left_out.items()
                   if isinstance(error, IncompleteScene)}  # fmt: skip
     broken = {key: str(error) for key, error in left_out.items() if key not in incomplete}
-    ids = [parse_scene_key(key) for key in folders.keys]
+    ids = [parse_scene_key(key) for key in tree.keys]
     maps = {scene.map_name for scene in ids if scene.split == "train"} | TRAIN_MAPS
     found = [out.found for out in outcomes if isinstance(out.found, Scene)]
     agreed = agreed_forms(scene.pose_form for scene in found if scene.pose_form)
@@ -396,12 +437,12 @@ def report_of(
         f"name is used, such as {labels[0]}"
     ] if labels else []  # fmt: skip
     return TreeReport(
-        root=str(root),
+        root=str(tree.root),
         scenes=tuple(scenes),
         incomplete=incomplete,
-        broken=dict(sorted((folders.refused | broken).items())),
+        broken=dict(sorted((tree.refused | broken).items())),
         notes=(*subsets, *named, *remarks_told(found), *_depth_notes(found)),
-        is_part=is_part,
+        is_part=tree.is_part,
     )
 
 

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from stereogenbench_data.errors import StereoGenBenchError
-from stereogenbench_data.index.build import find_scenes
+from stereogenbench_data.index.build import find_tree
 from stereogenbench_data.index.evidence import Understood
 from stereogenbench_data.index.scene_folder import (
     Description,
@@ -109,9 +109,8 @@ def chosen_scenes(
     Raises:
         StorageError: If there are no scenes.
     """
-    found, _ = find_scenes(root, wanted=wanted)
     by_map: dict[str, list[str]] = {}
-    for key in found.keys:
+    for key in find_tree(root, wanted=wanted).keys:
         by_map.setdefault(key.rpartition("/")[0], []).append(key)
     rounds = zip_longest(*by_map.values())
     spread = [key for each in rounds for key in each if key is not None]

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import pyarrow as pa
 
@@ -30,14 +30,13 @@ from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import Scene, SceneId, remarks_told
 from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.sources.location import (
-    is_remote,
     shown,
 )
 from stereogenbench_data.sources.retry import RetryPolicy
 
 if TYPE_CHECKING:
-    from stereogenbench_data.index.build import TreeReport
-    from stereogenbench_data.index.presumed import Baselines, ListedTree, Presumption
+    from stereogenbench_data.index.build import Tree, TreeReport
+    from stereogenbench_data.index.presumed import Baselines, Presumption
 
 
 MOST_REMOTE_SCENES: Final = 64
@@ -105,28 +104,28 @@ def open_tree(
     Those of a large folder are kept in the user's cache, and presumed where that is possible.
     """
     # What describes files takes long to import, and an index needs none of it.
-    from stereogenbench_data.index.build import walk
-    from stereogenbench_data.index.presumed import list_tree
+    from stereogenbench_data.index.build import POOL_FROM, find_tree, walk_tree
+    from stereogenbench_data.index.presumed import FEW_REMOTE
 
     with _no_collection():
-        place = root if is_remote(root) else Path(root)
-        tree = list_tree(place, wanted, conventions, retry=retry)
-    if tree is not None and rows == "presumed" and tree.has_one_shape:
+        tree = find_tree(root, wanted=wanted, if_none="all", conventions=conventions, retry=retry)
+        is_large = len(tree.keys) >= (POOL_FROM if tree.remote is None else FEW_REMOTE)
+        tree = tree.listed() if is_large else tree
+    if is_large and rows == "presumed" and not (tree.stated and tree.stated.has):
         opened = _open_presumed(tree, "read" if tree.remote is None else "when needed")
         if opened is not None:
             return opened
 
     def read() -> Opened:
-        if tree is not None and tree.remote is not None:
+        if tree.remote is not None:
             _require_few(tree)
         # In this process: a script without `if __name__ == "__main__"` could start no others.
-        how: Any = {"wanted": wanted, "conventions": conventions, "retry": retry}
-        return _of_report(walk(root, workers=1, if_none="all", **how))
+        return _of_report(walk_tree(tree, workers=1))
 
-    return (None if tree is None else _once(tree, "read", read)) or read()
+    return (_once(tree, "read", read) if is_large else None) or read()
 
 
-def _open_presumed(tree: "ListedTree", baselines: "Baselines") -> Opened | None:
+def _open_presumed(tree: "Tree", baselines: "Baselines") -> Opened | None:
     """Return the scenes of a tree, most of them presumed; None where nothing can be presumed."""
     from stereogenbench_data.index.presumed import Presumption, presumed_report
 
@@ -143,7 +142,7 @@ def _open_presumed(tree: "ListedTree", baselines: "Baselines") -> Opened | None:
     return opened._replace(presumption=presumption)
 
 
-def _once(tree: "ListedTree", name: str, find: Callable[[], Opened | None]) -> Opened | None:
+def _once(tree: "Tree", name: str, find: Callable[[], Opened | None]) -> Opened | None:
     """Return the rows of a tree that an earlier opening has kept, or find and keep them."""
     name = f"{name}-{tree.stamp}"
     kept = tree.cache.table(name)
@@ -177,9 +176,9 @@ def with_baselines(presumption: "Presumption", table: pa.Table) -> "tuple[pa.Tab
     return opened.table, opened.presumption
 
 
-def _require_few(tree: "ListedTree") -> None:
+def _require_few(tree: "Tree") -> None:
     """Refuse to describe many scenes behind a URL each time they are opened."""
-    count, where = len(tree.folders.keys), shown(tree.root)
+    count, where = len(tree.keys), shown(tree.root)
     if count > MOST_REMOTE_SCENES:
         raise StorageError(
             f"{where}: has no {INDEX_NAME}, its scenes cannot be presumed to be alike, and {count} "

@@ -14,16 +14,14 @@ without their names and keys: so a record is the scene's whose path it holds, or
 family, map and folder are all among its values.
 """
 
-import hashlib
 import json
 import re
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from operator import eq
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -33,41 +31,31 @@ from stereogenbench_data.geometry.rig import RECTIFIED_PX
 from stereogenbench_data.index.alike_rigs import RigReader
 from stereogenbench_data.index.build import (
     ALIKE,
-    POOL_FROM,
     Outcome,
+    Tree,
     TreeReport,
-    find_scenes,
     report_of,
     tell_requests,
 )
 from stereogenbench_data.index.evidence import agreed_forms
-from stereogenbench_data.index.rows import json_of, scene_of_json
 from stereogenbench_data.index.scene_folder import (
     DESCRIPTIONS,
     as_agreed,
     as_kept,
     assumed_places_m,
     caption_of,
-    describe_scene,
     held_name,
     members_of,
     merged_labels,
     missing_video,
-    require_finished,
     sized_as_videos,
-    unfinished,
 )
 from stereogenbench_data.index.tree import (
     Files,
-    FoundScenes,
-    RemoteFolder,
-    RemoteTree,
     SceneFolder,
-    TreeCache,
     in_parallel,
-    stamp_of,
 )
-from stereogenbench_data.schema.conventions import Conventions, Shape
+from stereogenbench_data.schema.conventions import Shape
 from stereogenbench_data.schema.parse import (
     parse_complete,
     parse_rig,
@@ -94,7 +82,7 @@ from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.sources.fetch_ahead import FetchAhead, Wanted
 from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import MissingObject, RetryPolicy
+from stereogenbench_data.sources.retry import MissingObject
 
 FOLDER: Final = "metadata"
 
@@ -174,158 +162,11 @@ FEW_REMOTE: Final = 8
 """Fewer scenes behind a URL are all described."""
 _KEPT_SCENES: Final = 512
 """Of how many scenes behind a URL what was described is kept in memory."""
-_READERS: Final = 8
-_AT_A_TIME: Final = 128
 _LONGEST_TOLD: Final = 2000
 _ROUNDING: Final = 1e-6
 """A file of all scenes may round what ``baseline.json`` has in full."""
 _OF_A_FORMAT: Final = ("poses", "world", "left")
 """Remarks that are presumed of all scenes of a group where each one that was read has them."""
-
-
-@dataclass(frozen=True, slots=True)
-class ListedTree:
-    """The scenes of a folder or URL, and their files.
-
-    Attributes:
-        root: The folder, or the URL.
-        folders: The keys of the scenes, and folders that hold none.
-        files: Key to files, or to why they cannot be listed.
-        is_part: Whether the user chose only some of the scenes.
-        stamp: A digest that changes when a file is added, removed or changed.
-        conventions: How the files are read.
-        remote: The folder behind the URL; None on this machine.
-        described: The outcomes of scenes that were described in full.
-    """
-
-    root: Path | str
-    folders: FoundScenes
-    files: dict[str, Files | StorageError]
-    is_part: bool
-    stamp: str
-    conventions: Conventions | None
-    remote: RemoteObject | None
-    described: dict[str, Outcome] = field(default_factory=dict)
-
-    @property
-    def cache(self) -> TreeCache:
-        """Where what was found out about it is kept."""
-        return TreeCache(self.root, self.read_as)
-
-    def folder(self, key: str) -> SceneFolder:
-        """Return a scene's folder."""
-        files = self.files.get(key)
-        if isinstance(files, StorageError):
-            raise files
-        if self.remote is not None and files is not None:
-            return RemoteFolder(self.remote, key, files, self.cache)
-        return SceneFolder(self.root, key)
-
-    def finished(self, key: str) -> Files:
-        """Return a scene's files, by whose names it is finished.
-
-        Raises:
-            StorageError: If they cannot be listed, or the scene cannot be used.
-        """
-        files = self.files[key]
-        if isinstance(files, StorageError):
-            raise files
-        require_finished(key, files)
-        if self.folders.is_marked and COMPLETE_JSON not in files:
-            raise unfinished(key)
-        return files
-
-    def of_each(self, read: Callable[[str], Any], keys: Sequence[str]) -> Iterator[Any]:
-        """Yield what is read of each scene, in order; several wait at a time."""
-        return _of_each(read, keys) if self.remote is None else in_parallel(read, keys)
-
-    def describe(self, key: str, videos: Collection[str] | None = None) -> Scene:
-        """Return a scene as its files say, or as the user's cache holds it; see `describe_scene`.
-
-        Raises:
-            StorageError: If it cannot be used.
-        """
-        folder, scene = self.folder(key), None
-        name = f"{key} {' '.join(sorted(videos or ()))} {stamp_of(folder.stamps())}"
-        kept = self.cache.read("scenes", name)
-        with suppress(ValueError, KeyError, TypeError, IndexError, AttributeError):
-            scene = None if kept is None else scene_of_json(json.loads(kept))
-        if scene is None:
-            scene = describe_scene(
-                self.root, key, conventions=self.conventions, folder=folder, videos=videos
-            )
-            self.cache.keep("scenes", name, json.dumps(json_of(scene)).encode())
-        return scene
-
-    def outcome(self, key: str) -> Outcome:
-        """Return what becomes of a scene whose files are all read."""
-        if key not in self.described:
-            files = self.files[key]
-            has_mark = isinstance(files, StorageError) or not files or COMPLETE_JSON in files
-            try:
-                self.described[key] = Outcome(key, self.describe(key), has_mark=has_mark)
-            except StereoGenBenchError as error:
-                self.described[key] = Outcome(key, error, has_mark=has_mark)
-        return self.described[key]
-
-    @property
-    def has_one_shape(self) -> bool:
-        """Whether the conventions hold for all scenes, not only for files with certain keys."""
-        return self.conventions is None or not self.conventions.shapes[0].has
-
-    @property
-    def stated(self) -> Shape | None:
-        """What conventions state of all scenes."""
-        return None if self.conventions is None else self.conventions.shapes[0]
-
-    @property
-    def read_as(self) -> str:
-        """What the conventions state, as a text."""
-        shapes = () if self.conventions is None else self.conventions.shapes
-        return " ".join(shape.text() for shape in shapes)
-
-
-def list_tree(
-    root: Path | str,
-    wanted: Callable[[SceneId], bool] | None,
-    conventions: Conventions | None = None,
-    *,
-    retry: RetryPolicy | None = None,
-) -> ListedTree | None:
-    """List the wanted scenes of a tree; None where they are few, which are better read whole."""
-    remote = RemoteObject(root, retry=retry) if isinstance(root, str) else None
-    tree = None if remote is None else RemoteTree(remote)
-    all_folders = None if tree is None else tree.scenes()
-    folders, is_part = find_scenes(root, wanted=wanted, if_none="all", folders=all_folders)
-    if len(folders.keys) < (POOL_FROM if tree is None else FEW_REMOTE):
-        return None
-
-    def listed(key: str) -> Files | StorageError:
-        try:
-            return SceneFolder(root, key).stamps()
-        except StorageError as error:
-            return error
-
-    files: dict[str, Files | StorageError] = {}
-    if tree is None:
-        files |= zip(folders.keys, _of_each(listed, folders.keys), strict=True)
-    else:
-        files |= tree.files(folders.keys)
-        listings = (found for found in files.values() if not isinstance(found, StorageError))
-        is_marked = any(COMPLETE_JSON in found for found in listings)
-        folders = replace(folders, is_marked=is_marked)
-    digest = hashlib.sha256(repr((is_part, folders.is_marked, folders.refused)).encode())
-    for key, found in files.items():
-        digest.update(repr((key, found)).encode())
-    return ListedTree(root, folders, files, is_part, digest.hexdigest()[:32], conventions, remote)
-
-
-def _of_each(read: Callable[[str], Any], keys: Sequence[str]) -> Iterator[Any]:
-    """Yield what is read of each scene, in order; several wait for a slow disk at a time."""
-    parts = [keys[start : start + _AT_A_TIME] for start in range(0, len(keys), _AT_A_TIME)]
-    with ThreadPoolExecutor(_READERS) as pool:
-        for part in pool.map(lambda part: [read(key) for key in part], parts):
-            yield from part
 
 
 @dataclass(frozen=True, slots=True)
@@ -342,7 +183,7 @@ class _Metadata:
 Baselines = Literal["read", "when needed"]
 
 
-def presumed_report(tree: ListedTree, baselines: Baselines) -> TreeReport | None:
+def presumed_report(tree: Tree, baselines: Baselines) -> TreeReport | None:
     """Return what a walk would find, of which most is presumed.
 
     None where nothing can be presumed: the first scenes are all broken or derived for training, or
@@ -359,7 +200,7 @@ def presumed_report(tree: ListedTree, baselines: Baselines) -> TreeReport | None
         if isinstance(found, StereoGenBenchError):
             # A focal length in pixels may need the size of the videos.
             is_of_rig = isinstance(found, SchemaError)
-            outcomes[key] = tree.outcome(key) if is_of_rig else Outcome(key, found)
+            outcomes[key] = tree.outcome(tree.folder(key)) if is_of_rig else Outcome(key, found)
             if len(outcomes) == ALIKE and not groups:
                 return None
             continue
@@ -373,7 +214,7 @@ def presumed_report(tree: ListedTree, baselines: Baselines) -> TreeReport | None
             count = max(count, _LOOKED_AT // len(groups))
         places = np.unique(np.linspace(0, len(group) - 1, count).astype(int)).tolist()
         keys = [group[place].id.key for place in places]
-        looked_at = [*in_parallel(tree.outcome, keys)]
+        looked_at = [*in_parallel(tree.outcome, map(tree.folder, keys))]
         outcomes |= {outcome.key: outcome for outcome in looked_at}
         models = [outcome.found for outcome in looked_at if isinstance(outcome.found, Scene)]
         others = [each for each in group if each.id.key not in outcomes]
@@ -382,22 +223,18 @@ def presumed_report(tree: ListedTree, baselines: Baselines) -> TreeReport | None
         if others and baselines != "read" and len({each.rig.primary_pair for each in models}) > 1:
             return presumed_report(tree, "read")
         for each in others:
-            scene = _presumed(each, models, tree.stated)
-            key = each.id.key
-            has_mark = COMPLETE_JSON in each.files
-            outcomes[key] = (
-                tree.outcome(key) if scene is None else Outcome(key, scene, has_mark=has_mark)
-            )
-    in_order = [outcomes[key] for key in tree.folders.keys]
-    return report_of(tree.root, tree.folders, in_order, is_part=tree.is_part)
+            scene, key = _presumed(each, models, tree.stated), each.id.key
+            presumed = scene and Outcome(key, scene, has_mark=COMPLETE_JSON in each.files)
+            outcomes[key] = presumed or tree.outcome(tree.folder(key))
+    return report_of(tree, outcomes)
 
 
 def _metadata(
-    tree: ListedTree, baselines: Baselines
+    tree: Tree, baselines: Baselines
 ) -> Iterator[tuple[str, _Metadata | StereoGenBenchError]]:
     """Yield what is known of each scene before it is described, or why it cannot be used."""
-    rigs, keys = RigReader(tree.stated), tree.folders.keys
-    merged = _merged(tree, tree.remote) if baselines == "read" and tree.remote else {}
+    rigs, keys = RigReader(tree.stated), tree.keys
+    merged = _merged(tree, tree.remote.root) if baselines == "read" and tree.remote else {}
 
     def read(key: str) -> tuple[Files, bytes] | StereoGenBenchError:
         try:
@@ -445,16 +282,16 @@ def _with_marked(labels: SceneLabels, folder: SceneFolder, files: Files) -> Scen
     return merged_labels(labels, marked)
 
 
-def _merged(tree: ListedTree, root: RemoteObject) -> Mapping[str, bytes]:
+def _merged(tree: Tree, root: RemoteObject) -> Mapping[str, bytes]:
     """Return a record of each scene that says what some scenes' own files say, if there is one."""
-    keys = tree.folders.keys
+    keys = tree.keys
     places = np.unique(np.linspace(0, len(keys) - 1, _LOOKED_AT).astype(int)).tolist()
     some = [keys[place] for place in places]
 
     def own(key: str) -> tuple[Any, ...]:
         folder = tree.folder(key)
         rig, labels, _ = parse_rig(folder.read(BASELINE_JSON), where=key, shape=tree.stated)
-        return rig, _with_marked(labels, folder, tree.finished(key))
+        return rig, _with_marked(labels, folder, tree.stamps(key))
 
     for records in merged_records(root, keys):
         with suppress(SchemaError, StorageError):  # of a record, or of the files of one of these
@@ -541,13 +378,13 @@ class Presumption:
         baselines: Whether each ``baseline.json`` was read.
     """
 
-    def __init__(self, tree: ListedTree, *, forms: Sequence[str], baselines: Baselines) -> None:
+    def __init__(self, tree: Tree, *, forms: Sequence[str], baselines: Baselines) -> None:
         """Name the tree, and how the poses are read of the scenes that were read."""
         self.was_told = False
         self.is_remote = tree.remote is not None
         self.baselines = baselines
         # On a disk files are listed anew when a scene is needed, so they need not be kept.
-        self.tree = tree if self.is_remote else replace(tree, files={}, described={})
+        self.tree = tree if self.is_remote else replace(tree, files={})
         self._agreed = agreed_forms(forms)
         self._ahead = FetchAhead()
         self._planned: dict[str, int] = {}
@@ -617,7 +454,7 @@ class Presumption:
 
     def _read(self, key: str, *, videos: frozenset[str] | None) -> Scene:
         try:
-            return self.tree.describe(key, videos)
+            return self.tree.describe(self.tree.folder(key), videos)
         except StereoGenBenchError as error:
             raise StorageError(self._contradicted(key, [str(error)])) from error
 
@@ -642,7 +479,7 @@ class Presumption:
 
         keys = [*keys]
         remote = self.tree.remote
-        for merged in () if remote is None else merged_records(remote, keys):
+        for merged in () if remote is None else merged_records(remote.root, keys):
             found = [caption_of({DESCRIPTION_JSON: merged[key]}, key=key)[0] for key in keys]
             if any(found) and all(map(eq, found, map(caption, keys[:_LEAST_OF_A_GROUP]))):
                 return found

@@ -31,7 +31,6 @@ import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -135,7 +134,7 @@ class TreeCache:
         place = self._place(kind, name)
         with suppress(OSError):
             place.parent.mkdir(parents=True, exist_ok=True)
-            write_atomic(place, zlib.compress(content, 1))
+            write_atomic(place, zlib.compress(content, 1), flush_to="system")
 
     def once(self, kind: str, name: str, find: Callable[[], bytes]) -> bytes:
         """Return what was kept under a kind and a name, or find it now and keep it."""
@@ -144,6 +143,11 @@ class TreeCache:
             found = find()
             self.keep(kind, name, found)
         return found
+
+    def forget(self, kind: str, name: str) -> None:
+        """Remove what was kept under a kind and a name."""
+        with suppress(OSError):
+            self._place(kind, name).unlink()
 
     def _place(self, kind: str, name: str) -> Path:
         digest = _digest(name)
@@ -350,30 +354,23 @@ _DEEPEST: Final = 8
 """How many levels below the root are searched."""
 
 
-@dataclass(frozen=True, slots=True)
-class FoundScenes:
-    """The keys of scenes, and for other folders path to reason and cure.
+def find_scene_folders(root: Path | RemoteObject) -> tuple[list[str], dict[str, str]]:
+    """Return the keys of the scenes below a root, sorted, and the folders of misplaced ones.
 
-    ``is_marked`` is whether a scene is known to have its completion mark; a URL does not tell it.
-    """
-
-    keys: tuple[str, ...]
-    refused: dict[str, str]
-    is_marked: bool = False
-
-
-def find_scene_folders(root: Path | RemoteObject) -> FoundScenes:
-    """Return the scenes below a root, sorted by key, and the folders that hold misplaced ones.
+    Returns:
+        The keys, and other folders: path to what is wrong with it, and the cure.
 
     Raises:
         StorageError: If the root is not a folder that can be listed, or no scene is where it
             belongs.
     """
+    if isinstance(root, Path) and not root.exists():
+        raise StorageError(f"{root}: does not exist; expected a folder that holds train/ or eval/.")
     where = root.where if isinstance(root, RemoteObject) else os.path.abspath(root)  # noqa: PTH100
     places, others = search(root, SPLITS if isinstance(root, RemoteObject) else ())
     refused = {path: why or refusal(where, path) for path, why in others.items()}
     refused |= {path: why for path in places if (why := refusal(where, path))}
-    keys = tuple(sorted({*places} - refused.keys()))
+    keys = sorted({*places} - refused.keys())
     if not keys:
         looked = f"{where}: holds no scene; looked for folders {_LAYOUT}"
         roots = {_release_root_of(f"{where}/{path}") for path in refused} - {"", where}
@@ -382,10 +379,7 @@ def find_scene_folders(root: Path | RemoteObject) -> FoundScenes:
         first = [f"{path}: {refused[path]}" for path in sorted(refused)[:1]]
         found = ", ".join(first or sorted(_names(root, ""))[:8]) or "nothing"
         raise StorageError(f"{looked}, and found {found}. Point at what holds train/ or eval/.")
-    is_marked = isinstance(root, Path) and any(
-        (root / key / COMPLETE_JSON).exists() for key in keys
-    )
-    return FoundScenes(keys, dict(sorted(refused.items())), is_marked)
+    return keys, dict(sorted(refused.items()))
 
 
 def search(
@@ -479,7 +473,11 @@ def _release_root_of(place: str) -> str:
 
 
 class RemoteTree:
-    """The scenes of a tree behind a URL, and their files."""
+    """The listings of a tree behind a URL.
+
+    Attributes:
+        root: The tree.
+    """
 
     def __init__(self, root: RemoteObject) -> None:
         """Ask for the commit of a tree of the Hub; nothing else is requested yet.
@@ -487,23 +485,18 @@ class RemoteTree:
         Raises:
             StorageError: If the server cannot be asked.
         """
-        self._root = root
+        self.root = root
         pinned = root.pinned()
         self._kept = TreeCache(pinned) if pinned else _NOTHING_KEPT
 
-    def scenes(self) -> FoundScenes:
-        """Return the keys of all scenes.
+    def scenes(self) -> tuple[list[str], dict[str, str]]:
+        """Return what `find_scene_folders` finds.
 
         Raises:
             StorageError: If the tree cannot be listed, or no scene is where it belongs.
         """
-
-        def found() -> list[Any]:
-            scenes = find_scene_folders(self._root)
-            return [scenes.keys, scenes.refused]
-
-        keys, refused = self._once("scenes", found)
-        return FoundScenes(tuple(keys), refused)
+        keys, refused = self._once("scenes", lambda: find_scene_folders(self.root))
+        return keys, refused
 
     def files(self, keys: Sequence[str]) -> dict[str, Files]:
         """Return the files of scenes.
@@ -529,7 +522,7 @@ class RemoteTree:
         def listed() -> dict[str, tuple[int, int]]:
             return {
                 path: (size, _number(version))
-                for path, (size, version) in self._root.below(folder).listed("all levels").items()
+                for path, (size, version) in self.root.below(folder).listed("all levels").items()
                 if size is not None
             }
 

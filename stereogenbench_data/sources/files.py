@@ -24,21 +24,28 @@ _NO_LOCKS: Final = frozenset({errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP})
 _LOCK_POLL_S: Final = 0.01
 
 
-def write_atomic(path: Path, content: bytes) -> None:
+def write_atomic(
+    path: Path, content: bytes, *, flush_to: Literal["disk", "system"] = "disk"
+) -> None:
     """Write a small file whole or not at all, replacing any file of that name.
+
+    Args:
+        path: The file.
+        content: Its bytes.
+        flush_to: "system" is faster, and a loss of power may leave the file damaged.
 
     Raises:
         OSError: If it cannot be written; the file that was there stays as it was.
     """
-    with open_atomic(path) as file:
+    with open_atomic(path, flush_to=flush_to) as file:
         file.write(content)
 
 
 @contextmanager
-def open_atomic(path: Path) -> Iterator[BinaryIO]:
+def open_atomic(path: Path, *, flush_to: Literal["disk", "system"] = "disk") -> Iterator[BinaryIO]:
     """Open a file that is written whole or not at all, replacing any file of that name.
 
-    When the block ends without an error, the file is synchronised with the disk and renamed into
+    When the block ends without an error, the file is flushed (see `write_atomic`) and renamed into
     place. Files that killed writers of this path left are removed.
 
     Raises:
@@ -49,7 +56,8 @@ def open_atomic(path: Path) -> Iterator[BinaryIO]:
         try:
             yield file
             file.flush()
-            os.fsync(file.fileno())
+            if flush_to == "disk":
+                os.fsync(file.fileno())
             temporary.replace(path)
         finally:
             # Unless it was renamed, it is removed before it is closed: closing frees its lock, and

@@ -5,6 +5,7 @@ import json
 import pytest
 
 from stereogenbench_data.audit.geometry import audit as geometry_audit
+from stereogenbench_data.index.tree import CACHE_VARIABLE
 from tests.audit.corruption import copied, rewrite_rgb
 from tests.cli.command import invoke
 
@@ -14,8 +15,8 @@ FEW = ("--workers", "1", "--per-scene", "1", "--where", f"scene={SCENE}")
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    """Run the command with a home of its own."""
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    """Run the command with a cache of its own."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     return lambda *words: invoke("audit", *words)
 
 
@@ -40,7 +41,7 @@ def test_a_finding_ends_with_exit_code_1_and_json_is_all_that_stdout_gets(
     assert f"- {SCENE}/cam_00_rgb.mp4: too dark: " in (tmp_path / "a.md").read_text()
 
 
-def test_a_stopped_audit_keeps_its_journal_and_the_next_run_uses_it(
+def test_a_stopped_audit_keeps_its_results_and_the_next_run_uses_them(
     small_shards, run, monkeypatch, tmp_path
 ):
     plain, audited = geometry_audit.audit_scene, []
@@ -54,7 +55,7 @@ def test_a_stopped_audit_keeps_its_journal_and_the_next_run_uses_it(
     monkeypatch.setattr(geometry_audit, "audit_scene", audit_some)
     limit = 1
     stopped = run(small_shards, "--workers", "1", "--per-scene", "1")
-    kept = [*(tmp_path / "home").rglob("audit-*.journal")]
+    kept = [*(tmp_path / "cache").rglob("audit-*/*/*")]
     limit = 4
     again = run(small_shards, "--workers", "1", "--per-scene", "1")
 

@@ -4,14 +4,16 @@ import json
 import re
 import shutil
 import warnings
+import zlib
 
 import fsspec
 import numpy as np
 import pytest
 
-from stereogenbench_data.audit.geometry.audit import audit, audit_journal, open_for_audit
+from stereogenbench_data.audit.geometry.audit import audit, open_for_audit
 from stereogenbench_data.audit.geometry.table import audit_markdown, pooled_px
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.index.tree import CACHE_VARIABLE
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.audit.corruption import (
@@ -331,38 +333,49 @@ def test_a_sample_is_spread_over_the_scenes_that_pass_the_filters(indexed_releas
         keys(2, map="Nowhere")
 
 
-def test_a_journal_of_other_frames_or_changed_files_is_not_used(indexed_release, tmp_path):
+@pytest.fixture
+def stopped(tmp_path, monkeypatch):
+    """Audit, and be stopped at the end: the results stay in a cache."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+
+    def run(index, frames, **options):
+        told = []
+
+        def progress(done, total):
+            told.append(done)
+            if told[-2:] == [total, total]:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt, match=r"^$"):
+            audit(index, frames=frames, workers=1, progress=progress, **options)
+        return told[0]
+
+    return run
+
+
+def test_results_of_other_frames_or_changed_files_are_not_used(indexed_release, tmp_path, stopped):
     folder = copied(indexed_release / SCENE, tmp_path / "data")
     index = open_for_audit(tmp_path / "data")
 
-    def run(frames):
-        with audit_journal(tmp_path / "j", index, frames=frames) as journal:
-            return len(journal), audit(index, frames=frames, workers=1, journal=journal)
-
-    first = run(2)
-    again = run(2)
+    known = [stopped(index, 2), stopped(index, 2), stopped(index, 3)]
+    again = audit(index, frames=2, workers=1)
     flat(folder)
-    index = open_for_audit(tmp_path / "data")
-    changed = run(2)
-    others = run(3)
+    changed = open_for_audit(tmp_path / "data")
+    known.append(stopped(changed, 3))
 
-    assert [first[0], again[0], changed[0], others[0]] == [0, 1, 1, 0]
-    assert again[1].to_json() == first[1].to_json()
-    assert first[1].findings == ()
-    assert [each.check for each in changed[1].findings] == ["flat"]
+    assert known == [0, 2, 0, 0]
+    assert again.findings == ()
+    assert [each.check for each in audit(changed, frames=2, workers=1).findings] == ["flat"]
 
 
-def test_a_damaged_journal_is_passed_over(exact, indexed_release, tmp_path):
+def test_a_damaged_result_is_passed_over(exact, indexed_release, tmp_path, stopped):
     index = open_for_audit(indexed_release)
+    stopped(index, 3, scenes=SCENE)
+    (kept,) = (tmp_path / "cache").rglob("audit-*/*/*")
+    text = zlib.decompress(kept.read_bytes())
+    kept.write_bytes(zlib.compress(text.replace(b'"figures": [{', b'"figures": [{"odd": 1, ')))
 
-    def run():
-        with audit_journal(tmp_path / "j", index, frames=3) as journal:
-            return audit(index, frames=3, workers=1, journal=journal, scenes=SCENE)
-
-    run()
-    text = (tmp_path / "j").read_text()
-    (tmp_path / "j").write_text(text.replace('"figures": [{', '"figures": [{"odd": 1, '))
-    report = run()
+    report = audit(index, frames=3, workers=1, scenes=SCENE)
 
     (expected,) = [scene for scene in exact.to_json()["scenes"] if scene["key"] == SCENE]
     assert report.to_json()["scenes"] == [expected]

@@ -8,8 +8,9 @@ import shutil
 import pytest
 
 from stereogenbench_data.index import build as walk_module
-from stereogenbench_data.index.build import scene_journal, walk
+from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.scene_folder import describe_scene
+from stereogenbench_data.index.tree import CACHE_VARIABLE
 
 KEY = "train/Uniform/Car_Dealer/scene_{:06d}"
 
@@ -85,61 +86,62 @@ def test_worker_processes_find_what_one_process_finds(linked_scenes, root, monke
     assert len(alone.scenes) == 4
 
 
-def stopped_walk(root, journal_path, *, after):
-    def stop(done, total):
-        if done == after:
-            raise KeyboardInterrupt
-
-    with (
-        scene_journal(journal_path, walk="w") as journal,
-        pytest.raises(KeyboardInterrupt, match=r"^$"),
-    ):
-        walk(root, journal=journal, progress=stop)
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    return tmp_path / "cache"
 
 
-def resumed_walk(root, journal_path, *, name="w"):
+def again(root, **how):
     """The number of scenes that were known at the start, and the report."""
     told = []
-    with scene_journal(journal_path, walk=name) as journal:
-        report = walk(root, journal=journal, progress=lambda done, total: told.append(done))
+    report = walk(root, progress=lambda done, total: told.append(done), **how)
     return told[0], report
 
 
-def test_a_journal_line_that_was_cut_short_is_read_again(linked_scenes, root, tmp_path):
+def test_a_stopped_walk_goes_on_and_a_damaged_row_is_read_again(linked_scenes, root, cache):
     linked_scenes(4)
-    journal = tmp_path / "journal"
-    stopped_walk(root, journal, after=3)
-    os.truncate(journal, journal.stat().st_size - 100)
 
-    known, report = resumed_walk(root, journal)
-    again, _ = resumed_walk(root, journal)
+    def stop(done, total):
+        if done == 3:
+            raise KeyboardInterrupt
 
-    assert (known, again) == (2, 4)
-    assert report == walk(root)
+    with pytest.raises(KeyboardInterrupt, match=r"^$"):
+        walk(root, progress=stop)
+    row = next(path for path in cache.rglob("scenes/*/*"))
+    os.truncate(row, row.stat().st_size - 100)
+
+    known, report = again(root)
+
+    assert (known, again(root)[0]) == (2, 4)
+    assert report == again(root)[1]
     assert len(report.scenes) == 4
 
 
-def test_a_scene_that_changed_since_is_read_again(linked_scenes, root, tmp_path):
+@pytest.mark.usefixtures("cache")
+def test_a_scene_that_changed_since_is_read_again(linked_scenes, root):
     keys = linked_scenes(3)
-    resumed_walk(root, tmp_path / "journal")
+    walk(root)
     path = root / keys[1] / "scene_description_qwen_dataset_level.json"
     path.unlink()
     path.write_text('{"detailed_caption": "Another."}')
 
-    known, report = resumed_walk(root, tmp_path / "journal")
+    known, report = again(root)
 
     assert known == 2
     captions = [scene.caption for scene in report.scenes]
     assert captions == ["Cars behind glass.", "Another.", "Cars behind glass."]
 
 
-def test_the_journal_of_another_walk_is_begun_anew(linked_scenes, root, tmp_path):
+@pytest.mark.usefixtures("cache")
+def test_a_walk_of_another_kind_reads_all_scenes(linked_scenes, root):
     linked_scenes(2)
-    resumed_walk(root, tmp_path / "journal")
+    walk(root)
 
-    known, _ = resumed_walk(root, tmp_path / "journal", name="other")
+    known, report = again(root, valid_depth="sample")
 
     assert known == 0
+    assert [scene.valid_depth_ratio for scene in report.scenes] != [None, None]
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,14 @@
 import errno
 import json
 import os
+from tempfile import TemporaryFile
 
 import pytest
 
 from stereogenbench_data.index import build as walk_module
 from stereogenbench_data.index.open_tree import IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.index.tree import CACHE_VARIABLE
 from tests.cli.command import invoke, one_line
 
 
@@ -84,14 +86,12 @@ def test_a_contradiction_that_is_not_fatal_is_reported(make_scene, root, run):
 def test_a_read_only_tree_asks_for_a_file_elsewhere(make_scene, root, run, tmp_path, monkeypatch):
     make_scene()
 
-    journal = walk_module.scene_journal
-
-    def refuse(path, **how):
-        if path.parent == root:
+    def refuse(dir):
+        if dir == root:
             raise OSError(errno.EROFS, os.strerror(errno.EROFS))
-        return journal(path, **how)
+        return TemporaryFile(dir=dir)
 
-    monkeypatch.setattr(walk_module, "scene_journal", refuse)
+    monkeypatch.setattr("stereogenbench_data.cli.index.TemporaryFile", refuse)
     refused, elsewhere = run(root), run(root, "-o", tmp_path / "elsewhere.parquet")
 
     assert refused.exit_code == 2
@@ -101,7 +101,8 @@ def test_a_read_only_tree_asks_for_a_file_elsewhere(make_scene, root, run, tmp_p
     assert len(SceneIndex.open(tmp_path / "elsewhere.parquet", root=root)) == 1
 
 
-def test_a_second_run_uses_the_journal_of_a_stopped_one(make_scene, root, run, monkeypatch):
+def test_a_second_run_goes_on_where_one_was_stopped(make_scene, root, run, tmp_path, monkeypatch):
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     for number in range(3):
         make_scene(f"train/Uniform/Car_Dealer/scene_{number:06d}")
     describe = walk_module.describe_scene
@@ -122,4 +123,3 @@ def test_a_second_run_uses_the_journal_of_a_stopped_one(make_scene, root, run, m
     assert "run the same command again" in first.stderr
     assert second.exit_code == 0
     assert described[-2:] == ["stopped", "train/Uniform/Car_Dealer/scene_000002"]
-    assert not (root / "index.parquet.journal").exists()

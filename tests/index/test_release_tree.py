@@ -9,12 +9,12 @@ from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.tree import find_scene_folders
 
-KEYS = (
+KEYS = [
     "eval/MapSeenInTrain/Uniform/Car_Dealer/scene_000000",
     "train/IPD_Gaussian/Car_Dealer/scene_000000",
     "train/Uniform/Car_Dealer/scene_000000",
     "train/Uniform/Car_Dealer/scene_000001",
-)
+]
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def test_other_folders_and_hidden_ones_are_passed_over(tree):
     (tree / "metadata" / "manifest.jsonl").write_text("{}")
     add(tree, ".cache/train/Uniform/Car_Dealer/scene_000000")
 
-    assert find_scene_folders(tree).keys == KEYS
+    assert find_scene_folders(tree) == (KEYS, {})
 
 
 @pytest.mark.parametrize(
@@ -50,10 +50,10 @@ def test_other_folders_and_hidden_ones_are_passed_over(tree):
 def test_a_misplaced_scene_is_listed_with_the_cure(tree, key, told):
     add(tree, key)
 
-    folders = find_scene_folders(tree)
+    keys, refused = find_scene_folders(tree)
 
-    assert folders.keys == KEYS
-    ((found, reason),) = folders.refused.items()
+    assert keys == KEYS
+    ((found, reason),) = refused.items()
     assert found == key
     assert re.search(told, reason)
 
@@ -87,18 +87,18 @@ def test_links_to_folders_are_followed(tree, tmp_path_factory):
     add(elsewhere, "Pairwise_Uniform/Car_Dealer/scene_000000")
     (tree / "train/Pairwise_Uniform").symlink_to(elsewhere / "Pairwise_Uniform")
 
-    assert "train/Pairwise_Uniform/Car_Dealer/scene_000000" in find_scene_folders(tree).keys
+    assert "train/Pairwise_Uniform/Car_Dealer/scene_000000" in find_scene_folders(tree)[0]
 
 
 def test_a_link_to_a_folder_above_itself_is_listed_and_not_followed(tree):
     (tree / "train/Uniform/loop").symlink_to(tree / "train")
 
-    folders = find_scene_folders(tree)
+    keys, refused = find_scene_folders(tree)
 
-    assert folders.keys == KEYS
+    assert keys == KEYS
     place = "train/Uniform/loop"
     told = f"{tree / place}: is a link to a folder above itself. Remove the link."
-    assert folders.refused == {place: told}
+    assert refused == {place: told}
 
 
 def test_a_folder_that_may_not_be_read_is_listed(tree, monkeypatch):
@@ -111,10 +111,10 @@ def test_a_folder_that_may_not_be_read_is_listed(tree, monkeypatch):
 
     monkeypatch.setattr(os, "scandir", forbidding)
 
-    folders = find_scene_folders(tree)
+    keys, refused = find_scene_folders(tree)
 
-    assert len(folders.keys) == 3
-    assert folders.refused == {
+    assert len(keys) == 3
+    assert refused == {
         "train/IPD_Gaussian": f"{tree}/train/IPD_Gaussian: cannot be searched (Permission denied). "
         f"Give permission, or choose another place."
     }

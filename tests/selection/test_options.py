@@ -50,7 +50,7 @@ def test_other_calls_list_their_own_options(small_shards, tmp_path):
     assert refusal(export_inputs, small_shards, tmp_path, tier="G1", frame=2)[0] == "frames"
     assert refusal(export_views, small_shards, tmp_path, layout="ply", point=2)[0] == "points"
     assert refusal(export_clips, small_shards, tmp_path, layout="musubi", pair=2)[0] == "pairs"
-    assert refusal(audit, small_shards, journals=2)[0] == "journal"
+    assert refusal(audit, small_shards, frame=2)[0] == "frames"
 
 
 def test_a_misspelled_family_of_drawn_scenes_is_answered_with_the_nearest_one():

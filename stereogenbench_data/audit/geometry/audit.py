@@ -24,12 +24,12 @@ from stereogenbench_data.audit.geometry.scene_audit import AuditTask, audit_scen
 from stereogenbench_data.audit.geometry.table import table_rows
 from stereogenbench_data.audit.scene_access import source_of, spread
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
-from stereogenbench_data.index.build import Journal, walk
+from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.open_tree import IncompleteSceneWarning
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.rows import row_of
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.index.tree import SceneFolder
+from stereogenbench_data.index.tree import SceneFolder, TreeCache
 from stereogenbench_data.jobs import WorkOptions, do_items
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
@@ -105,20 +105,18 @@ def audit(
     *,
     sample: int | None = None,
     frames: int = DEFAULT_FRAMES,
-    journal: Journal | None = None,
     **options: Unpack[AuditOptions],
 ) -> AuditReport:
     """Measure whether data are right: the paper's geometry audit and its quality checks.
 
     `reprojection` defines the reprojection error. A broken scene does not stop the audit; it is
-    a finding.
+    a finding. The user's cache keeps the result of each scene until the audit ends, so that a
+    stopped one goes on with the same number of frames; filters may differ.
 
     Args:
         data: A released tree, shards, an index file, the URL of either, or an index.
         sample: How many scenes, evenly spread; None for all.
         frames: How many frames of each scene, evenly spread; 0 for all, as in the paper.
-        journal: Keeps the result of each scene, so that a stopped audit can go on, see
-            `audit_journal`; None keeps nothing.
         **options: How it is run, and of which scenes. Progress is in frames, before that in the
             scenes of a tree that are read.
 
@@ -137,11 +135,13 @@ def audit(
     broken, incomplete = (_wanted(each, filters) for each in (index.broken, index.incomplete))
     rows = _chosen(index, sample, filters, left_out=broken | incomplete)
     scenes = [index.scene(int(row)) for row in rows]
-    stamps: dict[str, str] = {}
+    cache, kind = TreeCache(index.root), f"audit-{_FORMAT}-{frames}"
+    names = {scene.id.key: _stamp(index, scene) for scene in scenes}
     found: dict[str, SceneAudit] = {}
-    if journal is not None:
-        stamps = {scene.id.key: _stamp(index, scene) for scene in scenes}
-        found = _known(journal, stamps)
+    for key, name in names.items():
+        with suppress(KeyError, TypeError, ValueError):  # it is damaged
+            known = cache.read(kind, name)
+            found |= {} if known is None else {key: SceneAudit.revived(json.loads(known))}
     tasks = [
         AuditTask(scene, source_of(index, scene), frames)
         for scene in scenes
@@ -150,8 +150,7 @@ def audit(
 
     def keep(each: SceneAudit) -> None:
         found[each.key] = each
-        if journal is not None:
-            journal.record(each.key, plain(asdict(each)), stamp=stamps[each.key])
+        cache.keep(kind, names[each.key], json.dumps(plain(asdict(each))).encode())
 
     do_items(
         audit_scene,
@@ -162,6 +161,8 @@ def audit(
         done=sum(len(known.audited_frames) for known in found.values()),
         total=sum(len(spread(scene.frames, frames)) for scene in scenes),
     )
+    for name in names.values():
+        cache.forget(kind, name)
     audited = [found[scene.id.key] for scene in scenes]
     findings = [broken_finding(key, text) for key, text in sorted(broken.items())]
     for scene in audited:
@@ -208,27 +209,6 @@ def _chosen(
             raise
         return np.empty(0, dtype=np.int64)
     return rows[list(spread(len(rows), sample or 0))]
-
-
-def audit_journal(path: Path, index: SceneIndex, *, frames: int) -> Journal:
-    """Return the journal of an audit.
-
-    The journal starts anew for another root or number of frames. Filters and
-    the number of scenes may differ.
-
-    Raises:
-        StorageError: If the file exists and cannot be read.
-    """
-    return Journal(path, work={"audit": _FORMAT, "root": index.where, "frames": frames})
-
-
-def _known(journal: Journal, stamps: Mapping[str, str]) -> dict[str, SceneAudit]:
-    """Return the results of earlier runs for scenes that have not changed since."""
-    known: dict[str, SceneAudit] = {}
-    for key, stamp in stamps.items():
-        with suppress(KeyError, TypeError):  # nothing is known, or it is of another form
-            known[key] = SceneAudit.revived(journal.value(key, stamp=stamp))
-    return known
 
 
 def _stamp(index: SceneIndex, scene: Scene) -> str:
