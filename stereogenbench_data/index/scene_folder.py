@@ -801,11 +801,6 @@ def described_again(
         now = describe_scene("", folder.key, conventions=conventions, folder=folder, videos=videos)
     except (SchemaError, MediaError, StorageError) as error:
         return scene, [_placed(folder.key, str(error))]
-    if now.id.split == "eval" and not now.id.subset:
-        now = replace(now, id=replace(now.id, subset=scene.id.subset))
-    forms, forms_now = ((each.pose_form or "").split("|") for each in (scene, now))
-    if shape.poses is not None or {*forms} <= {*forms_now}:
-        now = replace(now, pose_form=scene.pose_form)
     by_videos = videos is None and {*scene.depth_unit_source} <= {"tag", "default"}
     new = [
         about
@@ -814,34 +809,39 @@ def described_again(
     ]
     new += ["videos"] if scene.members.keys() != now.members.keys() else []
     found = [_placed(folder.key, now.remark(about)) for about in new]
-    is_cut = now.frames > scene.frames and scene.remark("frames")
-    skipped = {
+    # What is not compared is taken from the row.
+    forms, forms_now = ((each.pose_form or "").split("|") for each in (scene, now))
+    lacks_poses = "poses" in new or scene.remark("poses")
+    parts = {
         "key_frames": scene.training is None,
-        "frames": is_cut or "frames" in new,
-        **dict.fromkeys(_OF_POSES, scene.remark("poses") or "poses" in new),
-        **dict.fromkeys(_UNITS, not by_videos or "depth" in new),
+        "frames": "frames" in new or (scene.remark("frames") and now.frames > scene.frames),
+        "pose_form": lacks_poses or shape.poses is not None or {*forms} <= {*forms_now},
+        **dict.fromkeys(_OF_POSES, lacks_poses),
+        **dict.fromkeys(_UNITS, "depth" in new or not by_videos),
     }
+    row = replace(now, **{part: getattr(scene, part) for part, is_kept in parts.items() if is_kept})
+    if row.id.split == "eval" and not row.id.subset:
+        row = replace(row, id=replace(row.id, subset=scene.id.subset))
     for part, name in _COMPARED.items():
-        if not skipped.get(part):
-            told = _changed(part, getattr(scene, part), getattr(now, part))
-            name = name if name in scene.members else ""
-            found += [(name, f"its path {each}" if part == "id" else each) for each in told]
+        told = _changed(part, getattr(scene, part), getattr(row, part))
+        name = name if name in scene.members else ""
+        found += [(name, f"its path {each}" if part == "id" else each) for each in told]
     for part in (*_STORED, *_UNITS) if videos is None else ():
-        cameras = zip(getattr(scene, part), getattr(now, part), strict=True)
+        cameras = zip(getattr(scene, part), getattr(row, part), strict=True)
         for camera, (before, after) in enumerate(cameras):
             name = scene.held_name(depth_name(camera))
-            if name in scene.members and not skipped.get(part):
+            if name in scene.members:
                 found += [(name, told) for told in _changed(part, before, after)]
     return now, found
 
 
-_OF_POSES: Final = ("lateral_m", "rig_residual_px", "pose_form")
+_OF_POSES: Final = ("lateral_m", "rig_residual_px")
 _STORED: Final = ("depth_codec", "depth_pixel_format")
 _UNITS: Final = ("depth_unit_m", "depth_offset_m")
 _COMPARED: Final = {
     "id": "", "rig": BASELINE_JSON, "labels": BASELINE_JSON, "caption": DESCRIPTION_JSON,
     "training": TRAINING_JSON, "key_frames": TRAINING_JSON,
-    **dict.fromkeys(("frames", *_OF_POSES), TRAJECTORY_JSON),
+    **dict.fromkeys(("frames", "pose_form", *_OF_POSES), TRAJECTORY_JSON),
 }  # fmt: skip
 """The parts of a row that are compared, and the files that tell them."""
 

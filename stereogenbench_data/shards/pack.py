@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -19,6 +19,7 @@ from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import read_json
 from stereogenbench_data.media.depth_frames import blosc2_module
+from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.shards.plan import DEFAULT_SHARD_BYTES, DepthCodec, ShardPlan, plan_shards
 from stereogenbench_data.shards.training import Derivation, TrainingSettings
 from stereogenbench_data.shards.writer import (
@@ -148,41 +149,38 @@ def pack(  # noqa: PLR0913 - each is an option of the command
             pack_task, tasks, name=lambda task: str(task.target), workers=workers, advance=advance
         )
     )
-    names = tuple(task.shard.name for task in part_tasks)
-    return replace(
-        _finish(plan_tasks, out), part=names, packed=tuple(name for name in names if name in packed)
+    found = {task.shard.name: find_packed(task) for task in plan_tasks}
+    shards = {name: index for name, index in found.items() if index is not None}
+    missing = tuple(name for name in found if name not in shards)
+    if not missing:
+        for task in plan_tasks:
+            shutil.rmtree(task.derived, ignore_errors=True)  # of a run killed after its last shard
+        _write_index(shards, out)
+    names = [task.shard.name for task in part_tasks]
+    return PackReport(
+        part=tuple(names),
+        packed=tuple(name for name in names if name in packed),
+        missing=missing,
+        index=None if missing else out / INDEX_NAME,
+        scenes=sum(len(task.shard.scenes) for task in plan_tasks),
     )
 
 
-def _finish(tasks: Sequence[ShardTask], out: Path) -> PackReport:
-    """Write the index, if all shards of the plan are finished by now.
+def _write_index(shards: Mapping[str, SceneIndex], out: Path) -> None:
+    """Write the index of all shards, given those of each.
 
     Raises:
-        StorageError: If the index cannot be written.
-        ShardError: If a shard was changed after it was packed.
+        StorageError: If it cannot be written.
     """
-    found = {task.shard.name: find_packed(task) for task in tasks}
-    packed = {name: index for name, index in found.items() if index is not None}
-    missing = tuple(name for name in found if name not in packed)
-    report = PackReport((), (), missing, None, sum(len(task.shard.scenes) for task in tasks))
-    if missing:
-        return report
-    for task in tasks:
-        shutil.rmtree(task.derived, ignore_errors=True)  # of a run killed after its last shard
-    for each in packed.values():
-        each.load_seek_tables()
-    index = SceneIndex.from_scenes(
-        [
-            replace(each.scene(row), seek_tables=each.seek_tables(row))
-            for each in packed.values()
-            for row in range(len(each))
-        ],
-        out,
-        shards={name: each.shards[name] for name, each in packed.items()},
-    )
-    # The index is written last: where it exists, every shard does, too.
-    index.write(out / INDEX_NAME)
-    return replace(report, index=out / INDEX_NAME)
+    scenes: list[Scene] = []
+    for shard in shards.values():
+        shard.load_seek_tables()
+        scenes += (
+            replace(shard.scene(row), seek_tables=shard.seek_tables(row))
+            for row in range(len(shard))
+        )
+    facts = {name: index.shards[name] for name, index in shards.items()}
+    SceneIndex.from_scenes(scenes, out, shards=facts).write(out / INDEX_NAME)
 
 
 # The folder of the shards: which plan it is for, and that it holds nothing else.

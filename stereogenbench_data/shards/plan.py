@@ -67,7 +67,6 @@ class PlannedMember:
     name: str
     source: str
     size: int
-    form: DepthCodec = "released"
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,7 +310,6 @@ def _released(scene: Scene, depth_codec: DepthCodec) -> list[PlannedMember]:
             f"{scene.id.key}.{packed.get(name, name)}",
             scene.members[name].path,
             scene.members[name].size,
-            depth_codec if name in packed else "released",
         )
         for name in MEMBER_ORDER
         if name in scene.members

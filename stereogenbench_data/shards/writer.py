@@ -227,14 +227,14 @@ def _pack(task: ShardTask, after_bytes: Advance) -> None:
         for scene in task.shard.scenes:
             members: dict[str, Member] = {}
             for member in _members(task, scene):
-                source, length = Path(task.root, member.source), member.size
+                name, source = member.name.partition(".")[2], Path(task.root, member.source)
+                length = member.size
                 chunks = _source_chunks(source, length, after_bytes)
-                if member.form != "released":
+                if name != source.name:
                     packed = _packed_depth(source, chunks, frames=scene.frames)
                     length, chunks = len(packed), iter([packed])
                 write(member_header(member.name, length))
                 crc32 = copy_with_crc32(chunks, write)
-                name = member.name.partition(".")[2]
                 members[name] = Member(Path(file.name).name, size - length, length, crc32)
                 write(bytes(padded(length) - length))
             file.flush()
