@@ -42,10 +42,10 @@ from stereogenbench_data.evaluation.inputs import export_inputs as export_inputs
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol as EvaluationProtocol
 from stereogenbench_data.evaluation.report import write_report as write_report
 from stereogenbench_data.evaluation.tables import tables_of as tables_of
-from stereogenbench_data.index.open import StaleIndexWarning as StaleIndexWarning
-from stereogenbench_data.index.open_tree import AssumptionWarning as AssumptionWarning
-from stereogenbench_data.index.open_tree import IncompleteSceneWarning as IncompleteSceneWarning
+from stereogenbench_data.index.table import AssumptionWarning as AssumptionWarning
+from stereogenbench_data.index.table import IncompleteSceneWarning as IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex as SceneIndex
+from stereogenbench_data.index.table import StaleIndexWarning as StaleIndexWarning
 from stereogenbench_data.samples.fields import PAIR_FIELDS as PAIR_FIELDS
 from stereogenbench_data.samples.fields import VIEW_FIELDS as VIEW_FIELDS
 from stereogenbench_data.samples.fields import EnlargedSizeWarning as EnlargedSizeWarning

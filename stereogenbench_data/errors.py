@@ -19,9 +19,9 @@ StereoGenBenchError
 
 Warnings, each a `UserWarning`, stand beside the code that gives them:
 
-StaleIndexWarning        index.open           a folder differs from its index
-IncompleteSceneWarning   index.open_tree      some scenes of the data cannot be used
-AssumptionWarning        index.open_tree      files are not as the paper prints them
+StaleIndexWarning        index.table          a folder differs from its index
+IncompleteSceneWarning   index.table          some scenes of the data cannot be used
+AssumptionWarning        index.table          files are not as the paper prints them
 OddSceneWarning          samples.fields       selected scenes differ from what the release promises
 SwappedSizeWarning       samples.fields       a size looks like (width, height)
 OpenVideosWarning        datasets.batches     more videos are needed than may be open

@@ -27,9 +27,12 @@ def open_data(
         StorageError: If the data do not exist, hold no complete scene or too many broken ones, or
             contradict conventions.
     """
-    from stereogenbench_data.index.open import StaleIndexWarning
-    from stereogenbench_data.index.open_tree import AssumptionWarning, IncompleteSceneWarning
-    from stereogenbench_data.index.table import SceneIndex
+    from stereogenbench_data.index.table import (
+        AssumptionWarning,
+        IncompleteSceneWarning,
+        SceneIndex,
+        StaleIndexWarning,
+    )
 
     with (
         warnings.catch_warnings(record=True) as warned,

@@ -40,8 +40,7 @@ from stereogenbench_data.errors import (
     text_without_secrets,
 )
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
-from stereogenbench_data.index.open_tree import MOST_LEFT_OUT, Rows
-from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.index.table import MOST_LEFT_OUT, Rows, SceneIndex
 from stereogenbench_data.media import depth
 from stereogenbench_data.samples.fields import (
     DEFAULT_PAIR_FIELDS,

@@ -1,24 +1,46 @@
 """The index: one row per scene, with all that selection and loading need before opening a video.
 
 On disk it is one Parquet file; in memory one Arrow table, sorted by key. Paths are relative to the
-data's root and never lead out of it.
+data's root and never lead out of it. `SceneIndex.open` makes one of any data:
+
+    a file ─────────────────────┬─ read ── root of its data ── digest ── is it stale?
+    a folder with an index file ┘
+    a URL ──────── fetched ─────── read ────────────────────── digest
+    a folder or URL without one ── its scenes: read whole where they are few, presumed where many
+
+An index file may come from a stranger: it opens data beside itself, and any other root is the
+user's own word. Conventions that are given for an index are compared with its rows (`_restated`).
+An index is old if its folder holds other scenes or shards (`_stale_message`): the names of folders
+tell, as copies and unpacked archives change dates; 7 ms for 8,493 scenes. What was read of a tree
+is kept in the user's cache, and what was taken for granted of it is told in one line.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+import functools
+import gc
+import warnings
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 import numpy as np
 import pyarrow as pa
 
-from stereogenbench_data.errors import StorageError
+from stereogenbench_data.errors import (
+    SchemaError,
+    StorageError,
+    explain_os_errors,
+    text_without_secrets,
+)
 from stereogenbench_data.index import compute as pc
 from stereogenbench_data.index.arrow import as_categories, as_numpy, one_array, table_digest
-from stereogenbench_data.index.open import open_table
-from stereogenbench_data.index.open_tree import Opened, Rows, opened_report, with_baselines
 from stereogenbench_data.index.parquet import (
+    INDEX_NAME,
     IndexHead,
+    made_again,
+    read_index_file,
     read_seek_tables,
     seek_tables_of,
     table_of_scenes,
@@ -26,14 +48,30 @@ from stereogenbench_data.index.parquet import (
 )
 from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, scene_of
 from stereogenbench_data.schema.conventions import Conventions, Shape, shape_of_text
-from stereogenbench_data.schema.records import Scene, SceneId, ShardFacts
-from stereogenbench_data.schema.release import VIDEO_FILES
-from stereogenbench_data.sources.location import shown
-from stereogenbench_data.sources.retry import RetryPolicy
+from stereogenbench_data.schema.records import Scene, SceneId, ShardFacts, remarks_told
+from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON, VIDEO_FILES
+from stereogenbench_data.schema.text import counted, shortened
+from stereogenbench_data.sources.location import is_remote, joined, local_path, shown, split_name
+from stereogenbench_data.sources.remote import RemoteObject
+from stereogenbench_data.sources.retry import MissingObject, RetryPolicy
 
 if TYPE_CHECKING:
-    from stereogenbench_data.index.build import TreeReport
+    from stereogenbench_data.index.build import Tree, TreeReport
+    from stereogenbench_data.index.presumed import Baselines, Presumption
 
+MAX_INDEX_BYTES: Final = 256 * 2**20
+"""The largest index that is fetched. One of 8,493 scenes has a few megabytes."""
+MOST_REMOTE_SCENES: Final = 64
+"""The most scenes behind a URL that are described when a tree without an index is opened."""
+MOST_LEFT_OUT: Final = 0.05
+"""The largest share of a tree's scenes that may be broken; one always may."""
+_LOOKED_AT: Final = 64
+"""How many scenes tell what opening a tree takes for granted."""
+_READ_AGAIN: Final = 3
+"""How many scenes' files are read again by the conventions."""
+_LONGEST_REASON: Final = 5000
+_SHOWN: Final = 10
+_NAMED: Final = 3
 _OF_BASELINES: Final = frozenset(
     {
         "baselines_cm", "focal_mm", "sensor_width_mm", "sensor_height_mm", "principal_x_px",
@@ -42,6 +80,27 @@ _OF_BASELINES: Final = frozenset(
     }
 )  # fmt: skip
 """Columns for which each ``baseline.json`` behind a URL is read."""
+
+
+class IncompleteSceneWarning(UserWarning):
+    """Some scenes of the data cannot be used; the message names them and the reasons."""
+
+
+class StaleIndexWarning(UserWarning):
+    """A folder holds scenes or shards that its index lacks, or lacks some that it lists."""
+
+
+class AssumptionWarning(UserWarning):
+    """Files of a tree are not as the paper prints them, and something was taken for granted."""
+
+
+Rows = Literal["presumed", "read"]
+"""Whether the rows of many scenes without an index may be presumed; see `index.presumed`."""
+
+
+SeekTables: TypeAlias = pa.BinaryArray | Path | None
+"""The packed seek tables of scenes, a row each, or the index file that holds them; None where there
+are none."""
 
 
 class SceneIndex:
@@ -62,22 +121,29 @@ class SceneIndex:
         presumption: What reads the scenes whose rows are presumed; None where all were read.
     """
 
-    def __init__(self, opened: Opened, *, retry: RetryPolicy | None = None) -> None:
+    def __init__(
+        self,
+        table: pa.Table,
+        head: IndexHead,
+        *,
+        seek_tables: SeekTables = None,
+        retry: RetryPolicy | None = None,
+    ) -> None:
         """Take a checked table; use `open` or `from_scenes` to make an index."""
-        self._head = head = opened.head
+        self._head = head
         self.root = head.root
         self.retry = retry
         self.incomplete = head.incomplete
         self.broken = head.broken
         self.shards = head.shards
         self.is_part = head.is_part
-        self.stale = opened.stale
+        self.stale = ""
         self.is_from_file = bool(head.digest)
-        self._table = opened.table
+        self._table = table
         self._columns: dict[str, np.ndarray] = {}
         self._digest = head.digest
-        self._seek_tables = opened.seek_tables
-        self.presumption = opened.presumption
+        self._seek_tables = seek_tables
+        self.presumption: Presumption | None = None
 
     @classmethod
     def open(
@@ -125,10 +191,29 @@ class SceneIndex:
             SchemaError: If the conventions are not understood.
         """
         stated = None if conventions is None else Conventions.read(conventions)
-        opened = open_table(
-            data, root=root, retry=retry, wanted=wanted, conventions=stated, rows=rows
+        named_root = None if root is None else _require_root(root)
+        open_tree = functools.partial(
+            _open_tree, wanted=wanted, conventions=stated, rows=rows, retry=retry
         )
-        return cls(opened, retry=retry)
+        if is_remote(data):
+            where = shown(data)
+            index = _open_url(str(data), root=named_root, retry=retry, open_tree=open_tree)
+        else:
+            where = str(local_path(data))
+            index = _open_path(local_path(data), root=named_root, open_tree=open_tree)
+        index.retry = retry
+        if stated is not None:
+            table = _restated(index._table, index._head, stated, retry=retry)
+            if table is not index._table:
+                index._table, index._digest = table, table_digest(table)
+        if left_out := index.incomplete | index.broken:
+            told = text_without_secrets(f"{where}: {listed(left_out)}")
+            warnings.warn(told, IncompleteSceneWarning, stacklevel=2)
+        if index.stale:
+            warnings.warn(index.stale, StaleIndexWarning, stacklevel=2)
+        if not index.is_from_file and (assumed := _assumed_of(index._table, where=index.where)):
+            warnings.warn(assumed, AssumptionWarning, stacklevel=2)
+        return index
 
     @classmethod
     def from_scenes(
@@ -151,9 +236,9 @@ class SceneIndex:
             StorageError: If two scenes have one key, or a path leaves the root.
         """
         scenes = tuple(scenes)
-        table = table_of_scenes(scenes, where=shown(root))
         head = IndexHead(str(root), shards=dict(shards or {}))
-        return cls(Opened(table, head, seek_tables=seek_tables_of(scenes)), retry=retry)
+        table = table_of_scenes(scenes, where=shown(root))
+        return cls(table, head, seek_tables=seek_tables_of(scenes), retry=retry)
 
     def only(self, rows: Iterable[int]) -> "SceneIndex":
         """Return an index of a few rows, small enough to be sent to a process with its work."""
@@ -163,7 +248,8 @@ class SceneIndex:
     @classmethod
     def from_report(cls, report: "TreeReport") -> "SceneIndex":
         """Return the index of the scenes that a walk found, and of those that it left out."""
-        return cls(opened_report(report))
+        table = table_of_scenes(report.scenes, where=shown(report.root))
+        return cls(table, report.head, seek_tables=seek_tables_of(report.scenes))
 
     def __repr__(self) -> str:
         """Return the root without secrets, and the number of scenes and shards."""
@@ -258,7 +344,7 @@ class SceneIndex:
         """
         if name not in self._columns:
             if name in _OF_BASELINES and self.presumption is not None:
-                self._table, self.presumption = with_baselines(self.presumption, self._table)
+                self._table, self.presumption = _with_baselines(self.presumption, self._table)
             columns = [field.name for field in SCHEMA if not pa.types.is_list(field.type)]
             if name not in columns:
                 known = ", ".join(columns)
@@ -379,3 +465,423 @@ class SceneIndex:
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs."""
         return self.__dict__ | {"_columns": {}}
+
+
+# Opening an index.
+
+
+def _open_path(
+    path: Path, *, root: str | None, open_tree: Callable[[Path], SceneIndex]
+) -> SceneIndex:
+    """Return the index in a file or folder, or the scenes of a tree without one."""
+    with explain_os_errors(f"{path}: cannot be looked at"):
+        is_folder, is_file = path.is_dir(), path.is_file()
+        is_tree = is_folder and not (path / INDEX_NAME).is_file()
+    if is_tree:
+        _require_no_root(path, root)
+        return open_tree(path)
+    if is_folder or is_file:
+        return _open_file(path / INDEX_NAME if is_folder else path, root=root)
+    raise StorageError(
+        f"{path}: does not exist; expected an index file, a folder with {INDEX_NAME} or a folder "
+        f"in the released layout."
+    )
+
+
+def _open_file(path: Path, *, root: str | None) -> SceneIndex:
+    """Return the index in a file. The user or, within limits, the file names its data's root.
+
+    Raises:
+        StorageError: If it is damaged or not an index of this version, or only the user may name
+            the place of its data.
+    """
+    table, head = read_index_file(path, where=str(path))
+    head = replace(head, root=_recorded_root(path, head, table) if root is None else root)
+    index = SceneIndex(table, head, seek_tables=path)
+    if not is_remote(head.root):
+        index.stale = _stale_message(table, head, index_file=path)
+    return index
+
+
+def _open_url(
+    url: str,
+    *,
+    root: str | None,
+    retry: RetryPolicy | None,
+    open_tree: Callable[[str], SceneIndex],
+) -> SceneIndex:
+    """Fetch an index. Its data are beside it, unless the user names another root."""
+    beside, name = split_name(url)
+    is_folder = not name.endswith(".parquet")
+    if is_folder:
+        beside, url = url.rstrip("/"), joined(url.rstrip("/"), INDEX_NAME)
+    remote = RemoteObject(url, retry=retry)
+    try:
+        size = remote.size()
+    except MissingObject:
+        if not is_folder:
+            raise
+        _require_no_root(shown(beside), root)
+        return open_tree(beside)
+    if size > MAX_INDEX_BYTES:
+        raise StorageError(
+            f"{remote.where}: an index may have {MAX_INDEX_BYTES:,} bytes, this one has "
+            f"{size:,}. It was not read. Check that the URL is that of an {INDEX_NAME}."
+        )
+    content = pa.BufferReader(remote.read(0, size))
+    table, head = read_index_file(content, where=remote.where)
+    head = replace(head, root=root or beside)
+    content.seek(0)
+    return SceneIndex(table, head, seek_tables=read_seek_tables(content))
+
+
+def _require_root(root: str | Path) -> str:
+    """Return the root that the user named: any URL, or a folder."""
+    if is_remote(root):
+        return str(root)
+    folder = local_path(root)
+    if not str(root) or not folder.is_dir():
+        raise StorageError(
+            f"{str(root)!r}: not a folder, and was named as the root of an index's data. Name the "
+            f"folder or URL to which the paths in the index are relative."
+        )
+    return str(folder)
+
+
+def _require_no_root(where: str | Path, root: str | None) -> None:
+    if root is not None:
+        raise StorageError(
+            f"{where}: has no {INDEX_NAME}, and a root was named for the data of one. Leave root "
+            f"out, or pass the index file."
+        )
+
+
+def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:
+    """Return the data's root: the index's own folder, or a recorded folder below it.
+
+    Raises:
+        StorageError: If the user must name the root, or it is not a folder.
+    """
+    beside, recorded = path.parent, head.root
+    if recorded == "." or not table.num_rows:
+        return str(beside)
+    if any((beside / file["path"]).exists() for file in table.column("members")[0].as_py()):
+        return str(beside)
+    folder = None
+    with suppress(OSError, ValueError, RuntimeError):  # not a path
+        is_url = recorded[:5].lower() == "file:"
+        place = local_path(recorded) if is_url else Path(recorded)
+        folder = None if is_remote(recorded) else (beside / place).resolve()
+    if folder is None or not folder.is_relative_to(beside.resolve()):
+        raise StorageError(
+            f"{path}: its data are not beside it, and it records their root as "
+            f"{shortened(repr(shown(recorded)), 300)}. An index opens data beside itself; any "
+            f"other root is your own word: SceneIndex.open({str(path)!r}, root=...), or --root "
+            f"with a command. Or move the index into that root."
+        )
+    if not folder.is_dir():
+        raise StorageError(
+            f"{path}: its data were at {folder}, which is not a folder now. Move the index into "
+            f"the data's root, or run `stereogenbench index` again."
+        )
+    return str(folder)
+
+
+_OF_DEPTH: Final = ("key", "depth_unit_m", "depth_offset_m", "depth_unit_source")
+
+
+def _restated(
+    table: pa.Table, head: IndexHead, conventions: Conventions, *, retry: RetryPolicy | None
+) -> pa.Table:
+    """Return the rows of an index with conventions, which must be those of its scenes.
+
+    Raises:
+        StorageError: If the rows were described by other conventions, or files contradict these.
+    """
+    from stereogenbench_data.index.scene_folder import described_again
+    from stereogenbench_data.sources.members import MemberSource
+
+    texts = [shape.text() for shape in conventions.shapes]
+    if {*table.column("conventions").to_pylist()} <= {*texts}:
+        return table
+    where, shape = shown(head.root), conventions.shapes[0]
+    if shape.has:
+        raise StorageError(
+            f"{where}: which of the {len(texts)} shapes of {conventions.where} a scene has is not "
+            f"in its index. Name the conventions where it is made: `stereogenbench index ROOT "
+            f"--conventions FILE`, and pack again."
+        )
+    source = MemberSource(head.root, shards=head.shards, revision=head.digest, retry=retry)
+    rows = np.unique(np.linspace(0, table.num_rows - 1, _READ_AGAIN).astype(int))
+    for row in rows.tolist():
+        scene = replace(scene_of(table.slice(row, 1).to_pylist()[0]), conventions=texts[0])
+        videos = [name for name in VIDEO_FILES if scene.held_name(name) in scene.members][:1]
+        _, found = described_again(scene, source, videos=videos)
+        for name, difference in found[:1]:
+            by = f"; so it is by {conventions.where}. Correct the conventions" if name else ""
+            raise StorageError(
+                f"{where}: {scene.id.key}/{name}: {difference}{by}. If the index is wrong: "
+                f"{made_again(where)}"
+            )
+    replaced: dict[str, Any] = {"conventions": texts[0]}
+    encoding = None if shape.depth is None else shape.depth.encoding
+    if shape.depth is not None and encoding is not None and encoding.unit_m is not None:
+        columns = (table.column(name).to_pylist() for name in _OF_DEPTH)
+        for key, units_m, offsets_m, sources in zip(*columns, strict=True):
+            stated = zip(units_m, offsets_m or [0.0] * CAMERA_COUNT, sources, strict=True)
+            for unit_m, stored_m, source in stated:
+                if source not in ("default", "unreadable"):
+                    shape.depth.require(unit_m, stored_m, where=f"{where}: {key}")
+        offset_m = encoding.offset_m
+        replaced["depth_unit_m"] = [encoding.unit_m] * CAMERA_COUNT
+        replaced["depth_unit_source"] = ["conventions"] * CAMERA_COUNT
+        replaced["depth_offset_m"] = [offset_m] * CAMERA_COUNT if offset_m else None
+    for name, value in replaced.items():
+        column = pa.array([value] * table.num_rows, type=SCHEMA.field(name).type)
+        table = table.set_column(SCHEMA.get_field_index(name), SCHEMA.field(name), column)
+    return table.combine_chunks()
+
+
+def _stale_message(table: pa.Table, head: IndexHead, *, index_file: Path) -> str:
+    """Return how an index differs from its root, and the cure; "" if it does not.
+
+    Folders of the tree that may not be listed are ignored. An index without any of its data is not
+    called old.
+
+    Args:
+        table: The rows of the index.
+        head: What is known besides them; its root is a folder of this machine.
+        index_file: Where the index is.
+    """
+    root, shards = Path(head.root), set(head.shards)
+    if shards:
+        what, known = "shard", shards
+        new = {path.name for path in root.glob("*.tar") if path.name[0] != "."} - shards
+        gone = {path for path in shards if not (root / path).exists()}
+        cure = (
+            "Fetch the index that belongs to these shards, move away what is not of it, or pack "
+            "all scenes into an empty folder."
+        )
+    else:
+        from stereogenbench_data.index.tree import SPLITS, search  # slow to import
+
+        members = one_array(table.column("members"))
+        first = pc.struct_field(members.values, "path").take(members.offsets[:-1])
+        # Folders of scenes may have other names than the scenes' keys.
+        known = {path.rpartition("/")[0] for path in first.to_pylist()}
+        what, placed = "scene", {*search(root, SPLITS)[0]}
+        left_out = head.broken.keys() - head.incomplete.keys()
+        added = set() if head.is_part else placed - known - left_out
+        new = {key for key in added if _is_finished(root, key)}
+        gone = known - placed
+        place = "" if index_file.parent == root else f" --out {index_file}"
+        cure = f"Run `stereogenbench index {root}{place}`."
+        if head.is_part:
+            cure = "It is of a part of the folder: make it again."
+    found = [
+        f"{counted(len(names), what)} {why} "
+        f"({', '.join(sorted(names)[:_NAMED])}{', ...' if len(names) > _NAMED else ''})"
+        for names, why in (
+            (new, "not in the index"),
+            (set() if gone == known else gone, "of the index, and not there"),
+        )
+        if names
+    ]
+    return (
+        f"{index_file}: is older than the folder {root}: {'; '.join(found)}. {cure}"
+        if found
+        else ""
+    )
+
+
+def _is_finished(root: Path, key: str) -> bool:
+    """Return whether a folder is a scene that an index would hold, by its names."""
+    from stereogenbench_data.schema.parse import parse_scene_key  # slow to import
+
+    try:
+        parse_scene_key(key)
+        names = {path.name for path in (root / key).iterdir()}
+    except (SchemaError, OSError):
+        return False
+    return COMPLETE_JSON in names and not names.isdisjoint(VIDEO_FILES)
+
+
+# Opening a tree without an index.
+
+
+def _open_tree(
+    root: str | Path,
+    *,
+    wanted: Callable[[SceneId], bool] | None,
+    rows: Rows,
+    conventions: Conventions | None,
+    retry: RetryPolicy | None,
+) -> SceneIndex:
+    """Return the scenes of a folder or URL in the released layout, without a few broken ones.
+
+    Those of a large folder are kept in the user's cache, and presumed where that is possible.
+    """
+    # What describes files takes long to import, and an index needs none of it.
+    from stereogenbench_data.index.build import POOL_FROM, find_tree, walk_tree
+    from stereogenbench_data.index.presumed import FEW_REMOTE
+
+    with _no_collection():
+        tree = find_tree(root, wanted=wanted, if_none="all", conventions=conventions, retry=retry)
+        is_large = len(tree.keys) >= (POOL_FROM if tree.remote is None else FEW_REMOTE)
+        tree = tree.listed() if is_large else tree
+    if is_large and rows == "presumed" and not (tree.stated and tree.stated.has):
+        index = _open_presumed(tree, "read" if tree.remote is None else "when needed")
+        if index is not None:
+            return index
+
+    def read() -> SceneIndex:
+        if tree.remote is not None:
+            _require_few(tree)
+        # In this process: a script without `if __name__ == "__main__"` could start no others.
+        return _of_report(walk_tree(tree, workers=1))
+
+    return (_once(tree, "read", read) if is_large else None) or read()
+
+
+def _open_presumed(tree: "Tree", baselines: "Baselines") -> SceneIndex | None:
+    """Return the scenes of a tree, most of them presumed; None where nothing can be presumed."""
+    from stereogenbench_data.index.presumed import Presumption, presumed_report
+
+    def presumed() -> SceneIndex | None:
+        with _no_collection():
+            report = presumed_report(tree, baselines)
+            return None if report is None else _of_report(report)
+
+    index = _once(tree, "presumed" if baselines == "read" else "listed", presumed)
+    if index is not None:
+        forms = index._table.column("pose_form").drop_null().to_pylist()
+        index.presumption = Presumption(tree, forms=forms, baselines=baselines)
+    return index
+
+
+def _once(tree: "Tree", name: str, find: Callable[[], SceneIndex | None]) -> SceneIndex | None:
+    """Return the rows of a tree that an earlier opening has kept, or find and keep them."""
+    name = f"{name}-{tree.stamp}"
+    kept = tree.cache.table(name)
+    if kept is not None:
+        table, head, tables = kept
+        # Without a digest: the user has made no index file.
+        head = replace(head, root=str(tree.root), digest="")
+        return SceneIndex(table, head, seek_tables=tables)
+    found = find()
+    if found is not None and not isinstance(found._seek_tables, Path):
+        head = replace(found._head, digest=table_digest(found._table))
+        tree.cache.keep_table(name, found._table, head, found._seek_tables)
+    return found
+
+
+def _with_baselines(presumption: "Presumption", table: pa.Table) -> "tuple[pa.Table, Presumption]":
+    """Return presumed rows once each ``baseline.json`` was read.
+
+    Raises:
+        StorageError: If one of them cannot be used, or read.
+    """
+    if presumption.baselines == "read":
+        return table, presumption
+    index = _open_presumed(presumption.tree, "read")
+    if index is None or index.presumption is None or index._table["key"] != table["key"]:
+        why = "" if index is None else listed(index.incomplete | index.broken)
+        raise StorageError(
+            f"{shown(presumption.tree.root)}: not all scenes are as was presumed: {why}. "
+            f"{presumption.cures()}"
+        )
+    return index._table, index.presumption
+
+
+def _require_few(tree: "Tree") -> None:
+    """Refuse to describe many scenes behind a URL each time they are opened."""
+    count, where = len(tree.keys), shown(tree.root)
+    if count > MOST_REMOTE_SCENES:
+        raise StorageError(
+            f"{where}: has no {INDEX_NAME}, its scenes cannot be presumed to be alike, and {count} "
+            f"are too many to fetch their headers each time. Index it once, or the part you need: "
+            f"`stereogenbench index {where} -o index.parquet --split eval`, and open that file "
+            f"with --root {where}, or SceneIndex.open('index.parquet', root=...)."
+        )
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Collect no garbage: beside torch's objects, the rows of thousands of scenes cost a third."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
+def _of_report(report: "TreeReport") -> SceneIndex:
+    """Return the scenes that a walk found.
+
+    Raises:
+        StorageError: If no scene is whole, or more than a few are broken.
+    """
+    from stereogenbench_data.index.build import FORMAT_CURE
+
+    where = shown(report.root)
+    if not report.scenes:
+        cure = f"\n{FORMAT_CURE.format(root=where)}" if report.broken else ""
+        raise StorageError(
+            f"{where}: no scene is complete: {listed(report.broken | report.incomplete)}{cure}"
+        )
+    found = len(report.scenes) + len(report.broken)
+    if len(report.broken) > max(1, found * MOST_LEFT_OUT):
+        raise StorageError(
+            f"{where}: {listed(report.broken)}\nRepair or remove them; or leave them out on "
+            f"purpose: `stereogenbench index {where}` makes an index without them."
+        )
+    return SceneIndex.from_report(report)
+
+
+def _assumed_of(table: pa.Table, *, where: str) -> str:
+    """Return what was taken for granted, by some of the scenes whose files were all read."""
+    is_odd = pc.or_(pc.is_valid(table.column("pose_form")), pc.is_valid(table.column("remarks")))
+    scenes = table.filter(is_odd).slice(0, _LOOKED_AT).to_pylist()
+    return assumptions(map(scene_of, scenes), where=where)
+
+
+def listed(left_out: Mapping[str, str]) -> str:
+    """Return how many scenes are left out, and the first of them with the reasons."""
+    lines = [
+        shortened(reason if key in reason else f"{key}: {reason}", _LONGEST_REASON)
+        for key, reason in sorted(left_out.items())[:_SHOWN]
+    ]
+    if len(left_out) > _SHOWN:
+        lines.append(f"and {len(left_out) - _SHOWN} more")
+    return "\n  ".join([f"{counted(len(left_out), 'scene')} cannot be used:", *lines])
+
+
+_ASSUMED: Final = (
+    "size", "stated", "baselines", "pair", "frames", "lens", "marker", "world", "pixels",
+)  # fmt: skip
+"""Remarks that are told when a tree is opened."""
+
+
+_PLAIN: Final = "unreal axes"
+
+
+def assumptions(scenes: Iterable[Scene], *, where: str) -> str:
+    """Return what was taken for granted about scenes and what was measured; "" if nothing."""
+    scenes = [scene for scene in scenes if scene.conventions is None]
+    forms = Counter(
+        (scene.pose_form or _PLAIN).split("|")[0].partition(" @ ")[0]
+        for scene in scenes if not scene.remark("world")
+    )  # fmt: skip
+    told = remarks_told(scenes, _ASSUMED) + [
+        f"poses are read as {shortened(form, 200)}: measured, the cameras' distances are the "
+        f"baselines ({counted(count, 'scene')})"
+        for form, count in forms.items() if _PLAIN not in form
+    ]  # fmt: skip
+    if not told:
+        return ""
+    return (
+        f"{where}: {'; '.join(told)}. `stereogenbench conventions {where} -o conventions.toml` "
+        f"writes down how its files are read, for conventions=."
+    )

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from stereogenbench_data.errors import ShardError
-from stereogenbench_data.index.open_tree import MOST_LEFT_OUT, IncompleteSceneWarning
 from stereogenbench_data.index.rows import row_of
-from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.index.table import MOST_LEFT_OUT, IncompleteSceneWarning, SceneIndex
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,

@@ -15,9 +15,8 @@ from typing import Final, Literal
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
 from stereogenbench_data.errors import MediaError, ShardError, cure_of
-from stereogenbench_data.index.open import StaleIndexWarning
 from stereogenbench_data.index.scene_folder import described_again
-from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.index.table import SceneIndex, StaleIndexWarning
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
     open_video,

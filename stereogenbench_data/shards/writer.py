@@ -19,7 +19,6 @@ from typing import Final
 
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, ShardError, StorageError, explain_os_errors
-from stereogenbench_data.index.open_tree import Opened
 from stereogenbench_data.index.parquet import INDEX_NAME, read_index_file
 from stereogenbench_data.index.scene_folder import derived_scene, described_again
 from stereogenbench_data.index.table import SceneIndex
@@ -132,7 +131,7 @@ def find_packed(task: ShardTask) -> SceneIndex | None:
             f"{task.target}: has {size} bytes, and had {packed_bytes} when it was packed. "
             f"Remove it, then run the same command again."
         )
-    return SceneIndex(Opened(table, head, seek_tables=task.index))
+    return SceneIndex(table, head, seek_tables=task.index)
 
 
 def pack_task(task: ShardTask, after_bytes: Advance) -> str:

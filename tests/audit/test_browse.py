@@ -14,7 +14,7 @@ from tests.servers.tools import require_module, require_tool
 
 # The index names a scene that was left out, each time that it is opened.
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::stereogenbench_data.index.open_tree.IncompleteSceneWarning"
+    "ignore::stereogenbench_data.index.table.IncompleteSceneWarning"
 )
 
 FLAGS = (

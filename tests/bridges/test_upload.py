@@ -107,7 +107,7 @@ def test_a_readme_of_the_user_is_not_replaced(folder):
     assert (folder / "README.md").read_text() == "mine"
 
 
-@pytest.mark.filterwarnings("ignore::stereogenbench_data.index.open.StaleIndexWarning")
+@pytest.mark.filterwarnings("ignore::stereogenbench_data.index.table.StaleIndexWarning")
 def test_a_missing_shard_is_named_before_the_upload(folder):
     next(folder.glob("*.tar")).unlink()
 

@@ -16,7 +16,7 @@ from stereogenbench_data import (
     StereoPairs,
     StorageError,
 )
-from stereogenbench_data.index.open_tree import AssumptionWarning, IncompleteSceneWarning
+from stereogenbench_data.index.table import AssumptionWarning, IncompleteSceneWarning
 from stereogenbench_data.samples.fields import OddSceneWarning
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest

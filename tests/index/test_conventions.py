@@ -9,9 +9,8 @@ import pytest
 from stereogenbench_data.datasets.mapped import SceneViews, StereoPairs
 from stereogenbench_data.errors import FieldError, StereoGenBenchError, StorageError
 from stereogenbench_data.index.learning import chosen_scenes, examine, learn, tables_of_notes
-from stereogenbench_data.index.open_tree import AssumptionWarning
 from stereogenbench_data.index.parquet import INDEX_NAME
-from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.index.table import AssumptionWarning, SceneIndex
 from stereogenbench_data.schema.conventions import parse_conventions, write_toml
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.shards.pack import pack

@@ -8,8 +8,7 @@ from tempfile import TemporaryFile
 import pytest
 
 from stereogenbench_data.index import build as walk_module
-from stereogenbench_data.index.open_tree import IncompleteSceneWarning
-from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
 from stereogenbench_data.index.tree import CACHE_VARIABLE
 from tests.cli.command import invoke, one_line
 

@@ -9,9 +9,8 @@ import pytest
 
 from stereogenbench_data import IncompleteSceneWarning, OddSceneWarning, StereoPairs
 from stereogenbench_data.errors import SchemaError, StorageError
-from stereogenbench_data.index.alike_rigs import RigReader
-from stereogenbench_data.index.open_tree import AssumptionWarning
-from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.index.presumed import RigReader
+from stereogenbench_data.index.table import AssumptionWarning, SceneIndex
 from stereogenbench_data.index.tree import CACHE_VARIABLE
 from stereogenbench_data.schema.parse import parse_rig
 from tests.servers.scene_fixtures import documents

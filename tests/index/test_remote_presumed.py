@@ -9,7 +9,7 @@ import pytest
 
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.index import open_tree as open_module
+from stereogenbench_data.index import table as open_module
 from stereogenbench_data.index.tree import CACHE_VARIABLE
 from tests.servers.hub import REPOSITORY, hub_serving
 

@@ -8,12 +8,12 @@ import av
 import pytest
 
 from stereogenbench_data.errors import SchemaError, StorageError
-from stereogenbench_data.index.open_tree import assumptions
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
     describe_scene,
     described_again,
 )
+from stereogenbench_data.index.table import assumptions
 from stereogenbench_data.schema.records import Member
 from stereogenbench_data.sources.members import MemberSource
 from tests.servers.videos import write_frames

@@ -9,10 +9,8 @@ import pytest
 
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.errors import SelectionError
-from stereogenbench_data.index.open import StaleIndexWarning
-from stereogenbench_data.index.open_tree import IncompleteSceneWarning
 from stereogenbench_data.index.parquet import INDEX_NAME
-from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex, StaleIndexWarning
 from stereogenbench_data.schema.release import COMPLETE_JSON
 from stereogenbench_data.selection.filters import filter_scenes, find_scene
 from tests.cli.command import invoke

@@ -16,10 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.index import open as index_module
+from stereogenbench_data.index import table as index_module
 from stereogenbench_data.index.arrow import table_digest
-from stereogenbench_data.index.open_tree import AssumptionWarning, IncompleteSceneWarning
-from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.index.table import AssumptionWarning, IncompleteSceneWarning, SceneIndex
 from stereogenbench_data.schema.records import Member, Rig, Scene, SceneId, SceneLabels
 
 METADATA = b"stereogenbench_data.index"
@@ -315,7 +314,7 @@ def recording(scenes, path, root):
     return path
 
 
-@pytest.mark.filterwarnings("ignore::stereogenbench_data.index.open.StaleIndexWarning")
+@pytest.mark.filterwarnings("ignore::stereogenbench_data.index.table.StaleIndexWarning")
 @pytest.mark.parametrize(
     "root",
     [

@@ -9,7 +9,7 @@ import pytest
 
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.index.open import StaleIndexWarning
+from stereogenbench_data.index.table import StaleIndexWarning
 from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.shards.download import download, wanted_files
 from tests.cli.command import COMMAND, invoke

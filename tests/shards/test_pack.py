@@ -15,8 +15,7 @@ from pathlib import Path
 import pytest
 
 from stereogenbench_data.errors import ShardError
-from stereogenbench_data.index.open_tree import IncompleteSceneWarning
-from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
 from stereogenbench_data.schema.records import Member
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.plan import PlannedShard

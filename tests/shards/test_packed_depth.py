@@ -9,8 +9,7 @@ import pytest
 
 from stereogenbench_data import PAIR_FIELDS, StereoPairs
 from stereogenbench_data.errors import ExtraError, ShardError, StorageError
-from stereogenbench_data.index.open_tree import IncompleteSceneWarning
-from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
 from stereogenbench_data.media.video import VideoReader
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES, depth_name, rgb_name
 from stereogenbench_data.shards.pack import pack

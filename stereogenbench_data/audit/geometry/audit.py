@@ -25,10 +25,9 @@ from stereogenbench_data.audit.geometry.table import table_rows
 from stereogenbench_data.audit.scene_access import source_of, spread
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
 from stereogenbench_data.index.build import walk
-from stereogenbench_data.index.open_tree import IncompleteSceneWarning
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.rows import row_of
-from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
 from stereogenbench_data.index.tree import SceneFolder, TreeCache
 from stereogenbench_data.jobs import WorkOptions, do_items
 from stereogenbench_data.schema.conventions import Conventions
