@@ -10,6 +10,7 @@ import re
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, Final, Literal
 
 from stereogenbench_data.errors import ShardError
@@ -138,18 +139,18 @@ def plan_shards(
     )
     shards: list[PlannedShard] = []
     planned: dict[str, list[PlannedMember]] = {}
-    for scene in scenes:
-        members = planned_members(scene, depth_codec=depth_codec, training=training)
-        planned[scene.id.key] = members
-        group, size, number = _group_of(scene), _tar_bytes(members), 0
-        last = shards[-1] if shards else None
-        if last is not None and last.name[: -len("-000000.tar")] == group:
-            if last.size + size <= target_bytes:
-                shards[-1] = PlannedShard(last.name, last.size + size, (*last.scenes, scene))
-                continue
-            number = int(last.name[-len("000000.tar") : -len(".tar")]) + 1
-        name = f"{group}-{number:06d}.tar"
-        shards.append(PlannedShard(name, len(END_OF_ARCHIVE) + size, (scene,)))
+    for group, of_group in groupby(scenes, key=_group_of):
+        before = len(shards)
+        for scene in of_group:
+            members = planned_members(scene, depth_codec=depth_codec, training=training)
+            planned[scene.id.key] = members
+            size = _tar_bytes(members)
+            if len(shards) > before and shards[-1].size + size <= target_bytes:
+                last = shards.pop()
+                shards.append(PlannedShard(last.name, last.size + size, (*last.scenes, scene)))
+            else:
+                name = f"{group}-{len(shards) - before:06d}.tar"
+                shards.append(PlannedShard(name, len(END_OF_ARCHIVE) + size, (scene,)))
     content = [
         [
             shard.name,

@@ -69,15 +69,6 @@ class _ExpectedShard:
 
 
 @dataclass(frozen=True, slots=True)
-class _SceneTask:
-    """A scene whose videos are decoded: those of these names, whose bytes are sound."""
-
-    root: str
-    scene: Scene
-    names: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class VerifyReport:
     """What was checked, and what is wrong in the order of shards, scenes and members.
 
@@ -136,20 +127,16 @@ def verify(
     ):
         problems += wrong
         sound |= right
-    tasks = [
-        _SceneTask(
+    works = [
+        (
             index.root,
             scene,
-            tuple(name for name in scene.held_videos if f"{scene.id.key}.{name}" in sound),
+            [name for name in scene.held_videos if f"{scene.id.key}.{name}" in sound],
         )
         for scene in scenes
     ]
     for found in engine.map(
-        _check_scene,
-        tasks,
-        name=lambda task: task.scene.id.key,
-        workers=workers,
-        advance=advance,
+        _decode, works, name=lambda work: work[1].id.key, workers=workers, advance=advance
     ):
         problems += found
     return VerifyReport(
@@ -158,7 +145,7 @@ def verify(
         scenes=len(index),
         members=sum(len(each.members) for each in expected.values()),
         bytes=sum(each.facts.size for each in expected.values()),
-        videos_decoded=sum(len(task.names) for task in tasks),
+        videos_decoded=sum(len(names) for _, _, names in works),
         problems=tuple(sorted(problems)),
         derived=index.derivation if index.is_derived else "",
     )
@@ -278,13 +265,22 @@ def _few(names: list[str]) -> str:
 # One scene: every frame.
 
 
-def _check_scene(task: _SceneTask, after_bytes: Advance) -> list[Problem]:
-    """Return what is wrong with a scene's videos; a worker process calls this."""
-    scene, problems = task.scene, []
-    for name in task.names:
+def _decode(work: tuple[str, Scene, list[str]], after_bytes: Advance) -> list[Problem]:
+    """Return what is wrong with the named videos of a scene; a worker process calls this."""
+    root, scene, names = work
+    problems = []
+    for name in names:
         member = scene.members[name]
         try:
-            _decode(task, name)
+            with (
+                FileSlice(Path(root, member.path), member) as file,
+                open_video(file, name=name, frames=scene.frames) as video,
+            ):
+                for index in range(scene.frames):
+                    if isinstance(video, VideoReader) and name.endswith("_rgb.mp4"):
+                        video.colour_frame(index)
+                    else:
+                        read_depth_units(video, index, encoding=ANY_DEPTH)
         except (MediaError, OSError) as error:
             reason = str(error).removeprefix(f"{name}: ").rstrip(".")
             cure = "Pack the scene again from an undamaged video."
@@ -293,18 +289,3 @@ def _check_scene(task: _SceneTask, after_bytes: Advance) -> list[Problem]:
             problems.append(Problem(member.path, scene.id.key, name, reason, cure))
         after_bytes(member.size)
     return problems
-
-
-def _decode(task: _SceneTask, name: str) -> None:
-    """Decode all frames of a video in a shard."""
-    scene = task.scene
-    where = scene.members[name]
-    with FileSlice(Path(task.root, where.path), where) as file:
-        if name.endswith("_rgb.mp4"):
-            with VideoReader(file, name=name, frames=scene.frames) as pictures:
-                for index in range(scene.frames):
-                    pictures.colour_frame(index)
-            return
-        with open_video(file, name=name, frames=scene.frames) as depth:
-            for index in range(scene.frames):
-                read_depth_units(depth, index, encoding=ANY_DEPTH)
