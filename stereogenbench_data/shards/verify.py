@@ -250,7 +250,7 @@ def _check_places(expected: _ExpectedShard) -> Iterator[Problem]:
 
 def _misindexed(expected: _ExpectedShard, sound: set[str]) -> Iterator[Problem]:
     """Yield where the index contradicts files in the shard, of scenes whose files are sound."""
-    source = MemberSource(expected.path.parent, shards={})
+    source = MemberSource(expected.path.parent, shards={}, check="opened")
     for scene in expected.scenes:
         if sound.issuperset(f"{scene.id.key}.{name}" for name in scene.members):
             _, differences = described_again(scene, source)

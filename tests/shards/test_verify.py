@@ -267,6 +267,15 @@ def test_a_damaged_index_of_shards_is_to_be_fetched_or_packed_again(shards):
         verify(shards)
 
 
+def test_a_checksum_in_the_index_that_is_not_that_of_a_sound_file_is_reported(shards, place):
+    member = place(SCENES[0], "cam_02_rgb.mp4")
+    altered = replace(member, crc32=member.crc32 ^ 1)
+    alter_scene(shards, SCENES[0], lambda s: {"members": s.members | {"cam_02_rgb.mp4": altered}})
+
+    told = (f"{PAIR}: {SCENES[0]}: ", "cam_02_rgb.mp4: has crc32", f"{altered.crc32:08x}")
+    assert_lines(lines(shards), told)
+
+
 def test_an_index_that_contradicts_itself_is_refused(shards):
     index = SceneIndex.open(shards)
     index.shards.pop(PAIR)
