@@ -30,6 +30,7 @@ from stereogenbench_data.index.scene_folder import (
     unfinished,
 )
 from stereogenbench_data.index.tree import (
+    NOTHING_KEPT,
     Files,
     RemoteFolder,
     RemoteTree,
@@ -306,7 +307,8 @@ def walk_tree(
     tree = tree if tree.remote is None or tree.files else tree.listed()
     outcomes: dict[str, Outcome] = {}
     total, pending = len(tree.keys), list[SceneFolder]()
-    for folder in map(tree.folder, tree.keys):
+    # The rows are kept, which stand for the small files.
+    for folder in map(replace(tree, cache=NOTHING_KEPT).folder, tree.keys):
         scene = None
         with suppress(StorageError):  # of its folder: that is found again
             scene = tree.kept(tree.name_of(folder))

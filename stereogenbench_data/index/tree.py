@@ -17,11 +17,12 @@ What was found out about trees without an index is kept in the user's cache:
         listing/ab/<digest of the folder>          what a commit of the Hub holds
         files/ab/<digest of path and ETag>         a small file of a scene behind a URL
 
-The listing is the path, size and modification time of every file, so what is kept is used only for
-unchanged files. Any number of processes, of several machines too, may read and write: files are
-renamed into place, whole or not at all, and a damaged one counts as missing.
+The listing is the path, size and times of every file, so what is kept is used only for unchanged
+files, and by the same code. Any number of processes, of several machines too, may read and write:
+files are renamed into place, whole or not at all, and a damaged one counts as missing.
 """
 
+import functools
 import hashlib
 import json
 import os
@@ -31,7 +32,6 @@ import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -48,7 +48,6 @@ from stereogenbench_data.index.parquet import (
     read_seek_tables,
     write_index_file,
 )
-from stereogenbench_data.index.rows import SCHEMA
 from stereogenbench_data.media.container import SeekableFile
 from stereogenbench_data.schema.document import MAX_TEXT_BYTES, require_text_size
 from stereogenbench_data.schema.parse import parse_scene_key
@@ -71,7 +70,6 @@ from stereogenbench_data.sources.retry import RetryPolicy
 CACHE_VARIABLE: Final = "STEREOGENBENCH_CACHE"
 """The environment variable that names another folder for the cache, or is "off"."""
 
-_FORMAT: Final = 4
 _MOST_TABLES: Final = 8
 """So many selections of a tree are kept: each has a table of its own."""
 
@@ -92,15 +90,12 @@ class TreeCache:
 
     def __init__(self, root: str | Path | None, read_as: str = "") -> None:
         """Name the tree, and the conventions it is read by; nothing is read or written yet."""
-        # What another version understood of the same files may differ.
-        made_by = ""
-        with suppress(PackageNotFoundError):  # of a checkout that is not installed
-            made_by = version("stereogenbench-data")
-        place = str(root) if root is None or is_remote(root) else os.path.realpath(root)
-        what = [_FORMAT, made_by, SCHEMA.names, place, read_as]
-        # Below a device nothing can be read or kept.
-        base = (root and cache_folder()) or os.devnull
-        self._folder = Path(base, "trees", _digest(json.dumps(what)))
+        self._folder = Path(os.devnull)  # below a device nothing can be read or kept
+        base = None if root is None else cache_folder()
+        if root is not None and base is not None:
+            place = str(root) if is_remote(root) else os.path.realpath(root)
+            what = json.dumps([_own_code(), place, read_as])
+            self._folder = base / "trees" / _digest(what)
 
     def table(self, name: str) -> tuple[pa.Table, IndexHead, pa.BinaryArray | None] | None:
         """Return the rows that were kept under a name, and what an index knows besides."""
@@ -154,11 +149,21 @@ class TreeCache:
         return self._folder / kind / digest[:2] / digest
 
 
+@functools.cache
+def _own_code() -> str:
+    """Return a digest of the code that reads scenes: other code may understand files otherwise."""
+    code = hashlib.sha256()
+    for layer in ("schema", "geometry", "media", "index"):
+        for path in sorted(Path(__file__).parents[1].joinpath(layer).rglob("*.py")):
+            code.update(path.read_bytes())
+    return code.hexdigest()
+
+
 def _digest(text: str) -> str:
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
 
 
-_NOTHING_KEPT: Final = TreeCache(None)
+NOTHING_KEPT: Final = TreeCache(None)
 
 
 _T = TypeVar("_T")
@@ -214,7 +219,7 @@ class SceneFolder:
         self.key = key
 
     def stamps(self) -> dict[str, tuple[int, int]]:
-        """Return the size in bytes and the modification time in ns of each file.
+        """Return the size in bytes of each file, and a number that changes with it.
 
         Raises:
             StorageError: If the folder cannot be read, or scenes are below it instead.
@@ -228,7 +233,11 @@ class SceneFolder:
         if not found and (deeper := next(folder.rglob(BASELINE_JSON), None)):
             path = deeper.parent.relative_to(self._root).as_posix()
             raise StorageError(refusal(str(self._root), path))
-        return {name: (found[name].st_size, found[name].st_mtime_ns) for name in sorted(found)}
+        # Times of modification can be set, as `tar` does; those of change cannot, but on Windows.
+        return {
+            name: (status.st_size, status.st_mtime_ns + status.st_ctime_ns)
+            for name, status in sorted(found.items())
+        }
 
     def fetch(self, names: Iterable[str]) -> None:
         """Fetch files at a time, if they are behind a URL."""
@@ -266,7 +275,7 @@ class RemoteFolder(SceneFolder):
         self.key = key
         self._folder = root.below(key)
         self._listed = files
-        self._kept = kept or _NOTHING_KEPT
+        self._kept = kept or NOTHING_KEPT
         self._objects: dict[str, RemoteObject] = {}
         self._parts: dict[str, list[tuple[int, bytes]]] = {}
 
@@ -487,7 +496,7 @@ class RemoteTree:
         """
         self.root = root
         pinned = root.pinned()
-        self._kept = TreeCache(pinned) if pinned else _NOTHING_KEPT
+        self._kept = TreeCache(pinned) if pinned else NOTHING_KEPT
 
     def scenes(self) -> tuple[list[str], dict[str, str]]:
         """Return what `find_scene_folders` finds.

@@ -16,21 +16,21 @@ KEY = "train/Uniform/Car_Dealer/scene_{:06d}"
 
 
 @pytest.fixture
-def linked_scenes(make_scene, root):
-    """Write scenes that share one scene's files, and return their keys."""
+def alike_scenes(make_scene, root):
+    """Write scenes with the same files, and return their keys."""
 
     def make(count):
         first = make_scene(KEY.format(0))
         keys = [KEY.format(number) for number in range(count)]
         for key in keys[1:]:
-            shutil.copytree(first, root / key, copy_function=os.link)
+            shutil.copytree(first, root / key)
         return keys
 
     return make
 
 
-def test_every_scene_is_whole_incomplete_or_broken(linked_scenes, root):
-    keys = linked_scenes(4)
+def test_every_scene_is_whole_incomplete_or_broken(alike_scenes, root):
+    keys = alike_scenes(4)
     (root / keys[1] / "_scene_complete.json").unlink()
     (root / keys[2] / "baseline.json").unlink()
     (root / "train/Uniform/scene.7").mkdir()
@@ -44,9 +44,9 @@ def test_every_scene_is_whole_incomplete_or_broken(linked_scenes, root):
     assert "has no baseline.json" in report.broken[keys[2]]
 
 
-def test_scenes_of_one_writer_read_their_poses_alike(linked_scenes, root):
+def test_scenes_of_one_writer_read_their_poses_alike(alike_scenes, root):
     """A camera that stands level at heading 0 fits two readings; others of its shape fit one."""
-    keys = linked_scenes(3)
+    keys = alike_scenes(3)
     for key, yaw_deg in zip(keys, (0.0, 25.0, 40.0), strict=True):
         _write_matrices(root / key / "trajectory.json", yaw_deg=yaw_deg)
 
@@ -74,8 +74,8 @@ def _write_matrices(path, *, yaw_deg):
     path.write_text(json.dumps(document | {"unit": "m"}))
 
 
-def test_worker_processes_find_what_one_process_finds(linked_scenes, root, monkeypatch):
-    keys = linked_scenes(5)
+def test_worker_processes_find_what_one_process_finds(alike_scenes, root, monkeypatch):
+    keys = alike_scenes(5)
     (root / keys[3] / "baseline.json").unlink()
     alone = walk(root, workers=1)
     monkeypatch.setattr(walk_module, "POOL_FROM", 1)
@@ -99,8 +99,8 @@ def again(root, **how):
     return told[0], report
 
 
-def test_a_stopped_walk_goes_on_and_a_damaged_row_is_read_again(linked_scenes, root, cache):
-    linked_scenes(4)
+def test_a_stopped_walk_goes_on_and_a_damaged_row_is_read_again(alike_scenes, root, cache):
+    alike_scenes(4)
 
     def stop(done, total):
         if done == 3:
@@ -119,8 +119,8 @@ def test_a_stopped_walk_goes_on_and_a_damaged_row_is_read_again(linked_scenes, r
 
 
 @pytest.mark.usefixtures("cache")
-def test_a_scene_that_changed_since_is_read_again(linked_scenes, root):
-    keys = linked_scenes(3)
+def test_a_scene_that_changed_since_is_read_again(alike_scenes, root):
+    keys = alike_scenes(3)
     walk(root)
     path = root / keys[1] / "scene_description_qwen_dataset_level.json"
     path.unlink()
@@ -134,8 +134,23 @@ def test_a_scene_that_changed_since_is_read_again(linked_scenes, root):
 
 
 @pytest.mark.usefixtures("cache")
-def test_a_walk_of_another_kind_reads_all_scenes(linked_scenes, root):
-    linked_scenes(2)
+def test_a_file_of_the_same_size_and_date_is_another_one(alike_scenes, root):
+    (key,) = alike_scenes(1)
+    walk(root)
+    path = root / key / "scene_description_qwen_dataset_level.json"
+    text, status = path.read_text(), path.stat()
+    path.write_text(text.replace("Cars", "Cats"))
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+
+    known, report = again(root)
+
+    assert known == 0
+    assert report.scenes[0].caption == "Cats behind glass."
+
+
+@pytest.mark.usefixtures("cache")
+def test_a_walk_of_another_kind_reads_all_scenes(alike_scenes, root):
+    alike_scenes(2)
     walk(root)
 
     known, report = again(root, valid_depth="sample")
