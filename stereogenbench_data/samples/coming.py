@@ -5,8 +5,6 @@ as long as its video stays open. Where the order turns out to be another one, pl
 Only data behind a URL are planned.
 """
 
-import os
-import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import Final, NamedTuple, Protocol, Self
@@ -71,7 +69,11 @@ class _Planned(NamedTuple):
 
 
 class ComingSamples:
-    """Plans the bytes of coming samples, and of the one that is read now."""
+    """Plans the bytes of coming samples, and of the one that is read now.
+
+    Attributes:
+        has_order: Whether samples were read as they were expected.
+    """
 
     def __init__(self, source: MemberSource, ahead: FetchAhead, streams: OpenVideos) -> None:
         """Plan nothing yet.
@@ -84,28 +86,30 @@ class ComingSamples:
         self._source = source
         self._ahead = ahead
         self._streams = streams
-        self._steps: Iterator[Step] = iter(())
         self._due: deque[_Planned] = deque()
         self._waiting: deque[_Planned] = deque()  # for their requests
         self._number = self._begun = 0
-        self._planned_bytes = self._read_bytes = 0
         self._positions: OrderedDict[tuple[str, int, int], Position | None] = OrderedDict()
         self._read_texts: set[str] = set()
-        self._is_filling = True
-        self._has_order = False
-        self._pid, self._lock = os.getpid(), threading.RLock()
+        self._begin_anew()
 
-    @property
-    def has_order(self) -> bool:
-        """Whether samples were read as they were expected, in this process."""
-        return self._has_order and self._pid == os.getpid()
+    def _begin_anew(self) -> None:
+        for planned in self._due:
+            self._ahead.release(planned.number)
+        self._due.clear()
+        self._waiting.clear()
+        self._planned_bytes = self._read_bytes = 0
+        self._steps: Iterator[Step] = iter(())
+        self._positions.clear()
+        self._read_texts.clear()
+        self._is_filling = True
+        self.has_order = False
 
     def expect(self, steps: Iterable[Step]) -> None:
         """Take the samples that will be read next; they replace those expected before."""
-        with self._own_lock():
-            if self._due:
-                self._begin_anew()
-            self._steps, self._has_order = iter(steps), True
+        if self._due:
+            self._begin_anew()
+        self._steps, self.has_order = iter(steps), True
 
     def begin(self, address: Address, files: Callable[[Address], NeededFiles]) -> None:
         """Plan a sample that is read now, unless it is planned, and some of those after it.
@@ -114,67 +118,44 @@ class ComingSamples:
             address: The sample.
             files: Returns what a sample is read from; not kept, as it refers to who keeps this.
         """
-        with self._own_lock():
-            if not self._due:
-                self._plan_next(files)
-            if self._due and self._due[0].address != address:
-                self._begin_anew()
-            if not self._due:
-                self._plan(Step(address, ends_run=False), files(address))
-            first = self._due[0].number
-            self._begun = max(self._begun, first)
-            self._ahead.begin(self._begun)
+        if not self._due:
+            self._plan_next(files)
+        if self._due and self._due[0].address != address:
+            self._begin_anew()
+        if not self._due:
+            self._plan(Step(address, ends_run=False), files(address))
+        first = self._due[0].number
+        self._begun = max(self._begun, first)
+        self._ahead.begin(self._begun)
+        if not self._is_filling:
+            low = _REFILLED_AT * self._ahead.limit_bytes
+            self._is_filling = self._ahead.planned_bytes < low
+        for _ in range(_AT_ONCE if self._is_filling else 0):
+            self._is_filling = self._ahead.planned_bytes < self._ahead.limit_bytes
+            self._is_filling = self._is_filling and self._plan_next(files)
             if not self._is_filling:
-                low = _REFILLED_AT * self._ahead.limit_bytes
-                self._is_filling = self._ahead.planned_bytes < low
-            for _ in range(_AT_ONCE if self._is_filling else 0):
-                self._is_filling = self._ahead.planned_bytes < self._ahead.limit_bytes
-                self._is_filling = self._is_filling and self._plan_next(files)
-                if not self._is_filling:
-                    break
-            # While more is planned, requests for later samples wait: they may grow.
-            last = first + _SOON if self._is_filling else self._number
-            up_to_bytes = _FIRST_BYTES + 2 * self._read_bytes
-            while self._waiting and (
-                self._waiting[0].number <= first
-                or (self._waiting[0].number <= last and self._waiting[0].up_to_bytes <= up_to_bytes)
-            ):
-                self._begun = self._waiting.popleft().number
-            self._ahead.begin(self._begun)
+                break
+        # While more is planned, requests for later samples wait: they may grow.
+        last = first + _SOON if self._is_filling else self._number
+        up_to_bytes = _FIRST_BYTES + 2 * self._read_bytes
+        while self._waiting and (
+            self._waiting[0].number <= first
+            or (self._waiting[0].number <= last and self._waiting[0].up_to_bytes <= up_to_bytes)
+        ):
+            self._begun = self._waiting.popleft().number
+        self._ahead.begin(self._begun)
 
     def end(self, address: Address) -> None:
         """Forget what a sample that was read needed alone."""
-        with self._own_lock():
-            if self._due and self._due[0].address == address:
-                read = self._due.popleft()
-                self._read_bytes = read.up_to_bytes
-                self._ahead.release(read.number)
+        if self._due and self._due[0].address == address:
+            read = self._due.popleft()
+            self._read_bytes = read.up_to_bytes
+            self._ahead.release(read.number)
 
     def close(self) -> None:
         """End all requests, and expect no sample."""
-        with self._own_lock():
-            self._begin_anew()
-            self._ahead.close()
-
-    def _own_lock(self) -> threading.RLock:
-        """Return the lock of this process: a fork begins anew."""
-        if self._pid != os.getpid():
-            self._pid, self._lock = os.getpid(), threading.RLock()
-            self._due.clear()
-            self._begin_anew()
-        return self._lock
-
-    def _begin_anew(self) -> None:
-        for planned in self._due:
-            self._ahead.release(planned.number)
-        self._due.clear()
-        self._waiting.clear()
-        self._planned_bytes = self._read_bytes = 0
-        self._steps = iter(())
-        self._positions.clear()
-        self._read_texts.clear()
-        self._is_filling = True
-        self._has_order = False
+        self._begin_anew()
+        self._ahead.close()
 
     def _plan_next(self, files: Callable[[Address], NeededFiles]) -> bool:
         step = next(self._steps, None)

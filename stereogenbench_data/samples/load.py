@@ -144,10 +144,10 @@ class _Stream:
 
 
 class Streams:
-    """A pool of open videos that survives fork and spawn: each process opens its own.
+    """A pool of open videos, for one thread at a time of the process that opened them.
 
-    Threads of one process take turns. Pictures and depth come back read-only, because the pool may
-    hand out the same ones again.
+    Pictures and depth come back read-only, because the pool may hand out the same ones again.
+    A copy, as in another process, has the same limits and nothing open.
 
     Attributes:
         limit: How many videos it keeps open.
@@ -162,8 +162,6 @@ class Streams:
         self.limit = limit
         self.kept_frames = kept_frames
         self._open: OrderedDict[_Place, _Stream] = OrderedDict()
-        self._lock = threading.RLock()
-        self._process = os.getpid()
 
     def rgb(
         self,
@@ -245,64 +243,49 @@ class Streams:
 
     @property
     def stats(self) -> "StreamStats":
-        """What this process has open."""
-        is_own = os.getpid() == self._process
-        return StreamStats(len(self._open) if is_own else 0, self.limit)
+        """What is open."""
+        return StreamStats(len(self._open), self.limit)
 
     def release(self, scene: Scene, *, run: int = 0) -> None:
         """Close the videos of a scene's run, of which no more is wanted for now."""
-        self._drop_inherited()
-        with self._lock:
-            for member in scene.members.values():
-                stream = self._open.pop((member.path, member.offset, run), None)
-                if stream is not None:
-                    stream.close()
+        for member in scene.members.values():
+            stream = self._open.pop((member.path, member.offset, run), None)
+            if stream is not None:
+                stream.close()
 
     def close(self) -> None:
         """Close every video; the pool can be used again."""
-        self._drop_inherited()
-        with self._lock:
-            while self._open:
-                self._open.popitem()[1].close()
+        while self._open:
+            self._open.popitem()[1].close()
 
     @contextmanager
     def _stream(self, scene: Scene, name: str, run: int) -> Iterator[_Stream]:
         """Yield an open video; it stays open unless reading it fails."""
-        self._drop_inherited()
-        with self._lock:
-            member, name = scene.member(name), scene.held_name(name)
-            place = (member.path, member.offset, run)
-            is_new = place not in self._open
-            if is_new:
-                while len(self._open) >= self.limit:
-                    self._open.popitem(last=False)[1].close()
-                file = self._source.open(scene, name)
-                with _cause_raised(file):
-                    label = self._source.label(scene, name)
-                    reader = open_video(file, name=label, frames=scene.frames)
-                self._open[place] = _Stream(reader, file)
-            self._open.move_to_end(place)
-            stream = self._open[place]
-            try:
-                with _cause_raised(stream.file):
-                    if is_new:
-                        require_indexed_picture(stream.reader, scene.rig)
-                    yield stream
-            except (MediaError, StorageError):
-                self._open.pop(place).close()
-                raise
+        member, name = scene.member(name), scene.held_name(name)
+        place = (member.path, member.offset, run)
+        is_new = place not in self._open
+        if is_new:
+            while len(self._open) >= self.limit:
+                self._open.popitem(last=False)[1].close()
+            file = self._source.open(scene, name)
+            with _cause_raised(file):
+                label = self._source.label(scene, name)
+                reader = open_video(file, name=label, frames=scene.frames)
+            self._open[place] = _Stream(reader, file)
+        self._open.move_to_end(place)
+        stream = self._open[place]
+        try:
+            with _cause_raised(stream.file):
+                if is_new:
+                    require_indexed_picture(stream.reader, scene.rig)
+                yield stream
+        except (MediaError, StorageError):
+            self._open.pop(place).close()
+            raise
 
-    def _drop_inherited(self) -> None:
-        if os.getpid() != self._process:
-            _inherited.append(self._open)
-            self._open = OrderedDict()
-            self._lock = threading.RLock()
-            self._process = os.getpid()
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Return what another process makes a pool of its own from."""
-        again = partial(Streams, limit=self.limit, kept_frames=self.kept_frames)
-        return again, (self._source,)
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy is made from: nothing is open."""
+        return self.__dict__ | {"_open": OrderedDict()}
 
 
 @contextmanager
@@ -347,7 +330,8 @@ class SampleLoader:
     """Loads samples: flat dicts of numpy arrays and texts.
 
     Rows of the index, poses, open videos and their current frames are kept for later samples.
-    Threads may share a loader. Files that it opens stay in this process.
+    Threads may share a loader: they decode by turns. Files that it opens stay in this process; a
+    fork, or a copy in another process, begins with nothing read.
     """
 
     def __init__(
@@ -393,7 +377,8 @@ class SampleLoader:
         self._begin_anew(Streams(self._source))
 
     def _begin_anew(self, streams: Streams) -> None:
-        """Begin with nothing read, and with these videos."""
+        """Begin in this process with nothing read, and with these videos."""
+        self._lock, self._pid = threading.RLock(), os.getpid()
         self._streams = streams
         self._coming = None
         if self._ahead is not None:
@@ -402,10 +387,18 @@ class SampleLoader:
         self._scenes: OrderedDict[int, _KnownScene] = OrderedDict()
         self._poses: OrderedDict[str, CameraPoses] = OrderedDict()
 
+    def _own_lock(self) -> threading.RLock:
+        """Return the lock of this process: a fork begins anew."""
+        if os.getpid() != self._pid:
+            _inherited.append(self._streams)
+            self._begin_anew(copy.copy(self._streams))
+        return self._lock
+
     @property
     def stats(self) -> StreamStats:
         """What this process has open."""
-        return self._streams.stats
+        is_own = os.getpid() == self._pid
+        return self._streams.stats if is_own else StreamStats(0, self._streams.limit)
 
     def copy(self) -> "SampleLoader":
         """Return a loader of the same samples with open videos of its own."""
@@ -423,41 +416,48 @@ class SampleLoader:
     @property
     def has_order(self) -> bool:
         """Whether samples were decoded as they were expected; True where none is fetched."""
-        return self._coming is None or self._coming.has_order
+        with self._own_lock():
+            return self._coming is None or self._coming.has_order
 
     def expect(self, steps: Iterable[Step]) -> None:
         """Take the samples that will be decoded next, so that their bytes are fetched ahead."""
-        if self._coming is not None:
-            if self._index.presumption is not None:
-                self._described = steps = DescribedAhead(steps, self._describe_soon)
-            self._coming.expect(steps)
+        with self._own_lock():
+            if self._coming is not None:
+                if self._index.presumption is not None:
+                    self._described = steps = DescribedAhead(steps, self._describe_soon)
+                self._coming.expect(steps)
 
     def begin(self, address: Address) -> None:
         """Fetch what a sample needs, which is decoded next, and what those after it need."""
-        if self._coming is not None:
-            if self._described is not None:
-                self._described.begin(address.row)
-            self._coming.begin(address, self._needed_files)
+        with self._own_lock():
+            if self._coming is not None:
+                if self._described is not None:
+                    self._described.begin(address.row)
+                self._coming.begin(address, self._needed_files)
 
     def end(self, address: Address) -> None:
         """Forget the bytes that a sample needed, which was decoded."""
-        if self._coming is not None:
-            self._coming.end(address)
+        with self._own_lock():
+            if self._coming is not None:
+                self._coming.end(address)
 
     def release(self, address: Address) -> None:
         """Close the videos of a run that has been read to its end."""
-        self._streams.release(self._known_scene(address).scene, run=address.run)
+        with self._own_lock():
+            self._streams.release(self._known_scene(address).scene, run=address.run)
 
     def stop_fetching(self) -> None:
         """End requests, and expect no sample."""
-        if self._coming is not None:
-            self._coming.close()
+        with self._own_lock():
+            if self._coming is not None:
+                self._coming.close()
 
     def close(self) -> None:
         """Close the videos that are open in this process, and end its requests."""
-        self.stop_fetching()
-        self._streams.close()
-        self._scenes.clear()
+        with self._own_lock():
+            self.stop_fetching()
+            self._streams.close()
+            self._scenes.clear()
 
     def _describe_soon(self, address: Address) -> None:
         """Describe a sample's presumed scene in the background."""
@@ -557,7 +557,8 @@ class SampleLoader:
             for start in range(0, len(address.frames), step):
                 frames = slice(start, start + step)
                 out = writer.pictures(frames, size=size) if decodes_in_place else {}
-                views, facts = self._decoded(address, frames=frames, out=out)
+                with self._own_lock():
+                    views, facts = self._decoded(address, frames=frames, out=out)
                 if request.transform is not None:
                     views = request.transform(views, np.random.default_rng(seeds))
                 writer.write(views, facts, frames)
@@ -631,7 +632,8 @@ class SampleLoader:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs."""
-        return self.__dict__ | dict.fromkeys(("_coming", "_described", "_scenes", "_poses"))
+        own = ("_lock", "_coming", "_described", "_scenes", "_poses")
+        return self.__dict__ | dict.fromkeys(own)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Become a copy, with nothing read."""

@@ -1,10 +1,12 @@
 """StereoPairs and SceneViews as torch sees them."""
 
 import gc
+import os
 import pickle
 import re
 import subprocess
 import sys
+import threading
 import warnings
 import weakref
 from concurrent.futures import ThreadPoolExecutor
@@ -33,6 +35,7 @@ from stereogenbench_data import (
     StorageError,
     collate,
 )
+from stereogenbench_data.media import depth
 from tests.datasets.conftest import fork_and, same
 
 EVERY_FIELD = tuple(PAIR_FIELDS)
@@ -172,6 +175,29 @@ def test_a_forked_child_reads_on_without_disturbing_its_parent(indexed_release):
 
     assert fork_and(lambda: read((3, 1, 6))) == 0
     read(range(7))
+
+
+@pytest.mark.filterwarnings("ignore:.*is multi-threaded:DeprecationWarning")
+def test_a_child_that_is_forked_while_a_thread_decodes_does_not_wait_for_it(
+    indexed_release, monkeypatch
+):
+    pairs, parent = StereoPairs(indexed_release, fields=("left",)), os.getpid()
+    decoding, forked = threading.Event(), threading.Event()
+
+    class Waiting(depth.VideoReader):
+        def frame(self, index):
+            if os.getpid() == parent:
+                decoding.set()
+                forked.wait()
+            return super().frame(index)
+
+    monkeypatch.setattr(depth, "VideoReader", Waiting)
+    with ThreadPoolExecutor(1) as threads:
+        threads.submit(lambda: pairs[0])
+        decoding.wait()
+        status = fork_and(lambda: (pairs[0], pairs.close()))
+        forked.set()
+    assert status == 0
 
 
 def test_a_batch_of_scenes_of_two_sizes_says_how_to_mend_it():
