@@ -107,6 +107,7 @@ PACKED_DEPTH_NAMES: Final = {
     depth_name(camera): f"cam_{camera:02d}_depth.b2frame" for camera in range(CAMERA_COUNT)
 }
 """Released name of a camera's depth to its name in shards where blosc2 packed it."""
+RELEASED_NAMES: Final = {packed: name for name, packed in PACKED_DEPTH_NAMES.items()}
 
 
 def baseline_bin(baseline_cm: float) -> str:

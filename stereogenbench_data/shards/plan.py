@@ -31,7 +31,6 @@ from stereogenbench_data.shards.training import (
     TrainingSettings,
     derived_names,
     expected_bytes,
-    released_name,
 )
 
 DepthCodec = Literal["released", "blosc2"]
@@ -60,8 +59,9 @@ _SIZE: Final = re.compile(r"(\d+(?:\.\d+)?) ?([kmgt]?i?)b?", re.IGNORECASE)
 class PlannedMember:
     """A file of a scene: its name in the shard, and the released file that it is made from.
 
-    ``source`` is relative to the release's root. ``size`` is that of the source, which is also the
-    member's unless depth is packed; of derived files, about what they will have.
+    ``source`` is relative to the release's root, and empty for files that are to be derived.
+    ``size`` is that of the source, which is also the member's unless depth is packed; of derived
+    files, about what they will have.
     """
 
     name: str
@@ -205,7 +205,13 @@ def planned_members(
     Raises:
         ShardError: If the scene cannot be packed.
     """
-    planned = _released(scene, depth_codec) if training is None else _derived(scene, training)
+    if training is None:
+        planned = _released(scene, depth_codec)
+    else:
+        planned = [
+            PlannedMember(f"{scene.id.key}.{name}", "", expected_bytes(scene, name, training))
+            for name in derived_names(scene, training)
+        ]
     for member in planned:
         member_header(member.name, member.size)  # refuses what a tar cannot hold
     return planned
@@ -282,20 +288,6 @@ def _group_of(scene: Scene) -> str:
     place = scene.id
     subset = [place.subset or "unnamed"] if place.split == "eval" else []
     return "-".join([place.split, *subset, place.family])
-
-
-def _derived(scene: Scene, training: TrainingSettings) -> list[PlannedMember]:
-    """Return the planned files of a scene of training shards, with about the sizes they will have.
-
-    Their source is that of the released file; ``training.json`` has none.
-    """
-    planned = []
-    for name in derived_names(scene, training):
-        source = "" if name == TRAINING_JSON else scene.held_name(released_name(name))
-        path = scene.members[source].path if source else ""
-        size = expected_bytes(scene, name, training)
-        planned.append(PlannedMember(f"{scene.id.key}.{name}", path, size))
-    return planned
 
 
 def _released(scene: Scene, depth_codec: DepthCodec) -> list[PlannedMember]:

@@ -41,6 +41,7 @@ from stereogenbench_data.schema.release import (
     FRAME_RATE_HZ,
     METADATA_FILES,
     PACKED_DEPTH_NAMES,
+    RELEASED_NAMES,
     TRAINING_JSON,
     depth_name,
     rgb_name,
@@ -158,14 +159,9 @@ def _has(scene: Scene, name: str) -> bool:
     return scene.held_name(name) in scene.members
 
 
-def released_name(name: str) -> str:
-    """Return the released name of a derived file."""
-    return next((each for each, packed in PACKED_DEPTH_NAMES.items() if packed == name), name)
-
-
 def source_bytes(scene: Scene, names: Sequence[str]) -> int:
     """Return the size of the source files that some derived files are made from."""
-    held = [scene.held_name(released_name(name)) for name in names]
+    held = [scene.held_name(RELEASED_NAMES.get(name, name)) for name in names]
     return sum(scene.members[name].size for name in held if name in scene.members)
 
 
@@ -217,8 +213,8 @@ def derive_scene(
                 continue
             if name == TRAINING_JSON:
                 continue
-            content = _open_source(source, scene, released_name(name))
-            where = source.label(scene, released_name(name))
+            video = RELEASED_NAMES.get(name, name)
+            content, where = _open_source(source, scene, video), source.label(scene, video)
             target, error = folder / name, None
             if name.endswith("_rgb.mp4"):
                 pictures = _source_pictures(content, scene, settings, name=where)

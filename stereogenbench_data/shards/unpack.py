@@ -6,16 +6,13 @@ FFV1 video again, with the same numbers, times and tags.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 from stereogenbench_data.engine import Progress
 from stereogenbench_data.errors import ShardError
 from stereogenbench_data.schema.records import Scene
-from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
+from stereogenbench_data.schema.release import RELEASED_NAMES
 from stereogenbench_data.shards.download import copy_files, is_whole, size_bytes
 from stereogenbench_data.shards.writer import open_shards
-
-_RELEASED_NAMES: Final = {packed: name for name, packed in PACKED_DEPTH_NAMES.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +58,11 @@ def unpack(
     missing: dict[Path, tuple[Scene, str]] = {}
     for scene in scenes:
         for name, member in scene.members.items():
-            path = out / scene.id.key / _RELEASED_NAMES.get(name, name)
+            path = out / scene.id.key / RELEASED_NAMES.get(name, name)
             if not path.exists():
                 missing[path] = scene, name
             # The size of a rewritten depth video is not known.
-            elif not (path.is_file() if name in _RELEASED_NAMES else is_whole(path, member)):
+            elif not (path.is_file() if name in RELEASED_NAMES else is_whole(path, member)):
                 raise ShardError(
                     f"{path}: already exists, and is not what the shards hold. Move it away, or "
                     f"unpack into another folder."

@@ -25,7 +25,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import packed_depth
 from stereogenbench_data.media.depth_frames import CODEC_NAME
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
-from stereogenbench_data.schema.release import CAMERA_COUNT, PACKED_DEPTH_NAMES, TRAINING_JSON
+from stereogenbench_data.schema.release import CAMERA_COUNT, RELEASED_NAMES, TRAINING_JSON
 from stereogenbench_data.schema.training import parse_training
 from stereogenbench_data.shards.plan import (
     DepthCodec,
@@ -229,7 +229,7 @@ def _pack(task: ShardTask, after_bytes: Advance) -> None:
                 name, source = member.name.partition(".")[2], Path(task.root, member.source)
                 length = member.size
                 chunks = _source_chunks(source, length, after_bytes)
-                if name != source.name:
+                if task.derivation is None and name in RELEASED_NAMES:
                     packed = _packed_depth(source, chunks, frames=scene.frames)
                     length, chunks = len(packed), iter([packed])
                 write(member_header(member.name, length))
@@ -254,7 +254,7 @@ def _row_of(task: ShardTask, scene: Scene) -> Scene:
     if task.derivation is not None:
         text, where = source.read(scene, TRAINING_JSON), source.label(scene, TRAINING_JSON)
         scene = derived_scene(scene, parse_training(text, where=where))
-    elif not scene.members.keys().isdisjoint(PACKED_DEPTH_NAMES.values()):
+    elif not RELEASED_NAMES.keys().isdisjoint(scene.members):
         scene = replace(scene, depth_codec=(CODEC_NAME,) * CAMERA_COUNT)
     now, differences = described_again(scene, source)
     for name, difference in differences[:1]:
