@@ -38,6 +38,8 @@ from stereogenbench_data.geometry.projection import (
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
 from stereogenbench_data.media.depth import depth_m_from_units
 from stereogenbench_data.schema.records import DepthEncoding, Scene
+from stereogenbench_data.schema.release import rgb_name
+from stereogenbench_data.selection.plan import Address
 
 MIRROR_X: Final = np.diag([-1.0, 1.0, 1.0, 1.0])
 
@@ -109,23 +111,25 @@ class Views:
         return np.logical_or.reduce(maps) if maps else None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class SceneFacts:
-    """A sample's scene, depth contracts, poses and place.
+    """What is known of a scene, for all of its samples.
 
     Attributes:
         scene: The row of the index.
+        intrinsics: Of its pictures as they are decoded, before a transform.
         encodings: The depth contract of each camera.
-        poses: Its `CameraPoses`, or None where nothing needs them.
-        url: Returns the file or folder that holds the scene.
-        frames: All frames of the sample.
+        url: Returns what holds one of its files: a shard, or the scene's folder.
+        videos: The videos that were opened for it, where its row is presumed and behind a URL.
+        poses: Its `CameraPoses`; None until they were read, or where nothing needs them.
     """
 
     scene: Scene
+    intrinsics: Intrinsics
     encodings: dict[int, DepthEncoding]
-    poses: Any
-    url: Callable[[], str]
-    frames: tuple[int, ...]
+    url: Callable[[str], str]
+    videos: frozenset[str] = frozenset()
+    poses: Any = None
 
     @property
     def is_rectified(self) -> bool:
@@ -454,10 +458,18 @@ def _as_seen(transforms: Motions, views: Views) -> Motions:
 
 @dataclass(eq=False)
 class PairSample:
-    """One source and one target of a sample, with the geometry of both directions."""
+    """One source and one target of a sample, with the geometry of both directions.
+
+    Attributes:
+        views: Some of its frames.
+        facts: What is known of its scene.
+        address: Its cameras before a transform, and all its frames.
+        target: The target camera.
+    """
 
     views: Views
     facts: SceneFacts
+    address: Address
     target: int
 
     @cached_property
@@ -497,7 +509,7 @@ class PairSample:
     @property
     def frame_rate_hz(self) -> float:
         """Frames of the sample a second: the video's rate, divided by the stride of a clip."""
-        frames = self.facts.frames
+        frames = self.address.frames
         stride = frames[1] - frames[0] if len(frames) > 1 else 1
         return self.facts.scene.frame_rate_hz / stride
 
@@ -507,9 +519,14 @@ class PairSample:
         cameras = f"{self.views.source:02d}"
         if self.views.targets:
             cameras += "-" + "+".join(f"{target:02d}" for target in self.views.targets)
-        first, last = self.facts.frames[0], self.facts.frames[-1]
+        first, last = self.address.frames[0], self.address.frames[-1]
         shown = f"{first:03d}" if first == last else f"{first:03d}-{last:03d}"
         return f"{self.facts.scene.id.key}/{cameras}/{shown}"
+
+    @property
+    def url(self) -> str:
+        """The shard, or the scene's folder, that holds the source's picture."""
+        return self.facts.url(rgb_name(self.address.source))
 
     def world_from(self, camera: int) -> Motions:
         """Return a camera's poses at the sample's frames."""

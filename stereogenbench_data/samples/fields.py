@@ -208,7 +208,7 @@ PAIR_FIELDS: Final[dict[str, Field]] = _table(
         lambda s: s.facts.scene.caption,
     ),
     _text("__key__", "scene, cameras and frame", lambda s: s.key),
-    _text("__url__", "file or folder that holds the scene", lambda s: s.facts.url()),
+    _text("__url__", "file or folder that holds the scene", lambda s: s.url),
 )  # fmt: skip
 
 VIEW_FIELDS: Final[dict[str, Field]] = _table(
@@ -475,7 +475,7 @@ class SampleWriter:
             frames: Where they lie on the sample's time axis.
         """
         pairs = [
-            PairSample(views, facts, target)
+            PairSample(views, facts, self._address, target)
             for target in self._target_cameras(views.source, views.targets)
         ]
         for each in self._fields:

@@ -28,9 +28,8 @@ from stereogenbench_data.errors import (
     StorageError,
     text_without_secrets,
 )
-from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
+from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
-from stereogenbench_data.geometry.rig import RECTIFIED_PX
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.container import SeekableFile
 from stereogenbench_data.media.depth import (
@@ -302,28 +301,8 @@ def _cause_raised(file: Path | SeekableFile) -> Iterator[None]:
         raise failure from error
 
 
-KEPT_POSES: Final = 32
-"""Of how many scenes the poses are kept (46 kB a scene of 81 frames)."""
-
 KEPT_SCENES: Final = 256
-"""Of how many scenes what the index says is kept."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _KnownScene:
-    """What is known of a scene from its row of the index.
-
-    Attributes:
-        scene: The row.
-        intrinsics: Of its pictures, as large as they are wanted.
-        encodings: The depth contract of each camera.
-        videos: The videos that were opened for it, where its row is presumed and behind a URL.
-    """
-
-    scene: Scene
-    intrinsics: Intrinsics
-    encodings: dict[int, DepthEncoding]
-    videos: frozenset[str]
+"""Of how many scenes row and poses are kept (poses of 81 frames take 46 kB)."""
 
 
 class SampleLoader:
@@ -384,8 +363,7 @@ class SampleLoader:
         if self._ahead is not None:
             self._coming = ComingSamples(self._source, self._ahead, streams)
         self._described: DescribedAhead | None = None
-        self._scenes: OrderedDict[int, _KnownScene] = OrderedDict()
-        self._poses: OrderedDict[str, CameraPoses] = OrderedDict()
+        self._scenes: OrderedDict[int, SceneFacts] = OrderedDict()
 
     def _own_lock(self) -> threading.RLock:
         """Return the lock of this process: a fork begins anew."""
@@ -472,7 +450,7 @@ class SampleLoader:
             *(depth_name(camera) for camera in self._cameras(address, "depth")),
         )
 
-    def _known_scene(self, address: Address) -> _KnownScene:
+    def _known_scene(self, address: Address) -> SceneFacts:
         """Return what is known of a sample's scene; that of the last rows asked for is kept."""
         row, presumption = address.row, self._index.presumption
         known = self._scenes.get(row)
@@ -491,8 +469,11 @@ class SampleLoader:
                 camera: scene.depth_encoding(camera, self._request.depth or depth_of(scene))
                 for camera in range(len(scene.depth_unit_m))
             }
-            opened = frozenset(videos) | (known.videos if known is not None else frozenset())
-            known = self._scenes[row] = _KnownScene(scene, intrinsics, encodings, opened)
+            url = partial(self._source.url, scene)
+            facts = SceneFacts(scene, intrinsics, encodings, url, frozenset(videos))
+            if known is not None:
+                facts.videos, facts.poses = facts.videos | known.videos, known.poses
+            known = self._scenes[row] = facts
             if len(self._scenes) > KEPT_SCENES:
                 self._scenes.popitem(last=False)
         return known
@@ -546,7 +527,8 @@ class SampleLoader:
             MediaError: If a video does not decode to what the index says.
             SchemaError: If the trajectory does not follow the format.
         """
-        request, scene = self._request, self._known_scene(address).scene
+        request, known = self._request, self._known_scene(address)
+        scene = known.scene
         size = request.size or (scene.rig.image_height_px, scene.rig.image_width_px)
         writer = SampleWriter(request, address, clip=clip, allocate=allocate)
         decodes_in_place = self._frames == "used once" and not self._is_changed
@@ -558,10 +540,10 @@ class SampleLoader:
                 frames = slice(start, start + step)
                 out = writer.pictures(frames, size=size) if decodes_in_place else {}
                 with self._own_lock():
-                    views, facts = self._decoded(address, frames=frames, out=out)
+                    views = self._decoded(known, address, frames=frames, out=out)
                 if request.transform is not None:
                     views = request.transform(views, np.random.default_rng(seeds))
-                writer.write(views, facts, frames)
+                writer.write(views, known, frames)
         except (StorageError, MediaError, SchemaError) as error:
             raise type(error)(f"{scene.id.key}, frames {address.frames}: {error}") from error
         finally:
@@ -569,19 +551,19 @@ class SampleLoader:
         return {name: writer.sample[name] for name in request.fields}
 
     def _decoded(
-        self, address: Address, *, frames: slice, out: Mapping[int, Any]
-    ) -> tuple[Views, SceneFacts]:
-        """Return the views of a sample, of some of its frames, and what is known of its scene.
+        self, known: SceneFacts, address: Address, *, frames: slice, out: Mapping[int, Any]
+    ) -> Views:
+        """Return the views of a sample, of some of its frames; poses become known if needed.
 
         What was decoded from a cache that was damaged since is decoded again.
 
         Args:
+            known: Its scene.
             address: The sample.
             frames: Which of its frames: one, or with a transform any number.
             out: By camera, the (t, 3, h, w) uint8 arrays to decode into, where each picture is used
                 once and nothing changes it.
         """
-        known = self._known_scene(address)
         try:
             return self._decode(known, address, frames=frames, out=out)
         except (MediaError, SchemaError, ShardError):
@@ -592,8 +574,8 @@ class SampleLoader:
             return self._decode(known, address, frames=frames, out=out)
 
     def _decode(
-        self, known: _KnownScene, address: Address, *, frames: slice, out: Mapping[int, Any]
-    ) -> tuple[Views, SceneFacts]:
+        self, known: SceneFacts, address: Address, *, frames: slice, out: Mapping[int, Any]
+    ) -> Views:
         scene, numbers, camera_px = known.scene, address.frames[frames], known.intrinsics
         shape = (len(numbers), 3, camera_px.height_px, camera_px.width_px)
         rgb = partial(self._streams.rgb, scene, run=address.run)
@@ -611,7 +593,9 @@ class SampleLoader:
                 else:
                     rgb(name=name, index=frame, out=place)
             pictures[camera] = found
-        views = Views(
+        if known.poses is None and self._needs_poses(known):
+            known.poses = self._read_poses(scene)
+        return Views(
             source=address.source,
             targets=address.targets,
             frames=numbers,
@@ -622,17 +606,10 @@ class SampleLoader:
             },
             intrinsics=camera_px,
         )
-        return views, SceneFacts(
-            scene,
-            known.encodings,
-            self._camera_poses(scene),
-            url=partial(self._source.url, scene, rgb_name(address.source)),
-            frames=address.frames,
-        )
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs."""
-        own = ("_lock", "_coming", "_described", "_scenes", "_poses")
+        own = ("_lock", "_coming", "_described", "_scenes")
         return self.__dict__ | dict.fromkeys(own)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -652,13 +629,12 @@ class SampleLoader:
                 for frame in address.frames
             ]
             frames[depth_name(camera)] = [frame for frame in lagged if frame is not None]
-        texts = (TRAJECTORY_JSON,) if self._needs_poses(scene) else ()
+        texts = (TRAJECTORY_JSON,) if self._needs_poses(known) else ()
         return NeededFiles(scene, frames, texts)
 
-    def _needs_poses(self, scene: Scene) -> bool:
-        rectified = scene.rig_residual_px <= RECTIFIED_PX
+    def _needs_poses(self, known: SceneFacts) -> bool:
         return self._poses_needed == "always" or (
-            self._poses_needed == "unless rectified" and not rectified
+            self._poses_needed == "unless rectified" and not known.is_rectified
         )
 
     def _cameras(self, address: Address, suffix: Literal["rgb", "depth"]) -> list[int]:
@@ -669,7 +645,7 @@ class SampleLoader:
         return list(dict.fromkeys(cameras))
 
     def _depth(
-        self, known: _KnownScene, address: Address, camera: int, frames: tuple[int, ...]
+        self, known: SceneFacts, address: Address, camera: int, frames: tuple[int, ...]
     ) -> StoredDepth:
         """Return a camera's stored depth over frames; that of single frames is kept."""
         parts = [self._stored(known, camera, frame, run=address.run) for frame in frames]
@@ -680,7 +656,7 @@ class SampleLoader:
             measured=np.concatenate([part.measured for part in parts]),
         )
 
-    def _stored(self, known: _KnownScene, camera: int, frame: int, *, run: int) -> StoredDepth:
+    def _stored(self, known: SceneFacts, camera: int, frame: int, *, run: int) -> StoredDepth:
         """Return a camera's stored depth at a frame of its pictures, (1, h, w)."""
         scene, encoding = known.scene, known.encodings[camera]
         index = depth_frame_index(frame, encoding=encoding, frames=scene.frames)
@@ -694,15 +670,9 @@ class SampleLoader:
         # Where depth of several frames is kept, what is computed from it would be too much.
         return stored if self._streams.kept_frames > 1 else replace(stored, derived=kept.derived)
 
-    def _camera_poses(self, scene: Scene) -> CameraPoses | None:
-        if not self._needs_poses(scene):
-            return None
+    def _read_poses(self, scene: Scene) -> CameraPoses:
+        from stereogenbench_data.index.evidence import poses_as  # slow to import
 
-        def read() -> CameraPoses:
-            from stereogenbench_data.index.evidence import poses_as  # slow to import
-
-            text = self._source.read(scene, TRAJECTORY_JSON)
-            where = self._source.label(scene, TRAJECTORY_JSON)
-            return poses_as(text, scene.pose_form, where=where)
-
-        return _kept(self._poses, scene.id.key, read, most=KEPT_POSES)
+        text = self._source.read(scene, TRAJECTORY_JSON)
+        where = self._source.label(scene, TRAJECTORY_JSON)
+        return poses_as(text, scene.pose_form, where=where)

@@ -65,7 +65,6 @@ def scene(encoding, *, rig="rectified", seed=0, size=SIZE):
     known = replace(
         known,
         poses=poses,
-        frames=FRAMES,
         encodings={camera: replace(encoding, unit_m=units_m[camera]) for camera in range(6)},
     )
     depths = {}

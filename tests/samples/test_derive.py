@@ -15,6 +15,7 @@ from stereogenbench_data.samples.derive import (
     Views,
 )
 from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.selection.plan import Address
 from tests.selection.conftest import made_scene
 
 GAP_CM = 20.0
@@ -33,7 +34,9 @@ def facts(encoding, *, residual_px=0.0, order=1.0, yaw_deg=(0.0,) * 6):
     centres[0, :, 1] = 100 * np.array(scene.lateral_m)
     rotations[0, :, 1] = yaw_deg
     poses = CameraPoses.from_unreal(centres, rotation_from_rotator_deg(rotations), unit_m=0.01)
-    return SceneFacts(scene, dict.fromkeys(range(6), encoding), poses, lambda: "url", (0,))
+    return SceneFacts(
+        scene, INTRINSICS, dict.fromkeys(range(6), encoding), lambda name: name, poses=poses
+    )
 
 
 def geometry(units, encoding, *, source=0, target=1, world="as recorded", padded=None, **scene):
@@ -138,7 +141,7 @@ def test_a_point_behind_the_other_camera_is_not_valid_and_has_no_disparity(form)
     units = some_units()
     encoding = DepthEncoding(0.1) if form == "depth" else DepthEncoding(500.0, form="inverse")
     pair = geometry(units, encoding, residual_px=5.0, yaw_deg=(0.0, 80.0, 0, 0, 0, 0))
-    to_the_right = PairSample(pair._views, pair._facts, target=1)
+    to_the_right = PairSample(pair._views, pair._facts, Address(0, 0, (1,), (0,)), target=1)
 
     # the right camera stands 0.2 m to the right and looks 80 degrees to the right of the left one
     ahead_m = np.divide(500, units, where=units > 0, out=np.zeros(units.shape))
