@@ -173,21 +173,13 @@ class Tree:
             return SceneFolder(self.root, key)
         return RemoteFolder(self.remote.root, key, self.files.get(key), self.cache)
 
-    def stamps(self, key: str) -> Files:
-        """Return a scene's files as they were listed, or list them now.
-
-        Raises:
-            StorageError: If they cannot be listed.
-        """
-        return self.files[key] if key in self.files else self.folder(key).stamps()
-
     def finished(self, key: str) -> Files:
         """Return a scene's files, by whose names it is finished.
 
         Raises:
             StorageError: If they cannot be listed, or the scene cannot be used.
         """
-        files = self.stamps(key)
+        files = self.files[key] if key in self.files else self.folder(key).stamps()
         require_finished(key, files)
         if self.is_marked and COMPLETE_JSON not in files:
             raise unfinished(key)

@@ -443,7 +443,7 @@ def _merged(tree: Tree, root: RemoteObject) -> Mapping[str, bytes]:
     def own(key: str) -> tuple[Any, ...]:
         folder = tree.folder(key)
         rig, labels, _ = parse_rig(folder.read(BASELINE_JSON), where=key, shape=tree.stated)
-        return rig, _with_marked(labels, folder, tree.stamps(key))
+        return rig, _with_marked(labels, folder, tree.finished(key))
 
     for records in merged_records(root, keys):
         with suppress(SchemaError, StorageError):  # of a record, or of the files of one of these

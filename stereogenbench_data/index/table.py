@@ -15,7 +15,6 @@ tell, as copies and unpacked archives change dates; 7 ms for 8,493 scenes. What 
 is kept in the user's cache, and what was taken for granted of it is told in one line.
 """
 
-import functools
 import gc
 import warnings
 from collections import Counter
@@ -192,15 +191,19 @@ class SceneIndex:
         """
         stated = None if conventions is None else Conventions.read(conventions)
         named_root = None if root is None else _require_root(root)
-        open_tree = functools.partial(
-            _open_tree, wanted=wanted, conventions=stated, rows=rows, retry=retry
-        )
         if is_remote(data):
-            where = shown(data)
-            index = _open_url(str(data), root=named_root, retry=retry, open_tree=open_tree)
+            place: str | Path = str(data).rstrip("/")
+            index, where = _index_of_url(str(data), root=named_root, retry=retry), shown(data)
         else:
-            where = str(local_path(data))
-            index = _open_path(local_path(data), root=named_root, open_tree=open_tree)
+            place = local_path(data)
+            index, where = _index_of_path(place, root=named_root), str(place)
+        if index is None:
+            if named_root is not None:
+                raise StorageError(
+                    f"{shown(place)}: has no {INDEX_NAME}, and a root was named for the data of "
+                    f"one. Leave root out, or pass the index file."
+                )
+            index = _open_tree(place, wanted=wanted, conventions=stated, rows=rows, retry=retry)
         index.retry = retry
         if stated is not None:
             table = _restated(index._table, index._head, stated, retry=retry)
@@ -470,47 +473,39 @@ class SceneIndex:
 # Opening an index.
 
 
-def _open_path(
-    path: Path, *, root: str | None, open_tree: Callable[[Path], SceneIndex]
-) -> SceneIndex:
-    """Return the index in a file or folder, or the scenes of a tree without one."""
-    with explain_os_errors(f"{path}: cannot be looked at"):
-        is_folder, is_file = path.is_dir(), path.is_file()
-        is_tree = is_folder and not (path / INDEX_NAME).is_file()
-    if is_tree:
-        _require_no_root(path, root)
-        return open_tree(path)
-    if is_folder or is_file:
-        return _open_file(path / INDEX_NAME if is_folder else path, root=root)
-    raise StorageError(
-        f"{path}: does not exist; expected an index file, a folder with {INDEX_NAME} or a folder "
-        f"in the released layout."
-    )
+def _index_of_path(path: Path, *, root: str | None) -> SceneIndex | None:
+    """Return the index in a file or folder; None of a folder without one.
 
-
-def _open_file(path: Path, *, root: str | None) -> SceneIndex:
-    """Return the index in a file. The user or, within limits, the file names its data's root.
+    The user or, within limits, the file names its data's root.
 
     Raises:
         StorageError: If it is damaged or not an index of this version, or only the user may name
             the place of its data.
     """
-    table, head = read_index_file(path, where=str(path))
-    head = replace(head, root=_recorded_root(path, head, table) if root is None else root)
-    index = SceneIndex(table, head, seek_tables=path)
+    with explain_os_errors(f"{path}: cannot be looked at"):
+        is_folder, is_file = path.is_dir(), path.is_file()
+        is_tree = is_folder and not (path / INDEX_NAME).is_file()
+    if is_tree:
+        return None
+    if not (is_folder or is_file):
+        raise StorageError(
+            f"{path}: does not exist; expected an index file, a folder with {INDEX_NAME} or a "
+            f"folder in the released layout."
+        )
+    file = path / INDEX_NAME if is_folder else path
+    table, head = read_index_file(file, where=str(file))
+    head = replace(head, root=_recorded_root(file, head, table) if root is None else root)
+    index = SceneIndex(table, head, seek_tables=file)
     if not is_remote(head.root):
-        index.stale = _stale_message(table, head, index_file=path)
+        index.stale = _stale_message(table, head, index_file=file)
     return index
 
 
-def _open_url(
-    url: str,
-    *,
-    root: str | None,
-    retry: RetryPolicy | None,
-    open_tree: Callable[[str], SceneIndex],
-) -> SceneIndex:
-    """Fetch an index. Its data are beside it, unless the user names another root."""
+def _index_of_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> SceneIndex | None:
+    """Return the index at a URL, fetched; None of a folder without one.
+
+    Its data are beside it, unless the user names another root.
+    """
     beside, name = split_name(url)
     is_folder = not name.endswith(".parquet")
     if is_folder:
@@ -519,10 +514,9 @@ def _open_url(
     try:
         size = remote.size()
     except MissingObject:
-        if not is_folder:
-            raise
-        _require_no_root(shown(beside), root)
-        return open_tree(beside)
+        if is_folder:
+            return None
+        raise
     if size > MAX_INDEX_BYTES:
         raise StorageError(
             f"{remote.where}: an index may have {MAX_INDEX_BYTES:,} bytes, this one has "
@@ -546,14 +540,6 @@ def _require_root(root: str | Path) -> str:
             f"folder or URL to which the paths in the index are relative."
         )
     return str(folder)
-
-
-def _require_no_root(where: str | Path, root: str | None) -> None:
-    if root is not None:
-        raise StorageError(
-            f"{where}: has no {INDEX_NAME}, and a root was named for the data of one. Leave root "
-            f"out, or pass the index file."
-        )
 
 
 def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:

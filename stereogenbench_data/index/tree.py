@@ -355,8 +355,6 @@ _LAYOUT: Final = "train/<family>/<map>/<scene> or eval/<subset>/<family>/<map>/<
 _SCENE_FILES: Final = frozenset({BASELINE_JSON, TRAJECTORY_JSON, COMPLETE_JSON, *VIDEO_FILES})
 SPLITS: Final = {"train": 4, "eval": 5}
 """How many parts a scene's path has, by its split."""
-_LISTERS: Final = 16
-"""Folders of a server that are listed at a time."""
 _FEW: Final = 32
 """Of fewer scenes of a folder each is listed by itself."""
 _DEEPEST: Final = 8
@@ -430,13 +428,12 @@ def search(
         ]
 
     paths = [""]
-    with ThreadPoolExecutor(_LISTERS) as pool:
-        for depth in range(1, _DEEPEST + 2):
-            found = [path for listed in pool.map(below, paths) for path in listed]
-            paths = []
-            for path in found:
-                is_place = SPLITS.get(path.partition("/")[0]) == depth
-                (places if is_place else paths).append(path)
+    for depth in range(1, _DEEPEST + 2):
+        found = [path for listed in in_parallel(below, paths) for path in listed]
+        paths = []
+        for path in found:
+            is_place = SPLITS.get(path.partition("/")[0]) == depth
+            (places if is_place else paths).append(path)
     return places, odd
 
 
