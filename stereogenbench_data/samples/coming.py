@@ -198,19 +198,8 @@ class ComingSamples:
         position = self._positions[place]
         if position is None:
             return []
-        ranges = [each for frame in frames for each in position.needed(frame)]
-        return self._source.wanted(scene, name, _joined(ranges)) if ranges else []
-
-
-def _joined(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the same bytes in as few ranges, ascending."""
-    joined: list[tuple[int, int]] = []
-    for start, stop in sorted(ranges):
-        if joined and start <= joined[-1][1]:
-            joined[-1] = (joined[-1][0], max(joined[-1][1], stop))
-        else:
-            joined.append((start, stop))
-    return joined
+        ranges = sorted(each for frame in frames for each in position.needed(frame))
+        return self._source.wanted(scene, name, ranges)
 
 
 class DescribedAhead:
