@@ -86,6 +86,7 @@ from stereogenbench_data.schema.release import (
     DESCRIPTION_JSON,
     DESCRIPTION_TXT,
     PACKED_DEPTH_NAMES,
+    RELEASED_NAMES,
     TRAINING_JSON,
     TRAJECTORY_JSON,
     VIDEO_FILES,
@@ -735,8 +736,10 @@ def derived_scene(scene: Scene, document: TrainingDocument) -> Scene:
     The rig keeps what ``baseline.json`` records, and knows the size of the derived pictures. The
     places of the files are not changed.
     """
-    names = [*document.files]
-    is_packed = not set(names).isdisjoint(PACKED_DEPTH_NAMES.values())
+    if not RELEASED_NAMES.keys().isdisjoint(document.files):
+        formats = tuple(map(grey_format, scene.depth_pixel_format))
+        codecs = (CODEC_NAME,) * CAMERA_COUNT
+        scene = replace(scene, depth_codec=codecs, depth_pixel_format=formats)
     return replace(
         scene,
         rig=replace(
@@ -745,10 +748,6 @@ def derived_scene(scene: Scene, document: TrainingDocument) -> Scene:
             image_height_px=document.size_px[1],
             recorded_size_px=document.source_size_px,
         ),
-        depth_codec=(CODEC_NAME,) * CAMERA_COUNT if is_packed else scene.depth_codec,
-        depth_pixel_format=tuple(map(grey_format, scene.depth_pixel_format))
-        if is_packed
-        else scene.depth_pixel_format,
         key_frames=document.key_frames,
         training=document.facts,
     )
