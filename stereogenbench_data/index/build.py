@@ -18,7 +18,6 @@ from typing import Any, Final, Literal
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, no_advance, require_workers
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
 from stereogenbench_data.index.evidence import agreed_forms
-from stereogenbench_data.index.parquet import IndexHead
 from stereogenbench_data.index.rows import json_of, scene_of_json
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
@@ -71,6 +70,10 @@ _MOST_UNTOLD: Final = 2500
 """More requests are told: the Hub answers 3,000 in five minutes."""
 _REQUESTS: Final = 2 * len(VIDEO_FILES) + len(METADATA_FILES)
 """The requests that describe a scene behind a URL: both ends of each video, and the small files."""
+_READERS: Final = 8
+"""Threads that list the files of scenes on this machine: its disk may be slow."""
+_AT_A_TIME: Final = 128
+"""How many scenes each of them lists at a time."""
 POOL_FROM: Final = 64
 """How many scenes there must be for worker processes to be worth their start."""
 
@@ -94,13 +97,6 @@ class TreeReport:
     broken: dict[str, str]
     notes: tuple[str, ...]
     is_part: bool
-
-    @property
-    def head(self) -> IndexHead:
-        """What an index of the scenes knows besides them."""
-        return IndexHead(
-            self.root, incomplete=self.incomplete, broken=self.broken, is_part=self.is_part
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +188,13 @@ class Tree:
 
     def of_each(self, read: Callable[[str], Any], keys: Sequence[str]) -> Iterator[Any]:
         """Yield what is read of each scene, in order; several wait at a time."""
-        return _of_each(read, keys) if self.remote is None else in_parallel(read, keys)
+        if self.remote is not None:
+            yield from in_parallel(read, keys)
+            return
+        parts = [keys[start : start + _AT_A_TIME] for start in range(0, len(keys), _AT_A_TIME)]
+        with ThreadPoolExecutor(_READERS) as pool:
+            for part in pool.map(lambda part: [*map(read, part)], parts):
+                yield from part
 
     def kept(self, name: str) -> Scene | None:
         """Return the scene that the user's cache holds by its `name_of`; None if there is none."""
@@ -236,18 +238,6 @@ class Tree:
         except StereoGenBenchError as error:
             has_mark = not files or COMPLETE_JSON in files
             return Outcome(folder.key, error, has_mark=has_mark)
-
-
-_READERS: Final = 8
-_AT_A_TIME: Final = 128
-
-
-def _of_each(read: Callable[[str], Any], keys: Sequence[str]) -> Iterator[Any]:
-    """Yield what is read of each scene, in order; several wait for a slow disk at a time."""
-    parts = [keys[start : start + _AT_A_TIME] for start in range(0, len(keys), _AT_A_TIME)]
-    with ThreadPoolExecutor(_READERS) as pool:
-        for part in pool.map(lambda part: [read(key) for key in part], parts):
-            yield from part
 
 
 def walk(  # noqa: PLR0913 - each is an option of the command

@@ -251,8 +251,14 @@ class SceneIndex:
     @classmethod
     def from_report(cls, report: "TreeReport") -> "SceneIndex":
         """Return the index of the scenes that a walk found, and of those that it left out."""
+        head = IndexHead(
+            report.root,
+            incomplete=report.incomplete,
+            broken=report.broken,
+            is_part=report.is_part,
+        )
         table = table_of_scenes(report.scenes, where=shown(report.root))
-        return cls(table, report.head, seek_tables=seek_tables_of(report.scenes))
+        return cls(table, head, seek_tables=seek_tables_of(report.scenes))
 
     def __repr__(self) -> str:
         """Return the root without secrets, and the number of scenes and shards."""
