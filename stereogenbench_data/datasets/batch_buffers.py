@@ -219,7 +219,7 @@ class _WorkerSlots:
     def __init__(self) -> None:
         self._owner = SlotOwner(os.getpid(), os.urandom(8))
         self._status = SharedNumbers([_WORKERS] * SLOTS).tensor
-        self._memory: list[torch.Tensor | None] = [None] * SLOTS
+        self._memory = [torch.empty(0, dtype=torch.uint8)] * SLOTS
         self._is_known = [False] * SLOTS
         self._views: list[Callable[[], Any]] = [lambda: None] * SLOTS
         self._layout: dict[str, BufferSpec] = {}
@@ -228,10 +228,9 @@ class _WorkerSlots:
     def allocate(self, count: int) -> BatchArrays:
         """Return the arrays for the next batch, in a free slot if there is one."""
         self._slot = self._free_slot() if self._layout else None
-        memory = None if self._slot is None else self._memory[self._slot]
-        if self._slot is None or memory is None:
+        if self._slot is None:
             return BatchArrays(count, fresh_bytes)
-        view = memory.numpy()
+        view = self._memory[self._slot].numpy()
         self._views[self._slot] = weakref.ref(view)
         whole = torch.from_numpy(view)
 
@@ -267,7 +266,7 @@ class _WorkerSlots:
             status = int(self._status[slot])
             if status == _SENT or self._views[slot]() is not None:
                 continue
-            if status == _RETIRED or self._memory[slot] is None:
+            if status == _RETIRED or not len(self._memory[slot]):
                 size_bytes = max(spec.stop for spec in self._layout.values())
                 self._memory[slot] = fresh_bytes("", size_bytes)
                 self._is_known[slot] = False
@@ -277,8 +276,7 @@ class _WorkerSlots:
 
     def _holds(self, slot: int, batch: dict[str, Any]) -> bool:
         """Return whether all tensors of a batch lie in the slot where the layout says."""
-        memory = self._memory[slot]
-        start = 0 if memory is None else memory.data_ptr()
+        start = self._memory[slot].data_ptr()
         return all(
             name in self._layout
             and value.data_ptr() == start + self._layout[name].start

@@ -255,7 +255,6 @@ class _MappedScenes(Dataset[Sample]):
             ahead=ahead if is_remote(index.root) else None,
         )
         self.buffers = BatchBuffers(options.get("buffers", "reused"))
-        self._streams = request.streams
         self.shared_epoch = SharedEpoch()
         self.is_random = _is_random(plan, request)
         self._is_watched = self.is_random
@@ -461,7 +460,7 @@ class _MappedScenes(Dataset[Sample]):
         """
         if batches.rule.shuffle:
             videos = videos_to_keep(
-                self.plan, batches.rule, streams=self._streams, processes=processes
+                self.plan, batches.rule, streams=self.request.streams, processes=processes
             )
             self._loader.keep_open(videos, frames=batches.rule.open_frames)
         self._of_all_ranks, self._step, self._stop = batches.of_all_ranks, processes, batches.end()

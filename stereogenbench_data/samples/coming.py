@@ -213,14 +213,12 @@ class DescribedAhead:
         self._waiting: deque[Step] = deque()
         self._soon: set[int] = set()
         self._given: set[int] = set()
-        self._ahead: set[int] = set()
         self._begun: set[int] = set()
 
     def begin(self, row: int) -> None:
         """Take a scene as begun."""
         self._begun.add(row)
         self._given.add(row)
-        self._ahead.discard(row)
 
     def __iter__(self) -> Self:
         return self
@@ -236,11 +234,11 @@ class DescribedAhead:
             if row not in self._given and row not in self._soon:
                 self._soon.add(row)
                 self._describe(step.address)
-        row = self._waiting[0].address.row if self._waiting else -1
-        if row < 0 or (row not in self._given and len(self._ahead) >= most):
+        if not self._waiting:
             raise StopIteration
-        if row not in self._given:
-            self._given.add(row)
-            self._ahead.add(row)
+        row = self._waiting[0].address.row
+        if row not in self._given and len(self._given) - len(self._begun) >= most:
+            raise StopIteration
+        self._given.add(row)
         self._soon.discard(row)
         return self._waiting.popleft()

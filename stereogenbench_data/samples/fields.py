@@ -438,13 +438,10 @@ class SampleWriter:
             allocate: Returns the array of a field; called once for each.
         """
         self.sample: Sample = {}
+        self._request, self._address, self._allocate = request, address, allocate
         known = request.known
         self._fields = [known[name] for name in request.fields]
-        self._kind = request.kind
-        self._address = address
         self._is_clip = clip == "clip"
-        self._layout = request.layout
-        self._allocate = allocate
 
     def pictures(self, frames: slice, *, size: tuple[int, int]) -> dict[int, Any]:
         """Return by camera where to decode pictures that are a field exactly as decoded.
@@ -458,10 +455,9 @@ class SampleWriter:
         for each in self._fields:
             if each.picture_of is None:
                 continue
-            source, targets = self._address.source, self._address.targets
-            shown = (
-                (source,) if each.picture_of == "source" else self._target_cameras(source, targets)
-            )
+            shown = self._target_cameras(self._address)
+            if each.picture_of == "source":
+                shown = (self._address.source,)
             for number, camera in enumerate(shown):
                 found[camera] = self._part(each, number, frames, shape=shape, dtype="u1")
         return found
@@ -476,7 +472,7 @@ class SampleWriter:
         """
         pairs = [
             PairSample(views, facts, self._address, target)
-            for target in self._target_cameras(views.source, views.targets)
+            for target in self._target_cameras(views)
         ]
         for each in self._fields:
             for number, pair in enumerate(pairs if each.per_target else pairs[:1]):
@@ -495,9 +491,9 @@ class SampleWriter:
                     if not np.may_share_memory(value, part):
                         np.copyto(part, value)
 
-    def _target_cameras(self, source: int, targets: tuple[int, ...]) -> tuple[int, ...]:
+    def _target_cameras(self, of: Address | Views) -> tuple[int, ...]:
         """Return the cameras along the axis of targets: of views the first is the source itself."""
-        return (source, *targets) if self._kind == "views" else targets
+        return (of.source, *of.targets) if self._request.kind == "views" else of.targets
 
     def _part(
         self, field: Field, number: int, frames: slice, *, shape: tuple[int, ...], dtype: Any
@@ -514,14 +510,13 @@ class SampleWriter:
         Returns:
             An array of that shape, a view of the whole field.
         """
-        is_stacked = field.per_target and self._layout == "stacked"
+        is_stacked = field.per_target and self._request.layout == "stacked"
         if field.name not in self.sample:
             whole = shape[1:] if field.per_frame else shape
             if field.per_frame and self._is_clip:
                 whole = (len(self._address.frames), *whole)
             if is_stacked:
-                shown = self._target_cameras(self._address.source, self._address.targets)
-                whole = (len(shown), *whole)
+                whole = (len(self._target_cameras(self._address)), *whole)
             self.sample[field.name] = self._allocate(field.name, whole, np.dtype(dtype))
         own = self.sample[field.name]
         own = own[number, ...] if is_stacked else own

@@ -153,12 +153,10 @@ class Streams:
         kept_frames: How many frames of each it keeps.
     """
 
-    def __init__(
-        self, source: MemberSource, *, limit: int = OPEN_STREAMS, kept_frames: int = 1
-    ) -> None:
+    def __init__(self, source: MemberSource, *, kept_frames: int = 1) -> None:
         """Open videos from a source; none is opened yet."""
         self._source = source
-        self.limit = limit
+        self.limit = OPEN_STREAMS
         self.kept_frames = kept_frames
         self._open: OrderedDict[_Place, _Stream] = OrderedDict()
 

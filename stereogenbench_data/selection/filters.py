@@ -98,14 +98,8 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     >>> did_you_mean("dispairty", ["left", "disparity"]), did_you_mean("colour", ["left"])
     ("; did you mean 'disparity'?", '.')
     """
-    nearest = nearest_first(name, known)
-    is_close = bool(nearest) and _likeness(name, nearest[0]) >= _CLOSE
-    return f"; did you mean {nearest[0]!r}?" if is_close else "."
-
-
-def nearest_first(name: str, known: Iterable[str]) -> list[str]:
-    """Return the known names, the most like a name first."""
-    return sorted(known, key=lambda each: _likeness(name, each), reverse=True)
+    nearest = max(known, key=lambda each: _likeness(name, each), default="")
+    return f"; did you mean {nearest!r}?" if _likeness(name, nearest) >= _CLOSE else "."
 
 
 def _likeness(name: str, known: str) -> float:

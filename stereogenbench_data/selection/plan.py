@@ -103,12 +103,11 @@ def balanced_share(
     *,
     scenes: int | None = None,
     max_bytes: int | None = None,
-    seed: int = 0,
 ) -> Int64[np.ndarray, " n"]:
     """Return the rows, ascending, of a share of scenes.
 
     Families take turns, in each family its maps, and in each map its scenes, in an order that
-    depends on their names and the seed alone. So a share of more scenes holds that of fewer.
+    depends on their names alone. So a share of more scenes holds that of fewer.
 
     Args:
         index: What the rows are of.
@@ -116,7 +115,6 @@ def balanced_share(
         sizes_bytes: How many bytes each of them takes.
         scenes: How many to choose.
         max_bytes: How many bytes those that are chosen may take together.
-        seed: Gives another order.
 
     Raises:
         SelectionError: If there are fewer scenes, or no scene fits into the bytes.
@@ -129,11 +127,11 @@ def balanced_share(
     columns = (index.column(name) for name in ("family", "map_name", "key"))
     families, maps, keys = (column[np.asarray(rows)].tolist() for column in columns)
     tree: dict[str, dict[str, list[int]]] = {}
-    for place in sorted(range(len(rows)), key=lambda place: _drawn(keys[place], seed)):
+    for place in sorted(range(len(rows)), key=lambda place: _drawn(keys[place])):
         tree.setdefault(families[place], {}).setdefault(maps[place], []).append(place)
     order = _in_turns(
-        _in_turns(of_map[name] for name in sorted(of_map, key=lambda name: _drawn(name, seed)))
-        for _, of_map in sorted(tree.items(), key=lambda item: _drawn(item[0], seed))
+        _in_turns(tree[family][name] for name in sorted(tree[family], key=_drawn))
+        for family in sorted(tree, key=_drawn)
     )
     if max_bytes is not None:
         smallest = min(sizes_bytes)
@@ -153,8 +151,8 @@ def _in_turns(lists: Iterable[Sequence[int]]) -> list[int]:
     return [each for turn in zip_longest(*lists) for each in turn if each is not None]
 
 
-def _drawn(text: str, seed: int) -> bytes:
-    return hashlib.sha256(f"{seed} {text}".encode()).digest()
+def _drawn(text: str) -> bytes:
+    return hashlib.sha256(f"0 {text}".encode()).digest()
 
 
 FramesSpec = (
@@ -273,19 +271,17 @@ drawn at random.
 """
 
 
-def run_starts(
-    windows: Windows, *, frames: int, key_frames: Sequence[int], least: int
-) -> tuple[int, ...]:
+def run_starts(windows: Windows, *, frames: int, key_frames: Sequence[int]) -> tuple[int, ...]:
     """Return the windows with which runs begin: groups of windows that decode by themselves.
 
-    A run holds the windows whose first frames lie between two key frames, with ``least`` frames or
-    more from the one to the other. Windows drawn at random, of which only the number is known
+    A run holds the windows whose first frames lie between two key frames, with `LEAST_RUN` frames
+    or more from the one to the other. Windows drawn at random, of which only the number is known
     before, are dealt evenly to as many runs.
     """
     count = windows.count(frames)
     cuts = [0]
     for key in key_frames:
-        if key - cuts[-1] >= least and frames - key >= least:
+        if min(key - cuts[-1], frames - key) >= LEAST_RUN:
             cuts.append(key)
     if isinstance(windows, Random):
         runs = min(count, len(cuts))
@@ -590,7 +586,7 @@ def _plan(index: SceneIndex, pairs: PairList, *, windows: Windows, seed: int) ->
             raise SelectionError(f"{same[0]}{others}: {error}") from error
         of_kind[frames, kind] = (
             count,
-            run_starts(windows, frames=frames, key_frames=kinds[kind], least=LEAST_RUN),
+            run_starts(windows, frames=frames, key_frames=kinds[kind]),
             key_distance(windows, key_frames=kinds[kind]),
         )
     counts, starts_of, distances = zip(*(of_kind[each] for each in alike), strict=True)
