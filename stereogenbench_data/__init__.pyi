@@ -1,5 +1,7 @@
 """The public names and the modules that hold them: the one list, for type checkers and imports."""
 
+from stereogenbench_data.bridges.matching import to_raft_stereo as to_raft_stereo
+from stereogenbench_data.bridges.matching import to_torchvision as to_torchvision
 from stereogenbench_data.datasets.batch_buffers import collate as collate
 from stereogenbench_data.datasets.batch_buffers import to_device as to_device
 from stereogenbench_data.datasets.batches import EpochBatches as EpochBatches
@@ -17,8 +19,6 @@ from stereogenbench_data.datasets.mapped import MixedSplitsWarning as MixedSplit
 from stereogenbench_data.datasets.mapped import SceneViews as SceneViews
 from stereogenbench_data.datasets.mapped import SeekTableWarning as SeekTableWarning
 from stereogenbench_data.datasets.mapped import StereoPairs as StereoPairs
-from stereogenbench_data.datasets.mapped import to_raft_stereo as to_raft_stereo
-from stereogenbench_data.datasets.mapped import to_torchvision as to_torchvision
 from stereogenbench_data.datasets.streamed import StereoPairStream as StereoPairStream
 from stereogenbench_data.errors import DescriptorError as DescriptorError
 from stereogenbench_data.errors import EvaluationError as EvaluationError

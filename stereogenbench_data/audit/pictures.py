@@ -11,15 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from stereogenbench_data.engine import Progress, advance_of
-from stereogenbench_data.errors import MediaError, SelectionError
-from stereogenbench_data.geometry.camera import rig_intrinsics
-from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.media.depth import DEPTH_CURES, NO_DEPTH_UNIT
-from stereogenbench_data.media.encoder import Encoding, VideoEncoder
-from stereogenbench_data.samples.fields import Request, Sample
-from stereogenbench_data.samples.load import SampleLoader
-from stereogenbench_data.samples.picture import (
+from stereogenbench_data.bridges.picture import (
     FRAME,
     NOT_MEASURED,
     Colour,
@@ -31,6 +23,14 @@ from stereogenbench_data.samples.picture import (
     draw_sheet,
     pair_tiles,
 )
+from stereogenbench_data.engine import Progress, advance_of
+from stereogenbench_data.errors import MediaError, SelectionError
+from stereogenbench_data.geometry.camera import rig_intrinsics
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.media.depth import DEPTH_CURES, NO_DEPTH_UNIT
+from stereogenbench_data.media.encoder import Encoding, VideoEncoder
+from stereogenbench_data.samples.fields import Request, Sample
+from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT, rgb_name

@@ -25,12 +25,12 @@ from PIL import Image
 
 from stereogenbench_data.bridges import dataset_facts
 from stereogenbench_data.bridges.in_memory import columns
+from stereogenbench_data.bridges.picture import draw_sheet, pair_tiles
 from stereogenbench_data.datasets.mapped import StereoPairs
 from stereogenbench_data.engine import Advance, Progress, advance_of
 from stereogenbench_data.errors import DescriptorError, explain_os_errors, needs_extra
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.picture import draw_sheet, pair_tiles
 from stereogenbench_data.schema.records import Scene, SceneId
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,

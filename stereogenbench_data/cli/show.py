@@ -40,7 +40,7 @@ def show(
     Example: `stereogenbench show shards/ scene_000001 --pair 0-5 -o sheet.png`
     """
     from stereogenbench_data.audit.pictures import SceneReader, clip_pages, scene_sheet, write_clip
-    from stereogenbench_data.samples.picture import write_png
+    from stereogenbench_data.bridges.picture import write_png
     from stereogenbench_data.selection.filters import find_scene
 
     ending = ".png" if out is None else out.suffix.lower()

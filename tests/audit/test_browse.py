@@ -210,7 +210,7 @@ def test_pictures_and_maps_are_drawn_as_they_are(page):
     assert np.abs(drawn("right") - right).mean() < 3
     wanted = np.stack([left[..., 0], right[..., 1], right[..., 2]], axis=-1)
     assert np.abs(drawn("anaglyph") - wanted).mean() < 3
-    from stereogenbench_data.samples.picture import ColourScale
+    from stereogenbench_data.bridges.picture import ColourScale
 
     disparity, valid = sample["disparity"][0].numpy(), sample["valid"][0].numpy()
     painted = ColourScale.of(disparity, measured=valid).paint(disparity, measured=valid)

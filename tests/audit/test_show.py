@@ -14,7 +14,7 @@ from stereogenbench_data.audit.pictures import (
     tile_width,
     write_clip,
 )
-from stereogenbench_data.samples.picture import (
+from stereogenbench_data.bridges.picture import (
     NOT_MEASURED,
     ColourScale,
     anaglyph,

@@ -18,8 +18,8 @@ from PIL import Image
 
 from stereogenbench_data.audit.browser.catalogue import Catalogue, parse_choice
 from stereogenbench_data.audit.pictures import HIDDEN, SceneReader
+from stereogenbench_data.bridges.picture import COLOUR_STOPS, NOT_MEASURED, channels_last
 from stereogenbench_data.errors import SelectionError, StereoGenBenchError
-from stereogenbench_data.samples.picture import COLOUR_STOPS, NOT_MEASURED, channels_last
 from stereogenbench_data.schema.text import shortened
 
 Query = Mapping[str, list[str]]

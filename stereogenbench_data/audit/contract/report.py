@@ -17,16 +17,16 @@ from stereogenbench_data.audit.contract.scoring import Gain
 from stereogenbench_data.audit.contract.verdict import QUOTIENT, Answer, Verdict, encoding_line
 from stereogenbench_data.audit.geometry.records import plain
 from stereogenbench_data.audit.scene_access import source_of
-from stereogenbench_data.errors import SelectionError
-from stereogenbench_data.geometry.projection import Projection, backward_warp
-from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.picture import (
+from stereogenbench_data.bridges.picture import (
     ColourScale,
     Tile,
     channels_last,
     draw_sheet,
     write_png,
 )
+from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.geometry.projection import Projection, backward_warp
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import filter_scenes
 

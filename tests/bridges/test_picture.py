@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stereogenbench_data.samples.picture import COLOUR_STOPS, ColourScale
+from stereogenbench_data.bridges.picture import COLOUR_STOPS, ColourScale
 
 
 def test_colours_run_from_the_low_end_to_the_high_one_and_grey_is_not_measured():
