@@ -380,7 +380,7 @@ class _MappedScenes(Dataset[Sample]):
             epoch: An epoch of their own; None goes with this dataset.
         """
         twin = copy.copy(self)
-        twin._loader, twin.buffers = self._loader.copy(), BatchBuffers(self.buffers.kind)
+        twin._loader, twin.buffers = copy.copy(self._loader), BatchBuffers(self.buffers.kind)
         if epoch is not None:
             twin.shared_epoch = SharedEpoch(epoch)
             twin._is_watched = False

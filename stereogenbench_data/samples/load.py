@@ -73,10 +73,6 @@ OPEN_STREAMS: Final = 24
 _Place = tuple[str, int, int]
 """Path and offset of a video, and which run of it is read."""
 
-_inherited: Final[list[object]] = []
-"""Readers that came over a fork. They share file offsets with the parent, so they are neither read
-nor closed here: the operating system takes them back when the process ends."""
-
 
 class StreamStats(NamedTuple):
     """What a pool has open.
@@ -146,17 +142,18 @@ class Streams:
     """A pool of open videos, for one thread at a time of the process that opened them.
 
     Pictures and depth come back read-only, because the pool may hand out the same ones again.
-    A copy, as in another process, has the same limits and nothing open.
 
     Attributes:
         limit: How many videos it keeps open.
         kept_frames: How many frames of each it keeps.
     """
 
-    def __init__(self, source: MemberSource, *, kept_frames: int = 1) -> None:
+    def __init__(
+        self, source: MemberSource, *, limit: int = OPEN_STREAMS, kept_frames: int = 1
+    ) -> None:
         """Open videos from a source; none is opened yet."""
         self._source = source
-        self.limit = OPEN_STREAMS
+        self.limit = limit
         self.kept_frames = kept_frames
         self._open: OrderedDict[_Place, _Stream] = OrderedDict()
 
@@ -280,10 +277,6 @@ class Streams:
             self._open.pop(place).close()
             raise
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy is made from: nothing is open."""
-        return self.__dict__ | {"_open": OrderedDict()}
-
 
 @contextmanager
 def _cause_raised(file: Path | SeekableFile) -> Iterator[None]:
@@ -307,8 +300,8 @@ class SampleLoader:
     """Loads samples: flat dicts of numpy arrays and texts.
 
     Rows of the index, poses, open videos and their current frames are kept for later samples.
-    Threads may share a loader: they decode by turns. Files that it opens stay in this process; a
-    fork, or a copy in another process, begins with nothing read.
+    Threads may share a loader: they decode by turns. Files that it opens stay in this process: a
+    fork, like any copy, begins with nothing read and nothing open.
     """
 
     def __init__(
@@ -345,59 +338,41 @@ class SampleLoader:
         self._ahead = ahead
         self._frames = frames
         self._needs = request.streams
-        poses = {request.known[name].needs_poses for name in request.fields}
-        self._poses_needed: Literal["always", "unless rectified", "never"] = "never"
-        if poses - {"never"}:
-            self._poses_needed = "always" if "always" in poses else "unless rectified"
+        self._needs_of_poses = {request.known[name].needs_poses for name in request.fields}
         # A transform may write into what it is given.
         self._is_changed = request.transform is not None
-        self._begin_anew(Streams(self._source))
+        self._limits = OPEN_STREAMS, 1
+        self._begin_anew()
 
-    def _begin_anew(self, streams: Streams) -> None:
-        """Begin in this process with nothing read, and with these videos."""
-        self._lock, self._pid = threading.RLock(), os.getpid()
-        self._streams = streams
+    def _begin_anew(self) -> None:
+        """Begin with nothing read and nothing open."""
+        _loaders.add(self)
+        self._lock = threading.RLock()
+        limit, kept_frames = self._limits
+        self._streams = Streams(self._source, limit=limit, kept_frames=kept_frames)
         self._coming = None
         if self._ahead is not None:
-            self._coming = ComingSamples(self._source, self._ahead, streams)
+            self._coming = ComingSamples(self._source, self._ahead, self._streams)
         self._described: DescribedAhead | None = None
         self._scenes: OrderedDict[int, SceneFacts] = OrderedDict()
-
-    def _own_lock(self) -> threading.RLock:
-        """Return the lock of this process: a fork begins anew."""
-        if os.getpid() != self._pid:
-            _inherited.append(self._streams)
-            self._begin_anew(copy.copy(self._streams))
-        return self._lock
 
     @property
     def stats(self) -> StreamStats:
         """What this process has open."""
-        is_own = os.getpid() == self._pid
-        return self._streams.stats if is_own else StreamStats(0, self._streams.limit)
-
-    def copy(self) -> "SampleLoader":
-        """Return a loader of the same samples with open videos of its own."""
-        twin = copy.copy(self)
-        if self._ahead is not None:
-            twin._ahead = FetchAhead(limit_bytes=self._ahead.limit_bytes)
-            twin._source = self._source.fetching_by(twin._ahead)
-        twin._begin_anew(Streams(twin._source))
-        return twin
+        return self._streams.stats
 
     def keep_open(self, videos: int, *, frames: int = 1) -> None:
         """Set how many videos, and how many frames of each, every process keeps open."""
-        self._streams.limit, self._streams.kept_frames = videos, frames
+        self._limits = self._streams.limit, self._streams.kept_frames = videos, frames
 
     @property
     def has_order(self) -> bool:
         """Whether samples were decoded as they were expected; True where none is fetched."""
-        with self._own_lock():
-            return self._coming is None or self._coming.has_order
+        return self._coming is None or self._coming.has_order
 
     def expect(self, steps: Iterable[Step]) -> None:
         """Take the samples that will be decoded next, so that their bytes are fetched ahead."""
-        with self._own_lock():
+        with self._lock:
             if self._coming is not None:
                 if self._index.presumption is not None:
                     self._described = steps = DescribedAhead(steps, self._describe_soon)
@@ -405,7 +380,7 @@ class SampleLoader:
 
     def begin(self, address: Address) -> None:
         """Fetch what a sample needs, which is decoded next, and what those after it need."""
-        with self._own_lock():
+        with self._lock:
             if self._coming is not None:
                 if self._described is not None:
                     self._described.begin(address.row)
@@ -413,24 +388,24 @@ class SampleLoader:
 
     def end(self, address: Address) -> None:
         """Forget the bytes that a sample needed, which was decoded."""
-        with self._own_lock():
+        with self._lock:
             if self._coming is not None:
                 self._coming.end(address)
 
     def release(self, address: Address) -> None:
         """Close the videos of a run that has been read to its end."""
-        with self._own_lock():
+        with self._lock:
             self._streams.release(self._known_scene(address).scene, run=address.run)
 
     def stop_fetching(self) -> None:
         """End requests, and expect no sample."""
-        with self._own_lock():
+        with self._lock:
             if self._coming is not None:
                 self._coming.close()
 
     def close(self) -> None:
         """Close the videos that are open in this process, and end its requests."""
-        with self._own_lock():
+        with self._lock:
             self.stop_fetching()
             self._streams.close()
             self._scenes.clear()
@@ -493,7 +468,7 @@ class SampleLoader:
                         f"{presumption.cures()}"
                     )
         reason = scene.remark("poses")
-        if self._poses_needed == "never" or not reason or presumption.was_told:
+        if self._needs_of_poses == {"never"} or not reason or presumption.was_told:
             return
         if not self._index.indexed_scene(row).remark("poses"):
             presumption.was_told = True
@@ -537,7 +512,7 @@ class SampleLoader:
             for start in range(0, len(address.frames), step):
                 frames = slice(start, start + step)
                 out = writer.pictures(frames, size=size) if decodes_in_place else {}
-                with self._own_lock():
+                with self._lock:
                     views = self._decoded(known, address, frames=frames, out=out)
                 if request.transform is not None:
                     views = request.transform(views, np.random.default_rng(seeds))
@@ -606,14 +581,17 @@ class SampleLoader:
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy in another process needs."""
-        own = ("_lock", "_coming", "_described", "_scenes")
+        """Return what a copy needs."""
+        own = ("_lock", "_streams", "_coming", "_described", "_scenes")
         return self.__dict__ | dict.fromkeys(own)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Become a copy, with nothing read."""
+        """Become a copy, with nothing read, open or fetched."""
         self.__dict__.update(state)
-        self._begin_anew(self._streams)
+        if self._ahead is not None:
+            self._ahead = copy.copy(self._ahead)
+            self._source = self._source.fetching_by(self._ahead)
+        self._begin_anew()
 
     def _needed_files(self, address: Address) -> NeededFiles:
         """Return what a sample is read from."""
@@ -631,9 +609,8 @@ class SampleLoader:
         return NeededFiles(scene, frames, texts)
 
     def _needs_poses(self, known: SceneFacts) -> bool:
-        return self._poses_needed == "always" or (
-            self._poses_needed == "unless rectified" and not known.is_rectified
-        )
+        needs = self._needs_of_poses
+        return "always" in needs or ("unless rectified" in needs and not known.is_rectified)
 
     def _cameras(self, address: Address, suffix: Literal["rgb", "depth"]) -> list[int]:
         """Return the cameras whose colour or depth is needed."""
@@ -674,3 +651,21 @@ class SampleLoader:
         text = self._source.read(scene, TRAJECTORY_JSON)
         where = self._source.label(scene, TRAJECTORY_JSON)
         return poses_as(text, scene.pose_form, where=where)
+
+
+_loaders: Final[weakref.WeakSet[SampleLoader]] = weakref.WeakSet()
+"""The loaders of this process: a fork begins anew with each, before it has any other thread."""
+
+_inherited: Final[list[object]] = []
+"""Videos that came over a fork. They share file offsets with the parent, so they are neither read
+nor closed here: the operating system takes them back when the process ends."""
+
+
+def _begin_in_fork() -> None:
+    for loader in tuple(_loaders):
+        _inherited.append(loader._streams)
+        loader._begin_anew()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_begin_in_fork)

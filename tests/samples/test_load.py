@@ -25,8 +25,8 @@ def data(request, small_release, small_shards):
     return SceneIndex.open(small_release if request.param == "files" else small_shards)
 
 
-def pool_of(data):
-    return Streams(MemberSource(data.root, shards=data.shards))
+def pool_of(data, **how):
+    return Streams(MemberSource(data.root, shards=data.shards), **how)
 
 
 def open_files():
@@ -40,8 +40,7 @@ def open_files():
 
 
 def test_the_pool_keeps_no_more_videos_open_than_its_limit(data):
-    pool = pool_of(data)
-    pool.limit = 4
+    pool = pool_of(data, limit=4)
     for row in range(2):
         for name in RGB:
             pool.rgb(data.scene(row), name, 0, size=None)
