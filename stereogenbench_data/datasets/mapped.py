@@ -290,7 +290,7 @@ class _MappedScenes(Dataset[Sample]):
     def _expect(self, batch: EpochBatch, reading: Sequence[int]) -> None:
         """Let the bytes of a batch, in the order of reading, and of those after it be fetched."""
         this = (batch.epoch, batch.number)
-        if batch.number is None or this != self._next_batch or not self._loader.has_order:
+        if this != self._next_batch or not self._loader.has_order:
             self._loader.expect(self.steps(batch, reading))
         self._next_batch = None
         if batch.number is not None and self._of_all_ranks is not None:

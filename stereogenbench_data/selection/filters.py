@@ -247,9 +247,8 @@ def _apply(
         return keep, lambda: f"{np.nanmin(numbers):g} to {np.nanmax(numbers):g}."
     if name == "min_frames":
         frames = index.column("frames")[rows]
-        if isinstance(wanted, bool) or not isinstance(wanted, int | np.integer) or wanted < 1:
-            raise SelectionError(f"min_frames must be a whole number from 1, got {wanted!r}.")
-        return frames >= wanted, lambda: f"{frames.min()} to {frames.max()}."
+        fewest = require_whole("min_frames", wanted, least=1)
+        return frames >= fewest, lambda: f"{frames.min()} to {frames.max()}."
     if name == "caption":
         if not isinstance(wanted, str) or not wanted.split():
             raise SelectionError(f"caption must be one or more words, got {wanted!r}.")
@@ -286,6 +285,17 @@ def _quoted(value: Any) -> str:
         return f"{value:g}"
     is_plain = isinstance(value, str) and _PLAIN.fullmatch(value)
     return shortened(value if is_plain else repr(value), _LONGEST_SHOWN)
+
+
+def require_whole(name: str, number: Any, *, least: int) -> int:
+    """Return a whole number.
+
+    Raises:
+        SelectionError: If it is another kind of number, or below the least.
+    """
+    if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < least:
+        raise SelectionError(f"{name} must be a whole number from {least}, got {number!r}.")
+    return int(number)
 
 
 def require_range(name: str, wanted: Any) -> Range:

@@ -32,6 +32,7 @@ from stereogenbench_data.selection.filters import (
     baselines_cm,
     choose_pairs,
     filter_scenes,
+    require_whole,
     split_options,
 )
 from stereogenbench_data.selection.order import Runs
@@ -323,11 +324,11 @@ def parse_frames(spec: Any) -> Windows:
     parts = [spec] if isinstance(spec, str | int | np.integer) else spec
     if isinstance(parts, Sequence | np.ndarray) and len(parts) > 0:
         if not isinstance(parts[0], str):
-            frames = tuple(_whole(number, least=0) for number in parts)
+            frames = tuple(require_whole("frames", number, least=0) for number in parts)
             if len(set(frames)) < len(frames):
                 raise SelectionError(f"frames={spec!r} names a frame twice.")
             return Chosen(tuple(sorted(frames)))
-        match parts[0], [_whole(number, least=1) for number in parts[1:]]:
+        match parts[0], [require_whole("frames", number, least=1) for number in parts[1:]]:
             case "every", [step]:
                 return Every(step)
             case "random", [n]:
@@ -343,12 +344,6 @@ def parse_frames(spec: Any) -> Windows:
         "('every', k), ('random', n), ('clips', length, stride, step) or ('random clips', n, "
         "length, stride)."
     )
-
-
-def _whole(number: Any, *, least: int) -> int:
-    if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < least:
-        raise SelectionError(f"frames must be whole numbers of at least {least}, got {number!r}.")
-    return int(number)
 
 
 LEAST_RUN: Final = 24
@@ -497,7 +492,7 @@ def plan_pairs(index: SceneIndex, *, seed: int = 0, **selection: Unpack[Selectio
         SelectionError: If nothing matches, naming what left nothing and what there is; or if the
             seed is not a whole number from 0.
     """
-    seed = _require_seed(seed)
+    seed = require_whole("seed", seed, least=0)
     chosen, filters = split_options(selection, PairOptions)
     windows = parse_frames(filters.pop("frames", "first"))
     balance, limit = chosen.pop("balance", None), chosen.pop("limit", None)
@@ -532,7 +527,7 @@ def plan_views(
         SelectionError: If nothing matches, naming what left nothing and what there is; or if a
             camera does not exist or is given twice, or the seed is not a whole number from 0.
     """
-    seed = _require_seed(seed)
+    seed = require_whole("seed", seed, least=0)
     if isinstance(cameras, str) and cameras == "each":
         views = np.arange(CAMERA_COUNT, dtype=np.int8)[:, None]
     else:
@@ -560,12 +555,6 @@ def _require_cameras(cameras: Any) -> tuple[int, ...]:
             f"got {cameras!r}."
         )
     return tuple(int(camera) for camera in found)
-
-
-def _require_seed(seed: Any) -> int:
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise SelectionError(f"seed must be a whole number from 0, got {seed!r}.")
-    return int(seed)
 
 
 def _plan(index: SceneIndex, pairs: PairList, *, windows: Windows, seed: int) -> Plan:

@@ -98,10 +98,10 @@ def test_starts_of_random_clips_cover_a_scene_evenly():
     ("spec", "message"),
     [
         ("last", "is not understood"),
-        (-1, "at least 0, got -1"),
+        (-1, "whole number from 0, got -1"),
         ([1, 1], "names a frame twice"),
         ([1.5], "got 1.5"),
-        (("every", 0), "at least 1, got 0"),
+        (("every", 0), "whole number from 1, got 0"),
         (("random", 2, 3), "is not understood"),
         (None, "is not understood"),
         (81, "frame 81 is asked for of a scene with 81 frames, .* min_frames=82"),
