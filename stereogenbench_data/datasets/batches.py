@@ -606,8 +606,7 @@ class EpochBatches(Sampler[list[int]]):
 
     def next_pass(self) -> Pass:
         """Return the pass that begins at the next position; it begins with its first batch."""
-        epoch, start = self.passes.next_position
-        return self.pass_from(epoch, start)
+        return self.pass_from(*self.passes.next_position)
 
     def pass_from(self, epoch: int, start: int) -> Pass:
         """Return a pass over this rank's batches of an epoch from a global batch on."""

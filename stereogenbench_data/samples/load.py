@@ -501,8 +501,7 @@ class SampleLoader:
             SchemaError: If the trajectory does not follow the format.
         """
         request, known = self._request, self._known_scene(address)
-        scene = known.scene
-        size = request.size or (scene.rig.image_height_px, scene.rig.image_width_px)
+        size = (known.intrinsics.height_px, known.intrinsics.width_px)
         writer = SampleWriter(request, address, clip=clip, allocate=allocate)
         decodes_in_place = self._frames == "used once" and not self._is_changed
         # One frame at a time, or all that a transform treats alike.
@@ -518,7 +517,7 @@ class SampleLoader:
                     views = request.transform(views, np.random.default_rng(seeds))
                 writer.write(views, known, frames)
         except (StorageError, MediaError, SchemaError) as error:
-            raise type(error)(f"{scene.id.key}, frames {address.frames}: {error}") from error
+            raise type(error)(f"{known.scene.id.key}, frames {address.frames}: {error}") from error
         finally:
             self.end(address)
         return {name: writer.sample[name] for name in request.fields}
