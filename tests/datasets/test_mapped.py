@@ -165,23 +165,13 @@ def test_what_a_user_writes_into_a_sample_stays_there(indexed_release):
     assert same(pairs[0], untouched)
 
 
-def test_a_forked_child_reads_on_without_disturbing_its_parent(indexed_release):
-    pairs = StereoPairs(indexed_release, frames="all", fields=("left",))
-    expected = [pairs[number]["left"] for number in range(7)]
-    pairs[0]
-
-    def read(numbers):
-        assert all(torch.equal(pairs[number]["left"], expected[number]) for number in numbers)
-
-    assert fork_and(lambda: read((3, 1, 6))) == 0
-    read(range(7))
-
-
 @pytest.mark.filterwarnings("ignore:.*is multi-threaded:DeprecationWarning")
-def test_a_child_that_is_forked_while_a_thread_decodes_does_not_wait_for_it(
+def test_a_fork_reads_on_while_a_thread_of_its_parent_decodes_undisturbed(
     indexed_release, monkeypatch
 ):
-    pairs, parent = StereoPairs(indexed_release, fields=("left",)), os.getpid()
+    pairs, parent = StereoPairs(indexed_release, frames="all", fields=("left",)), os.getpid()
+    expected = [pairs[number]["left"] for number in range(7)]
+    pairs.close()
     decoding, forked = threading.Event(), threading.Event()
 
     class Waiting(depth.VideoReader):
@@ -191,13 +181,16 @@ def test_a_child_that_is_forked_while_a_thread_decodes_does_not_wait_for_it(
                 forked.wait()
             return super().frame(index)
 
+    def read(numbers):
+        assert all(torch.equal(pairs[number]["left"], expected[number]) for number in numbers)
+
     monkeypatch.setattr(depth, "VideoReader", Waiting)
     with ThreadPoolExecutor(1) as threads:
-        threads.submit(lambda: pairs[0])
+        reading = threads.submit(read, range(7))
         decoding.wait()
-        status = fork_and(lambda: (pairs[0], pairs.close()))
+        status = fork_and(lambda: read((3, 1, 6)))
         forked.set()
-    assert status == 0
+    assert (status, reading.exception()) == (0, None)
 
 
 def test_a_batch_of_scenes_of_two_sizes_says_how_to_mend_it():
