@@ -22,7 +22,7 @@ from stereogenbench_data.cli.options import (
     option,
 )
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.writing import writing
+from stereogenbench_data.errors import explain_os_errors
 from stereogenbench_data.schema.text import counted, plain_line
 
 _INDEX_NAME = "index.parquet"
@@ -73,7 +73,8 @@ def index(  # noqa: PLR0913 - one parameter an option
     # A root or a folder that cannot be used is refused before hours of work.
     recorded_root(root, beside=target.parent)
     there = next(folder for folder in target.absolute().parents if folder.is_dir())
-    with writing(target):
+    cure = "Choose another place with --out."
+    with explain_os_errors(f"{target}: the index cannot be written", cure):
         TemporaryFile(dir=there).close()
     stated = None if conventions is None else Conventions.read(conventions)
     with warnings.catch_warnings(), progress_bar("indexing", unit="scenes") as progress:

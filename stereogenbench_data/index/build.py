@@ -31,6 +31,7 @@ from stereogenbench_data.index.scene_folder import (
 from stereogenbench_data.index.tree import (
     NOTHING_KEPT,
     Files,
+    MisplacedScenes,
     RemoteFolder,
     RemoteTree,
     SceneFolder,
@@ -395,7 +396,12 @@ def report_of(tree: Tree, of_keys: Mapping[str, Outcome]) -> TreeReport:
     left_out = {out.key: out.found for out in outcomes if not isinstance(out.found, Scene)}
     incomplete = {key: str(error) for key, error in left_out.items()
                   if isinstance(error, IncompleteScene)}  # fmt: skip
-    broken = {key: str(error) for key, error in left_out.items() if key not in incomplete}
+    broken = {
+        path: reason
+        for key, error in left_out.items() if key not in incomplete
+        for path, reason in (error.refused if isinstance(error, MisplacedScenes)
+                             else {key: str(error)}).items()
+    }  # fmt: skip
     ids = [parse_scene_key(key) for key in tree.keys]
     maps = {scene.map_name for scene in ids if scene.split == "train"} | TRAIN_MAPS
     found = [out.found for out in outcomes if isinstance(out.found, Scene)]

@@ -103,7 +103,7 @@ def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Tab
             raise _altered(where, "its rows were changed after they were written")
     except StorageError:
         raise
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+    except (pa.ArrowException, OSError, UnicodeDecodeError, LookupError) as error:
         if isinstance(error, OSError) and error.errno and cure_of(error):
             error = OSError(error.errno, os.strerror(error.errno))  # Arrow's text is long
             raise StorageError(describe_os_error(f"{where}: cannot be read", error)) from error
@@ -128,7 +128,7 @@ def read_seek_tables(file: Path | pa.BufferReader) -> pa.BinaryArray | None:
             return None
         found = _read_bounded(file, footer, schema, [SEEK_COLUMN], where=SEEK_COLUMN)
         return one_array(found.column(SEEK_COLUMN))
-    except (pa.ArrowException, OSError):
+    except (pa.ArrowException, OSError, LookupError):
         return None
 
 

@@ -33,6 +33,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
 import pyarrow as pa
@@ -206,6 +207,16 @@ def stamp_of(files: Files) -> str:
     return hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest()[:32]
 
 
+class MisplacedScenes(StorageError):
+    """Where a scene belongs there is none, and others are below it.
+
+    Attributes:
+        refused: Path of each to what is wrong with it, and the cure.
+    """
+
+    refused: Mapping[str, str] = MappingProxyType({})
+
+
 class SceneFolder:
     """A scene's folder on this machine.
 
@@ -222,7 +233,7 @@ class SceneFolder:
         """Return the size in bytes of each file, and a number that changes with it.
 
         Raises:
-            StorageError: If the folder cannot be read, or scenes are below it instead.
+            StorageError: If the folder cannot be read; `MisplacedScenes` if scenes are below it.
         """
         folder = Path(self._root, self.key)
         with (
@@ -230,9 +241,13 @@ class SceneFolder:
             os.scandir(folder) as entries,
         ):
             found = {entry.name: entry.stat() for entry in entries if is_read(entry.name)}
-        if not found and (deeper := next(folder.rglob(BASELINE_JSON), None)):
-            path = deeper.parent.relative_to(self._root).as_posix()
-            raise StorageError(refusal(str(self._root), path))
+        files = () if found else folder.rglob("*")
+        if deeper := {each.parent for each in files if each.name in _SCENE_FILES}:
+            paths = (each.relative_to(self._root).as_posix() for each in deeper)
+            refused = {path: refusal(str(self._root), path) for path in sorted(paths)}
+            error = MisplacedScenes("\n".join(refused.values()))
+            error.refused = refused
+            raise error
         # Times of modification can be set, as `tar` does; those of change cannot, but on Windows.
         return {
             name: (status.st_size, status.st_mtime_ns + status.st_ctime_ns)
@@ -383,9 +398,13 @@ def find_scene_folders(root: Path | RemoteObject) -> tuple[list[str], dict[str, 
         roots = {_release_root_of(f"{where}/{path}") for path in refused} - {"", where}
         if roots:
             raise StorageError(f"{looked}. Point at {' or '.join(sorted(roots)[:3])} instead.")
-        first = [f"{path}: {refused[path]}" for path in sorted(refused)[:1]]
-        found = ", ".join(first or sorted(_names(root, ""))[:8]) or "nothing"
-        raise StorageError(f"{looked}, and found {found}. Point at what holds train/ or eval/.")
+        if refused:
+            path = min(refused)
+            told = f"{len(refused)} elsewhere, such as {path}: {refused[path]}"
+        else:
+            names = ", ".join(sorted(_names(root, ""))[:8]) or "nothing"
+            told = f"{names}. Point at what holds train/ or eval/."
+        raise StorageError(f"{looked}, and found {told}")
     return keys, dict(sorted(refused.items()))
 
 

@@ -10,17 +10,24 @@ import shutil
 import zlib
 from collections.abc import Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
-from typing import Final
+from typing import BinaryIO, Final
+
+import numpy as np
 
 from stereogenbench_data.engine import Progress, advance_of
-from stereogenbench_data.errors import StorageError, explain_os_errors
+from stereogenbench_data.errors import MediaError, ShardError, StorageError, explain_os_errors
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.media.depth import write_depth_video
+from stereogenbench_data.media.depth import (
+    ANY_DEPTH,
+    open_video,
+    read_depth_units,
+    write_depth_video,
+)
 from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.schema.records import Member, Scene
 from stereogenbench_data.schema.release import COMPLETE_JSON
@@ -149,13 +156,15 @@ def copy_files(
 
     Args:
         index: The index of the data.
-        missing: What to copy. Packed depth whose copy has the released name becomes a video again.
+        missing: What to copy. Packed depth whose copy has the released name becomes a video again;
+            if that is there, it is compared.
         workers: How many files are copied at the same time.
         progress: Called repeatedly with the bytes done, and all of them.
         total: How many bytes there are with the copies that are there already.
 
     Raises:
-        StorageError: If a file cannot be read or written, or its checksum differs.
+        StorageError: If a file cannot be read or written, or its checksum differs; `ShardError` if
+            a depth video is there, and holds something else.
         ExtraError: If blosc2 is needed and not installed.
     """
     sizes = {path: scene.members[name].size for path, (scene, name) in missing.items()}
@@ -210,22 +219,54 @@ def _copy(
 ) -> None:
     scene, name = of
     member, where = scene.members[name], f"{source.url(*of)}: {scene.id.key}.{name}"
+    packed = io.BytesIO()
 
-    def write(chunk: bytes) -> None:
-        if stop.is_set():
-            raise StorageError(f"{path}: is not copied any further.")
-        content.write(chunk)
+    def copied_to(file: BinaryIO) -> None:
+        def write(chunk: bytes) -> None:
+            if stop.is_set():
+                raise StorageError(f"{path}: is not copied any further.")
+            file.write(chunk)
+
+        with closing(_chunks(index, member)) as chunks:
+            crc32 = copy_with_crc32(chunks, write)
+        require_crc32(crc32, expected=member.crc32, name=where)
 
     with _named_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open_atomic(path) as file, closing(_chunks(index, member)) as chunks:
-            packed = io.BytesIO()
-            content = file if path.name == name else packed
-            crc32 = copy_with_crc32(chunks, write)
-            require_crc32(crc32, expected=member.crc32, name=where)
-            if content is packed:
-                with DepthFrames(packed, name=where, frames=scene.frames) as depth:
-                    write_depth_video(depth, Path(file.name))
+        if path.name == name:
+            with open_atomic(path) as file:
+                copied_to(file)
+            return
+        copied_to(packed)
+        with DepthFrames(packed, name=where, frames=scene.frames) as depth:
+            if path.exists():
+                _require_restored(path, depth, frames=scene.frames)
+                return
+            with open_atomic(path) as file:
+                write_depth_video(depth, Path(file.name))
+
+
+def _require_restored(path: Path, packed: DepthFrames, *, frames: int) -> None:
+    """Refuse a depth video that does not hold the numbers of packed depth."""
+    is_same = False
+    with suppress(MediaError, StorageError), open_video(path, name=str(path), frames=frames) as own:
+        is_same = all(
+            np.array_equal(
+                read_depth_units(own, frame, encoding=ANY_DEPTH),
+                read_depth_units(packed, frame, encoding=ANY_DEPTH),
+            )
+            for frame in range(frames)
+        )
+    if not is_same:
+        raise in_the_way(path)
+
+
+def in_the_way(path: Path) -> ShardError:
+    """Return the error of a file that exists and is another one."""
+    return ShardError(
+        f"{path}: already exists, and is not what the shards hold. Move it away, or unpack into "
+        f"another folder."
+    )
 
 
 def _chunks(index: SceneIndex, member: Member) -> Generator[bytes, None, None]:

@@ -11,7 +11,7 @@ from stereogenbench_data.engine import Progress
 from stereogenbench_data.errors import ShardError
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import RELEASED_NAMES
-from stereogenbench_data.shards.download import copy_files, is_whole, size_bytes
+from stereogenbench_data.shards.download import copy_files, in_the_way, is_whole, size_bytes
 from stereogenbench_data.shards.writer import open_shards
 
 
@@ -56,18 +56,18 @@ def unpack(
     if out.resolve() == Path(index.root).resolve():
         raise ShardError(f"{out}: holds the shards themselves. Unpack into another folder.")
     missing: dict[Path, tuple[Scene, str]] = {}
+    restored: dict[Path, tuple[Scene, str]] = {}
     for scene in scenes:
         for name, member in scene.members.items():
             path = out / scene.id.key / RELEASED_NAMES.get(name, name)
             if not path.exists():
                 missing[path] = scene, name
-            # The size of a rewritten depth video is not known.
-            elif not (path.is_file() if name in RELEASED_NAMES else is_whole(path, member)):
-                raise ShardError(
-                    f"{path}: already exists, and is not what the shards hold. Move it away, or "
-                    f"unpack into another folder."
-                )
-    copy_files(index, missing, workers=workers, progress=progress, total=size_bytes(*scenes))
+            elif name in RELEASED_NAMES and path.is_file():
+                restored[path] = scene, name
+            elif not is_whole(path, member):
+                raise in_the_way(path)
+    copies, total = missing | restored, size_bytes(*scenes)
+    copy_files(index, copies, workers=workers, progress=progress, total=total)
     unpacked = {scene.id.key for scene, _ in missing.values()}
     kept = tuple(scene.id.key for scene in scenes if scene.id.key not in unpacked)
     return UnpackReport(out, tuple(sorted(unpacked)), kept)

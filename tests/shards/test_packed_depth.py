@@ -166,6 +166,15 @@ def test_a_file_that_is_there_and_differs_is_left_alone(packed, unpacked, tmp_pa
     assert bytes_of(tree) == before
 
 
+@pytest.mark.parametrize("other", ["cam_04_depth.mkv", "baseline.json"])
+def test_other_depth_in_the_place_of_restored_depth_is_refused(packed, unpacked, tmp_path, other):
+    tree = shutil.copytree(unpacked[0], tmp_path / "tree")
+    shutil.copyfile(tree / KEY / other, tree / KEY / "cam_03_depth.mkv")
+
+    with pytest.raises(ShardError, match=r"scene_000001/cam_03_depth.mkv: already exists, .*"):
+        unpack(packed, tree)
+
+
 @pytest.mark.parametrize("name", ["cam_03_depth.b2frame", "trajectory.json"])
 def test_a_damaged_member_is_not_unpacked(shards, tmp_path, name):
     member = scenes_of(shards)[KEY].members[name]
