@@ -202,15 +202,15 @@ def _claim_folder(plan: ShardPlan, out: Path) -> None:
                 f"folder outside its train/ and eval/."
             )
     is_claimed = place.exists()
-    found = read_json(place) if is_claimed else plan.settings
+    found = read_json(place, cure="Pack into another folder.") if is_claimed else plan.settings
     if found != plan.settings:
         differing = [
             name for name in plan.settings | found if found.get(name) != plan.settings.get(name)
         ]
         raise ShardError(
             f"{place}: this folder is for another plan ({', '.join(differing)} differ): of other "
-            f"scenes or cameras, size of the shards, depth codec or training settings. Pack into "
-            f"an empty folder, or remove what is in {out}."
+            f"scenes or cameras, of files that have changed since, or with other options. Pack "
+            f"into an empty folder, or remove what is in {out}."
         )
     known = {shard.name for shard in plan.shards} if is_claimed else set()
     for path in sorted(out.iterdir()) if out.exists() else []:
