@@ -153,16 +153,19 @@ class Tree:
                 return self.folder(key).stamps()
             return None
 
+        refused: Mapping[str, str] = {}
         if self.remote is None:
             found = zip(self.keys, self.of_each(stamps, self.keys), strict=True)
             files = {key: each for key, each in found if each is not None}
         else:
-            files = self.remote.files(self.keys)
+            files, refused = self.remote.files(self.keys)
+        refused = self.refused | dict(sorted(refused.items()))
         is_marked = self.is_marked or any(COMPLETE_JSON in each for each in files.values())
-        digest = hashlib.sha256(repr((self.is_part, is_marked, self.refused, self.keys)).encode())
+        digest = hashlib.sha256(repr((self.is_part, is_marked, refused, self.keys)).encode())
         for item in files.items():
             digest.update(repr(item).encode())
-        return replace(self, files=files, is_marked=is_marked, stamp=digest.hexdigest()[:32])
+        stamp = digest.hexdigest()[:32]
+        return replace(self, files=files, refused=refused, is_marked=is_marked, stamp=stamp)
 
     def folder(self, key: str) -> SceneFolder:
         """Return a scene's folder; on this machine its files are listed anew."""

@@ -523,8 +523,11 @@ class RemoteTree:
         keys, refused = self._once("scenes", lambda: find_scene_folders(self.root))
         return keys, refused
 
-    def files(self, keys: Sequence[str]) -> dict[str, Files]:
-        """Return the files of scenes.
+    def files(self, keys: Sequence[str]) -> tuple[dict[str, Files], dict[str, str]]:
+        """Return the files of scenes, and scenes beside or below them whose place is wrong.
+
+        Returns:
+            Key to files, and path to what is wrong with it.
 
         Raises:
             StorageError: If they cannot be listed.
@@ -536,12 +539,16 @@ class RemoteTree:
         for folder, own in by_folder.items():
             folders += [folder] if len(own) >= _FEW else own
         found: dict[str, dict[str, tuple[int, int]]] = {key: {} for key in keys}
+        others: set[str] = set()
         for folder, listed in zip(folders, in_parallel(self._listed, folders), strict=True):
             for path, (size, stamp) in listed.items():
                 key, _, name = f"{folder}/{path}".rpartition("/")
                 if key in found and is_read(name):
                     found[key][sys.intern(name)] = size, stamp
-        return {key: dict(sorted(files.items())) for key, files in found.items()}
+                elif key not in found and name in _SCENE_FILES:
+                    others.add(key)
+        refused = {key: why for key in others if (why := refusal(self.root.where, key))}
+        return {key: dict(sorted(files.items())) for key, files in found.items()}, refused
 
     def _listed(self, folder: str) -> dict[str, tuple[int, int]]:
         def listed() -> dict[str, tuple[int, int]]:

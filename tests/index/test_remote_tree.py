@@ -59,6 +59,21 @@ def test_no_byte_of_depth_is_sent_twice_to_index_a_repository(hub_tree, small_re
     assert sent <= sizes
 
 
+def test_scenes_that_lie_too_deep_are_told_behind_a_url_too(small_release, tmp_path, monkeypatch):
+    tree = shutil.copytree(small_release, tmp_path / "tree", copy_function=os.link)
+    (folder,) = tree.glob("train/Uniform/*")
+    scenes = sorted(path.name for path in folder.iterdir())
+    (folder / "more").mkdir()
+    for name in scenes:
+        (folder / name).rename(folder / "more" / name)
+
+    with hub_serving(tree, monkeypatch):
+        report = build.walk(HUB)
+
+    assert [key.split("/")[-2:] for key in report.broken] == [["more", name] for name in scenes]
+    assert all("found 5 folders" in told for told in report.broken.values())
+
+
 @pytest.mark.usefixtures("hub_tree")
 def test_the_command_indexes_a_part_of_a_repository(tmp_path, small_release):
     out = tmp_path / "part.parquet"
