@@ -24,7 +24,11 @@ from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from stereogenbench_data.errors import StorageError, explain_os_errors, needs_extra
+from stereogenbench_data.errors import (
+    StorageError,
+    explain_os_errors,
+    needs_extra,
+)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -191,7 +195,9 @@ class ProcessPool(Engine):
             needed, mp_context=context, initializer=_start_worker, initargs=(shared,)
         )
         try:
-            with _interrupts_held():
+            cure = "Use one worker, or see whether Python may be executed here."
+            failed = explain_os_errors("worker processes cannot be started", cure)
+            with failed, _interrupts_held():
                 futures = {
                     pool.submit(_run_in_process, work.task, item, number): item
                     for number, item in enumerate(items)

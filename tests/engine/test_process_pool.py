@@ -59,6 +59,17 @@ def test_a_dead_worker_is_an_error_that_names_its_item_and_not_a_wait():
         list(LOCAL.map(killed_at_three, range(5), name=called, workers=2))
 
 
+def test_workers_that_cannot_be_started_are_an_error_with_the_cure():
+    context = multiprocessing.get_context("spawn")
+    usual = multiprocessing.spawn.get_executable()
+    context.set_executable("/bin/false")
+    try:
+        with pytest.raises(StorageError, match=r"cannot be started .* Use one|process died"):
+            list(LOCAL.map(doubled, range(5), name=called, workers=2))
+    finally:
+        context.set_executable(usual)
+
+
 class Deadly:
     """Ends the process that unpickles it."""
 
