@@ -14,6 +14,7 @@ because it is stored without loss.
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -33,6 +34,8 @@ FORMAT: Final = 1
 MOST_PSNR_DB: Final = 100.0
 """The PSNR that is stored for pictures without any error, and the largest."""
 
+_DIGEST: Final = re.compile("[0-9a-f]{64}")
+_NAME: Final = re.compile(r"[\w.+-]{1,40}")
 _DERIVED: Final = {*map(rgb_name, range(CAMERA_COUNT)), *PACKED_DEPTH_NAMES.values()}
 
 
@@ -58,7 +61,7 @@ class TrainingDocument:
 
 
 def parse_training(text: bytes, *, where: str) -> TrainingDocument:
-    """Return the content of a ``training.json``; the index checks its facts as it does others.
+    """Return the content of a ``training.json``.
 
     Args:
         text: The file's bytes.
@@ -96,17 +99,22 @@ def parse_training(text: bytes, *, where: str) -> TrainingDocument:
             ),
         )
         is_ordered = key_frames[:1] == (0,) and list(key_frames) == sorted({*key_frames})
+        sides_px, facts = [side for size in sizes_px for side in size], found.facts
+        digest, names = facts.source_digest, [facts.quality, facts.codec, pictures["pixel_format"]]
         odd = [
             f"{what} {value}"
             for what, value, is_right in (
                 ("format", document["format"], document["format"] == FORMAT),
-                ("width_px or height_px", sizes_px, all(min(size) > 0 for size in sizes_px)),
+                ("width_px or height_px", sides_px,
+                 all(type(side) is int and 0 < side <= 2**16 for side in sides_px)),
+                ("index_digest", digest, _DIGEST.fullmatch(digest)),
+                ("quality, codec or pixel_format", names, all(map(_NAME.fullmatch, names))),
                 ("key_frames", key_frames, is_ordered),
                 ("files", [*files], files and {*files} <= _DERIVED),
                 ("psnr_db", decibels, all(0 <= each <= MOST_PSNR_DB for each in decibels)),
             )
             if not is_right
-        ]
+        ]  # fmt: skip
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         odd = [f"a value ({error!r})"]
     if odd:

@@ -432,6 +432,10 @@ def test_an_altered_psnr_contradicts_the_shard(shards):
         (lambda text: text.replace(b'"crc32": "', b'"crc32": "x'), "invalid literal"),
         (lambda text: text.replace(b'"format": 1', b'"format": 2'), "format 2"),
         (lambda text: text.replace(b'"width_px": 32', b'"width_px": 0'), "width_px"),
+        (lambda text: text.replace(b'"width_px": 48', b'"width_px": 48.5'), r"width_px .*48\.5"),
+        (lambda text: text.replace(b'"width_px": 48', b'"width_px": 1e999'), "width_px .*inf"),
+        (lambda text: text.replace(b'"balanced"', b'"a quality"'), "quality, .*a quality"),
+        (lambda text: text.replace(b'"balanced"', b"3"), "a value .*expected string"),
     ],
 )
 def test_an_altered_description_is_refused_with_its_place(packed, alter, found):
