@@ -1,54 +1,52 @@
 """Shared batch buffers: samples are written where their batch will be, and the memory is reused.
 
 Fresh memory costs more than what is written into it, as the system clears it page by page. So the
-buffers of a batch are reused once nobody holds any part of it. In the process that trains these
-are arrays of its own. A worker process has a few slots of shared memory, each for one batch: it
-writes a batch into a free slot and sends a `BatchHandle`, a few hundred bytes that say what lies
-where. Unpickled in the process that trains, a handle is the batch itself, over the same memory;
-when the last tensor over it is gone, that process marks the slot as free.
+buffers of a batch are reused once nobody holds any part of it. Without worker processes these are
+arrays of the process. With a loader's workers they are slots of one `BatchMemory`, each for one
+batch: the process that trains owns it and gives a slot out with the tasks of a batch, each worker
+writes its own samples there, and what comes back are texts, and what has no place in the slot. When
+the last tensor over a slot is gone, the slot is free.
 
 What keeps a batch unchanged while somebody holds it:
 
-- Slots belong to one worker process, so to one pass. Two passes never share any.
-- A worker writes into a slot only if its own last view of it is gone, too.
-- Only the process that opened a batch gives its slot back. A fork of it does not.
-- A batch that is open while its process forks keeps its slot for good, as the child may read it:
-  the worker takes new memory instead.
-- Where no slot is free, a batch gets memory of its own.
+- The memory belongs to the workers of one pass, or of one loader whose workers persist.
+- Only the process that owns it says which slots are free; no state of a slot is shared.
+- A batch that is open while its process forks keeps its slot for good, as the child may read it.
+- Who takes a batch out of those on their way decides what becomes of its slot, once.
 
 Where references are not counted, memory is reused later or never, but not too early. The option
-``buffers="fresh"`` of the datasets gives each batch memory of its own.
+``buffers="fresh"`` of the datasets gives each batch memory of its own, which is copied out of its
+slot.
 """
 
 import itertools
 import math
-import multiprocessing
+import mmap
 import os
+import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from multiprocessing import reduction
 from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
 from torch.utils.data import default_collate, get_worker_info
 
-from stereogenbench_data.datasets.batches import SharedNumbers
 from stereogenbench_data.errors import FieldError, SelectionError
 from stereogenbench_data.samples.fields import Allocate, Sample
 
 Buffers = Literal["reused", "fresh"]
 """Whether the memory of batches is reused once nobody holds it."""
 
-SLOTS: Final = 3
-"""Slots of a worker: two batches that are made or on their way, and one that the loop holds."""
-
 KEPT_BUFFERS: Final = 3
 """Buffers of a process that are kept for each field: a loop holds one while another is made."""
 
 _ALIGNED: Final = 64
 
-_WORKERS, _SENT, _RETIRED = 0, 1, 2
-"""State of a slot: free for the worker, in use by the training process, or retired."""
+_SLOT_BYTES: Final = 1 << 36
+"""Slots lie so far apart in their file, of which the system keeps only what was written."""
 
 
 class BatchArrays:
@@ -56,11 +54,18 @@ class BatchArrays:
 
     Attributes:
         count: How many samples there are.
+        holds_all: Whether every array that was asked for is a slice of them.
     """
 
-    def __init__(self, count: int, take: Callable[[str, int], torch.Tensor]) -> None:
-        """Begin without fields; ``take`` returns memory for a field, by its name and size."""
+    def __init__(self, count: int, take: Callable[[str, int], torch.Tensor | None]) -> None:
+        """Begin without fields.
+
+        Args:
+            count: How many samples there are.
+            take: Returns memory for a field, by its name and size; None where there is no place.
+        """
         self.count = count
+        self.holds_all = True
         self._arrays: dict[str, np.ndarray] = {}
         self._slices: dict[str, tuple[torch.Tensor, ...]] = {}
         self._take = take
@@ -70,7 +75,8 @@ class BatchArrays:
 
         def allocate(name: str, shape: tuple[int, ...], dtype: Any) -> Any:
             whole = self._whole(name, shape, np.dtype(dtype))
-            if whole.shape[1:] != shape:
+            if whole is None or whole.shape[1:] != shape:
+                self.holds_all = False
                 return np.empty(shape, dtype=dtype)
             return whole[number, ...]
 
@@ -83,13 +89,15 @@ class BatchArrays:
             if isinstance(value, str):
                 tensors[name] = value
             else:
-                same = self._arrays[name].shape[1:] == value.shape
+                same = name in self._arrays and self._arrays[name].shape[1:] == value.shape
                 tensors[name] = self._slices[name][number] if same else torch.from_numpy(value)
         return tensors
 
-    def _whole(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> np.ndarray:
+    def _whole(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
         if name not in self._arrays:
             flat = self._take(name, self.count * math.prod(shape) * dtype.itemsize)
+            if flat is None:
+                return None
             kind = torch.from_numpy(np.empty(0, dtype=dtype)).dtype
             whole = flat.view(kind).view(self.count, *shape)
             self._arrays[name], self._slices[name] = whole.numpy(), whole.unbind()
@@ -99,7 +107,11 @@ class BatchArrays:
 class BatchBuffers:
     """Where the batches of a dataset are made, in each process by itself.
 
-    A copy that is pickled or forked into a worker begins with no slots, and makes its own.
+    A copy that is pickled or forked into a worker begins with no buffers.
+
+    Attributes:
+        kind: Whether memory is reused.
+        makes_batches: Whether `collate` makes the batches of this process, as it has before.
     """
 
     def __init__(self, kind: Buffers = "reused") -> None:
@@ -112,34 +124,22 @@ class BatchBuffers:
             known = ", ".join(map(repr, get_args(Buffers)))
             raise SelectionError(f"buffers must be one of {known}, got {kind!r}.")
         self.kind = kind
+        self.makes_batches = False
         self._free: dict[str, list[np.ndarray]] = {}
-        self._slots: _WorkerSlots | None = None
 
     def allocate(self, count: int) -> BatchArrays:
         """Return the arrays for a batch of ``count`` samples."""
-        if self.kind == "fresh":
-            return BatchArrays(count, fresh_bytes)
-        if self._slots is not None:
-            return self._slots.allocate(count)
-        in_worker = get_worker_info() is not None
-        return BatchArrays(count, fresh_bytes if in_worker else self._take)
+        is_fresh = self.kind == "fresh" or get_worker_info() is not None
+        return BatchArrays(count, fresh_bytes if is_fresh else self._take)
 
-    @property
-    def makes_batches(self) -> bool:
-        """Whether `collate` makes the batches of this worker process, as it has before."""
-        return self._slots is not None
-
-    def collate(self, samples: Sequence[Sample]) -> Any:
-        """Return samples as a batch; in a worker, as a handle if they lie in a slot.
+    def collate(self, samples: Sequence[Sample]) -> dict[str, Any]:
+        """Return samples as a batch, as `collate` does; more of them are expected.
 
         Raises:
             FieldError: If a field has another shape in one sample than in the first.
         """
-        if self.kind == "fresh" or get_worker_info() is None:
-            return collate(samples)
-        if self._slots is None:
-            self._slots = _WorkerSlots()
-        return self._slots.collate(samples)
+        self.makes_batches = True
+        return collate(samples)
 
     def _take(self, name: str, size_bytes: int) -> torch.Tensor:
         free = self._free.setdefault(name, [])
@@ -176,197 +176,182 @@ def fresh_bytes(name: str, size_bytes: int) -> torch.Tensor:
 
 
 class BufferSpec(NamedTuple):
-    """Where a field of a batch lies in a slot, in bytes from its beginning."""
-
-    dtype: torch.dtype
-    shape: tuple[int, ...]
-    start: int
-    stop: int
-
-
-class SlotOwner(NamedTuple):
-    """A worker process: its pid and a random token, because pids are reused."""
-
-    pid: int
-    token: bytes
-
-
-class BatchHandle(NamedTuple):
-    """A batch that lies in a worker's slot; unpickling it gives the batch.
+    """Where a field of a batch lies in a slot.
 
     Attributes:
-        owner: The worker.
-        slot: The number of the slot.
-        status: int64 (SLOTS,), shared: whose each slot is. With new memory, else None.
-        memory: The slot's memory where the receiver does not know it yet, else None.
-        fields: What lies where, or the field itself where it is no tensor; in order.
+        dtype: Its type, as numpy writes it.
+        shape: The shape of one sample's.
+        start: Where it begins, in bytes.
+        item_bytes: Of one sample.
     """
 
-    owner: SlotOwner
-    slot: int
-    status: torch.Tensor | None
-    memory: torch.Tensor | None
-    fields: dict[str, Any]
+    dtype: str
+    shape: tuple[int, ...]
+    start: int
+    item_bytes: int
+
+
+class Layout(NamedTuple):
+    """Where the fields of a batch lie in a slot.
+
+    Attributes:
+        count: The samples of a full batch.
+        fields: Where each field lies, None of texts; in the order of a batch's fields.
+        size_bytes: Of a slot.
+    """
+
+    count: int
+    fields: dict[str, BufferSpec | None]
+    size_bytes: int
+
+    @classmethod
+    def of_samples(cls, samples: Sequence[Sample], *, count: int) -> "Layout":
+        """Return the layout of batches of such samples; of no field where their shapes differ."""
+        fields: dict[str, BufferSpec | None] = {}
+        end = 0
+        for name, value in samples[0].items():
+            fields[name] = None
+            if isinstance(value, str):
+                continue
+            kinds = {(each[name].dtype, each[name].shape) for each in samples}
+            fields[name] = BufferSpec(value.dtype.str, value.shape, end, value.nbytes)
+            end += -(-count * value.nbytes // _ALIGNED) * _ALIGNED
+            if len(kinds) > 1 or end > _SLOT_BYTES:
+                return cls(count, {}, 0)
+        return cls(count, fields, end)
+
+
+class BatchMemory:
+    """The slots of the batches that workers make: one file, which has no name and no state.
+
+    The process that trains owns it. Workers get it when they start, and write into the slots that
+    tasks name. On Linux the file is memory; elsewhere it is a temporary file.
+    """
+
+    def __init__(self, *, kept: int = 0, fd: int | None = None) -> None:
+        """Begin with no slot.
+
+        Args:
+            kept: The memory of so many free slots is kept.
+            fd: The open file; None makes one.
+        """
+        self._fd = _memory_file() if fd is None else fd
+        self._kept = kept
+        self._count = 0
+        self._free: list[int] = []
+        self._lent: dict[int, int] = {}
+        self._maps: dict[int, mmap.mmap] = {}
+        _memories.add(self)
+
+    def take(self) -> int:
+        """Return the number of a free slot."""
+        if self._free:
+            return self._free.pop()
+        slot, self._count = self._count, self._count + 1
+        os.ftruncate(self._fd, self._count * _SLOT_BYTES)
+        return slot
+
+    def give_back(self, slot: int) -> None:
+        """Take a slot as free."""
+        if len(self._free) >= self._kept and slot in self._maps and hasattr(mmap, "MADV_REMOVE"):
+            self._maps[slot].madvise(mmap.MADV_REMOVE)
+        self._free.append(slot)
+
+    def bytes_of(self, slot: int, size_bytes: int) -> np.ndarray:
+        """Return a slot's memory, uint8 (size_bytes,)."""
+        held = self._maps.get(slot)
+        if held is None or len(held) < size_bytes:
+            while len(self._maps) > max(self._kept, _MOST_MAPPED):
+                del self._maps[next(iter(self._maps))]
+            held = mmap.mmap(self._fd, max(1, size_bytes), offset=slot * _SLOT_BYTES)
+            self._maps[slot] = held
+        return np.frombuffer(held, dtype=np.uint8, count=size_bytes)
+
+    def arrays(self, slot: int, layout: Layout) -> BatchArrays:
+        """Return the arrays of a batch in a slot."""
+        whole = torch.from_numpy(self.bytes_of(slot, layout.size_bytes))
+
+        def take(name: str, size_bytes: int) -> torch.Tensor | None:
+            spec = layout.fields.get(name)
+            if spec is None or layout.count * spec.item_bytes != size_bytes:
+                return None
+            return whole[spec.start : spec.start + size_bytes]
+
+        return BatchArrays(layout.count, take)
+
+    def batch(self, slot: int, layout: Layout, *, count: int) -> dict[str, torch.Tensor]:
+        """Return the tensors of a batch in a slot, which is free when none of them is left.
+
+        Each field is a tensor of its own, so that one that is saved does not take the others along.
+        """
+        # The array lives as long as any tensor over it does, however it was sliced.
+        array = self.bytes_of(slot, layout.size_bytes)
+        number = next(_numbers)
+        self._lent[number] = slot
+        weakref.finalize(array, _release, weakref.ref(self), number).atexit = False
+        return {
+            name: torch.from_numpy(
+                array[spec.start : spec.start + count * spec.item_bytes]
+                .view(spec.dtype)
+                .reshape(count, *spec.shape)
+            )
+            for name, spec in layout.fields.items()
+            if spec is not None
+        }
+
+    def close(self) -> None:
+        """Close the file; batches that are held keep their memory."""
+        self._maps.clear()
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            os.close(fd)
+
+    def __del__(self) -> None:
+        """Close the file when no reference is left."""
+        self.close()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return what the batch is made from where it arrives."""
-        return _open_batch, tuple(self)
+        """Return what a worker that is started, not forked, opens the file from."""
+        return _received, (reduction.DupFd(self._fd), self._kept)  # type: ignore[no-untyped-call]
 
 
-class _WorkerSlots:
-    """A worker's end of its slots."""
+_MOST_MAPPED: Final = 64
+"""So many slots a process keeps mapped, where a loop holds ever more batches."""
 
-    def __init__(self) -> None:
-        self._owner = SlotOwner(os.getpid(), os.urandom(8))
-        self._status = SharedNumbers([_WORKERS] * SLOTS).tensor
-        self._memory = [torch.empty(0, dtype=torch.uint8)] * SLOTS
-        self._is_known = [False] * SLOTS
-        self._views: list[Callable[[], Any]] = [lambda: None] * SLOTS
-        self._layout: dict[str, BufferSpec] = {}
-        self._slot: int | None = None
+_numbers: Final = itertools.count()
 
-    def allocate(self, count: int) -> BatchArrays:
-        """Return the arrays for the next batch, in a free slot if there is one."""
-        self._slot = self._free_slot() if self._layout else None
-        if self._slot is None:
-            return BatchArrays(count, fresh_bytes)
-        view = self._memory[self._slot].numpy()
-        self._views[self._slot] = weakref.ref(view)
-        whole = torch.from_numpy(view)
-
-        def take(name: str, size_bytes: int) -> torch.Tensor:
-            spec = self._layout.get(name)
-            if spec is None or spec.stop - spec.start != size_bytes:
-                return fresh_bytes(name, size_bytes)
-            return whole[spec.start : spec.stop]
-
-        return BatchArrays(count, take)
-
-    def collate(self, samples: Sequence[Sample]) -> Any:
-        """Return samples as a handle, or as a plain batch where they do not lie in a slot."""
-        batch = collate(samples)
-        slot, self._slot = self._slot, None
-        if slot is None or not self._holds(slot, batch):
-            self._layout = self._layout or _layout_of(batch)
-            return batch
-        new = not self._is_known[slot]
-        self._is_known[slot] = True
-        self._status[slot] = _SENT
-        return BatchHandle(
-            self._owner,
-            slot,
-            status=self._status if new else None,
-            memory=self._memory[slot] if new else None,
-            fields={name: self._layout.get(name, value) for name, value in batch.items()},
-        )
-
-    def _free_slot(self) -> int | None:
-        """Return a slot that nobody holds, None where all are held."""
-        for slot in range(SLOTS):
-            status = int(self._status[slot])
-            if status == _SENT or self._views[slot]() is not None:
-                continue
-            if status == _RETIRED or not len(self._memory[slot]):
-                size_bytes = max(spec.stop for spec in self._layout.values())
-                self._memory[slot] = fresh_bytes("", size_bytes)
-                self._is_known[slot] = False
-                self._status[slot] = _WORKERS
-            return slot
-        return None
-
-    def _holds(self, slot: int, batch: dict[str, Any]) -> bool:
-        """Return whether all tensors of a batch lie in the slot where the layout says."""
-        start = self._memory[slot].data_ptr()
-        return all(
-            name in self._layout
-            and value.data_ptr() == start + self._layout[name].start
-            and (value.dtype, tuple(value.shape)) == self._layout[name][:2]
-            for name, value in batch.items()
-            if isinstance(value, torch.Tensor)
-        )
+_memories: Final[weakref.WeakSet[BatchMemory]] = weakref.WeakSet()
 
 
-def _layout_of(batch: dict[str, Any]) -> dict[str, BufferSpec]:
-    """Return a place for each tensor of a batch, one after another."""
-    layout: dict[str, BufferSpec] = {}
-    end = 0
-    for name, value in batch.items():
-        if isinstance(value, torch.Tensor):
-            layout[name] = BufferSpec(value.dtype, tuple(value.shape), end, end + value.nbytes)
-            end += -(-value.nbytes // _ALIGNED) * _ALIGNED
-    return layout
+def _memory_file() -> int:
+    """Return an open file without a name."""
+    if hasattr(os, "memfd_create"):
+        with suppress(OSError):
+            return os.memfd_create("stereogenbench batches")
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
 
 
-class _OpenBatch(NamedTuple):
-    """A batch that this process, or the one that it was forked from, has opened."""
-
-    pid: int
-    status: torch.Tensor
-    slot: int
+def _received(fd: Any, kept: int) -> BatchMemory:
+    return BatchMemory(fd=fd.detach(), kept=kept)
 
 
-_opened: Final[dict[SlotOwner, tuple[torch.Tensor, dict[int, torch.Tensor]]]] = {}
-"""Status and memory of the slots that this process has batches from."""
-
-_open_batches: Final[dict[int, _OpenBatch]] = {}
-"""The open batches. Who takes one out of here decides what becomes of its slot."""
-
-_count: Final = itertools.count()
-
-
-def _open_batch(
-    owner: SlotOwner,
-    slot: int,
-    status: torch.Tensor | None,
-    memory: torch.Tensor | None,
-    fields: dict[str, Any],
-) -> dict[str, Any]:
-    """Return the batch of a handle; the slot is given back when none of its tensors is left."""
-    if status is not None and memory is not None:
-        if owner not in _opened:
-            running = {process.pid for process in multiprocessing.active_children()}
-            forget_slots({each.pid for each in _opened if each.pid not in running})
-            _opened[owner] = (status, {})
-        _opened[owner][1][slot] = memory
-    statuses, memories = _opened[owner]
-    # The array lives as long as any tensor over it does, however it was sliced.
-    array = memories[slot].numpy()
-    number = next(_count)
-    _open_batches[number] = _OpenBatch(os.getpid(), statuses, slot)
-    weakref.finalize(array, _release, number).atexit = False
-    whole = torch.from_numpy(array)
-    return {
-        name: whole[spec.start : spec.stop].view(spec.dtype).view(spec.shape)
-        if isinstance(spec, BufferSpec)
-        else spec
-        for name, spec in fields.items()
-    }
+def _release(owner: Callable[[], BatchMemory | None], number: int) -> None:
+    """Give the slot of a batch back, unless a fork may have it."""
+    memory = owner()
+    slot = None if memory is None else memory._lent.pop(number, None)
+    if memory is not None and slot is not None:
+        memory.give_back(slot)
 
 
-def _release(number: int) -> None:
-    """Give the slot of a batch back to its worker, if this process opened the batch."""
-    held = _open_batches.pop(number, None)
-    if held is not None and held.pid == os.getpid():
-        held.status[held.slot] = _WORKERS
-
-
-def _retire_slots_of_open_batches() -> None:
-    """Keep the slots of all open batches for good: a child is about to be forked that has them."""
-    for number in tuple(_open_batches):
-        held = _open_batches.pop(number, None)
-        if held is not None and held.pid == os.getpid():
-            held.status[held.slot] = _RETIRED
+def _keep_lent_slots() -> None:
+    """Never use the slots of open batches again: a child is about to be forked that has them."""
+    for memory in tuple(_memories):
+        memory._lent.clear()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=_retire_slots_of_open_batches)
-
-
-def forget_slots(pids: set[int]) -> None:
-    """Let go of the slots of worker processes that have ended; open batches keep their memory."""
-    for owner in tuple(_opened):
-        if owner.pid in pids:
-            _opened.pop(owner, None)
+    os.register_at_fork(before=_keep_lent_slots)
 
 
 def to_tensors(sample: Sample) -> Sample:

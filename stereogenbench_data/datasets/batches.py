@@ -8,13 +8,13 @@ Workers see the epoch through shared memory, and those that are spawned the rows
 import copy
 import itertools
 import math
+import os
 import sys
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from multiprocessing.reduction import ForkingPickler
-from typing import Any, Final, Literal, Protocol, TypedDict, Unpack
+from typing import Any, Final, Literal, NamedTuple, Protocol, TypedDict, Unpack
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -30,16 +30,17 @@ from stereogenbench_data.samples.load import OPEN_STREAMS
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.filters import require_options
 from stereogenbench_data.selection.order import (
-    GROUPS_OF_LARGE,
-    OPEN_SCENES,
     ORDER_VERSION,
-    SHUFFLE_GROUPS,
     DropLast,
     EpochOrder,
+    Numbers,
     OrderRule,
     Runs,
+    groups_for,
     last_batch,
+    open_runs_for,
     rank_share,
+    usual_groups,
 )
 from stereogenbench_data.selection.plan import Plan
 
@@ -51,6 +52,16 @@ class RepeatedEpochWarning(UserWarning):
     """A second pass draws the same random frames and transforms, or has the same order."""
 
 
+_SHARED_NUMBERS: Final = 1 << 16
+"""Numbers in a block of shared memory; a block is an open file, so all of a process share few."""
+
+_blocks: Final[list[torch.Tensor]] = []
+"""What is left of this process's last block."""
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_blocks.clear)
+
+
 class SharedNumbers:
     """Whole numbers of which running workers see every change.
 
@@ -59,8 +70,18 @@ class SharedNumbers:
     """
 
     def __init__(self, numbers: Sequence[int] | torch.Tensor) -> None:
-        """Begin with these numbers: a tensor in shared memory stays where it is."""
-        self.tensor = torch.as_tensor(numbers, dtype=torch.int64).share_memory_()
+        """Begin with these numbers: a tensor stays where it is, in shared memory."""
+        if isinstance(numbers, torch.Tensor):
+            self.tensor = numbers
+            return
+        count = len(numbers)
+        if not _blocks or len(_blocks[0]) < count:
+            with torch.inference_mode(mode=False):
+                size = max(count, _SHARED_NUMBERS)
+                block = torch.zeros(size, dtype=torch.int64, device="cpu").share_memory_()
+            _blocks[:] = [block]
+        self.tensor, _blocks[0] = _blocks[0][:count], _blocks[0][count:]
+        self.tensor[:] = torch.tensor(numbers, dtype=torch.int64, device="cpu")
 
     def __getitem__(self, place: int) -> int:
         """Return a number."""
@@ -193,6 +214,14 @@ _STATES: Final = (
 )
 
 
+_DIGESTS: Final = {
+    "selection": "as many samples of as many scenes are selected, and other scenes, pairs, frames, "
+    "or another seed",
+    "index": "the index is another one: its files were changed, or indexed in another way",
+}
+"""What differs where nothing but a digest does."""
+
+
 Position = tuple[int, int]
 """An epoch, and how many of its global batches are consumed."""
 
@@ -212,21 +241,21 @@ class EpochOptions(TypedDict, total=False):
             last batch may be short, and ranks may differ by one batch. "pad": each rank gets as
             many full batches and no sample is left out; samples from the epoch's start fill up,
             marked in the field ``is_padding`` (batch,) bool.
-        shuffle_groups: How many groups of scenes are shuffled separately; batch n belongs to group
-            n mod shuffle_groups. By default 4, but 2 where scenes are so large that a group has
-            fewer than 16 open; small selections have fewer groups. Each video is
-            decoded by one process, once an epoch, if world_size * num_workers divides
-            ``shuffle_groups``: make it that product or a multiple of it.
+        shuffle_groups: How many groups of scenes are shuffled separately, for ranks: batch n is of
+            group n mod shuffle_groups. If left out 8, or fewer with larger batches, pictures or
+            fewer scenes, raised to a multiple of the ranks; a state keeps it, and goes on with it
+            under other ranks. A number that is given counts.
         open_scenes: The shuffle buffer, counted in scenes: how many each group interleaves. If left
-            out 16, or the batch size where that is more, but of large pictures no more than about
-            0.9 GB of decoders hold: of 1280x1280 pixels 16 with one pair a scene, and 4 with all
-            pairs. Fewer take less memory and shuffle less well. A process has them of each
-            group that it reads.
+            out, about 64 of all groups together, or a batch where that is more (with few scenes a
+            few more), but of large pictures no more than about 3.6 GB of decoders hold: of
+            1280x1280 pixels 64 with one pair a scene, and 17 with all pairs. Fewer take less memory
+            and shuffle less well. A rank has those of its groups open, shared out among its
+            workers.
         open_frames: How many neighbouring frames of each open scene are interleaved, where several
             samples show a frame (all pairs). A batch then shows more moments, and their pictures
             and depth stay in memory. If left out, as many as a batch has samples of an open scene,
-            within 0.5 GB a group: 3 with all pairs of 1280x1280 pixels and a batch of 16, 1 with
-            one pair a scene.
+            within 2 GB: 2 with all pairs of 1280x1280 pixels and a batch of 32, 1 with one pair a
+            scene.
     """
 
     seed: int
@@ -249,6 +278,8 @@ class EpochBatch(list[int]):
         ends_of_runs: The samples after which their videos are wanted no more for now.
         number: Its number among the batches of all ranks; None for a batch outside of an epoch.
         group: The shuffle group that it is of.
+        open_runs: How many runs of its group who reads it has open at a time.
+        open_frames: How many frames of each are kept.
     """
 
     def __init__(
@@ -267,6 +298,40 @@ class EpochBatch(list[int]):
         self.ends_of_runs = ends_of_runs
         self.number = number
         self.group = group
+        self.open_runs = 0
+        self.open_frames = 1
+
+    def at(self, places: Sequence[int]) -> "EpochBatch":
+        """Return the samples at some of its places as a batch."""
+        part = EpochBatch([self[place] for place in places], epoch=self.epoch)
+        part.__dict__ |= self.__dict__
+        if self.is_padding is not None:
+            part.is_padding = [self.is_padding[place] for place in places]
+        return part
+
+
+class WorkerShare(NamedTuple):
+    """Which samples of its rank's batches one of a rank's workers decodes.
+
+    Attributes:
+        rank: The rank, from 0.
+        world_size: How many ranks there are.
+        worker: The worker, from 0.
+        workers: How many the rank has.
+        of: "streams": those of its own streams, of every batch, as `EpochOrder.workers_of` deals
+            them. "batches": all of every batch in turn.
+    """
+
+    rank: int
+    world_size: int
+    worker: int
+    workers: int
+    of: Literal["streams", "batches"]
+
+    @property
+    def batches_apart(self) -> int:
+        """How far the numbers of two batches lie apart that it decodes one after the other."""
+        return self.world_size * (self.workers if self.of == "batches" else 1)
 
 
 @dataclass(eq=False)
@@ -444,22 +509,46 @@ class GlobalBatches:
     def batch(self, number: int, *, epoch: int) -> EpochBatch:
         """Return the samples of a batch."""
         order, size = self.order(epoch), self.rule.batch_size
-        samples = order.batch(number) if number < order.batches else np.empty(0, dtype=np.int64)
+        samples, ends_of_runs = np.empty(0, dtype=np.int64), list[int]()
+        if number < order.batches:
+            samples, ends_run, _ = order.described(number)
+            ends_of_runs = samples[ends_run].tolist()
         batch = EpochBatch(
             (order.full_batch(number) if self.is_padded else samples).tolist(),
             epoch=epoch,
-            ends_of_runs=samples[order.ends_run(number)].tolist() if len(samples) else (),
+            ends_of_runs=ends_of_runs,
             number=number,
             group=number % order.groups,
         )
+        batch.open_runs = order.streams(batch.group)
+        batch.open_frames = self.rule.open_frames
         if self.is_padded:
             places = range(number * size, (number + 1) * size)
             batch.is_padding = [place >= order.samples for place in places]
         return batch
 
+    def workers_of(self, batch: EpochBatch, share: WorkerShare) -> Numbers:
+        """Return which of a rank's workers decodes each sample of one of its batches."""
+        if batch.number is None or share.of == "batches":
+            turn = (batch.number or 0) // share.world_size
+            return np.full(len(batch), turn % share.workers)
+        workers: Numbers = np.arange(len(batch)) % share.workers  # of what fills up the epoch
+        order = self.order(batch.epoch)
+        if batch.number < order.batches:
+            groups = groups_of_rank(order.groups, share.rank, share.world_size)
+            own = order.workers_of(batch.number, groups=groups, workers=share.workers)
+            workers[: len(own)] = own
+        return workers
+
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs; it computes the order itself."""
         return self.__dict__ | {"_order": None}
+
+
+def groups_of_rank(groups: int, rank: int, world_size: int) -> range:
+    """Return the shuffle groups that a rank's batches are of."""
+    apart = math.gcd(groups, world_size)
+    return range(rank % apart, groups, apart)
 
 
 class OrderedSamples(Protocol):
@@ -475,8 +564,9 @@ class EpochBatches(Sampler[list[int]]):
 
     Its passes are of the same epoch until `set_epoch` is called, as with torch's samplers; each
     pass of a ``loader(...)`` is of the next epoch. The order depends only on the selection, the
-    seed, the epoch, the batch size, the shuffle groups and the open scenes; rank r gets the global
-    batches n with n mod world_size = r. torchdata's ``StatefulDataLoader`` can save and load its
+    seed, the epoch, the batch size, the shuffle groups and the open scenes: never on workers, nor
+    on ranks that divide the groups. Rank r gets the global batches n with n mod world_size = r.
+    torchdata's ``StatefulDataLoader`` can save and load its
     position. torch's own `DataLoader` reads ahead: use the dataset's ``loader(...)``, which counts
     what the training loop has taken.
 
@@ -530,9 +620,11 @@ class EpochBatches(Sampler[list[int]]):
             self.__setstate__(batches.__dict__)
             return
         self.dataset = dataset
-        plan = dataset.plan
-        self.rule = fitting_rule(dataset.index, plan, batch_size, options)
+        plan, self._options = dataset.plan, options
         self.rank, self.world_size = _require_group(options.get("rank"), options.get("world_size"))
+        self.rule = fitting_rule(
+            dataset.index, plan, batch_size, options, world_size=self.world_size
+        )
         self._drop_last = options.get("drop_last", self.rule.shuffle)
         self.drop_last, self.is_padded = self._drop_last is True, self._drop_last == "pad"
         self._follows_the_group = "rank" not in options
@@ -700,16 +792,22 @@ class EpochBatches(Sampler[list[int]]):
             )
 
     def state_at(self, epoch: int, batches: int) -> State:
-        """Return the state after a number of global batches of an epoch."""
+        """Return the state after a number of global batches of an epoch.
+
+        After the last one that these ranks take, all are consumed: other ranks, for whom the epoch
+        would end later, begin the next one.
+        """
         return {
             "version": ORDER_VERSION,
             "epoch": epoch,
-            "batches_consumed": min(batches, self.batches_of_all),
-            **self._identity,
+            "batches_consumed": self.batches_of_all if batches >= self.end() else batches,
+            **self._identity(self.rule),
         }
 
     def position_in(self, state: Mapping[str, Any]) -> Position:
         """Return the epoch and the number of global batches that a state says are consumed.
+
+        The shuffle groups are those of the state from now on, unless some were asked for.
 
         Raises:
             StateError: If it belongs to other samples or another order, naming what differs.
@@ -718,9 +816,15 @@ class EpochBatches(Sampler[list[int]]):
             raise StateError(
                 f"a state is a dict as state_dict() returns it, got {state!r:.60}: {_STATES}"
             )
-        own = {"version": ORDER_VERSION, **self._identity}
-        if state.get("version", ORDER_VERSION) != ORDER_VERSION:
-            own = {"version": ORDER_VERSION}  # the rest may have other names
+        rule = self._rule_of(state)
+        own = {"version": ORDER_VERSION, **self._identity(rule)}
+        version = state.get("version", ORDER_VERSION)
+        if type(version) is not int or version != ORDER_VERSION:
+            raise StateError(
+                f"the state is of version {version!r} of the order, and this release has version "
+                f"{ORDER_VERSION}: the same seed gives other batches. Begin its epoch anew, "
+                "set_epoch(epoch) without the state, or go on with the release that saved it."
+            )
         missing = sorted({*own, "epoch", "batches_consumed"} - state.keys())
         if missing:
             raise StateError(
@@ -730,25 +834,47 @@ class EpochBatches(Sampler[list[int]]):
         differing = [
             f"{name} is {value!r} here and {state[name]!r} there"
             for name, value in own.items()
-            if type(state[name]) is not type(value) or state[name] != value
+            if name not in _DIGESTS
+            and (type(state[name]) is not type(value) or state[name] != value)
         ]
+        if not differing:
+            differing = [why for name, why in _DIGESTS.items() if state[name] != own[name]]
         if differing:
             raise StateError(
                 f"the state was saved for other batches: {'; '.join(differing)}. Open the same "
                 "data with the same selection and options, or begin the epoch anew without it."
             )
-        epoch = require_count(state, "epoch")
-        return epoch, require_count(state, "batches_consumed", most=self.batches_of_all)
+        position = (
+            require_count(state, "epoch"),
+            require_count(state, "batches_consumed", most=self.batches_of_all),
+        )
+        if rule != self.rule:
+            self.rule = rule
+            self.of_all_ranks = GlobalBatches(
+                rule, self.dataset.plan.runs, is_padded=self.is_padded
+            )
+        return position
+
+    def _rule_of(self, state: Mapping[str, Any]) -> OrderRule:
+        """Return the rule with a state's shuffle groups, unless some were asked for."""
+        groups = state.get("shuffle_groups")
+        if "shuffle_groups" in self._options or type(groups) is not int or groups < 1:
+            return self.rule
+        if groups == self._identity(self.rule)["shuffle_groups"]:
+            return self.rule
+        options = EpochOptions(**{**self._options, "shuffle_groups": groups})
+        dataset, size = self.dataset, self.rule.batch_size
+        return fitting_rule(dataset.index, dataset.plan, size, options, world_size=self.world_size)
 
     @property
     def batches_of_all(self) -> int:
         """How many batches hold all samples of an epoch, those of all ranks."""
         return -(-len(self.dataset.plan) // self.rule.batch_size)
 
-    @cached_property
-    def _identity(self) -> State:
-        """What must be the same when a state is saved and when it is loaded."""
-        rule = self.rule.in_effect(self.dataset.plan.runs)
+    def _identity(self, rule: OrderRule) -> State:
+        """Return what must be the same when a state is saved and when it is loaded."""
+        plan, index = self.dataset.plan, self.dataset.index
+        rule = rule.in_effect(plan.runs)
         return {
             "seed": rule.seed,
             "batch_size": rule.batch_size,
@@ -757,8 +883,10 @@ class EpochBatches(Sampler[list[int]]):
             "open_frames": rule.open_frames,
             "shuffle": rule.shuffle,
             "drop_last": self._drop_last,
-            "selection": self.dataset.plan.digest,
-            "index": self.dataset.index.digest,
+            "scenes": len(plan.scene_rows),
+            "samples": len(plan),
+            "selection": plan.digest,
+            "index": index.digest,
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -804,9 +932,8 @@ def _require_group(rank: int | None, world_size: int | None) -> tuple[int, int]:
 SPARE_FILES = 128
 """Open files that are left to everything else."""
 
-
-GROUP_BYTES: Final = 900_000_000
-"""Memory for the open scenes of a shuffle group, where nobody asks for a number of them."""
+RANK_BYTES: Final = 3_600_000_000
+"""Memory for the open scenes of a rank, where nobody asks for a number of them."""
 
 _DECODER_BYTES: Final = 17
 """Of a camera's decoders for each pixel: 12.6 of H.264 with its reference pictures, 4.3 of FFV1,
@@ -815,8 +942,8 @@ measured at 1280x1280."""
 _KEPT_BYTES: Final = 4
 """Of the current picture and what is measured in it, kept for each pixel for other pairs."""
 
-FRAMES_BYTES: Final = 500_000_000
-"""Memory for further frames of a shuffle group's open scenes, where several samples show one."""
+FRAMES_BYTES: Final = 2_000_000_000
+"""Memory for further frames of a rank's open scenes, where several samples show one."""
 
 _FRAME_BYTES: Final = 6
 """Of a further frame for each pixel: the picture, stored depth and where it is measured."""
@@ -830,50 +957,77 @@ class RepeatedDecodingWarning(UserWarning):
     """Several processes read the same shuffle group, so each of them decodes its videos."""
 
 
-def videos_to_keep(
-    plan: Plan, rule: OrderRule, *, streams: frozenset[Stream], processes: int
-) -> int:
-    """Return how many videos one of several processes keeps open for its share of an epoch.
+class IdleWorkersWarning(UserWarning):
+    """A loader has more workers than open scenes, so some have nothing to do."""
 
-    A process reads every shuffle group of which it gets batches, each with its open scenes. A
-    warning says what to do if the process may not open that many files, or if several processes
-    decode the same videos and more groups would avoid it.
+
+def warn_of_division(batches: EpochBatches, share: WorkerShare, *, videos_per_scene: int) -> None:
+    """Warn where processes decode the same videos, have nothing to do, or may not open enough.
+
+    Args:
+        batches: The batches of a rank.
+        share: How they are divided among its workers.
+        videos_per_scene: How many videos of an open scene are read.
     """
-    lengths = plan.runs.lengths
-    groups = rule.groups_of(lengths)
-    together = processes // math.gcd(rule.shuffle_groups, processes)
-    spared = replace(rule, shuffle_groups=math.lcm(rule.shuffle_groups, processes))
-    if together > 1 and lengths.max() > 1 and spared.groups_of(lengths) % processes == 0:
+    if not batches.rule.shuffle:
+        return
+    order = batches.of_all_ranks.order(0)
+    readers = share.world_size * (share.workers if share.of == "batches" else 1)
+    groups = groups_of_rank(order.groups, share.rank, readers)
+    open_scenes = sum(map(order.streams, groups))
+    together = readers // math.gcd(order.groups, readers)
+    if together > 1 and batches.dataset.plan.runs.lengths.max() > 1:
+        cure = (
+            "Use fewer ranks or a smaller batch_size, so that ranks times batch are no more than "
+            "the scenes."
+        )
+        if share.of == "batches":
+            cure = (
+                "Use pairs.loader(...), whose workers share the videos out, or as many workers as "
+                "divide the groups."
+            )
         warnings.warn(
-            f"every video is decoded by {together} processes, as {processes} (ranks times workers) "
-            f"read {rule.shuffle_groups} shuffle groups: give shuffle_groups={processes}, or a "
-            "multiple of it. This is another order of the epoch; each group has its own open "
-            "scenes.",
+            f"every video is decoded {together} times, as {readers} processes read {order.groups} "
+            f"shuffle groups of {len(batches.dataset.plan.scene_rows)} scenes. {cure}",
             RepeatedDecodingWarning,
             stacklevel=5,
         )
-    scenes = groups // math.gcd(groups, processes) * rule.most_open(lengths)
-    wanted = max(OPEN_STREAMS, scenes * videos_per_scene(plan, streams))
-    allowed = max(OPEN_STREAMS, _most_files() - SPARE_FILES)
+    if share.of == "streams":
+        if share.workers > open_scenes:
+            warnings.warn(
+                f"{share.workers - open_scenes} of {share.workers} workers have nothing to do: a "
+                f"rank has {open_scenes} scenes open at a time, and one worker decodes a scene. "
+                f"Use num_workers={open_scenes}, or open_scenes="
+                f"{-(-share.workers // len(groups))} where there are as many scenes.",
+                IdleWorkersWarning,
+                stacklevel=5,
+            )
+        open_scenes = -(-open_scenes // share.workers)
+    wanted, allowed = open_scenes * videos_per_scene, videos_allowed()
     if wanted > allowed:
         warnings.warn(
             f"up to {wanted} videos would be open at a time, and this process may open {allowed}: "
             "they will be closed and opened again, which is slow. Raise the limit (`ulimit -n "
             f"{wanted + SPARE_FILES}`), use more workers, or fewer open_scenes than "
-            f"{rule.open_scenes}.",
+            f"{batches.rule.open_scenes}.",
             OpenVideosWarning,
             stacklevel=5,
         )
-    return min(wanted, allowed)
+
+
+def videos_allowed() -> int:
+    """Return how many videos this process may have open."""
+    return max(OPEN_STREAMS, _most_files() - SPARE_FILES)
 
 
 def fitting_rule(
-    index: SceneIndex, plan: Plan, batch_size: int, options: EpochOptions
+    index: SceneIndex, plan: Plan, batch_size: int, options: EpochOptions, *, world_size: int
 ) -> OrderRule:
-    """Return a rule with as many open scenes and frames as fit into the memory of a shuffle group.
+    """Return a rule with as many open scenes and frames as fit into the memory of a rank.
 
-    They depend on the selected pairs and the stored size of their pictures alone, not on fields,
-    ranks or workers: so does the order. What a user asks for counts instead.
+    They depend on the selected pairs and the stored size of their pictures alone, not on fields or
+    workers, and on ranks only in that they share the groups out. What a user asks for counts
+    instead.
 
     Raises:
         SelectionError: If an option is out of its range.
@@ -881,26 +1035,29 @@ def fitting_rule(
     rule = OrderRule(
         batch_size, seed=options.get("seed", plan.seed), shuffle=options.get("shuffle", True)
     )
-    rows, shares_moments = plan.scene_rows, bool((plan.runs.pairs > 1).any())
+    rows, runs = plan.scene_rows, plan.runs
+    shares_moments = bool((runs.pairs > 1).any())
     pixels = (index.column("image_width_px")[rows] * index.column("image_height_px")[rows]).max()
     of_cameras = int(pixels) * videos_per_scene(plan, frozenset({"source_rgb", "target_rgb"}))
     # About what the decoders of an open scene take, at the most.
     scene_bytes = of_cameras * (_DECODER_BYTES + (_KEPT_BYTES if shares_moments else 0))
-    fitting = max(2, GROUP_BYTES // max(1, scene_bytes))
-    open_scenes = options.get("open_scenes")
-    if open_scenes is None:
-        open_scenes = min(max(OPEN_SCENES, batch_size), fitting)
-    rule = replace(rule, open_scenes=open_scenes)
+    size, fitting = rule.batch_size, max(2, RANK_BYTES // max(1, scene_bytes))
+    usual = groups_for(runs, batch_size=size, fitting=fitting, world_size=world_size)
+    rule = replace(
+        rule,
+        shuffle_groups=options.get("shuffle_groups", usual),
+        open_scenes=options.get("open_scenes", size),
+    )
+    groups = rule.groups_of(runs.lengths)
+    if "open_scenes" not in options:
+        wanted = open_runs_for(runs, batch_size=size, fitting=fitting, groups=groups)
+        rule = replace(rule, open_scenes=wanted)
     frames = 1
     if shares_moments:
-        further = FRAMES_BYTES // max(1, open_scenes * of_cameras * _FRAME_BYTES)
-        frames = max(1, min(1 + further, -(-batch_size // open_scenes)))
-    groups = SHUFFLE_GROUPS if fitting >= OPEN_SCENES else GROUPS_OF_LARGE
-    return replace(
-        rule,
-        shuffle_groups=options.get("shuffle_groups", groups),
-        open_frames=options.get("open_frames", frames),
-    )
+        of_rank = min(groups, usual_groups(batch_size=size, fitting=fitting))
+        further = FRAMES_BYTES // max(1, of_rank * rule.open_scenes * of_cameras * _FRAME_BYTES)
+        frames = max(1, min(1 + further, -(-size // rule.open_scenes)))
+    return replace(rule, open_frames=options.get("open_frames", frames))
 
 
 def _most_files() -> int:

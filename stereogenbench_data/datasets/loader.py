@@ -25,7 +25,7 @@ import queue
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property, partial
 from multiprocessing import connection, get_context
@@ -38,14 +38,22 @@ from weakref import WeakSet, ref
 
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, DistributedSampler, Sampler, SequentialSampler
+from torch.utils.data import (
+    DataLoader,
+    DistributedSampler,
+    Sampler,
+    SequentialSampler,
+    get_worker_info,
+)
 
-from stereogenbench_data.datasets.batch_buffers import forget_slots
+from stereogenbench_data.datasets.batch_buffers import BatchMemory, Layout, collate
+from stereogenbench_data.datasets.batch_parts import Making, PartedBatches, part_as_made
 from stereogenbench_data.datasets.batches import (
     EpochBatches,
     EpochOptions,
     Pass,
     State,
+    WorkerShare,
 )
 from stereogenbench_data.errors import (
     PassError,
@@ -53,6 +61,7 @@ from stereogenbench_data.errors import (
     StereoGenBenchError,
     WorkerError,
 )
+from stereogenbench_data.samples.load import Work
 from stereogenbench_data.selection.order import EpochOrder, Numbers
 from stereogenbench_data.selection.plan import Plan
 
@@ -74,7 +83,7 @@ class Workers:
 
     Attributes:
         serves: The pass whose batches they load; None before the first.
-        batches: Its batches that were not taken yet.
+        parted: Its batches on their way; None where this process loads.
     """
 
     def __init__(self, loader: DataLoader[Any]) -> None:
@@ -83,26 +92,36 @@ class Workers:
         Without worker processes this one loads.
         """
         self._torch: DataLoader[Any] | None = None
-        self.batches: Iterator[Any] = iter(())
+        self._results: Iterator[Any] = iter(())
         self.serves: Pass | None = None
-        self._numbers = _DueBatches()
+        self.parted: PartedBatches | None = None
+        self._due = _DueTasks()
         self._context: _WatchedContext | None = None
-        if loader.num_workers > 0:
+        self._memory: BatchMemory | None = None
+        own: dict[str, Any] = {"collate_fn": loader.collate_fn}
+        workers, ahead = loader.num_workers, loader.prefetch_factor
+        if workers > 0 and ahead is not None:
             given: Any = loader.multiprocessing_context
             base = given.get_context() if isinstance(given, BaseContext) else get_context(given)
             self._context = _WatchedContext(base)
+            # Of what is on its way, and what the loop holds.
+            self._memory = BatchMemory(kept=workers * ahead + 2)
+            own = {
+                "collate_fn": part_as_made,
+                "worker_init_fn": _Beginning(self._memory, loader.worker_init_fn),
+                "prefetch_factor": ahead * workers,
+                "in_order": True,
+            }
         self._torch = DataLoader(
             loader.dataset,
-            batch_sampler=self._numbers,
-            num_workers=loader.num_workers,
-            collate_fn=loader.collate_fn,
+            batch_sampler=self._due,
+            num_workers=workers,
             pin_memory=loader.pin_memory,
             timeout=loader.timeout,
-            worker_init_fn=loader.worker_init_fn,
             multiprocessing_context=self._context,
             generator=loader.generator,
-            prefetch_factor=loader.prefetch_factor,
             persistent_workers=loader.persistent_workers,
+            **own,
         )
         self._loader = ref(loader)
         self._stop_reader, self._stop_writer = connection.Pipe(duplex=False)
@@ -116,18 +135,35 @@ class Workers:
             return set()
         return {process.pid for process in self._context.processes if process.pid is not None}
 
+    def take_work(self, loader: DataLoader[Any]) -> Work:
+        """Return what the workers have done for a loader since this was asked before."""
+        if self.parted is None or self._loader() is not loader:
+            return Work()
+        work, self.parted.work = self.parted.work, Work()
+        return work
+
     @property
     def is_of_this_process(self) -> bool:
         """Whether this process started them, and not one that it was forked from."""
         return self._context is None or os.getpid() == self._pid
 
-    def begin(self, begun: Pass, numbers: Iterator[Any]) -> None:
+    def begin(self, begun: Pass, numbers: Iterator[Any], loader: "PairsLoader") -> None:
         """Begin a pass over batches; the pass that these workers served before has ended."""
         if self._torch is None:
             raise PassError("these workers have ended: call iter(loader) again.")
         are_new, self.serves = self.serves is None, begun
-        self._numbers.due = numbers
-        self.batches = iter(self._torch)
+        self._due.tasks = numbers
+        if self._memory is not None:
+            self.parted = PartedBatches(
+                numbers,
+                loader.batches.of_all_ranks,
+                loader.share,
+                memory=self._memory,
+                made_by=Making(loader.collate_fn, loader.dataset.buffers.kind, loader.layout),
+                before=self.parted,
+            )
+            self._due.tasks = self.parted.tasks()
+        self._results = iter(self._torch)
         if self._context is not None and are_new:
             # The thread does not refer to these workers: without other references they end.
             of_thread = (self._context, self._stop_reader)
@@ -136,19 +172,26 @@ class Workers:
             )
             self._thread.start()
 
+    def next(self) -> Any:
+        """Return the next batch."""
+        if self.parted is None:
+            return next(self._results)
+        return self.parted.next(self._results)
+
     def __del__(self) -> None:
         """End the workers when no reference is left."""
         self.end()
 
     def end(self) -> None:
-        """End the workers, and release the memory that came from them."""
+        """End the workers; batches that came from them keep their memory."""
         self.serves = None  # a pass that goes on is told
-        batches, self.batches = self.batches, iter(())
+        results, self._results = self._results, iter(())
         loader, self._torch = self._torch, None
+        self._due.tasks = iter(())
         if loader is None or self._context is None or sys.is_finalizing():
             return
         if not self.is_of_this_process:
-            _inherited.append((loader, batches))
+            _inherited.append((loader, results))
             return
         if self._thread is not None:
             # From now on workers may end.
@@ -158,10 +201,11 @@ class Workers:
             self._thread = None
         # Now, and not when the last traceback is gone that knows the iterator. Lightning ends
         # workers in this way, too; where none could be started there is nothing to end.
-        shutdown = getattr(batches, "_shutdown_workers", None)
+        shutdown = getattr(results, "_shutdown_workers", None)
         if shutdown is not None:
             shutdown()
-        forget_slots({each.pid for each in self._context.processes if each.pid is not None})
+        if self._memory is not None:
+            self._memory.close()
 
     def error(self, noticed: BaseException) -> WorkerError | None:
         """Return an error that names the worker that died; None if none did.
@@ -211,14 +255,27 @@ def _watch(context: "_WatchedContext", stop_reader: Any) -> None:
     context.is_dead.set()
 
 
-class _DueBatches(Sampler[list[int]]):
-    """The batch sampler of workers: the numbers of the samples that are due."""
+class _DueTasks(Sampler[Any]):
+    """The batch sampler of workers: the tasks, or the batches, that are due."""
 
     def __init__(self) -> None:
-        self.due: Iterator[list[int]] = iter(())
+        self.tasks: Iterator[Any] = iter(())
 
-    def __iter__(self) -> Iterator[list[int]]:
-        return self.due
+    def __iter__(self) -> Iterator[Any]:
+        return self.tasks
+
+
+class _Beginning(NamedTuple):
+    """What a worker does first: it takes the memory of its batches, and what the user asks for."""
+
+    memory: BatchMemory
+    worker_init_fn: Callable[[int], object] | None
+
+    def __call__(self, worker: int) -> None:
+        info: Any = get_worker_info()
+        info.dataset.begin_worker(self.memory)
+        if self.worker_init_fn is not None:
+            self.worker_init_fn(worker)
 
 
 _running: Final[WeakSet[Workers]] = WeakSet()
@@ -398,6 +455,10 @@ class LoaderStats(NamedTuple):
             in one line (of the first batches of epoch 0); empty of more than 100,000 samples.
         waiting: The share of the time that the loop has waited for batches, from the beginning of
             the latest pass to its latest batch; starting the workers counts.
+        packets_decoded: How many packets were given to decoders, by all workers, in all passes.
+        frames_used: How many frames of videos the samples showed, each camera's frame once. One
+            packet a frame is the least; a scene that is begun inside takes more.
+        time: Where the time of those who load went, and which is the limit, in one line.
     """
 
     epoch: int
@@ -407,6 +468,9 @@ class LoaderStats(NamedTuple):
     videos_limit: int
     mixing: str
     waiting: float
+    packets_decoded: int
+    frames_used: int
+    time: str
 
 
 class ShareSampler(DistributedSampler[Any]):
@@ -499,7 +563,7 @@ class PairsLoader(DataLoader[Any]):
             **options: Those of `DataLoader`.
         """
         if options.get("collate_fn") is None:
-            options["collate_fn"] = dataset.buffers.collate
+            options["collate_fn"] = collate
         super().__init__(
             dataset,
             batch_sampler=batch_sampler or batches,
@@ -510,8 +574,30 @@ class PairsLoader(DataLoader[Any]):
         self._begun_passes = 0
         self._pass_began_s = self._passed_s = self._waited_s = 0.0
         self._persistent: Workers | None = None
+        self._work = Work()
+        self.layout: Layout | None = None
         self._set_sampler()
-        dataset.keep_open(batches, processes=batches.world_size * max(1, num_workers))
+        dataset.read_by(batches, self.share)
+
+    @property
+    def share(self) -> WorkerShare:
+        """How the batches of this rank are divided among the workers."""
+        batches, workers = self.batches, self.num_workers
+        is_by_streams = workers > 0 and (batches.rule.shuffle or self._holds_runs)
+        return WorkerShare(
+            batches.rank,
+            batches.world_size,
+            worker=0,
+            workers=max(1, workers),
+            of="streams" if is_by_streams else "batches",
+        )
+
+    @property
+    def _holds_runs(self) -> bool:
+        """Whether a whole run for each worker is on its way, where nothing is shuffled."""
+        lengths = self.batches.dataset.plan.runs.lengths
+        ahead = (self.prefetch_factor or 0) * self.batches.batch_size * self.batches.world_size
+        return bool(ahead >= lengths.mean())
 
     def _set_sampler(self) -> None:
         # Past torch's guard against another sampler: it says that the batches are a rank's share.
@@ -566,7 +652,13 @@ class PairsLoader(DataLoader[Any]):
         Raises:
             StateError: If it belongs to other samples or another order, naming what differs.
         """
+        rule = self.batches.rule
         epoch, start = self.batches.position_in(state)
+        if self.batches.rule != rule:
+            # Workers that persist expect the batches of another order.
+            if self._persistent is not None:
+                self._forget(self._persistent)
+            self.dataset.read_by(self.batches, self.share)
         if start > 0 and start >= self.batches.end(start):
             epoch, start = epoch + 1, 0
         self.batches.passes.set(epoch, start)
@@ -574,6 +666,7 @@ class PairsLoader(DataLoader[Any]):
     def stats(self) -> LoaderStats:
         """Return what the loader has and holds now: open videos, workers, batches."""
         pids = {pid for each in _running for pid in each.pids_for(self)}
+        work = self._all_work()
         videos = self.dataset.stats()
         epoch, taken = self.batches.passes.position
         return LoaderStats(
@@ -584,7 +677,17 @@ class PairsLoader(DataLoader[Any]):
             videos_limit=videos.videos_limit,
             mixing=self._mixing,
             waiting=self._waited_s / self._passed_s if self._passed_s else 0.0,
+            packets_decoded=work.packets_decoded,
+            frames_used=work.frames_used,
+            time=work.in_words(),
         )
+
+    def _all_work(self) -> Work:
+        """What was done for this loader, by its workers or by this process, in all its passes."""
+        self._work.add(self.dataset.take_work())
+        for each in _running:
+            self._work.add(each.take_work(self))
+        return self._work
 
     @cached_property
     def _mixing(self) -> str:
@@ -657,7 +760,7 @@ class PairsLoader(DataLoader[Any]):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy needs: it has passes and workers of its own."""
-        own = {"_persistent": None, "_begun_passes": 0, "sampler": None}
+        own = {"_persistent": None, "_begun_passes": 0, "sampler": None, "_work": Work()}
         return self.__dict__ | own | {"batches": copy.copy(self.batches)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -769,7 +872,7 @@ class LoaderPass(Iterator[Any]):
         loader, asked_s = self._loader, perf_counter()
         with self._ended_by_errors():
             try:
-                batch = next(workers.batches)
+                batch = workers.next()
             except (RuntimeError, OSError, EOFError) as error:
                 # Where a dead worker caused it, the error names that.
                 death = None if isinstance(error, StereoGenBenchError) else workers.error(error)
@@ -777,6 +880,8 @@ class LoaderPass(Iterator[Any]):
                     raise
                 loader._forget(workers)
                 raise death from error
+        if workers.parted is not None:
+            loader.layout = workers.parted.layout
         loader._waited_s += perf_counter() - asked_s
         loader._passed_s = perf_counter() - loader._pass_began_s
         begun.taken += 1
@@ -800,7 +905,7 @@ class LoaderPass(Iterator[Any]):
         loader._begin(begun)
         self._pass, self._workers = begun, workers
         with self._ended_by_errors():
-            workers.begin(begun, numbers)
+            workers.begin(begun, numbers, loader)
 
     @contextmanager
     def _ended_by_errors(self) -> Iterator[None]:
@@ -826,6 +931,7 @@ class LoaderPass(Iterator[Any]):
         if self._pass is None or workers is None:
             return
         self._loader._end(self._pass)
+        self._loader._work.add(workers.take_work(self._loader))
         if self._pid == os.getpid() and self._loader.num_workers == 0:
             self._loader.dataset.stop_fetching()
         if workers is not self._loader._persistent:

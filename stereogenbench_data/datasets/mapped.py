@@ -4,8 +4,10 @@ import copy
 import multiprocessing
 import operator
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
+from time import perf_counter
 from typing import Any, Final, Literal, Self, TypedDict, Unpack, get_args
 
 import numpy as np
@@ -14,9 +16,11 @@ from torch.utils.data import Dataset, get_worker_info
 from stereogenbench_data.datasets.batch_buffers import (
     BatchArrays,
     BatchBuffers,
+    BatchMemory,
     Buffers,
     to_tensors,
 )
+from stereogenbench_data.datasets.batch_parts import BatchPart, MadePart, make_part
 from stereogenbench_data.datasets.batches import (
     EpochBatch,
     EpochBatches,
@@ -24,7 +28,10 @@ from stereogenbench_data.datasets.batches import (
     GlobalBatches,
     Passes,
     SharedEpoch,
-    videos_to_keep,
+    WorkerShare,
+    videos_allowed,
+    videos_per_scene,
+    warn_of_division,
 )
 from stereogenbench_data.datasets.loader import (
     LoaderOptions,
@@ -55,7 +62,7 @@ from stereogenbench_data.samples.fields import (
     parse_request,
     warn_if_swapped,
 )
-from stereogenbench_data.samples.load import SampleLoader, StreamStats
+from stereogenbench_data.samples.load import OPEN_STREAMS, SampleLoader, StreamStats, Work
 from stereogenbench_data.schema.conventions import Conventions, depth_of
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_COUNT, DEFAULT_DEPTH_UNIT_M, depth_name
@@ -194,8 +201,11 @@ class _MappedScenes(Dataset[Sample]):
         self.is_random = _is_random(plan, request)
         self._is_watched = self.is_random
         self._of_all_ranks: GlobalBatches | None = None
-        self._step = self._stop = 0
+        self._share, self._stop = WorkerShare(0, 1, 0, 1, "batches"), 0
         self._next_batch: tuple[int, int] | None = None
+        self._open_runs: tuple[Any, dict[int, int]] = None, {}
+        self._memory: BatchMemory | None = None
+        self._idle_since_s = 0.0
 
     @property
     def epoch(self) -> int:
@@ -238,7 +248,7 @@ class _MappedScenes(Dataset[Sample]):
             self._mark_drawn(batch)
         return to_tensors(self._sample(number, batch))
 
-    def __getitems__(self, numbers: Sequence[int]) -> list[Sample]:
+    def __getitems__(self, numbers: Sequence[int]) -> Any:
         """Return several samples in the order asked, each stream read forwards on the way.
 
         What `EpochBatches` gives is read as it comes: a stream that ends with what lies before its
@@ -246,15 +256,18 @@ class _MappedScenes(Dataset[Sample]):
 
         Samples of one shape lie side by side in memory, so that `collate` need not copy them. What
         `EpochBatches` gives is drawn for its own epoch, and has the field ``is_padding`` with
-        ``drop_last="pad"``.
+        ``drop_last="pad"``. Workers of our loader are given a `BatchPart` and return a `MadePart`.
         """
+        if isinstance(numbers, BatchPart):
+            return self._made(numbers)
         batch = (
             numbers if isinstance(numbers, EpochBatch) else EpochBatch(numbers, epoch=self.epoch)
         )
         places = list(range(len(batch)))
         if batch is not numbers:
             places.sort(key=batch.__getitem__)
-        samples = self._read(batch, places, self.buffers.allocate(len(batch)))
+        share = self._share_of_batches()
+        samples = self._read(batch, places, self.buffers.allocate(len(batch)), share)
         loaded = dict(zip(places, samples, strict=True))
         return [loaded[place] for place in range(len(batch))]
 
@@ -271,47 +284,119 @@ class _MappedScenes(Dataset[Sample]):
         They lie side by side in memory where `BatchBuffers.collate` makes batches of them.
         """
         arrays = self.buffers.allocate(len(batch)) if self.buffers.makes_batches else None
-        return self._read(batch, range(start, len(batch)), arrays)
+        return self._read(batch, range(start, len(batch)), arrays, self._share_of_batches())
+
+    def _share_of_batches(self) -> WorkerShare:
+        """Return what this process decodes where it is given whole batches."""
+        info, share = get_worker_info(), self._share
+        worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
+        return share._replace(worker=worker, workers=workers, of="batches")
 
     def _read(
-        self, batch: EpochBatch, places: Sequence[int], arrays: BatchArrays | None
+        self,
+        batch: EpochBatch,
+        places: Sequence[int],
+        arrays: BatchArrays | None,
+        share: WorkerShare,
     ) -> Iterator[Sample]:
         """Yield samples of a batch, as slices of the batch's arrays if they are given."""
+        of_place = None if arrays is None else arrays.of_sample
+        samples = self._load(batch, places, of_place, share)
+        for place, sample in zip(places, samples, strict=True):
+            yield to_tensors(sample) if arrays is None else arrays.as_tensors(place, sample)
+
+    def _load(
+        self,
+        batch: EpochBatch,
+        places: Sequence[int],
+        of_place: Callable[[int], Allocate] | None,
+        share: WorkerShare,
+    ) -> Iterator[Sample]:
+        """Yield samples of a batch as arrays and texts, written into what is allocated for them."""
         self._mark_drawn(batch)
-        self._expect(batch, [batch[place] for place in places])
+        self._keep_open(batch)
+        self._expect(batch, [batch[place] for place in places], share)
         for place in places:
-            allocate = new_array if arrays is None else arrays.of_sample(place)
+            allocate = new_array if of_place is None else of_place(place)
             sample = self._sample(batch[place], batch, allocate)
             if batch.is_padding is not None:
                 sample["is_padding"] = allocate("is_padding", (), np.bool_)
                 sample["is_padding"][...] = batch.is_padding[place]
-            yield to_tensors(sample) if arrays is None else arrays.as_tensors(place, sample)
+            yield sample
 
-    def _expect(self, batch: EpochBatch, reading: Sequence[int]) -> None:
+    def _made(self, task: BatchPart) -> MadePart:
+        """Return what this worker makes of its part of a batch."""
+        began_s, batch = perf_counter(), task.batch
+        if not batch:
+            # What is fetched ahead goes on where this batch is one of those that were expected.
+            if self._next_batch is not None:
+                self._next_batch = (
+                    self._next_batch[0],
+                    self._next_batch[1] + task.share.world_size,
+                )
+            return MadePart(task.key, [])
+        if self._open_runs[0] != task.key[0]:
+            # What an earlier pass has open is not wanted any more.
+            self._loader.close()
+            self._open_runs = task.key[0], {}
+        places = range(len(batch))
+        made = make_part(
+            task, self._memory, lambda of_place: self._load(batch, places, of_place, task.share)
+        )
+        made.work = self._loader.take_work()
+        if self._idle_since_s:
+            made.work.waiting_s = began_s - self._idle_since_s
+        self._idle_since_s = perf_counter()
+        return made
+
+    def begin_worker(self, memory: BatchMemory) -> None:
+        """Begin as a worker of a loader, whose batches lie in this memory."""
+        self._memory = memory
+
+    def take_work(self) -> Work:
+        """Return what this process has done for samples since this was asked before."""
+        return self._loader.take_work()
+
+    def _keep_open(self, batch: EpochBatch) -> None:
+        """Keep as many videos open as the groups have runs open that this process reads."""
+        known = self._open_runs[1]
+        if batch.number is not None and known.get(batch.group) != batch.open_runs:
+            known[batch.group] = batch.open_runs
+            scenes = sum(known.values())
+            videos = scenes * self._videos_per_scene
+            videos = min(max(OPEN_STREAMS, videos), videos_allowed())
+            self._loader.keep_open(videos, frames=batch.open_frames, scenes=scenes)
+
+    def _expect(self, batch: EpochBatch, reading: Sequence[int], share: WorkerShare) -> None:
         """Let the bytes of a batch, in the order of reading, and of those after it be fetched."""
         this = (batch.epoch, batch.number)
         if this != self._next_batch or not self._loader.has_order:
-            self._loader.expect(self.steps(batch, reading))
+            self._loader.expect(self.steps(batch, reading, share))
         self._next_batch = None
         if batch.number is not None and self._of_all_ranks is not None:
-            self._next_batch = (batch.epoch, batch.number + self._step)
+            self._next_batch = (batch.epoch, batch.number + share.batches_apart)
 
-    def steps(self, batch: EpochBatch, reading: Sequence[int]) -> Iterator[Step]:
+    def steps(
+        self, batch: EpochBatch, reading: Sequence[int], share: WorkerShare
+    ) -> Iterator[Step]:
         """Yield the samples of a batch, and of those that this process gets after it."""
-        known, number = self._of_all_ranks, batch.number
+        known, number, epoch = self._of_all_ranks, batch.number, batch.epoch
         while True:
             for each in reading:
                 if -len(self.plan) <= each < len(self.plan):
-                    address = self._address(each, batch.epoch, group=batch.group)
+                    address = self._address(each, batch)
                     yield Step(address, each in batch.ends_of_runs)
-            if number is None or known is None or number + self._step >= self._stop:
+            if number is None or known is None or number + share.batches_apart >= self._stop:
                 return
-            number += self._step
-            batch = reading = known.batch(number, epoch=batch.epoch)
+            number += share.batches_apart
+            batch = known.batch(number, epoch=epoch)
+            if share.of == "streams":
+                batch = batch.at(np.flatnonzero(known.workers_of(batch, share) == share.worker))
+            reading = batch
 
-    def _address(self, number: int, epoch: int, *, group: int) -> Address:
-        address = self.plan.locate(number % len(self.plan), epoch=epoch, group=group)
-        return address._replace(run=0) if self._of_all_ranks is None else address
+    def _address(self, number: int, batch: EpochBatch) -> Address:
+        address = self.plan.locate(number % len(self.plan), epoch=batch.epoch, group=batch.group)
+        return address._replace(run=0) if batch.number is None else address
 
     def _sample(self, number: int, batch: EpochBatch, allocate: Allocate = new_array) -> Sample:
         """Return a sample of a batch as arrays, written into what is allocated for them."""
@@ -326,7 +411,7 @@ class _MappedScenes(Dataset[Sample]):
         if not -count <= number < count:
             raise IndexError(f"no sample {number}: there are {count}")
         number %= count
-        address = self._address(number, batch.epoch, group=batch.group)
+        address = self._address(number, batch)
         sample = self._loader.load(
             address,
             clip="clip" if self.plan.windows.is_clip else "frame",
@@ -385,21 +470,18 @@ class _MappedScenes(Dataset[Sample]):
             twin.shared_epoch = SharedEpoch(epoch)
             twin._is_watched = False
         twin._of_all_ranks = twin._next_batch = None
+        twin._open_runs = None, {}
         return twin
 
-    def keep_open(self, batches: EpochBatches, *, processes: int) -> None:
-        """Read by these batches, in one of several processes: each video is opened once.
-
-        Videos are kept open for as many runs as the batches interleave, and closed after a run's
-        last sample.
-        """
-        if batches.rule.shuffle:
-            videos = videos_to_keep(
-                self.plan, batches.rule, streams=self.request.streams, processes=processes
-            )
-            self._loader.keep_open(videos, frames=batches.rule.open_frames)
-        self._of_all_ranks, self._step, self._stop = batches.of_all_ranks, processes, batches.end()
+    def read_by(self, batches: EpochBatches, share: WorkerShare) -> None:
+        """Expect these batches, divided in this way: what comes next is fetched ahead."""
+        self._of_all_ranks, self._share, self._stop = batches.of_all_ranks, share, batches.end()
         self._next_batch = None
+        warn_of_division(batches, share, videos_per_scene=self._videos_per_scene)
+
+    @cached_property
+    def _videos_per_scene(self) -> int:
+        return videos_per_scene(self.plan, self.request.streams)
 
     def stop_fetching(self) -> None:
         """End the requests of this process for coming samples."""

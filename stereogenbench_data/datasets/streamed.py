@@ -15,6 +15,7 @@ from stereogenbench_data.datasets.batches import (
     RepeatedEpochWarning,
     SharedNumbers,
     State,
+    WorkerShare,
     require_count,
 )
 from stereogenbench_data.datasets.mapped import Data, PairsOptions, StereoPairs
@@ -80,9 +81,9 @@ class StereoPairStream(IterableDataset[Sample]):
     def collate(self, samples: Sequence[Sample]) -> Any:
         """Make a batch of samples: `DataLoader`'s ``collate_fn``, where speed matters.
 
-        Worker processes then write samples where their batch will be, in shared memory that is
-        used again once the loop drops the batch. Do not keep samples in a worker. Any other
-        ``collate_fn`` works too, and costs the copies that torch makes.
+        Worker processes then write samples where their batch will be, in shared memory. Do not keep
+        samples in a worker. Any other ``collate_fn`` works too, and costs the copies that torch
+        makes.
 
         Raises:
             FieldError: If a field has another shape in one sample than in the first.
@@ -139,7 +140,10 @@ class StereoPairStream(IterableDataset[Sample]):
         """
         self.batches.require_shared_once(self)
         place = self._place
-        self.pairs.keep_open(self.batches, processes=place["world_size"] * place["workers"])
+        share = WorkerShare(
+            place["rank"], place["world_size"], place["worker"], place["workers"], "batches"
+        )
+        self.pairs.read_by(self.batches, share)
         begun, pid = self._resumed or (None, 0)
         self._resumed = None
         if begun is None or pid != os.getpid() or begun.epoch != self.epoch:

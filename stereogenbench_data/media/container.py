@@ -79,6 +79,14 @@ class SeekableFile(io.RawIOBase):
         """Return the bytes from start to stop, which lie within the file, or the first of them."""
 
 
+@dataclass(slots=True)
+class Effort:
+    """What frames cost: packets that were decoded, and seconds in which they were read."""
+
+    packets: int = 0
+    reading_s: float = 0.0
+
+
 class FrameReader:
     """What readers of frames have in common.
 
@@ -88,11 +96,13 @@ class FrameReader:
         name: What messages call the file.
         frames: How many frames it has.
         header: What the file's header says; the pixel format is empty where it does not give it.
+        effort: What its frames cost so far.
     """
 
     name: str
     frames: int
     header: "StreamFacts"
+    effort: Effort
 
     def close(self) -> None:
         """Close the reader; closing twice does nothing."""

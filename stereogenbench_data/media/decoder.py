@@ -20,6 +20,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import chain, islice, pairwise
+from time import perf_counter
 from typing import TYPE_CHECKING, Final
 
 import av
@@ -29,7 +30,13 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from stereogenbench_data.errors import MediaError
-from stereogenbench_data.media.container import Placed, exact, frames_by_duration, stream_codec
+from stereogenbench_data.media.container import (
+    Effort,
+    Placed,
+    exact,
+    frames_by_duration,
+    stream_codec,
+)
 
 if TYPE_CHECKING:
     VideoPacket = Packet[VideoStream]
@@ -184,6 +191,9 @@ class Decoder:
 
     Damage is an error (``err_detect=explode``), never concealed. There is one thread: frame threads
     would run ahead of the frame asked for, and blur which one failed.
+
+    Attributes:
+        effort: What its packets cost so far; shared with the decoders before it of the same file.
     """
 
     def __init__(
@@ -193,6 +203,7 @@ class Decoder:
         clock: Clock,
         placed: Placed = "at the first packet",
         crc32s: Sequence[int] = (),
+        effort: Effort | None = None,
     ) -> None:
         """Take over a container that was just opened.
 
@@ -202,7 +213,9 @@ class Decoder:
             placed: Where the container stands.
             crc32s: What `packet_checksums` found, of a codec whose packets come in the order in
                 which they are shown.
+            effort: What counts its packets.
         """
+        self.effort = effort or Effort()
         self._container = container
         self._is_placed = placed == "at the first packet"
         self._clock = clock
@@ -351,11 +364,14 @@ class Decoder:
     def _pull(self) -> tuple[int, VideoFrame]:
         """Return the next picture with its number, from as many packets as it takes."""
         while not self._pending:
+            began_s = perf_counter()
             packet = next(self._packets, None)
+            self.effort.reading_s += perf_counter() - began_s
             if packet is None:
                 raise UnexpectedPicture("the stream ends before it")
             if packet.size and not packet.is_discard:
                 self._register(packet)
+                self.effort.packets += 1
             self._pending.extend((self._index(frame), frame) for frame in packet.decode())
         return self._pending.popleft()
 

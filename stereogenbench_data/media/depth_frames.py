@@ -19,6 +19,7 @@ from dataclasses import asdict, dataclass
 from io import FileIO
 from itertools import accumulate, pairwise
 from pathlib import Path
+from time import perf_counter
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -26,6 +27,7 @@ from jaxtyping import UInt16
 
 from stereogenbench_data.errors import MediaError, missing_extra
 from stereogenbench_data.media.container import (
+    Effort,
     FrameReader,
     StreamFacts,
     VideoFile,
@@ -246,6 +248,7 @@ class DepthFrames(FrameReader):
             MediaError: If it is not such a file, is damaged or has another number of frames.
         """
         self.name = name
+        self.effort = Effort()
         self._own = FileIO(file) if isinstance(file, str | Path) else None
         self._file: Any = self._own or file
         try:
@@ -264,8 +267,11 @@ class DepthFrames(FrameReader):
         size = self._sizes[index]
         if size == 0:
             return b""
+        began_s = perf_counter()
         self._file.seek(self.chunk_bounds[index])
         chunk = self._read(size)
+        self.effort.reading_s += perf_counter() - began_s
+        self.effort.packets += 1
         where = f"{self.name}: frame {index}"
         require_chunk(chunk, clip=self.clip, crc32=self._crc32s[index], name=where)
         return chunk

@@ -17,6 +17,7 @@ from jaxtyping import UInt8, UInt16
 
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.container import (
+    Effort,
     FrameReader,
     StreamFacts,
     VideoFile,
@@ -145,6 +146,7 @@ class VideoReader(FrameReader):
         """
         self.name = name
         self.frames = frames
+        self.effort = Effort()
         self.scaler = VideoReformatter()
         self.converter = Converter()
         self._file = file
@@ -169,7 +171,9 @@ class VideoReader(FrameReader):
         if steady is None:
             container.close()
         else:
-            self._decoder = Decoder(container, clock=steady, placed=placed, crc32s=self._crc32s)
+            self._decoder = Decoder(
+                container, clock=steady, placed=placed, crc32s=self._crc32s, effort=self.effort
+            )
 
     @property
     def facts(self) -> StreamFacts:
@@ -227,7 +231,11 @@ class VideoReader(FrameReader):
         if self._decoder is None:
             container, placed = open_by_header(self._file, name=self.name)
             self._decoder = Decoder(
-                container, clock=self._clock, placed=placed, crc32s=self._crc32s
+                container,
+                clock=self._clock,
+                placed=placed,
+                crc32s=self._crc32s,
+                effort=self.effort,
             )
         try:
             return self._decoder.reach(index)
@@ -241,7 +249,9 @@ class VideoReader(FrameReader):
             with open_container(self._file, name=self.name) as container:
                 self._clock = self._survey(container)
         container = open_container(self._file, name=self.name)
-        self._decoder = Decoder(container, clock=self._clock, crc32s=self._crc32s)
+        self._decoder = Decoder(
+            container, clock=self._clock, crc32s=self._crc32s, effort=self.effort
+        )
         try:
             return self._decoder.decode_to(index)
         except (UnexpectedPicture, av.FFmpegError) as error:

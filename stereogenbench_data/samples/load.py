@@ -13,9 +13,10 @@ import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 from typing import Any, Final, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -70,6 +71,9 @@ T = TypeVar("T")
 OPEN_STREAMS: Final = 24
 """How many videos a process keeps open: two scenes with all their cameras' colour and depth."""
 
+_MOST_SHOWN: Final = 16
+"""Of so many times the open videos it is known which frames were shown."""
+
 _Place = tuple[str, int, int]
 """Path and offset of a video, and which run of it is read."""
 
@@ -84,6 +88,48 @@ class StreamStats(NamedTuple):
 
     videos_open: int
     videos_limit: int
+
+
+@dataclass(slots=True)
+class Work:
+    """What a process, or several together, have done for samples.
+
+    Attributes:
+        packets_decoded: Packets given to decoders. More than frames used are decoded where a scene
+            is begun inside, and where a video is decoded more than once.
+        frames_used: Frames of videos that samples show, each once for every run in which it is
+            read.
+        reading_s: Seconds in which files were opened and packets read.
+        decoding_s: Seconds in which packets became pictures and depth, of the size that is wanted.
+        making_s: Seconds in which these became samples.
+        waiting_s: Seconds in which workers waited for tasks.
+    """
+
+    packets_decoded: int = 0
+    frames_used: int = 0
+    reading_s: float = 0.0
+    decoding_s: float = 0.0
+    making_s: float = 0.0
+    waiting_s: float = 0.0
+
+    def add(self, other: "Work") -> None:
+        """Add what another has done."""
+        for each in fields(self):
+            setattr(self, each.name, getattr(self, each.name) + getattr(other, each.name))
+
+    def in_words(self) -> str:
+        """Return where the time went, and which is the limit; empty where nothing was done."""
+        parts = {
+            "reading": self.reading_s,
+            "decoding": self.decoding_s,
+            "making samples": self.making_s,
+            "waiting for the loop": self.waiting_s,
+        }
+        total_s = sum(parts.values())
+        if total_s <= 0:
+            return ""
+        shares = ", ".join(f"{name} {part_s / total_s:.0%}" for name, part_s in parts.items())
+        return f"{shares}: {max(parts, key=parts.__getitem__)} is the limit"
 
 
 def _kept(cache: OrderedDict[Any, Any], key: Any, make: Callable[[], T], *, most: int) -> T:
@@ -146,6 +192,7 @@ class Streams:
     Attributes:
         limit: How many videos it keeps open.
         kept_frames: How many frames of each it keeps.
+        work: What it has done.
     """
 
     def __init__(
@@ -155,7 +202,11 @@ class Streams:
         self._source = source
         self.limit = limit
         self.kept_frames = kept_frames
+        self.work = Work()
         self._open: OrderedDict[_Place, _Stream] = OrderedDict()
+        # The frames of each video that were shown, as bits: kept when the pool closes a video that
+        # is read on, so that what is decoded twice is not taken for two frames.
+        self._shown: OrderedDict[_Place, int] = OrderedDict()
 
     def rgb(
         self,
@@ -184,7 +235,7 @@ class Streams:
         """
         most = self.kept_frames
         height, width = size or (scene.rig.image_height_px, scene.rig.image_width_px)
-        with self._stream(scene, name, run) as stream:
+        with self._stream(scene, name, run, index) as stream:
             if out is not None:
                 shape = (out.shape[-2], out.shape[-1])
                 read_rgb(stream.reader, index, size=shape, out=out, content="colour")
@@ -222,7 +273,7 @@ class Streams:
             StorageError: If the video cannot be read.
             MediaError: If it is not one that the encoding describes or does not decode.
         """
-        with self._stream(scene, name, run) as stream:
+        with self._stream(scene, name, run, index) as stream:
 
             def read() -> StoredDepth:
                 units = read_depth_units(stream.reader, index, encoding=encoding)
@@ -243,7 +294,9 @@ class Streams:
     def release(self, scene: Scene, *, run: int = 0) -> None:
         """Close the videos of a scene's run, of which no more is wanted for now."""
         for member in scene.members.values():
-            stream = self._open.pop((member.path, member.offset, run), None)
+            place = (member.path, member.offset, run)
+            self._shown.pop(place, None)
+            stream = self._open.pop(place, None)
             if stream is not None:
                 stream.close()
 
@@ -251,12 +304,15 @@ class Streams:
         """Close every video; the pool can be used again."""
         while self._open:
             self._open.popitem()[1].close()
+        self._shown.clear()
 
     @contextmanager
-    def _stream(self, scene: Scene, name: str, run: int) -> Iterator[_Stream]:
-        """Yield an open video; it stays open unless reading it fails."""
+    def _stream(self, scene: Scene, name: str, run: int, index: int) -> Iterator[_Stream]:
+        """Yield an open video, a frame of which is read; it stays open unless that fails."""
+        began_s = perf_counter()
         member, name = scene.member(name), scene.held_name(name)
         place = (member.path, member.offset, run)
+        self._mark_shown(place, index)
         is_new = place not in self._open
         if is_new:
             while len(self._open) >= self.limit:
@@ -267,15 +323,29 @@ class Streams:
                 reader = open_video(file, name=label, frames=scene.frames)
             self._open[place] = _Stream(reader, file)
         self._open.move_to_end(place)
-        stream = self._open[place]
+        stream, work = self._open[place], self.work
+        effort, opened_s = stream.reader.effort, perf_counter()
+        packets, reading_s = effort.packets, effort.reading_s
         try:
             with _cause_raised(stream.file):
                 if is_new:
                     require_indexed_picture(stream.reader, scene.rig)
                 yield stream
+            read_s = effort.reading_s - reading_s
+            work.packets_decoded += effort.packets - packets
+            work.reading_s += opened_s - began_s + read_s
+            work.decoding_s += perf_counter() - opened_s - read_s
         except (MediaError, StorageError):
             self._open.pop(place).close()
             raise
+
+    def _mark_shown(self, place: _Place, index: int) -> None:
+        """Count a frame that a sample shows, unless another one did."""
+        shown = self._shown.pop(place, 0)
+        self.work.frames_used += not shown >> index & 1
+        self._shown[place] = shown | 1 << index
+        while len(self._shown) > _MOST_SHOWN * max(self.limit, OPEN_STREAMS):
+            self._shown.popitem(last=False)
 
 
 @contextmanager
@@ -293,7 +363,7 @@ def _cause_raised(file: Path | SeekableFile) -> Iterator[None]:
 
 
 KEPT_SCENES: Final = 256
-"""Of how many scenes row and poses are kept (poses of 81 frames take 46 kB)."""
+"""Of so many scenes at least row and poses are kept (poses of 81 frames take 46 kB)."""
 
 
 class SampleLoader:
@@ -341,7 +411,7 @@ class SampleLoader:
         self._needs_of_poses = {request.known[name].needs_poses for name in request.fields}
         # A transform may write into what it is given.
         self._is_changed = request.transform is not None
-        self._limits = OPEN_STREAMS, 1
+        self._limits, self._kept_scenes = (OPEN_STREAMS, 1), KEPT_SCENES
         self._begin_anew()
 
     def _begin_anew(self) -> None:
@@ -361,9 +431,27 @@ class SampleLoader:
         """What this process has open."""
         return self._streams.stats
 
-    def keep_open(self, videos: int, *, frames: int = 1) -> None:
-        """Set how many videos, and how many frames of each, every process keeps open."""
+    @property
+    def work(self) -> Work:
+        """What this process has done."""
+        return self._streams.work
+
+    def take_work(self) -> Work:
+        """Return what this process has done since this was asked before."""
+        work, self._streams.work = self._streams.work, Work()
+        return work
+
+    def keep_open(self, videos: int, *, frames: int = 1, scenes: int = 0) -> None:
+        """Set how many videos, and how many frames of each, every process keeps open.
+
+        Args:
+            videos: How many videos.
+            frames: How many frames of each.
+            scenes: Of how many scenes these are at the most: what is known of as many that came
+                before is kept, too.
+        """
         self._limits = self._streams.limit, self._streams.kept_frames = videos, frames
+        self._kept_scenes = max(KEPT_SCENES, 2 * scenes)
 
     @property
     def has_order(self) -> bool:
@@ -447,8 +535,9 @@ class SampleLoader:
             if known is not None:
                 facts.videos, facts.poses = facts.videos | known.videos, known.poses
             known = self._scenes[row] = facts
-            if len(self._scenes) > KEPT_SCENES:
+            while len(self._scenes) > self._kept_scenes:
                 self._scenes.popitem(last=False)
+        self._scenes.move_to_end(row)
         return known
 
     def _require_as_presumed(self, row: int, scene: Scene) -> None:
@@ -500,6 +589,8 @@ class SampleLoader:
             MediaError: If a video does not decode to what the index says.
             SchemaError: If the trajectory does not follow the format.
         """
+        began_s, work = perf_counter(), self._streams.work
+        before_s = work.reading_s + work.decoding_s
         request, known = self._request, self._known_scene(address)
         size = (known.intrinsics.height_px, known.intrinsics.width_px)
         writer = SampleWriter(request, address, clip=clip, allocate=allocate)
@@ -520,6 +611,7 @@ class SampleLoader:
             raise type(error)(f"{known.scene.id.key}, frames {address.frames}: {error}") from error
         finally:
             self.end(address)
+        work.making_s += perf_counter() - began_s - (work.reading_s + work.decoding_s - before_s)
         return {name: writer.sample[name] for name in request.fields}
 
     def _decoded(

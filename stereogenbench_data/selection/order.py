@@ -1,18 +1,20 @@
 """The order of an epoch: which samples make up batch n, as arithmetic on integers.
 
-The order is a pure function of the selection's runs, the seed, the epoch and the rule; ranks and
-workers are not in it. A run is what decodes by itself: the samples from one key frame of a scene to
-the next, so a whole scene where its videos have one key frame. A permutation of the runs, laid end
-to end, is cut into shuffle groups of equally many samples; group g gives the batches n with
-n mod groups = g. A group deals its runs to as many streams as it keeps runs open, and interleaves
-the streams so that each advances evenly, at a pace of its own, to the group's end. A stream starts
-inside its first run, at a moment of its own, and reads what lies before it at its end: else the
-first batches would show first frames alone, and all streams would stay in step.
+The order is a pure function of the selection's runs, the seed, the epoch and the rule; workers are
+not in it. A run is what decodes by itself: the samples from one key frame of a scene to the next,
+so a whole scene where its videos have one key frame. A permutation of the runs, laid end to end, is
+cut into shuffle groups of equally many samples; group g gives the batches n with n mod groups = g,
+so that ranks can share the groups out. A group deals its runs to streams, as many as the rule keeps
+runs open, and interleaves the streams so that each advances evenly, at a pace of its own, to the
+group's end. A stream starts inside its first run, at a moment of its own, and reads what lies
+before it at its end: else the first batches would show first frames alone, and all streams would
+stay in step.
 
-Within a run moments ascend: a process that gets every batch of a group decodes each run once, but
-for what is skipped to reach the moment at which a stream starts. Where several samples show a
-moment (all pairs), as many neighbouring moments are interleaved as the rule has open frames.
-A cut between groups may part a run: groups - 1 runs at the most.
+Within a run moments ascend: a process that gets every sample of a stream decodes each run once, but
+for what is skipped to reach the moment at which the stream starts. So a rank's workers share the
+streams of its groups out (`EpochOrder.workers_of`). Where several samples show a moment (all
+pairs), as many neighbouring moments are interleaved as the rule has open frames. A cut between
+groups may part a run: groups - 1 runs at the most.
 
 No more than a few thousand samples are ordered at a time, so memory and time until the first batch
 grow with the runs, not with the samples. Random numbers are the raw stream of PCG64, which numpy
@@ -21,6 +23,7 @@ keeps the same for ever.
 
 import heapq
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, Literal, NamedTuple
@@ -29,16 +32,25 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt64
 
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.selection.filters import require_whole
 
-ORDER_VERSION: Final = 4
+ORDER_VERSION: Final = 5
 """Changes whenever the same arguments give another order; a saved state names it."""
 
-SHUFFLE_GROUPS: Final = 4
-GROUPS_OF_LARGE: Final = 2
-"""Where scenes are so large that memory limits how many are open: two workers have one each."""
+OPEN_SCENES: Final = 64
+"""So many runs are open in all groups together, where memory allows it."""
 
-OPEN_SCENES: Final = 16
-"""Fewer open runs than this make batches of small size too much alike."""
+SHUFFLE_GROUPS: Final = 8
+"""Into so many groups the open runs are parted, where each then fills a batch."""
+
+_EVEN_ROUNDS: Final = 8
+"""With fewer runs a stream, as many more are open as make the streams equally long."""
+
+_START: Final = 0.25
+_START_RUNS: Final = 18
+_START_SHARE: Final = 0.03
+"""What lies before the start of a stream is decoded twice: on average a quarter of a run, and less
+where that of all streams would be more than 18 runs and 3 % of all runs."""
 
 DRIFT: Final = 0.1
 """How far a stream's pace may differ from the mean, so that streams do not run in step."""
@@ -91,9 +103,7 @@ class OrderRule:
         seed: The seed of the order.
         shuffle_groups: Into how many groups the runs are parted; fewer where a group would have
             fewer runs than a batch can show.
-        open_scenes: How many runs a group interleaves. Fewer than `OPEN_SCENES` are never
-            exceeded. From there on there may be more, up to twice as many where a group has fewer
-            than twice as many, so that its streams are equally long and batches equally mixed.
+        open_scenes: How many runs a group interleaves; all of them, where it has fewer.
         open_frames: How many neighbouring moments of a run are interleaved, where several samples
             show a moment.
         shuffle: Whether the order is shuffled; otherwise it is that of the samples' numbers.
@@ -102,16 +112,15 @@ class OrderRule:
     batch_size: int
     seed: int = 0
     shuffle_groups: int = SHUFFLE_GROUPS
-    open_scenes: int = OPEN_SCENES
+    open_scenes: int = OPEN_SCENES // SHUFFLE_GROUPS
     open_frames: int = 1
     shuffle: bool = True
 
     def __post_init__(self) -> None:
         """Require numbers in their ranges."""
         for name in ("batch_size", "seed", "shuffle_groups", "open_scenes", "open_frames"):
-            value, least = getattr(self, name), int(name != "seed")
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                raise SelectionError(f"{name} must be a whole number from {least}, got {value!r}.")
+            whole = require_whole(name, getattr(self, name), least=int(name != "seed"))
+            object.__setattr__(self, name, whole)
         if not isinstance(self.shuffle, bool):
             raise SelectionError(f"shuffle must be True or False, got {self.shuffle!r}.")
 
@@ -119,12 +128,12 @@ class OrderRule:
         """Return into how many groups runs of this many samples are parted.
 
         So few that the longest run need not come twice in a batch, but two at least, of two
-        runs each, so that two processes need not decode the same; and a divisor of
-        ``shuffle_groups``, so that processes that share those out share these too.
+        runs each, so that two ranks need not decode the same; and a divisor of
+        ``shuffle_groups``, so that ranks that share those out share these too.
         """
         if not self.shuffle:
             return 1
-        as_long_as_the_longest = round(int(lengths.sum()) / int(lengths.max()))
+        as_long_as_the_longest = _as_long_as_the_longest(lengths)
         shown = min(self.batch_size, self.open_scenes)
         at_least = 2 if as_long_as_the_longest >= 4 else 1
         most = min(self.shuffle_groups, max(at_least, as_long_as_the_longest // shown))
@@ -138,40 +147,98 @@ class OrderRule:
         """
         if not self.shuffle:
             return OrderRule(self.batch_size, shuffle_groups=1, open_scenes=1, shuffle=False)
-        lengths = runs.lengths
         shares_moments = bool((runs.pairs > 1).any())
-        has_later_moments = bool((lengths > runs.pairs).any())
-        most = self._most_runs(lengths)
-        all_are_open = self.streams_of(most) == most
+        has_later_moments = bool((runs.lengths > runs.pairs).any())
         return replace(
             self,
-            shuffle_groups=self.groups_of(lengths),
-            open_scenes=len(lengths) if all_are_open else self.open_scenes,
+            shuffle_groups=self.groups_of(runs.lengths),
+            open_scenes=min(self.open_scenes, len(runs.pairs)),
             open_frames=self.open_frames if shares_moments and has_later_moments else 1,
         )
 
-    def streams_of(self, runs: int) -> int:
-        """Return how many of a group's runs are open at a time: one in each stream."""
-        if self.open_scenes < OPEN_SCENES:
-            return min(runs, self.open_scenes)
-        return -(-runs // max(1, runs // self.open_scenes))
 
-    def most_open(self, lengths: Numbers) -> int:
-        """Return a bound on the runs that one group of a selection has open at a time."""
-        most = self._most_runs(lengths)
-        if self.open_scenes < OPEN_SCENES:
-            return self.streams_of(most)
-        in_turn = max(1, most // self.open_scenes // 2)
-        return min(most, self.open_scenes + self.open_scenes // in_turn)
+def usual_groups(*, batch_size: int, fitting: int) -> int:
+    """Return into how many groups the open runs are parted, of as many runs as one may wish.
 
-    def _most_runs(self, lengths: Numbers) -> int:
-        """Return a bound on the runs of a group: the shortest ones, and parts of two others."""
-        samples = int(lengths.sum())
-        batches_of_all = -(-samples // self.batch_size)
-        turns = -(-batches_of_all // self.groups_of(lengths))
-        longest_group = min(samples, turns * self.batch_size)
-        whole = int((np.cumsum(np.sort(lengths)) <= longest_group - 2).sum())
-        return min(len(lengths), whole + 2)
+    About `OPEN_SCENES` runs are open in all: as 8 groups of 8 for batches of 8, as 4 of 16 for
+    batches of 16. A power of two, so that 1, 2, 4 and 8 ranks have one order.
+
+    Args:
+        batch_size: Samples in a batch.
+        fitting: How many open runs fit into the memory of a rank.
+    """
+    return _power_of_two(min(SHUFFLE_GROUPS, _open_in_all(batch_size, fitting) // batch_size))
+
+
+def groups_for(runs: Runs, *, batch_size: int, fitting: int, world_size: int) -> int:
+    """Return how many groups a selection has where nobody asks for a number of them.
+
+    Groups are needed for ranks alone: the usual number, or fewer where a group would have fewer
+    runs than a batch can show, is raised to a multiple of the ranks.
+
+    Args:
+        runs: The runs of the selection.
+        batch_size: Samples in a batch.
+        fitting: How many open runs fit into the memory of a rank.
+        world_size: How many ranks share the batches.
+    """
+    most = max(1, _as_long_as_the_longest(runs.lengths) // batch_size)
+    usual = usual_groups(batch_size=batch_size, fitting=fitting)
+    groups = -(-_power_of_two(min(usual, most)) // world_size) * world_size
+    return groups if groups <= most else max(1, most // world_size) * world_size
+
+
+def open_runs_for(runs: Runs, *, batch_size: int, fitting: int, groups: int) -> int:
+    """Return how many runs each group has open where nobody asks for a number of them.
+
+    With fewer than 8 runs a stream, there are more streams, so that all are equally long: else a
+    run of the longer ones would come twice in a batch. Memory may not allow as many.
+
+    Args:
+        runs: The runs of the selection.
+        batch_size: Samples in a batch.
+        fitting: How many open runs fit into the memory of a rank.
+        groups: The number of groups.
+    """
+    of_rank = min(groups, usual_groups(batch_size=batch_size, fitting=fitting))
+    wanted, most = _open_in_all(batch_size, fitting) // of_rank, fitting // of_rank
+    each = len(runs.pairs) / groups
+    rounds = max(1, int(each // wanted))
+    if rounds < _EVEN_ROUNDS:
+        wanted = max(wanted, min(most, math.ceil(each / rounds)))
+    return min(wanted, len(runs.pairs))
+
+
+def _open_in_all(batch_size: int, fitting: int) -> int:
+    return min(fitting, max(OPEN_SCENES, batch_size))
+
+
+def _power_of_two(most: int) -> int:
+    """Return the greatest power of two up to a number, 1 at the least."""
+    return 1 << max(0, most.bit_length() - 1)
+
+
+def _as_long_as_the_longest(lengths: Numbers) -> int:
+    """Return how many runs as long as the longest there would be."""
+    return round(int(lengths.sum()) / int(lengths.max()))
+
+
+class OrderedBatch(NamedTuple):
+    """A batch of an epoch: (n,) each.
+
+    Attributes:
+        samples: Its samples, in their order.
+        ends_run: Which of them are the last that their group reads of a run.
+        stream: From which stream of its group each comes; the run where nothing is shuffled.
+    """
+
+    samples: Numbers
+    ends_run: Bool[np.ndarray, " n"]
+    stream: Numbers
+
+    def part(self, start: int, stop: int) -> "OrderedBatch":
+        """Return a part of it, by places."""
+        return OrderedBatch(*(each[start:stop] for each in self))
 
 
 class EpochOrder:
@@ -192,6 +259,7 @@ class EpochOrder:
         self.batches = -(-self.samples // rule.batch_size)
         self.groups = rule.groups_of(runs.lengths)
         self._groups: dict[int, _Group] = {}
+        self._streams: dict[int, int] = {}
 
     def batch(self, number: int) -> Numbers:
         """Return the samples of a batch, in its order.
@@ -199,15 +267,7 @@ class EpochOrder:
         Raises:
             IndexError: If there is no such batch.
         """
-        return self._batch(number)[0]
-
-    def ends_run(self, number: int) -> Bool[np.ndarray, " n"]:
-        """Return which samples of a batch are the last that its group reads of a run.
-
-        Raises:
-            IndexError: If there is no such batch.
-        """
-        return self._batch(number)[1]
+        return self.described(number).samples
 
     def full_batch(self, number: int) -> Numbers:
         """Return a batch that is never short: after the last sample the epoch starts again."""
@@ -217,17 +277,53 @@ class EpochOrder:
         again = [self.batch(place // size)[place % size] for place in places.tolist()]
         return np.concatenate([own, np.array(again, dtype=np.int64)])
 
-    def _batch(self, number: int) -> tuple[Numbers, Bool[np.ndarray, " n"]]:
+    def described(self, number: int) -> OrderedBatch:
+        """Return a batch with what is known of its samples.
+
+        Raises:
+            IndexError: If there is no such batch.
+        """
         if not 0 <= number < self.batches:
             raise IndexError(f"no batch {number}: the epoch has {self.batches}")
         size = self.rule.batch_size
         if not self.rule.shuffle:
             samples = np.arange(number * size, min(self.samples, (number + 1) * size))
             after = np.searchsorted(self.runs.first_sample, samples + 1)
-            return samples, self.runs.first_sample[after] == samples + 1
+            ends_run = self.runs.first_sample[after] == samples + 1
+            return OrderedBatch(samples, ends_run, after - 1)
         turn, group = divmod(number, self.groups)
         found = self._group(group)
         return found.samples(turn * size, min(found.length, (turn + 1) * size))
+
+    def streams(self, group: int) -> int:
+        """Return how many runs a group has open at a time: one in each of its streams."""
+        if not self.rule.shuffle:
+            return 1
+        if group not in self._streams:
+            self._streams[group] = min(self.rule.open_scenes, len(self._pieces(group).run))
+        return self._streams[group]
+
+    def workers_of(
+        self, number: int, *, groups: Sequence[int], workers: int
+    ) -> Int64[np.ndarray, " n"]:
+        """Return which of a rank's workers decodes each sample of a batch.
+
+        The streams of the rank's groups, group by group and in each by their first samples, are
+        dealt to the workers in turn. So each video is decoded by one of them, and batches are
+        shared evenly. Where nothing is shuffled, the runs are dealt.
+
+        Args:
+            number: The batch.
+            groups: The groups that the rank reads.
+            workers: How many workers it has.
+        """
+        streams = self.described(number).stream
+        if not self.rule.shuffle:
+            return streams % workers
+        group = number % self.groups
+        before = sum(map(self.streams, groups[: groups.index(group)]))
+        places: Numbers = before + self._group(group).places_of_streams[streams]
+        return places % workers
 
     def _group(self, group: int) -> "_Group":
         if group not in self._groups:
@@ -294,7 +390,7 @@ class _Group:
         self._runs = order.runs
         self._rule = order.rule
         self.length = int((pieces.stop - pieces.begin).sum())
-        count = order.rule.streams_of(len(pieces.run))
+        count = order.streams(group)
         # Numbers from 0 up to 1, made of the upper 53 bits.
         raw = order.raw(3 * count, part=group + 1).reshape(3, count)
         draws = (raw >> np.uint64(11)) * 2.0**-53
@@ -303,7 +399,9 @@ class _Group:
         streams = [pieces.take(found) for found in _dealt(pieces, streams=count)]
         # Evenly spread over the streams, so that few streams are apart, too. Cubes spread nearly as
         # wide as the shares themselves, with a quarter before them instead of half.
-        starts = ((np.argsort(draws[2]) + draws[2]) / max(1, count)) ** 3
+        before = max(_START_RUNS, _START_SHARE * len(self._runs.pairs))
+        before = min(_START, before / max(1, count * order.groups))
+        starts = ((np.argsort(draws[2]) + draws[2]) / max(1, count)) ** (1 / before - 1)
         self._streams = [
             self._started(stream, share)
             for stream, share in zip(streams, starts.tolist(), strict=True)
@@ -312,26 +410,33 @@ class _Group:
         self._lengths = np.array([int(ends[-1]) for ends in self._ends], dtype=np.int64)
         self._before = self._samples_before()
         self._starts = self._before.sum(axis=1)
-        self._chunks: dict[int, tuple[Numbers, Bool[np.ndarray, " n"]]] = {}
+        self._chunks: dict[int, OrderedBatch] = {}
 
-    def samples(self, start: int, stop: int) -> tuple[Numbers, Bool[np.ndarray, " n"]]:
-        """Return samples of the group by their places, and which are the last of a piece."""
-        found, is_last = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=bool)]
+    @cached_property
+    def places_of_streams(self) -> Numbers:
+        """Where each stream stands where they are ordered by their first samples."""
+        places = np.empty(len(self._lengths), dtype=np.int64)
+        first = self._times(slice(None), np.zeros(len(places), dtype=np.int64))
+        places[np.argsort(first, kind="stable")] = np.arange(len(places))
+        return places
+
+    def samples(self, start: int, stop: int) -> OrderedBatch:
+        """Return samples of the group by their places."""
+        found = []
         chunk = int(np.searchsorted(self._starts, start, side="right")) - 1
         while start < stop:
-            samples, ends = self._chunk(chunk)
             begin = start - int(self._starts[chunk])
             end = min(stop, int(self._starts[chunk + 1])) - int(self._starts[chunk])
-            found.append(samples[begin:end])
-            is_last.append(ends[begin:end])
+            found.append(self._chunk(chunk).part(begin, end))
             start, chunk = start + end - begin, chunk + 1
-        return np.concatenate(found), np.concatenate(is_last)
+        return OrderedBatch(*map(np.concatenate, zip(*found, strict=True)))
 
-    def _chunk(self, number: int) -> tuple[Numbers, Bool[np.ndarray, " n"]]:
+    def _chunk(self, number: int) -> OrderedBatch:
         if number not in self._chunks:
             if len(self._chunks) > 1:
                 del self._chunks[next(iter(self._chunks))]
             samples, ends, times = [], [], []
+            counts = np.diff(self._before[number : number + 2], axis=0)[0]
             for stream, (low, high) in enumerate(
                 zip(self._before[number], self._before[number + 1], strict=True)
             ):
@@ -343,7 +448,9 @@ class _Group:
                 samples.append(self._in_run(pieces.run[piece], place))
                 ends.append(places + 1 == stops[piece])
             merged = np.argsort(np.concatenate(times), kind="stable")
-            self._chunks[number] = np.concatenate(samples)[merged], np.concatenate(ends)[merged]
+            streams = np.repeat(np.arange(len(counts)), counts)
+            whole = np.concatenate(samples), np.concatenate(ends), streams
+            self._chunks[number] = OrderedBatch(*(each[merged] for each in whole))
         return self._chunks[number]
 
     def _times(

@@ -1,0 +1,331 @@
+"""A batch in parts: each worker makes its own samples of every batch, which are put together.
+
+A rank's workers share the streams of its batches out (`EpochOrder.workers_of`), so each video is
+decoded by one worker, whatever their number, and a rank's memory does not grow with them. Tasks go
+through torch's own queues, in order: task b W + w is worker w's part of batch b. A worker whose
+part is empty answers at once.
+
+The first batch comes as plain arrays and tells where fields lie in a slot; until it has come, tasks
+are empty. From then on a task names a slot of the `BatchMemory` of its pass, where workers write
+their samples side by side. What does not fit there, such as pictures of another size, comes as
+plain arrays, and the batch is stacked of them.
+
+A batch on its way is in one place, `PartedBatches`. Whoever takes it out there, the loop or torch's
+thread that pins memory, decides what becomes of its slot.
+"""
+
+import itertools
+import traceback
+import weakref
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from torch.utils.data._utils.pin_memory import pin_memory
+
+from stereogenbench_data.datasets.batch_buffers import (
+    BatchArrays,
+    BatchMemory,
+    Buffers,
+    Layout,
+    collate,
+    to_tensors,
+)
+from stereogenbench_data.datasets.batches import EpochBatch, GlobalBatches, WorkerShare
+from stereogenbench_data.errors import StereoGenBenchError
+from stereogenbench_data.samples.fields import Allocate, Sample
+from stereogenbench_data.samples.load import Work
+
+_NOTHING: Final = EpochBatch((), epoch=0)
+
+_FILLER: Final = -1
+"""The number of what is dealt while nothing else may be."""
+
+
+class BatchPart(NamedTuple):
+    """A worker's task: its samples of a batch.
+
+    Attributes:
+        batch: The samples.
+        places: The places of the batch where they belong.
+        share: Whose they are.
+        key: The number of the pass, and of the batch in it.
+        slot: Where to write them; None where they are sent.
+        layout: Where fields lie in the slot.
+    """
+
+    batch: EpochBatch
+    places: list[int]
+    share: WorkerShare
+    key: tuple[int, int]
+    slot: int | None = None
+    layout: Layout | None = None
+
+
+@dataclass(slots=True)
+class MadePart:
+    """What a worker made of its part.
+
+    Attributes:
+        key: The number of the pass, and of the batch in it.
+        places: Where its samples belong.
+        samples: The samples; of those in the slot the texts alone.
+        is_in_slot: Whether everything else of them is in the slot.
+        work: What the worker has done since its part before.
+        failed: The place of a sample that could not be loaded, and why.
+        is_pinned: Whether torch's thread has put it into its batch.
+    """
+
+    key: tuple[int, int]
+    places: list[int]
+    samples: list[Sample] = field(default_factory=list)
+    is_in_slot: bool = True
+    work: Work | None = None
+    failed: tuple[int, StereoGenBenchError] | None = None
+    is_pinned: bool = False
+
+    def pin_memory(self) -> "MadePart":
+        """Put it into its batch, which is copied to pinned memory if it is whole now.
+
+        torch's thread calls this with what comes from workers.
+        """
+        parted = _parted.get(self.key[0])
+        if parted is not None and self.key[1] != _FILLER:
+            parted.add(self, pinned=True)
+        self.is_pinned = True
+        return self
+
+
+def make_part(
+    task: BatchPart,
+    memory: BatchMemory | None,
+    load: Callable[[Callable[[int], Allocate] | None], Iterator[Sample]],
+) -> MadePart:
+    """Make the samples of a task, in its slot if it has one.
+
+    Args:
+        task: The task.
+        memory: The slots.
+        load: Yields the samples as arrays and texts. It is given what allocates their arrays, by
+            their places in the task; None where they may lie anywhere.
+    """
+    made = MadePart(task.key, task.places)
+    arrays: BatchArrays | None = None
+    if memory is not None and task.slot is not None and task.layout is not None:
+        arrays = memory.arrays(task.slot, task.layout)
+    of_place = None if arrays is None else (lambda n: arrays.of_sample(task.places[n]))
+    try:
+        for sample in load(of_place):
+            made.samples.append(sample)
+    except StereoGenBenchError as error:
+        # Of a batch the first row's error is raised, whichever worker has met it.
+        error.add_note(traceback.format_exc())
+        made.failed = task.places[len(made.samples)], error
+        made.samples.clear()
+        return made
+    made.is_in_slot = not made.samples or (arrays is not None and arrays.holds_all)
+    if made.is_in_slot:
+        made.samples = [
+            {name: value for name, value in each.items() if isinstance(value, str)}
+            for each in made.samples
+        ]
+    return made
+
+
+def part_as_made(made: MadePart) -> MadePart:
+    """Send what a worker has made as it is: the ``collate_fn`` of workers."""
+    return made
+
+
+class Making(NamedTuple):
+    """How batches are made of samples.
+
+    Attributes:
+        collate_fn: Makes a batch of samples, in the process that trains.
+        buffers: Whether a batch may lie in its slot.
+        layout: Where fields lie in a slot; None where no batch has told.
+    """
+
+    collate_fn: Callable[[list[Sample]], Any]
+    buffers: Buffers
+    layout: Layout | None
+
+
+@dataclass(slots=True)
+class _Coming:
+    """A batch on its way: how many samples it has, its slot, and what has come of it.
+
+    ``whole`` is the batch where it was put together already.
+    """
+
+    count: int
+    slot: int | None
+    layout: Layout | None
+    parts: list[MadePart] = field(default_factory=list)
+    whole: Any = None
+
+
+class PartedBatches:
+    """The batches of one pass on their way: dealt to workers in parts, and put together.
+
+    Attributes:
+        layout: Where fields lie in a slot; None before the first batch has come.
+        work: What the workers have done.
+    """
+
+    layout: Layout | None
+
+    def __init__(
+        self,
+        batches: Iterator[Any],
+        of_all_ranks: GlobalBatches,
+        share: WorkerShare,
+        *,
+        memory: BatchMemory,
+        made_by: Making,
+        before: "PartedBatches | None",
+    ) -> None:
+        """Deal nothing yet.
+
+        Args:
+            batches: The batches of the pass.
+            of_all_ranks: Says which worker decodes which sample.
+            share: Whose batches they are.
+            memory: The slots.
+            made_by: How batches are made of samples.
+            before: The pass that the same workers served before. Its slots are free once torch has
+                waited for them, which is when it asks for the first task.
+        """
+        self.layout, self.work = made_by.layout, Work()
+        self._batches, self._of_all_ranks, self._share = batches, of_all_ranks, share
+        self._memory, self._made_by, self._before = memory, made_by, before
+        self._pass, self._due = next(_passes), 0
+        self._coming: dict[int, _Coming] = {}
+        _parted[self._pass] = self
+
+    def tasks(self) -> Iterator[BatchPart]:
+        """Yield the tasks of all workers, batch by batch."""
+        if self._before is not None:
+            self._before._discard()
+            self._before = None
+        nothing = BatchPart(_NOTHING, [], self._share, (self._pass, _FILLER))
+        for number, batch in enumerate(self._batches):
+            while self.layout is None and number > 0:
+                yield from [nothing] * self._share.workers
+            yield from self._parts(batch, number)
+
+    def _parts(self, batch: Any, number: int) -> list[BatchPart]:
+        """Return a batch's tasks, one for each worker."""
+        if not isinstance(batch, EpochBatch):
+            batch = EpochBatch(batch, epoch=0)
+        share, layout = self._share, self.layout
+        worker_of = np.full(len(batch), number % share.workers)
+        if batch.number is not None:
+            worker_of = self._of_all_ranks.workers_of(batch, share)
+        if layout is not None and (not layout.fields or layout.count < len(batch)):
+            layout = None
+        slot = None if layout is None else self._memory.take()
+        self._coming[number] = _Coming(len(batch), slot, layout)
+        parts = []
+        if batch.number is not None:
+            batch.open_runs = -(-batch.open_runs // share.workers)
+        for worker in range(share.workers):
+            own, key = share._replace(worker=worker), (self._pass, number)
+            places = np.flatnonzero(worker_of == worker).tolist()
+            if places:
+                parts.append(BatchPart(batch.at(places), places, own, key, slot, layout))
+            else:
+                parts.append(BatchPart(_NOTHING, [], own, key))
+        return parts
+
+    def next(self, results: Iterator[MadePart]) -> Any:
+        """Return the next batch.
+
+        Args:
+            results: What workers send, in the order of the tasks.
+
+        Raises:
+            StopIteration: If there is none.
+            StereoGenBenchError: If samples could not be loaded: the error of the first of them.
+        """
+        is_pinned, came = False, 0
+        while came < self._share.workers:
+            made = next(results)
+            if made.key[1] == _FILLER:
+                continue
+            came, is_pinned = came + 1, made.is_pinned
+            if not is_pinned:
+                self.add(made)
+        coming = self._coming.pop(self._due)
+        self._due += 1
+        if coming.whole is not None:
+            return coming.whole
+        return self._put_together(coming, pinned=is_pinned)
+
+    def add(self, made: MadePart, *, pinned: bool = False) -> None:
+        """Take a part that came from a worker."""
+        coming = self._coming[made.key[1]]
+        coming.parts.append(made)
+        if made.work is not None:
+            self.work.add(made.work)
+        is_failed = any(part.failed is not None for part in coming.parts)
+        is_whole = len(coming.parts) == self._share.workers
+        if pinned and is_whole and not is_failed and self._made_by.collate_fn is collate:
+            coming.whole = self._put_together(coming, pinned=True)
+
+    def _put_together(self, coming: _Coming, *, pinned: bool) -> Any:
+        """Return a batch all of whose parts have come."""
+        failures = [part.failed for part in coming.parts if part.failed is not None]
+        if failures:
+            if coming.slot is not None:
+                self._memory.give_back(coming.slot)
+            raise min(failures, key=lambda failure: failure[0])[1]
+        tensors: dict[str, Any] = {}
+        if coming.slot is not None and coming.layout is not None:
+            tensors = self._memory.batch(coming.slot, coming.layout, count=coming.count)
+            if self._made_by.buffers == "fresh":
+                tensors = {name: tensor.clone() for name, tensor in tensors.items()}
+        samples: dict[int, Sample] = {}
+        for part in coming.parts:
+            samples |= zip(part.places, part.samples, strict=True)
+        rows = [samples[place] for place in range(coming.count)]
+        is_in_slot = all(part.is_in_slot for part in coming.parts) and coming.layout is not None
+        if coming.layout is not None and is_in_slot and self._made_by.collate_fn is collate:
+            batch: Any = {
+                name: tensors[name] if name in tensors else [row[name] for row in rows]
+                for name in coming.layout.fields
+            }
+        else:
+            if self.layout is None:
+                count = self._of_all_ranks.rule.batch_size
+                self.layout = Layout.of_samples(rows, count=count)
+            batch = self._made_by.collate_fn(self._samples(coming, tensors))
+        return pin_memory(batch) if pinned else batch
+
+    def _samples(self, coming: _Coming, tensors: dict[str, Any]) -> list[Sample]:
+        """Return the samples of a batch one by one, as tensors and texts."""
+        samples: dict[int, Sample] = {}
+        for part in coming.parts:
+            for place, sample in zip(part.places, part.samples, strict=True):
+                if part.is_in_slot and coming.layout is not None:
+                    samples[place] = {
+                        name: tensors[name][place] if name in tensors else sample[name]
+                        for name in coming.layout.fields
+                    }
+                else:
+                    samples[place] = to_tensors(sample)
+        return [samples[place] for place in range(coming.count)]
+
+    def _discard(self) -> None:
+        """Take the slots of what was not taken as free: no worker writes into them any more."""
+        while self._coming:
+            _, coming = self._coming.popitem()
+            if coming.slot is not None and coming.whole is None:
+                self._memory.give_back(coming.slot)
+
+
+_passes: Final = itertools.count()
+
+_parted: Final[weakref.WeakValueDictionary[int, PartedBatches]] = weakref.WeakValueDictionary()
+"""The passes of this process by their numbers, for torch's thread that pins memory."""
