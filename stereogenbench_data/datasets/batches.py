@@ -969,7 +969,7 @@ def warn_of_division(batches: EpochBatches, share: WorkerShare, *, videos_per_sc
         share: How they are divided among its workers.
         videos_per_scene: How many videos of an open scene are read.
     """
-    if not batches.rule.shuffle:
+    if not (batches.rule.shuffle and videos_per_scene):
         return
     order = batches.of_all_ranks.order(0)
     readers = share.world_size * (share.workers if share.of == "batches" else 1)

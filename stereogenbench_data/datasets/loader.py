@@ -583,7 +583,7 @@ class PairsLoader(DataLoader[Any]):
     def share(self) -> WorkerShare:
         """How the batches of this rank are divided among the workers."""
         batches, workers = self.batches, self.num_workers
-        is_by_streams = workers > 0 and (batches.rule.shuffle or self._holds_runs)
+        is_by_streams = workers == 0 or batches.rule.shuffle or self._holds_runs
         return WorkerShare(
             batches.rank,
             batches.world_size,

@@ -174,7 +174,8 @@ def groups_for(runs: Runs, *, batch_size: int, fitting: int, world_size: int) ->
     """Return how many groups a selection has where nobody asks for a number of them.
 
     Groups are needed for ranks alone: the usual number, or fewer where a group would have fewer
-    runs than a batch can show, is raised to a multiple of the ranks.
+    runs than a batch can show, is raised to a multiple of the ranks; not where there are fewer runs
+    than all ranks' batches can show, so that ranks share groups, and decode the same.
 
     Args:
         runs: The runs of the selection.
@@ -184,8 +185,10 @@ def groups_for(runs: Runs, *, batch_size: int, fitting: int, world_size: int) ->
     """
     most = max(1, _as_long_as_the_longest(runs.lengths) // batch_size)
     usual = usual_groups(batch_size=batch_size, fitting=fitting)
-    groups = -(-_power_of_two(min(usual, most)) // world_size) * world_size
-    return groups if groups <= most else max(1, most // world_size) * world_size
+    groups = _power_of_two(min(usual, most))
+    if world_size > most:
+        return groups
+    return min(-(-groups // world_size), most // world_size) * world_size
 
 
 def open_runs_for(runs: Runs, *, batch_size: int, fitting: int, groups: int) -> int:

@@ -5,7 +5,7 @@ import torch
 from torch.utils.data import DataLoader, default_collate
 
 from stereogenbench_data import PAIR_FIELDS, StateError, StereoPairs, collate
-from stereogenbench_data.datasets.batch_buffers import KEPT_BUFFERS, SLOTS
+from stereogenbench_data.datasets.batch_buffers import KEPT_BUFFERS
 from tests.datasets.conftest import same
 
 FIELDS = ("left", "disparity", "valid", "baseline_m", "frame_index", "__key__")
@@ -79,7 +79,9 @@ def places(loader):
     return found
 
 
-@pytest.mark.parametrize(("workers", "most"), [(0, KEPT_BUFFERS), (1, SLOTS + 2)])
+# With workers: two batches a worker on their way, what the loop holds, and the first, which comes
+# before it is known where fields lie.
+@pytest.mark.parametrize(("workers", "most"), [(0, KEPT_BUFFERS), (1, 2 + 2), (2, 4 + 2)])
 def test_a_loop_that_lets_its_batches_go_uses_the_same_memory_again(pairs, workers, most):
     found = places(pairs.loader(9, num_workers=workers))
 
@@ -94,7 +96,7 @@ def test_passes_broken_off_cost_workers_that_persist_no_memory(pairs):
             del batch
 
     assert len(places(loader)) == 15
-    assert len(set(places(loader))) <= 2 * SLOTS
+    assert len(set(places(loader))) <= 4 + 1
 
 
 def test_fresh_buffers_give_each_batch_memory_of_its_own(pairs, small_index):

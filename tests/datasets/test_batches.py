@@ -48,16 +48,18 @@ def test_a_position_is_flat_json_and_says_what_it_belongs_to(keyed):
 
     assert json.loads(json.dumps(state)) == state
     assert state == {
-        "version": 4,
+        "version": 5,
         "epoch": 0,
         "batches_consumed": 4,
         "seed": 3,
         "batch_size": 4,
-        "shuffle_groups": 2,
+        "shuffle_groups": 1,
         "open_scenes": 4,
         "open_frames": 1,
         "shuffle": True,
         "drop_last": True,
+        "scenes": 4,
+        "samples": 140,
         "selection": keyed.plan.digest,
         "index": keyed.index.digest,
     }
@@ -76,23 +78,22 @@ def test_what_is_loaded_goes_on_once_and_then_epochs_are_whole(keyed):
     ("options", "message"),
     [
         ({"batch_size": 5}, "batch_size is 5 here and 4 there"),
-        ({"batch_size": 1, "shuffle_groups": 2}, "shuffle_groups is 2 here and 4 there"),
+        ({"shuffle_groups": 2}, "shuffle_groups is 2 here and 1 there"),
         ({"shuffle": False}, "shuffle is False here and True there"),
         ({"drop_last": "pad", "seed": 2}, "seed is 2 here.*; drop_last is 'pad' here"),
     ],
     ids=str,
 )
 def test_a_position_in_another_order_is_refused_by_name(keyed, options, message):
-    size = 1 if options.get("batch_size") == 1 else 4
-    state = EpochBatches(keyed, size).state_dict()
+    state = EpochBatches(keyed, 4).state_dict()
 
     with pytest.raises(StateError, match=message):
-        EpochBatches(keyed, **({"batch_size": size} | options)).load_state_dict(state)
+        EpochBatches(keyed, **({"batch_size": 4} | options)).load_state_dict(state)
 
 
 @pytest.mark.parametrize(
     "options",
-    [{"shuffle_groups": 12, "open_scenes": 40}, {"open_scenes": 4}],
+    [{"shuffle_groups": 1, "open_scenes": 40}, {"open_scenes": 4}],
     ids=str,
 )
 def test_options_that_few_scenes_leave_without_effect_are_the_same_order(keyed, options):
@@ -112,16 +113,57 @@ def test_a_sequential_position_goes_with_any_seed(keyed):
 def test_a_position_in_another_selection_is_refused_by_name(keyed, small_index):
     state = EpochBatches(keyed, 4).state_dict()
     options = {"fields": ("__key__",), "frames": "all"}
-    for other in (
-        StereoPairs(small_index, pairs="all", **options),
-        StereoPairs(small_index, pairs="adjacent", direction="right_to_left", **options),
-        StereoPairs(small_index, pairs="adjacent", fields=("__key__",), frames=list(range(1, 7))),
-        StereoPairs(small_index, pairs="adjacent", split="train", **options),
+    shifted = options | {"frames": list(range(1, 7))}
+    for other, said in (
+        (StereoPairs(small_index, pairs="all", **options), "samples is 420 here and 140 there"),
+        (
+            StereoPairs(small_index, pairs="adjacent", direction="right_to_left", **options),
+            "as many samples of as many scenes are selected, and other scenes, pairs, frames",
+        ),
+        (StereoPairs(small_index, pairs="adjacent", **shifted), "samples is 120 here and 140"),
+        (
+            StereoPairs(small_index, pairs="adjacent", split="train", **options),
+            "scenes is 3 here and 4 there; samples is 105 here and 140 there",
+        ),
     ):
-        with pytest.raises(StateError, match=r"selection is '[0-9a-f]{64}' here and"):
-            EpochBatches(other, 4, seed=0).load_state_dict(state)
-    with pytest.raises(StateError, match=r"index is '[0-9a-f]{64}' here and '0{64}' there"):
+        with pytest.raises(StateError, match=said):
+            EpochBatches(other, 4, seed=0, shuffle_groups=1, open_scenes=4).load_state_dict(state)
+    with pytest.raises(StateError, match="the index is another one: its files were changed, or"):
         EpochBatches(keyed, 4).load_state_dict(state | {"index": "0" * 64})
+
+
+def test_other_ranks_go_on_with_the_groups_of_a_state(keyed):
+    """The order follows the number of ranks at the first start alone."""
+    first = EpochBatches(keyed, 1, rank=1, world_size=3)
+    state = json.loads(json.dumps(first.state_at(2, 9)))
+    left = []
+    for rank in (0, 1):
+        batches = EpochBatches(keyed, 1, rank=rank, world_size=2)
+        assert batches.rule.shuffle_groups == 4
+        batches.load_state_dict(state)
+        assert batches.rule == first.rule
+        left.insert(0, list(batches))  # batch 9 is rank 1's
+
+    keyed.set_epoch(2)
+    whole = [list(EpochBatches(keyed, 1, rank=rank, world_size=3)) for rank in range(3)]
+    assert first.rule.shuffle_groups == 3
+    assert in_turn(left)[:-1] == in_turn(whole)[9:]
+    asked = EpochBatches(keyed, 1, shuffle_groups=4)
+    with pytest.raises(StateError, match="shuffle_groups is 4 here and 3 there"):
+        asked.load_state_dict(state)
+
+
+@pytest.mark.parametrize("then", [1, 3])
+def test_after_an_epochs_last_batch_other_ranks_begin_the_next_one(keyed, then):
+    """Three ranks drop what fills no batch of each of them: that is not left for fewer."""
+    before = [EpochBatches(keyed, 9, rank=rank, world_size=4) for rank in range(4)]
+    states = [list(batches) and batches.state_dict() for batches in before]
+    assert states == [states[0]] * 4
+
+    loader = keyed.loader(9, rank=0, world_size=then)
+    loader.load_state_dict(states[0])
+    assert loader.epoch == 1
+    assert loader.state_dict()["batches_consumed"] == 0
 
 
 @pytest.mark.parametrize(
@@ -129,8 +171,8 @@ def test_a_position_in_another_selection_is_refused_by_name(keyed, small_index):
     [
         ({"batches_consumed": -1}, "batches_consumed is -1, no whole number"),
         ({"epoch": "2"}, "epoch is '2', no whole number"),
-        ({"version": True}, "version is 4 here and True there"),
-        ({"version": 2, "order": "shuffled", "tail": "drop"}, "version is 4 here and 2 there"),
+        ({"version": True}, "of version True of the order, and this release has version 5"),
+        ({"version": 4, "order": "shuffled"}, "of version 4 of .* Begin its epoch anew, set_epoch"),
         ({"batches_consumed": 36}, "batches_consumed is 36, and there are 35"),
     ],
 )

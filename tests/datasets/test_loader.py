@@ -17,7 +17,11 @@ from stereogenbench_data import (
     SceneIndex,
     StereoPairs,
 )
-from stereogenbench_data.datasets.batches import OpenVideosWarning, RepeatedDecodingWarning
+from stereogenbench_data.datasets.batches import (
+    IdleWorkersWarning,
+    OpenVideosWarning,
+    RepeatedDecodingWarning,
+)
 from stereogenbench_data.selection.order import OrderRule
 from tests.datasets.conftest import flat, in_turn, keys_of
 
@@ -274,7 +278,7 @@ def test_each_frame_is_decoded_once_and_scenes_are_opened_again_for_their_beginn
 def test_a_scene_that_is_parted_between_groups_is_read_forwards_in_each(small_index, read):
     """One process reads both groups; one decoder for them would go to and fro."""
     pairs = StereoPairs(small_index, frames="all", fields=("left",))
-    loader = pairs.loader(6, drop_last=False)
+    loader = pairs.loader(6, drop_last=False, shuffle_groups=2)
     order = loader.batches.of_all_ranks.order(0)
     assert order.groups == 2
     groups = [
@@ -304,46 +308,54 @@ def test_too_many_open_videos_are_warned_of(small_index, monkeypatch):
     monkeypatch.setattr("resource.getrlimit", lambda which: (160, 160))
     pairs = StereoPairs(small_index, pairs="all", frames="all")
 
-    with pytest.warns(OpenVideosWarning, match=r"up to 88 videos .* may open 32.*ulimit -n 216"):
+    with pytest.warns(OpenVideosWarning, match=r"up to 44 videos .* may open 32.*ulimit -n 172"):
         loader = pairs.loader(4)
-    assert loader.stats().videos_limit == 32
+    for number, _ in enumerate(loader):
+        assert loader.stats().videos_open <= loader.stats().videos_limit == 32
+        if number == 20:
+            break
+    assert pairs.loader(4, num_workers=2).num_workers == 2  # of half as many videos each
 
 
-@pytest.mark.parametrize(
-    ("workers", "options", "said"),
-    [
-        (8, {}, r"by 2 processes, as 8 \(ranks times workers\) read 4 .*: .*shuffle_groups=8"),
-        (2, {"world_size": 2, "rank": 1, "shuffle_groups": 2}, "by 2 processes, as 4 .*_groups=4"),
-    ],
-)
-def test_workers_that_decode_the_same_videos_are_warned_of(small_index, workers, options, said):
-    scene = small_index.scene(0)
-    ids = (replace(scene.id, key=f"{scene.id.key}{number}") for number in range(16))
-    index = SceneIndex.from_scenes([replace(scene, id=each) for each in ids], small_index.root)
-    pairs = StereoPairs(index, frames=range(2), fields=("left",))
-
+def test_ranks_that_decode_the_same_videos_are_warned_of(small_index):
+    pairs = StereoPairs(small_index, frames=range(2), fields=("left",))
+    said = r"decoded 2 times, as 2 processes read 1 .* of 4 scenes. Use fewer ranks or a smaller"
     with pytest.warns(RepeatedDecodingWarning, match=said):
-        pairs.loader(1, num_workers=workers, **options)
-    for few in (4, 32):  # A group each; more workers than scenes.
-        assert pairs.loader(1, num_workers=few).num_workers == few
+        pairs.loader(4, rank=1, world_size=2)
+
+    assert pairs.loader(2, rank=1, world_size=2).batches.rule.shuffle_groups == 2
+    assert pairs.loader(4, rank=1, world_size=2, shuffle_groups=2).batches.world_size == 2
+
+
+def test_workers_who_have_nothing_to_do_are_warned_of(small_index):
+    pairs = StereoPairs(small_index, frames="all", fields=("left", "__key__"))
+    said = "3 of 7 workers have nothing to do: a rank has 4 scenes open.* Use num_workers=4, or"
+    with pytest.warns(IdleWorkersWarning, match=said):
+        loader = pairs.loader(4, num_workers=7)
+    assert keys_of(loader) == keys_of(pairs.loader(4, num_workers=4))
 
 
 @pytest.mark.parametrize(
-    ("side_px", "selection", "expected", "shuffle_groups", "frames_of_16"),
+    ("side_px", "selection", "expected", "shuffle_groups", "frames_of_32"),
     [
-        (1280, {}, 16, 4, 1),
-        (1280, {"pairs": "all"}, 4, 2, 3),
-        (480, {"pairs": "all"}, 16, 4, 1),
-        (8192, {"pairs": "all"}, 2, 2, 1),
+        (1280, {}, 8, 8, 1),
+        (1280, {"pairs": "all"}, 4, 4, 2),
+        (480, {"pairs": "all"}, 13, 8, 1),
+        (8192, {"pairs": "all"}, 2, 1, 1),
     ],
     ids=str,
 )
 def test_scenes_of_large_pictures_are_interleaved_in_smaller_numbers(
-    small_index, side_px, selection, expected, shuffle_groups, frames_of_16
+    small_index, side_px, selection, expected, shuffle_groups, frames_of_32
 ):
+    scenes = [small_index.scene(number % 4) for number in range(100)]
     scenes = [
-        replace(scene, rig=replace(scene.rig, image_width_px=side_px, image_height_px=side_px))
-        for scene in map(small_index.scene, range(4))
+        replace(
+            scene,
+            id=replace(scene.id, key=f"{scene.id.key}{number}"),
+            rig=replace(scene.rig, image_width_px=side_px, image_height_px=side_px),
+        )
+        for number, scene in enumerate(scenes)
     ]
     index = SceneIndex.from_scenes(scenes, small_index.root)
     options = {"frames": "all", "fields": ("__key__",), **selection}
@@ -351,7 +363,7 @@ def test_scenes_of_large_pictures_are_interleaved_in_smaller_numbers(
 
     assert pairs.loader(4).batches.rule.open_scenes == expected
     assert pairs.loader(4).batches.rule.open_frames == 1
-    assert pairs.loader(16).batches.rule.open_frames == frames_of_16
+    assert pairs.loader(32).batches.rule.open_frames == frames_of_32
     assert pairs.loader(4).batches.rule.shuffle_groups == shuffle_groups
     assert pairs.loader(4, num_workers=3).batches.rule == pairs.loader(4).batches.rule
     others = StereoPairs(index, **(options | {"fields": ("depth",)}))

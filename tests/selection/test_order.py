@@ -14,7 +14,9 @@ from stereogenbench_data.selection.order import (
     EpochOrder,
     OrderRule,
     Runs,
+    groups_for,
     last_batch,
+    open_runs_for,
     rank_share,
 )
 
@@ -32,6 +34,20 @@ def order_of(lengths, *, pairs=1, key_distance=1, epoch=0, **rule):
     """Return the order of runs with so many moments each."""
     rule = OrderRule(**({"batch_size": 16} | rule))
     return EpochOrder(runs_of(lengths, pairs=pairs, key_distance=key_distance), rule, epoch=epoch)
+
+
+NO_LIMIT = 10**6
+"""So many open runs fit into memory."""
+
+
+def usual_order(lengths, batch_size, *, world_size=1, fitting=NO_LIMIT, **options):
+    """Return the order that runs have where nobody asks for groups or open runs."""
+    runs = runs_of(lengths, pairs=options.pop("pairs", 1))
+    groups = groups_for(runs, batch_size=batch_size, fitting=fitting, world_size=world_size)
+    opened = open_runs_for(runs, batch_size=batch_size, fitting=fitting, groups=groups)
+    seed, epoch = options.get("seed", 0), options.get("epoch", 0)
+    rule = OrderRule(batch_size, seed=seed, shuffle_groups=groups, open_scenes=opened)
+    return EpochOrder(runs, rule, epoch=epoch)
 
 
 def run_of(order, numbers):
@@ -109,8 +125,7 @@ def test_moments_of_a_run_ascend_but_for_where_a_stream_starts(lengths, rule):
             assert (np.diff(moments) < 0).sum() <= 1
             parts += 1
 
-    streams = order.groups * order.rule.most_open(order.runs.lengths)
-    assert goes_back <= streams
+    assert goes_back <= sum(map(order.streams, range(order.groups)))
     assert parts - len(lengths) <= order.groups - 1
 
 
@@ -120,7 +135,8 @@ def test_the_last_sample_of_each_part_of_a_run_is_marked(lengths, rule):
     order = order_of(lengths, **rule)
     seen, wanted = set(), set()
     for number in range(order.batches):
-        seen |= set(order.batch(number)[order.ends_run(number)].tolist())
+        batch = order.described(number)
+        seen |= set(batch.samples[batch.ends_run].tolist())
     if not order.rule.shuffle:
         wanted = set((order.runs.first_sample[1:] - 1).tolist())
     else:
@@ -132,8 +148,8 @@ def test_the_last_sample_of_each_part_of_a_run_is_marked(lengths, rule):
 
 
 @pytest.mark.parametrize("runs", [3, 13, 2123])
-@pytest.mark.parametrize("open_scenes", [1, 4, 15])
-def test_a_small_number_of_open_runs_is_reached_and_never_exceeded(runs, open_scenes):
+@pytest.mark.parametrize("open_scenes", [1, 4, 15, 64])
+def test_the_number_of_open_runs_is_reached_and_never_exceeded(runs, open_scenes):
     order = order_of([7] * runs, batch_size=1, shuffle_groups=1, open_scenes=open_scenes)
     numbers = group_of(order, 0)
     place = np.argsort(numbers)
@@ -142,7 +158,7 @@ def test_a_small_number_of_open_runs_is_reached_and_never_exceeded(runs, open_sc
     opened = np.searchsorted(first, np.arange(len(numbers)), side="right")
     closed = np.searchsorted(last, np.arange(len(numbers)))
 
-    assert (opened - closed).max() == min(runs, open_scenes)
+    assert (opened - closed).max() == order.streams(0) == min(runs, open_scenes)
 
 
 @pytest.mark.parametrize("batches", [1, 15, 40])
@@ -186,7 +202,7 @@ def test_wrapped_batches_go_on_from_the_epochs_start():
     assert wrapped == (epoch * 3)[:100]
 
 
-def test_the_order_of_version_4_never_changes():
+def test_the_order_of_version_5_never_changes():
     """If this fails, orders that users have saved positions in have changed: see ORDER_VERSION."""
     order = order_of(
         [3, 4, 5, 4, 3, 4, 5, 4], batch_size=4, shuffle_groups=2, open_scenes=2, seed=7, epoch=3
@@ -207,7 +223,7 @@ def test_how_much_is_ordered_at_a_time_changes_nothing(monkeypatch):
     assert all_batches(order_of(lengths, pairs=3, batch_size=5, shuffle_groups=2)) == whole
 
 
-PINNED_SHA256 = "1543305132e0c660fd544e2477d9f6ace19134f950d89e6ac096a907a9450469"
+PINNED_SHA256 = "6975469ad1221e0a5077bba3484393b0a72b2bd242cc31931861594000322c89"
 PINNED = [
     [2, 28, 3, 29],
     [16, 22, 17, 23],
@@ -245,7 +261,7 @@ def test_a_batch_of_16_holds_at_least_12_scenes_of_64_or_more(scenes, lengths):
         "some pairs": generator.integers(1, 16, scenes) * 9,
     }[lengths]
     for seed in range(3):
-        order = order_of(found, seed=seed, epoch=seed)
+        order = usual_order(found, 16, seed=seed, epoch=seed)
         batches = range(min(1000, order.samples // 16))
         runs = run_of(order, np.array([order.batch(number) for number in batches]))
         assert different(runs).min() >= 12
@@ -257,7 +273,7 @@ INDEPENDENT = np.random.default_rng(0).integers(0, 81, (4000, 16)).std(axis=1).m
 
 @pytest.mark.parametrize("scenes", [64, 2000])
 def test_whole_scenes_are_not_in_step(scenes):
-    order = order_of([81] * scenes)
+    order = usual_order([81] * scenes, 16)
     _, frames = shown(order, range(min(2000, order.samples // 16)))
     spread = frames.std(axis=1)
 
@@ -303,10 +319,107 @@ def test_in_a_block_each_pair_is_read_at_ascending_moments(lengths, rule):
 
 
 @pytest.mark.parametrize(
-    ("scenes", "groups"), [(1, 1), (3, 1), (4, 2), (15, 2), (63, 2), (64, 4), (9000, 4)]
+    ("scenes", "groups"), [(1, 1), (3, 1), (4, 2), (15, 2), (47, 4), (64, 8), (9000, 8)]
 )
-def test_small_selections_have_fewer_groups(scenes, groups):
-    assert order_of([5] * scenes).groups == groups
+def test_small_selections_have_fewer_groups_than_were_asked_for(scenes, groups):
+    assert order_of([5] * scenes, batch_size=8).groups == groups
+
+
+@pytest.mark.parametrize(
+    ("scenes", "batch_size", "fitting", "expected"),
+    [
+        (64, 8, NO_LIMIT, (8, 8)),
+        (7754, 8, NO_LIMIT, (8, 8)),
+        (7754, 16, NO_LIMIT, (4, 16)),
+        (7754, 24, NO_LIMIT, (2, 32)),
+        (7754, 100, NO_LIMIT, (1, 100)),
+        (7754, 1, NO_LIMIT, (8, 8)),
+        (7754, 8, 17, (2, 8)),
+        (500, 8, NO_LIMIT, (8, 9)),
+        (500, 8, 64, (8, 8)),
+        (100, 16, NO_LIMIT, (4, 25)),
+        (4, 8, NO_LIMIT, (1, 4)),
+    ],
+)
+def test_about_64_runs_are_open_in_groups_that_fill_a_batch(scenes, batch_size, fitting, expected):
+    """As far as memory allows; with few runs a stream some more, so that streams are even."""
+    order = usual_order([81] * scenes, batch_size, fitting=fitting)
+
+    assert (order.groups, order.rule.open_scenes) == expected
+
+
+@pytest.mark.parametrize(
+    ("ranks", "groups"), [(1, 8), (2, 8), (4, 8), (8, 8), (3, 9), (64, 64), (969, 969), (970, 8)]
+)
+def test_groups_are_raised_to_a_multiple_of_the_ranks_while_their_batches_have_scenes(
+    ranks, groups
+):
+    assert usual_order([81] * 7754, 8, world_size=ranks).groups == groups
+
+
+def packets_of(order, *, ranks, workers):
+    """Return how many packets workers decode for each sample, of runs with one key frame each.
+
+    Every worker keeps a video open from the first of its samples to the last of a part.
+    """
+    apart = np.gcd(order.groups, ranks)
+    packets = 0
+    for rank in range(ranks):
+        groups = range(rank % apart, order.groups, apart)
+        reached = {}
+        for number in range(rank, order.batches, ranks):
+            batch = order.described(number)
+            own = order.workers_of(number, groups=groups, workers=workers)
+            runs = run_of(order, batch.samples)
+            places = batch.samples - order.runs.first_sample[runs]
+            for sample in zip(
+                own.tolist(), runs.tolist(), places.tolist(), batch.ends_run.tolist(), strict=True
+            ):
+                worker, run, place, ends_run = sample
+                video = worker, number % order.groups, run
+                before = reached.get(video, -1)
+                # A decoder that is behind goes on; another one begins at the key frame.
+                packets += place - before if place > before else place + 1
+                reached[video] = place
+                if ends_run:
+                    del reached[video]
+    return packets / order.samples
+
+
+@pytest.mark.parametrize(
+    ("scenes", "batch_size", "ranks", "workers", "most"),
+    [
+        (64, 8, 1, 3, 1.35),
+        (64, 8, 2, 7, 1.35),
+        (500, 8, 1, 6, 1.05),
+        (500, 8, 8, 2, 1.05),
+        (500, 16, 1, 14, 1.05),
+        (500, 16, 8, 3, 1.05),
+        (500, 1, 4, 16, 1.05),
+        (2177, 8, 64, 1, 1.10),
+        (2177, 8, 1, 5, 1.05),
+    ],
+)
+def test_workers_decode_each_video_about_once(scenes, batch_size, ranks, workers, most):
+    order = usual_order([81] * scenes, batch_size, world_size=ranks)
+
+    assert 1 <= packets_of(order, ranks=ranks, workers=workers) < most
+
+
+@pytest.mark.parametrize("workers", [1, 3, 8, 14])
+def test_each_stream_is_one_workers_and_workers_have_about_as_many(workers):
+    order = usual_order([81] * 200, 8, world_size=2)
+    for rank in (0, 1):
+        groups, found = range(rank, order.groups, 2), {}
+        for number in range(rank, order.batches, 2):
+            streams = order.described(number).stream.tolist()
+            own = order.workers_of(number, groups=groups, workers=workers).tolist()
+            for stream, worker in zip(streams, own, strict=True):
+                assert found.setdefault((number % order.groups, stream), worker) == worker
+        counts = np.bincount(list(found.values()), minlength=workers)
+
+        assert len(found) == sum(map(order.streams, groups))
+        assert counts.max() - counts.min() <= 1
 
 
 def test_memory_grows_with_the_runs_and_not_with_the_samples():
