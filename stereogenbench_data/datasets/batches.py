@@ -975,20 +975,17 @@ def warn_of_division(batches: EpochBatches, share: WorkerShare, *, videos_per_sc
     readers = share.world_size * (share.workers if share.of == "batches" else 1)
     groups = groups_of_rank(order.groups, share.rank, readers)
     open_scenes = sum(map(order.streams, groups))
-    together = readers // math.gcd(order.groups, readers)
-    if together > 1 and batches.dataset.plan.runs.lengths.max() > 1:
-        cure = (
-            "Use fewer ranks or a smaller batch_size, so that ranks times batch are no more than "
-            "the scenes."
-        )
-        if share.of == "batches":
-            cure = (
-                "Use pairs.loader(...), whose workers share the videos out, or as many workers as "
-                "divide the groups."
-            )
+    together, scenes = readers // math.gcd(order.groups, readers), len(order.runs.pairs)
+    cure = "Use fewer ranks or a smaller batch_size: ranks times batch at most the scenes."
+    is_avoidable = True
+    if share.of == "batches":
+        cure = "Use pairs.loader(...), whose workers share the videos out, or shuffle_groups="
+        cure += f"{readers}, which is another order."
+        is_avoidable = readers * batches.batch_size <= scenes
+    if together > 1 and is_avoidable and order.runs.lengths.max() > 1:
         warnings.warn(
             f"every video is decoded {together} times, as {readers} processes read {order.groups} "
-            f"shuffle groups of {len(batches.dataset.plan.scene_rows)} scenes. {cure}",
+            f"shuffle groups of {scenes} runs of frames. {cure}",
             RepeatedDecodingWarning,
             stacklevel=5,
         )

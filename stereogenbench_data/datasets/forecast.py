@@ -191,15 +191,18 @@ def planned_bytes(pairs: StereoPairs, batch_size: int, *, workers: int) -> tuple
         index = copy.copy(index)
         index.root = "https://forecast.invalid"  # stands for their place, and is never asked
     batches, own = pairs.loader(batch_size, drop_last=False).batches, pairs.with_own_videos()
-    own.keep_open(batches, processes=workers)
+    own.read_by(batches, WorkerShare(0, 1, 0, workers, "streams"))
+    scenes, frames = batches.rule.open_scenes * batches.of_all_ranks.order(0).groups, 1
+    videos, frames = scenes * len(VIDEO_FILES), batches.rule.open_frames
     requests = count = samples = 0
-    for worker in range(min(workers, batches.end())):
+    for worker in range(workers):
         ahead = PlannedFetches()
         decoder = SampleLoader(index, pairs.request, check="metadata", frames="shared", ahead=ahead)
-        decoder.keep_open(own.stats().videos_limit, frames=batches.rule.open_frames)
-        first = batches.of_all_ranks.batch(worker, epoch=0)
-        decoder.expect(own.steps(first, first))
-        for step in itertools.islice(own.steps(first, first), _MOST_PLANNED - samples):
+        decoder.keep_open(videos, frames=frames, scenes=scenes)
+        share = WorkerShare(0, 1, worker, workers, "streams")
+        decoder.expect(own.steps_of_epoch(share))
+        most = -(-_MOST_PLANNED // workers)
+        for step in itertools.islice(own.steps_of_epoch(share), most):
             decoder.begin(step.address)
             decoder.end(step.address)
             samples += 1

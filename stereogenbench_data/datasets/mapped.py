@@ -394,6 +394,11 @@ class _MappedScenes(Dataset[Sample]):
                 batch = batch.at(np.flatnonzero(known.workers_of(batch, share) == share.worker))
             reading = batch
 
+    def steps_of_epoch(self, share: WorkerShare) -> Iterator[Step]:
+        """Yield what a worker reads in epoch 0 of the batches that this dataset is read by."""
+        before = EpochBatch((), epoch=0, number=share.rank - share.batches_apart)
+        return self.steps(before, (), share)
+
     def _address(self, number: int, batch: EpochBatch) -> Address:
         address = self.plan.locate(number % len(self.plan), epoch=batch.epoch, group=batch.group)
         return address._replace(run=0) if batch.number is None else address

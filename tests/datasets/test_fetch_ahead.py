@@ -99,6 +99,7 @@ def test_the_first_frame_of_a_pair_takes_a_request_a_stream(served, large_shards
     assert sum(each.sent for each in asked) <= 1.05 * needed_bytes(large_shards, 0)
 
 
+@pytest.mark.filterwarnings("ignore:1 of 2 workers have nothing to do")
 @pytest.mark.parametrize(
     ("frames", "workers"), [("all", 2), (("random", 3), 0), (("clips", 3), 2)], ids=str
 )

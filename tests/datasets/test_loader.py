@@ -319,7 +319,7 @@ def test_too_many_open_videos_are_warned_of(small_index, monkeypatch):
 
 def test_ranks_that_decode_the_same_videos_are_warned_of(small_index):
     pairs = StereoPairs(small_index, frames=range(2), fields=("left",))
-    said = r"decoded 2 times, as 2 processes read 1 .* of 4 scenes. Use fewer ranks or a smaller"
+    said = r"decoded 2 times, as 2 processes read 1 .* of 4 runs .* Use fewer ranks or a smaller"
     with pytest.warns(RepeatedDecodingWarning, match=said):
         pairs.loader(4, rank=1, world_size=2)
 
