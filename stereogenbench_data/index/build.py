@@ -124,6 +124,7 @@ class Tree:
         keys: The wanted scenes, sorted.
         refused: Path to reason and cure, for folders of misplaced scenes.
         is_part: Whether the user chose only some of the scenes.
+        others: The scenes that were not wanted.
         is_marked: Whether some scene, wanted or not, is known to have its completion mark.
         cache: Where what is found out is kept.
         remote: What lists the files behind the URL; None on this machine.
@@ -137,6 +138,7 @@ class Tree:
     keys: tuple[str, ...]
     refused: dict[str, str]
     is_part: bool
+    others: tuple[SceneId, ...]
     is_marked: bool
     cache: TreeCache
     remote: RemoteTree | None = None
@@ -161,7 +163,8 @@ class Tree:
             files, refused = self.remote.files(self.keys)
         refused = self.refused | dict(sorted(refused.items()))
         is_marked = self.is_marked or any(COMPLETE_JSON in each for each in files.values())
-        digest = hashlib.sha256(repr((self.is_part, is_marked, refused, self.keys)).encode())
+        chosen = (self.is_part, sorted(self.train_maps()), is_marked, refused, self.keys)
+        digest = hashlib.sha256(repr(chosen).encode())
         for item in files.items():
             digest.update(repr(item).encode())
         stamp = digest.hexdigest()[:32]
@@ -184,6 +187,11 @@ class Tree:
         if self.is_marked and COMPLETE_JSON not in files:
             raise unfinished(key)
         return files
+
+    def train_maps(self) -> set[str]:
+        """Return the maps of the scenes in train, wanted or not."""
+        scenes = [*map(parse_scene_key, self.keys), *self.others]
+        return {scene.map_name for scene in scenes if scene.split == "train"}
 
     @property
     def stated(self) -> Shape | None:
@@ -348,7 +356,8 @@ def find_tree(
     remote = RemoteTree(RemoteObject(str(root), retry=retry)) if is_remote(root) else None
     keys, refused = find_scene_folders(Path(root)) if remote is None else remote.scenes()
     is_marked = remote is None and any(Path(root, key, COMPLETE_JSON).exists() for key in keys)
-    chosen = [key for key in keys if wanted is None or wanted(parse_scene_key(key))]
+    ids = [parse_scene_key(key) for key in keys]
+    chosen = [scene.key for scene in ids if wanted is None or wanted(scene)]
     if not chosen and if_none == "refuse":
         there = sorted({key.rpartition("/")[0] for key in keys})
         more = f" and {len(there) - _NAMED} folders more" if len(there) > _NAMED else ""
@@ -362,6 +371,7 @@ def find_tree(
         tuple(chosen or keys),
         refused,
         is_part=wanted is not None and bool(chosen),
+        others=tuple(scene for scene in ids if chosen and wanted and not wanted(scene)),
         is_marked=is_marked,
         cache=TreeCache(root, " ".join(shape.text() for shape in shapes)),
         remote=remote,
@@ -405,8 +415,7 @@ def report_of(tree: Tree, of_keys: Mapping[str, Outcome]) -> TreeReport:
         for path, reason in (error.refused if isinstance(error, MisplacedScenes)
                              else {key: str(error)}).items()
     }  # fmt: skip
-    ids = [parse_scene_key(key) for key in tree.keys]
-    maps = {scene.map_name for scene in ids if scene.split == "train"} | TRAIN_MAPS
+    maps = tree.train_maps() | TRAIN_MAPS
     found = [out.found for out in outcomes if isinstance(out.found, Scene)]
     agreed = agreed_forms(scene.pose_form for scene in found if scene.pose_form)
     found = _without_unfetched([as_agreed(scene, agreed) for scene in found])

@@ -118,6 +118,7 @@ class SceneIndex:
         is_from_file: Whether it was read from an index file, so that scenes which it leaves out
             were left out on purpose.
         presumption: What reads the scenes whose rows are presumed; None where all were read.
+        others: The scenes of a folder without an index that were not wanted when it was opened.
     """
 
     def __init__(
@@ -143,6 +144,7 @@ class SceneIndex:
         self._digest = head.digest
         self._seek_tables = seek_tables
         self.presumption: Presumption | None = None
+        self.others: tuple[SceneId, ...] = ()
 
     @classmethod
     def open(
@@ -721,10 +723,6 @@ def _open_tree(
         tree = find_tree(root, wanted=wanted, if_none="all", conventions=conventions, retry=retry)
         is_large = len(tree.keys) >= (POOL_FROM if tree.remote is None else FEW_REMOTE)
         tree = tree.listed() if is_large else tree
-    if is_large and rows == "presumed" and not (tree.stated and tree.stated.has):
-        index = _open_presumed(tree, "read" if tree.remote is None else "when needed")
-        if index is not None:
-            return index
 
     def read() -> SceneIndex:
         if tree.remote is not None:
@@ -732,7 +730,12 @@ def _open_tree(
         # In this process: a script without `if __name__ == "__main__"` could start no others.
         return _of_report(walk_tree(tree, workers=1))
 
-    return (_once(tree, "read", read) if is_large else None) or read()
+    index = None
+    if is_large and rows == "presumed" and not (tree.stated and tree.stated.has):
+        index = _open_presumed(tree, "read" if tree.remote is None else "when needed")
+    index = index or (_once(tree, "read", read) if is_large else None) or read()
+    index.others = tree.others
+    return index
 
 
 def _open_presumed(tree: "Tree", baselines: "Baselines") -> SceneIndex | None:

@@ -186,14 +186,18 @@ def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray,
 
 
 def may_pass(filters: Mapping[str, Any]) -> Callable[[SceneId], bool] | None:
-    """Return whether a scene may pass filters, by its path alone; None if all may."""
+    """Return whether a scene may pass filters, by its path alone; None if all may.
+
+    All may where several characters or animations are named: their files alone say which there are.
+    """
     of_path = {
         name: {wanted} if isinstance(wanted, str) else set(wanted)
         for name, wanted in filters.items()
         if name in ("split", "subset", "family", "map", "scenes")
         and isinstance(wanted, str | list | tuple)
     }
-    if not of_path:
+    of_files = [filters.get(name) for name in ("character", "animation")]
+    if not of_path or any(isinstance(wanted, list | tuple) for wanted in of_files):
         return None
 
     def passes(scene: SceneId) -> bool:
@@ -205,6 +209,7 @@ def may_pass(filters: Mapping[str, Any]) -> Callable[[SceneId], bool] | None:
             any(str(part).strip("/").lower() in scene.key.lower() for part in wanted)
             if name == "scenes"
             else values[name] in wanted
+            or (name == "subset" and scene.split == "eval" and scene.subset is None)
             for name, wanted in of_path.items()
         )
 
@@ -221,17 +226,19 @@ def _apply(
 ) -> tuple[Bool[np.ndarray, " n"], Callable[[], str]]:
     """Return which rows one filter keeps, and what describes the values that there are."""
     if name in _TEXT_COLUMNS:
-        column = index.column(_TEXT_COLUMNS[name])
+        field = _TEXT_COLUMNS[name]
+        column = index.column(field)
         values = column[rows]
         names = _texts(name, wanted)
-        known = set(column.tolist())
+        there = [*column.tolist(), *(getattr(scene, field, None) for scene in index.others)]
+        known = set(there)
         if name == "scenes":  # parts of keys stand for whole ones
-            names = [key if key in known else str(column[find_scene(index, key)]) for key in names]
+            names = [key if key in known else _find_key(index, sorted(there), key) for key in names]
         nowhere = sorted(set(names) - known)
         if nowhere and len(nowhere) < len(set(names)):
             raise SelectionError(
-                f"{filter_text(name, nowhere[0])} matches none of {counted(len(column), 'scene')} "
-                f"of the index; found {_listed(column, near=nowhere)}{stale_note(index)}"
+                f"{filter_text(name, nowhere[0])} matches none of {counted(len(there), 'scene')} "
+                f"of the index; found {_listed(there, near=nowhere)}{stale_note(index)}"
             )
         return np.isin(values.astype(str), names), lambda: _listed(values, near=nowhere)
     if name in _RANGE_COLUMNS:
@@ -346,6 +353,11 @@ def find_scene(index: SceneIndex, text: str) -> int:
         SelectionError: If no key or several keys hold the text, naming those that are close.
     """
     keys = [str(key) for key in index.column("key")]
+    return keys.index(_find_key(index, keys, text))
+
+
+def _find_key(index: SceneIndex, keys: list[str], text: str) -> str:
+    """Return the one of sorted keys that a text stands for; see `find_scene`."""
     lowered = [key.lower() for key in keys]
     wanted = text.strip("/").lower()
     for matches in (
@@ -355,7 +367,7 @@ def find_scene(index: SceneIndex, text: str) -> int:
         [row for row, key in enumerate(lowered) if wanted in key],
     ):
         if len(matches) == 1:
-            return matches[0]
+            return keys[matches[0]]
         if matches:
             raise SelectionError(
                 f"{shortened(text)!r} is a part of {len(matches)} keys: "

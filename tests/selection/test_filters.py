@@ -1,5 +1,7 @@
 """Filters keep what they say and name themselves where nothing is left."""
 
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.selection.filters import filter_scenes
+from stereogenbench_data.selection.filters import filter_scenes, may_pass
 from tests.selection.conftest import made_scene
 
 
@@ -89,3 +91,38 @@ def test_whole_folders_of_one_key_win_over_a_part_of_others():
     index = SceneIndex.from_scenes(map(made_scene, both), Path("release"))
 
     assert keys(index, scenes="uniform") == both[1:]
+
+
+@pytest.fixture(scope="module")
+def nameless_release(small_release, tmp_path_factory):
+    """Three scenes in train, and two in eval: the folder of one does not tell its subset."""
+    root = tmp_path_factory.mktemp("nameless") / "release"
+    shutil.copytree(small_release, root, copy_function=os.link)
+    seen = root / "eval" / "MapSeenInTrain"
+    shutil.copytree(seen, seen.with_name("Other"), copy_function=os.link)
+    return root
+
+
+@pytest.mark.parametrize(
+    ("filters", "expected"),
+    [
+        ({"split": ("train", "eval"), "family": "IPD_Gaussian"}, 1),
+        ({"split": "eval", "family": ("IPD_Gaussian", "Uniform")}, 2),
+        ({"split": "eval", "character": ("SK_Synth11", "SK_Synth16")}, 2),
+        ({"split": "train", "family": ("Uniform", "Nope")}, "Nope matches none of 5 scenes of the"),
+        ({"split": "eval", "scenes": "scene_000000"}, "is a part of 4 keys"),
+        # Whether a map was seen is told by all of train, and not by the folder's name.
+        ({"split": "eval", "subset": "seen_map"}, 2),
+    ],
+    ids=str,
+)
+def test_a_folder_answers_as_its_index_does(nameless_release, filters, expected):
+    wholes = SceneIndex.open(nameless_release)
+    part = SceneIndex.open(nameless_release, wanted=may_pass(filters))
+
+    for index in (wholes, part):
+        if isinstance(expected, str):
+            with pytest.raises(SelectionError, match=expected):
+                keys(index, **filters)
+        else:
+            assert len(keys(index, **filters)) == expected
