@@ -87,16 +87,19 @@ def forecast(
 
 
 def _table(found: Any) -> str:
-    heads = ("accelerators", "machines", "cores", "workers", "MB/s", "requests/s", "fed", "limit")
+    heads = (
+        "accelerators", "machines", "cores each", "workers each", "MB/s in all",
+        "requests/s in all", "fed", "limit",
+    )  # fmt: skip
     lines = [
         f"A sample: {found.decoding_s * 1e3:.3g} ms of a core, {found.bytes / 1e3:,.1f} kB in "
         f"{found.requests:.3g} requests, each {found.delay_ms:.3g} ms until its first byte",
         "",
-        "{:>12}  {:>8}  {:>9}  {:>7}  {:>12}  {:>12}  {:>4}  {}".format(*heads),
+        "{:>12}  {:>8}  {:>10}  {:>12}  {:>12}  {:>17}  {:>4}  {}".format(*heads),
     ]
     lines += [
-        f"{each.accelerators:12,}  {each.machines:8,}  {each.cores:9,}  {each.workers:7,}  "
-        f"{each.mb_s:12,.1f}  {each.requests_s:12,.1f}  {each.share:4.0%}  {each.limit}"
+        f"{each.accelerators:12,}  {each.machines:8,}  {each.cores:10,}  {each.workers:12,}  "
+        f"{each.mb_s:12,.1f}  {each.requests_s:17,.1f}  {each.share:4.0%}  {each.limit}"
         for each in found.scales
     ]
     return "\n".join(lines)

@@ -14,7 +14,6 @@ Times are seconds of one sample; `machine_s`, `rate_s` and `demand_s` are sample
 
 import contextlib
 import copy
-import itertools
 import math
 import os
 import statistics
@@ -23,12 +22,15 @@ import timeit
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain, islice, repeat
 from typing import Any, Final
 
+from stereogenbench_data.datasets.batches import WorkerShare
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import SampleLoader
+from stereogenbench_data.schema.release import VIDEO_FILES
 from stereogenbench_data.sources.fetch_ahead import CONNECTIONS, PlannedFetches
 from stereogenbench_data.sources.location import is_remote, joined
 from stereogenbench_data.sources.remote import RemoteObject
@@ -45,10 +47,10 @@ class Scale:
     Attributes:
         accelerators: How many.
         machines: How many machines hold them.
-        cores: Cores that decode all that they take, of all machines.
-        workers: Workers that load all that they take, of each machine.
-        mb_s: 10^6 bytes a second that they take.
-        requests_s: Requests a second that they take.
+        cores: Cores of each machine that decode all that its accelerators take.
+        workers: Workers of each machine that load all that its accelerators take.
+        mb_s: 10^6 bytes a second that all of them take.
+        requests_s: Requests a second that all of them take.
         share: The part of their demand that is met.
         limit: What binds; "accelerators" where they get all they take.
     """
@@ -117,7 +119,7 @@ def forecast(  # noqa: PLR0913 - each names one thing that a user knows
         total_mb_s: Bandwidth of the server for all machines.
         requests_s: Requests a second that the server allows all machines together.
         batch_size: Samples in a batch.
-        measure_s: How long to decode, in seconds.
+        measure_s: How long to decode, in seconds; two batches of each worker at the least.
         **options: As for `StereoPairs`: fields, size, and the selection.
 
     Raises:
@@ -127,15 +129,21 @@ def forecast(  # noqa: PLR0913 - each names one thing that a user knows
     here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     cores = here if cores is None else cores
     workers = cores if workers is None else workers
-    numbers = {
-        "samples_s": samples_s, "accelerators": min(accelerators, default=0),
-        "per_machine": per_machine, "cores": cores, "workers": workers,
-        "connection_mb_s": connection_mb_s, "machine_mb_s": machine_mb_s,
-        "total_mb_s": total_mb_s, "requests_s": requests_s, "measure_s": measure_s,
-    }  # fmt: skip
-    for name, number in numbers.items():
+    finite = [
+        ("samples_s", samples_s), ("per_machine", per_machine), ("cores", cores),
+        ("workers", workers), ("measure_s", measure_s),
+        *(("accelerators", number) for number in [*accelerators] or [0]),
+    ]  # fmt: skip
+    limits = [
+        ("connection_mb_s", connection_mb_s), ("machine_mb_s", machine_mb_s),
+        ("total_mb_s", total_mb_s), ("requests_s", requests_s),
+    ]  # fmt: skip
+    for name, number in finite + limits:
         if not number > 0:
             raise SelectionError(f"{name} must be above 0, got {number!r}.")
+    for name, number in [*finite, ("delay_ms", delay_ms or 0)]:
+        if not 0 <= number < math.inf:
+            raise SelectionError(f"{name} must be a finite number from 0, got {number!r}.")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # advice on splits and workers: nothing is trained here
         pairs = StereoPairs(data, **options)
@@ -151,19 +159,20 @@ def forecast(  # noqa: PLR0913 - each names one thing that a user knows
         machines, demand = -(-number // per_machine), number * samples_s
         rates = {
             "accelerators": demand,
-            "processor": machines * min(workers, cores) / decoding_s,
-            "delay" if waits_s >= sends_s else "connection bandwidth": machines
-            * (workers / (waits_s + sends_s) if waits_s + sends_s else math.inf),
-            "machine bandwidth": machines * machine_mb_s * 1e6 / count,
-            "total bandwidth": total_mb_s * 1e6 / count,
-            "requests": requests_s / requests,
+            "processor": _rate(machines * min(workers, cores), decoding_s),
+            "delay" if waits_s >= sends_s else "connection bandwidth": _rate(
+                machines * workers, waits_s + sends_s
+            ),
+            "machine bandwidth": _rate(machines * machine_mb_s * 1e6, count),
+            "total bandwidth": _rate(total_mb_s * 1e6, count),
+            "requests": _rate(requests_s, requests),
         }
         limit = min(rates, key=rates.__getitem__)
         scales.append(
             Scale(
                 accelerators=number,
                 machines=machines,
-                cores=math.ceil(demand * decoding_s),
+                cores=math.ceil(demand / machines * decoding_s),
                 workers=math.ceil(demand / machines * worker_s),
                 mb_s=demand * count / 1e6,
                 requests_s=demand * requests,
@@ -172,6 +181,11 @@ def forecast(  # noqa: PLR0913 - each names one thing that a user knows
             )
         )
     return Forecast(len(pairs), decoding_s, count, requests, delay_ms, tuple(scales))
+
+
+def _rate(there: float, of_sample: float) -> float:
+    """Return the samples a second that something allows of which each sample takes so much."""
+    return there / of_sample if of_sample else math.inf
 
 
 def planned_bytes(pairs: StereoPairs, batch_size: int, *, workers: int) -> tuple[float, float]:
@@ -192,7 +206,7 @@ def planned_bytes(pairs: StereoPairs, batch_size: int, *, workers: int) -> tuple
         index.root = "https://forecast.invalid"  # stands for their place, and is never asked
     batches, own = pairs.loader(batch_size, drop_last=False).batches, pairs.with_own_videos()
     own.read_by(batches, WorkerShare(0, 1, 0, workers, "streams"))
-    scenes, frames = batches.rule.open_scenes * batches.of_all_ranks.order(0).groups, 1
+    scenes = batches.rule.open_scenes * batches.of_all_ranks.order(0).groups
     videos, frames = scenes * len(VIDEO_FILES), batches.rule.open_frames
     requests = count = samples = 0
     for worker in range(workers):
@@ -202,7 +216,7 @@ def planned_bytes(pairs: StereoPairs, batch_size: int, *, workers: int) -> tuple
         share = WorkerShare(0, 1, worker, workers, "streams")
         decoder.expect(own.steps_of_epoch(share))
         most = -(-_MOST_PLANNED // workers)
-        for step in itertools.islice(own.steps_of_epoch(share), most):
+        for step in islice(own.steps_of_epoch(share), most):
             decoder.begin(step.address)
             decoder.end(step.address)
             samples += 1
@@ -211,28 +225,30 @@ def planned_bytes(pairs: StereoPairs, batch_size: int, *, workers: int) -> tuple
 
 
 def _decoding_s(pairs: StereoPairs, batch_size: int, *, workers: int, seconds: float) -> float:
-    """Return the seconds of a core for a sample, timed once a third of the time has passed.
+    """Return the seconds of a core for a sample, measured once a third of the time has passed.
 
-    Local data are loaded by a worker on each core, since workers share memory and caches. Of data
-    behind a URL only the processor time is counted, of this process.
+    Local data are loaded by a worker on each core, since workers share memory and caches, and
+    counted is what each worker took for its samples. Of data behind a URL only the processor time
+    is counted, of this process.
     """
     reads_url = is_remote(pairs.index.root)
-    processes = 0 if reads_url else min(workers, -(-len(pairs) // batch_size))
-    clock = time.process_time if reads_url else time.perf_counter
-    began_s, start_s, samples = time.perf_counter(), 0.0, 0
-    loader = pairs.loader(
-        batch_size, num_workers=processes, persistent_workers=processes > 0, drop_last=False
-    )
+    loader = pairs.loader(batch_size, num_workers=0 if reads_url else workers, drop_last=False)
+
+    def done() -> tuple[int, float]:
+        work = loader.work()
+        spent_s = work.reading_s + work.decoding_s + work.making_s
+        return work.samples, time.process_time() if reads_url else spent_s
+
+    began_s, before = time.perf_counter(), None
     with contextlib.closing(loader):
-        while not samples or time.perf_counter() - began_s < seconds:
-            for batch in loader:
-                if start_s:
-                    samples += len(next(iter(batch.values())))
-                elif time.perf_counter() - began_s > seconds / 3:
-                    start_s = clock()
-                if samples and time.perf_counter() - began_s > seconds:
-                    break
-        return (clock() - start_s) / samples * max(1, processes)
+        for _ in chain.from_iterable(repeat(loader)):
+            passed_s = time.perf_counter() - began_s
+            if before is None and passed_s > seconds / 3:
+                before = done()
+            elif before is not None and passed_s > seconds and done()[0] > before[0]:
+                break
+        samples, spent_s = (after - first for after, first in zip(done(), before or (0, 0.0)))
+        return spent_s / samples
 
 
 def _delay_ms(index: SceneIndex) -> float:

@@ -666,7 +666,7 @@ class PairsLoader(DataLoader[Any]):
     def stats(self) -> LoaderStats:
         """Return what the loader has and holds now: open videos, workers, batches."""
         pids = {pid for each in _running for pid in each.pids_for(self)}
-        work = self._all_work()
+        work = self.work()
         videos = self.dataset.stats()
         epoch, taken = self.batches.passes.position
         return LoaderStats(
@@ -682,12 +682,12 @@ class PairsLoader(DataLoader[Any]):
             time=work.in_words(),
         )
 
-    def _all_work(self) -> Work:
-        """What was done for this loader, by its workers or by this process, in all its passes."""
+    def work(self) -> Work:
+        """Return what was done for this loader, by its workers or this process, in all passes."""
         self._work.add(self.dataset.take_work())
         for each in _running:
             self._work.add(each.take_work(self))
-        return self._work
+        return copy.copy(self._work)
 
     @cached_property
     def _mixing(self) -> str:

@@ -95,6 +95,7 @@ class Work:
     """What a process, or several together, have done for samples.
 
     Attributes:
+        samples: Samples that were made.
         packets_decoded: Packets given to decoders. More than frames used are decoded where a scene
             is begun inside, and where a video is decoded more than once.
         frames_used: Frames of videos that samples show, each once for every run in which it is
@@ -105,6 +106,7 @@ class Work:
         waiting_s: Seconds in which workers waited for tasks.
     """
 
+    samples: int = 0
     packets_decoded: int = 0
     frames_used: int = 0
     reading_s: float = 0.0
@@ -611,6 +613,7 @@ class SampleLoader:
             raise type(error)(f"{known.scene.id.key}, frames {address.frames}: {error}") from error
         finally:
             self.end(address)
+        work.samples += 1
         work.making_s += perf_counter() - began_s - (work.reading_s + work.decoding_s - before_s)
         return {name: writer.sample[name] for name in request.fields}
 

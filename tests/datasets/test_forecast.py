@@ -1,6 +1,7 @@
 """What limits a training: the formula by hand, its properties, and the command."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 
@@ -58,9 +59,11 @@ def test_what_accelerators_need_is_added_up(small_shards, costs):
     of = {"samples_s": 50, "accelerators": (20,), "cores": 32, "delay_ms": 60}
     found = forecast(small_shards, **of).scales[0]
 
-    assert (found.machines, found.cores, found.share, found.limit) == (3, 20, 1, "accelerators")
-    # 1000 samples/s of 3 machines by workers of max(20 ms, 3 * 60 ms / 8)
-    assert found.workers == math.ceil(1000 / 3 * 0.0225)
+    assert (found.machines, found.share, found.limit) == (3, 1, "accelerators")
+    # 1000 samples/s of 3 machines by cores of 20 ms and workers of max(20 ms, 3 * 60 ms / 8)
+    assert (found.cores, found.workers) == (7, 8) == (
+        math.ceil(1000 / 3 * 0.02), math.ceil(1000 / 3 * 0.0225),
+    )  # fmt: skip
     assert (found.mb_s, found.requests_s) == pytest.approx((400, 3000))
 
 
@@ -69,11 +72,51 @@ def test_what_accelerators_need_is_added_up(small_shards, costs):
     [
         ({"samples_s": 0}, "samples_s must be above 0, got 0"),
         ({"samples_s": 1, "accelerators": ()}, "accelerators must be above 0, got 0"),
+        ({"samples_s": math.inf}, "samples_s must be a finite number from 0, got inf"),
+        ({"samples_s": math.nan}, "samples_s must be above 0, got nan"),
+        ({"samples_s": 1, "accelerators": (1, math.inf)}, "accelerators must be a finite .* inf"),
+        ({"samples_s": 1, "delay_ms": -3}, "delay_ms must be a finite number from 0, got -3"),
     ],
 )
 def test_a_number_out_of_its_range_is_named(small_shards, options, message):
     with pytest.raises(SelectionError, match=message):
         forecast(small_shards, **options)
+
+
+def test_samples_without_pictures_ask_nothing_of_the_network(small_shards):
+    found = forecast(
+        small_shards, samples_s=1e-3, accelerators=(1,), fields=("caption", "scene"), measure_s=0.1,
+        delay_ms=60, machine_mb_s=1, total_mb_s=1, requests_s=1,
+    )  # fmt: skip
+
+    assert (found.bytes, found.requests, found.scales[0].limit) == (0, 0, "accelerators")
+
+
+class Batches:
+    """Batches of 8 samples that two workers make side by side, both always after 8 s more."""
+
+    def __init__(self, clock):
+        """Move a clock."""
+        self.clock = clock
+
+    def __iter__(self):
+        """Return those of a pass."""
+        for _ in range(10):
+            self.clock.now_s += 8
+            yield from [{"frame_index": range(8)}] * 2
+
+    def close(self):
+        """Have no worker to end."""
+
+
+@pytest.mark.parametrize("seconds", [1, 6, 30, 1000])
+def test_decoding_is_timed_truly_whatever_a_batch_takes(small_shards, monkeypatch, seconds):
+    clock = SimpleNamespace(now_s=0.0, perf_counter=lambda: clock.now_s)
+    monkeypatch.setattr(forecasting, "time", clock)
+    pairs = StereoPairs(small_shards, frames="all")
+    monkeypatch.setattr(pairs, "loader", lambda *args, **named: Batches(clock))
+
+    assert forecasting._decoding_s(pairs, 8, workers=2, seconds=seconds) == 1
 
 
 # What a sample takes.
@@ -147,5 +190,6 @@ def test_the_command_prints_a_table(small_shards, monkeypatch):
     assert text.exit_code == 0, text.output
     assert "each 60 ms until its first byte" in text.stdout
     lines = text.stdout.splitlines()
+    assert "machines  cores each  workers each   MB/s in all  requests/s in all" in lines[2]
     assert lines[-1].split()[:2] == ["10,000", "1,250"]
     assert lines[-1].endswith("total bandwidth")
