@@ -649,7 +649,7 @@ def _is_random(plan: Plan, request: Request) -> bool:
         return isinstance(plan.windows, Random)
     from stereogenbench_data.samples.transforms import Compose, Crop, Letterbox, Resize
 
-    steps = transform.transforms if isinstance(transform, Compose) else [transform]
+    steps = transform.steps() if isinstance(transform, Compose) else [transform]
     fixed = (Crop, Letterbox, Resize)
     return isinstance(plan.windows, Random) or not all(isinstance(step, fixed) for step in steps)
 
