@@ -46,41 +46,49 @@ def balanced(
 ) -> Int64[np.ndarray, " m"]:
     """Return the places, ascending, of a subsample with equally many baselines of each stratum.
 
+    It is drawn once, for all epochs: what it leaves out is never seen. Another seed draws another.
+
     Args:
         baselines_cm: Baselines in cm.
         by: "bins": the strata are the paper's baseline bins; "log_baseline": 16 equally wide
             intervals of log-baseline over the range at hand. Empty strata do not count.
-        limit: How many to draw in all; the strata's shares differ by at most one. None draws as
-            many from each stratum as the smallest one has.
+        limit: How many to draw in all; the strata's shares differ by at most one, and the first
+            strata that have enough get that one more. None draws as many from each stratum as the
+            smallest one has.
         seed: The draw's seed.
 
     Raises:
         SelectionError: If a stratum has fewer baselines than its share of the limit, or the limit
-            is less than one for each.
+            is no whole number, or less than one for each.
     """
     strata = _strata(baselines_cm, by=by)
     found = np.unique(strata).tolist()
     members = [np.flatnonzero(strata == stratum) for stratum in found]
-    poorest = min(map(len, members))
-    if limit is None:
-        limit = poorest * len(found)
+    counts = np.array([*map(len, members)])
+    poorest = int(counts.min())
+    most = poorest * len(found) + int((counts > poorest).sum())
+    limit = poorest * len(found) if limit is None else require_whole("limit", limit, least=1)
     if limit < len(found):
         raise SelectionError(
             f"limit={limit} is less than one pair for each of {len(found)} strata."
         )
+    if limit > most:
+        stratum = found[int(counts.argmin())]
+        name = f"stratum {stratum + 1} of {LOG_STRATA} of log-baseline"
+        if by == "bins":
+            name = f"the bin {list(BASELINE_BINS)[stratum]} cm"
+        raise SelectionError(
+            f"balance={by!r}, limit={limit}: {-(-limit // len(found))} pairs are wanted of {name}, "
+            f"which has {poorest}; the most that balances is {most}."
+        )
     generator = np.random.default_rng(np.random.SeedSequence((seed, 0xBA1A)))
-    drawn = []
-    for number, (stratum, places) in enumerate(zip(found, members, strict=True)):
-        share = limit // len(found) + (number < limit % len(found))
-        if share > len(places):
-            name = f"stratum {stratum + 1} of {LOG_STRATA} of log-baseline"
-            if by == "bins":
-                name = f"the bin {list(BASELINE_BINS)[stratum]} cm"
-            raise SelectionError(
-                f"balance={by!r}, limit={limit}: {share} pairs are wanted of {name}, which has "
-                f"{len(places)}; the most that balances is {poorest * len(found)}."
-            )
-        drawn.append(generator.choice(places, size=share, replace=False))
+    share, more = divmod(limit, len(found))
+    has_more = counts > share
+    shares = share + (has_more & (np.cumsum(has_more) <= more))
+    drawn = [
+        generator.choice(places, size=size, replace=False)
+        for places, size in zip(members, shares.tolist(), strict=True)
+    ]
     return np.sort(np.concatenate(drawn))
 
 
@@ -352,7 +360,10 @@ batches would hardly be mixed better."""
 
 
 class PairOptions(TypedDict, total=False):
-    """Which pairs of a scene: see `choose_pairs`, and `balanced` for balance and limit."""
+    """Which pairs of a scene: see `choose_pairs`, and `balanced` for balance and limit.
+
+    A balanced subsample is the same in every epoch.
+    """
 
     pairs: PairsSpec
     direction: Direction
