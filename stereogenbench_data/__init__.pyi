@@ -10,6 +10,7 @@ from stereogenbench_data.datasets.batches import (
     RepeatedDecodingWarning as RepeatedDecodingWarning,
 )
 from stereogenbench_data.datasets.batches import RepeatedEpochWarning as RepeatedEpochWarning
+from stereogenbench_data.datasets.batches import UnsharedRanksWarning as UnsharedRanksWarning
 from stereogenbench_data.datasets.derive import DERIVE_FIELDS as DERIVE_FIELDS
 from stereogenbench_data.datasets.derive import DERIVED_FIELDS as DERIVED_FIELDS
 from stereogenbench_data.datasets.derive import derive as derive

@@ -39,7 +39,7 @@ from stereogenbench_data.jobs import WorkOptions, atomic_folder, do_items, job_f
 from stereogenbench_data.samples.fields import Request
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.selection.filters import SceneFilters, require_options
+from stereogenbench_data.selection.filters import SceneFilters, require_options, whole_number
 from stereogenbench_data.selection.plan import Address, FramesSpec
 from stereogenbench_data.sources.files import write_atomic
 
@@ -414,9 +414,10 @@ def _points(layout: Layout, points: Any) -> int | None:
     if layout == "moge" or points == "all":
         return None
     points = USUAL_POINTS[layout] if points is None else points
-    if isinstance(points, bool) or not isinstance(points, int) or points < 1:
+    number = whole_number(points)
+    if number is None or number < 1:
         raise SelectionError(f"points must be a number from 1, or 'all', got {points!r}.")
-    return points
+    return number
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,14 +21,14 @@ import numpy as np
 import pyarrow as pa
 import torch
 import torch.distributed
-from torch.utils.data import Sampler
+from torch.utils.data import Sampler, get_worker_info
 
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Stream
 from stereogenbench_data.samples.load import OPEN_STREAMS
 from stereogenbench_data.schema.release import CAMERA_COUNT
-from stereogenbench_data.selection.filters import require_options
+from stereogenbench_data.selection.filters import require_options, whole_number
 from stereogenbench_data.selection.order import (
     ORDER_VERSION,
     DropLast,
@@ -916,17 +916,30 @@ def _group() -> tuple[int, int] | None:
     return None
 
 
+class UnsharedRanksWarning(UserWarning):
+    """Several ranks were started, and nothing tells their numbers, so each gets all batches."""
+
+
 def _require_group(rank: int | None, world_size: int | None) -> tuple[int, int]:
     """Return rank and world size, given or as torch.distributed says."""
     if rank is None and world_size is None:
-        return _group() or (0, 1)
-    whole = all(isinstance(n, int) and not isinstance(n, bool) for n in (rank, world_size))
-    if rank is None or world_size is None or not whole or not 0 <= rank < world_size:
+        group, ranks = _group(), os.environ.get("WORLD_SIZE", "")
+        if group is None and ranks.isdecimal() and int(ranks) > 1 and get_worker_info() is None:
+            warnings.warn(
+                f"WORLD_SIZE says that {ranks} ranks were started, and there is no process group, "
+                f"so each of them reads all batches. Make loaders after init_process_group, or "
+                f"give rank= and world_size=; rank=0, world_size=1 reads all without a word.",
+                UnsharedRanksWarning,
+                stacklevel=4,
+            )
+        return group or (0, 1)
+    numbers = whole_number(rank), whole_number(world_size)
+    if numbers[0] is None or numbers[1] is None or not 0 <= numbers[0] < numbers[1]:
         raise SelectionError(
             f"rank must be a number from 0 below world_size, and both be given: got rank={rank!r}, "
             f"world_size={world_size!r}."
         )
-    return rank, world_size
+    return numbers[0], numbers[1]
 
 
 SPARE_FILES = 128

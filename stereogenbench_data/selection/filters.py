@@ -279,7 +279,8 @@ def filter_text(name: str, wanted: Any) -> str:
     >>> filter_text("family", ["Uniform", "IPD_Gaussian"]), filter_text("focal_mm", (18, 35))
     ('family Uniform or IPD_Gaussian', 'focal_mm 18 to 35')
     """
-    if isinstance(wanted, str) or not isinstance(wanted, Iterable):
+    is_one = isinstance(wanted, str) or whole_number(wanted) is not None
+    if is_one or not isinstance(wanted, Iterable):
         return f"{name} {_quoted(wanted)}"
     values = [*wanted]
     is_range = len(values) == 2 and not any(isinstance(value, str) for value in values)
@@ -288,21 +289,35 @@ def filter_text(name: str, wanted: Any) -> str:
 
 def _quoted(value: Any) -> str:
     """Return a value as text, in quotes if spaces or odd characters are in it."""
-    if isinstance(value, int | float):
-        return f"{value:g}"
+    number = value if isinstance(value, int | float) else whole_number(value)
+    if number is not None:
+        return f"{number:g}"
     is_plain = isinstance(value, str) and _PLAIN.fullmatch(value)
     return shortened(value if is_plain else repr(value), _LONGEST_SHOWN)
 
 
+def whole_number(number: Any) -> int | None:
+    """Return a whole number of Python, numpy or torch; None of anything else.
+
+    >>> whole_number(np.int64(3)), whole_number(3.0), whole_number(True)
+    (3, None, None)
+    """
+    try:
+        return None if isinstance(number, bool) else operator.index(number)
+    except TypeError:
+        return None
+
+
 def require_whole(name: str, number: Any, *, least: int) -> int:
-    """Return a whole number.
+    """Return a whole number of Python, numpy or torch.
 
     Raises:
         SelectionError: If it is another kind of number, or below the least.
     """
-    if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < least:
+    whole = whole_number(number)
+    if whole is None or whole < least:
         raise SelectionError(f"{name} must be a whole number from {least}, got {number!r}.")
-    return int(number)
+    return whole
 
 
 def require_range(name: str, wanted: Any) -> Range:
@@ -526,7 +541,7 @@ def require_pairs(pairs: Any) -> tuple[tuple[int, int], ...]:
             f"(0, 5) or [(0, 5), (1, 3)], got {pairs!r}."
         )
     listed = [*listed]
-    if len(listed) == 2 and all(isinstance(camera, int | np.integer) for camera in listed):
+    if len(listed) == 2 and None not in map(whole_number, listed):
         listed = [listed]
     found = []
     for pair in listed:

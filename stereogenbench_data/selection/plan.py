@@ -10,6 +10,7 @@ who need a uniform distribution to subsample. Source: the appendix on realised b
 """
 
 import hashlib
+import operator
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ from stereogenbench_data.selection.filters import (
     filter_scenes,
     require_whole,
     split_options,
+    whole_number,
 )
 from stereogenbench_data.selection.order import Runs
 
@@ -329,7 +331,7 @@ def parse_frames(spec: Any) -> Windows:
         return spec
     if isinstance(spec, str) and spec in ("first", "all"):
         return Every(1) if spec == "all" else Chosen((0,))
-    parts = [spec] if isinstance(spec, str | int | np.integer) else spec
+    parts = [spec] if isinstance(spec, str | bool) or whole_number(spec) is not None else spec
     if isinstance(parts, Sequence | np.ndarray) and len(parts) > 0:
         if not isinstance(parts[0], str):
             frames = tuple(require_whole("frames", number, least=0) for number in parts)
@@ -474,6 +476,7 @@ class Plan:
         Raises:
             IndexError: If there is no such sample.
         """
+        number = operator.index(number)
         if not 0 <= number < len(self):
             raise IndexError(f"no sample {number}: there are {len(self)}")
         scene = int(self.first_sample.searchsorted(number, side="right")) - 1
@@ -558,14 +561,14 @@ def _require_cameras(cameras: Any) -> tuple[int, ...]:
     found: tuple[Any, ...] = (cameras,)
     if isinstance(cameras, Sequence | np.ndarray):
         found = tuple(np.asarray(cameras, dtype=object).tolist())
-    whole = all(isinstance(camera, int | np.integer) for camera in found)
-    there = frozenset(range(CAMERA_COUNT))
-    if not (whole and found and len(set(found)) == len(found) and set(found) <= there):
+    numbers = tuple(number for number in map(whole_number, found) if number is not None)
+    is_each_once = 0 < len(found) == len(set(numbers))
+    if not is_each_once or not set(numbers) <= set(range(CAMERA_COUNT)):
         raise SelectionError(
             f"cameras must be 'all', 'each' or different numbers of 0 to {CAMERA_COUNT - 1}, "
             f"got {cameras!r}."
         )
-    return tuple(int(camera) for camera in found)
+    return numbers
 
 
 def _plan(index: SceneIndex, pairs: PairList, *, windows: Windows, seed: int) -> Plan:

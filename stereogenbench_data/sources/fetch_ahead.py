@@ -6,6 +6,7 @@ begun. Threads fetch the ranges in the order in which they are needed; a thread 
 nothing left to fetch. What could not be fetched raises its error where it is read.
 """
 
+import operator
 import os
 import sys
 import threading
@@ -16,7 +17,6 @@ from collections.abc import Callable, Hashable, Iterable
 from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass, field
 from itertools import islice, takewhile
-from operator import attrgetter
 from typing import Final, NamedTuple
 
 from stereogenbench_data.errors import SelectionError
@@ -33,7 +33,7 @@ LARGEST_REQUEST: Final = 2 * 1024 * 1024
 LARGEST_GAP: Final = 2048
 """Bytes that nobody needs between two ranges that are merged: the headers of a tar."""
 
-_START: Final = attrgetter("start")
+_START: Final = operator.attrgetter("start")
 
 
 class Wanted(NamedTuple):
@@ -109,11 +109,14 @@ class FetchAhead:
         Raises:
             SelectionError: If the number is out of its range.
         """
-        if type(limit_bytes) is not int or limit_bytes < 0:
+        try:
+            self.limit_bytes = -1 if isinstance(limit_bytes, bool) else operator.index(limit_bytes)
+        except TypeError:
+            self.limit_bytes = -1
+        if self.limit_bytes < 0:
             raise SelectionError(
                 f"fetch_ahead_bytes must be a whole number from 0, got {limit_bytes!r}."
             )
-        self.limit_bytes = limit_bytes
         self.requests = self.bytes = 0
         self._own: _State | None = None
         self._finalizer: Callable[[], object] | None = None

@@ -3,11 +3,18 @@
 import itertools
 import json
 
+import numpy as np
 import pytest
 import torch
 from torchdata.stateful_dataloader import StatefulDataLoader
 
-from stereogenbench_data import EpochBatches, SelectionError, StateError, StereoPairs
+from stereogenbench_data import (
+    EpochBatches,
+    SelectionError,
+    StateError,
+    StereoPairs,
+    UnsharedRanksWarning,
+)
 from tests.datasets.conftest import flat, in_turn, keys_of
 
 
@@ -203,6 +210,8 @@ def test_what_is_no_dict_is_refused(keyed, state):
     [
         ({"rank": 2, "world_size": 2}, "got rank=2, world_size=2"),
         ({"rank": 1}, "got rank=1, world_size=None"),
+        ({"rank": 0.0, "world_size": 2}, "got rank=0.0, world_size=2"),
+        ({"rank": False, "world_size": 2}, "got rank=False, world_size=2"),
         ({"drop_last": 1}, "drop_last must be True, False or 'pad', got 1"),
         (
             {"batch_size": 64, "rank": 0, "world_size": 3},
@@ -214,6 +223,25 @@ def test_what_is_no_dict_is_refused(keyed, state):
 def test_options_that_no_epoch_has_are_refused(keyed, options, message):
     with pytest.raises(SelectionError, match=message):
         EpochBatches(keyed, **({"batch_size": 4} | options))
+
+
+@pytest.mark.parametrize("kind", [np.int32, torch.tensor])
+def test_ranks_may_be_numbers_of_numpy_and_torch(keyed, kind):
+    batches = EpochBatches(keyed, 4, rank=kind(1), world_size=kind(2))
+
+    assert [*batches] == [*EpochBatches(keyed, 4, rank=1, world_size=2)]
+
+
+def test_ranks_without_a_process_group_are_told_that_they_read_the_same(keyed, monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+
+    with pytest.warns(UnsharedRanksWarning, match="2 ranks .* no process group.*init_proc") as told:
+        loader = keyed.loader(4)
+    assert told[0].filename == __file__
+    assert len(loader) == 35
+    keyed.loader(4, rank=0, world_size=1)  # without a word
+    monkeypatch.setenv("WORLD_SIZE", "1")
+    keyed.loader(4)
 
 
 def test_batches_made_before_the_process_group_are_refused_in_it(keyed, tmp_path):

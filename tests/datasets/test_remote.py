@@ -2,7 +2,9 @@
 
 import shutil
 
+import numpy as np
 import pytest
+import torch
 from torch.utils.data import DataLoader
 
 from stereogenbench_data import PAIR_FIELDS, SceneIndex, StereoPairs
@@ -49,6 +51,16 @@ def root_of(request, small_shards):
 def root(request, root_of):
     """`small_shards` at every kind of place."""
     return root_of(request.param)
+
+
+@pytest.mark.parametrize("kind", [np.int64, torch.tensor])
+def test_samples_may_be_numbered_by_numpy_and_torch(shards_served, kind):
+    pairs = StereoPairs(shards_served.url, fields=("left", "__key__"), frames="all")
+    loader = DataLoader(pairs, 2, sampler=[kind(3), kind(5), kind(1)])
+
+    assert [each for batch in loader for each in batch["__key__"]] == [
+        pairs[number]["__key__"] for number in (3, 5, 1)
+    ]
 
 
 def test_shards_give_what_the_released_files_give(root, indexed_release):

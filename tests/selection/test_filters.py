@@ -55,6 +55,7 @@ def test_a_filter_keeps_the_scenes_that_match(index, filters, expected):
             r"of those left by family Uni.*; found seen_map\.$",
         ),
         ({"min_frames": 82}, r"min_frames 82 matches none of 9 .* 40 to 81\.$"),
+        ({"min_frames": np.int16(82)}, "min_frames 82 matches none of 9"),
         # A value that no scene has is not passed over beside one that some have.
         ({"family": ["Uniform", "Nope"]}, "family Nope matches none of 9 scenes of the index"),
         ({"focal_mm": (80, 90)}, "focal_mm 80 to 90 .* found 20 to 35"),

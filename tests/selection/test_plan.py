@@ -3,7 +3,9 @@
 import itertools
 import re
 
+import numpy as np
 import pytest
+import torch
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.selection.filters import baselines_cm
@@ -17,6 +19,28 @@ def test_samples_are_numbered_scene_window_pair(index):
     expected = itertools.product(range(4), [(3,), (7,)], [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)])
     first = found[0].row
     assert [(a.row - first, a.frames, (a.source, *a.targets)) for a in found] == list(expected)
+
+
+@pytest.mark.parametrize("kind", [np.uint16, torch.tensor])
+def test_numbers_of_numpy_and_torch_are_numbers(index, kind):
+    def digest(of):
+        options = {"seed": of(3), "min_frames": of(40), "baseline_cm": None}
+        pairs = plan_pairs(
+            index, pairs=(of(0), of(2)), frames=("random", of(2)), balance="bins", limit=of(5),
+            **options,
+        )  # fmt: skip
+        views = plan_views(index, cameras=(of(0), of(4)), frames=of(7), seed=of(1), filters={})
+        return pairs.digest, views.digest, pairs.locate(of(4), epoch=0)
+
+    assert digest(kind) == digest(int)
+
+
+@pytest.mark.parametrize("seed", [1.0, True, "1", torch.tensor(1.0), np.float32(1)], ids=repr)
+def test_a_seed_that_is_no_whole_number_is_refused(index, seed):
+    with pytest.raises(
+        SelectionError, match=f"seed must be .* from 0, got {re.escape(repr(seed))}"
+    ):
+        plan_pairs(index, seed=seed)
 
 
 def test_only_random_frames_depend_on_the_epoch(index):
