@@ -33,15 +33,19 @@ class _Scalar(torch.nn.Module):
 
 
 class _Module(LightningModule):
-    def __init__(self):
+    def __init__(self, steps=1):
         super().__init__()
         self.network = _Scalar()
+        self.steps = steps
 
     def training_step(self, batch, number):
         return self.network.loss(batch)
 
     def configure_optimizers(self):
-        return torch.optim.SGD(self.parameters(), 1e-6)
+        """As docs/trainers.md says: with trainer.estimated_stepping_batches no run would go on."""
+        optimiser = torch.optim.SGD(self.parameters(), 1e-6)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 1e-6, total_steps=self.steps)
+        return [optimiser], [{"scheduler": schedule, "interval": "step"}]
 
 
 class _Stopped(Exception):
@@ -67,7 +71,7 @@ def _trainer(**options):
 
 def lightning(loader, folder, *, stop_at=None, resume=False, devices=1, **options):
     """Train with Lightning; stop after a step's checkpoint, or go on from it."""
-    module, checkpoint = _Module(), Path(folder) / "lightning.ckpt"
+    module, checkpoint = _Module(EPOCHS * len(loader)), Path(folder) / "lightning.ckpt"
     trainer = _trainer(
         max_epochs=EPOCHS, devices=devices, strategy="ddp" if devices > 1 else "auto",
         callbacks=[_StopAt(stop_at, checkpoint)] if stop_at else [], **options,
