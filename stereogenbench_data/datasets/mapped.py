@@ -60,6 +60,7 @@ from stereogenbench_data.samples.fields import (
     Transform,
     new_array,
     parse_request,
+    require_importable,
     warn_if_swapped,
 )
 from stereogenbench_data.samples.load import OPEN_STREAMS, SampleLoader, StreamStats, Work
@@ -505,6 +506,15 @@ class _MappedScenes(Dataset[Sample]):
         A loader has its own videos, which its ``close()`` closes.
         """
         self._loader.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy needs.
+
+        Raises:
+            FieldError: If the copy is for a process that cannot import the transform.
+        """
+        require_importable(self.request.transform)
+        return self.__dict__
 
     def __repr__(self) -> str:
         """Return a summary."""

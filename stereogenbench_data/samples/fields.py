@@ -8,9 +8,11 @@ front of that, in the fields that depend on the target. A new field is a new row
 """
 
 import re
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from multiprocessing.context import get_spawning_popen
 from typing import Any, Final, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -407,6 +409,26 @@ def parse_request(
                 f"{transform!r}: leave it out."
             )
     return Request(kind, names, layout, size, depth, transform)
+
+
+def require_importable(transform: Any) -> None:
+    """Require that a process that is being spawned can import a transform's class.
+
+    Such a process imports the script again, but no notebook and no interactive session.
+
+    Raises:
+        FieldError: If the class is of a notebook.
+    """
+    started = get_spawning_popen()
+    if started is None or hasattr(sys.modules["__main__"], "__file__"):
+        return
+    for step in getattr(transform, "steps", lambda: [transform])():
+        if step.__module__ == "__main__":
+            raise FieldError(
+                f"the transform {step!r} is of this notebook, and worker processes of the start "
+                f"method {started.method!r} cannot import it: move the class into a module (a .py "
+                f"file beside the notebook), or load with num_workers=0."
+            )
 
 
 Allocate = Callable[[str, tuple[int, ...], Any], Any]

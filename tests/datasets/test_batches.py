@@ -282,3 +282,13 @@ def test_torchdatas_loader_saves_and_loads_its_position(keyed, workers, stop):
     assert keys_of(resumed) == unbroken
     resumed.batch_sampler.set_epoch(3)
     assert sorted(flat(keys_of(resumed))) == sorted(flat(unbroken))
+
+
+def test_a_pass_knows_its_length_also_of_the_rest_of_an_epoch(keyed):
+    loader = keyed.loader(4)
+    state = [loader.state_dict() for _, _ in zip(loader, range(5), strict=False)][-1]
+    resumed = keyed.loader(4)
+    resumed.load_state_dict(state)
+
+    assert len(iter(resumed)) == len(list(resumed)) == 30
+    assert len(iter(resumed)) == len(resumed) == 35

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import threading
+import types
 import warnings
 import weakref
 from concurrent.futures import ThreadPoolExecutor
@@ -140,6 +141,35 @@ def test_workers_of_every_kind_give_what_the_main_process_gives(indexed_release,
     )
 
     assert all(same(one, other) for one, other in zip(alone, loader, strict=True))
+
+
+class Noted:
+    """A transform that a notebook defines."""
+
+    swaps_views = False
+
+    def __call__(self, views, generator):
+        """Change nothing."""
+        return views
+
+
+@pytest.mark.parametrize("kind", ["map-style", "stream"])
+def test_a_transform_of_a_notebook_is_refused_where_workers_cannot_import_it(
+    indexed_release, monkeypatch, kind
+):
+    notebook = types.ModuleType("__main__")
+    monkeypatch.setitem(sys.modules, "__main__", notebook)
+    monkeypatch.setattr(Noted, "__module__", "__main__")
+    monkeypatch.setattr(notebook, "Noted", Noted, raising=False)
+    options = {"fields": ("left",), "transform": Compose([RandomCrop(8, 8), Noted()])}
+    workers = {"num_workers": 1, "multiprocessing_context": "spawn"}
+    made = StereoPairs(indexed_release, **options).loader(1, **workers)
+    if kind == "stream":
+        made = DataLoader(StereoPairStream(indexed_release, 1, **options), 1, **workers)
+
+    with pytest.raises(FieldError, match=r"Noted object .* of this notebook.*'spawn'.*module \("):
+        next(iter(made))
+    assert pickle.loads(pickle.dumps(StereoPairs(indexed_release, **options))).is_random
 
 
 def test_transforms_draw_anew_each_epoch_and_the_same_for_the_same_seed(indexed_release):
