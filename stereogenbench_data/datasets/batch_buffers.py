@@ -195,12 +195,12 @@ class Layout(NamedTuple):
     """Where the fields of a batch lie in a slot.
 
     Attributes:
-        count: The samples of a full batch.
+        samples: The samples of a full batch.
         fields: Where each field lies, None of texts; in the order of a batch's fields.
         size_bytes: Of a slot.
     """
 
-    count: int
+    samples: int
     fields: dict[str, BufferSpec | None]
     size_bytes: int
 
@@ -273,11 +273,11 @@ class BatchMemory:
 
         def take(name: str, size_bytes: int) -> torch.Tensor | None:
             spec = layout.fields.get(name)
-            if spec is None or layout.count * spec.item_bytes != size_bytes:
+            if spec is None or layout.samples * spec.item_bytes != size_bytes:
                 return None
             return whole[spec.start : spec.start + size_bytes]
 
-        return BatchArrays(layout.count, take)
+        return BatchArrays(layout.samples, take)
 
     def batch(self, slot: int, layout: Layout, *, count: int) -> dict[str, torch.Tensor]:
         """Return the tensors of a batch in a slot, which is free when none of them is left.
@@ -312,7 +312,7 @@ class BatchMemory:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what a worker that is started, not forked, opens the file from."""
-        return _received, (reduction.DupFd(self._fd), self._kept)  # type: ignore[no-untyped-call]
+        return _received, (reduction.DupFd(self._fd), self._kept)
 
 
 _MOST_MAPPED: Final = 64

@@ -223,7 +223,7 @@ class PartedBatches:
         worker_of = np.full(len(batch), number % share.workers)
         if batch.number is not None:
             worker_of = self._of_all_ranks.workers_of(batch, share)
-        if layout is not None and (not layout.fields or layout.count < len(batch)):
+        if layout is not None and (not layout.fields or layout.samples < len(batch)):
             layout = None
         slot = None if layout is None else self._memory.take()
         self._coming[number] = _Coming(len(batch), slot, layout)

@@ -247,8 +247,9 @@ def _decoding_s(pairs: StereoPairs, batch_size: int, *, workers: int, seconds: f
                 before = done()
             elif before is not None and passed_s > seconds and done()[0] > before[0]:
                 break
-        samples, spent_s = (after - first for after, first in zip(done(), before or (0, 0.0)))
-        return spent_s / samples
+        samples, spent_s = done()
+    before_samples, before_s = before or (0, 0.0)
+    return (spent_s - before_s) / (samples - before_samples)
 
 
 def _delay_ms(index: SceneIndex) -> float:

@@ -392,7 +392,8 @@ class _MappedScenes(Dataset[Sample]):
             number += share.batches_apart
             batch = known.batch(number, epoch=epoch)
             if share.of == "streams":
-                batch = batch.at(np.flatnonzero(known.workers_of(batch, share) == share.worker))
+                own = known.workers_of(batch, share) == share.worker
+                batch = batch.at(np.flatnonzero(own).tolist())
             reading = batch
 
     def steps_of_epoch(self, share: WorkerShare) -> Iterator[Step]:

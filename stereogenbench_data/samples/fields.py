@@ -420,7 +420,7 @@ def require_importable(transform: Any) -> None:
         FieldError: If the class is of a notebook.
     """
     started = get_spawning_popen()
-    if started is None or hasattr(sys.modules["__main__"], "__file__"):
+    if transform is None or started is None or hasattr(sys.modules["__main__"], "__file__"):
         return
     for step in getattr(transform, "steps", lambda: [transform])():
         if step.__module__ == "__main__":
