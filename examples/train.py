@@ -100,7 +100,7 @@ def main() -> None:
                 print(f"step {step}: held-out error {curve[step]:.2f} px", flush=True)
             if step == given.steps:
                 break
-    seconds = time.perf_counter() - began
+    seconds, stats = time.perf_counter() - began, loader.stats()
 
     picture = DEMO / "training.png"
     draw(curve, network, held_out).savefig(picture, dpi=110)
@@ -108,8 +108,10 @@ def main() -> None:
     print(f"curve and predictions: {picture}. Next: README.md, then docs/training.md")
     print(
         f"{given.steps * BATCH / seconds:.0f} samples a second, validation included; "
-        f"{loader.stats().waiting:.0%} of the last epoch waiting for data"
+        f"{stats.waiting:.0%} of the last epoch waiting for data"
     )
+    packets = stats.packets_decoded / stats.frames_used
+    print(f"{packets:.2f} packets decoded for each frame shown; workers: {stats.time}")
     print(f"pixels off by more than 1 px: {off[0]} before, {off[1]} after")
     print(f"held-out error {curve[0]:.2f} px before, {curve[step]:.2f} px after")
 

@@ -5,6 +5,7 @@ from stereogenbench_data.bridges.matching import to_torchvision as to_torchvisio
 from stereogenbench_data.datasets.batch_buffers import collate as collate
 from stereogenbench_data.datasets.batch_buffers import to_device as to_device
 from stereogenbench_data.datasets.batches import EpochBatches as EpochBatches
+from stereogenbench_data.datasets.batches import IdleWorkersWarning as IdleWorkersWarning
 from stereogenbench_data.datasets.batches import OpenVideosWarning as OpenVideosWarning
 from stereogenbench_data.datasets.batches import (
     RepeatedDecodingWarning as RepeatedDecodingWarning,

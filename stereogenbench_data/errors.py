@@ -26,6 +26,7 @@ OddSceneWarning          samples.fields       selected scenes differ from what t
 SwappedSizeWarning       samples.fields       a size looks like (width, height)
 OpenVideosWarning        datasets.batches     more videos are needed than may be open
 RepeatedDecodingWarning  datasets.batches     several processes decode the same videos
+IdleWorkersWarning       datasets.batches     a loader has more workers than open scenes
 FewerPairsWarning        selection.filters    the data hold some cameras alone
 MixedSplitsWarning       datasets.mapped      train and eval scenes come together
 RepeatedEpochWarning     datasets.batches     a pass repeats the random frames of another

@@ -62,6 +62,11 @@ class BatchPart(NamedTuple):
     slot: int | None = None
     layout: Layout | None = None
 
+    @property
+    def is_filler(self) -> bool:
+        """Whether it is of no batch."""
+        return self.key[1] == _FILLER
+
 
 @dataclass(slots=True)
 class MadePart:

@@ -329,8 +329,8 @@ class _MappedScenes(Dataset[Sample]):
         """Return what this worker makes of its part of a batch."""
         began_s, batch = perf_counter(), task.batch
         if not batch:
-            # What is fetched ahead goes on where this batch is one of those that were expected.
-            if self._next_batch is not None:
+            # What is fetched ahead goes on after a batch of which nothing is this worker's.
+            if self._next_batch is not None and not task.is_filler:
                 self._next_batch = (
                     self._next_batch[0],
                     self._next_batch[1] + task.share.world_size,

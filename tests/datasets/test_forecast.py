@@ -105,7 +105,7 @@ class Batches:
         """Return those of a pass; the next one is made when one is given."""
         for _ in range(10):
             self.clock.now_s += 4
-            self.done.add(Work(samples=8, reading_s=1, decoding_s=5, making_s=2, waiting_s=9))
+            self.done.add(Work(8, reading_s=1.0, decoding_s=5.0, making_s=2.0, waiting_s=9.0))
             yield {"frame_index": range(8)}
 
     def work(self):

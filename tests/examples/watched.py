@@ -2,8 +2,8 @@
 
 python -m tests.examples.watched FOLDER EXAMPLE
 
-Then it runs the example once more, to its end. The batches of training samples that a torch
-DataLoader gives become FOLDER/killed.RANK and FOLDER/done.RANK, a list of the names of each one's
+Then it runs the example once more, to its end. The batches of training samples that a loader
+gives become FOLDER/killed.RANK and FOLDER/done.RANK, a list of the names of each one's
 samples, and FOLDER/ends.json says how the ranks of both runs ended.
 """
 
@@ -15,7 +15,6 @@ import sys
 from pathlib import Path
 
 from torch.nn import parallel
-from torch.utils.data import dataloader
 
 from stereogenbench_data.datasets import loader
 from tests.frameworks.forked import forked_ranks
@@ -29,7 +28,7 @@ def names_of(batch):
 
 
 def watch(notes, example, batches):
-    take = dataloader._BaseDataLoaderIter.__next__
+    take = loader.LoaderPass.__next__
     taken = []
 
     def noted(self):
@@ -40,7 +39,7 @@ def watch(notes, example, batches):
             os.kill(os.getpid(), signal.SIGKILL)
         return batch
 
-    dataloader._BaseDataLoaderIter.__next__ = noted
+    loader.LoaderPass.__next__ = noted
     sys.argv[:] = [example]
     runpy.run_path(example, run_name="__main__")
 

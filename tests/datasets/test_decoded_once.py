@@ -1,0 +1,141 @@
+"""At the size of the release each video is decoded about once, counted on real files."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from stereogenbench_data import SceneIndex, StereoPairs
+from stereogenbench_data.datasets import loader as loading
+from tests.datasets.conftest import keys_of
+
+pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
+
+SCENES = 7754
+FIELDS = ("left", "right", "depth", "__key__")
+
+
+@pytest.fixture(scope="module")
+def of_real_size(small_release, tmp_path_factory):
+    """As many scenes as the release has to train on: hard links of two drawn ones."""
+    root = tmp_path_factory.mktemp("of_real_size")
+    drawn = SceneIndex.open(small_release)
+    scenes = []
+    for number in range(SCENES):
+        scene = drawn.indexed_scene(number % 2)
+        key = f"{scene.id.key.rpartition('/')[0]}/scene_{number:06d}"
+        members = {}
+        for name, member in scene.members.items():
+            path = f"{key}/{name}"
+            (root / path).parent.mkdir(parents=True, exist_ok=True)
+            os.link(Path(small_release) / member.path, root / path)
+            members[name] = replace(member, path=path)
+        scenes.append(replace(scene, id=replace(scene.id, key=key), members=members))
+    return SceneIndex.from_scenes(scenes, root)
+
+
+@pytest.fixture
+def tasks(monkeypatch):
+    """For each scene the workers that were given samples of it, as the loader deals them."""
+    given = {}
+
+    class Recording(loading.PartedBatches):
+        def _parts(self, batch, number):
+            for part in (parts := super()._parts(batch, number)):
+                for sample in part.batch:
+                    run = (batch.number % 8, sample // 7)
+                    given.setdefault(run, set()).add(part.share.worker)
+            return parts
+
+    monkeypatch.setattr(loading, "PartedBatches", Recording)
+    return given
+
+
+@pytest.mark.parametrize(
+    ("selection", "workers", "batches"),
+    [({}, 0, 400), ({}, 3, 400), ({"pairs": "all"}, 2, 300)],
+    ids=str,
+)
+def test_each_frame_is_decoded_about_once(of_real_size, selection, workers, batches, tasks):
+    """Packets and frames of the epoch's beginning, when all scenes are begun inside."""
+    pairs = StereoPairs(of_real_size, frames="all", fields=FIELDS, **selection)
+    loader = pairs.loader(8, num_workers=workers)
+    shown = set()
+    for number, batch in enumerate(loader):
+        for key in batch["__key__"]:
+            scene, cameras, frame = key.rsplit("/", 2)
+            left, right = cameras.split("-")
+            shown |= {(scene, left, frame), (scene, right, frame), (scene, left, frame, "depth")}
+        if number == batches:
+            break
+    found = loader.stats()
+    loader.close()
+
+    assert (loader.batches.rule.shuffle_groups, loader.batches.rule.open_scenes) == (8, 8)
+    # Workers have read ahead of the loop.
+    assert len(shown) <= found.frames_used <= len(shown) + 16 * 8 * 3
+    # All pairs show every frame of a scene many times, so few scenes are begun.
+    assert 1 <= found.packets_decoded / found.frames_used < 1.15
+    assert all(len(of_scene) == 1 for of_scene in tasks.values() if not selection)
+
+
+def test_the_order_is_the_same_for_any_number_of_workers(of_real_size):
+    keyed = StereoPairs(of_real_size, frames="all", fields=("__key__",))
+
+    def begun(workers):
+        loader = keyed.loader(8, num_workers=workers)
+        return [keys for keys, _ in zip(keys_of_a_pass(loader), range(40), strict=False)]
+
+    def keys_of_a_pass(loader):
+        for batch in loader:
+            yield from keys_of([batch])
+
+    orders = [begun(workers) for workers in (0, 1, 2, 3, 5)]
+
+    assert orders == [orders[0]] * 5
+
+
+def test_a_loader_says_where_its_workers_time_goes(of_real_size):
+    pairs = StereoPairs(of_real_size, frames="all", fields=FIELDS)
+    loader = pairs.loader(8, num_workers=2)
+    assert loader.stats().time == ""
+    for number, _ in enumerate(loader):
+        if number == 50:
+            break
+
+    said = loader.stats().time
+    assert [word in said for word in ("reading", "decoding", "making samples", "waiting")]
+    assert said.endswith("is the limit")
+    assert loader.work().samples >= 400
+
+
+def test_samples_of_many_open_scenes_are_described_once(of_real_size, monkeypatch):
+    pairs = StereoPairs(of_real_size, frames="all", fields=("left", "world_from_left"))
+    described = []
+    real = SceneIndex.scene
+
+    def scene(self, row, **options):
+        described.append(row)
+        return real(self, row, **options)
+
+    monkeypatch.setattr(SceneIndex, "scene", scene)
+    loader = pairs.loader(128, open_scenes=500, shuffle_groups=1)
+    for number, _ in enumerate(loader):
+        if number == 20:
+            break
+
+    assert len(described) == len(set(described)) >= 500
+
+
+def test_many_datasets_hold_few_files_open(small_index):
+    folder = Path("/proc/self/fd")
+    if not folder.is_dir():
+        pytest.skip("needs /proc")
+    first = StereoPairs(small_index)
+    before = len(list(folder.iterdir()))
+    many = [StereoPairs(small_index) for _ in range(200)]
+
+    assert len(list(folder.iterdir())) <= before + 1
+    many[7].set_epoch(3)
+    assert [many[6].epoch, many[7].epoch, first.epoch] == [0, 3, 0]
