@@ -73,7 +73,8 @@ class RunOptions(WorkOptions, total=False):
 
     Attributes:
         out: A folder that keeps partial results, so that a stopped evaluation goes on; without
-            it they are lost.
+            it they are lost. What a callable computes cannot be seen: ``name`` tells its results
+            from those of another, as of another class, parameter or checkpoint.
         allow_missing: How many right views of pairs may be missing or unusable; they are counted
             in the tables. 0 makes the first an error.
     """
@@ -107,14 +108,16 @@ def evaluate(
             that is given a dict of tensors, the tier's inputs for some frames of one pair in
             order, and returns their right views, uint8 or floats of 0 to 1, (n, 3, h, w).
         tier: "G0", "G1" or "G2": what the method was given.
-        name: What tables call the method; else the folder's or the callable's name.
+        name: What tables call the method; else the folder's or the callable's name. A callable
+            whose results ``out`` keeps must be given one.
         protocol: Which metrics and how; the paper's with what needs no weights unless given.
         conventions: How the files of a folder are read, as for `StereoPairs`.
         **options: How it is run (`RunOptions`) and what is scored (`Selection`).
 
     Raises:
         EvaluationError: If a prediction is missing, or is not what it must be, naming it; if
-            ``out`` holds results of other settings or predictions.
+            ``out`` holds results of other settings, predictions or names; if ``out`` is to keep
+            those of a callable without a name.
         SelectionError: If nothing matches the selection.
         ExtraError: If a package or weights that a metric needs are not there.
     """
@@ -124,6 +127,12 @@ def evaluate(
     source: PredictionSource
     if callable(predictions):
         called = name or str(getattr(predictions, "__name__", type(predictions).__name__))
+        if options.get("out") and not name:
+            raise EvaluationError(
+                f"{options['out']}: is to keep the scores of {called}, and another method may be "
+                f"called so, too. Pass name=..., another for each method, parameter and "
+                f"checkpoint, so that its scores are found again and no other's."
+            )
         source = CalledMethod(called, predictions, known)
         options["workers"], options["engine"] = 1, LOCAL
     else:

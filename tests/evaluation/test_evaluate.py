@@ -5,6 +5,7 @@ import math
 import os
 import shutil
 import signal
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -195,11 +196,60 @@ def test_an_evaluation_that_was_killed_goes_on_with_what_it_has(scored_index, pr
         calls.append(len(inputs["left"]))
         return inputs["left"]
 
-    resumed = scored(scored_index, lefts, protocol, out=out)
+    resumed = scored(scored_index, lefts, protocol, name="lefts", out=out)
 
     assert kept.stat().st_mtime_ns == before
     assert sum(calls) == 2 * FRAMES
     assert numbers(resumed) == numbers(scored(scored_index, lefts, protocol))
+
+
+class Faded:
+    """A method with a parameter, and what it was called with."""
+
+    def __init__(self, share):
+        self.share, self.calls = share, 0
+
+    def __call__(self, inputs):
+        self.calls += 1
+        return inputs["left"] / 255 * self.share
+
+
+@pytest.mark.parametrize(
+    ("method", "called"),
+    [
+        (Faded(0.5), "Faded"),
+        (partial(Faded(0.5)), "partial"),
+        (Faded(0.5).__call__, "__call__"),
+        (lambda inputs: inputs["left"], "<lambda>"),
+        (torch.nn.Identity(), "Identity"),
+    ],
+)
+def test_a_callable_whose_scores_are_kept_must_be_named_before_anything_is_done(
+    scored_index, protocol, tmp_path, method, called
+):
+    out = tmp_path / "out"
+
+    for nameless in ({}, {"name": None}, {"name": ""}):
+        with pytest.raises(
+            EvaluationError, match=rf"out: is to keep the scores of {called},.* Pass name="
+        ):
+            scored(scored_index, method, protocol, out=out, **nameless)
+    assert not out.exists()
+
+
+def test_kept_scores_are_those_of_the_name_alone(scored_index, protocol, tmp_path):
+    whole, half = Faded(1.0), Faded(0.5)
+    first = scored(scored_index, whole, protocol, name="whole", out=tmp_path)
+
+    with pytest.raises(
+        EvaluationError, match=r"other methods: \['whole'\], where \['half'\] is asked for"
+    ):
+        scored(scored_index, half, protocol, name="half", out=tmp_path)
+    again = scored(scored_index, whole, protocol, name="whole", out=tmp_path)
+
+    assert half.calls == 0
+    assert whole.calls == 2 * 3
+    assert numbers(again) == numbers(first)
 
 
 def test_results_of_another_evaluation_are_refused_by_what_differs(
