@@ -10,6 +10,7 @@ research. A plug-in has the members of its kind in
 `stereogenbench_data.evaluation.models.loading`.
 """
 
+import math
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -33,6 +34,7 @@ class FoundationStereo:
         sha256 = load_file(network, path, select=lambda file: file.get("model", file))
         self.network, self.device = network.to(device), device
         self.on_cuda = device.startswith("cuda")
+        self.range_px = (0, options.get("max_disp", math.inf))  # of its search
         self.name = f"FoundationStereo ({weights.name})"
         self.settings = {
             "weights": path.name, "weights_sha256": sha256, "iterations": ITERATIONS,

@@ -74,7 +74,9 @@ class ProtocolOptions:
         Path | None,
         option("Folder of weights [torch.hub's checkpoints].", metavar="DIR", panel=_METRICS),
     ] = None
-    device: Annotated[str, option("Device of learned models.", panel=_METRICS)] = "cpu"
+    device: Annotated[
+        str, option("Of learned models; other than cpu: one process.", panel=_METRICS)
+    ] = "cpu"
 
     def protocol(self) -> "EvaluationProtocol":
         """Return the protocol of the options.

@@ -53,6 +53,7 @@ COLUMNS: Final[dict[str, Column]] = {
     "target_matches": Column("M_gt", "neither", 0, "keypoint_matcher"),
     "predicted_matches": Column("M_pred", "neither", 0, "keypoint_matcher"),
     "common_matches": Column("M_both", "neither", 0, "keypoint_matcher"),
+    "sd_beyond": Column("beyond range", "neither", 3, "stereo_matcher"),
     "sd_answered": Column("answered", "neither", 3, "stereo_matcher"),
     **{
         f"sd_{fit}_{name}": Column(f"{label} {words}", "neither", digits, "stereo_matcher")

@@ -20,7 +20,7 @@ from typing import Any, Final, Unpack
 import torch
 
 from stereogenbench_data.datasets.mapped import Data, StereoPairs, opened
-from stereogenbench_data.engine import LOCAL
+from stereogenbench_data.engine import LOCAL, ProcessPool
 from stereogenbench_data.errors import (
     EvaluationError,
     PredictionError,
@@ -32,6 +32,7 @@ from stereogenbench_data.evaluation.metrics.frechet import (
     FrechetDistance,
     frechet_distance,
 )
+from stereogenbench_data.evaluation.models.loading import place_of
 from stereogenbench_data.evaluation.predictions import (
     CalledMethod,
     Method,
@@ -50,7 +51,7 @@ from stereogenbench_data.evaluation.scene_scores import (
     score_scene,
     settings_of,
 )
-from stereogenbench_data.evaluation.tables import Labels, PairMeans, Scores, tally
+from stereogenbench_data.evaluation.tables import Labels, PairMeans, Scores, tallies
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import JobKind, WorkOptions, do_items, job_folder
 from stereogenbench_data.schema.conventions import Conventions
@@ -69,7 +70,9 @@ _PROBLEMS_SHOWN: Final = 2
 class RunOptions(WorkOptions, total=False):
     """How an evaluation is run; none of it changes a score.
 
-    Progress is in frames. A callable is called, and its right views scored, in this process.
+    Progress is in frames. A callable is called, and its right views scored, in this process. Where
+    a protocol's device is not the CPU, this machine works in one process unless ``workers`` says
+    otherwise: each process has its own copy of the models there.
 
     Attributes:
         out: A folder that keeps partial results, so that a stopped evaluation goes on; without
@@ -287,6 +290,10 @@ def score_pairs(run: Run, options: RunOptions | EvaluationOptions) -> list[Score
             "frames": sorted({pair.frames for pair in pairs}),
             "pairs": sorted({pair.pair for pair in pairs}),
             "settings": settings,
+            "matchers": [
+                place_of(matcher)
+                for matcher in (run.protocol.keypoint_matcher, run.protocol.stereo_matcher)
+            ],
             **({"predictions": folders} if folders else {}),
             **run.settings,
         }
@@ -295,6 +302,10 @@ def score_pairs(run: Run, options: RunOptions | EvaluationOptions) -> list[Score
                 tempfile.TemporaryDirectory(prefix="stereogenbench-")
             )
             out = Path(given)
+            if run.protocol.device != "cpu" and isinstance(
+                options.get("engine", LOCAL), ProcessPool
+            ):
+                options = {**options, "workers": options.get("workers") or 1}
             stack.enter_context(job_folder(out, state, kind=EVALUATION))
             _score_missing_scenes(run, out, options)
             return [_scores(run, out, source.name, settings) for source in run.sources]
@@ -427,7 +438,7 @@ def _scores(run: Run, out: Path, name: str, settings: Mapping[str, Any]) -> Scor
                     is_primary=is_primary,
                     baseline_cm=scene.rig.baseline_cm(*each.pair),
                     frames=len(each.frames),
-                    tallies={column: tally(numbers) for column, numbers in scores.columns.items()},
+                    tallies=tallies(scores.columns),
                     problem=scores.problem,
                     views_sha256=scores.views_sha256,
                 )

@@ -21,14 +21,11 @@ from stereogenbench_data.evaluation.columns import (
 from stereogenbench_data.samples.fields import require_size
 from stereogenbench_data.schema.records import DepthEncoding
 
-PROTOCOL_VERSION: Final = 1
+PROTOCOL_VERSION: Final = 2
 """Raised whenever the same right views get other scores under the same settings."""
 
 PAPER_SIZE: Final = (480, 832)
 """(height, width) at which the paper's frame-wise metrics are computed."""
-
-PAPER_BACKENDS: Final = {"keypoint_matcher": "DeDoDe", "stereo_matcher": "FoundationStereo"}
-"""What the paper measures E_match and SD with: the classes of two plug-ins in ``examples/``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,18 +113,9 @@ class EvaluationProtocol:
         return tuple(name for name in COLUMNS if name in filled)
 
     def label(self, column: str) -> str:
-        """Return what tables call a column: with the backend, where it is not the paper's."""
+        """Return what tables call a column: with the backend, of a model of one's own its class."""
         known = COLUMNS[column]
-        if not known.backend or self.is_papers(column):
+        if not known.backend:
             return known.label
-        return f"{known.label} ({self._backend(column)})"
-
-    def is_papers(self, column: str) -> bool:
-        """Return whether a column is measured with what the paper measures it with."""
-        backend = COLUMNS[column].backend
-        return not backend or self._backend(column) == PAPER_BACKENDS[backend]
-
-    def _backend(self, column: str) -> str:
-        """Return the name of what a column is measured with; of a model of one's own its class."""
-        name: str = getattr(self, COLUMNS[column].backend)
-        return name.rpartition(":")[2]
+        name: str = getattr(self, known.backend)
+        return f"{known.label} ({name.rpartition(':')[2]})"

@@ -13,6 +13,7 @@ from typing import Any, Final
 from stereogenbench_data.errors import EvaluationError, explain_os_errors, missing_extra
 from stereogenbench_data.evaluation.columns import COLUMNS, HEAVY_TAILED
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
+from stereogenbench_data.evaluation.metrics.scale import LEAST_R2
 from stereogenbench_data.evaluation.predictions import pair_name
 from stereogenbench_data.evaluation.protocol import PROTOCOL_VERSION, TIERS
 from stereogenbench_data.evaluation.tables import (
@@ -23,21 +24,23 @@ from stereogenbench_data.evaluation.tables import (
     Table,
     Value,
     cell,
+    exceeded_ceiling,
     group_by,
 )
 from stereogenbench_data.schema.release import BASELINE_BINS, baseline_bin
 from stereogenbench_data.schema.text import counted, markdown_table, markdown_text
 from stereogenbench_data.sources.files import open_atomic, write_atomic
 
-FORMAT: Final = 5
+FORMAT: Final = 6
 _GAPS_SHOWN: Final = 20
 ABSENT: Final = "-"
 _ARROWS: Final = {"higher": "↑", "lower": "↓", "neither": ""}
 _LATEX: Final = {
     "\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$",
     "{": r"\{", "}": r"\}", "±": r"$\pm$", "↑": r"$\uparrow$", "↓": r"$\downarrow$",
-    "∞": r"$\infty$", "†": r"$^\dagger$", "≤": r"$\le$", "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$", "|": "$|$", "[": "{[}", "*": "{*}",
+    "∞": r"$\infty$", "†": r"$^\dagger$", "‡": r"$^\ddagger$", "≤": r"$\le$",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$", "|": "$|$",
+    "[": "{[}", "*": "{*}",
 }  # fmt: skip
 
 
@@ -255,9 +258,7 @@ def _texts(table: Table) -> list[list[str]]:
         counts = [row.scenes, row.frames, *([row.missing] if has_gaps else [])]
         texts = [row.method, *(label or ABSENT for label in row.labels)]
         texts += [ABSENT if count is None else str(count) for count in counts]
-        lines.append(
-            texts + [_cell_text(table, row.values.get(name), name) for name in table.columns]
-        )
+        lines.append(texts + [_cell_text(table, row.values, name) for name in table.columns])
     return lines
 
 
@@ -269,8 +270,8 @@ def heading(table: Table, column: str) -> str:
     return f"{table.protocol.label(column)}{_ARROWS[COLUMNS[column].better]}{median}"
 
 
-def _cell_text(table: Table, value: Value | None, column: str) -> str:
-    match value:
+def _cell_text(table: Table, values: Mapping[str, Value], column: str) -> str:
+    match values.get(column):
         case None:
             return ABSENT
         case FrechetDistance(value=None, samples=samples):
@@ -279,24 +280,39 @@ def _cell_text(table: Table, value: Value | None, column: str) -> str:
             compared, mark = ("≤", " !") if is_under else (">", "")
             return f"{distance:.2f} (N {min(samples)} {compared} D {dim}){mark}"
         case Cell() as found:
-            return _number_text(found, column)
+            remarks = _remarks(found, column, values)
+            text = _number_text(found, column)
+            return f"{text} ({', '.join(remarks)})" if remarks else text
         case printed:
             text = printed.replace("inf", "∞")
-            marked = column in COLUMNS and not table.protocol.is_papers(column)
-            return f"{text} †" if marked else text
+            return f"{text} †" if column in COLUMNS and COLUMNS[column].backend else text
 
 
 def _number_text(found: Cell, column: str) -> str:
-    """Return a cell's mean and interval, and what is not in them."""
+    """Return a cell's mean and interval."""
     digits = COLUMNS[column].digits
     text = "∞" if found.infinite and not found.undefined else ABSENT
     if found.mean is not None:
-        text = f"{found.mean:.{digits}f}"
+        text = f"{found.mean:.{digits}f}{' ‡' if found.loose else ''}"
         text += "" if found.ci95 is None else f" ± {found.ci95:.{digits}f}"
         text += f" [{found.median:.{digits}f}]" if column in HEAVY_TAILED else ""
-    counts = ((found.infinite, "identical"), (found.undefined, "undefined"))
-    left_out = [f"{count} {what}" for count, what in counts if count]
-    return f"{text} ({', '.join(left_out)})" if left_out else text
+    return text
+
+
+def _remarks(found: Cell, column: str, values: Mapping[str, Value]) -> list[str]:
+    """Return what is not in a cell's mean, and what it is to be read with."""
+    counts = (
+        (found.infinite, "identical"),
+        (found.undefined, "undefined"),
+        (found.loose, f"with R2 below {LEAST_R2:g}"),
+    )
+    told = [f"{count} {what}" for count, what in counts if count]
+    match values.get("sd_beyond"):
+        case Cell(mean=float(share)) if column in HEAVY_TAILED and share > 0:
+            told.append(f"{share:.1%} beyond range")
+    if column == "p_psnr" and (ceiling_db := exceeded_ceiling(values)) is not None:
+        told.append(f"above the target's {ceiling_db:.2f}")
+    return told
 
 
 def _plain_table(table: Table) -> dict[str, Any]:

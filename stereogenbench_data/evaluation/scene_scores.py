@@ -28,6 +28,7 @@ from stereogenbench_data.evaluation.models.loading import (
     Picture,
     Settings,
     load_model,
+    range_of,
 )
 from stereogenbench_data.evaluation.models.opencv import require_opencv
 from stereogenbench_data.evaluation.predictions import (
@@ -172,16 +173,18 @@ def _e_match(picture: Any, target: TargetFrame, protocol: EvaluationProtocol) ->
 
 def _sd(picture: Any, target: TargetFrame, protocol: EvaluationProtocol) -> dict[str, float]:
     """Return SD by each fit of the protocol, all of one disparity map."""
-    estimated_px = model_of(protocol, "stereo_matcher")(target.left, picture)
+    matcher = model_of(protocol, "stereo_matcher")
+    estimated_px = matcher(target.left, picture)
     found: dict[str, float] = {}
     for method in scale.FITS:
         fit = scale.fit_scale(
             estimated_px,
             target.sample["disparity"][0],
             scored=target.sample["visible"][0],
+            range_px=range_of(matcher),
             method=method,
         )
-        found |= {f"sd_{method}": fit.drift, "sd_answered": fit.answered}
+        found |= {f"sd_{method}": fit.drift, "sd_beyond": fit.beyond, "sd_answered": fit.answered}
         found |= {f"sd_{method}_{name}": getattr(fit, name) for name in EXPLAIN_A_FIT}
     return found
 

@@ -22,7 +22,7 @@ from stereogenbench_data.audit.paper_numbers import PaperRow, PaperTable, paper_
 from stereogenbench_data.errors import EvaluationError, missing_extra
 from stereogenbench_data.evaluation.columns import COLUMNS, FRAME_METRICS
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
-from stereogenbench_data.evaluation.metrics.scale import SD_OF_THE_PAPER
+from stereogenbench_data.evaluation.metrics.scale import LEAST_R2, SD_OF_THE_PAPER
 from stereogenbench_data.evaluation.protocol import PAPER_SIZE, EvaluationProtocol
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import (
@@ -50,12 +50,14 @@ class Tally:
         finite: How many are finite.
         infinite: How many are infinite: identical pictures, for PSNR.
         undefined: How many are nan: frames without a score.
+        loose: How many of the finite are of a line that explains hardly anything (`LEAST_R2`).
     """
 
     mean: float
     finite: int
     infinite: int
     undefined: int
+    loose: int = 0
 
     @property
     def text(self) -> str:
@@ -102,6 +104,7 @@ class Cell:
         scenes: How many scenes have a finite mean.
         infinite: How many frames are infinite, and not averaged.
         undefined: How many frames have no score.
+        loose: How many frames have a score by a line that explains hardly anything.
     """
 
     mean: float | None
@@ -110,19 +113,33 @@ class Cell:
     scenes: int
     infinite: int
     undefined: int
+    loose: int
 
 
-def tally(numbers: Iterable[float]) -> Tally:
+def tallies(columns: Mapping[str, Sequence[float]]) -> dict[str, Tally]:
+    """Return the tally of each column of frames; that of a fit by the R2 beside it."""
+    return {
+        name: tally(numbers, r2=columns.get(f"{name}_r2", ())) for name, numbers in columns.items()
+    }
+
+
+def tally(numbers: Iterable[float], *, r2: Sequence[float] = ()) -> Tally:
     """Return the mean of the finite numbers, and how many there are of each kind.
 
+    Args:
+        numbers: One a frame.
+        r2: Of the lines that they are the slopes of, if they are.
+
     >>> tally([1.0, 3.0, math.inf, math.nan])
-    Tally(mean=2.0, finite=2, infinite=1, undefined=1)
+    Tally(mean=2.0, finite=2, infinite=1, undefined=1, loose=0)
     """
     found = list(numbers)
+    loose = [fit for number, fit in zip(found, r2, strict=False) if math.isfinite(number)]
     finite = [number for number in found if math.isfinite(number)]
     infinite = sum(map(math.isinf, found))
     mean = math.fsum(finite) / len(finite) if finite else math.nan
-    return Tally(mean, len(finite), infinite, len(found) - len(finite) - infinite)
+    undefined = len(found) - len(finite) - infinite
+    return Tally(mean, len(finite), infinite, undefined, sum(not fit >= LEAST_R2 for fit in loose))
 
 
 def cell(pairs: Sequence[PairMeans], column: str) -> Cell:
@@ -131,20 +148,21 @@ def cell(pairs: Sequence[PairMeans], column: str) -> Cell:
     Raises:
         ExtraError: If scipy, which knows Student's t, is not installed.
     """
-    tallies = [each.tallies[column] for each in pairs]
+    found_in = [each.tallies[column] for each in pairs]
     scenes = group_by((each for each in pairs if each.tallies[column].finite), lambda p: p.scene)
     means = [
         math.fsum(each.tallies[column].mean for each in found) / len(found)
         for found in scenes.values()
     ]
-    infinite = sum(found.infinite for found in tallies)
+    infinite = sum(found.infinite for found in found_in)
     return Cell(
         mean=math.fsum(means) / len(means) if means else None,
         ci95=None if infinite else half_interval(means),
         median=median(means) if means else None,
         scenes=len(means),
         infinite=infinite,
-        undefined=sum(found.undefined for found in tallies),
+        undefined=sum(found.undefined for found in found_in),
+        loose=sum(found.loose for found in found_in),
     )
 
 
@@ -528,6 +546,33 @@ def _paper_row(row: PaperRow, labels: Labels, *, differs: str) -> TableRow:
     )
 
 
+def exceeded_ceiling(values: Mapping[str, Value]) -> float | None:
+    """Return the P-PSNR of the rendered target, in dB, where a row's own is above it."""
+    match values.get("p_psnr"), values.get("p_psnr_ceiling"):
+        case Cell(mean=float(own_db)), Cell(mean=float(ceiling_db)) if own_db > ceiling_db:
+            return ceiling_db
+    return None
+
+
+def _notes_of_odd_cells(rows: Sequence[TableRow], columns: Sequence[str]) -> list[str]:
+    """Return what to know of cells that are not to be read as the others."""
+    notes = []
+    cells = [row.values.get(column) for row in rows for column in columns]
+    if any(isinstance(each, Cell) and each.loose for each in cells):
+        notes.append(
+            f"‡ In so many frames the line explains less than {LEAST_R2:.0%} of the true "
+            f"disparity's variance (R2 below {LEAST_R2:g}), as for a repeated left view or an "
+            f"unlike picture. Its slope, and so SD, may then be any number."
+        )
+    if "p_psnr" in columns and any(exceeded_ceiling(row.values) is not None for row in rows):
+        notes.append(
+            "P-PSNR asks how well patches of the left view are found again. A view that repeats "
+            "the left one has more of it than the rendered target: above the target's is not "
+            "better."
+        )
+    return notes
+
+
 def _notes(
     results: Sequence[Scores],
     rows: Sequence[TableRow],
@@ -554,13 +599,15 @@ def _notes(
     others = [
         protocol.label(column)
         for column in of_frames
-        if any(column in row.values for row in paper) and not protocol.is_papers(column)
+        if any(column in row.values for row in paper) and COLUMNS[column].backend
     ]
     if others:
         notes.append(
-            f"† The paper measures this by DeDoDe (E_match) or FoundationStereo (SD), not by what "
-            f"the head of the column names ({', '.join(others)}): not comparable."
+            f"† The paper measures this by its own build of DeDoDe (E_match) or FoundationStereo "
+            f"(SD). That what the head of the column names ({', '.join(others)}) answers as that "
+            f"does is not known: not comparable."
         )
+    notes += _notes_of_odd_cells(rows, columns)
     frames = {pair.frames for one in results for pair in one.pairs if not pair.problem}
     if paper and (protocol.size != PAPER_SIZE or frames - {FRAME_COUNT}):
         (height, width), ours = protocol.size, ", ".join(map(str, sorted(frames)))

@@ -47,7 +47,7 @@ def test_the_same_right_views_give_the_same_report_and_one_other_bit_is_found(
     assert [each for each in found if each.startswith("coverage[a].views_sha256: ")]
     assert [each for each in found if each.startswith("tables[branches].rows[a seen_map, Uniform]")]
     text = page([first], tables_of([first]))
-    for told in ("- protocol: version 1\n", first.views_sha256, f"sha256 {scored_index.digest}"):
+    for told in ("- protocol: version 2\n", first.views_sha256, f"sha256 {scored_index.digest}"):
         assert told in text
 
 

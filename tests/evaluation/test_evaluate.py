@@ -17,6 +17,7 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
 
 from stereogenbench_data import EvaluationError, EvaluationProtocol
+from stereogenbench_data.engine import LOCAL, ProcessPool
 from stereogenbench_data.errors import FieldError, PredictionError, StorageError
 from stereogenbench_data.evaluation.models import i3d, inception
 from stereogenbench_data.evaluation.predictions import frame_name, item_name
@@ -250,6 +251,60 @@ def test_kept_scores_are_those_of_the_name_alone(scored_index, protocol, tmp_pat
     assert half.calls == 0
     assert whole.calls == 2 * 3
     assert numbers(again) == numbers(first)
+
+
+MATCHER = """
+import numpy as np
+
+class Mine:
+    name, settings = "Mine", {{}}
+
+    def __call__(self, left, right):
+        return np.full(left.shape[1:], {0}, dtype=np.float32)
+"""
+
+
+def test_a_matcher_of_the_same_name_in_another_file_is_another_one(
+    scored_index, right_views, tmp_path, monkeypatch
+):
+    for place in ("one", "two"):
+        (tmp_path / place).mkdir()
+        (tmp_path / place / "mine.py").write_text(MATCHER.format(len(place)))
+    protocol = EvaluationProtocol(metrics=("sd",), size=SIZE, stereo_matcher="mine.py:Mine")
+
+    monkeypatch.chdir(tmp_path / "one")
+    for _ in range(2):
+        scored(scored_index, right_views, protocol, frames=[0], out=tmp_path / "out")
+    monkeypatch.chdir(tmp_path / "two")
+    with pytest.raises(
+        EvaluationError,
+        match=r"other matchers: \['sift', '.*one/mine\.py:Mine'\], where .*two/mine",
+    ):
+        scored(scored_index, right_views, protocol, frames=[0], out=tmp_path / "out")
+
+
+class Counting(ProcessPool):
+    """Processes of this machine, and how many were asked for."""
+
+    asked: ClassVar = []
+
+    def map(self, *given, workers, **options):
+        self.asked.append(workers)
+        yield from LOCAL.map(*given, workers=1, **options)
+
+
+@pytest.mark.parametrize(
+    ("device", "workers", "asked"),
+    [("cpu", None, None), ("cuda", None, 1), ("cuda:1", None, 1), ("cuda", 3, 3)],
+)
+def test_models_on_a_gpu_are_loaded_by_one_process_unless_more_are_asked_for(
+    scored_index, right_views, device, workers, asked
+):
+    protocol = EvaluationProtocol(metrics=("psnr",), size=SIZE, device=device)
+
+    scored(scored_index, right_views, protocol, frames=[0], workers=workers, engine=Counting())
+
+    assert Counting.asked.pop() == asked
 
 
 def test_results_of_another_evaluation_are_refused_by_what_differs(

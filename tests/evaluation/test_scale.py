@@ -1,6 +1,7 @@
 """SD: hand-worked lines, and SGBM on photographs with measured disparity."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,8 @@ from PIL import Image
 from scipy.stats import linregress
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.metrics.scale import fit_scale
+from stereogenbench_data.evaluation.metrics.scale import fit_scale, scale_settings
+from stereogenbench_data.evaluation.models.loading import range_of
 from stereogenbench_data.evaluation.models.opencv import Sgbm
 from tests.evaluation.conftest import photograph
 
@@ -75,6 +77,52 @@ def test_only_what_is_scored_and_answered_counts(truth):
     assert fit.drift == pytest.approx(0.5, abs=1e-6)
     assert fit.valid == pytest.approx(300 / 600)
     assert fit.answered == pytest.approx(300 / 400)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("beyond", [0.2, 0.5])
+def test_pixels_whose_true_disparity_the_matcher_cannot_find_are_counted_and_not_scored(
+    truth, method, beyond
+):
+    estimated = truth / 2
+    far = truth > np.quantile(truth, 1 - beyond)
+    estimated[far] = np.random.default_rng(1).uniform(0, 9, np.count_nonzero(far))
+    limit_px = float(truth[~far].max())
+
+    fit = fit_scale(estimated, truth, scored=EVERYWHERE, range_px=(-16, limit_px), method=method)
+    lower = fit_scale(-estimated, -truth, scored=EVERYWHERE, range_px=(-limit_px, 0), method=method)
+    polluted = fit_scale(estimated, truth, scored=EVERYWHERE, method="least_squares")
+
+    assert fit.slope == lower.slope == pytest.approx(2)
+    assert fit.beyond == lower.beyond == pytest.approx(beyond)
+    assert fit.answered == 1
+    assert fit.valid == pytest.approx(1 - beyond)
+    assert polluted.beyond == 0
+    assert abs(polluted.slope - 2) > 0.5
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_where_the_matcher_cannot_find_most_pixels_there_is_no_number_and_their_share_is_told(
+    truth, method
+):
+    limit_px = float(np.quantile(truth, 0.49))
+
+    fit = fit_scale(truth, truth, scored=EVERYWHERE, range_px=(0, limit_px), method=method)
+
+    assert math.isnan(fit.drift)
+    assert fit.valid == 0
+    assert fit.beyond == pytest.approx(0.51, abs=0.002)
+
+
+def test_a_matcher_of_ones_own_states_its_range_or_finds_all(sgbm):
+    states_it = SimpleNamespace(name="a", settings={}, range_px=(0, 64))
+    states_none = SimpleNamespace(name="b", settings={})
+
+    assert range_of(sgbm) == (-16, 175)
+    assert range_of(states_it) == (0, 64)
+    assert range_of(states_none) == (-math.inf, math.inf)
+    told = [scale_settings(each) for each in (states_it, states_none)]
+    assert [(each["least_px"], each["largest_px"]) for each in told] == [(0, 64), (None, None)]
 
 
 @pytest.mark.parametrize("method", METHODS)

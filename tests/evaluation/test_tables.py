@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,6 +20,7 @@ from stereogenbench_data.evaluation.tables import (
     release_difference,
     strata,
     table_of,
+    tallies,
     tally,
 )
 
@@ -143,11 +145,11 @@ def test_what_is_not_comparable_with_the_paper_is_said(scores):
     assert "The paper scores 81 frames a scene at 832x480, this 2 at 416x240: not comp" in text
 
 
-def test_the_papers_own_backends_are_not_marked_and_its_sd_stands_in_the_filtered_column(scores):
-    papers = EvaluationProtocol(
+def test_a_plug_in_of_any_name_is_named_and_the_papers_number_beside_it_marked(scores):
+    protocol = EvaluationProtocol(
         keypoint_matcher="mine.py:DeDoDe", stereo_matcher="mine.py:FoundationStereo"
     )
-    table = table_of([scores(tier="G1", protocol=papers)], "branches")
+    table = table_of([scores(tier="G1", protocol=protocol)], "branches")
     text = markdown(table)
     head, line = (
         [each.strip() for each in line.split("|")]
@@ -155,10 +157,10 @@ def test_the_papers_own_backends_are_not_marked_and_its_sd_stands_in_the_filtere
     )
     cells = dict(zip(head, line, strict=True))
 
-    assert "| E_match↓ |" in text
-    assert "†" not in text
-    assert cells["SD filtered↓ [median]"] == "0.3951"
-    assert cells["SD least squares↓ [median]"] == "-"
+    assert "| E_match (DeDoDe)↓ |" in text
+    assert cells["SD filtered (FoundationStereo)↓ [median]"] == "0.3951 †"
+    assert cells["SD least squares (FoundationStereo)↓ [median]"] == "-"
+    assert "(E_match (DeDoDe), SD filtered (FoundationStereo)) answers as that does" in text
 
 
 def test_identical_and_undefined_frames_are_counted_in_the_cell(scores):
@@ -167,6 +169,39 @@ def test_identical_and_undefined_frames_are_counted_in_the_cell(scores):
     assert "∞ (4 identical)" in text
     assert "10.00 (1 identical)" in text
     assert "(2 undefined)" in text
+
+
+def test_a_line_that_explains_hardly_anything_marks_its_number_in_every_table_and_text(scores):
+    one = scores()
+    columns = {
+        "sd_filtered": (17.0, 7220.0, 0.1), "sd_filtered_r2": (0.004, NAN, 0.9),
+        "sd_least_squares": (0.2, 0.3, 0.4), "sd_least_squares_r2": (0.1, 0.8, 0.9),
+        "sd_beyond": (0.0, 0.5, 0.1),
+    }  # fmt: skip
+    loose = replace(one, pairs=(replace(one.pairs[0], frames=3, tallies=tallies(columns)),))
+    table = table_of([loose], "branches")
+    text = markdown(table)
+
+    assert tallies(columns)["sd_filtered"].loose == 2
+    assert "| 2412.3667 ‡ [2412.3667] (2 with R2 below 0.1, 20.0% beyond range) |" in text
+    assert "| 0.3000 [0.3000] (20.0% beyond range) |" in text
+    assert "‡ In so many frames the line explains less than 10% of" in text
+    assert r"2412.3667 $^\ddagger$" in latex(table)
+    assert "‡" not in markdown(table_of([one], "branches"))
+
+
+def test_p_psnr_above_the_targets_is_told_beside_the_number(scores):
+    one = scores(protocol=EvaluationProtocol(metrics=("p_psnr",)))
+
+    def text(own_db, target_db):
+        columns = {"p_psnr": [own_db], "p_psnr_ceiling": [target_db]}
+        pair = replace(one.pairs[0], tallies=tallies(columns))
+        return markdown(table_of([replace(one, pairs=(pair,))], "branches"))
+
+    assert "| 45.57 (above the target's 23.13) |" in text(45.57, 23.126)
+    assert "above the target's is not better" in text(45.57, 23.126)
+    for known in (text(23.126, 23.126), text(20.0, 23.126), text(NAN, NAN)):
+        assert "above" not in known
 
 
 def test_a_gap_is_a_column_of_the_table(scores):

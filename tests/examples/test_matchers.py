@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from stereogenbench_data.evaluation.models.loading import load_model
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol
+from stereogenbench_data.evaluation.models.loading import load_model, range_of
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 DEDODE = f"{EXAMPLES / 'dedode_matcher.py'}:DeDoDe"
@@ -68,7 +67,8 @@ def site(monkeypatch, tmp_path):
     (tmp_path / "core" / "foundation_stereo.py").write_text(FOUNDATION_STEREO)
     (tmp_path / "omegaconf.py").write_text(
         "class OmegaConf:\n    @staticmethod\n    def load(path):\n"
-        "        return {'configuration': path.read_text()}\n"
+        "        name, _, value = path.read_text().partition(': ')\n"
+        "        return {name: int(value)}\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     names = ("kornia", "core", "core.foundation_stereo", "omegaconf")
@@ -113,10 +113,4 @@ def test_foundation_stereo_is_padded_for_and_its_answer_cut_to_the_picture(site)
     expected[3, 4] = np.nan
     np.testing.assert_array_equal(disparity, expected)
     assert matcher.name == "FoundationStereo (23-51-11)"
-
-
-def test_columns_that_the_plug_ins_measure_are_the_papers():
-    protocol = EvaluationProtocol(keypoint_matcher=DEDODE, stereo_matcher=FOUNDATION)
-
-    assert protocol.is_papers("e_match")
-    assert protocol.is_papers("sd_filtered")
+    assert range_of(matcher) == (0, 416)

@@ -7,7 +7,12 @@ from typing import Final, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from stereogenbench_data.evaluation.models.loading import Settings, StereoMatcher
+from stereogenbench_data.evaluation.models.loading import (
+    Range,
+    Settings,
+    StereoMatcher,
+    range_of,
+)
 
 FitMethod = Literal["filtered", "least_squares"]
 
@@ -16,6 +21,9 @@ _OUTLIER_PX: Final = 1.0
 _MAD_TO_SIGMA: Final = 1.4826
 _FEWEST_PIXELS: Final = 100
 _FEWEST_SHARE: Final = 0.01
+_FEWEST_IN_RANGE: Final = 0.5
+LEAST_R2: Final = 0.1
+"""The share of variance below which a line says nothing: its slope, and so SD, may be any."""
 _MEDIAN_PIXELS: Final = 20_000
 """About how many pixels, evenly spaced in reading order, the medians of a fit are taken of."""
 
@@ -52,7 +60,10 @@ class ScaleFit:
         offset_px: True disparity where none is estimated.
         outliers: The share of the answered pixels that were left out of the fit.
         valid: The share of the picture's pixels that the line was fitted to.
-        answered: The share of the scored pixels for which the matcher had an answer.
+        answered: The share of the scored pixels within the matcher's range for which it had an
+            answer.
+        beyond: The share of the scored pixels whose true disparity the matcher cannot find, and
+            which are left out.
         residual_px: Root mean squared residual of the fitted pixels.
         r2: The share of the fitted pixels' true variance that the line explains.
     """
@@ -63,6 +74,7 @@ class ScaleFit:
     outliers: float = math.nan
     valid: float = 0.0
     answered: float = math.nan
+    beyond: float = math.nan
     residual_px: float = math.nan
     r2: float = math.nan
 
@@ -72,6 +84,7 @@ def fit_scale(
     true_px: Float[np.ndarray, "h w"],
     *,
     scored: Bool[np.ndarray, "h w"],
+    range_px: Range = (-math.inf, math.inf),
     method: FitMethod = "filtered",
 ) -> ScaleFit:
     """Return the line through true over estimated disparity, and SD.
@@ -84,27 +97,24 @@ def fit_scale(
         estimated_px: A matcher's disparity of (left, predicted right); nan where it has none.
         true_px: The true disparity at the same resolution.
         scored: Where the truth is known and the point is seen by both cameras.
+        range_px: The least and the largest disparity that the matcher can find. Pixels whose true
+            one is beyond are left out; if those are more than half, there is no line.
         method: How to fit; `FITS` says what each does.
     """
+    in_view = int(np.count_nonzero(scored))
+    scored = scored & (true_px >= range_px[0]) & (true_px <= range_px[1])
     answered = np.flatnonzero(scored & np.isfinite(estimated_px) & np.isfinite(true_px))
     estimated, true = (
         values.reshape(-1)[answered].astype(np.float64) for values in (estimated_px, true_px)
     )
     wanted = int(np.count_nonzero(scored))
-    kept = np.ones(true.size, dtype=bool)
-    has_line = _has_line(estimated, wanted=wanted)
-    if has_line and method == "filtered":
-        some = slice(None, None, max(1, len(answered) // _MEDIAN_PIXELS))
-        if estimated[some].min() == estimated[some].max():
-            some = slice(None)
-        slope, offset = _median_line(estimated[some], true[some])
-        apart = np.abs(true - slope * estimated - offset)
-        sigma = _MAD_TO_SIGMA * float(np.median(apart[some]))
-        kept = apart <= max(_OUTLIER_SIGMAS * sigma, _OUTLIER_PX)
-        has_line = _has_line(estimated[kept], wanted=wanted)
     share = estimated.size / wanted if wanted else math.nan
-    if not has_line:
-        return ScaleFit(answered=share)
+    beyond = 1 - wanted / in_view if in_view else math.nan
+    kept = np.zeros(true.size, dtype=bool)
+    if beyond <= 1 - _FEWEST_IN_RANGE and _has_line(estimated, wanted=wanted):
+        kept = _near_the_median_line(estimated, true) if method == "filtered" else ~kept
+    if not _has_line(estimated[kept], wanted=wanted):
+        return ScaleFit(answered=share, beyond=beyond)
     slope, offset = _least_squares(estimated[kept], true[kept])
     residual = (true - slope * estimated - offset)[kept]
     pixels = int(np.count_nonzero(kept))
@@ -117,6 +127,7 @@ def fit_scale(
         outliers=(estimated.size - pixels) / estimated.size,
         valid=pixels / scored.size,
         answered=share,
+        beyond=beyond,
         residual_px=math.sqrt(mean_squared),
         r2=1 - mean_squared / variance if variance else math.nan,
     )
@@ -124,11 +135,18 @@ def fit_scale(
 
 def scale_settings(matcher: StereoMatcher) -> Settings:
     """Return every choice that SD depends on, and what each of its columns is."""
+    least_px, largest_px = (
+        edge_px if math.isfinite(edge_px) else None for edge_px in range_of(matcher)
+    )
     return {
         "matcher": matcher.name,
         **{f"sd_{method}": what for method, what in FITS.items()},
         "paper": SD_OF_THE_PAPER,
         "occlusion": "pixels that the right camera does not see are not scored, by true depth",
+        "range": "pixels whose true disparity the matcher cannot find are not scored, nor is a "
+        f"frame of which they are more than {1 - _FEWEST_IN_RANGE:.0%}",
+        "least_px": least_px,
+        "largest_px": largest_px,
         "direction": "true over estimated disparity",
         "fewest_pixels": _FEWEST_PIXELS,
         "fewest_share": _FEWEST_SHARE,
@@ -142,7 +160,21 @@ def _has_line(estimated: Float64[np.ndarray, " n"], *, wanted: int) -> bool:
     A matcher answers few pixels of unlike pictures, and a line through those can have any slope.
     """
     enough = max(_FEWEST_PIXELS, _FEWEST_SHARE * wanted)
-    return estimated.size >= enough and bool(estimated.min() < estimated.max())
+    return bool(estimated.size >= enough and estimated.min() < estimated.max())
+
+
+def _near_the_median_line(
+    estimated: Float64[np.ndarray, " n"], true: Float64[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Return which pixels are no outliers."""
+    some = slice(None, None, max(1, len(estimated) // _MEDIAN_PIXELS))
+    if estimated[some].min() == estimated[some].max():
+        some = slice(None)
+    slope, offset = _median_line(estimated[some], true[some])
+    apart = np.abs(true - slope * estimated - offset)
+    sigma = _MAD_TO_SIGMA * float(np.median(apart[some]))
+    near: Bool[np.ndarray, " n"] = apart <= max(_OUTLIER_SIGMAS * sigma, _OUTLIER_PX)
+    return near
 
 
 def _least_squares(

@@ -7,6 +7,7 @@ the paper's. Pictures are uint8 RGB, channel first.
 """
 
 import hashlib
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
@@ -62,13 +63,29 @@ class KeypointMatcher(Model, Protocol):
 
 
 class StereoMatcher(Model, Protocol):
-    """Estimates the disparity of a rectified pair."""
+    """Estimates the disparity of a rectified pair.
+
+    One that searches a range states it as ``range_px``, the least and the largest disparity that it
+    finds: pixels whose true disparity is beyond are not scored (`range_of`).
+    """
 
     def __call__(self, left: Picture, right: Picture) -> Float32[np.ndarray, "h w"]:
         """Return the left picture's disparity in pixels; nan where it has no answer.
 
         x_right = x_left - disparity: positive in front of the cameras.
         """
+
+
+Range = tuple[float, float]
+
+
+def range_of(matcher: StereoMatcher) -> Range:
+    """Return the least and the largest disparity, in pixels, that a matcher can find.
+
+    Of a matcher that states no ``range_px``, all.
+    """
+    least_px, largest_px = getattr(matcher, "range_px", (-math.inf, math.inf))
+    return least_px, largest_px
 
 
 MODELS: Final[dict[str, dict[str, str]]] = {
@@ -111,6 +128,12 @@ def load_model(kind: str, name: str, *, device: str = "cpu", weights: Path | Non
     taken = signature(model).parameters
     given = {"device": device, "weights": weights}
     return model(**{option: value for option, value in given.items() if option in taken})
+
+
+def place_of(name: str) -> str:
+    """Return a model's name with the path of its file in full, if it is one of a file."""
+    file, _, class_name = name.rpartition(":")
+    return f"{Path(file).resolve()}:{class_name}" if file.endswith(".py") else name
 
 
 @dataclass(frozen=True, slots=True)

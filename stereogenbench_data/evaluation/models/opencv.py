@@ -92,7 +92,12 @@ class Sgbm:
     The negative ones distinguish a view that is shifted the wrong way, or not at all, from one that
     is shifted a little. There is no answer for larger disparities, nor in the columns at both sides
     whose search range leaves the picture.
+
+    Attributes:
+        range_px: The least and the largest disparity.
     """
+
+    range_px: Final = (_LEAST_PX, _LEAST_PX + _DISPARITIES - 1)
 
     def __init__(self) -> None:
         """Make the matcher.
