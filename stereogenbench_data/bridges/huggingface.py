@@ -1,10 +1,11 @@
 """Stereo samples as a Hugging Face ``datasets.IterableDataset``, and the features of raw shards."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Unpack
+from typing import TYPE_CHECKING, Any, Final, Self, Unpack
 
 from stereogenbench_data.bridges.in_memory import SampleOptions, columns, samples_of, to_arrays
+from stereogenbench_data.datasets.batches import SharedEpoch
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.errors import (
     FieldError,
@@ -178,45 +179,77 @@ def features(*, depth_suffix: str = "mkv") -> "Features":
     )
 
 
+class RowDecoder:
+    """Turns rows of raw shards into samples; see `decode`."""
+
+    def __init__(self, fields: tuple[str, ...], options: SampleOptions) -> None:
+        """Keep the fields and the options of the samples."""
+        self._fields, self._options, self._epoch = fields, options, SharedEpoch()
+
+    def set_epoch(self, epoch: int) -> None:
+        """Draw new random frames and transforms in rows that are mapped after this call.
+
+        Running workers, and datasets that hold this function, see it, too.
+
+        Raises:
+            SelectionError: If it is not a whole number from 0.
+        """
+        self._epoch.set(epoch)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """Return this one: ``datasets`` copies functions where it concatenates or interleaves."""
+        return self
+
+    def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
+        """Return the sample of a row; of rows in columns, as ``batched=True`` gives, all samples.
+
+        Raises:
+            SelectionError: If a single row gives another number of samples than one.
+            StorageError: If a scene lacks a file.
+            SchemaError: If a metadata file does not follow the format.
+            MediaError: If a video does not decode to what its header says.
+        """
+        if isinstance(row["__key__"], str):
+            samples = self._samples(row)
+            if len(samples) != 1:
+                raise SelectionError(
+                    f"{row['__key__']}: the scene gives {len(samples)} samples, but map takes one "
+                    "per row. Pass batched=True, batch_size=1."
+                )
+            return samples[0]
+        rows = [dict(zip(row, values, strict=True)) for values in zip(*row.values(), strict=True)]
+        found = [sample for each in rows for sample in self._samples(each)]
+        return {name: [sample[name] for sample in found] for name in self._fields}
+
+    def _samples(self, row: dict[str, Any]) -> list[Sample]:
+        absent = [name for name in VIDEO_FILES if name in row and row[name] is None]
+        if absent and row.get(TRAINING_JSON) is None:
+            raise StorageError(
+                f"{row['__key__']}: the shard has no {', '.join(absent)}. If it was packed with "
+                '--depth-codec blosc2, read it with features(depth_suffix="b2frame").'
+            )
+        epoch = self._epoch.value
+        found = samples_of(
+            row["__key__"], row, fields=self._fields, epoch=epoch, options=self._options
+        )
+        return [to_arrays(sample) for sample in found]
+
+
 def decode(
     fields: Iterable[str] = DEFAULT_PAIR_FIELDS, **options: Unpack[SampleOptions]
-) -> Callable[[dict[str, Any]], dict[str, Any]]:
+) -> RowDecoder:
     """Return a function for ``map`` that turns rows of raw shards into samples.
 
     If every scene gives one sample, use ``dataset.map(decode(...), remove_columns=...)``. If a
     scene gives several, use ``map(..., batched=True, batch_size=1)``. All samples of a scene are
     then in memory at once, so prefer `iterable` for many frames or pairs.
 
+    Random frames and transforms are those of epoch 0 until its ``set_epoch`` is called; that of the
+    dataset does not reach a function. What ``map`` has stored of a ``Dataset`` does not change.
+
     Args:
         fields: Names of the fields to return.
         **options: pairs, frames, direction, baseline_cm, size, transform, depth, seed, as
             for `StereoPairs`.
     """
-    return partial(_decoded, fields=tuple(fields), options=options)
-
-
-def _decoded(
-    row: dict[str, Any], *, fields: tuple[str, ...], options: SampleOptions
-) -> dict[str, Any]:
-    if isinstance(row["__key__"], str):
-        samples = _samples(row, fields, options)
-        if len(samples) != 1:
-            raise SelectionError(
-                f"{row['__key__']}: the scene gives {len(samples)} samples, but map takes one per "
-                "row. Pass batched=True, batch_size=1."
-            )
-        return samples[0]
-    rows = [dict(zip(row, values, strict=True)) for values in zip(*row.values(), strict=True)]
-    found = [sample for each in rows for sample in _samples(each, fields, options)]
-    return {name: [sample[name] for sample in found] for name in fields}
-
-
-def _samples(row: dict[str, Any], fields: tuple[str, ...], options: SampleOptions) -> list[Sample]:
-    absent = [name for name in VIDEO_FILES if name in row and row[name] is None]
-    if absent and row.get(TRAINING_JSON) is None:
-        raise StorageError(
-            f"{row['__key__']}: the shard has no {', '.join(absent)}. If it was packed with "
-            '--depth-codec blosc2, read it with features(depth_suffix="b2frame").'
-        )
-    found = samples_of(row["__key__"], row, fields=fields, epoch=0, options=options)
-    return [to_arrays(sample) for sample in found]
+    return RowDecoder(tuple(fields), options)

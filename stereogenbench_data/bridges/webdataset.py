@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Unpack
 
 from stereogenbench_data.bridges.in_memory import SampleOptions, samples_of
+from stereogenbench_data.datasets.batches import SharedEpoch
 from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS, Sample
 from stereogenbench_data.selection.filters import SceneFilters, require_options
 
@@ -21,11 +22,17 @@ class SceneDecoder:
         """Keep the fields and the options of the samples."""
         self._fields = fields
         self._options = options
-        self._epoch = 0
+        self._epoch = SharedEpoch()
 
     def set_epoch(self, epoch: int) -> None:
-        """Draw new random frames and transforms in iterations that start after this call."""
-        self._epoch = epoch
+        """Draw new random frames and transforms in iterations that start after this call.
+
+        Running workers see it, too.
+
+        Raises:
+            SelectionError: If it is not a whole number from 0.
+        """
+        self._epoch.set(epoch)
 
     def __call__(self, scenes: Iterable[Mapping[str, Any]]) -> Iterator[Sample]:
         """Yield the samples of every scene.
@@ -35,12 +42,13 @@ class SceneDecoder:
             SchemaError: If a metadata file does not follow the format.
             MediaError: If a video does not decode to what its header says.
         """
+        epoch = self._epoch.value
         for scene in scenes:
             for sample in samples_of(
                 scene["__key__"],
                 scene,
                 fields=self._fields,
-                epoch=self._epoch,
+                epoch=epoch,
                 options=self._options,
             ):
                 if "__url__" in sample and "__url__" in scene:

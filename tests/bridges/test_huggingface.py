@@ -177,6 +177,30 @@ def test_a_scene_of_many_samples_is_mapped_in_batches_of_one(urls):
         next(iter(rows.map(decoder)))
 
 
+@pytest.mark.parametrize("made", ["mapped", "concatenated", "running workers"])
+def test_mapped_rows_draw_for_the_epoch_of_their_decoder(urls, made):
+    rows = raw(urls)
+    decoder = huggingface.decode(("frame_index",), frames=("random", 3))
+    features = datasets.Features({"frame_index": datasets.Value("int64")})
+    samples = rows.map(
+        decoder, batched=True, batch_size=1, remove_columns=rows.column_names, features=features
+    )
+    if made == "concatenated":
+        samples = datasets.concatenate_datasets([samples])
+    if made == "running workers":
+        samples = DataLoader(samples, batch_size=None, num_workers=1, persistent_workers=True)
+
+    def drawn(epoch):
+        decoder.set_epoch(epoch)
+        return [int(sample["frame_index"]) for sample in samples]
+
+    first, second, again = drawn(0), drawn(1), drawn(0)
+
+    assert first == again != second
+    with pytest.raises(SelectionError, match="an epoch is a whole number from 0, got -1"):
+        decoder.set_epoch(-1)
+
+
 def test_without_datasets_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "datasets", None)
 

@@ -7,6 +7,7 @@ import tempfile
 import numpy as np
 import pytest
 import webdataset
+from torch.utils.data import DataLoader
 
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.bridges.webdataset import decode
@@ -79,6 +80,20 @@ def test_random_frames_differ_among_scenes_and_epochs_and_repeat_by_seed(scenes)
     assert frames(0, 0) == frames(0, 0)
     assert frames(0, 0) != frames(0, 1)
     assert frames(0, 0) != frames(1, 0)
+
+
+def test_running_workers_draw_for_the_epoch_that_was_set(urls):
+    stage = decode(("frame_index",), frames=("random", 2))
+    scenes = webdataset.WebDataset(urls, shardshuffle=False).compose(stage)
+    loader = DataLoader(scenes, batch_size=None, num_workers=1, persistent_workers=True)
+
+    def drawn(epoch):
+        stage.set_epoch(epoch)
+        return [int(sample["frame_index"]) for sample in loader]
+
+    first, second, again = drawn(0), drawn(1), drawn(0)
+
+    assert first == again != second
 
 
 def test_nothing_is_left_in_the_temporary_folder(scenes, tmp_path, monkeypatch):
