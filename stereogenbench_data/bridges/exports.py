@@ -12,10 +12,9 @@ def training_filters(options: Mapping[str, Any]) -> SceneFilters:
     """Return the filters on scenes among options; without ``split``, training scenes.
 
     A model that was trained on evaluation scenes cannot be evaluated on them, so these are exported
-    only where they are named.
+    only where they are named, or where ``split`` is None and so lets all pass.
     """
-    names = SceneFilters.__annotations__
-    found = {name: options[name] for name in names if options.get(name) is not None}
+    found = {name: options[name] for name in SceneFilters.__annotations__ if name in options}
     return cast("SceneFilters", {"split": "train", **found})
 
 

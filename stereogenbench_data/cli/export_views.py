@@ -107,7 +107,7 @@ def _export(
     from stereogenbench_data.bridges.export_views import export_views
 
     names = ("cameras", "frames", "size", "points")
-    given = {
+    given: dict[str, Any] = chosen.filters() | {
         name: value for name, value in vars(chosen).items() if name in names and value is not None
     }
     index = source.open()
@@ -118,7 +118,6 @@ def _export(
             layout=layout,
             progress=progress,
             **given,
-            **chosen.filters(),
             **work.options(),
         )
     typer.echo(f"{out}: {counted(len(folders), 'folder')}")

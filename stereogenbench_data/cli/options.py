@@ -162,6 +162,18 @@ def filter_of(text: str) -> tuple[str, Any]:
     return ("scenes" if name == "scene" else name), value if name == "caption" else [value]
 
 
+def _refuse_two(name: str, *values: Any) -> None:
+    """Refuse several values of a filter that takes one."""
+    shown = (
+        ":".join(f"{end:g}" for end in each) if isinstance(each, tuple) else str(each)
+        for each in values
+    )
+    raise typer.BadParameter(
+        f"{name} is given more than once ({', '.join(shown)}): give it one value.",
+        param_hint="--where",
+    )
+
+
 def part_of(text: str) -> tuple[int, int]:
     """Return (number, count) of a part such as 1/4."""
     number, _, count = text.partition("/")
@@ -273,12 +285,26 @@ class SceneOptions:
     ] = None
 
     def filters(self) -> dict[str, Any]:
-        """Return the filters that were given, by their names in `SceneFilters`."""
+        """Return the filters that were given, by their names in `SceneFilters`.
+
+        ``split`` is None where all splits are asked for, and left out where nothing is.
+
+        Raises:
+            typer.BadParameter: If a filter that takes one value is given several.
+        """
         filters: dict[str, Any] = {}
         for name, value in self.where or []:
-            is_listed = isinstance(value, list)
-            filters[name] = [*filters.get(name, ()), *value] if is_listed else value
-        return filters if self.split in (None, "all") else {"split": self.split} | filters
+            if isinstance(value, list):
+                value = [*filters.get(name, ()), *value]
+            elif name in filters:
+                _refuse_two(name, filters[name], value)
+            filters[name] = value
+        if "split" not in filters and self.split is not None:
+            return {"split": None if self.split == "all" else self.split} | filters
+        (default,) = (each.default for each in fields(self) if each.name == "split")
+        if self.split != default:
+            _refuse_two("split", self.split, *filters["split"])
+        return filters
 
     def by_path(self) -> "Callable[[SceneId], bool] | None":
         """Return whether a scene's path passes the filters; None if all pass.

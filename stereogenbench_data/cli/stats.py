@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict
+from typing import Any
 
 import typer
 
@@ -31,7 +32,8 @@ def stats(
     """
     from stereogenbench_data.audit.statistics import compared, statistics, statistics_markdown
 
-    found = statistics(source.open(), **chosen.filters())
+    filters: Any = chosen.filters()
+    found = statistics(source.open(), **filters)
     lines = compared(found)
     document = found.to_json() | {
         "paper": [asdict(line) | {"agrees": line.agrees} for line in lines]

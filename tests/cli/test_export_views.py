@@ -27,6 +27,15 @@ def test_training_scenes_are_exported(indexed_release, tmp_path, name, file):
     assert (folder / file).is_file()
 
 
+@pytest.mark.parametrize(
+    ("split", "folders"), [(("--split", "all"), 4), (("--split", "eval"), 1), ((), 3)]
+)
+def test_all_splits_are_exported_where_all_are_asked_for(indexed_release, tmp_path, split, folders):
+    done = invoke("export", "moge", indexed_release, tmp_path, *USUAL, *split)
+
+    assert done.stdout == f"{tmp_path}: {folders} folders\n".replace("1 folders", "1 folder")
+
+
 def test_filters_cameras_frames_and_points_are_taken(indexed_release, tmp_path):
     done = invoke(
         "export", "ply", indexed_release, tmp_path, *USUAL, "--where", "family=Uniform",

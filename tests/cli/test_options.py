@@ -53,6 +53,31 @@ def test_filters_are_named_and_texts_are_gathered():
     }  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("words", "values"),
+    [
+        (["focal_mm=18:35", "focal_mm=35:50"], "focal_mm is given more than once (18:35, 35:50)"),
+        (["baseline_cm=6", "family=A", "baseline_cm=9"], "baseline_cm is given more than once (6:"),
+        (["min_frames=9", "min_frames=9"], "min_frames is given more than once (9, 9)"),
+        (["caption=red", "caption=blue"], "caption is given more than once (red, blue)"),
+        (["split=eval"], "split is given more than once (train, eval)"),
+    ],
+)
+def test_a_filter_of_one_value_that_is_given_two_is_refused_with_both(words, values):
+    where = [word for each in words for word in ("--where", each)]
+
+    message = refused("eval", "controls", "d", "--split", "train", *where)
+    assert SceneOptions(where=[filter_of("split=train")]).filters() == {"split": ["train"]}
+
+    assert f"--where: {values}" in message
+    assert "give it one value." in message
+
+
+def test_all_splits_are_not_the_same_as_none_that_was_named():
+    assert SceneOptions(split="all").filters() == {"split": None}
+    assert SceneOptions().filters() == {}
+
+
 def test_synth_takes_one_number_for_width_and_height(tmp_path):
     words = ("synth", tmp_path, "--frames", 1, "--plan-only", "--workers", 1, "--size")
 
