@@ -661,14 +661,23 @@ def require_finished(
 
 
 def caption_of(texts: Mapping[str, bytes], *, key: str) -> tuple[str, tuple[Remark, ...]]:
-    """Return a scene's caption from its files: the detailed one, else the short one, else ""."""
+    """Return a scene's caption from its files: the detailed one, else the short one, else "".
+
+    That of the JSON counts, and a text file that does not hold it is a remark.
+    """
     remarks: list[Remark] = []
+    found: dict[str, str] = {}
     for name in (each for each in DESCRIPTIONS if each in texts):
         caption, odd = parse_caption(texts[name], where=f"{key}/{name}")
         remarks += odd
         if caption:
-            return caption, tuple(remarks)
-    return "", tuple(remarks)
+            found[name] = caption
+    stated, text = found.get(DESCRIPTION_JSON, ""), found.get(DESCRIPTION_TXT, "")
+    if text and " ".join(stated.split()) not in " ".join(text.split()):
+        remarks.append(
+            Remark("caption", f"{key}/{DESCRIPTION_TXT}: has another caption than the JSON beside")
+        )
+    return stated or text, tuple(remarks)
 
 
 def merged_labels(labels: SceneLabels, marked: SceneLabels) -> SceneLabels:

@@ -99,7 +99,7 @@ REMARKS: Final = {
     "baselines": "baselines that are not recorded are sums of their neighbours",
     "unit": "baselines lie outside of the family's range",
     "labels": "labels that are not understood are left out",
-    "caption": "captions that are not understood are left out",
+    "caption": "captions that are not understood are left out; that of the JSON counts",
 }
 """What a remark may be about, and what follows from it."""
 

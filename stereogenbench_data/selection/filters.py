@@ -131,7 +131,7 @@ class SceneFilters(TypedDict, total=False):
         valid_depth_ratio: Range of the share of measured depth pixels, known only for an index
             that was made with it.
         min_frames: The fewest frames that a scene may have, so that clips of that length fit.
-        caption: Words that must all occur in the caption, in any case and order.
+        caption: Whole words that must all occur in the caption, in any case and order.
     """
 
     split: str | Sequence[str] | None
@@ -260,9 +260,10 @@ def _apply(
         if not isinstance(wanted, str) or not wanted.split():
             raise SelectionError(f"caption must be one or more words, got {wanted!r}.")
         words = wanted.lower().split()
+        whole = [re.compile(rf"(?<!\w){re.escape(word)}(?!\w)") for word in words]
         captions = [str(caption).lower() for caption in index.column("caption")[rows]]
         keep = np.array(
-            [all(word in caption for word in words) for caption in captions], dtype=bool
+            [all(word.search(caption) for word in whole) for caption in captions], dtype=bool
         )
         written = counted(sum(map(bool, captions)), "scene")
         every = "all of " * (len(words) > 1) + ", ".join(map(_quoted, words))

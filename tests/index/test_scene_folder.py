@@ -122,6 +122,26 @@ def test_the_text_file_stands_in_for_the_description(make_scene, root):
     assert describe_scene(root, KEY).caption == "Cars."
 
 
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("Cars behind glass.\n", ""),
+        ("Title: a yard\nCars  behind\nglass.", ""),
+        ("A red horse.", f"{KEY}/scene_description_qwen_dataset_level.txt: has another caption"),
+        ("", ""),
+    ],
+)
+def test_the_jsons_caption_counts_and_a_text_file_without_it_is_told(make_scene, root, text, told):
+    folder = make_scene()
+    (folder / "scene_description_qwen_dataset_level.txt").write_text(text)
+
+    scene = describe_scene(root, KEY)
+
+    assert scene.caption == "Cars behind glass."
+    assert scene.remark("caption").startswith(told)
+    assert bool(scene.remark("caption")) == bool(told)
+
+
 def test_frames_without_poses_at_the_end_are_not_used(described):
     scene = described("trajectory.json", lambda document: document["frames"].pop())
 

@@ -31,6 +31,7 @@ def keys(index, **filters):
         ({"focal_mm": (21, 22)}, 2),
         ({"min_frames": 81}, 8),
         ({"caption": "COURTYARD sky"}, 4),
+        ({"caption": "sky"}, 4),
         ({"scenes": "train/Uniform/Town/scene_000001"}, 1),
         ({"split": "train", "family": "Uniform", "map": None}, 3),
     ],
@@ -71,6 +72,8 @@ def test_a_filter_keeps_the_scenes_that_match(index, filters, expected):
         ({"focal_mm": ("a", "b")}, "focal_mm must be"),
         ({"focal_mm": (np.nan, 2)}, "focal_mm"),
         ({"caption": "   "}, "caption must be one or more words"),
+        ({"caption": "court"}, "caption court matches none of 9 scenes; .* none with court"),
+        ({"caption": "street igh"}, "none with all of street, igh"),
     ],
     ids=str,
 )
