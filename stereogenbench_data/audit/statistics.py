@@ -171,18 +171,27 @@ _Place = TypeVar("_Place", bound=tuple[str, ...])
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One figure of the paper and ours, both as texts with the paper's number of digits."""
+    """One figure of the paper and ours, both as texts with the paper's number of digits.
+
+    Attributes:
+        split: Of which scenes.
+        table: Where it stands in the paper.
+        item: What it is.
+        paper: The paper's.
+        ours: That of the data.
+        agrees: Whether the two are equal, or of a range whether ours lies within the paper's.
+    """
 
     split: str
     table: str
     item: str
     paper: str
     ours: str
+    agrees: bool
 
-    @property
-    def agrees(self) -> bool:
-        """Whether the two are equal."""
-        return self.paper == self.ours
+
+def _equal(split: str, table: str, item: str, paper: str, ours: str) -> Line:
+    return Line(split, table, item, paper, ours, paper == ours)
 
 
 def compared(found: Statistics) -> tuple[Line, ...]:
@@ -210,7 +219,7 @@ def _beside(
     """Yield the numbers of scenes that the paper or the data have, 0 where one has none."""
     for place in dict.fromkeys([*paper, *ours]):
         item = f"{what}, {' '.join(filter(None, place))}"
-        yield Line(place[0], table, item, str(paper.get(place, 0)), str(ours.get(place, 0)))
+        yield _equal(place[0], table, item, str(paper.get(place, 0)), str(ours.get(place, 0)))
 
 
 def _count_lines(found: Statistics) -> Iterator[Line]:
@@ -237,7 +246,7 @@ def _baseline_lines(found: Statistics) -> Iterator[Line]:
                     ours = f"{getattr(branch, f'{name}_cm')[figure]:.{decimals}f}"
                 unit = "" if figure == "count" else " (cm)"
                 item = f"{name.replace('_', ' ')}, {split} {family}: {figure}{unit}"
-                yield Line(split, table, item, row[figure], ours)
+                yield _equal(split, table, item, row[figure], ours)
 
 
 def _bin_lines(found: Statistics) -> Iterator[Line]:
@@ -264,9 +273,9 @@ def _focal_lines(found: Statistics) -> Iterator[Line]:
         if not spreads:
             continue
         least, most = min(each["min"] for each in spreads), max(each["max"] for each in spreads)
-        ours = paper if low <= least and most <= high else f"{least:g} to {most:g}"
+        ours, agrees = f"{least:g} to {most:g}", low <= least and most <= high
         item = f"focal lengths within (mm), {split}"
-        yield Line(split, "appendix on generation parameters", item, paper, ours)
+        yield Line(split, "appendix on generation parameters", item, paper, ours, agrees)
 
 
 def _map_lines(found: Statistics) -> Iterator[Line]:
@@ -289,7 +298,7 @@ def _map_lines(found: Statistics) -> Iterator[Line]:
     }
     for row in paper_table("eval_maps"):
         item, ours_is = f"subset of {row['map']}", subsets.get(row["map"], "-")
-        yield Line("eval", tables["eval"], item, row["subset"], ours_is)
+        yield _equal("eval", tables["eval"], item, row["subset"], ours_is)
 
 
 def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
@@ -308,7 +317,17 @@ def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
         agreeing = sum(line.agrees for line in lines)
         title = f"Against the paper: {agreeing} of {len(lines)} figures agree"
         rows = [
-            ("same" if line.agrees else "**differs**", line.item, line.paper, line.ours, line.table)
+            (
+                "**differs**"
+                if not line.agrees
+                else "same"
+                if line.paper == line.ours
+                else "within",
+                line.item,
+                line.paper,
+                line.ours,
+                line.table,
+            )
             for line in sorted(lines, key=lambda each: each.agrees)
         ]
         text += _section(title, [("", "figure", "paper", "here", "source"), *rows])

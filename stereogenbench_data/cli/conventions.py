@@ -16,7 +16,7 @@ from stereogenbench_data.cli.options import (
     option,
 )
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.writing import writing
+from stereogenbench_data.cli.writing import write_report
 from stereogenbench_data.schema.text import counted, plain_line
 
 
@@ -51,8 +51,9 @@ def conventions(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.audit.format_report import format_report
     from stereogenbench_data.schema.conventions import Conventions
 
-    if check is not None and out is not None:
-        raise typer.BadParameter("tests a file and writes none: leave --out out.", param_hint="-o")
+    if (check is not None or report) and out is not None:
+        what = "--check tests a file" if check is not None else "--report prints"
+        raise typer.BadParameter(f"{what} and writes none: leave it out.", param_hint="--out")
     stated = None if check is None else Conventions.read(check)
     with progress_bar("reading scenes", unit="scenes") as progress:
         found = survey(
@@ -66,12 +67,8 @@ def conventions(  # noqa: PLR0913 - one parameter an option
         )
     if report:
         typer.echo(format_report(found))
-    elif check is None:
-        if out is not None:
-            with writing(out):
-                out.write_text(found.toml, encoding="utf-8")
-        else:
-            typer.echo(found.toml, nl=False)
+    elif check is None and out is None:
+        typer.echo(found.toml, nl=False)
     usable = sum(each.scene is not None for each in found.examined)
     verified = "" if found.learned is None else f", {len(found.learned.verified)} verified the rest"
     typer.echo(f"{counted(usable, 'scene')} of {len(found.examined)} read{verified}", err=True)
@@ -82,6 +79,7 @@ def conventions(  # noqa: PLR0913 - one parameter an option
         untested = f"; no picture could test {', '.join(found.untested)}" if found.untested else ""
         typer.echo(f"{check}: {'contradicted' if found.problems else 'fits'}{untested}", err=True)
     elif out is not None:
+        write_report(out, found.toml)
         typer.echo(f"{out}: use it with --conventions, or StereoPairs(..., conventions=)", err=True)
     if found.problems:
         raise typer.Exit(FINDINGS)

@@ -57,12 +57,11 @@ def doctor(  # noqa: PLR0913 - one parameter an option
             progress=progress,
             filters=filters,
         )
+    document = json.dumps(doctor_json(report), indent=2) if as_json else None
+    typer.echo(document or "\n".join(doctor_lines(report)))
     if out is not None:
         with writing(out):
             draw_report(out, report, index)
-    document = json.dumps(doctor_json(report), indent=2) if as_json else None
-    typer.echo(document or "\n".join(doctor_lines(report)))
-    if out is not None and not as_json:
-        typer.echo(f"\npicture: {out}")
+        typer.echo(f"\npicture: {out}", err=as_json)
     if report.is_wrong:
         raise typer.Exit(FINDINGS)

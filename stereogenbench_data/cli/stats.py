@@ -35,11 +35,9 @@ def stats(
     filters: Any = chosen.filters()
     found = statistics(source.open(), **filters)
     lines = compared(found)
-    document = found.to_json() | {
-        "paper": [asdict(line) | {"agrees": line.agrees} for line in lines]
-    }
+    document = found.to_json() | {"paper": [asdict(line) for line in lines]}
     text = json.dumps(document, indent=1)
     markdown = statistics_markdown(found, lines)
+    typer.echo(text if as_json else markdown.rstrip())
     if out is not None:
         write_report(out, text if out.suffix == ".json" else markdown)
-    typer.echo(text if as_json else markdown.rstrip())

@@ -23,7 +23,7 @@ def writing(place: Path) -> Iterator[None]:
 
 
 def write_report(path: Path, text: str) -> None:
-    """Write a report as UTF-8 into a new file or over an existing one; create its folder.
+    """Write a report as UTF-8 into a new file or over an existing one.
 
     What UTF-8 cannot encode, such as odd bytes of file names, becomes ``?``.
 
@@ -34,7 +34,5 @@ def write_report(path: Path, text: str) -> None:
     from stereogenbench_data.sources.files import open_output
 
     content = text.encode(errors="replace")
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open_output(path) as file:
-            file.write(content)
+    with writing(path), open_output(path) as file:
+        file.write(content)

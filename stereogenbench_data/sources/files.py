@@ -74,7 +74,7 @@ def open_atomic(path: Path, *, flush_to: Literal["disk", "system"] = "disk") -> 
 
 @contextmanager
 def open_output(path: Path) -> Iterator[BinaryIO]:
-    """Open a file that the user named, as `open_atomic` does.
+    """Open a file that the user named, as `open_atomic` does; its folder is made.
 
     Links are followed. Devices and pipes are written to directly.
     """
@@ -82,6 +82,7 @@ def open_output(path: Path) -> Iterator[BinaryIO]:
         with path.open("wb") as file:
             yield file
         return
+    path.parent.mkdir(parents=True, exist_ok=True)
     with open_atomic(path.resolve()) as file:
         yield file
 

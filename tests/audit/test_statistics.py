@@ -91,6 +91,26 @@ def test_an_index_with_the_papers_figures_agrees_with_all_of_its_tables(release)
     assert len({line.table for line in lines}) == 7
 
 
+def test_focal_lengths_of_the_data_stand_beside_the_papers_range(release):
+    found = statistics(release, focal_mm=(20, 83))
+    first, *others = found.branches
+    longer = dataclasses.replace(first, focal_mm=first.focal_mm | {"max": 90.0})
+    beyond = dataclasses.replace(found, branches=(longer, *others))
+
+    def line(of):
+        return next(each for each in compared(of) if each.item.endswith("within (mm), train"))
+
+    within, differs = line(found), line(beyond)
+    low, _, high = within.ours.partition(" to ")
+    assert 20 <= float(low) < 21
+    assert 82 < float(high) <= 83
+    assert (within.paper, within.agrees) == ("18 to 85", True)
+    assert (differs.ours, differs.agrees) == (f"{low} to 90", False)
+    for told, shown in ((within, "within"), (differs, "**differs**")):
+        text = statistics_markdown(found, [told])
+        assert f"| {shown} | focal lengths within (mm), train | 18 to 85 | {told.ours} |" in text
+
+
 def test_one_scene_less_is_seen_in_every_figure_that_it_moves(release):
     keys = release.column("key").tolist()
     last = max(key for key in keys if "/Scene_Saloon/" in key)

@@ -53,6 +53,49 @@ def test_a_file_that_cannot_be_written_is_named_and_not_left_half(
     assert left == []
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("show", "-o", "new/deep/sheet.png"),
+        ("show", "-o", "new/deep/clip.gif"),
+        ("stats", "-o", "new/deep/stats.md"),
+        ("conventions", "--scenes", "1", "--pictures", "0", "-o", "new/deep/conventions.toml"),
+    ],
+    ids=lambda words: words[-1],
+)
+def test_the_folder_of_a_file_is_made(small_release, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+
+    done = invoke(words[0], small_release, *words[1:])
+
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / words[-1]).stat().st_size > 0
+
+
+def test_conventions_that_cannot_be_written_leave_those_that_were_there(small_release, tmp_path):
+    file = tmp_path / "conventions.toml"
+    file.write_text("[depth]\nunit_m = 0.001\n")
+    words = ("conventions", small_release, "--scenes", "1", "--pictures", "0")
+    with files_of_at_most(10):
+        refused = invoke(*words, "-o", file)
+    both = invoke(*words, "--report", "-o", file)
+
+    assert refused.exit_code == 2
+    assert "conventions.toml (File too large)" in one_line(refused.stderr)
+    assert "1 scene of 1 read" in refused.stderr
+    assert file.read_text() == "[depth]\nunit_m = 0.001\n"
+    assert [*tmp_path.iterdir()] == [file]
+    assert both.exit_code == 2
+    assert "--out: --report prints and writes none: leave it out." in one_line(both.stderr)
+
+
+def test_a_statistic_is_printed_where_its_file_cannot_be_written(small_shards, tmp_path):
+    shown = invoke("stats", small_shards, "-o", tmp_path)
+
+    assert shown.exit_code == 2
+    assert "# Statistics of" in shown.stdout
+
+
 def test_a_report_may_go_through_a_link_or_a_pipe(tmp_path):
     link, target, pipe = tmp_path / "link.md", tmp_path / "target.md", tmp_path / "pipe"
     target.write_text("before")
