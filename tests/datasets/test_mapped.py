@@ -75,6 +75,28 @@ def test_a_view_field_is_as_its_table_says_with_the_views_in_front(indexed_relea
         assert str(stacked.dtype) == f"torch.{field.dtype}"
 
 
+def test_stacked_views_of_clips_have_the_axes_that_the_page_of_samples_states(indexed_release):
+    fields = (
+        "baselines_m", "cams_from_cam", "world_from_cam", "camera", "image", "intrinsics",
+        "focal_mm", "frame_index", "frame_rate_hz",
+    )  # fmt: skip
+    options = {"split": "train", "frames": ("clips", 3), "fields": fields, "size": (40, 48)}
+
+    def shapes(cameras):
+        sample = SceneViews(indexed_release, cameras=cameras, **options)[0]
+        return {name: tuple(value.shape) for name, value in sample.items()}
+
+    of_all = {"intrinsics": (3, 3), "focal_mm": (), "frame_index": (3,), "frame_rate_hz": ()}
+    assert shapes((0, 4)) == of_all | {
+        "baselines_m": (2, 2), "cams_from_cam": (2, 3, 2, 4, 4), "world_from_cam": (2, 3, 4, 4),
+        "camera": (2,), "image": (2, 3, 3, 40, 48),
+    }  # fmt: skip
+    assert shapes("each") == of_all | {
+        "baselines_m": (1,), "cams_from_cam": (3, 1, 4, 4), "world_from_cam": (3, 4, 4),
+        "camera": (), "image": (3, 3, 40, 48),
+    }  # fmt: skip
+
+
 def test_a_sweep_of_clips_has_an_axis_of_targets_and_one_of_time_and_holds_single_samples(
     indexed_release,
 ):
