@@ -61,6 +61,15 @@ def test_every_python_that_is_named_is_tested_and_admitted():
     assert all(version in SpecifierSet(PROJECT["requires-python"]) for version in named)
 
 
+def test_blender_is_asked_for_by_the_one_python_that_it_has_wheels_for():
+    (bpy,) = map(Requirement, EXTRAS["blender"])
+    minors = [f"3.{minor}" for minor in range(11, 16)]
+
+    asking = [each for each in minors if bpy.marker.evaluate({"python_version": each})]
+
+    assert asking == ["3.13"]
+
+
 @pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/architecture.md"])
 def test_every_path_and_name_on_a_page_for_developers_exists(page):
     whole = (HOME / page).read_text()

@@ -95,7 +95,8 @@ def facts_of(index: SceneIndex | None, *, about: About | None = None) -> Facts:
             f"known, because `stereogenbench synth` did not draw them. Not stated: "
             f"{', '.join(missing)}. If they are the scenes of the StereoGenBench paper, add "
             "`--about release`. If not, write the questions into a file with `stereogenbench "
-            "croissant --template -o about.json`, answer them, and add `--about about.json`."
+            "publish croissant --template -o about.json`, answer them, and add "
+            "`--about about.json`."
         )
     return facts
 
@@ -106,7 +107,7 @@ def _stated(about: Path) -> Facts:
     except (OSError, ValueError) as error:
         raise DescriptorError(
             f"{about}: cannot be read as JSON ({error}). Write one with `stereogenbench publish "
-            "croissant --template -o about.json`."
+            "publish croissant --template -o about.json`."
         ) from error
     if not isinstance(facts, dict):
         raise DescriptorError(f"{about}: must be a JSON object, found a {type(facts).__name__}.")

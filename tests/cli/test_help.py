@@ -1,9 +1,11 @@
 """Help and examples: what a newcomer meets first."""
 
+import ast
 import re
 import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import typer
@@ -11,6 +13,7 @@ import typer
 from stereogenbench_data.cli.commands import app
 from tests.cli.command import invoke, one_line
 
+HOME = Path(__file__).resolve().parents[2]
 COMMANDS = typer.main.get_command(app).commands
 
 
@@ -43,6 +46,42 @@ def test_the_help_of_every_command_has_an_example_that_parses(path):
 
     assert tuple(words[: len(path)]) == path
     command.make_context(path[-1], words[len(path) :], resilient_parsing=False)
+
+
+def texts_of(path):
+    """Return the texts of a module, joined ones as one, or that of a page."""
+    if path.suffix != ".py":
+        return [path.read_text()]
+    texts = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            texts.append(node.value)
+        elif isinstance(node, ast.JoinedStr):
+            parts = (getattr(part, "value", "") for part in node.values)
+            texts.append("".join(part if isinstance(part, str) else "..." for part in parts))
+    return texts
+
+
+def test_every_command_that_a_message_or_a_page_names_is_there():
+    places = [
+        HOME / "README.md",
+        *HOME.glob("docs/*.md"),
+        *HOME.glob("stereogenbench_data/**/*.py"),
+    ]
+    named = {}
+    for place in places:
+        for text in texts_of(place):
+            for words in re.findall(r"`stereogenbench ([a-z]+)(?: ([a-z]+)\b(?!/))?", text):
+                named.setdefault(words, place)
+    known = {path[0] for path in CALLS}
+    groups = {path[0] for path in CALLS if len(path) > 1}
+
+    assert len(named) > 15
+    assert {words: place for words, place in named.items() if words[0] not in known} == {}
+    wrong = {
+        words: place for words, place in named.items() if words[0] in groups and words not in CALLS
+    }
+    assert wrong == {}
 
 
 def test_every_option_says_what_it_is_and_a_flag_takes_no_value():
