@@ -107,7 +107,7 @@ def _stated(about: Path) -> Facts:
     except (OSError, ValueError) as error:
         raise DescriptorError(
             f"{about}: cannot be read as JSON ({error}). Write one with `stereogenbench publish "
-            "publish croissant --template -o about.json`."
+            "croissant --template -o about.json`."
         ) from error
     if not isinstance(facts, dict):
         raise DescriptorError(f"{about}: must be a JSON object, found a {type(facts).__name__}.")

@@ -43,7 +43,8 @@ TierOption = Annotated[
     ),
 ]
 ScoredSizeOption = Annotated[
-    Any, option("--size", "Width x height of what is scored.", parser=size_of, metavar="WxH")
+    Any,
+    option("--size", "Width x height of what is scored; N is NxN.", parser=size_of, metavar="WxH"),
 ]
 PAPER_SIZE = "832x480"
 

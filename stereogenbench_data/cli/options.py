@@ -89,12 +89,12 @@ def out_folder(text: str) -> Path:
 
 
 def size_of(text: str) -> tuple[int, int]:
-    """Return (height, width) of a size, which is WIDTHxHEIGHT."""
+    """Return (height, width) of a size, which is WIDTHxHEIGHT, or N of a square."""
     from stereogenbench_data.errors import FieldError
     from stereogenbench_data.samples.fields import require_size
 
     try:
-        return require_size(text)
+        return require_size(f"{text}x{text}" if text.isdecimal() else text)
     except FieldError as error:
         raise typer.BadParameter(str(error)) from None
 
@@ -186,7 +186,12 @@ def part_of(text: str) -> tuple[int, int]:
 
 SizeOption = Annotated[
     Any,
-    option("--size", "Width x height, such as 832x480 [as stored].", parser=size_of, metavar="WxH"),
+    option(
+        "--size",
+        "Width x height, such as 832x480; N is NxN [as stored].",
+        parser=size_of,
+        metavar="WxH",
+    ),
 ]
 SplitOption = Annotated[
     str | None, option("The split [all; to export: train].", metavar="train|eval|all", panel=SCENES)

@@ -22,10 +22,6 @@ if TYPE_CHECKING:
     from stereogenbench_data.synthesis.renderer import Renderer
 
 
-def _picture_size(text: str) -> tuple[int, int]:
-    return size_of(f"{text}x{text}" if text.isdecimal() else text)
-
-
 @grouped
 def synth(  # noqa: PLR0913 - one parameter an option
     out: OutArgument,
@@ -33,7 +29,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
     family: Annotated[str, option(f"Family of baselines: {', '.join(FAMILIES)}.")] = FAMILIES[0],
     scenes: Annotated[int, option("Number of scenes; they are numbered from 0.")] = 1,
     size: Annotated[
-        Any, option("Width x height, both even; N is NxN.", parser=_picture_size, metavar="WxH")
+        Any, option("Width x height, both even; N is NxN.", parser=size_of, metavar="WxH")
     ] = str(IMAGE_SIZE_PX),
     frames: Annotated[int, option("Frames, at 15 Hz.")] = FRAME_COUNT,
     seed: Annotated[int, option("Seed of all that is random.")] = 0,

@@ -3,11 +3,19 @@
 import subprocess
 import sys
 
+import typer
 from typer.testing import CliRunner
 
 from stereogenbench_data.cli.commands import app
 
 COMMAND = (sys.executable, "-m", "stereogenbench_data")
+COMMANDS = typer.main.get_command(app).commands
+CALLS = {
+    (name, *([inner] if inner else [])): call
+    for name, each in COMMANDS.items()
+    for inner, call in (getattr(each, "commands", None) or {"": each}).items()
+}
+"""The commands by the words that call them."""
 
 
 def invoke(*words, **options):

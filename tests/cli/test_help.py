@@ -8,13 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
-import typer
 
-from stereogenbench_data.cli.commands import app
-from tests.cli.command import invoke, one_line
+from tests.cli.command import CALLS, COMMANDS, invoke, one_line
 
 HOME = Path(__file__).resolve().parents[2]
-COMMANDS = typer.main.get_command(app).commands
 
 
 def shown(*arguments):
@@ -30,13 +27,6 @@ def test_help_groups_the_commands_in_the_order_of_use_and_says_what_each_exit_st
     assert text.index("synth scenes/") < text.index("show scenes/") < text.index("browse scenes/")
     for status in ("0 done", "1 something is wrong with the data", "2 it could", "130 stopped"):
         assert status in text
-
-
-CALLS = {
-    (name, *([inner] if inner else [])): call
-    for name, each in COMMANDS.items()
-    for inner, call in (getattr(each, "commands", None) or {"": each}).items()
-}
 
 
 @pytest.mark.parametrize("path", CALLS, ids=" ".join)

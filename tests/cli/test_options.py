@@ -8,7 +8,7 @@ import pytest
 
 from stereogenbench_data.cli.options import DataOptions, SceneOptions, filter_of
 from stereogenbench_data.samples.fields import SwappedSizeWarning
-from tests.cli.command import invoke, one_line
+from tests.cli.command import CALLS, invoke, one_line
 
 
 def refused(*words):
@@ -78,11 +78,22 @@ def test_all_splits_are_not_the_same_as_none_that_was_named():
     assert SceneOptions().filters() == {}
 
 
-def test_synth_takes_one_number_for_width_and_height(tmp_path):
+def test_every_command_takes_one_number_for_width_and_height(tmp_path):
     words = ("synth", tmp_path, "--frames", 1, "--plan-only", "--workers", 1, "--size")
+    sizes = {
+        path: option
+        for path, call in CALLS.items()
+        for option in call.params
+        if "--size" in option.opts
+    }
 
     assert [invoke(*words, size).exit_code for size in ("64", "64x48")] == [0, 0]
     assert "WIDTHxHEIGHT" in refused(*words, "64x")
+    assert ("pack",) in sizes
+    for path, size in sizes.items():
+        context = CALLS[path].make_context(path[-1], [], resilient_parsing=True)
+        assert size.process_value(context, "96") == (96, 96), path
+        assert size.process_value(context, "96x48") == (48, 96), path
 
 
 def test_a_size_that_looks_swapped_gives_a_warning_that_names_the_option(small_shards, tmp_path):
