@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import platform
 import signal
+import socket
 import threading
 from abc import abstractmethod
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -27,8 +28,10 @@ from typing import Any, Final, TypeVar
 from stereogenbench_data.errors import (
     StorageError,
     explain_os_errors,
+    missing_extra,
     needs_extra,
 )
+from stereogenbench_data.schema.text import shortened
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -284,6 +287,17 @@ _TRIES: Final = 3
 _CANCEL_S: Final = 30.0
 """How long cancelled tasks have to remove their unfinished files."""
 _RAY_POLL_S: Final = 1.0
+_ANSWER_S: Final = 8.0
+"""How long an address has to take a connection, and to answer."""
+_HTTP2_PREFACE: Final = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
+_HTTP2_KIND_AT: Final = 3
+_HTTP2_SETTINGS: Final = b"\x04"
+"""The kind of the frame that a server of HTTP/2 begins with (RFC 9113, section 3.4)."""
+_START_RAY: Final = (
+    "Start a cluster with `ray start --head` and give its address as the engine or by RAY_ADDRESS, "
+    "or choose the engine `local`."
+)
+_LONGEST_TOLD: Final = 600
 _PER_CORE: Final = 2
 """How many items are submitted to Ray for each core of the cluster, one of them waiting."""
 
@@ -297,9 +311,9 @@ class RayCluster(Engine):
     Progress is reported when an item is finished.
 
     Attributes:
-        address: "ray://HOST:PORT" (needs ``ray[client]``) or "HOST:PORT"; "auto" for the cluster
-            of ``RAY_ADDRESS`` or of this machine. If this process is connected to Ray already,
-            that connection is used instead, and stays.
+        address: "ray://HOST:PORT" or "HOST:PORT"; "auto" for the cluster of ``RAY_ADDRESS`` or of
+            this machine. If this process is connected to Ray already, that connection is used
+            instead, and stays.
         gpus: How many GPUs each task has to itself.
     """
 
@@ -348,7 +362,7 @@ def _ray_result(ray: Any, reference: Any, work: _Work, item: Any) -> tuple[Any, 
         found: tuple[Any, int] = ray.get(reference)
     except ray.exceptions.RayTaskError as error:
         cause = error.cause
-        if isinstance(cause, RuntimeError) and "failed to import" in _first_line(cause):
+        if isinstance(cause, RuntimeError) and "failed to import" in str(cause).partition("\n")[0]:
             raise StorageError(
                 f"{work.name(item)}: a node of the Ray cluster cannot import this package, or has "
                 f"another version of it. Install the same stereogenbench-data on all nodes."
@@ -356,7 +370,7 @@ def _ray_result(ray: Any, reference: Any, work: _Work, item: Any) -> tuple[Any, 
         failure = cause if isinstance(cause, Exception) else error
     except ray.exceptions.RayError as error:
         raise StorageError(
-            f"{work.name(item)}: Ray did not finish it in {_TRIES} tries ({_first_line(error)}). "
+            f"{work.name(item)}: Ray did not finish it in {_TRIES} tries ({_one_line(error)}). "
             f"Check whether its worker was killed for lack of memory, and run it again with fewer "
             f"workers; what is finished is kept."
         ) from error
@@ -392,13 +406,17 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
         return
     in_main_thread = threading.current_thread() is threading.main_thread()
     on_end = signal.getsignal(signal.SIGTERM)
+    _require_answer(os.environ.get("RAY_ADDRESS", "") if address == "auto" else address)
     try:
         ray.init(address=address, log_to_driver=False)
     except (ConnectionError, ImportError, RuntimeError, ValueError) as error:
+        if "ray[client]" in str(error):
+            raise missing_extra(f"the engine {address!r}", "ray", _one_line(error)) from error
+        cure = _START_RAY
+        if "version" in str(error).lower():
+            cure = "Install the same releases of Ray and of Python here and on all nodes."
         raise StorageError(
-            f"{address}: no Ray cluster could be connected to ({_first_line(error)}). Start one "
-            f"with `ray start --head` and give its address as the engine or by RAY_ADDRESS, or "
-            f"choose the engine `local`."
+            f"{address}: no Ray cluster could be connected to ({_one_line(error)}). {cure}"
         ) from error
     try:
         if in_main_thread and on_end is not None:
@@ -408,6 +426,29 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
         ray.shutdown()
 
 
-def _first_line(error: BaseException) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
+def _require_answer(address: str) -> None:
+    """Raise unless what is at HOST:PORT answers by HTTP/2, as Ray does; Ray itself waits for long.
+
+    Other addresses, which Ray looks up, are not asked.
+
+    Raises:
+        StorageError: If nothing is there, or something else than Ray.
+    """
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not (host and port.isdecimal()):
+        return
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=_ANSWER_S) as there:
+            if os.environ.get("RAY_USE_TLS", "0").lower() in ("1", "true"):
+                return
+            there.sendall(_HTTP2_PREFACE)
+            with there.makefile("rb") as answer:
+                kind = answer.read(_HTTP2_KIND_AT + 1)[_HTTP2_KIND_AT:]
+    except (OSError, OverflowError, UnicodeError) as error:
+        raise StorageError(f"{address}: nothing answers there ({error}). {_START_RAY}") from error
+    if kind != _HTTP2_SETTINGS:
+        raise StorageError(f"{address}: what answers there is not Ray. {_START_RAY}")
+
+
+def _one_line(error: BaseException) -> str:
+    return shortened(" ".join(str(error).split()), _LONGEST_TOLD) or type(error).__name__

@@ -189,7 +189,9 @@ def test_where_no_cluster_runs_none_is_started(monkeypatch):
     monkeypatch.setattr(module, "is_initialized", lambda: False)
     monkeypatch.setattr(module, "init", nowhere)
 
-    with pytest.raises(StorageError, match=r"auto: no Ray cluster .* Start one with `ray start"):
+    with pytest.raises(
+        StorageError, match=r"auto: no Ray cluster .* Start a cluster with `ray start"
+    ):
         list(RayCluster().map(pid, [1], name=called))
 
 
