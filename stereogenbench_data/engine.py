@@ -406,8 +406,12 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
         return
     in_main_thread = threading.current_thread() is threading.main_thread()
     on_end = signal.getsignal(signal.SIGTERM)
-    _require_answer(os.environ.get("RAY_ADDRESS", "") if address == "auto" else address)
+    if address == "auto":  # of which Ray itself takes no ray:// from there
+        address = os.environ.get("RAY_ADDRESS") or address
     try:
+        # What Ray finds by itself may be a cluster that has died.
+        find = ray._private.services.canonicalize_bootstrap_address
+        _require_answer(find(address) if address == "auto" else address)
         ray.init(address=address, log_to_driver=False)
     except (ConnectionError, ImportError, RuntimeError, ValueError) as error:
         if "ray[client]" in str(error):

@@ -9,6 +9,7 @@ import sys
 import threading
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -31,10 +32,12 @@ def test_every_case_of_ray_passes():
 
 
 class RayStandIn:
-    """In place of the module: it is not connected, and cannot be."""
+    """In place of the module: it finds an address, is not connected, and cannot be."""
 
-    def __init__(self, error):
+    def __init__(self, error, found):
         self.error, self.asked = error, []
+        services = SimpleNamespace(canonicalize_bootstrap_address={"auto": found}.get)
+        self._private = SimpleNamespace(services=services)
 
     def is_initialized(self):
         return False
@@ -44,9 +47,9 @@ class RayStandIn:
         raise self.error
 
 
-def refusal(monkeypatch, address, *, error=None):
+def refusal(monkeypatch, address, *, error=None, found=None):
     """Return what a cluster at an address is refused with, and the addresses that Ray was given."""
-    ray = RayStandIn(error or ConnectionError("not reached"))
+    ray = RayStandIn(error or ConnectionError("not reached"), found)
     monkeypatch.setitem(sys.modules, "ray", ray)
     with pytest.raises((StorageError, ExtraError)) as caught:
         list(RayCluster(address).map(print, [1], name=str))
@@ -92,8 +95,10 @@ def test_an_address_at_which_nothing_is_is_refused_before_ray_waits_for_it(monke
     assert ": nothing answers there (" in message
     assert "Start a cluster with `ray start --head`" in message
     assert asked == []
-    monkeypatch.setenv("RAY_ADDRESS", address)
-    assert refusal(monkeypatch, "auto") == (message, [])
+    assert refusal(monkeypatch, "auto", found=address) == (message, [])
+    with monkeypatch.context() as there:
+        there.setenv("RAY_ADDRESS", address)
+        assert refusal(there, "auto") == (message, [])
     for nowhere in ("no-such-host.invalid:6379", "127.0.0.1:99999"):
         assert refusal(monkeypatch, nowhere)[0].startswith(f"{nowhere}: nothing answers there (")
 
