@@ -26,6 +26,7 @@ from stereogenbench_data.errors import (
 from stereogenbench_data.geometry.camera import recorded_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
+from stereogenbench_data.index.clocks import require_one_clock
 from stereogenbench_data.index.evidence import (
     SidesError,
     Understood,
@@ -33,7 +34,12 @@ from stereogenbench_data.index.evidence import (
     understood_poses,
 )
 from stereogenbench_data.index.tree import FILES, Files, SceneFolder, folder_of
-from stereogenbench_data.media.container import SeekableFile, StreamFacts, depth_coding
+from stereogenbench_data.media.container import (
+    SeekableFile,
+    StreamFacts,
+    VideoFile,
+    depth_coding,
+)
 from stereogenbench_data.media.decoder import MOST_EXTRA_FRAMES
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
@@ -46,6 +52,7 @@ from stereogenbench_data.media.depth import (
     resolve_encoding,
 )
 from stereogenbench_data.media.depth_frames import CODEC_NAME
+from stereogenbench_data.media.heads import heads_of
 from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
 from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
 from stereogenbench_data.schema.conventions import (
@@ -95,7 +102,6 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.schema.training import TrainingDocument, parse_training
 from stereogenbench_data.sources.members import MemberSource
-from stereogenbench_data.sources.ranged_file import RangedFile
 
 _T = TypeVar("_T")
 
@@ -222,6 +228,8 @@ class Description:
         self.remarks += odd
         try:
             frames = self.common_frames()
+            if self.document is None:  # derived frames are numbered anew
+                self.remarks += require_one_clock(self.key, self.facts)
             self.require_one_size()
             if rig is not None:
                 first = next(iter(self.facts.values()))
@@ -300,31 +308,35 @@ class Description:
             if held not in self.files:
                 self.unread[name] = missing_video(self.key, name)
             elif opened is None or name in opened:
-                video, where = self.folder.video(held), self.where(held)
-                reads: Literal["all", "little"] = "all"
-                if isinstance(video, RangedFile):
-                    reads = "little"
+                video = self.folder.video(held)
                 try:
-                    is_picture = name.endswith(".mp4")
-                    facts = probe(
-                        video, name=where, pixel_format="later" if is_picture else "needed"
-                    )
-                    if is_picture and facts.is_colour is None:
-                        facts = probe(video, name=where)
-                    self.depths += [facts] if name in _DEPTHS else []
-                    if name in _DEPTHS:  # lossy depth passes: a `DepthEncoding` may accept it
-                        require_depth_stream(
-                            codec=depth_coding(facts), pixel_format=facts.pixel_format,
-                            encoding=ANY_DEPTH, name=where,
-                        )  # fmt: skip
-                    self.facts[name] = facts
-                    if (table := read_seek_table(video, name=where, reads=reads)) is not None:
-                        self.tables[held] = table
+                    with heads_of(video, name=self.where(held)) as known:
+                        self.probe_video(name, held, known)
                 except MediaError as error:
                     self.unread[held] = str(error)
                 finally:
                     if not isinstance(video, Path):
                         video.close()
+
+    def probe_video(self, name: str, held: str, video: VideoFile) -> None:
+        """Find what a video is, and where its packets lie.
+
+        Raises:
+            MediaError: If it cannot be used.
+        """
+        where, is_picture = self.where(held), name.endswith(".mp4")
+        facts = probe(video, name=where, pixel_format="later" if is_picture else "needed")
+        if is_picture and facts.is_colour is None:
+            facts = probe(video, name=where)
+        if name in _DEPTHS:  # lossy depth passes: a `DepthEncoding` may accept it
+            self.depths.append(facts)
+            require_depth_stream(
+                codec=depth_coding(facts), pixel_format=facts.pixel_format,
+                encoding=ANY_DEPTH, name=where,
+            )  # fmt: skip
+        self.facts[name] = facts
+        if (table := read_seek_table(video, name=where)) is not None:
+            self.tables[held] = table
 
     def rig(self, conventions: Conventions | None) -> tuple[Rig, SceneLabels]:
         """Return what ``baseline.json`` says, by the conventions for its keys."""
@@ -357,7 +369,8 @@ class Description:
         if max(counts.values()) - frames > MOST_EXTRA_FRAMES:
             raise StorageError(f"{told}. Fetch those again.")
         if told:
-            self.remark("frames", f"{told}. The first {frames} of all are used")
+            assumed = f"The first {frames} of all are used, assumed to begin together"
+            self.remark("frames", f"{told}. {assumed}")
         return frames
 
     def odd_ones(self, found: Mapping[str, object], what: str) -> str:

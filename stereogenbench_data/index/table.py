@@ -854,9 +854,11 @@ def listed(left_out: Mapping[str, str]) -> str:
 
 
 _ASSUMED: Final = (
-    "size", "stated", "baselines", "pair", "frames", "lens", "marker", "world", "pixels",
+    "size", "stated", "baselines", "pair", "lens", "marker", "world", "pixels",
 )  # fmt: skip
-"""Remarks that are told when a tree is opened."""
+"""Remarks that are told when a tree is opened without conventions."""
+_OF_TIME: Final = ("frames", "rate")
+"""Remarks that are told whenever a tree is opened."""
 
 
 _PLAIN: Final = "unreal axes"
@@ -864,12 +866,14 @@ _PLAIN: Final = "unreal axes"
 
 def assumptions(scenes: Iterable[Scene], *, where: str) -> str:
     """Return what was taken for granted about scenes and what was measured; "" if nothing."""
+    scenes = list(scenes)
+    of_time = remarks_told(scenes, _OF_TIME)
     scenes = [scene for scene in scenes if scene.conventions is None]
     forms = Counter(
         (scene.pose_form or _PLAIN).split("|")[0].partition(" @ ")[0]
         for scene in scenes if not scene.remark("world")
     )  # fmt: skip
-    told = remarks_told(scenes, _ASSUMED) + [
+    told = of_time + remarks_told(scenes, _ASSUMED) + [
         f"poses are read as {shortened(form, 200)}: measured, the cameras' distances are the "
         f"baselines ({counted(count, 'scene')})"
         for form, count in forms.items() if _PLAIN not in form

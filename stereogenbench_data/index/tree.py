@@ -50,6 +50,7 @@ from stereogenbench_data.index.parquet import (
     write_index_file,
 )
 from stereogenbench_data.media.container import SeekableFile
+from stereogenbench_data.media.heads import END_BYTES
 from stereogenbench_data.schema.document import MAX_TEXT_BYTES, require_text_size
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import (
@@ -64,7 +65,7 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.sources.location import is_remote
 from stereogenbench_data.sources.members import read_text_file
-from stereogenbench_data.sources.ranged_file import FIRST_BLOCK, RangedFile
+from stereogenbench_data.sources.ranged_file import RangedFile
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy
 
@@ -185,7 +186,7 @@ def is_read(name: str) -> bool:
 
 
 _AT_A_TIME: Final = 24
-_READ_WHOLE: Final = 4 * FIRST_BLOCK
+_READ_WHOLE: Final = 2 * END_BYTES
 """Videos up to this size are fetched whole when a scene is described, of larger ones both ends."""
 
 
@@ -322,7 +323,7 @@ class RemoteFolder(SceneFolder):
                 size, _ = self._files[name]
                 self._objects[name] = self._folder.below(name, expected_size=size)
                 if is_video and size > _READ_WHOLE:
-                    parts += (name, 0, FIRST_BLOCK), (name, size - FIRST_BLOCK, size)
+                    parts += (name, 0, END_BYTES), (name, size - END_BYTES, size)
                 else:
                     parts.append((name, 0, size))
         for part, data in zip(parts, in_parallel(self._part, parts), strict=True):
@@ -348,15 +349,12 @@ class RemoteFolder(SceneFolder):
             StorageError: If it cannot be read.
         """
         self.fetch([name])
-        remote, parts = self._objects[name], self._parts[name]
-
-        def fetch(start: int, stop: int) -> bytes:
-            for first, data in parts:
-                if first <= start and stop <= first + len(data):
-                    return data[start - first : stop - first]
-            return remote.read(start, stop)
-
-        return RangedFile(fetch, size=self._files[name][0])
+        size, _ = self._files[name]
+        video = RangedFile(self._objects[name].read, size=size)
+        video.is_far = size > _READ_WHOLE
+        for start, data in self._parts[name]:
+            video.keep(start, data)
+        return video
 
     def _part(self, part: tuple[str, int, int]) -> bytes:
         name, start, stop = part

@@ -40,7 +40,12 @@ class SeekableFile(io.RawIOBase):
     Attributes:
         opens_by_header: Whether a video is opened by its header, so that no packet is fetched.
         hides_packets: While it is set, the file seems to end where packets lie.
+        has_packets: Whether packets are there to be looked into.
+        is_far: Whether each read takes as long as a request.
     """
+
+    has_packets = True
+    is_far = False
 
     def __init__(self, size: int) -> None:
         """Begin at the start."""
@@ -141,6 +146,19 @@ _TAG_ERRORS: Final[dict[str, Any]] = (
 
 
 @dataclass(frozen=True, slots=True)
+class FrameTimes:
+    """When the frames of a video are shown.
+
+    Attributes:
+        ticks: The time of each frame, ascending, in ticks.
+        tick_s: A tick in seconds.
+    """
+
+    ticks: Sequence[int | Fraction]
+    tick_s: Fraction
+
+
+@dataclass(frozen=True, slots=True)
 class StreamFacts:
     """The facts in a video file's header.
 
@@ -162,6 +180,7 @@ class StreamFacts:
         container: FFmpeg's names of the container, such as "matroska,webm".
         is_lossless: Whether a header of H.264 or HEVC says that it was coded without loss.
         siting: Where its chroma lies, see `CodedPicture`.
+        times: When its frames are shown; None if only the header was read.
     """
 
     codec: str
@@ -177,6 +196,7 @@ class StreamFacts:
     container: str = field(default="", compare=False)
     is_lossless: bool = False
     siting: str | None = field(default=None, compare=False)
+    times: FrameTimes | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,7 +268,7 @@ def open_container(
         MediaError: If the content is not an MP4 or Matroska file with at least one video stream.
     """
     if isinstance(file, str | Path):
-        _require_file(Path(file), name=name)
+        require_file(Path(file), name=name)
     try:
         container = _open(file, options=_OPTIONS if pixel_format == "needed" else _UNDECODED)
         if not container.streams.video or container.streams.video[0].start_time is None:
@@ -307,11 +327,20 @@ def _open(file: VideoFile, *, options: dict[str, str]) -> InputContainer:
     else:
         file.seek(0)
         place = file
+        if isinstance(file, SeekableFile) and not file.has_packets:
+            # Parsers look into packets, for what the container tells too.
+            options = options | {"fflags": "+noparse"}
     container: InputContainer = av.open(place, mode="r", options=options, **_TAG_ERRORS)
     return container
 
 
-def _require_file(path: Path, *, name: str) -> None:
+def require_file(path: Path, *, name: str) -> None:
+    """Refuse a path that is not a file, or an empty one.
+
+    Raises:
+        StorageError: If it is missing, a folder or not readable.
+        MediaError: If it is empty.
+    """
     if path.is_dir():
         raise StorageError(f"{name}: is a folder, not a video file: pass the file's path.")
     try:

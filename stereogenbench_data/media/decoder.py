@@ -17,6 +17,7 @@ import zlib
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import chain, islice, pairwise
@@ -104,11 +105,13 @@ class TableClock:
 Clock = SteadyClock | TableClock
 
 
-def steady_clock(container: InputContainer, *, frames: int) -> SteadyClock | None:
+def steady_clock(
+    container: InputContainer, *, frames: int, extra: int = MOST_EXTRA_FRAMES
+) -> SteadyClock | None:
     """Return the clock that the header describes, None if it contradicts itself or ``frames``.
 
     An MP4 header lists all samples: their number and decoding times must be those of ``frames``
-    frames at one rate, or of a few more. A Matroska header gives only the duration.
+    frames at one rate, or of at most ``extra`` more. A Matroska header gives only the duration.
     """
     stream = container.streams.video[0]
     rate, time_base = exact(stream.average_rate), exact(stream.time_base)
@@ -116,11 +119,11 @@ def steady_clock(container: InputContainer, *, frames: int) -> SteadyClock | Non
         return None
     step = 1 / (rate * time_base)
     if stream.frames == 0:
-        agrees = 0 <= frames_by_duration(container) - frames <= MOST_EXTRA_FRAMES
+        agrees = 0 <= frames_by_duration(container) - frames <= extra
     else:
         entries = list(stream.index_entries)
         agrees = (
-            0 <= stream.frames - frames <= MOST_EXTRA_FRAMES
+            0 <= stream.frames - frames <= extra
             and stream.frames == len(entries)
             and not any(entry.is_discard for entry in entries)
             and all(abs(b.timestamp - a.timestamp - step) <= 1 for a, b in pairwise(entries))
@@ -128,18 +131,32 @@ def steady_clock(container: InputContainer, *, frames: int) -> SteadyClock | Non
     return SteadyClock(stream.start_time, step) if agrees else None
 
 
-def table_clock(
-    container: InputContainer, *, name: str, steady: SteadyClock | None = None
-) -> TableClock:
+def clock_by_cues(container: InputContainer) -> tuple[SteadyClock, list[int]] | None:
+    """Return the clock that a Matroska header describes, and its key frames by their list.
+
+    None where the two do not agree, or one is missing.
+    """
+    stream = container.streams.video[0]
+    frames = frames_by_duration(container)
+    clock = steady_clock(container, frames=frames)
+    if clock is None or frames == 0:
+        return None
+    with suppress(av.FFmpegError):
+        container.seek(clock.latest(frames - 1), stream=stream)
+    keys = [clock.index(entry.timestamp) for entry in stream.index_entries]
+    known = [key for key in keys if key is not None]
+    return (clock, known) if len(known) == len(keys) and known[:1] == [0] else None
+
+
+def table_clock(container: InputContainer, *, name: str) -> TableClock:
     """Return the times of all frames, read by going through all packets from where they stand.
 
     Frames of an intra-only codec are counted in the order of the file, with which their times
-    must agree; and with the rate, if the header gives one.
+    must agree.
 
     Args:
         container: An open file.
         name: What messages call it.
-        steady: The clock that the header describes, if it describes one.
 
     Raises:
         MediaError: If a packet is cut short or carries another packet's time, or one that
@@ -164,13 +181,12 @@ def table_clock(
         raise cut_short(error.strerror) from error
     if stream_codec(container).is_intra_only:
         for number, pts in enumerate(times):
-            is_after = number == 0 or pts > times[number - 1]
-            if not is_after or (steady is not None and steady.index(pts) != number):
+            if number and pts <= times[number - 1]:
                 raise MediaError(
-                    f"{name}: its frame number {number} as stored is shown at {pts} ticks, and its "
-                    f"codec stores frames in the order in which they are shown, at the rate in the "
-                    f"header. A time was altered: compare the file with its checksum, or fetch it "
-                    f"again."
+                    f"{name}: its frame number {number} as stored is shown at {pts} ticks, the one "
+                    f"before at {times[number - 1]}, and its codec stores frames in the order in "
+                    f"which they are shown. A time was altered: compare the file with its "
+                    f"checksum, or fetch it again."
                 )
     times.sort()
     twice = next((a for a, b in pairwise(times) if a == b), None)

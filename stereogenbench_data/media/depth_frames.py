@@ -16,6 +16,7 @@ import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from fractions import Fraction
 from io import FileIO
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -29,6 +30,7 @@ from stereogenbench_data.errors import MediaError, missing_extra
 from stereogenbench_data.media.container import (
     Effort,
     FrameReader,
+    FrameTimes,
     StreamFacts,
     VideoFile,
     merged_tags,
@@ -358,4 +360,5 @@ class DepthFrames(FrameReader):
             frame_rate_hz=clip.rate[0] / clip.rate[1],
             tags=merged_tags(clip.tags, clip.stream_tags),
             is_colour=False,
+            times=FrameTimes(clip.pts, Fraction(*clip.time_base)),
         )

@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import av
 import numpy as np
@@ -32,8 +32,9 @@ from stereogenbench_data.media.container import (
     open_container,
     stream_codec,
 )
-from stereogenbench_data.media.decoder import BLIND_JUMP, steady_clock
+from stereogenbench_data.media.decoder import BLIND_JUMP, clock_by_cues
 from stereogenbench_data.media.depth_frames import PACKED_SUFFIX, DepthFrames
+from stereogenbench_data.media.heads import END_BYTES, Heads, heads_of, is_far
 
 LARGEST_HEADER: Final = 256 * 1024
 """Bytes of a video's header that a table holds; a video with a longer one has no table."""
@@ -55,8 +56,6 @@ _CUES: Final = b"\x1c\x53\xbb\x6b"
 _LOOKED_BEHIND: Final = 64
 _BLOCK_HEADER_BYTES: Final = 4
 """What Matroska writes between where FFmpeg finds a packet and the packet's own bytes."""
-_LOOKED_THROUGH: Final = 64 * 1024
-"""Bytes at a file's end in which Matroska's list of key frames is looked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,18 +171,15 @@ class HeaderFile(SeekableFile):
         return self._table.header_bytes(start, stop)
 
 
-def read_seek_table(
-    file: VideoFile, *, name: str, reads: Literal["all", "little"] = "all"
-) -> SeekTable | None:
+def read_seek_table(file: VideoFile, *, name: str) -> SeekTable | None:
     """Return a video's seek table; None if it cannot have one.
 
-    Packets must lie in the order in which they are decoded, and the header must not be large.
+    Packets must lie in the order in which they are decoded, and the header must not be large. Of a
+    Matroska file that is far away, those from one key frame to the next count as one.
 
     Args:
         file: A path, or a seekable binary file; the latter stays the caller's to close.
         name: What messages call the file.
-        reads: A Matroska file has no list of its packets: "all" goes through them. With "little",
-            for a file that is far away, those from one key frame to the next count as one.
 
     Raises:
         StorageError: If the file cannot be read.
@@ -194,15 +190,23 @@ def read_seek_table(
             bounds = depth.chunk_bounds
         packed = SeekTable(bounds, tuple(range(depth.frames)))
         return _with_header(packed, file, file_bytes=bounds[-1])
+    with heads_of(file, name=name) as known:
+        table = _table_of(known, name=name)
+        if table is None and isinstance(known, Heads) and is_far(known):
+            table = _table_of(known.video, name=name)
+    return table
+
+
+def _table_of(file: VideoFile, *, name: str) -> SeekTable | None:
     with open_container(file, name=name) as container:
         file_bytes, begins = container.size, container.streams.video[0].start_time
         try:
             if container.streams.video[0].frames:
                 found = _listed(container)
-            elif reads == "all":
-                found = _gone_through(container, file)
-            else:
+            elif is_far(file):
                 found = _by_clusters(container, file)
+            else:
+                found = _gone_through(container, file)
         except av.FFmpegError as error:
             raise MediaError(
                 f"{name}: its packets cannot be read ({error.strerror}): fetch it again."
@@ -278,26 +282,21 @@ def _by_clusters(container: InputContainer, file: VideoFile) -> SeekTable | None
 
     The frames behind a key frame lie somewhere in its part.
     """
-    stream = container.streams.video[0]
-    frames = frames_by_duration(container)
-    clock = steady_clock(container, frames=frames)
-    if clock is None:
+    found = clock_by_cues(container)
+    if found is None:
         return None
-    container.seek(clock.latest(frames - 1), stream=stream)
-    parts = [(clock.index(entry.timestamp), entry.pos) for entry in stream.index_entries]
-    keys = [key for key, _ in parts if key is not None]
-    end_bytes = container.size
-    last = _read(file, max(0, end_bytes - _LOOKED_THROUGH), end_bytes)
+    _, keys = found
+    places = [entry.pos for entry in container.streams.video[0].index_entries]
+    frames, end_bytes = frames_by_duration(container), container.size
+    last = _read(file, max(0, end_bytes - END_BYTES), end_bytes)
     cues = last.rfind(_CUES)
-    if len(keys) != len(parts) or keys[:1] != [0] or cues < 0:
+    if cues < 0:
         return None
     end = end_bytes - len(last) + cues
     bounds = [0] * frames
-    ends = [*(pos for _, pos in parts[1:]), end]
-    stops = [*keys[1:], frames]
-    for (key, pos), stop, part_end in zip(parts, stops, ends, strict=True):
-        first = key or 0
-        bounds[first:stop] = [pos, *[part_end] * (stop - first - 1)]
+    ends, stops = [*places[1:], end], [*keys[1:], frames]
+    for key, pos, stop, part_end in zip(keys, places, stops, ends, strict=True):
+        bounds[key:stop] = [pos, *[part_end] * (stop - key - 1)]
     return SeekTable(
         (*bounds, end),
         tuple(keys),
@@ -308,6 +307,8 @@ def _by_clusters(container: InputContainer, file: VideoFile) -> SeekTable | None
 
 
 def _read(file: VideoFile, start: int, stop: int) -> bytes:
+    if isinstance(file, Heads):
+        return file.exact(start, stop)
     if isinstance(file, str | Path):
         with Path(file).open("rb", buffering=0) as opened:
             opened.seek(start)

@@ -4,8 +4,10 @@ Nothing is guessed: a gap, a cut or a damaged packet is an error. A neighbouring
 returned instead.
 """
 
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path
+from fractions import Fraction
 from typing import Any, Final, Literal
 
 import av
@@ -19,9 +21,10 @@ from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.container import (
     Effort,
     FrameReader,
+    FrameTimes,
     StreamFacts,
     VideoFile,
-    codec_of,
+    exact,
     frames_by_duration,
     is_colour_format,
     open_by_header,
@@ -36,10 +39,12 @@ from stereogenbench_data.media.decoder import (
     Decoder,
     TableClock,
     UnexpectedPicture,
+    clock_by_cues,
     steady_clock,
     table_clock,
 )
 from stereogenbench_data.media.depth_frames import PACKED_SUFFIX, DepthFrames
+from stereogenbench_data.media.heads import Heads, heads_of, is_far
 from stereogenbench_data.media.siting import (
     CENTRE,
     Converter,
@@ -64,18 +69,17 @@ RED_GREEN_BLUE: Final = (2, 0, 1)
 def probe(
     file: VideoFile, *, name: str, pixel_format: Literal["needed", "later"] = "needed"
 ) -> StreamFacts:
-    """Return what a video file is, from its header where the header can be trusted.
+    """Return what a video file is, and when its frames are shown, from as few bytes as tell it.
 
-    Frames are counted by the header of an MP4 file, and by duration and rate of a Matroska file
-    if its last frame is found where they place it. Else all packets are counted. For an intra-only
-    codec and a path, the times of all packets are compared with their order.
+    Packets are not read, unless nothing else tells where they are. Of a Matroska file that is far
+    away, frames are taken to be shown at the rate in its header, with which its key frames must
+    agree.
 
     Args:
         file: A path, or a seekable binary file; the latter stays the caller's to close.
         name: What messages call the file. A name that ends in ``.b2frame`` is of depth packed by
             blosc2.
-        pixel_format: "later" decodes no picture where only that would show the pixel format (tens
-            of milliseconds for large H.264).
+        pixel_format: "later" decodes no picture where only that would show the pixel format.
 
     Raises:
         StorageError: If the file cannot be read.
@@ -84,38 +88,44 @@ def probe(
     if name.endswith(PACKED_SUFFIX):
         with DepthFrames(file, name=name, frames="any") as depth:
             return depth.facts
+    with heads_of(file, name=name) as known:
+        facts = _probed(known, name=name, pixel_format=pixel_format)
+        is_vague = pixel_format == "needed" and not (facts and facts.pixel_format)
+        if isinstance(known, Heads) and (facts is None or is_vague):
+            facts = _probed(known.video, name=name, pixel_format=pixel_format)
+    if facts is None or facts.frames == 0:
+        raise MediaError(f"{name}: holds no frame (0 packets): fetch it again.")
+    return facts
+
+
+def _probed(
+    file: VideoFile, *, name: str, pixel_format: Literal["needed", "later"]
+) -> StreamFacts | None:
+    """Return what a video is; None where its ends alone do not tell when frames are shown."""
     with open_container(file, name=name, pixel_format=pixel_format) as container:
         require_whole_payload(container, name=name)
-        frames = _frames_in_header(container)
-        facts = stream_facts(container, name=name, frames=frames)
-    is_intra_only = codec_of(facts.codec).is_intra_only
-    if frames and not (is_intra_only and isinstance(file, str | Path)):
-        return facts
-    with open_container(file, name=name) as container:
-        claimed = frames or frames_by_duration(container)
-        steady = steady_clock(container, frames=claimed)
-        frames = len(table_clock(container, name=name, steady=steady).times)
-    if frames == 0:
-        raise MediaError(f"{name}: holds no frame (0 packets): fetch it again.")
-    return replace(facts, frames=frames)
+        stream = container.streams.video[0]
+        ticks: Sequence[int | Fraction] | None
+        if not is_far(file) or stream.frames:
+            ticks = table_clock(container, name=name).times
+        else:
+            ticks = _by_header(container)
+        facts = stream_facts(container, name=name, frames=0)
+        tick_s = exact(stream.time_base) or Fraction(1)
+    if ticks is None:
+        if isinstance(file, Heads):
+            return None
+        with open_container(file, name=name) as container:
+            ticks = table_clock(container, name=name).times
+    return replace(facts, frames=len(ticks), times=FrameTimes(ticks, tick_s))
 
 
-def _frames_in_header(container: InputContainer) -> int:
-    """Return how many frames the header claims, 0 if it does not say or cannot be trusted."""
-    stream = container.streams.video[0]
-    if stream.frames:
-        is_cut = any(entry.is_discard for entry in stream.index_entries)
-        return 0 if is_cut else stream.frames
-    frames = frames_by_duration(container)
-    clock = steady_clock(container, frames=frames)
-    if clock is None:
-        return 0
-    try:
-        container.seek(clock.latest(frames - 1), stream=stream)
-        shown = [packet.pts for packet in container.demux(stream) if packet.pts is not None]
-    except av.FFmpegError:
-        return 0
-    return frames if shown and clock.index(max(shown)) == frames - 1 else 0
+def _by_header(container: InputContainer) -> list[Fraction] | None:
+    """Return the times of frames at the rate of a Matroska header, if key frames agree with it."""
+    if (found := clock_by_cues(container)) is None:
+        return None
+    clock, _ = found
+    return [clock.start + i * clock.step for i in range(frames_by_duration(container))]
 
 
 class VideoReader(FrameReader):
@@ -160,11 +170,9 @@ class VideoReader(FrameReader):
             self._crc32s = packet_checksums(container, frames=frames, name=name)
             self.header = stream_facts(container, name=name, frames=frames)
             self._siting = self.header.siting
-            steady = steady_clock(container, frames=frames)
-            if steady is None and placed == "anywhere":
-                container.close()
-                container = open_container(file, name=name)
-            self._clock: Clock = steady or self._survey(container)
+            # Frames beyond those of the scene may be missing among these.
+            extra = MOST_EXTRA_FRAMES if is_far(file) else 0
+            steady = steady_clock(container, frames=frames, extra=extra)
         except MediaError:
             container.close()
             raise
@@ -174,6 +182,7 @@ class VideoReader(FrameReader):
             self._decoder = Decoder(
                 container, clock=steady, placed=placed, crc32s=self._crc32s, effort=self.effort
             )
+        self._clock: Clock = steady or self._survey()
 
     @property
     def facts(self) -> StreamFacts:
@@ -246,8 +255,7 @@ class VideoReader(FrameReader):
     def _reach_from_start(self, index: int) -> VideoFrame:
         """Decode a frame by the long way, by the exact times of all frames, skipping nothing."""
         if not isinstance(self._clock, TableClock):
-            with open_container(self._file, name=self.name) as container:
-                self._clock = self._survey(container)
+            self._clock = self._survey()
         container = open_container(self._file, name=self.name)
         self._decoder = Decoder(
             container, clock=self._clock, crc32s=self._crc32s, effort=self.effort
@@ -262,9 +270,12 @@ class VideoReader(FrameReader):
                 f"compare it with its checksum, or fetch it again."
             ) from error
 
-    def _survey(self, container: InputContainer) -> TableClock:
-        steady = steady_clock(container, frames=self.frames)
-        clock = table_clock(container, name=self.name, steady=steady)
+    def _survey(self) -> TableClock:
+        """Return the time of every frame; only of a file that is far away packets are read."""
+        file, name = self._file, self.name
+        near = nullcontext(file) if is_far(file) else heads_of(file, name=name)
+        with near as known, open_container(known, name=name) as container:
+            clock = table_clock(container, name=name)
         found, expected = len(clock.times), self.frames
         if not 0 <= found - expected <= MOST_EXTRA_FRAMES:
             raise MediaError(

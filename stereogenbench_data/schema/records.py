@@ -90,6 +90,7 @@ REMARKS: Final = {
     "sensor": "the release's sensor is assumed, so the focal length in mm is not known",
     "videos": "pairs of cameras whose videos are missing are refused",
     "frames": "the frames that all videos have are used",
+    "rate": "frames are matched by number, where videos have different rates",
     "depth": "depth is refused, unless you pass a DepthEncoding with its unit_m",
     "size": "the videos' picture size counts, where baseline.json has another",
     "stated": "the videos and baseline.json count, where files state otherwise",

@@ -87,6 +87,8 @@ class RangedFile(SeekableFile):
         failure: The error of the first fetch that failed; further fetches raise it again.
     """
 
+    is_far = True
+
     def __init__(
         self,
         fetch: Callable[[int, int], bytes],
@@ -120,6 +122,10 @@ class RangedFile(SeekableFile):
         if self._checksum is not None and table is not None:
             self._checksum.add(0, table.head)
             self._checksum.add(table.bounds[-1], table.tail)
+
+    def keep(self, start: int, data: bytes) -> None:
+        """Keep bytes from a start on that were fetched before."""
+        self._blocks.append((start, data))
 
     def close(self) -> None:
         """Free what was fetched."""
