@@ -5,7 +5,7 @@ those of all videos agree by half a step to the next frame. Steps may vary, in a
 When a video begins does not matter, unless videos have different numbers of frames.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -40,31 +40,36 @@ class _Clock:
     tick_s: float
     rate_hz: float
 
-    def allowed_s(self, other: "_Clock") -> Float64[np.ndarray, " frames"]:
-        """Return by how much the times of another video may differ.
-
-        Half a step, on average of those before and behind a frame, or what times are rounded to.
-        """
+    def half_steps_s(self) -> Float64[np.ndarray, " frames"]:
+        """Return half the steps around each frame, on average of the one before and behind it."""
         steps_s = np.diff(self.shown_s)
         around_s = np.concatenate([steps_s[:1], (steps_s[:-1] + steps_s[1:]) / 2, steps_s[-1:]])
-        return np.maximum(around_s / 2, self.tick_s + other.tick_s)
+        halves_s: Float64[np.ndarray, " frames"] = around_s / 2
+        return halves_s
 
     def first_off(self, other: "_Clock") -> int | None:
         """Return the first frame that another video shows at another time; None if none is."""
         frames = min(len(self.shown_s), len(other.shown_s))
-        if frames < 2:
-            return None
-        off_s = np.abs(other.shown_s[:frames] - self.shown_s[:frames])
-        is_off = off_s > self.allowed_s(other)[:frames]
+        own, its = ((each.shown_s[:frames], each.half_steps_s()[:frames]) for each in (self, other))
+        allowed_s = np.maximum(np.minimum(own[1], its[1]), self.tick_s + other.tick_s)
+        is_off = np.abs(own[0] - its[0]) > allowed_s
         return int(is_off.argmax()) if is_off.any() else None
 
-    def step_s(self) -> tuple[float, float]:
-        """Return the mean step between frames, and by how much rounding may have changed it.
+    def begins_with(self, other: "_Clock") -> bool:
+        """Return whether another video begins at the same time."""
+        allowed_s = max(self.half_steps_s()[0], self.tick_s + other.tick_s)
+        return bool(abs(other.begins_s - self.begins_s) <= allowed_s)
+
+    def step_s(self) -> tuple[float, float] | None:
+        """Return the step between frames, and by how much rounding may have changed it.
 
         Where the header gives a rate that rounded times do not contradict, it is that of the rate.
+        None where steps vary.
         """
         steps = len(self.shown_s) - 1
         mean_s, rounding_s = float(self.shown_s[-1]) / steps, self.tick_s / steps
+        if np.abs(self.shown_s - np.arange(steps + 1) * mean_s).max() > self.tick_s:
+            return None
         if self.rate_hz and abs(1 / self.rate_hz - mean_s) <= rounding_s:
             return 1 / self.rate_hz, 0.0
         return mean_s, rounding_s
@@ -75,7 +80,8 @@ def require_one_clock(key: str, videos: Mapping[str, StreamFacts]) -> tuple[Rema
 
     Args:
         key: The scene.
-        videos: What each video is, by its name. Those whose times are not known are passed over.
+        videos: What each video is, by its name. Those whose times are not known are passed over,
+            and those of a single frame.
 
     Returns:
         A remark where rates differ by too little to show in so few frames.
@@ -83,32 +89,43 @@ def require_one_clock(key: str, videos: Mapping[str, StreamFacts]) -> tuple[Rema
     Raises:
         StorageError: If they are; it names the file, the frame and the cure.
     """
-    clocks = list(_clocks(videos))
+    clocks = [clock for clock in _clocks(videos) if len(clock.shown_s) > 1]
     if not clocks:
         return ()
-    usual = max(clocks, key=lambda clock: len(_like(clock, clocks)))
-    like = _like(usual, clocks)
-    others = f"that of {counted(len(like), 'other video')}, such as {usual.name},"
-    odd = [each for each in clocks if each not in like]
-    for each in odd[:1]:
-        frame = usual.first_off(each) or 0
-        more = f" ({', '.join(other.name for other in odd[1:])} likewise)" if odd[1:] else ""
+    usual, odd = _parted(clocks, lambda a, b: a.first_off(b) is None)
+    if odd:
+        name, frame = odd[0].name, usual.first_off(odd[0]) or 0
+        more = f" ({', '.join(each.name for each in odd[1:])} likewise)" if odd[1:] else ""
         raise StorageError(
-            f"{key}/{each.name}: its frame {frame} is shown {each.shown_s[frame]:.3f} s after its "
-            f"first one, and {others} {usual.shown_s[frame]:.3f} s after{more}. So frames of one "
-            f"number are not one moment: some were dropped, doubled or added, or it has another "
-            f"rate. {_CURE}"
+            f"{key}/{name}: its frame {frame} is shown {odd[0].shown_s[frame]:.3f} s after its "
+            f"first one, and that of {counted(len(clocks) - len(odd), 'other video')}, such as "
+            f"{usual.name}, {usual.shown_s[frame]:.3f} s after{more}. So frames of one number are "
+            f"not one moment: some were dropped, doubled or added, or it has another rate. {_CURE}"
         )
     if len({len(each.shown_s) for each in clocks}) > 1:
-        for each in clocks:
-            if abs(each.begins_s - usual.begins_s) > usual.allowed_s(each)[0]:
-                raise StorageError(
-                    f"{key}/{each.name}: its frame 0 is shown at {each.begins_s:.3f} s, and "
-                    f"{others} at {usual.begins_s:.3f} s, and they have different numbers of "
-                    f"frames. So frames of one number are not one moment: some are missing at an "
-                    f"end. {_CURE}"
-                )
+        _require_one_begin(key, clocks)
     return tuple(_of_rates(key, usual, clocks))
+
+
+def _require_one_begin(key: str, clocks: Sequence[_Clock]) -> None:
+    """Refuse videos of different lengths of which one begins later."""
+    usual, odd = _parted(clocks, _Clock.begins_with)
+    if odd:
+        more = f" ({', '.join(each.name for each in odd[1:])} likewise)" if odd[1:] else ""
+        raise StorageError(
+            f"{key}/{odd[0].name}: its frame 0 is shown at {odd[0].begins_s:.3f} s, and that of "
+            f"{counted(len(clocks) - len(odd), 'other video')}, such as {usual.name}, at "
+            f"{usual.begins_s:.3f} s{more}, and not all have the same number of frames. So frames "
+            f"of one number are not one moment: some are missing at an end. {_CURE}"
+        )
+
+
+def _parted(
+    clocks: Sequence[_Clock], are_alike: Callable[[_Clock, _Clock], bool]
+) -> tuple[_Clock, list[_Clock]]:
+    """Return the first clock that is like most others, and those that are not like it."""
+    usual = max(clocks, key=lambda clock: sum(are_alike(clock, each) for each in clocks))
+    return usual, [each for each in clocks if not are_alike(usual, each)]
 
 
 def _clocks(videos: Mapping[str, StreamFacts]) -> Iterator[_Clock]:
@@ -120,21 +137,17 @@ def _clocks(videos: Mapping[str, StreamFacts]) -> Iterator[_Clock]:
             yield _Clock(name, begins_s, times_s - begins_s, tick_s, facts.frame_rate_hz)
 
 
-def _like(clock: _Clock, clocks: Sequence[_Clock]) -> list[_Clock]:
-    return [each for each in clocks if clock.first_off(each) is None]
-
-
 def _of_rates(key: str, usual: _Clock, clocks: Sequence[_Clock]) -> Iterator[Remark]:
     """Yield a remark about the first video with another rate than most."""
-    if min(len(each.shown_s) for each in clocks) < 2:
-        return
-    usual_s, usual_rounding_s = usual.step_s()
+    usual_step = usual.step_s()
     for each in clocks:
-        step_s, rounding_s = each.step_s()
-        if abs(step_s - usual_s) > _SAME_RATE * usual_s + rounding_s + usual_rounding_s:
+        step = each.step_s()
+        if usual_step is None or step is None:
+            continue
+        if abs(step[0] - usual_step[0]) > _SAME_RATE * usual_step[0] + step[1] + usual_step[1]:
             yield Remark(
                 "rate",
-                f"{key}/{each.name}: shows {1 / step_s:.6g} frames a second, and {usual.name} "
-                f"{1 / usual_s:.6g}",
+                f"{key}/{each.name}: shows {1 / step[0]:.6g} frames a second, and {usual.name} "
+                f"{1 / usual_step[0]:.6g}",
             )
             return

@@ -42,10 +42,12 @@ class SeekableFile(io.RawIOBase):
         hides_packets: While it is set, the file seems to end where packets lie.
         has_packets: Whether packets are there to be looked into.
         is_far: Whether each read takes as long as a request.
+        packets: How many packets a video has; None if that is not known.
     """
 
     has_packets = True
     is_far = False
+    packets: int | None = None
 
     def __init__(self, size: int) -> None:
         """Begin at the start."""

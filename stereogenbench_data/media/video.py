@@ -22,6 +22,7 @@ from stereogenbench_data.media.container import (
     Effort,
     FrameReader,
     FrameTimes,
+    SeekableFile,
     StreamFacts,
     VideoFile,
     exact,
@@ -170,9 +171,7 @@ class VideoReader(FrameReader):
             self._crc32s = packet_checksums(container, frames=frames, name=name)
             self.header = stream_facts(container, name=name, frames=frames)
             self._siting = self.header.siting
-            # Frames beyond those of the scene may be missing among these.
-            extra = MOST_EXTRA_FRAMES if is_far(file) else 0
-            steady = steady_clock(container, frames=frames, extra=extra)
+            steady = steady_clock(container, frames=frames, extra=_extra_frames(file, frames))
         except MediaError:
             container.close()
             raise
@@ -318,6 +317,16 @@ class VideoReader(FrameReader):
         if self._decoder is not None:
             self._decoder.close()
             self._decoder = None
+
+
+def _extra_frames(file: VideoFile, frames: int) -> int:
+    """Return how many frames more than it must have the header of a video may tell of.
+
+    They may be missing among those that it must have. Where all packets can be looked at, or are
+    known to be as many, their times are taken instead.
+    """
+    is_known = not isinstance(file, SeekableFile) or not file.is_far or file.packets == frames
+    return 0 if is_known else MOST_EXTRA_FRAMES
 
 
 def require_indexed_picture(reader: FrameReader, rig: Rig) -> None:

@@ -117,6 +117,7 @@ class RangedFile(SeekableFile):
         self._ahead = ahead
         self._fed_from: int | None = None
         self.opens_by_header = table is not None and table.opening == 0
+        self.packets = None if table is None else table.packets
         self._blocks: list[tuple[int, bytes]] = []
         self._checksum = None if crc32 is None else _Checksum(crc32, size=size, name=name)
         if self._checksum is not None and table is not None:

@@ -123,7 +123,9 @@ def test_packed_depth_has_a_table_of_its_chunks(videos):
 
 def test_far_away_the_packets_of_a_cluster_count_as_one(videos):
     whole = read_seek_table(videos["depth.mkv"], name="depth.mkv")
-    table = read_seek_table(videos["depth.mkv"], name="depth.mkv", reads="little")
+    content = videos["depth.mkv"].read_bytes()
+    far = RangedFile(lambda start, stop: content[start:stop], size=len(content))
+    table = read_seek_table(far, name="depth.mkv")
 
     assert table.keys == whole.keys
     one, other = ([each.bounds[key] for key in each.keys[1:]] for each in (table, whole))

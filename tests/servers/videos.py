@@ -1,6 +1,7 @@
 """Videos of frames that a test makes, and those of the small scenes."""
 
 from collections.abc import Iterable, Mapping
+from fractions import Fraction
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -44,7 +45,8 @@ def write_video(
         for units in maps:
             units[0] = 0
         return write_depth(path, maps, tags=tags)
-    grey = [np.full((*size, 3), 40 * index, dtype=np.uint8) for index in range(frames)]
+    step = min(40, 255 // frames)
+    grey = [np.full((*size, 3), step * index, dtype=np.uint8) for index in range(frames)]
     return write_rgb(path, grey, tags=tags)
 
 
@@ -58,3 +60,37 @@ def write_rgb(path: Path, pictures: Iterable[Any], **how: Any) -> Path:
     """Encode pictures (h, w, 3) with H.264, or as is told."""
     frames = (av.VideoFrame.from_ndarray(each, format="rgb24") for each in pictures)
     return write_frames(path, frames, **({"codec": "libx264", "pixel_format": "yuv420p"} | how))
+
+
+def write_at(
+    path: Path,
+    times: Iterable[Fraction | float],
+    *,
+    codec: str | None = None,
+    tick_s: Fraction | None = None,
+    rate_hz: Fraction | int = 15,
+    **how: Any,
+) -> Path:
+    """Encode frames of a scene, each darker than the next, that are shown at some times in s.
+
+    A path that ends in ``.mkv`` is of depth, another of pictures.
+    """
+    is_depth = path.suffix == ".mkv"
+    tick_s = tick_s or Fraction(1, 1000 if is_depth else 15360)
+    with av.open(str(path), "w", options=how.get("file_options", {})) as container:
+        container.metadata.update({"DEPTH_SCALE": "0.001"} if is_depth else {})
+        codec = codec or ("ffv1" if is_depth else "libx264")
+        stream = container.add_stream(codec, rate=rate_hz, options=how.get("options", {}))
+        stream.height, stream.width = SIZE
+        stream.pix_fmt = how.get("pixel_format", "gray16le" if is_depth else "yuv420p")
+        stream.codec_context.time_base = stream.time_base = tick_s
+        for number, time_s in enumerate(times):
+            shown = (
+                av.VideoFrame.from_ndarray(np.full(SIZE, 3000 + number, np.uint16), "gray16le")
+                if is_depth
+                else av.VideoFrame.from_ndarray(np.full((*SIZE, 3), 8 * number, np.uint8), "rgb24")
+            )
+            shown.pts, shown.time_base = round(time_s / tick_s), tick_s
+            container.mux(stream.encode(shown))
+        container.mux(stream.encode(None))
+    return path
