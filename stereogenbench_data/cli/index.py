@@ -40,6 +40,9 @@ def index(  # noqa: PLR0913 - one parameter an option
     valid_depth: Annotated[
         bool, flag("--valid-depth", "Measure the share of valid depth, to select by it.")
     ] = False,
+    checksums: Annotated[
+        bool, flag("--checksums", "Read all files through, so that damage is seen later.")
+    ] = False,
     chosen: SceneOptions,
     conventions: ConventionsOption = None,
     as_json: JsonOption = False,
@@ -52,7 +55,7 @@ def index(  # noqa: PLR0913 - one parameter an option
 
     Example: `stereogenbench index scenes/`
     """
-    from stereogenbench_data.index.build import ManyRequestsWarning, walk
+    from stereogenbench_data.index.build import ManyReadsWarning, walk
     from stereogenbench_data.index.parquet import recorded_root
     from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.schema.conventions import Conventions
@@ -78,13 +81,14 @@ def index(  # noqa: PLR0913 - one parameter an option
         TemporaryFile(dir=there).close()
     stated = None if conventions is None else Conventions.read(conventions)
     with warnings.catch_warnings(), progress_bar("indexing", unit="scenes") as progress:
-        warnings.simplefilter("always", ManyRequestsWarning)
+        warnings.simplefilter("always", ManyReadsWarning)
         warnings.showwarning = lambda told, *_: _tell(str(told))
         report = walk(
             root,
             **work.options(),
             progress=progress,
             valid_depth=mode,
+            checksums="all" if checksums else "none",
             wanted=wanted,
             conventions=stated,
         )

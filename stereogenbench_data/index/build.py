@@ -5,6 +5,7 @@ The user's cache keeps the described scenes, so a killed run continues where it 
 
 import hashlib
 import json
+import os
 import re
 import warnings
 from collections import defaultdict
@@ -12,7 +13,9 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
+from time import perf_counter
 from typing import Any, Final, Literal
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, no_advance, require_workers
@@ -36,11 +39,13 @@ from stereogenbench_data.index.tree import (
     RemoteTree,
     SceneFolder,
     TreeCache,
+    WholeFiles,
     find_scene_folders,
     in_parallel,
     stamp_of,
 )
 from stereogenbench_data.media.depth import require_depth_stream
+from stereogenbench_data.media.heads import END_BYTES, Asked
 from stereogenbench_data.schema.conventions import Conventions, Shape, depth_of
 from stereogenbench_data.schema.document import brief
 from stereogenbench_data.schema.parse import parse_scene_key
@@ -59,6 +64,8 @@ from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy
 
 _NAMED: Final = 6
+Checksums = Literal["none", "all"]
+
 ALIKE: Final = 20
 """How many scenes that are broken for one reason show that it is the format."""
 FORMAT_CURE: Final = (
@@ -69,6 +76,10 @@ FORMAT_CURE: Final = (
 )
 _MOST_UNTOLD: Final = 2500
 """More requests are told: the Hub answers 3,000 in five minutes."""
+_MOST_UNTOLD_SCENES: Final = 100
+"""Of more scenes of a folder it is told what reading them takes."""
+_TRIED: Final = 2
+"""How many of them are described to know that; imports are part of the first."""
 _REQUESTS: Final = 2 * len(VIDEO_FILES) + len(METADATA_FILES)
 """The requests that describe a scene behind a URL: both ends of each video, and the small files."""
 _READERS: Final = 8
@@ -130,6 +141,8 @@ class Tree:
         remote: What lists the files behind the URL; None on this machine.
         conventions: Where quantities stand in the files; what they do not state is found.
         valid_depth: Whether depth pictures are decoded, see `walk`.
+        checksums: Whether rows hold checksums, see `walk`.
+        reads: Whether of videos on this machine only heads are read, or all.
         files: Key to files, of scenes whose files are listed.
         stamp: A digest of all this, which changes when a file is added, removed or changed.
     """
@@ -144,6 +157,8 @@ class Tree:
     remote: RemoteTree | None = None
     conventions: Conventions | None = None
     valid_depth: ValidDepth = "skip"
+    checksums: Checksums = "none"
+    reads: Literal["heads", "whole files"] = "heads"
     files: Mapping[str, Files] = field(default_factory=dict)
     stamp: str = ""
 
@@ -173,7 +188,7 @@ class Tree:
     def folder(self, key: str) -> SceneFolder:
         """Return a scene's folder; on this machine its files are listed anew."""
         if self.remote is None:
-            return SceneFolder(self.root, key)
+            return (SceneFolder if self.reads == "heads" else WholeFiles)(self.root, key)
         return RemoteFolder(self.remote.root, key, self.files.get(key), self.cache)
 
     def finished(self, key: str) -> Files:
@@ -222,7 +237,8 @@ class Tree:
             StorageError: If its files cannot be listed.
         """
         opened = "all" if videos is None else sorted(videos)
-        return repr((folder.key, opened, self.valid_depth, stamp_of(folder.stamps())))
+        how = self.valid_depth, self.checksums
+        return repr((folder.key, opened, *how, stamp_of(folder.stamps())))
 
     def describe(self, folder: SceneFolder, videos: Collection[str] | None = None) -> Scene:
         """Return a scene as its files say, or as the user's cache holds it; see `describe_scene`.
@@ -237,6 +253,12 @@ class Tree:
                 self.root, folder.key, valid_depth=self.valid_depth, conventions=self.conventions,
                 folder=folder, videos=videos,
             )  # fmt: skip
+            if self.checksums == "all" and isinstance(folder, WholeFiles):
+                members = {
+                    name: replace(each, crc32=folder.crc32(name))
+                    for name, each in scene.members.items()
+                }
+                scene = replace(scene, members=members)
             self.cache.keep("scenes", name, json.dumps(json_of(scene)).encode())
         return scene
 
@@ -259,6 +281,7 @@ def walk(  # noqa: PLR0913 - each is an option of the command
     engine: Engine = LOCAL,
     progress: Progress | None = None,
     valid_depth: ValidDepth = "skip",
+    checksums: Checksums = "none",
     wanted: Callable[[SceneId], bool] | None = None,
     if_none: Literal["refuse", "all"] = "refuse",
     conventions: Conventions | None = None,
@@ -275,6 +298,7 @@ def walk(  # noqa: PLR0913 - each is an option of the command
         progress: Called after each scene with the number of scenes done and that of all.
         valid_depth: "sample" decodes some depth pictures of each scene, for the share of pixels
             that have a depth.
+        checksums: "all" reads all files of a folder on this machine through, for the crc32 of each.
         wanted: Returns whether to describe the scene of a path; None is all.
         if_none: What to do where no scene is wanted: refuse, or describe all of them.
         conventions: Where quantities stand in the files and how they are read.
@@ -285,8 +309,15 @@ def walk(  # noqa: PLR0913 - each is an option of the command
             first `ALIKE` scenes are broken for one reason, so that it is the format of the files.
     """
     require_workers(workers)
+    if checksums == "all" and is_remote(root):
+        raise StorageError(
+            f"{shown(root)}: checksums are made of files on a disk. Download the scenes, or index "
+            f"them without checksums."
+        )
     tree = find_tree(root, wanted=wanted, if_none=if_none, conventions=conventions, retry=retry)
     tree = replace(tree, valid_depth=valid_depth)
+    if checksums == "all":
+        tree = replace(tree, checksums="all", reads="whole files")
     return walk_tree(tree, workers=workers, engine=engine, progress=progress)
 
 
@@ -314,12 +345,17 @@ def walk_tree(
         progress(len(outcomes), total)
     if engine is LOCAL and len(pending) < POOL_FROM:
         workers = 1
-    if tree.remote is not None:
-        tell_requests(tree.root, len(pending), each=_REQUESTS, what="all files")
     bare = replace(tree, keys=(), refused={}, files={})
-    for outcome in engine.map(
-        bare.outcome, pending, name=lambda folder: folder.key, workers=workers
-    ):
+    tried: list[Outcome] = []
+    if tree.remote is not None:
+        size_bytes = sum(_asked_bytes(tree.files[each.key]) for each in pending)
+        tell_requests(
+            tree.root, len(pending), each=_REQUESTS, what="all files", size_bytes=size_bytes
+        )
+    elif len(pending) > _MOST_UNTOLD_SCENES or tree.checksums == "all":
+        bare, tried, pending = _tried(bare, pending, workers=workers)
+    others = engine.map(bare.outcome, pending, name=lambda folder: folder.key, workers=workers)
+    for outcome in chain(tried, others):
         outcomes[outcome.key] = outcome
         if len(outcomes) == ALIKE:
             require_not_all_alike(tree.root, outcomes.values())
@@ -328,20 +364,87 @@ def walk_tree(
     return report_of(tree, outcomes)
 
 
-class ManyRequestsWarning(UserWarning):
-    """So many requests are made that a server may let them wait."""
+class ManyReadsWarning(UserWarning):
+    """So much is read that it takes a while."""
 
 
-def tell_requests(root: str | Path, scenes: int, *, each: int, what: str) -> None:
+def tell_requests(
+    root: str | Path, scenes: int, *, each: int, what: str, size_bytes: int | None = None
+) -> None:
     """Warn of the requests that scenes behind a URL take, if a server may let them wait."""
     requests, where = scenes * each, shown(root)
     if requests > _MOST_UNTOLD:
+        size = "" if size_bytes is None else f" some {_size(size_bytes)}"
         message = (
-            f"{where}: reads {what} of {scenes} scenes, in {requests:,} requests: on the Hub "
+            f"{where}: reads {what} of {scenes} scenes,{size} in {requests:,} requests: on the Hub "
             f"without a login some {requests // 600} minutes. An interrupted run goes on where it "
             f"stopped; an index holds them: `stereogenbench index {where}`."
         )
-        warnings.warn(message, ManyRequestsWarning, stacklevel=2)
+        warnings.warn(message, ManyReadsWarning, stacklevel=2)
+
+
+def _asked_bytes(files: Files) -> int:
+    """Return how many bytes of a scene behind a URL are asked for."""
+    return sum(min(size, 2 * END_BYTES if name[:4] == "cam_" else size)
+               for name, (size, _) in files.items())  # fmt: skip
+
+
+def _tried(
+    tree: Tree, pending: Sequence[SceneFolder], *, workers: int | None
+) -> tuple[Tree, list[Outcome], list[SceneFolder]]:
+    """Describe some scenes, and tell what the others will take.
+
+    Where a disk takes most of the time to read heads, one more is read through: if that is faster,
+    the others are, too.
+
+    Returns:
+        How the others are read, what became of the first, and the others.
+    """
+    outcomes: list[Outcome] = []
+
+    def tried(folder: SceneFolder) -> float:
+        begins_s = perf_counter()
+        outcomes.append(tree.outcome(folder))
+        return perf_counter() - begins_s
+
+    folders = [tree.folder(each.key) for each in pending[:_TRIED]]
+    each_s = min(map(tried, folders), default=0.0)
+    asked = folders[-1].asked if folders else Asked()
+    if tree.reads == "heads" and asked.took_s > each_s / 2:
+        whole = WholeFiles(tree.root, pending[_TRIED].key)
+        whole_s = tried(whole)
+        if whole_s < each_s:
+            tree, each_s, asked = replace(tree, reads="whole files"), whole_s, whole.asked
+    others = [tree.folder(each.key) for each in pending[len(outcomes) :]]
+    if others:
+        _tell_reads(tree, len(others), asked, took_s=each_s, workers=workers)
+    return tree, outcomes, others
+
+
+def _tell_reads(
+    tree: Tree, scenes: int, each: Asked, *, took_s: float, workers: int | None
+) -> None:
+    """Warn of what so many scenes take, of which one took some seconds."""
+    workers = min(workers or os.cpu_count() or 1, scenes)
+    what = "the heads of all videos" if tree.reads == "heads" else "all files through"
+    told = (
+        f"{shown(tree.root)}: reads {what} of {scenes} scenes, some {_size(each.bytes * scenes)} "
+        f"in {each.reads * scenes:,} reads, which takes some {_lasting(took_s * scenes / workers)} "
+        f"by {counted(workers, 'worker')}. An interrupted run goes on where it stopped."
+    )
+    warnings.warn(told, ManyReadsWarning, stacklevel=2)
+
+
+def _size(size_bytes: int) -> str:
+    """Return a number of bytes for messages."""
+    return f"{size_bytes / 1e9:,.1f} GB" if size_bytes >= 1e9 else f"{size_bytes / 1e6:,.1f} MB"
+
+
+def _lasting(time_s: float) -> str:
+    """Return a time for messages."""
+    if time_s < 90:
+        return f"{time_s:.0f} s"
+    return f"{time_s / 60:.0f} minutes" if time_s < 5400 else f"{time_s / 3600:.1f} hours"
 
 
 def find_tree(

@@ -52,7 +52,7 @@ from stereogenbench_data.media.depth import (
     resolve_encoding,
 )
 from stereogenbench_data.media.depth_frames import CODEC_NAME
-from stereogenbench_data.media.heads import heads_of
+from stereogenbench_data.media.heads import Heads, heads_of
 from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
 from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
 from stereogenbench_data.schema.conventions import (
@@ -312,6 +312,8 @@ class Description:
                 try:
                     with heads_of(video, name=self.where(held)) as known:
                         self.probe_video(name, held, known)
+                        if isinstance(known, Heads) and isinstance(video, Path):
+                            self.folder.asked += known.asked
                 except MediaError as error:
                     self.unread[held] = str(error)
                 finally:

@@ -24,6 +24,7 @@ files are renamed into place, whole or not at all, and a damaged one counts as m
 
 import functools
 import hashlib
+import io
 import json
 import os
 import re
@@ -33,6 +34,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from time import perf_counter
 from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
@@ -49,8 +51,8 @@ from stereogenbench_data.index.parquet import (
     read_seek_tables,
     write_index_file,
 )
-from stereogenbench_data.media.container import SeekableFile
-from stereogenbench_data.media.heads import END_BYTES
+from stereogenbench_data.media.container import BinaryFile
+from stereogenbench_data.media.heads import END_BYTES, Asked
 from stereogenbench_data.schema.document import MAX_TEXT_BYTES, require_text_size
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import (
@@ -223,7 +225,10 @@ class SceneFolder:
 
     Attributes:
         key: The scene's key.
+        asked: What was asked for of its videos so far.
     """
+
+    asked = Asked()
 
     def __init__(self, root: str | Path, key: str) -> None:
         """Name the folder by the data's root and the scene's key; nothing is read yet."""
@@ -268,13 +273,51 @@ class SceneFolder:
         where = f"{self.key}/{name}"
         return read_text_file(Path(self._root, where), where=where)
 
-    def video(self, name: str) -> Path | SeekableFile:
+    def video(self, name: str) -> Path | BinaryFile:
         """Return a video: its path, or an open file that the caller closes.
 
         Raises:
             StorageError: If it cannot be read.
         """
         return Path(self._root, self.key, name)
+
+
+class WholeFiles(SceneFolder):
+    """A scene's folder on this machine of which each file is read through, once."""
+
+    def __init__(self, root: str | Path, key: str) -> None:
+        """Name the folder by the data's root and the scene's key; nothing is read yet."""
+        super().__init__(root, key)
+        self._crc32s: dict[str, int] = {}
+
+    def read(self, name: str) -> bytes:
+        """Return a metadata file, whole, as `SceneFolder.read` does."""
+        content = super().read(name)
+        self._crc32s[name] = zlib.crc32(content)
+        return content
+
+    def video(self, name: str) -> io.BytesIO:
+        """Return a video, whole in memory.
+
+        Raises:
+            StorageError: If it cannot be read.
+        """
+        begins_s, path = perf_counter(), Path(self._root, self.key, name)
+        with explain_os_errors(f"{path}: cannot be read", "Fetch it again."):
+            content = path.read_bytes()
+        self.asked += Asked(len(content), 1, perf_counter() - begins_s)
+        self._crc32s[name] = zlib.crc32(content)
+        return io.BytesIO(content)
+
+    def crc32(self, name: str) -> int:
+        """Return the crc32 of a file.
+
+        Raises:
+            StorageError: If it cannot be read.
+        """
+        if name not in self._crc32s:
+            self.video(name).close()
+        return self._crc32s[name]
 
 
 class RemoteFolder(SceneFolder):

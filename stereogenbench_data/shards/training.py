@@ -49,7 +49,7 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.schema.training import FORMAT
 from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.sources.members import MemberSource
-from stereogenbench_data.sources.ranged_file import require_crc32
+from stereogenbench_data.sources.ranged_file import FileSlice, require_crc32
 
 _LARGEST_DENOMINATOR: Final = 100_000
 _DEPTH_BITS_A_PIXEL: Final = 1.5
@@ -253,13 +253,14 @@ def derive_scene(
 
 
 def _open_source(source: MemberSource, scene: Scene, name: str) -> VideoFile:
-    """Return a source video: its path, or its bytes in memory where it is part of a shard."""
-    opened = source.open(scene, name)
+    """Return a source video: its path, or or its bytes in memory where they have a checksum."""
+    opened, member = source.open(scene, name), scene.member(name)
     if isinstance(opened, Path):
-        return opened
+        if member.crc32 is None:
+            return opened
+        opened = FileSlice(opened, member)
     with opened:
         content = opened.read()
-    member = scene.member(name)
     require_crc32(zlib.crc32(content), expected=member.crc32, name=source.label(scene, name))
     return io.BytesIO(content)
 

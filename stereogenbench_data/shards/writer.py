@@ -10,6 +10,7 @@ import io
 import os
 import shutil
 import stat
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -43,6 +44,7 @@ from stereogenbench_data.shards.training import (
 from stereogenbench_data.sources.files import copy_with_crc32, open_atomic, try_locked
 from stereogenbench_data.sources.location import is_remote, shown
 from stereogenbench_data.sources.members import MemberSource
+from stereogenbench_data.sources.ranged_file import require_crc32
 
 PARTS: Final = ".parts"
 """The folder beside the shards that holds the index of each, and locks."""
@@ -228,7 +230,10 @@ def _pack(task: ShardTask, after_bytes: Advance) -> None:
             for member in _members(task, scene):
                 name, source = member.name.partition(".")[2], Path(task.root, member.source)
                 length = member.size
-                chunks = _source_chunks(source, length, after_bytes)
+                crc32 = None
+                if task.derivation is None:
+                    crc32 = scene.members[RELEASED_NAMES.get(name, name)].crc32
+                chunks = _source_chunks(source, length, after_bytes, crc32=crc32)
                 if task.derivation is None and name in RELEASED_NAMES:
                     packed = _packed_depth(source, chunks, frames=scene.frames)
                     length, chunks = len(packed), iter([packed])
@@ -266,12 +271,16 @@ def _row_of(task: ShardTask, scene: Scene) -> Scene:
     return replace(scene, members=members, seek_tables=now.seek_tables)
 
 
-def _source_chunks(source: Path, size: int, after_bytes: Advance) -> Iterator[bytes]:
+def _source_chunks(
+    source: Path, size: int, after_bytes: Advance, *, crc32: int | None
+) -> Iterator[bytes]:
     """Yield all bytes of a released file of the planned size.
 
     Raises:
-        ShardError: If it is missing, unreadable, has another size or changes meanwhile.
+        ShardError: If it is missing, unreadable, has another size or checksum, or changes
+            meanwhile.
     """
+    found_crc32 = 0
     cure = "Fetch it again, then run the same command again."
     with explain_os_errors(f"{source}: cannot be read", cure, kind=ShardError):
         if not stat.S_ISREG(source.stat().st_mode):
@@ -284,7 +293,10 @@ def _source_chunks(source: Path, size: int, after_bytes: Advance) -> Iterator[by
                     f"Let nothing write to the release; run `stereogenbench index` again if it has "
                     f"an index."
                 )
-            yield from read_chunks(file, size, after_bytes=after_bytes)
+            for chunk in read_chunks(file, size, after_bytes=after_bytes):
+                found_crc32 = zlib.crc32(chunk, found_crc32)
+                yield chunk
+            require_crc32(found_crc32, expected=crc32, name=str(source))
             after = source.stat()
             found = (after.st_size, after.st_mtime_ns)
             if found != (size, before.st_mtime_ns) or not os.path.samestat(after, before):

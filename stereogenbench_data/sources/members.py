@@ -8,7 +8,7 @@ import zlib
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, TypeVar
 
 from stereogenbench_data.errors import ShardError, StorageError, explain_os_errors
 from stereogenbench_data.media.container import SeekableFile
@@ -26,6 +26,8 @@ from stereogenbench_data.sources.ranged_file import (
 )
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy, require_expected_size
+
+_Local = TypeVar("_Local", Path | FileSlice, FileSlice)
 
 _KEPT_TABLES: Final = 256
 """Of how many scenes the seek tables are kept."""
@@ -57,9 +59,9 @@ class MemberSource:
             shards: What the index knows of each shard, by path.
             revision: The index's digest, by which a cache distinguishes data.
             cache: Where to keep members that come from a URL, or None.
-            check: What is compared with its checksum. "opened": each member of a shard or of the
-                cache when this process first opens it, and each member from a URL when its last
-                byte arrives. "metadata": metadata files only.
+            check: What is compared with its checksum, where the index has one. "opened": each file
+                on this machine when this process first opens it, and each member from a URL when
+                its last byte arrives. "metadata": metadata files only.
             retry: How reading from a server is retried; None for the defaults.
             ahead: Where `wanted` ranges are fetched ahead; None fetches each when it is read.
         """
@@ -82,8 +84,8 @@ class MemberSource:
         """
         member, name = scene.member(name), scene.held_name(name)
         if not is_remote(self._root):
-            found = open_local(self._root, member, shard=self._shards.get(member.path))
-            return found if isinstance(found, Path) else self._checked(found, scene, name)
+            local = open_local(self._root, member, shard=self._shards.get(member.path))
+            return self._checked(local, scene, name)
         _require_safe(member)
         remote = self._object(member)
         if self._cache is not None:
@@ -169,16 +171,19 @@ class MemberSource:
                 self._tables.popitem(last=False)
         return self._tables[key].get(name)
 
-    def _checked(self, file: FileSlice, scene: Scene, name: str) -> FileSlice:
-        """Return an open file after its first checksum comparison, where `check` asks for one."""
+    def _checked(self, file: _Local, scene: Scene, name: str) -> _Local:
+        """Return a file after its first checksum comparison, where `check` asks for one."""
         member = scene.members[name]
         place = (member.path, member.offset)
         if self._check == "opened" and member.crc32 is not None and place not in self._sound:
+            whole = FileSlice(file, member) if isinstance(file, Path) else file
             try:
-                require_crc32(file.crc32(), expected=member.crc32, name=self.label(scene, name))
+                require_crc32(whole.crc32(), expected=member.crc32, name=self.label(scene, name))
             except StorageError:
-                file.close()
+                whole.close()
                 raise
+            if isinstance(file, Path):
+                whole.close()
             self._sound.add(place)
         return file
 
@@ -193,9 +198,10 @@ class MemberSource:
         require_text_size(member.size, where=where)
         opened = self.open(scene, name)
         if isinstance(opened, Path):
-            return read_text_file(opened, where=where)
-        with opened:
-            text = opened.read()
+            text = read_text_file(opened, where=where)
+        else:
+            with opened:
+                text = opened.read()
         require_crc32(zlib.crc32(text), expected=member.crc32, name=where)
         return text
 

@@ -8,7 +8,11 @@ from torch.utils.data import DataLoader
 
 from stereogenbench_data import SceneViews, StereoPairs
 from stereogenbench_data.errors import ShardError
+from stereogenbench_data.index.build import ManyReadsWarning, walk
+from stereogenbench_data.index.parquet import INDEX_NAME
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import rgb_name
+from stereogenbench_data.shards.pack import pack
 
 SCENE = "train/IPD_Gaussian/SynthStage/scene_000000"
 SHARD = "train-IPD_Gaussian-000000.tar"
@@ -73,6 +77,40 @@ def test_it_is_found_in_workers_and_by_the_loader(shards):
         list(DataLoader(pairs, batch_size=None, num_workers=1))
     with pytest.raises(ShardError, match=WRONG):
         list(pairs.loader(2))
+
+
+@pytest.fixture
+def folder(small_release, tmp_path):
+    """A copy of a folder, indexed with checksums, in which then a bit was flipped."""
+    root = shutil.copytree(small_release, tmp_path / "folder")
+    with pytest.warns(ManyReadsWarning, match="reads all files through of 2 scenes"):
+        SceneIndex.from_report(walk(root, checksums="all")).write(root / INDEX_NAME)
+    path = root / SCENE / rgb_name(0)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    return root
+
+
+@pytest.mark.parametrize(
+    "options", [{"frames": ("clips", 4)}, {"frames": "first", "check": "opened"}], ids=str
+)
+def test_a_flipped_bit_of_a_folder_with_checksums_is_found(folder, options):
+    told = rf"{SCENE}/{rgb_name(0)}: has crc32 [0-9a-f]{{8}}, and the index says"
+
+    with pytest.raises(ShardError, match=told):
+        selected(folder, **options)[0]
+    with pytest.raises(ShardError, match=told):
+        pack(folder, folder.parent / "packed", workers=1)
+
+
+def test_a_flipped_bit_of_a_text_is_found_with_checksums(folder):
+    (path,) = (folder / SCENE).glob("trajectory.json")
+    text = path.read_bytes()
+    path.write_bytes(text.replace(b"1", b"2", 1))
+
+    with pytest.raises(ShardError, match=r"trajectory.json: has crc32 .*, and the index says"):
+        SceneViews(folder, scenes=SCENE, fields=("world_from_cam",), check="metadata")[0]
 
 
 @pytest.mark.parametrize("options", [{"frames": "first"}, {"frames": "all", "check": "metadata"}])

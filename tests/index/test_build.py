@@ -4,13 +4,19 @@ import json
 import math
 import os
 import shutil
+import zlib
+from dataclasses import replace
+from io import FileIO
 
 import pytest
 
 from stereogenbench_data.index import build as walk_module
-from stereogenbench_data.index.build import walk
+from stereogenbench_data.index import tree as tree_module
+from stereogenbench_data.index.build import ManyReadsWarning, walk
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.index.tree import CACHE_VARIABLE
+from stereogenbench_data.media import heads as heads_module
+from stereogenbench_data.media.heads import Asked, heads_of
 
 KEY = "train/Uniform/Car_Dealer/scene_{:06d}"
 
@@ -116,6 +122,71 @@ def test_a_stopped_walk_goes_on_and_a_damaged_row_is_read_again(alike_scenes, ro
     assert (known, again(root)[0]) == (2, 4)
     assert report == again(root)[1]
     assert len(report.scenes) == 4
+
+
+def test_what_many_scenes_take_is_told_before_they_are_read(alike_scenes, root, monkeypatch):
+    keys = alike_scenes(6)
+    asked = Asked()
+    for path in (root / keys[0]).glob("cam_*"):
+        with heads_of(path, name=path.name) as heads:
+            asked += heads.asked
+    monkeypatch.setattr(walk_module, "_MOST_UNTOLD_SCENES", 5)
+
+    size, reads = f"{asked.bytes * 4 / 1e6:.1f} MB", f"{asked.reads * 4} reads"
+    told = rf"{root}: reads the heads of all videos of 4 scenes, some {size} in {reads}, .* worker"
+    with pytest.warns(ManyReadsWarning, match=told):
+        report = walk(root)
+
+    assert len(report.scenes) == 6
+
+
+def test_files_are_read_through_where_a_disk_is_slow_to_find_them(alike_scenes, root, monkeypatch):
+    keys = alike_scenes(6)
+    size = sum(path.stat().st_size for path in (root / keys[0]).glob("cam_*"))
+    now_s = [0.0]
+
+    class SlowFile(FileIO):
+        def read(self, size=-1):
+            now_s[0] += 0.01
+            return super().read(size)
+
+    monkeypatch.setattr(heads_module, "FileIO", SlowFile)
+    for module in (walk_module, heads_module, tree_module):
+        monkeypatch.setattr(module, "perf_counter", lambda: now_s[0])
+    monkeypatch.setattr(walk_module, "_MOST_UNTOLD_SCENES", 5)
+
+    told = f"reads all files through of 3 scenes, some {size * 3 / 1e6:.1f} MB in 36 reads"
+    with pytest.warns(ManyReadsWarning, match=told):
+        report = walk(root)
+
+    assert len(report.scenes) == 6
+
+
+@pytest.mark.usefixtures("cache")
+def test_checksums_of_a_folder_go_on_where_they_were_stopped(alike_scenes, root):
+    keys = alike_scenes(4)
+    bare = walk(root).scenes
+
+    def stop(done, total):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    told = "reads all files through of 2 scenes, some .* MB in 24 reads, which takes some 0 s by 1"
+    with (
+        pytest.warns(ManyReadsWarning, match=told),
+        pytest.raises(KeyboardInterrupt, match=r"^$"),
+    ):
+        walk(root, checksums="all", progress=stop)
+    known, report = again(root, checksums="all")
+
+    assert known == 3
+    for scene, before in zip(report.scenes, bare, strict=True):
+        assert replace(scene, members=before.members) == before
+        assert all(each.crc32 is None for each in before.members.values())
+        for name, member in scene.members.items():
+            content = (root / scene.id.key / name).read_bytes()
+            assert (member.crc32, member.size) == (zlib.crc32(content), len(content))
+    assert [scene.id.key for scene in report.scenes] == keys
 
 
 @pytest.mark.usefixtures("cache")
