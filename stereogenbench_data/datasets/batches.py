@@ -8,8 +8,10 @@ Workers see the epoch through shared memory, and those that are spawned the rows
 import copy
 import itertools
 import math
+import multiprocessing
 import os
 import sys
+import threading
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -52,36 +54,74 @@ class RepeatedEpochWarning(UserWarning):
     """A second pass draws the same random frames and transforms, or has the same order."""
 
 
-_SHARED_NUMBERS: Final = 1 << 16
-"""Numbers in a block of shared memory; a block is an open file, so all of a process share few."""
+_BLOCK: Final = 1 << 13
+"""Numbers in a block of shared memory. A block is an open file, so the numbers of a process are in
+few: a process may have thousands of datasets, and not as many files."""
 
-_blocks: Final[list[torch.Tensor]] = []
-"""What is left of this process's last block."""
+
+class _Block:
+    """What is left of this process's last block; a fork begins its own."""
+
+    def __init__(self) -> None:
+        self.lock, self.rest = threading.Lock(), torch.empty(0, dtype=torch.int64, device="cpu")
+
+    def take(self, count: int) -> torch.Tensor:
+        """Return so many shared numbers, all 0."""
+        with self.lock:
+            if len(self.rest) < count:
+                # Whatever mode or default device the user has set, and without torch's threads, of
+                # which a fork has none; new memory is 0.
+                storage = torch.UntypedStorage._new_shared(8 * max(count, _BLOCK))
+                with torch.inference_mode(mode=False):
+                    self.rest = torch.empty(0, dtype=torch.int64, device="cpu").set_(storage)
+            taken, self.rest = self.rest[:count], self.rest[count:]
+        return taken
+
+
+_block = _Block()
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_blocks.clear)
+    os.register_at_fork(after_in_child=_block.__init__)  # type: ignore[misc]
 
 
 class SharedNumbers:
     """Whole numbers of which running workers see every change.
 
-    Workers get the same numbers, however they are started. Any other copy, by `copy` or by pickle,
-    has numbers of its own, which its own workers share.
+    The workers of the process that made them have the same numbers, however they are started. Any
+    other copy has numbers of its own, which its own workers share: by `copy`, by pickle, or in a
+    process that was forked or spawned as another rank.
     """
 
-    def __init__(self, numbers: Sequence[int] | torch.Tensor) -> None:
-        """Begin with these numbers: a tensor stays where it is, in shared memory."""
-        if isinstance(numbers, torch.Tensor):
-            self.tensor = numbers
-            return
-        count = len(numbers)
-        if not _blocks or len(_blocks[0]) < count:
-            with torch.inference_mode(mode=False):
-                size = max(count, _SHARED_NUMBERS)
-                block = torch.zeros(size, dtype=torch.int64, device="cpu").share_memory_()
-            _blocks[:] = [block]
-        self.tensor, _blocks[0] = _blocks[0][:count], _blocks[0][count:]
-        self.tensor[:] = torch.tensor(numbers, dtype=torch.int64, device="cpu")
+    def __init__(self, numbers: Sequence[int], *, tensor: torch.Tensor | None = None) -> None:
+        """Begin with these numbers, or with those of the owner that started this worker."""
+        self._owner = os.getpid()
+        self._tensor = _block.take(len(numbers)) if tensor is None else tensor
+        for place, number in enumerate(numbers):
+            self._tensor[place] = number
+
+    @classmethod
+    def of_owner(cls, tensor: torch.Tensor, owner: int) -> "SharedNumbers":
+        """Return the numbers that another process owns."""
+        numbers = cls((), tensor=tensor)
+        numbers._owner = owner
+        return numbers
+
+    @property
+    def owner(self) -> int:
+        """The process whose workers share these numbers."""
+        return self._owner
+
+    @property
+    def tensor(self) -> torch.Tensor:
+        """The numbers, (n,) int64."""
+        if self._owner != os.getpid() and not self._is_worker_of_owner:
+            self.__init__(self._tensor.tolist())  # type: ignore[misc]
+        return self._tensor
+
+    @property
+    def _is_worker_of_owner(self) -> bool:
+        parent = multiprocessing.parent_process()
+        return get_worker_info() is not None and parent is not None and parent.pid == self._owner
 
     def __getitem__(self, place: int) -> int:
         """Return a number."""
@@ -97,7 +137,9 @@ class SharedNumbers:
 
 
 # For processes of this machine alone, such as workers that are spawned.
-ForkingPickler.register(SharedNumbers, lambda numbers: (SharedNumbers, (numbers.tensor,)))
+ForkingPickler.register(
+    SharedNumbers, lambda numbers: (SharedNumbers.of_owner, (numbers.tensor, numbers.owner))
+)
 
 
 class SharedEpoch:

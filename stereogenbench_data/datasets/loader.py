@@ -28,7 +28,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property, partial
-from multiprocessing import connection, get_context
+from multiprocessing import connection, get_context, resource_tracker
 from multiprocessing.context import BaseContext
 from multiprocessing.process import BaseProcess
 from multiprocessing.queues import Queue
@@ -163,7 +163,9 @@ class Workers:
                 before=self.parted,
             )
             self._due.tasks = self.parted.tasks()
-        self._results = iter(self._torch)
+        # So workers do not end by it before they have begun.
+        with _sigterm_blocked(self._context):
+            self._results = iter(self._torch)
         if self._context is not None and are_new:
             # The thread does not refer to these workers: without other references they end.
             of_thread = (self._context, self._stop_reader)
@@ -266,16 +268,53 @@ class _DueTasks(Sampler[Any]):
 
 
 class _Beginning(NamedTuple):
-    """What a worker does first: it takes the memory of its batches, and what the user asks for."""
+    """What a worker does first: it obeys, takes the memory of its batches, and what users ask."""
 
     memory: BatchMemory
     worker_init_fn: Callable[[int], object] | None
 
     def __call__(self, worker: int) -> None:
+        _end_with_parent_alone()
         info: Any = get_worker_info()
         info.dataset.begin_worker(self.memory)
         if self.worker_init_fn is not None:
             self.worker_init_fn(worker)
+
+
+@contextmanager
+def _sigterm_blocked(context: "_WatchedContext | None") -> Iterator[None]:
+    """Let this thread, and the processes that it starts, take no SIGTERM for now."""
+    if context is None or not hasattr(signal, "sigwaitinfo"):
+        yield
+        return
+    if context.get_start_method() != "fork":
+        resource_tracker.ensure_running()  # where it has to be started, it unblocks the signal
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_with_parent_alone() -> None:
+    """Let SIGTERM end this worker only where its parent sends it.
+
+    Launchers and schedulers send it to a whole process group. A worker that ended would end the
+    training process in the middle of its step, before it could save. It cannot be ignored, as
+    multiprocessing ends its processes by it and waits for them. So it is blocked, as it was when
+    this process was started, and taken by a thread. Where a system does not tell who sent a signal
+    (macOS), workers end as usual.
+    """
+    if not hasattr(signal, "sigwaitinfo"):
+        return
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+
+    def obey() -> None:
+        while signal.sigwaitinfo({signal.SIGTERM}).si_pid != os.getppid():
+            pass
+        os._exit(0)
+
+    threading.Thread(target=obey, name="sigterm", daemon=True).start()
 
 
 _running: Final[WeakSet[Workers]] = WeakSet()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from torch.utils.data import DataLoader
 
 from stereogenbench_data import (
@@ -21,7 +22,7 @@ from stereogenbench_data import (
     StereoPairStream,
     collate,
 )
-from tests.datasets.conftest import flat, keys_of
+from tests.datasets.conftest import flat, fork_and, keys_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
 COPIES = {
@@ -163,3 +164,38 @@ def test_a_loader_made_in_each_epoch_is_warned_of_once_where_it_would_repeat(sma
         orders = [keys_of(pairs.loader(2)) for _ in range(3)]
     assert orders[0] == orders[1] == orders[2]
     assert len(told) == 1
+
+
+def test_a_forked_rank_has_an_epoch_of_its_own_which_its_workers_share(small_index):
+    """Else a slow rank would draw for the epoch that a fast one has gone on to."""
+    pairs = StereoPairs(small_index, fields=("__key__",), frames=("random", 3))
+    pairs.set_epoch(1)
+    expected = {}
+    for epoch in (1, 4):
+        pairs.set_epoch(epoch)
+        expected[epoch] = sorted(sample["__key__"] for sample in pairs)
+    pairs.set_epoch(1)
+
+    def rank():
+        assert pairs.epoch == 1
+        pairs.set_epoch(4)
+        loader = DataLoader(pairs, batch_size=4, num_workers=1, collate_fn=collate)
+        found = sorted(key for batch in loader for key in batch["__key__"])
+        assert found == expected[4] != expected[1]
+
+    assert fork_and(rank) == 0
+    assert pairs.epoch == 1
+
+
+@pytest.mark.parametrize("mode", ["inference", "default device"])
+def test_a_dataset_is_made_in_any_mode_of_torch(small_index, mode):
+    if mode == "inference":
+        with torch.inference_mode():
+            pairs = StereoPairs(small_index, fields=("__key__",))
+    else:
+        with torch.device("meta"):
+            pairs = StereoPairs(small_index, fields=("__key__",))
+    pairs.set_epoch(2)
+
+    assert pairs.epoch == 2
+    assert len(list(pairs.loader(2, num_workers=1))) == 2
