@@ -26,7 +26,7 @@ from stereogenbench_data.schema.release import (
     depth_name,
     rgb_name,
 )
-from stereogenbench_data.shards.tar import BLOCK_BYTES, END_OF_ARCHIVE, member_header, padded
+from stereogenbench_data.shards.tar import BLOCK_BYTES, END_OF_ARCHIVE, padded, require_member
 from stereogenbench_data.shards.training import (
     TrainingSettings,
     derived_names,
@@ -213,7 +213,7 @@ def planned_members(
             for name in derived_names(scene, training)
         ]
     for member in planned:
-        member_header(member.name, member.size)  # refuses what a tar cannot hold
+        require_member(member.name, member.size)
     return planned
 
 
