@@ -633,10 +633,14 @@ class PairsLoader(DataLoader[Any]):
 
     @property
     def _holds_runs(self) -> bool:
-        """Whether a whole run for each worker is on its way, where nothing is shuffled."""
+        """Whether half a run for each worker is on its way, where nothing is shuffled.
+
+        Else most workers would wait for the one whose run is due: to decode the same pictures in
+        all of them costs more, and is faster (measured at 1280x1280, with depth).
+        """
         lengths = self.batches.dataset.plan.runs.lengths
         ahead = (self.prefetch_factor or 0) * self.batches.batch_size * self.batches.world_size
-        return bool(ahead >= lengths.mean())
+        return bool(2 * ahead >= lengths.mean())
 
     def _set_sampler(self) -> None:
         # Past torch's guard against another sampler: it says that the batches are a rank's share.

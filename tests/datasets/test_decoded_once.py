@@ -87,6 +87,22 @@ def test_the_order_is_the_same_for_any_number_of_workers(of_real_size):
     assert orders == [orders[0]] * 5
 
 
+@pytest.mark.parametrize(("batch_size", "most"), [(8, 1), (1, 3)])
+def test_whole_runs_are_dealt_to_workers_where_nothing_is_shuffled(
+    of_real_size, tasks, batch_size, most
+):
+    """Where half a run of 7 frames for each worker is on its way; else batches in turn."""
+    pairs = StereoPairs(of_real_size, frames="all", fields=("__key__",))
+    for number, _ in enumerate(pairs.loader(batch_size, num_workers=3, shuffle=False)):
+        if number == 100:
+            break
+    runs = {}
+    for (_, run), workers in tasks.items():
+        runs.setdefault(run, set()).update(workers)
+
+    assert max(map(len, runs.values())) == most
+
+
 def test_a_loader_says_where_its_workers_time_goes(of_real_size):
     pairs = StereoPairs(of_real_size, frames="all", fields=FIELDS)
     loader = pairs.loader(8, num_workers=2)
