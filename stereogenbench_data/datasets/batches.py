@@ -48,6 +48,7 @@ from stereogenbench_data.selection.plan import Plan
 
 _rows: Final[WeakKeyDictionary[SceneIndex, torch.Tensor]] = WeakKeyDictionary()
 """The rows of each index that was sent to other processes, laid out once."""
+_OURS_OR_TORCH: Final = frozenset({__name__.partition(".")[0], "torch"})
 
 
 class RepeatedEpochWarning(UserWarning):
@@ -82,6 +83,14 @@ _block = _Block()
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_block.__init__)  # type: ignore[misc]
+
+
+def users_level() -> int:
+    """Return the stack level of a caller's warning that is neither this package's nor torch's."""
+    frame, level = sys._getframe(1), 1
+    while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in _OURS_OR_TORCH:
+        frame, level = frame.f_back, level + 1
+    return level
 
 
 class SharedNumbers:
@@ -195,7 +204,7 @@ class SharedEpoch:
                 "set_epoch(epoch) before each pass, or use StereoPairs(...).loader(...), whose "
                 "every pass is of the next epoch.",
                 RepeatedEpochWarning,
-                stacklevel=3,
+                stacklevel=users_level(),
             )
 
     def mark_ended(self, rule: OrderRule, *, loader: int) -> None:
@@ -213,7 +222,7 @@ class SharedEpoch:
                 "each of its passes is of the next epoch. Or call set_epoch(epoch) of the dataset, "
                 "or of the new loader, before each pass.",
                 RepeatedEpochWarning,
-                stacklevel=5,
+                stacklevel=users_level(),
             )
 
 
@@ -1042,7 +1051,7 @@ def warn_of_division(batches: EpochBatches, share: WorkerShare, *, videos_per_sc
             f"every video is decoded {together} times, as {readers} processes read {order.groups} "
             f"shuffle groups of {scenes} runs of frames. {cure}",
             RepeatedDecodingWarning,
-            stacklevel=5,
+            stacklevel=users_level(),
         )
     if share.of == "streams":
         if share.workers > open_scenes:
@@ -1052,7 +1061,7 @@ def warn_of_division(batches: EpochBatches, share: WorkerShare, *, videos_per_sc
                 f"Use num_workers={open_scenes}, or open_scenes="
                 f"{-(-share.workers // len(groups))} where there are as many scenes.",
                 IdleWorkersWarning,
-                stacklevel=5,
+                stacklevel=users_level(),
             )
         open_scenes = -(-open_scenes // share.workers)
     wanted, allowed = open_scenes * videos_per_scene, videos_allowed()
@@ -1063,7 +1072,7 @@ def warn_of_division(batches: EpochBatches, share: WorkerShare, *, videos_per_sc
             f"{wanted + SPARE_FILES}`), use more workers, or fewer open_scenes than "
             f"{batches.rule.open_scenes}.",
             OpenVideosWarning,
-            stacklevel=5,
+            stacklevel=users_level(),
         )
 
 

@@ -17,6 +17,7 @@ from stereogenbench_data.datasets.batches import (
     State,
     WorkerShare,
     require_count,
+    users_level,
 )
 from stereogenbench_data.datasets.mapped import Data, PairsOptions, StereoPairs
 from stereogenbench_data.errors import StateError
@@ -156,7 +157,7 @@ class StereoPairStream(IterableDataset[Sample]):
                 f"{self!r} begins epoch {self.epoch} a second time, in the same order. Call "
                 "set_epoch(epoch) of the stream before each pass.",
                 RepeatedEpochWarning,
-                stacklevel=2,
+                stacklevel=users_level(),
             )
         self._begun[place["worker"] % _MOST_WORKERS] += 1
         self._latest = begun

@@ -144,8 +144,11 @@ def test_an_epoch_that_was_set_again_may_be_repeated(small_index, ordered_by):
         pairs.set_epoch(0)
         list(loader)
 
-    with pytest.warns(RepeatedEpochWarning, match="4 samples of 4 scenes.* epoch 0 come a second"):
+    with pytest.warns(
+        RepeatedEpochWarning, match="4 samples of 4 scenes.* epoch 0 come a second"
+    ) as told:
         list(loader)
+    assert told[0].filename == __file__
     assert keys_of(loader) == keys_of(loader)
 
 
@@ -199,3 +202,21 @@ def test_a_dataset_is_made_in_any_mode_of_torch(small_index, mode):
 
     assert pairs.epoch == 2
     assert len(list(pairs.loader(2, num_workers=1))) == 2
+
+
+def test_a_warning_of_a_repeated_epoch_points_at_the_users_line(small_index):
+    fields = ("__key__",)
+    loader = DataLoader(StereoPairStream(small_index, 2, fields=fields), batch_size=None)
+    pairs = StereoPairs(small_index, frames=("random", 2), fields=fields)
+    made_anew = StereoPairs(small_index, fields=fields)
+    passes = {
+        "a stream": lambda: list(loader),
+        "torch's loader": lambda: [*DataLoader(pairs, 2, collate_fn=collate)],
+        "a loop over a loader": lambda: [batch for batch in made_anew.loader(2)],  # noqa: C416
+    }
+    for name, one_pass in passes.items():
+        one_pass()
+        with pytest.warns(RepeatedEpochWarning) as told:
+            one_pass()
+
+        assert told[0].filename == __file__, name
