@@ -28,6 +28,7 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from multiprocessing import reduction
+from numbers import Number
 from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -368,25 +369,43 @@ def collate(samples: Sequence[Sample]) -> dict[str, Any]:
     """Stack samples into a batch: what torch's own ``default_collate`` does, with a named reason.
 
     Args:
-        samples: Samples of one dataset, with the same fields.
+        samples: Samples with the same fields, of the same types.
 
     Returns:
         Tensors with a batch axis in front; texts as lists.
 
     Raises:
         FieldError: If a field has another shape in one sample than in the first, as where scenes
-            of several sizes, or sweeps with several numbers of views, are put in one batch.
+            of several sizes, or sweeps with several numbers of views, are put in one batch; if it
+            has another type there or is missing, as beside samples of another dataset.
     """
     first = samples[0]
-    for sample in samples[1:]:
-        for name, value in sample.items():
-            if isinstance(value, torch.Tensor) and value.shape != first[name].shape:
-                raise FieldError(
-                    f"{name} is {tuple(value.shape)} in {sample.get('__key__', 'one sample')} and "
-                    f"{tuple(first[name].shape)} in {first.get('__key__', 'the first')}: give "
-                    "size=(height, width), or batch sweeps one by one."
-                )
+    for place, sample in enumerate(samples):
+        for name in {**first, **sample}:
+            here, there = _form(sample, name), _form(first, name)
+            if here == there:
+                continue
+            cure = "give samples of several datasets the same fields, of the same types."
+            if here[0] == there[0]:
+                here, there = here[1:], there[1:]
+                cure = "give size=(height, width), or batch sweeps one by one."
+            told, told_first = (" ".join(map(str, each)) for each in (here, there))
+            raise FieldError(
+                f"{name} is {told} in {sample.get('__key__', f'sample {place} of the batch')} and "
+                f"{told_first} in {first.get('__key__', 'sample 0 of the batch')}: {cure}"
+            )
     return {name: _stacked([sample[name] for sample in samples]) for name in first}
+
+
+def _form(sample: Sample, name: str) -> tuple[Any, ...]:
+    """Return what the fields of a batch must have in common: their type, of arrays the shape."""
+    if name not in sample:
+        return ("missing",)
+    value = sample[name]
+    if isinstance(value, torch.Tensor | np.ndarray):
+        return str(value.dtype), tuple(value.shape)
+    kinds = {str: "a text", Number: "a number"}
+    return (next((kinds[each] for each in kinds if isinstance(value, each)), type(value).__name__),)
 
 
 def to_device(

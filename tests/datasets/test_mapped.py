@@ -253,6 +253,43 @@ def test_a_batch_of_scenes_of_two_sizes_says_how_to_mend_it():
         collate([wide, tall])
 
 
+OURS = {"left": torch.zeros(3, 4, 4, dtype=torch.uint8), "baseline_m": 0.1, "__key__": "a"}
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            {"left": torch.zeros(3, 4, 4)},
+            r"left is torch\.float32 \(3, 4, 4\) in b and torch\.uint8",
+        ),
+        ({"left": np.zeros((3, 4, 4), np.uint8)}, r"left is uint8 \(3, 4, 4\) in b and torch\.ui"),
+        ({"left": None}, r"left is NoneType in b and torch\.uint8 \(3, 4, 4\) in a"),
+        ({"left": ...}, r"left is missing in b and torch\.uint8 \(3, 4, 4\) in a"),
+        ({"baseline_m": "10 cm"}, "baseline_m is a text in b and a number in a"),
+        ({"__key__": ...}, "__key__ is missing in sample 1 of the batch and a text in a"),
+        ({"weight": torch.ones(1)}, r"weight is torch\.float32 \(1,\) in b and missing in a"),
+    ],
+)
+def test_samples_of_two_datasets_that_do_not_go_together_are_named(change, told):
+    changed = OURS | {"__key__": "b"} | change
+    theirs = {name: value for name, value in changed.items() if value is not ...}
+
+    with pytest.raises(FieldError, match=rf"{told}.*: give samples of several datasets the same"):
+        collate([OURS, theirs])
+    with pytest.raises(FieldError, match=r" is .* and .*: give samples of several datasets"):
+        collate([theirs, OURS])
+
+
+def test_numbers_and_texts_of_any_kind_go_together():
+    theirs = OURS | {"baseline_m": np.float64(0.2), "__key__": np.str_("b")}
+
+    batch = collate([OURS, theirs])
+
+    assert batch["baseline_m"].tolist() == [0.1, 0.2]
+    assert batch["__key__"] == ["a", "b"]
+
+
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
