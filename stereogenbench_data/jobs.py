@@ -93,7 +93,7 @@ def job_folder(
             refuse_other_work()
             if stated.exists() and _has_items(root, kind):
                 asked = json.loads(json_bytes(settings))
-                for name, theirs, ours in _differences(read_json(stated), asked):
+                for name, theirs, ours in differing(read_json(stated), asked):
                     raise kind.error(
                         f"{root}: holds {kind.noun} of other {name}: {theirs!r}, where {ours!r} is "
                         f"asked for. Choose another folder, or remove it."
@@ -109,12 +109,12 @@ def _has_items(root: Path, kind: JobKind) -> bool:
     return any(path not in own and not path.is_dir() for path in root.rglob("*"))
 
 
-def _differences(theirs: Any, ours: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+def differing(theirs: Any, ours: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
     """Yield the name of each setting that differs, with both values; None where it is not there."""
     if isinstance(theirs, dict) and isinstance(ours, dict):
         for key in dict.fromkeys([*ours, *theirs]):
             inner = f"{name}.{key}" if name else key
-            yield from _differences(theirs.get(key), ours.get(key), inner)
+            yield from differing(theirs.get(key), ours.get(key), inner)
     elif theirs != ours:
         yield name, theirs, ours
 

@@ -21,7 +21,7 @@ from jaxtyping import Float64
 
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import SynthesisError, explain_os_errors
-from stereogenbench_data.jobs import WorkOptions, do_items
+from stereogenbench_data.jobs import WorkOptions, differing, do_items
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
 from stereogenbench_data.selection.filters import require_options
@@ -208,15 +208,25 @@ class _Tree:
 
     def _require_own(self, folder: Path, index: int) -> None:
         """Refuse a folder whose completion marker is of no proposal of the scene."""
+        differs = f"its {COMPLETE_JSON} is missing or damaged"
         with suppress(OSError, ValueError, KeyError, TypeError, OverflowError):
             found = (folder / COMPLETE_JSON).read_text()
-            number = max(0, int(json.loads(found)["synthesis"]["proposal"]))
+            marker = json.loads(found)
+            number = max(0, int(marker["synthesis"]["proposal"]))
             proposal = propose(self.request, index=index, number=number, renderer=self.renderer)
-            if found == completion_text(proposal, renderer=self.drawn_by):
+            expected = completion_text(proposal, renderer=self.drawn_by)
+            if found == expected:
                 return
+            # What was asked for comes before what was drawn by it.
+            settings = json.loads(expected)["synthesis"]
+            for name, theirs, ours in differing(marker["synthesis"], settings):
+                differs = f"its {name} is {theirs!r}, and {ours!r} in this one"
+                break
+            else:
+                differs = f"its {COMPLETE_JSON} differs"
         raise SynthesisError(
-            f"{folder}: another request wrote this scene (its {COMPLETE_JSON} differs or is "
-            f"missing). Choose another output or another map, or move the folder away."
+            f"{folder}: another request wrote this scene ({differs}). Choose another output or "
+            f"another map, or move the folder away."
         )
 
     @contextmanager

@@ -10,7 +10,7 @@ import pytest
 from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.media.encoder import VideoWriter
 from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
-from stereogenbench_data.synthesis.request import SynthRequest
+from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 from tests.servers.tools import files_of
 
 SMALL = {"size_px": 32, "frames": 2, "seed": 9}
@@ -86,13 +86,21 @@ def test_a_scene_that_another_request_wrote_is_neither_kept_nor_overwritten(tmp_
     (key,) = synthesise(tmp_path, SynthRequest(**SMALL))
     before = files_of(tmp_path)
 
-    for other in ({"frames": 3}, {"seed": 1}, {"scenes": 3, "focal_mm": 30.0}):
+    for other, differs in (
+        ({"frames": 3}, "its frames is 2, and 3 in this one"),
+        ({"seed": 1}, r"its seed is \d+, and 1 in this one"),
+        ({"scenes": 3, "focal_mm": 30.0}, r"its focal_mm is [\d.]+, and 30\.0 in this one"),
+        ({"height_px": 34}, r"its picture_px is \[\d+, \d+\], and \[\d+, 34\] in this one"),
+        ({"contract": ExportContract(depth_unit_m=0.01)}, r"its contract is .*unit_m=0\.01"),
+    ):
         for act in (synthesise, plan_scenes):
-            with pytest.raises(SynthesisError, match="scene_000000: another request wrote"):
+            with pytest.raises(
+                SynthesisError, match=rf"scene_000000: another request wrote .*{differs}"
+            ):
                 act(tmp_path, SynthRequest(**(SMALL | other)))
     assert files_of(tmp_path) == before
     (tmp_path / key / "_scene_complete.json").unlink()
-    with pytest.raises(SynthesisError, match=r"_scene_complete\.json differs or is missing"):
+    with pytest.raises(SynthesisError, match=r"its _scene_complete\.json is missing or damaged"):
         synthesise(tmp_path, SynthRequest(**SMALL))
 
 
