@@ -45,8 +45,9 @@ lint: $(READY)
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
-# Draws its scenes first (20 minutes or so, kept in build/bench), then races for three quarters of an
-# hour from the disk, and for some six hours over networks. Let nothing else run.
+# Draws its scenes first (20 minutes or so, kept in build/bench), then races for some 15 minutes.
+# `.venv/bin/python -m benchmarks --only all` is everything: an hour from the disk, and some six hours
+# over networks. Let nothing else run.
 bench: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
 		--constraint $(CONSTRAINTS) --editable ".[bench]"

@@ -26,6 +26,8 @@ from benchmarks.workloads import WORKLOADS
 
 ROOT: Final = Path(__file__).parents[1]
 ALL: Final = (*(workload.name for workload in WORKLOADS), "network", "accuracy", "training")
+USUAL: Final = ("first", "all-frames", "all-pairs", "release-size", "workers")
+"""What is measured unless something is named: in some 15 minutes on two cores."""
 QUICK: Final = ("first", "all-frames", "random", "accuracy")
 
 
@@ -33,10 +35,13 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     """Return the options of a command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument(
-        "--only", action="append", choices=ALL, help="measure only this; may be repeated"
-    )
+        "--only", action="append", choices=(*ALL, "all"),
+        help=f"measure only this, or all, in hours; may be repeated [{', '.join(USUAL)}]",
+    )  # fmt: skip
     parser.add_argument("--quick", action="store_true", help="one round of " + ", ".join(QUICK))
-    parser.add_argument("--rounds", type=int, default=5, help="rounds of every race [5]")
+    parser.add_argument(
+        "--rounds", type=int, help="rounds of every race [5 of what is named, or 3]"
+    )
     parser.add_argument("--delays", help="of the races over a network, in ms, such as 0,60")
     parser.add_argument("--scenes", type=int, default=0, help="of the races over a network")
     parser.add_argument("--resume", action="store_true", help="keep the rounds that exist")
@@ -79,8 +84,9 @@ def run_all(
     options: argparse.Namespace, material: Material, results: Results, *, report: Report
 ) -> list[str]:
     """Run the measurements that are asked for; return the failures."""
-    names = options.only or (QUICK if options.quick else ALL)
-    rounds, resume = 1 if options.quick else options.rounds, options.resume
+    names, rounds = options.only or (QUICK if options.quick else USUAL), options.rounds
+    names, resume = ALL if "all" in names else names, options.resume
+    rounds = 1 if options.quick else rounds or (5 if options.only else 3)
     few = min(rounds, 3)
     workloads = [workload for workload in WORKLOADS if workload.name in names]
     if options.quick:

@@ -4,6 +4,10 @@ Each measurement forks from this process, which has imported everything and open
 inherits memory, files or threads of another. Time runs from the moment at which worker processes
 have started (the mean over several) until the last batch has arrived. So opening files, filling
 queues and the uneven end all count.
+
+A pass over as many scenes as the release has is timed in part: from one of its batches to another.
+Workers make their batches side by side, so as many lie between as make whole rounds, a batch of
+each worker.
 """
 
 import multiprocessing
@@ -37,7 +41,8 @@ class Measured:
 
     Attributes:
         samples: The number of samples.
-        seconds: Wall time from the start of the workers to the last batch.
+        seconds: Wall time from the start of the workers to the last batch; of a part of a pass,
+            that between its batches.
         cpu_s: Processor time of all processes.
         first_samples: The samples of the first batch; 0 of the limit, which has no batches.
         first_s: Wall time to the first batch.
@@ -96,8 +101,10 @@ def _report(work: Callable[[], Any], to: Connection) -> None:
 
 def _run(name: str, job: Job, *, workers: int) -> Measured:
     torch.set_num_threads(1)
-    list(job.of_scene)  # Computed before the clock starts.
     batches = CONTESTANTS[name].batches
+    if batches is not None and job.workload.part:
+        return part_of_pass(partial(batches, job), job=job, workers=workers)
+    list(job.of_scene)  # Computed before the clock starts.
     if batches is not None:
         return whole_pass(partial(batches, job), workers=workers)
     before = _cpu_s()
@@ -106,25 +113,21 @@ def _run(name: str, job: Job, *, workers: int) -> Measured:
 
 
 def _cpu_s() -> float:
-    """Return the processor time of this process and of its ended children."""
+    """Return the processor time of this process and of its children, ended or not."""
+    running = multiprocessing.active_children()
     spent = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(usage.ru_utime + usage.ru_stime for usage in spent)
+    # Linux has a clock for each process, whose number is made of the process's.
+    clocks = [~child.pid << 3 | 2 for child in running if child.pid is not None]
+    return sum(usage.ru_utime + usage.ru_stime for usage in spent) + sum(
+        map(time.clock_gettime, clocks)
+    )
 
 
 def whole_pass(make: Callable[..., DataLoader[Any]], *, workers: int) -> Measured:
     """Return what one pass takes over a loader, which is made with the options of its workers."""
-    torch.set_num_threads(1)
     before = _cpu_s()
-    started = torch.zeros(max(1, workers), dtype=torch.float64).share_memory_()
-
-    def note_start(worker: int) -> None:
-        torch.set_num_threads(1)
-        started[worker] = time.perf_counter()
-
-    warnings.filterwarnings("ignore", message="This DataLoader will create")
-    loader = make(num_workers=workers, worker_init_fn=note_start)
+    loader, started = _started(make, workers=workers)
     arrived: list[tuple[int, float]] = []
-    note_start(0)
     for batch in loader:
         arrived.append((len(batch["scene"]), time.perf_counter()))
     del batch, loader  # ends the workers, whose processor time counts
@@ -134,6 +137,50 @@ def whole_pass(make: Callable[..., DataLoader[Any]], *, workers: int) -> Measure
         sum(samples for samples, _ in arrived), last - began, _cpu_s() - before,
         first_samples, first - began,
     )  # fmt: skip
+
+
+def part_of_pass(make: Callable[..., DataLoader[Any]], *, job: Job, workers: int) -> Measured:
+    """Return what as many samples as others go through take, after some batches of a pass."""
+    workload, count = job.workload, len(job.of_part().wanted)
+    begun, timed = (
+        _whole_rounds(batches, workers=workers)
+        for batches in (workload.begun, -(-count // workload.batch))
+    )
+    loader, started = _started(make, workers=workers)
+    samples, cpu_s, arrived = [], [], []
+    for number, batch in enumerate(loader, start=1):
+        arrived.append(time.perf_counter())
+        samples.append(len(batch["scene"]))
+        if number in (begun, begun + timed):
+            cpu_s.append(_cpu_s())
+        if number == begun + timed:
+            break
+    return Measured(
+        sum(samples[begun:]), arrived[-1] - arrived[begun - 1], cpu_s[1] - cpu_s[0],
+        samples[0], arrived[0] - float(started.mean()),
+    )  # fmt: skip
+
+
+def _whole_rounds(batches: int, *, workers: int) -> int:
+    """Return the batches of whole rounds of some workers, two rounds at least."""
+    return max(2, -(-batches // max(1, workers))) * max(1, workers)
+
+
+def _started(
+    make: Callable[..., DataLoader[Any]], *, workers: int
+) -> tuple[DataLoader[Any], torch.Tensor]:
+    """Return a loader, and the times at which its workers start; its own, where it has none."""
+    torch.set_num_threads(1)
+    started = torch.zeros(max(1, workers), dtype=torch.float64).share_memory_()
+
+    def note_start(worker: int) -> None:
+        torch.set_num_threads(1)
+        started[worker] = time.perf_counter()
+
+    warnings.filterwarnings("ignore", message="This DataLoader will create")
+    loader = make(num_workers=workers, worker_init_fn=note_start)
+    note_start(0)
+    return loader, started
 
 
 def _bare(job: Job, *, processes: int) -> tuple[int, float]:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from torch.utils.data import DataLoader
 
@@ -26,12 +26,14 @@ class Contestant:
         batches: Returns the `DataLoader` for a job, with the given options; None of the limit,
             which has no batches.
         module: A module that it needs beside the package, if any.
+        scenes: Whether it has all scenes of a workload that others go through in part.
     """
 
     title: str
     reading: Reading
     batches: Callable[..., DataLoader[Any]] | None
     module: str | None = None
+    scenes: Literal["all", "part"] = "part"
 
 
 def _torch(dataset: Callable[[Job], Any]) -> Callable[..., DataLoader[Any]]:
@@ -58,8 +60,10 @@ CONTESTANTS: Final = {
         "torchcodec RGB, PyAV depth", "anywhere", _torch(_torchcodec), "torchcodec"
     ),
     "decord": Contestant("decord RGB, PyAV depth", "anywhere", _torch(_decord), "decord"),
-    OURS: Contestant("ours, StereoPairs.loader", "forwards", ours.mapped),
-    "ours-stream": Contestant("ours, StereoPairStream", "forwards", ours.streamed),
+    OURS: Contestant("ours, StereoPairs.loader", "forwards", ours.mapped, scenes="all"),
+    "ours-stream": Contestant(
+        "ours, StereoPairStream", "forwards", ours.streamed, scenes="all"
+    ),
     "ours-shards": Contestant("ours, from shards", "forwards", ours.from_shards),
 }  # fmt: skip
 

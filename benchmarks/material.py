@@ -1,18 +1,20 @@
 """The data of the benchmarks: drawn once into a folder, and reused if complete.
 
-Four scenes of two families are drawn. The trees `many` and `eight` hold hard links to their files
-under other keys: as many scenes open at a time as in a real epoch, without drawing for hours.
+Four scenes of two families are drawn. The trees `whole`, `many` and `eight` hold hard links to
+their files under other keys: as many scenes as the release has, or as are open at a time in a real
+epoch, without drawing for hours.
 """
 
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.results import Report
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import FRAME_RATE_HZ, IMAGE_SIZE_PX
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.synthesis.produce import synthesise
@@ -21,6 +23,8 @@ from stereogenbench_data.synthesis.request import SynthRequest
 FAMILIES: Final = (("IPD_Gaussian", 11), ("Uniform", 12))
 """The families drawn, two scenes each, with their seeds."""
 
+WHOLE: Final = 7754
+"""The scenes of the release to train on."""
 MANY: Final = 24
 EIGHT: Final = 8
 
@@ -33,16 +37,23 @@ class Material:
         root: The folder of all data.
         size_px: Width and height of the pictures.
         frames: Frames of a scene.
+        scenes: Scenes of the tree `whole`.
     """
 
     root: Path
     size_px: int = IMAGE_SIZE_PX
     frames: int = 81
+    scenes: int = WHOLE
 
     @property
     def release(self) -> Path:
         """Four drawn scenes in the released layout."""
         return self.root / "release"
+
+    @property
+    def whole(self) -> Path:
+        """As many scenes as the release has to train on: links, with an index."""
+        return self.root / "whole"
 
     @property
     def many(self) -> Path:
@@ -90,6 +101,10 @@ def prepared(material: Material, *, report: Report, workers: int | None = None) 
             report(f"linking and indexing {tree}")
             _link(material.release, tree, scenes=scenes)
             SceneIndex.open(tree).write(tree / INDEX_NAME)
+    if not (material.whole / INDEX_NAME).exists():
+        report(f"linking {material.whole}")
+        _link(material.release, material.whole, scenes=material.scenes)
+        _index_links(material.release, material.whole, scenes=material.scenes)
     if not (material.shards / INDEX_NAME).exists():
         report(f"packing {material.shards}")
         # Each scene is larger than a byte, so it has a shard of its own.
@@ -101,13 +116,39 @@ def prepared(material: Material, *, report: Report, workers: int | None = None) 
 def _link(release: Path, tree: Path, *, scenes: int) -> None:
     """Make a tree of links to four scenes in turn, families alternating."""
     for number in range(scenes):
-        family, _ = FAMILIES[number % 2]
-        drawn = release / "train" / family / "SynthStage" / f"scene_{number // 2 % 2:06d}"
-        linked = tree / "train" / family / "SynthStage" / f"scene_{number // 2:06d}"
+        drawn, linked = (
+            root / key for root, key in zip((release, tree), _keys(number), strict=True)
+        )
         linked.mkdir(parents=True, exist_ok=True)
         for file in drawn.iterdir():
             if not (linked / file.name).exists():
                 os.link(file, linked / file.name)
+
+
+def _keys(number: int) -> tuple[str, str]:
+    """Return the keys of a drawn scene, and of the scene of links to it."""
+    folder = f"train/{FAMILIES[number % 2][0]}/SynthStage"
+    return f"{folder}/scene_{number // 2 % 2:06d}", f"{folder}/scene_{number // 2:06d}"
+
+
+def _index_links(release: Path, tree: Path, *, scenes: int) -> None:
+    """Index a tree of links: what is known of four scenes, under other keys."""
+    index = SceneIndex.open(release)
+    index.load_seek_tables()
+    drawn = {
+        str(key): replace(index.scene(row), seek_tables=index.seek_tables(row))
+        for row, key in enumerate(index.column("key"))
+    }
+
+    def linked(number: int) -> Scene:
+        old, key = _keys(number)
+        members = {
+            name: replace(member, path=member.path.replace(old, key))
+            for name, member in drawn[old].members.items()
+        }
+        return replace(drawn[old], id=replace(drawn[old].id, key=key), members=members)
+
+    SceneIndex.from_scenes(map(linked, range(scenes)), tree).write(tree / INDEX_NAME)
 
 
 def facts(material: Material) -> dict[str, Any]:

@@ -53,7 +53,7 @@ def _race(
     settings = {
         "title": workload.title, "scenes": workload.scenes, "batch": workload.batch,
         "few": workload.few, "window": str(workload.window), "workers": list(workload.workers),
-        "samples": len(job.wanted),
+        "samples": len(job.of_part().wanted),
     }  # fmt: skip
     section: dict[str, Any] = results.race(workload.name)
     if not plan.resume or section["settings"] != settings:
@@ -71,7 +71,9 @@ def _race(
         found = {}
         for name, workers in in_turn if number % 2 == 0 else in_turn[::-1]:
             try:
-                own = replace(job, reading=CONTESTANTS[name].reading)
+                contestant = CONTESTANTS[name]
+                own = job if contestant.scenes == "all" else job.of_part()
+                own = replace(own, reading=contestant.reading)
                 found[entry(name, workers)] = asdict(measured(name, own, workers=workers))
             except MeasurementError as error:
                 section["failed"][entry(name, workers)] = str(error)[-500:]

@@ -145,7 +145,7 @@ def race_table(workload: Workload, race: dict[str, Any]) -> str:
         return "" if entrant == other else spread_text(ratio, form)
 
     rows = []
-    for workers in sorted(workload.workers):
+    for workers in sorted(race["settings"]["workers"]):  # of the machine that measured
         limit, naive = entry(LIMIT, workers), entry(NAIVE, workers)
         for name in dict.fromkeys((LIMIT, OURS, *CONTESTANTS)):
             own = entry(name, workers)
@@ -161,6 +161,8 @@ def race_table(workload: Workload, race: dict[str, Any]) -> str:
         "", "workers", "samples/s", "to the limit", "to the limit, by processor time", "to naive",
     )  # fmt: skip
     slices = f"{race['settings']['samples']} samples of {counted(workload.scenes, 'scene')}"
+    if workload.part:
+        slices += f" by ours, once it has begun, and of {workload.part} of them by the others"
     text = f"## {workload.title}\n\n{counted(len(rounds), 'round')}, {slices}.\n\n"
     text += table(head, rows)
     if race["failed"]:

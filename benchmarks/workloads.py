@@ -4,9 +4,14 @@ For contestants that read videos forwards (ours, the limit, scene-wise decoders)
 the same, so their slice is the first ``window`` frames of each scene. For those that start again at
 every sample, later frames cost more, so their slice is drawn from *all* samples of the workload,
 spread evenly over the video. Both are samples of the same workload.
+
+Of as many scenes as the release has nobody goes through all. Ours, whose order depends on their
+number, has all of them, and is timed for a while after it has begun; the others, for which a scene
+costs the same among any number of them, go through a few.
 """
 
 import itertools
+import os
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +19,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from benchmarks.material import EIGHT, Material
+from benchmarks.material import EIGHT, MANY, WHOLE, Material
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.index.table import SceneIndex
 
@@ -60,6 +65,9 @@ class Workload:
         target: The target ratios, if any.
         more: Further contestants in this workload.
         field: Contestants in this workload instead of the usual ones.
+        part: The scenes that contestants other than ours go through; 0 is all, by all contestants.
+        begun: Batches of ours that are not timed where there is a part: each of the scenes that are
+            open then begins at some frame, and what lies before is decoded, too.
     """
 
     name: str
@@ -76,6 +84,8 @@ class Workload:
     target: Target | None = None
     more: tuple[str, ...] = ()
     field: tuple[str, ...] = ()
+    part: int = 0
+    begun: int = 0
 
     @property
     def is_clip(self) -> bool:
@@ -88,6 +98,8 @@ class Workload:
         maps = ("disparity", "disparity_right") if self.both_ways else ("disparity",)
         return ("left", "right", *maps, "baseline_m", "frame_index", "pair", "scene")
 
+
+_POWERS: Final = tuple(count for count in (1, 2, 4, 8, 16) if count <= max(2, os.cpu_count() or 1))
 
 WORKLOADS: Final = (
     Workload(
@@ -119,6 +131,14 @@ WORKLOADS: Final = (
         "random", "random single frames, 8 a scene, 1280", 4, ("random", 8), ("random", 8),
         target=Target(0.7, 3), more=("ours-shards",),
     ),
+    Workload(
+        "release-size", f"primary pair, all frames shuffled, 1280, {WHOLE:,} scenes", WHOLE, "all",
+        range(12), batch=8, target=Target(0.85, 15), part=16, begun=16,
+    ),
+    Workload(
+        "workers", f"the same {WHOLE:,} scenes by any number of workers", WHOLE, "all", range(12),
+        batch=8, workers=_POWERS, field=("limit", "ours"), part=16, begun=16,
+    ),
 )  # fmt: skip
 
 
@@ -130,7 +150,7 @@ def tiny(workload: Workload) -> Workload:
     return replace(
         workload, scenes=min(workload.scenes, 2), few=2, frames=frames, workers=(0,), batch=1,
         window=range(2) if isinstance(workload.window, range) else frames,
-        size=None if workload.size is None else (24, 40),
+        size=None if workload.size is None else (24, 40), part=0,
     )  # fmt: skip
 
 
@@ -151,7 +171,15 @@ class Job:
     @cached_property
     def tree(self) -> Path:
         """The released folder that this workload reads."""
-        return self.material.many if self.workload.scenes > EIGHT else self.material.eight
+        material, scenes = self.material, self.workload.scenes
+        if scenes > MANY:
+            return material.whole
+        return material.many if scenes > EIGHT else material.eight
+
+    def of_part(self) -> "Job":
+        """Return the job of contestants that go through a part of the scenes, if there is one."""
+        part = self.workload.part
+        return replace(self, workload=replace(self.workload, scenes=part, part=0)) if part else self
 
     @cached_property
     def keys(self) -> list[str]:

@@ -9,5 +9,5 @@ from benchmarks.material import Material, prepared
 def material(tmp_path_factory) -> Material:
     """Everything that a race reads."""
     root = tmp_path_factory.mktemp("bench")
-    wanted = Material(root, size_px=64, frames=4)
+    wanted = Material(root, size_px=64, frames=4, scenes=40)
     return prepared(wanted, report=lambda _: None, workers=1)

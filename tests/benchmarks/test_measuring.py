@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,8 @@ from benchmarks.material import facts
 from benchmarks.plots import plot_all
 from benchmarks.results import Results, Spread, ratios
 from benchmarks.workloads import WORKLOADS, Job, tiny
-from stereogenbench_data import StereoPairs
+from stereogenbench_data import SceneIndex, StereoPairs
+from stereogenbench_data.index.scene_folder import describe_scene
 
 TINY = {workload.name: tiny(workload) for workload in WORKLOADS}
 
@@ -53,6 +55,51 @@ def test_rounds_that_are_there_are_not_run_again_when_resumed(results, material)
 
     assert reported == []
     assert results.race("all-frames")["rounds"] == before
+
+
+@pytest.fixture(scope="module")
+def release_size():
+    """The races at the release's size, of 40 scenes."""
+    wanted = {"scenes": 40, "batch": 2, "window": range(2), "few": 2, "part": 4, "begun": 2}
+    (first, second) = (each for each in WORKLOADS if each.part)
+    return replace(first, **wanted, workers=(0,)), replace(second, **wanted, workers=(1, 2))
+
+
+def test_ours_has_all_scenes_and_others_a_part_for_as_many_samples(release_size, material, results):
+    plan, names = race.Plan(rounds=1), ("release-size", "workers")
+    assert race.run_races([*release_size], material, results, plan=plan, report=str) == []
+    whole, by_workers = (results.race(name)["rounds"][0] for name in names)
+
+    for name in ("limit/0", "ours/0", "ours-stream/0", "webdataset/0"):
+        assert whole[name]["samples"] == 8
+    assert {name: run["samples"] for name, run in by_workers.items()} == {
+        "limit/1": 8, "ours/1": 8, "limit/2": 8, "ours/2": 8,
+    }  # fmt: skip
+    assert min(run["cpu_s"] for run in (*whole.values(), *by_workers.values())) > 0
+    text = tables.tables({"races": {name: results.race(name) for name in names}})
+    assert "8 samples of 7754 scenes by ours, once it has begun, and of 16 of them by th" in text
+    assert "| ours, StereoPairs.loader | 2 |" in text
+
+
+def test_whole_rounds_of_workers_are_timed(release_size, material, monkeypatch):
+    """Batches that workers make side by side come together, so others would be timed wrongly."""
+    job, seconds = Job(release_size[1], material), iter(range(100))
+    monkeypatch.setattr(clock, "_started", lambda make, workers: (make(), np.zeros(1)))
+    monkeypatch.setattr(clock, "_cpu_s", lambda: 0.0)
+    monkeypatch.setattr(clock, "time", SimpleNamespace(perf_counter=lambda: next(seconds) // 3))
+    loader = [{"scene": [0, 1]}] * 100
+    found = clock.part_of_pass(lambda: loader, job=job, workers=3)
+
+    assert (found.samples, found.seconds) == (12, 2)
+
+
+def test_the_index_of_links_says_what_their_files_say(material):
+    index = SceneIndex.open(material.whole)
+
+    assert len(index) == 40
+    for row in (0, 13, 39):
+        scene = index.scene(row)
+        assert scene == replace(describe_scene(material.whole, scene.id.key), seek_tables=None)
 
 
 def test_a_contestant_that_hangs_is_stopped():
