@@ -215,8 +215,9 @@ class Layout(NamedTuple):
             if isinstance(value, str):
                 continue
             kinds = {(each[name].dtype, each[name].shape) for each in samples}
-            fields[name] = BufferSpec(value.dtype.str, value.shape, end, value.nbytes)
-            end += -(-count * value.nbytes // _ALIGNED) * _ALIGNED
+            array = value.numpy()
+            fields[name] = BufferSpec(array.dtype.str, array.shape, end, array.nbytes)
+            end += -(-count * array.nbytes // _ALIGNED) * _ALIGNED
             if len(kinds) > 1 or end > _SLOT_BYTES:
                 return cls(count, {}, 0)
         return cls(count, fields, end)

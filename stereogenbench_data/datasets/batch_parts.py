@@ -188,7 +188,7 @@ class PartedBatches:
         share: WorkerShare,
         *,
         memory: BatchMemory,
-        made_by: Making,
+        making: Making,
         before: "PartedBatches | None",
     ) -> None:
         """Deal nothing yet.
@@ -198,13 +198,13 @@ class PartedBatches:
             of_all_ranks: Says which worker decodes which sample.
             share: Whose batches they are.
             memory: The slots.
-            made_by: How batches are made of samples.
+            making: How batches are made of samples.
             before: The pass that the same workers served before. Its slots are free once torch has
                 waited for them, which is when it asks for the first task.
         """
-        self.layout, self.work = made_by.layout, Work()
+        self.layout, self.work = making.layout, Work()
         self._batches, self._of_all_ranks, self._share = batches, of_all_ranks, share
-        self._memory, self._made_by, self._before = memory, made_by, before
+        self._memory, self._making, self._before = memory, making, before
         self._pass, self._due = next(_passes), 0
         self._coming: dict[int, _Coming] = {}
         _parted[self._pass] = self
@@ -276,51 +276,40 @@ class PartedBatches:
             self.work.add(made.work)
         is_failed = any(part.failed is not None for part in coming.parts)
         is_whole = len(coming.parts) == self._share.workers
-        if pinned and is_whole and not is_failed and self._made_by.collate_fn is collate:
+        if pinned and is_whole and not is_failed and self._making.collate_fn is collate:
             coming.whole = self._put_together(coming, pinned=True)
 
     def _put_together(self, coming: _Coming, *, pinned: bool) -> Any:
         """Return a batch all of whose parts have come."""
+        slot, layout = coming.slot, coming.layout
         failures = [part.failed for part in coming.parts if part.failed is not None]
         if failures:
-            if coming.slot is not None:
-                self._memory.give_back(coming.slot)
+            if slot is not None:
+                self._memory.give_back(slot)
             raise min(failures, key=lambda failure: failure[0])[1]
-        tensors: dict[str, Any] = {}
-        if coming.slot is not None and coming.layout is not None:
-            tensors = self._memory.batch(coming.slot, coming.layout, count=coming.count)
-            if self._made_by.buffers == "fresh":
-                tensors = {name: tensor.clone() for name, tensor in tensors.items()}
-        samples: dict[int, Sample] = {}
-        for part in coming.parts:
-            samples |= zip(part.places, part.samples, strict=True)
-        rows = [samples[place] for place in range(coming.count)]
-        is_in_slot = all(part.is_in_slot for part in coming.parts) and coming.layout is not None
-        if coming.layout is not None and is_in_slot and self._made_by.collate_fn is collate:
-            batch: Any = {
-                name: tensors[name] if name in tensors else [row[name] for row in rows]
-                for name in coming.layout.fields
-            }
-        else:
-            if self.layout is None:
-                count = self._of_all_ranks.rule.batch_size
-                self.layout = Layout.of_samples(rows, count=count)
-            batch = self._made_by.collate_fn(self._samples(coming, tensors))
-        return pin_memory(batch) if pinned else batch
-
-    def _samples(self, coming: _Coming, tensors: dict[str, Any]) -> list[Sample]:
-        """Return the samples of a batch one by one, as tensors and texts."""
-        samples: dict[int, Sample] = {}
+        rows: list[Sample] = [{}] * coming.count
         for part in coming.parts:
             for place, sample in zip(part.places, part.samples, strict=True):
-                if part.is_in_slot and coming.layout is not None:
-                    samples[place] = {
-                        name: tensors[name][place] if name in tensors else sample[name]
-                        for name in coming.layout.fields
-                    }
-                else:
-                    samples[place] = to_tensors(sample)
-        return [samples[place] for place in range(coming.count)]
+                rows[place] = sample if part.is_in_slot else to_tensors(sample)
+        in_slot = {each for part in coming.parts if part.is_in_slot for each in part.places}
+        if slot is not None and layout is not None:
+            tensors = self._memory.batch(slot, layout, count=coming.count)
+            if self._making.buffers == "fresh":
+                tensors = {name: tensor.clone() for name, tensor in tensors.items()}
+            if self._making.collate_fn is collate and len(in_slot) == len(rows):
+                texts = layout.fields.keys() - tensors
+                batch = {
+                    name: [row[name] for row in rows] if name in texts else tensors[name]
+                    for name in layout.fields
+                }
+                return pin_memory(batch) if pinned else batch
+            for place in in_slot:
+                own = {name: tensor[place] for name, tensor in tensors.items()} | rows[place]
+                rows[place] = {name: own[name] for name in layout.fields}
+        if self.layout is None:
+            self.layout = Layout.of_samples(rows, count=self._of_all_ranks.rule.batch_size)
+        batch = self._making.collate_fn(rows)
+        return pin_memory(batch) if pinned else batch
 
     def _discard(self) -> None:
         """Take the slots of what was not taken as free: no worker writes into them any more."""

@@ -159,7 +159,7 @@ class Workers:
                 loader.batches.of_all_ranks,
                 loader.share,
                 memory=self._memory,
-                made_by=Making(loader.collate_fn, loader.dataset.buffers.kind, loader.layout),
+                making=Making(loader.collate_fn, loader.dataset.buffers.kind, loader.layout),
                 before=self.parted,
             )
             self._due.tasks = self.parted.tasks()
