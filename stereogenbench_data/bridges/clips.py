@@ -235,8 +235,8 @@ def export_clips(
 
     Each video is written whole or not at all, and finished clips are kept, so that a stopped run
     goes on if it is run again. The manifests are written when all clips are there. Evaluation
-    scenes are exported only where ``split`` names them or is None: a model that was trained on them
-    cannot be evaluated on them.
+    scenes are exported only where ``split`` names them or is "all": a model that was trained on
+    them cannot be evaluated on them.
 
     Args:
         data: As for `StereoPairs`.

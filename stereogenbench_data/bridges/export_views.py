@@ -328,7 +328,7 @@ def export_views(
 ) -> list[Path]:
     """Export views of scenes, and return the folders that hold them, in the order of the scenes.
 
-    Evaluation scenes are exported only where ``split`` names them or is None. What was exported
+    Evaluation scenes are exported only where ``split`` names them or is "all". What was exported
     before is kept, so that a stopped run goes on.
 
     Args:

@@ -12,10 +12,14 @@ def training_filters(options: Mapping[str, Any]) -> SceneFilters:
     """Return the filters on scenes among options; without ``split``, training scenes.
 
     A model that was trained on evaluation scenes cannot be evaluated on them, so these are exported
-    only where they are named, or where ``split`` is None and so lets all pass.
+    only where ``split`` names them, or is "all".
     """
-    found = {name: options[name] for name in SceneFilters.__annotations__ if name in options}
-    return cast("SceneFilters", {"split": "train", **found})
+    names = SceneFilters.__annotations__
+    given = {name: options[name] for name in names if options.get(name) is not None}
+    found = {"split": "train", **given}
+    if found["split"] == "all":
+        found["split"] = None
+    return cast("SceneFilters", found)
 
 
 def depth_setting(depth: DepthEncoding | None) -> dict[str, Any] | None:

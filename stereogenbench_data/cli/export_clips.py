@@ -7,9 +7,9 @@ import typer
 
 from stereogenbench_data.cli.options import (
     DataOptions,
+    ExportedOptions,
     OutArgument,
     PairsOption,
-    SceneOptions,
     SizeOption,
     WorkOptions,
     flag,
@@ -20,8 +20,8 @@ from stereogenbench_data.cli.progress import progress_bar
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportedPairOptions(SceneOptions):
-    """Which pairs of which scenes are exported: of the train split unless another is named."""
+class ExportedPairOptions(ExportedOptions):
+    """Which pairs of which scenes are exported."""
 
     pairs: PairsOption = "primary"
 

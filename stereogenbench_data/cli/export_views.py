@@ -8,9 +8,9 @@ import typer
 from stereogenbench_data.cli.options import (
     CamerasOption,
     DataOptions,
+    ExportedOptions,
     FramesOption,
     OutArgument,
-    SceneOptions,
     SizeOption,
     WorkOptions,
     grouped,
@@ -28,8 +28,8 @@ def _points_of(text: str) -> int | str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewOptions(SceneOptions):
-    """Which views of which scenes are exported: of the train split unless another is named."""
+class ViewOptions(ExportedOptions):
+    """Which views of which scenes are exported."""
 
     cameras: CamerasOption = None
     frames: FramesOption = "first"

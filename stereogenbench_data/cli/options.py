@@ -292,8 +292,6 @@ class SceneOptions:
     def filters(self) -> dict[str, Any]:
         """Return the filters that were given, by their names in `SceneFilters`.
 
-        ``split`` is None where all splits are asked for, and left out where nothing is.
-
         Raises:
             typer.BadParameter: If a filter that takes one value is given several.
         """
@@ -304,12 +302,10 @@ class SceneOptions:
             elif name in filters:
                 _refuse_two(name, filters[name], value)
             filters[name] = value
-        if "split" not in filters and self.split is not None:
-            return {"split": None if self.split == "all" else self.split} | filters
         (default,) = (each.default for each in fields(self) if each.name == "split")
-        if self.split != default:
+        if "split" in filters and self.split != default:
             _refuse_two("split", self.split, *filters["split"])
-        return filters
+        return filters if self.split in (None, "all") else {"split": self.split} | filters
 
     def by_path(self) -> "Callable[[SceneId], bool] | None":
         """Return whether a scene's path passes the filters; None if all pass.
@@ -326,6 +322,16 @@ class SceneOptions:
                 param_hint="--where",
             )
         return may_pass(filters)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportedOptions(SceneOptions):
+    """Which scenes an export takes: of the train split unless another, or all, is named."""
+
+    def filters(self) -> dict[str, Any]:
+        """Return the filters that were given, as exports take them."""
+        filters = super().filters()
+        return filters | {"split": "all"} if self.split == "all" else filters
 
 
 PairsOption = Annotated[

@@ -82,8 +82,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
     index = source.open()
     training = None if size is None else _training(index, size, quality, cameras)
     filters: Any = chosen.filters()
-    is_part = share.is_given or any(value is not None for value in filters.values())
-    rows = filter_scenes(index, filters).tolist() if is_part else None
+    rows = filter_scenes(index, filters).tolist() if filters or share.is_given else None
     if rows is not None and share.is_given:
         sizes = [
             packed_bytes(index.indexed_scene(row), depth_codec=depth_codec, training=training)

@@ -73,11 +73,6 @@ def test_a_filter_of_one_value_that_is_given_two_is_refused_with_both(words, val
     assert "give it one value." in message
 
 
-def test_all_splits_are_not_the_same_as_none_that_was_named():
-    assert SceneOptions(split="all").filters() == {"split": None}
-    assert SceneOptions().filters() == {}
-
-
 def test_every_command_takes_one_number_for_width_and_height(tmp_path):
     words = ("synth", tmp_path, "--frames", 1, "--plan-only", "--workers", 1, "--size")
     sizes = {
