@@ -1,8 +1,7 @@
 """The fields of a sample: the one table that says what each is, what it needs and how it is made.
 
-Shapes are of one frame. A clip puts a time axis T in front; a sweep, or several views, put an axis
-of targets in front of that, in the fields that depend on the target. So a field of views that has
-an axis V, one for each view, has two where views are stacked. A new field is a new row here.
+Shapes are of one frame. A clip puts a time axis T in front; a sweep puts an axis of targets in
+front of that, in the fields that depend on the target. A new field is a new row here.
 
 `Request` is what a dataset asks of every sample, `SampleWriter` writes it. The size of pictures is
 (height, width), as arrays have it; texts have WIDTHxHEIGHT.
@@ -421,7 +420,7 @@ def require_importable(transform: Any) -> None:
         FieldError: If the class is of a notebook.
     """
     started = get_spawning_popen()
-    if transform is None or started is None or hasattr(sys.modules["__main__"], "__file__"):
+    if started is None or transform is None or hasattr(sys.modules["__main__"], "__file__"):
         return
     for step in getattr(transform, "steps", lambda: [transform])():
         if step.__module__ == "__main__":

@@ -12,6 +12,7 @@ import warnings
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from multiprocessing.context import set_spawning_popen
 
 import numpy as np
 import pytest
@@ -192,6 +193,21 @@ def test_a_transform_of_a_notebook_is_refused_where_workers_cannot_import_it(
     with pytest.raises(FieldError, match=r"Noted object .* of this notebook.*'spawn'.*module \("):
         next(iter(made))
     assert pickle.loads(pickle.dumps(StereoPairs(indexed_release, **options))).is_random
+
+
+@pytest.mark.parametrize("transform", [None, RandomCrop(8, 8)])
+def test_a_notebook_without_a_transform_of_its_own_may_spawn(
+    indexed_release, monkeypatch, transform
+):
+    monkeypatch.setitem(sys.modules, "__main__", types.ModuleType("__main__"))
+    pairs = StereoPairs(indexed_release, transform=transform)
+
+    set_spawning_popen(types.SimpleNamespace(method="spawn"))
+    try:
+        sent = pickle.dumps(pairs)
+    finally:
+        set_spawning_popen(None)
+    assert len(pickle.loads(sent)) == len(pairs)
 
 
 def test_transforms_draw_anew_each_epoch_and_the_same_for_the_same_seed(indexed_release):
