@@ -232,9 +232,10 @@ def require_epoch(epoch: int) -> int:
     Raises:
         SelectionError: If it is not a whole number from 0.
     """
-    if not isinstance(epoch, int | np.integer) or not 0 <= epoch < 2**63:
+    whole = whole_number(epoch)
+    if whole is None or not 0 <= whole < 2**63:
         raise SelectionError(f"an epoch is a whole number from 0, got {epoch!r}.")
-    return int(epoch)
+    return whole
 
 
 def _parted(index: SceneIndex) -> tuple[Any, ...]:
