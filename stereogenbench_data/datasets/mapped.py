@@ -113,12 +113,12 @@ class ReadOptions(TypedDict, total=False):
         seed: Seed of random frames, transforms and the balanced subsample; 0 if left out.
         cache: Where to keep on disk what is read from a URL; None fetches, each time, just the
             bytes that samples need.
-        check: Which videos of shards are compared whole with the checksums of the index, by each
+        check: Which videos are compared whole with checksums of the index, if it has any, by each
             process that opens them: "opened" all; "read" (the default) where at least half the
             frames of a scene are asked for, so that it costs little beside decoding them;
-            "metadata" none. Those in shards on disk and in the cache are compared before a frame is
-            given, those from a URL when their last byte has come. Metadata files are always
-            compared; the files of a released folder have no checksums.
+            "metadata" none. Those on disk and in the cache are compared before a frame is given,
+            those from a URL when their last byte has come. Metadata files are always compared. Of a
+            folder `stereogenbench index --checksums` makes checksums.
         buffers: "reused", the default: the memory of a batch is used for a later one once nobody
             holds any part of it. "fresh": each batch has memory of its own, which costs speed.
         fetch_ahead_bytes: How many bytes each process fetches from a URL before they are needed,

@@ -1,6 +1,6 @@
 """One scene's folder: whether it is finished, whole and consistent, and its row of the index.
 
-Everything that an index says of a scene comes from its JSON files and the headers of its videos. No
+Everything that an index says of a scene comes from its JSON files and the heads of its videos. No
 picture is decoded unless the share of measured depth is asked for. `described_again` compares files
 with an existing row.
 """

@@ -1,7 +1,9 @@
 """Frames of a video by number, exact: frame i is the i-th in the order of presentation.
 
-Nothing is guessed: a gap, a cut or a damaged packet is an error. A neighbouring frame is never
-returned instead.
+Nothing is guessed: a cut or a damaged packet, or another number of frames, is an error. A
+neighbouring frame is never returned instead. Times may have gaps, as the number of a frame follows
+from the order: whether frames of one number are one moment in all videos of a scene is compared
+where the scene is described (`index.clocks`).
 """
 
 from collections.abc import Sequence

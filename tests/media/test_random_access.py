@@ -9,7 +9,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import MediaError
+from stereogenbench_data.media.seek_table import read_seek_table
 from stereogenbench_data.media.video import VideoReader, read_rgb
+from stereogenbench_data.sources.ranged_file import RangedFile
 
 X264 = ("-c:v", "libx264", "-pix_fmt", "yuv420p")
 STRUCTURES = {
@@ -88,6 +90,22 @@ def test_frames_are_counted_by_order_at_rates_that_vary_or_no_clock_ticks(clips,
 
     assert shown == [33, 5, 47, 0, 46]
     assert how or reader.facts.frame_rate_hz == pytest.approx(24000 / 1001)
+
+
+@pytest.mark.parametrize("place", ["here", "far away"])
+def test_frames_around_a_gap_are_counted_by_order_in_any_order(clips, place):
+    """The header tells of one frame more than there are; a seek lands behind the gap."""
+    source = clips.encode("groups of 6.mkv", *X264, "-g", "6", "-bf", "0")
+    path = clips.remuxed(source, "gap.mkv", without=[11])
+    content, file = path.read_bytes(), path
+    if place == "far away":
+        table = read_seek_table(path, name="clip")
+        file = RangedFile(lambda a, b: content[a:b], size=len(content), table=table)
+
+    with VideoReader(file, name="clip", frames=clips.frames - 1) as reader:
+        found = [clips.number(read_rgb(reader, index)) for index in (40, 5, 30, 11, 10, 46)]
+
+    assert found == [41, 5, 31, 12, 10, 47]
 
 
 def test_an_edit_list_that_hides_frames_counts_those_that_are_left(clips):
