@@ -11,6 +11,13 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from stereogenbench_data.audit.geometry.picture_limits import (
+    BORDER_SHARE,
+    DARK_MEAN,
+    FLAT_SD,
+    INVALID_SHARE,
+    NEAR_SHARE,
+)
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.synthesis.proposal import Proposal, Rig
 from stereogenbench_data.synthesis.renderer import Spawn, World
@@ -20,7 +27,7 @@ Array = Any
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """The limits of the filters.
+    """The limits of the filters; those of pictures are the audit's (`picture_limits`).
 
     Attributes:
         support_gap_m: Largest height of the soles above the ground, or depth below it.
@@ -60,16 +67,16 @@ class Limits:
     visible_share: float = 0.5
     valid_share: float = 0.5
     farthest_m: float = 65.535
-    near_share: float = 0.3
-    border_share: float = 0.25
+    near_share: float = NEAR_SHARE
+    border_share: float = BORDER_SHARE
     viewpoints: int = 4
     step_m: float = 0.25
     turn_deg: float = 2.5
     jerk_deg: float = 0.4
     subject_step_m: float = 0.6
-    invalid_share: float = 0.6
-    dark_mean: float = 12.0
-    flat_sd: float = 4.0
+    invalid_share: float = INVALID_SHARE
+    dark_mean: float = DARK_MEAN
+    flat_sd: float = FLAT_SD
 
 
 LIMITS: Final = Limits()

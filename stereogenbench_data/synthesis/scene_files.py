@@ -17,6 +17,7 @@ import av
 import numpy as np
 from jaxtyping import Float64
 
+from stereogenbench_data.audit.geometry.picture_limits import border_share
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.media.depth import grey_frame
 from stereogenbench_data.media.encoder import VideoWriter
@@ -100,19 +101,15 @@ def write_cameras(
 
 _THIN: Final = 4
 """Brightness is measured on every fourth row and column."""
-_BORDER_PART: Final = 0.02
 _LUMA: Final = np.array([0.299, 0.587, 0.114], np.float32)
 
 
 def _measured(view: RenderedView, *, subject_m: float) -> tuple[float, ...]:
     """Return what `write_cameras` measures at a frame, given the subject's depth."""
     brightness = view.picture[::_THIN, ::_THIN].astype(np.float32) @ _LUMA
-    depth_m = view.depth_m
-    rim = max(1, round(_BORDER_PART * min(depth_m.shape)))
-    borders = (depth_m[:rim], depth_m[-rim:], depth_m[:, :rim], depth_m[:, -rim:])
-    near = np.concatenate([each.ravel() for each in borders]) < LIMITS.near_share * subject_m
-    invalid = (depth_m >= LIMITS.farthest_m).mean()
-    return float(invalid), float(brightness.mean()), float(brightness.std()), float(near.mean())
+    invalid = (view.depth_m >= LIMITS.farthest_m).mean()
+    near = border_share(view.depth_m < LIMITS.near_share * subject_m)
+    return float(invalid), float(brightness.mean()), float(brightness.std()), near
 
 
 def check_pictures(measured: Mapping[int, Float64[np.ndarray, "frames 4"]]) -> Refusal | None:

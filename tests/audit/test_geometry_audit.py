@@ -22,6 +22,7 @@ from tests.audit.corruption import (
     exchange,
     late,
     lengthen_label,
+    place_cameras,
     read_depth,
     rewrite_depth,
     rewrite_rgb,
@@ -152,6 +153,11 @@ def without_depth(units):
     return units
 
 
+def noisy(units):
+    noise = np.random.default_rng(0).normal(1, 0.02, units.shape)
+    return np.where(units < 65535, np.rint(units * noise), units)
+
+
 def hidden(units):
     units[:, :, :20] = 300
     return units
@@ -181,9 +187,9 @@ def other_lens(folder):
 @pytest.mark.parametrize(
     ("change", "where", "check", "found"),
     [
-        (other_lens, "trajectory.json", "unreadable", "states another focal (99 mm) than baseline"),
+        (other_lens, "", "contradiction", "states another focal (99 mm) than baseline"),
         (pictures(2, lambda seen: (seen * 0.05).astype(np.uint8)), "cam_02_rgb.mp4", "too dark",
-         "95th percentile of luma, of 255 is "),
+         "mean luma, of 255 is "),
         (flat, "cam_04_rgb.mp4", "flat", "of 255 is 0, frame 0 "),
         (pictures(1, lambda seen: seen[[0, 1, 2, 3, 3, 3, 3]], crf=0), "cam_01_rgb.mp4", "frozen",
          "is 0, frame 3 (limit 0.25)"),
@@ -194,12 +200,14 @@ def other_lens(folder):
          "count of different depths is 1 "),
         (depth(1, lambda units: units[[0] * 7]), "cam_01_depth.mkv", "frozen",
          "depth that changes to the next audited frame while the camera moves is 0 %, frame 0"),
-        (depth(5, hidden), "cam_05_depth.mkv", "occluder", "is 31."),
+        (depth(5, hidden), "cam_05_depth.mkv", "occluder", "covers is 40."),
         (pictures(1, late(1)), "cam_01_rgb.mp4", "picture time", "by those of the frame after"),
         (pictures(4, lambda seen: seen[::-1]), "cam_04_rgb.mp4", "picture content",
          "correlation with other cameras' pictures"),
-        (depth(0, lambda units: np.roll(units, 1, 2)), "", "depth residual",
-         "most in 0-5 (limit 0.05 %); `stereogenbench doctor` looks for the cause"),
+        (depth(0, lambda units: np.roll(units, 1, 2)), "cam_00_depth.mkv", "depth residual",
+         "most in 0-5 (limit 0.05 %); `stereogenbench doctor` looks for the cause: depth, "),
+        (depth(2, noisy), "cam_02_depth.mkv", "depth agreement", "2 %, but not to 0.5 % is 7"),
+        (lambda folder: rewrite_depth(folder, noisy), "", "depth agreement", "(limit 20 %); noise"),
         (depth(4, scaled(1.02)), "cam_04_depth.mkv", "depth residual", "is 2.011 %, most"),
         (lambda folder: rewrite_depth(folder, as_ray(folder)), "", "depth residual", ", most in "),
         (lambda folder: scale_camera(folder, sensor_height_mm=3 / 4), "", "motion residual",
@@ -230,6 +238,26 @@ def test_what_is_wrong_is_a_finding(
     assert any(check in row.ours for row in report.rows if row.check == "findings")
     assert f"## Findings ({len(report.findings)})" in audit_markdown(report)
     assert audit_markdown(report).startswith(f"# WRONG: {len(report.findings)} finding")
+
+
+@pytest.mark.parametrize(
+    ("factors", "named"),
+    [
+        pytest.param(dict.fromkeys(range(6), 1.1), {""}, id="all places"),
+        pytest.param({3: 1.05}, {"", "cam_03_depth.mkv", "cam_03_rgb.mp4"}, id="one place"),
+    ],
+)
+def test_where_places_are_wrong_no_picture_is_called_late_without_the_other_causes(
+    decidable_release, tmp_path, factors, named
+):
+    report = made_wrong(decidable_release, tmp_path, lambda folder: place_cameras(folder, factors))
+
+    told = {each.check: each.found for each in report.findings}
+    assert {each.member for each in report.findings} <= named
+    assert told["picture time"].partition("; ")[2] == (
+        "late or early, or wrong: the pictures, depth, a camera's place, or the lens"
+    )
+    assert all("a camera's place, or the lens" in found for found in told.values())
 
 
 def without_texture(folder):

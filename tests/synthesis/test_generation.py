@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from stereogenbench_data.audit.geometry.audit import audit
 from stereogenbench_data.errors import StereoGenBenchError, SynthesisError
 from stereogenbench_data.schema.release import FAMILIES
 from stereogenbench_data.synthesis.filters import LIMITS, check_poses
@@ -124,6 +125,47 @@ def test_a_scene_that_fails_after_rendering_is_replaced_by_its_next_proposal(
 
     marker = json.loads((tmp_path / "tree" / key / "_scene_complete.json").read_text())
     assert marker["synthesis"]["proposal"] > plan.proposal.number
+
+
+def put(value, where):
+    """Return what sets a part of every picture, or of every depth map, to a value."""
+
+    def change(shown):
+        shown = np.array(shown)
+        shown[where] = value
+        return shown
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "reason", "checks"),
+    [
+        ({"picture": lambda picture: put(21, picture > 90)(picture * 0 + 9)}, "", set()),
+        ({"picture": lambda picture: put(120, np.s_[2:4])(picture // 64)}, "dark", {"too dark"}),
+        ({"picture": lambda picture: picture // 24 + 90}, "flat", {"flat"}),
+        ({"depth_m": put(np.inf, np.s_[:18])}, "", set()),
+        ({"depth_m": put(np.inf, np.s_[:22])}, "invalid_depth", {"invalid depth"}),
+        ({"depth_m": put(0.1, np.s_[:16, :8])}, "", set()),
+        ({"depth_m": put(0.1, np.s_[:, :2])}, "border_occluder", {"occluder"}),
+    ],
+)  # fmt: skip
+def test_the_audit_finds_in_pictures_what_generation_refuses_and_nothing_else(
+    tmp_path, monkeypatch, spoilt, reason, checks
+):
+    refusals = []
+    monkeypatch.setattr(
+        "stereogenbench_data.synthesis.produce.check_pictures",
+        lambda measured: refusals.append(check_pictures(measured)),  # and pass all
+    )
+    synthesise(
+        tmp_path, SynthRequest(map_name="SynthYard", **SMALL), renderer=Spoilt(9999, **spoilt)
+    )
+
+    found = {each.check for each in audit(tmp_path, workers=1).findings}
+
+    assert [refusal.reason if refusal else "" for refusal in refusals] == [reason]
+    assert found & {"too dark", "flat", "invalid depth", "occluder"} == checks
 
 
 def test_a_renderer_that_always_fails_its_checks_ends_with_the_reason(tmp_path, monkeypatch):

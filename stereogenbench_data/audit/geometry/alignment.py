@@ -3,7 +3,8 @@
 Points on smooth surfaces are taken from one camera to another, or from one moment to another, by
 their depth and the recorded poses. On a plane 1 / depth is linear in the pixel, so the target's
 inverse depth, interpolated at that place, equals the expected one but for rounding. What is left
-is reported without a cause: the doctor (`audit.contract`) looks for one.
+is reported with every cause that would look so: the doctor (`audit.contract`) looks for the right
+one.
 
 A point is seen through if the target sees something behind it. An occluder never causes that: it
 hides what is behind it. In correct data the share of such points is 0 to 0.1 % between cameras.
@@ -15,12 +16,12 @@ frames beside with them: whether each camera shows its own view and moment.
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from statistics import median
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Float64
 
-from stereogenbench_data.audit.geometry.records import Figure
+from stereogenbench_data.audit.geometry.records import CHECKS, Figure
 from stereogenbench_data.audit.geometry.reprojection import MeasuredDepth, moved_points
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
@@ -56,6 +57,7 @@ LEAST_CONTRAST: Final = 2.0
 """Least standard deviation, in grey levels, of a band-passed picture with texture."""
 
 Points = Float64[np.ndarray, " n"]
+Key = TypeVar("Key")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,15 +143,23 @@ def _landed(
 class _Residuals:
     """What is left between two cameras, or two moments of one, over all frames.
 
-    ``beyond`` holds by how much points of one surface are off beyond one stored step.
+    ``beyond`` holds by how much points of one surface are off beyond one stored step. ``near``
+    counts points, of any surface, whose depths differ by less than 2 %, ``rough`` those of them
+    whose depths differ by more than 0.5 %.
     """
 
     smooth: int = 0
     through: int = 0
+    near: int = 0
+    rough: int = 0
     beyond: list[Points] = field(default_factory=list)
 
     def add(self, landed: _Landed) -> None:
         """Add points."""
+        away = np.abs(landed.off) - 2 * landed.steps
+        near = away < _VISIBLE
+        self.near += int(near.sum())
+        self.rough += int((near & (away > _TOLERANCE)).sum())
         off, steps = landed.off[landed.smooth], landed.steps[landed.smooth]
         self.smooth += len(off)
         self.through += int((off < -_TOLERANCE - 2 * steps).sum())
@@ -250,6 +260,8 @@ class AlignmentCheck:
         """Yield what all frames show."""
         known = {pair: each for pair, each in self._depth.items() if each.smooth >= _FEWEST_POINTS}
         yield _of_pairs("see_through", {p: each.through / each.smooth for p, each in known.items()})
+        near = {pair: each for pair, each in self._depth.items() if each.near >= _FEWEST_POINTS}
+        yield _of_pairs("depth_agreement", {p: each.rough / each.near for p, each in near.items()})
         residuals = {pair: each.percentile(_MOST_OF_PAIR) for pair, each in known.items()}
         residuals = {pair: each for pair, each in residuals.items() if not np.isnan(each)}
         yield _of_pairs("depth_residual", residuals)
@@ -257,16 +269,7 @@ class AlignmentCheck:
         yield from _untested("see_through", seen, "too few points of smooth surfaces")
         yield from self._motion_figures()
         yield from self._time_figures()
-        correlations = {pair: float(np.mean(each)) for pair, each in self._correlations.items()}
-        for camera in range(CAMERA_COUNT):
-            own = [each for pair, each in correlations.items() if camera in pair]
-            others = [each for pair, each in correlations.items() if camera not in pair]
-            if own and others:
-                odd = median(others) - max(own)
-                where = f"its best is {max(own):.2f}"
-                yield Figure("picture_odd", rgb_name(camera), odd, where)
-        seen = {camera for pair in correlations for camera in pair}
-        yield from _untested("picture_odd", seen, "no texture, or no depth")
+        yield from self._content_figures()
 
     def _motion_figures(self) -> Iterator[Figure]:
         moved_px = float(np.mean(self._moved_px)) if self._moved_px else 0.0
@@ -279,29 +282,74 @@ class AlignmentCheck:
             return
         yield Figure("motion_residual", where=why)
 
+    def _content_figures(self) -> Iterator[Figure]:
+        correlations = {pair: float(np.mean(each)) for pair, each in self._correlations.items()}
+        odd, best = {}, {}
+        for camera in range(CAMERA_COUNT):
+            own = [each for pair, each in correlations.items() if camera in pair]
+            others = [each for pair, each in correlations.items() if camera not in pair]
+            if own and others:
+                odd[camera] = median(others) - max(own)
+                best[camera] = f"its best is {max(own):.2f}"
+        yield from _of_cameras("picture_odd", odd, best)
+        seen = {camera for pair in correlations for camera in pair}
+        yield from _untested("picture_odd", seen, "no texture, or no depth")
+
     def _time_figures(self) -> Iterator[Figure]:
         gains: dict[int, dict[int, float]] = {}
         for (camera, lag), each in sorted(self._lags.items()):
             gains.setdefault(camera, {})[lag] = float(np.mean(each))
-        timed = set()
+        timed, most, beside = set(), {}, {}
         for camera, of in gains.items():
             lag = max(of, key=lambda lag: of[lag])
-            beside = f"by those of the frame {'before' if lag < 0 else 'after'}"
-            yield Figure("picture_lag", rgb_name(camera), of[lag], beside)
+            most[camera] = of[lag]
+            beside[camera] = f"by those of the frame {'before' if lag < 0 else 'after'}"
             timed |= {camera} if min(of.values()) <= -_TELLS_TIME else set()
+        yield from _of_cameras("picture_lag", most, beside)
         why = "pictures of the neighbouring frames fit as well, or there are none"
         yield from _untested("picture_lag", timed, why)
 
 
+def _off(quantity: str, values: Mapping[Key, float]) -> list[Key]:
+    """Return what is beyond the limit or, in a finding, comes near the largest value."""
+    limit, most = CHECKS[quantity].limit, max(values.values(), default=0.0)
+    return [key for key, value in values.items() if most > limit and value > min(limit, most / 2)]
+
+
 def _of_pairs(quantity: str, values: Mapping[tuple[int, int], float]) -> Figure:
-    """Return the largest value of any pair, with the pairs that come near and what they share."""
+    """Return the largest value of any pair, with the pairs that come near.
+
+    If the pairs that are off are all those of one camera, its file comes with it.
+    """
     most = max(values.values(), default=float("nan"))
     if not most > 0:
         return Figure(quantity, "", most)
     among = [pair for pair, value in values.items() if value > most / 2]
-    shared = set.intersection(*map(set, among)) if len(among) > 1 else set()
-    member = depth_name(min(shared)) if len(shared) == 1 else ""
-    return Figure(quantity, member, most, f"most in {', '.join(f'{a}-{b}' for a, b in among)}")
+    off = _off(quantity, values)
+    odd = (
+        depth_name(camera) for camera in range(CAMERA_COUNT)
+        if len(off) > 1 and off == [pair for pair in values if camera in pair]
+    )  # fmt: skip
+    where = f"most in {', '.join(f'{a}-{b}' for a, b in among)}"
+    return Figure(quantity, next(odd, ""), most, where)
+
+
+def _of_cameras(
+    quantity: str, values: Mapping[int, float], where: Mapping[int, str]
+) -> Iterator[Figure]:
+    """Yield each camera's value with its pictures' file; one for all, if several are off.
+
+    Pictures are compared where depth and poses put them, so wrong lenses, places or depth put
+    several cameras off.
+    """
+    off = _off(quantity, values)
+    if len(off) <= 1:
+        for camera, value in values.items():
+            yield Figure(quantity, rgb_name(camera), value, where[camera])
+        return
+    worst = max(off, key=lambda camera: values[camera])
+    those = f"in cameras {', '.join(map(str, off))}"
+    yield Figure(quantity, "", values[worst], f"{where[worst]}, {those}")
 
 
 def _untested(quantity: str, tested: set[int], why: str) -> Iterator[Figure]:

@@ -7,10 +7,9 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 
+from stereogenbench_data.audit.geometry.picture_limits import NEAR_SHARE, border_share, borders
 from stereogenbench_data.audit.geometry.records import Figure
 
-NEAR_SHARE: Final = 0.3
-"""An occluder is nearer than this share of the distance of the subject, see `subject_m`."""
 _SUBJECT_PERCENT: Final = 20
 MOVED_SHARE: Final = 0.01
 """Motion of a picture's middle, as a share of its width, beyond which pictures must change."""
@@ -59,7 +58,7 @@ def reduced_size(height_px: int, width_px: int) -> tuple[int, int]:
 def light_figures(
     member: str, frame: int, luma: Luma, *, before: tuple[int, Luma] | None
 ) -> Iterator[Figure]:
-    """Yield brightness, contrast and change of one picture.
+    """Yield the mean, the standard deviation and the change of brightness of one picture.
 
     Args:
         member: Its file.
@@ -67,9 +66,8 @@ def light_figures(
         luma: The picture.
         before: An earlier frame's number and picture that this one must differ from, if any.
     """
-    dark, bright = np.percentile(luma, (5, 95))
-    yield Figure("brightness", member, float(bright), f"frame {frame}")
-    yield Figure("contrast", member, float(bright - dark), f"frame {frame}")
+    yield Figure("brightness", member, float(luma.mean()), f"frame {frame}")
+    yield Figure("contrast", member, float(luma.std()), f"frame {frame}")
     if before is not None:
         yield Figure("change", member, float(np.abs(luma - before[1]).mean()), f"frame {before[0]}")
 
@@ -135,11 +133,10 @@ def subject_m(depths: list[tuple[Map, Mask]]) -> float:
 
 
 def border_occluder(depth_m: Map, measured: Mask, *, far_m: float) -> tuple[float, str]:
-    """Return the share of a picture that something near hides from a border, and which border.
+    """Return the share of a picture's border that something near covers, and where it is most.
 
-    Near is closer than `NEAR_SHARE` of ``far_m``. Unbroken runs of near pixels from the left,
-    right or top border count. A row that is near from end to end is the ground unless nearly the
-    whole picture is near.
+    Near is closer than `NEAR_SHARE` of ``far_m``. A row that is near from end to end is the ground
+    unless nearly the whole picture is near.
 
     Args:
         depth_m: Depth in metres.
@@ -147,20 +144,13 @@ def border_occluder(depth_m: Map, measured: Mask, *, far_m: float) -> tuple[floa
         far_m: The distance of the subject, see `subject_m`.
 
     Returns:
-        The share, and "left", "right", "top", "all", or "" if it is 0.
+        The share, and "left", "right", "top", "bottom", or "" if it is 0.
     """
     if math.isnan(far_m):
         return 0.0, ""
-    step = max(1, math.ceil(max(depth_m.shape) / _LOOKED_AT_PX))
-    near = (measured & (depth_m < NEAR_SHARE * far_m))[::step, ::step]
-    if near.mean() > _COVERED:
-        return float(near.mean()), "all"
-    beside = near & ~near.all(axis=1, keepdims=True)
-    share, side = 0.0, ""
-    for name, turned in (("left", beside), ("right", beside[:, ::-1]), ("top", near.T)):
-        # The lengths of runs of near pixels from the first column.
-        lengths = np.where(turned.all(axis=1), turned.shape[1], turned.argmin(axis=1))
-        found = float(lengths.sum() / turned.size)
-        if found > share:
-            share, side = found, name
-    return share, side
+    near = measured & (depth_m < NEAR_SHARE * far_m)
+    if near.mean() <= _COVERED:
+        near &= ~near.all(axis=1, keepdims=True)
+    shares = {side: float(each.mean()) for side, each in borders(near).items()}
+    share = border_share(near)
+    return share, max(shares, key=lambda side: shares[side]) if share else ""

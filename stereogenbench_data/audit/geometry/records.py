@@ -5,6 +5,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
+from stereogenbench_data.audit.geometry.picture_limits import (
+    BORDER_SHARE,
+    DARK_MEAN,
+    FLAT_SD,
+    INVALID_SHARE,
+)
 from stereogenbench_data.audit.paper_numbers import AUDIT
 from stereogenbench_data.media.decoder import MOST_EXTRA_FRAMES
 
@@ -70,6 +76,7 @@ class SceneAudit:
         figures: What was measured of its metadata, its files and how they fit together.
         pairs: Reprojection of the primary pair and of cameras 0 and 5.
         problems: Maps files that could not be read to the reason.
+        contradiction: What metadata files state of the rig in two ways; "" for nothing.
     """
 
     key: str
@@ -78,6 +85,7 @@ class SceneAudit:
     figures: tuple[Figure, ...]
     pairs: tuple[PairAudit, ...]
     problems: Mapping[str, str]
+    contradiction: str = ""
 
     @classmethod
     def revived(cls, record: Mapping[str, Any]) -> "SceneAudit":
@@ -171,10 +179,6 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-FLAT: Final = 8.0
-"""Pictures whose luma spans less (5th to 95th percentile) show nothing."""
-
-
 @dataclass(frozen=True, slots=True)
 class Check:
     """A quantity with a limit.
@@ -207,7 +211,6 @@ def with_unit(value: float, unit: str = "") -> str:
     return f"{value * 100:.4g} %" if unit == "%" else f"{value:.3g} {unit}".rstrip()
 
 
-_DOCTOR: Final = "; `stereogenbench doctor` looks for the cause"
 CHECKS: Final = {
     "intrinsics_px": Check(
         "intrinsics", "largest deviation of fx, fy, cx, cy from f / s W", 1e-3, unit="px",
@@ -230,6 +233,10 @@ CHECKS: Final = {
         "depth residual",
         "90th percentile of what inverse depth differs between cameras, beyond one step", 0.0005,
         unit="%"),
+    "depth_agreement": Check(
+        "depth agreement",
+        "share of points whose depths in two cameras agree to 2 %, but not to 0.5 %", 0.2,
+        unit="%"),
     "motion_residual": Check(
         "motion residual",
         "median of what inverse depth differs from frame to frame, beyond one step", 0.001,
@@ -242,29 +249,57 @@ CHECKS: Final = {
         0.15),
     "copied": Check(
         "copied view", "share of pictures that another camera shows bit for bit", 0.5, unit="%"),
-    "brightness": Check("too dark", "95th percentile of luma, of 255", 25, min),
-    "contrast": Check("flat", "span of luma (5th to 95th percentile), of 255", FLAT, min),
+    "brightness": Check("too dark", "mean luma, of 255", DARK_MEAN, min),
+    "contrast": Check("flat", "standard deviation of luma, of 255", FLAT_SD, min),
     "change": Check(
         "frozen", "change of luma to the next audited frame while the camera moves", 0.25, min),
     "depth_change": Check(
         "frozen", "share of depth that changes to the next audited frame while the camera moves",
         1e-6, min, "%"),
-    "valid_depth": Check("invalid depth", "share of pixels with depth", 0.1, min, "%"),
+    "valid_depth": Check(
+        "invalid depth", "share of pixels with depth", 1e-6, min, "%"),
+    "mean_valid_depth": Check(
+        "invalid depth", "mean share of pixels with depth", 1 - INVALID_SHARE, min, "%"),
     "depth_levels": Check("invalid depth", "count of different depths", 8, min),
     "depth_step": Check("depth quantum", "distance of stored numbers", 4, unit="units"),
     "occluder": Check(
-        "occluder", "share of a picture that something near hides from its border", 0.1,
+        "occluder", "share of a picture's border that something near covers", BORDER_SHARE,
         unit="%"),
 }  # fmt: skip
 """By quantity, in the order of the table."""
 
+_DOCTOR: Final = "`stereogenbench doctor` looks for the cause"
+_UNFIT: Final = "depth, a camera's place, or the lens"
+_CAUSES: Final = {
+    "adjacent_cm": "baseline.json or trajectory.json is wrong",
+    "baseline_cm": "baseline.json or trajectory.json is wrong",
+    "rotation_px": "the rig is not rectified, or the poses are wrong",
+    "lateral_px": "the rig is not rectified, or the poses are wrong",
+    "reprojection_px": f"{_DOCTOR}: {_UNFIT}",
+    "see_through": f"{_DOCTOR}: {_UNFIT}",
+    "depth_residual": f"{_DOCTOR}: {_UNFIT}",
+    "depth_agreement": f"noise, or wrong: {_UNFIT}",
+    "motion_residual": f"{_DOCTOR}: depth, the poses, or the lens",
+    "picture_lag": f"late or early, or wrong: the pictures, {_UNFIT}",
+    "picture_odd": (
+        f"of another camera (`stereogenbench doctor` tests exchanges) or another moment, or wrong: "
+        f"the pictures, {_UNFIT}"
+    ),
+    "copied": "either may be the copy",
+    "change": "frames are repeated, or the poses are those of another scene",
+    "depth_change": "frames are repeated, or the poses are those of another scene",
+}
+"""Every cause that would look like a figure beyond its limit, where the figure does not show it."""
+
 
 def findings_of(scene: SceneAudit) -> Iterator[Finding]:
-    """Yield the files of a scene that cannot be read, and its figures beyond a limit."""
+    """Yield what cannot be read of a scene, what is stated twice, and figures beyond a limit."""
     for name, text in scene.problems.items():
         # The file's path stands in front of some messages.
         place, colon, rest = text.partition(f"{name}: ")
         yield Finding(scene.key, name, "unreadable", rest if colon and " " not in place else text)
+    if scene.contradiction:
+        yield Finding(scene.key, "", "contradiction", scene.contradiction)
     for figure in scene.figures:
         found = None if figure.member in scene.problems else _beyond(scene, figure)
         if found is not None:
@@ -285,9 +320,9 @@ def _beyond(scene: SceneAudit, figure: Figure) -> tuple[str, str] | None:
     if check.worst(figure.value, check.limit) != figure.value:  # nan is not beyond it either
         return None
     place = f", {figure.where}" if figure.where else ""
-    cause = _DOCTOR if figure.quantity in ("depth_residual", "motion_residual") else ""
+    causes = f"; {_CAUSES[figure.quantity]}" if figure.quantity in _CAUSES else ""
     value, limit = check.text(figure.value), check.text(check.limit)
-    return check.name, f"{check.what} is {value}{place} (limit {limit}){cause}"
+    return check.name, f"{check.what} is {value}{place} (limit {limit}){causes}"
 
 
 def untested_of(scene: SceneAudit) -> Iterator[Finding]:

@@ -25,7 +25,8 @@ from stereogenbench_data.audit.geometry.picture_check import (
     stored_figures,
     subject_m,
 )
-from stereogenbench_data.audit.geometry.records import CHECKS, FLAT, Figure, SceneAudit
+from stereogenbench_data.audit.geometry.picture_limits import FLAT_SD
+from stereogenbench_data.audit.geometry.records import CHECKS, Figure, SceneAudit
 from stereogenbench_data.audit.geometry.reprojection import (
     MeasuredDepth,
     PairErrors,
@@ -198,8 +199,6 @@ class _SceneCheck:
         figures.append(Figure("reprojection_px", "", pairs[0].median_px(-1)))
         figures += self.alignment.figures()
         figures += self._of_files()
-        if stated_twice := self.scene.remark("left"):
-            self.files.problems.setdefault(TRAJECTORY_JSON, stated_twice)
         return SceneAudit(
             key=self.scene.id.key,
             frames=self.scene.frames,
@@ -207,6 +206,7 @@ class _SceneCheck:
             figures=tuple(figures),
             pairs=pairs,
             problems=dict(sorted(self.files.problems.items())),
+            contradiction=self.scene.remark("left"),
         )
 
     def _metadata(self) -> tuple[list[Figure], CameraPoses | None]:
@@ -305,7 +305,7 @@ class _SceneCheck:
                 worst[figure.quantity, figure.member] = figure
         shows_much = {
             member for (quantity, member), figure in worst.items()
-            if quantity == "contrast" and figure.value >= FLAT
+            if quantity == "contrast" and figure.value >= FLAT_SD
         }  # fmt: skip
         for (quantity, member), figure in worst.items():
             if quantity != "change" or member in shows_much:
