@@ -42,7 +42,8 @@ NO_LIMIT = 10**6
 
 def usual_order(lengths, batch_size, *, world_size=1, fitting=NO_LIMIT, **options):
     """Return the order that runs have where nobody asks for groups or open runs."""
-    runs = runs_of(lengths, pairs=options.pop("pairs", 1))
+    key_distance = options.pop("key_distance", 1)
+    runs = runs_of(lengths, pairs=options.pop("pairs", 1), key_distance=key_distance)
     groups = groups_for(runs, batch_size=batch_size, fitting=fitting, world_size=world_size)
     opened = open_runs_for(runs, batch_size=batch_size, fitting=fitting, groups=groups)
     seed, epoch = options.get("seed", 0), options.get("epoch", 0)
@@ -357,10 +358,11 @@ def test_groups_are_raised_to_a_multiple_of_the_ranks_while_their_batches_have_s
     assert usual_order([81] * 7754, 8, world_size=ranks).groups == groups
 
 
-def packets_of(order, *, ranks, workers):
-    """Return how many packets workers decode for each sample, of runs with one key frame each.
+def packets_of(order, *, ranks, workers, pairs=1, key_distance=None):
+    """Return how many packets workers decode for each moment, of one camera that all pairs show.
 
-    Every worker keeps a video open from the first of its samples to the last of a part.
+    Every worker keeps a video open from the first of its samples to the last of a part. Runs begin
+    with a key frame, and have others at a distance.
     """
     apart = np.gcd(order.groups, ranks)
     packets = 0
@@ -371,19 +373,22 @@ def packets_of(order, *, ranks, workers):
             batch = order.described(number)
             own = order.workers_of(number, groups=groups, workers=workers)
             runs = run_of(order, batch.samples)
-            places = batch.samples - order.runs.first_sample[runs]
+            places = (batch.samples - order.runs.first_sample[runs]) // pairs
             for sample in zip(
                 own.tolist(), runs.tolist(), places.tolist(), batch.ends_run.tolist(), strict=True
             ):
                 worker, run, place, ends_run = sample
                 video = worker, number % order.groups, run
                 before = reached.get(video, -1)
-                # A decoder that is behind goes on; another one begins at the key frame.
-                packets += place - before if place > before else place + 1
+                # A decoder that is behind goes on; another one begins at the key frame before.
+                skipped = place % key_distance if key_distance else place
+                if place != before:
+                    goes_on = before < place <= before + skipped + 1
+                    packets += place - before if goes_on else skipped + 1
                 reached[video] = place
                 if ends_run:
                     del reached[video]
-    return packets / order.samples
+    return packets / (order.samples / pairs)
 
 
 @pytest.mark.parametrize(
@@ -404,6 +409,27 @@ def test_workers_decode_each_video_about_once(scenes, batch_size, ranks, workers
     order = usual_order([81] * scenes, batch_size, world_size=ranks)
 
     assert 1 <= packets_of(order, ranks=ranks, workers=workers) < most
+
+
+@pytest.mark.parametrize(
+    ("shape", "ranks", "workers", "most"),
+    [
+        ({"lengths": [81] * 64, "pairs": 15}, 1, 6, 1.35),
+        ({"lengths": [81] * 500, "pairs": 15}, 2, 7, 1.05),
+        ({"lengths": [24] * 64, "key_distance": 8}, 1, 5, 1.01),
+        ({"lengths": [24] * 300, "key_distance": 8, "pairs": 3}, 4, 3, 1.02),
+        ({"lengths": [*range(20, 81)] * 9}, 2, 5, 1.05),
+    ],
+    ids=["64, all pairs", "500, all pairs", "key frames", "three pairs", "of many lengths"],
+)
+def test_so_they_do_with_all_pairs_key_frames_and_scenes_of_many_lengths(
+    shape, ranks, workers, most
+):
+    shape = dict(shape)
+    how = {name: shape[name] for name in ("pairs", "key_distance") if name in shape}
+    order = usual_order(shape.pop("lengths"), 8, world_size=ranks, **shape)
+
+    assert 1 <= packets_of(order, ranks=ranks, workers=workers, **how) < most
 
 
 @pytest.mark.parametrize("workers", [1, 3, 8, 14])
