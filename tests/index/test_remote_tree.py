@@ -2,7 +2,11 @@
 
 import os
 import shutil
+from collections import Counter
+from io import FileIO
+from pathlib import Path
 
+import av
 import fsspec
 import numpy as np
 import pytest
@@ -12,10 +16,13 @@ from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import build
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.index.tree import find_scene_folders, folder_of, stamp_of
+from stereogenbench_data.media import heads
+from stereogenbench_data.schema.release import VIDEO_FILES
 from stereogenbench_data.sources.remote import RemoteObject
 from tests.cli.command import invoke, one_line
 from tests.servers.fixtures import BUCKET
 from tests.servers.hub import REPOSITORY, hub_serving
+from tests.servers.videos import SIZE, write_depth, write_rgb
 
 HUB = f"hf://datasets/{REPOSITORY}@main"
 
@@ -57,6 +64,57 @@ def test_no_byte_of_depth_is_sent_twice_to_index_a_repository(hub_tree, small_re
     sizes = sum(path.stat().st_size for path in small_release.rglob("*.mkv"))
     sent = sum(asked.sent for asked in hub_tree.asked if asked.path.endswith(".mkv"))
     assert sent <= sizes
+
+
+@pytest.fixture
+def large_videos(make_scene, root):
+    """The key of a scene of noise, whose videos have more than 40 kB each."""
+    frames, rng = 100, np.random.default_rng(2)
+    folder = make_scene(frames=frames)
+    units = rng.integers(0, 2**16, (frames, *SIZE), dtype=np.uint16)
+    pictures = rng.integers(0, 256, (frames, *SIZE, 3), dtype=np.uint8)
+    depth = write_depth(folder / "cam_00_depth.mkv", units, tags={"DEPTH_SCALE": "0.001"})
+    write_rgb(folder / "cam_00_rgb.mp4", pictures, options={"crf": "5"})
+    for camera in range(1, 6):
+        for name in ("rgb.mp4", "depth.mkv"):
+            shutil.copy(folder / f"cam_00_{name}", folder / f"cam_{camera:02d}_{name}")
+    assert depth.stat().st_size > 100_000
+    return folder.relative_to(root).as_posix()
+
+
+def test_at_most_40_kb_of_a_video_are_sent_to_describe_a_scene(large_videos, root, monkeypatch):
+    local = describe_scene(root, large_videos)
+    with hub_serving(root, monkeypatch) as server:
+        remote = describe_scene(HUB, large_videos)
+
+    sent = Counter[str]()
+    for asked in server.asked:
+        sent[asked.path.rpartition("/")[2]] += asked.sent
+    assert remote == local
+    assert {name for name in sent if name.startswith("cam_")} == {*VIDEO_FILES}
+    assert all(sent[name] <= 40_000 for name in VIDEO_FILES)
+
+
+def test_at_most_40_kb_of_a_video_are_read_to_describe_a_scene(large_videos, root, monkeypatch):
+    read = Counter[str]()
+
+    class CountedFile(FileIO):
+        def read(self, size=-1):
+            content = super().read(size)
+            read[Path(self.name).name] += len(content)
+            return content
+
+    def opened(file, **how):
+        assert not isinstance(file, str), f"{file} is opened past the count"
+        return open_any(file, **how)
+
+    open_any = av.open
+    monkeypatch.setattr(heads, "FileIO", CountedFile)
+    monkeypatch.setattr(av, "open", opened)
+    describe_scene(root, large_videos)
+
+    assert read.keys() == {*VIDEO_FILES}
+    assert all(read[name] <= 20_000 for name in VIDEO_FILES)
 
 
 def test_scenes_that_lie_too_deep_are_told_behind_a_url_too(small_release, tmp_path, monkeypatch):
