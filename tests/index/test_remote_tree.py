@@ -87,12 +87,14 @@ def test_at_most_40_kb_of_a_video_are_sent_to_describe_a_scene(large_videos, roo
     with hub_serving(root, monkeypatch) as server:
         remote = describe_scene(HUB, large_videos)
 
-    sent = Counter[str]()
+    sent, requests = Counter[str](), Counter[str]()
     for asked in server.asked:
         sent[asked.path.rpartition("/")[2]] += asked.sent
+        requests[asked.path.rpartition("/")[2]] += asked.sent > 0
     assert remote == local
     assert {name for name in sent if name.startswith("cam_")} == {*VIDEO_FILES}
     assert all(sent[name] <= 40_000 for name in VIDEO_FILES)
+    assert max(requests[name] for name in VIDEO_FILES) == 2
 
 
 def test_at_most_40_kb_of_a_video_are_read_to_describe_a_scene(large_videos, root, monkeypatch):

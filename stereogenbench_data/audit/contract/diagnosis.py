@@ -10,6 +10,8 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Final
 
+import numpy as np
+
 from stereogenbench_data.audit.contract.cameras import CameraCheck, check_cameras
 from stereogenbench_data.audit.contract.hypotheses import QUESTIONS, Hypothesis, Question
 from stereogenbench_data.audit.contract.matching import (
@@ -135,6 +137,7 @@ class ContractSearch:
         self._fitted: dict[tuple[Hypothesis, bool], ScoredContract] = {}
         self._promising = cache(self._find_promising)
         self._power = cache(self._find_power)
+        self._moved_px = cache(self._find_moved_px)
         self.declared = self.candidate(Hypothesis.declared(views.encoding), is_scaled=False)
 
     def candidate(self, hypothesis: Hypothesis, *, is_scaled: bool = True) -> ScoredContract:
@@ -257,7 +260,14 @@ class ContractSearch:
         return evidence(self._matches, best, flat)
 
     def gain(self, better: ScoredContract, worse: ScoredContract) -> Evidence:
-        """Return by how much one contract is better than another."""
+        """Return by how much one contract is better than another.
+
+        A lag that moves predictions by less than `BIAS_PX` was not tested.
+        """
+        if better.hypothesis.changes_from(worse.hypothesis) == ("frame_lag",):
+            moved_px = self._moved_px(better.hypothesis, worse.hypothesis.frame_lag)
+            if better.scale * moved_px < BIAS_PX:
+                return _NOTHING
         found = evidence(self._matches, better, worse)
         kind = better.hypothesis.kind
         only_kind = better.hypothesis.changes_from(worse.hypothesis) == ("kind",)
@@ -268,6 +278,15 @@ class ContractSearch:
             if shape_kind is not None and (shape_kind != kind or found.mean_db > 0):
                 return replace(found, by_shape=shape_kind == kind)
         return found
+
+    def _find_moved_px(self, hypothesis: Hypothesis, lag: int) -> float:
+        """Return by how much another lag moves predictions on average, in a middling view."""
+        other, moved_px = hypothesis.changed("frame_lag", lag), []
+        for match in self._matches:
+            here, there = (self._views.predicted(match, each) for each in (hypothesis, other))
+            if here is not None and there is not None and (known := here[1] & there[1]).any():
+                moved_px.append(float(np.abs(here[0] - there[0])[known].mean()))
+        return float(np.median(moved_px)) if moved_px else 0.0
 
     def _find_power(self, planar: Hypothesis) -> RayPower:
         """Return the power of the ray's length for a hypothesis of any kind and scale."""

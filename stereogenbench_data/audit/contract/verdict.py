@@ -117,7 +117,7 @@ def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
     doubtful = list(dict.fromkeys(answer for answer, gain in each_gain if not gain.is_excluded))
     is_sure = not (close or lacking or doubtful) and bool(tested)
     at_end = question == "frame_lag" and abs(best) == max(LAGS)
-    want = "frames" if question == "frame_lag" else "depth where it would be"
+    want = "frames or of motion" if question == "frame_lag" else "depth where it would be"
     is_near = best == declared and not (close or lacking)
     words = "; ".join([
         *([f"not excluded by the margin: {_named(doubtful)}"] if is_near and doubtful else []),
