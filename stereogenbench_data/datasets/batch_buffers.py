@@ -23,19 +23,21 @@ import itertools
 import math
 import mmap
 import os
+import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from multiprocessing import reduction
 from numbers import Number
+from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
 from torch.utils.data import default_collate, get_worker_info
 
-from stereogenbench_data.errors import FieldError, SelectionError
+from stereogenbench_data.errors import FieldError, SelectionError, StorageError
 from stereogenbench_data.samples.fields import Allocate, Sample
 
 Buffers = Literal["reused", "fresh"]
@@ -45,6 +47,9 @@ KEPT_BUFFERS: Final = 3
 """Buffers of a process that are kept for each field: a loop holds one while another is made."""
 
 _ALIGNED: Final = 64
+
+_SHARED: Final = Path("/dev/shm")
+"""Where torch's shared memory lies on Linux."""
 
 _SLOT_BYTES: Final = 1 << 36
 """Slots lie so far apart in their file, of which the system keeps only what was written."""
@@ -167,10 +172,21 @@ def _give_back(free: list[np.ndarray], buffer: np.ndarray) -> None:
 
 
 def fresh_bytes(name: str, size_bytes: int) -> torch.Tensor:
-    """Return new memory for a field: in a worker such that it is not copied when it is sent."""
+    """Return new memory for a field: in a worker such that it is not copied when it is sent.
+
+    Raises:
+        StorageError: If shared memory is full.
+    """
     del name
     if get_worker_info() is None:
         return torch.empty(size_bytes, dtype=torch.uint8)
+    if _SHARED.is_dir() and (free := shutil.disk_usage(_SHARED).free) < size_bytes:
+        # Writing beyond it would kill the worker.
+        raise StorageError(
+            f"{_SHARED}: has {free / 1e6:.0f} MB left, and a field of a batch takes "
+            f"{size_bytes / 1e6:.0f} MB. Give the container more (--shm-size, or --ipc=host), take "
+            "smaller batches, or use loader(...) of the dataset, whose batches need none of it."
+        )
     # As torch's own collate does.
     storage = torch.UntypedStorage._new_shared(size_bytes)
     return torch.empty(0, dtype=torch.uint8).set_(storage)

@@ -200,9 +200,10 @@ class SharedEpoch:
             watched[2] = 1
             warnings.warn(
                 f"{dataset!r} is read by torch's own DataLoader, and samples of epoch {epoch} "
-                "come a second time, with the same random frames and transforms. Call "
-                "set_epoch(epoch) before each pass, or use StereoPairs(...).loader(...), whose "
-                "every pass is of the next epoch.",
+                "come a second time, with the same random frames and transforms. If this is "
+                "another pass, call set_epoch(epoch) before each, or use StereoPairs(...)"
+                ".loader(...), whose every pass is of the next epoch. A sampler that draws with "
+                "replacement repeats samples within a pass, and that changes nothing.",
                 RepeatedEpochWarning,
                 stacklevel=users_level(),
             )

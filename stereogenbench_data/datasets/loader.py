@@ -230,6 +230,8 @@ class Workers:
         if code is not None and code < 0:
             how = f"was killed by {signal.Signals(-code).name}"
             cure = "If memory ran out, use fewer workers or open_scenes."
+            if code == -signal.SIGBUS:
+                cure = "Memory for batches is full: use smaller ones, or a smaller prefetch_factor."
         elif method != "fork":
             cure += (
                 f" Workers of the start method {method!r} import the script again: its loop must "

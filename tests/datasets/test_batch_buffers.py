@@ -1,10 +1,12 @@
 """Memory of batches: written once, not copied, and used again only when nobody holds any of it."""
 
+import shutil
+
 import pytest
 import torch
 from torch.utils.data import DataLoader, default_collate
 
-from stereogenbench_data import PAIR_FIELDS, StateError, StereoPairs, collate
+from stereogenbench_data import PAIR_FIELDS, StateError, StereoPairs, StorageError, collate
 from stereogenbench_data.datasets.batch_buffers import KEPT_BUFFERS
 from tests.datasets.conftest import same
 
@@ -126,3 +128,14 @@ def test_a_position_is_not_guessed_where_another_loader_reads_the_batches(pairs)
     next(iter(loader))
     assert loader.epoch == 1
     assert loader.state_dict()["batches_consumed"] == 1
+
+
+def test_full_shared_memory_is_named_with_the_cure(pairs, monkeypatch):
+    """Of torch's own loader: batches of ours need none."""
+    usage = shutil.disk_usage("/")._replace(free=1_000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
+    options = {"num_workers": 1, "collate_fn": collate, "multiprocessing_context": "fork"}
+    with pytest.raises(StorageError, match=r"/dev/shm: has 0 MB left.*--shm-size"):
+        next(iter(DataLoader(pairs, 9, **options)))
+
+    assert len(next(iter(pairs.loader(9, num_workers=1)))["left"]) == 9
