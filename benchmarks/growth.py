@@ -11,7 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from multiprocessing import active_children
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,6 +36,11 @@ def drawn_index(folder: Path, scenes: int) -> SceneIndex:
     return SceneIndex.from_scenes(rows, found.root)
 
 
+def write_index(folder: Path, scenes: int, path: Path) -> None:
+    """Write such an index."""
+    drawn_index(folder, scenes).write(path)
+
+
 def held_mb() -> float:
     """Return the memory of this process in MB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
@@ -55,10 +60,11 @@ def measure(folder: Path, scenes: int) -> dict[str, float]:
     found: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as work:
         path = Path(work) / "index.parquet"
-        drawn = drawn_index(folder, scenes)
-        drawn.write(path)
-        root = drawn.root
-        del drawn
+        # In a process of its own, whose memory is not this one's.
+        writing = get_context("spawn").Process(target=write_index, args=(folder, scenes, path))
+        writing.start()
+        writing.join()
+        root = SceneIndex.open(folder).root
         before_mb = held_mb()
         index = timed(lambda: SceneIndex.open(path, root=root), found, "open the index")
         options: dict[str, Any] = {"frames": "all", "pairs": "all", "fields": FIELDS}
