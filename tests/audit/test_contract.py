@@ -528,6 +528,20 @@ def test_ray_depth_is_not_taken_for_what_explains_few_of_the_matches(verdict_on)
     assert not verdict.fits
 
 
+def test_a_lag_that_moves_predictions_by_less_than_a_tenth_of_a_pixel_was_not_tested(tmp_path):
+    """Where pictures move by 0.01 px a frame, their codec repeats parts of earlier ones."""
+    request = SynthRequest(
+        family="IPD_Gaussian", map_name=RAY_CASTING.maps, size_px=128, frames=9, seed=1, scenes=4
+    )
+    synthesise(tmp_path, request, part=(4, 4))
+    (verdict,) = diagnose(tmp_path, workers=1, frames=1).verdicts
+
+    lag = answer(verdict, "frame lag")
+
+    assert (lag.status, verdict.is_wrong) == ("cannot tell", False)
+    assert lag.note.startswith("not tested, for lack of frames or of motion: -3, -2, -1, 1, 2, 3")
+
+
 def still(frames):
     """Return frames of which all are the first."""
     return np.repeat(frames[:1], len(frames), axis=0)
