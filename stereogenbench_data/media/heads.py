@@ -28,7 +28,7 @@ END_BYTES: Final = 16 * 1024
 """How much of a file that is far away is looked at, at its begin and at its end."""
 
 _BEGIN_BYTES: Final = 4096
-"""Bytes that are read first: most headers, and of the first packet what tells the pixel format."""
+"""Bytes that are read at the file's begin and of the first packet, which tell the pixel format."""
 _HEAD_BYTES: Final = 32
 """Bytes that are read where a block or a box begins."""
 
@@ -188,7 +188,7 @@ def _knows_blocks(heads: Heads) -> bool:
 
     The sizes of elements that are entered do not count: they may be unknown.
     """
-    at = 0
+    at, looked_at = 0, _BEGIN_BYTES
     for _ in range(_MOST_ELEMENTS):
         if at >= heads.size:
             return True
@@ -200,8 +200,9 @@ def _knows_blocks(heads: Heads) -> bool:
             return False
         at = begin + size
         if number in _BLOCKS:
-            if _is_laced(heads.know(begin, min(size, _BLOCK_BYTES))):
+            if _is_laced(heads.know(begin, min(size, looked_at))):
                 return False
+            looked_at = _BLOCK_BYTES
             if is_far(heads):
                 end = max(at, heads.size - END_BYTES)
                 heads.know(end, END_BYTES)
@@ -232,7 +233,7 @@ def _element(heads: Heads, at: int) -> tuple[int, int, int | None]:
 
 def _knows_boxes(heads: Heads) -> bool:
     """Look at an MP4 file; return whether it could be understood."""
-    at = 0
+    at, looked_at = 0, _BEGIN_BYTES
     for _ in range(_MOST_ELEMENTS):
         if at >= heads.size:
             return True
@@ -246,6 +247,9 @@ def _knows_boxes(heads: Heads) -> bool:
             return False
         if kind not in _PACKETS:
             heads.know(at, size)
+        elif kind == b"mdat":
+            heads.know(at, min(size, looked_at))
+            looked_at = _BOX_BYTES
         at += size
     return False
 

@@ -37,6 +37,12 @@ KINDS = {
     "clusters.mkv": ("-c:v", "ffv1", "-cluster_time_limit", "300", *GREY),
     "no list.mkv": ("-c:v", "ffv1", "-live", "1", *GREY),
     "list first.mkv": ("-c:v", "ffv1", "-reserve_index_space", "2000", *GREY),
+    "old ffv1 behind a list.mkv": (
+        "-c:v", "ffv1", "-level", "1", "-reserve_index_space", "9000", *GREY
+    ),
+    "fast vp9.mp4": (
+        "-c:v", "libvpx-vp9", "-deadline", "realtime", "-cpu-used", "8", "-movflags", "+faststart"
+    ),
     "png.mkv": ("-c:v", "png", "-pix_fmt", "gray16be"),
     "vfw.mkv": ("-c:v", "utvideo", "-pix_fmt", "yuv420p"),
 }  # fmt: skip
@@ -77,8 +83,10 @@ def test_ffmpeg_tells_the_same_without_the_packets(path, clips):
 def test_at_most_40_kb_of_a_file_are_asked_for(path, clips):
     file = clips.counting(path)
 
-    probe(file, name="clip", pixel_format="later")
-    read_seek_table(file, name="clip")
+    needed = "later" if path.suffix == ".mp4" or "rgb" in path.name else "needed"
+    with heads_of(file, name="clip") as heads:
+        probe(heads, name="clip", pixel_format=needed)
+        read_seek_table(heads, name="clip")
 
     assert path.stat().st_size > 40_000
     assert file.bytes_read < 20_000
