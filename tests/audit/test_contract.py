@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from stereogenbench_data.audit.contract.cameras import CameraCheck, CameraFigures
 from stereogenbench_data.audit.contract.diagnosis import Rival, SceneDiagnosis
-from stereogenbench_data.audit.contract.doctor import diagnose
+from stereogenbench_data.audit.contract.doctor import DoctorReport, diagnose
 from stereogenbench_data.audit.contract.hypotheses import LAGS, Hypothesis
 from stereogenbench_data.audit.contract.matching import match_pairs
+from stereogenbench_data.audit.contract.report import doctor_lines
 from stereogenbench_data.audit.contract.scoring import Evidence, pooled
 from stereogenbench_data.audit.contract.verdict import (
     QUOTIENT,
@@ -162,6 +163,25 @@ def test_a_unit_that_the_other_kind_explains_as_well_is_left_open():
         answer(verdict, QUOTIENT).note
     )
     assert wrong_topics(told) == {QUOTIENT}
+
+
+def test_a_kind_that_less_than_the_margin_confirms_says_what_tells_it():
+    scene = diagnosed(rivals=(Rival("kind", "ray", Evidence(0.06, 0.01, by_shape=True)),))
+    verdict = judge([scene], declared=DepthEncoding())
+
+    (line,) = [each for each in doctor_lines(DoctorReport("data", (scene,), (verdict,), {}))
+               if each.startswith("depth along")]  # fmt: skip
+
+    assert "confirmed" in line
+    assert line.endswith("0.06 dB (95 %: 0.04 to 0.08) worse, told by the shape of disparity")
+
+
+def test_a_wrong_quotient_does_not_accuse_the_unit():
+    verdict = judged(
+        is_scaled=True, scale=1.05, scale_error=1e-3, other_kind_scale=1.05, gain=Evidence(9.0, 0.1)
+    )
+
+    assert verdict.contradicted == ["unit / (focal length x baseline) 0.95238 x declared ± 0.28%"]
 
 
 @pytest.mark.parametrize("question", TOPICS)
@@ -425,12 +445,13 @@ def pictures_of(camera, change):
         (lambda folder: rewrite_depth(folder, as_inverse(folder), cameras=[4]),
          "depth of camera 4 fits better as inverse depth"),
         (pictures_of(0, lambda pictures: np.roll(pictures, -1, axis=1)),
-         r"pictures of camera 0 are [01]\.\d px higher"),
+         r"pictures of camera 0 are [01]\.\d px higher, or show another moment"),
         (pictures_of(1, lambda pictures: pictures[:, :, ::-1]),
          "pictures of camera 1 do not fit those of the others.*"),
         (pictures_of(1, lambda pictures: np.roll(pictures, 3, axis=2)),
          "pictures of camera 1 do not fit those of the others.*"),
-        (pictures_of(5, late(3)), "pictures of camera 5 are 3 frames late"),
+        (pictures_of(5, late(3)),
+         "pictures of camera 5 are 3 frames late, or its recorded place is wrong"),
         (lambda folder: place_cameras(folder, {3: 1.2}), ".*camera 3.*another place.*"),
     ],
     ids=["5 % more", "lagged", "flipped", "inverse", "higher", "mirrored", "shifted", "late",
@@ -458,6 +479,20 @@ def test_two_cameras_that_differ_are_both_named(verdict_on):
     first, second = verdict.problems
     assert re.fullmatch(r"depth of camera 1 is (2|1\.99\d*|2\.00\d*) x that of the others", first)
     assert second.startswith("depth of camera 4 is 1.")
+
+
+def test_pictures_of_most_cameras_in_other_rows_are_told_as_that(verdict_on):
+    def corrupt(folder):
+        for camera, rows in {1: 1, 3: -1, 4: 2, 5: -2}.items():
+            rewrite_rgb(folder, camera, lambda pictures, by=rows: np.roll(pictures, by, axis=1))
+
+    verdict = verdict_on(corrupt)
+
+    assert all(
+        "cameras disagree in rows of pictures, and no majority of them agrees" in problem
+        for problem in verdict.problems
+    )
+    assert verdict.problems
 
 
 def without_texture(folder):

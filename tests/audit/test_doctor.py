@@ -51,6 +51,7 @@ def test_a_wrong_quotient_ends_with_1_and_no_unit_to_paste(detailed_release, tmp
     assert float(unit_m.removesuffix(")")) == pytest.approx(0.001, rel=0.01)
     assert verdict["choices"][1].startswith("if unit and baselines are right: a focal length of ")
     assert verdict["choices"][2].startswith("if unit and focal length are right: baselines of ")
+    assert verdict["choices"][2].endswith(" x what is recorded")
 
 
 def test_a_picture_that_cannot_be_drawn_takes_no_report_along(detailed_release, tmp_path):

@@ -178,7 +178,7 @@ def check_cameras(
         late = _late_by(views, matches, contract, pairs, camera)
         when = f"{counted(abs(late), 'frame')} {'late' if late > 0 else 'early'}"
         problems[camera] = (
-            f"pictures of camera {camera} are {when}"
+            f"pictures of camera {camera} are {when}, or its recorded place is wrong"
             if late
             else _picture_problem(pairs, camera, rows.get(camera))
         )
@@ -281,11 +281,11 @@ def _picture_problem(pairs: Sequence[_Beside], camera: int, row_problem: str | N
     """Return what is wrong with a camera's pictures."""
     explained = max(beside.share for beside in _of(pairs, camera))
     if row_problem is not None and explained >= LEAST_SHARE:
-        return row_problem
-    found = f", perhaps {row_problem.split(' are ')[1]}" if row_problem else ""
+        return f"{row_problem}, or show another moment"
+    rows = f" ({row_problem})" if row_problem else ""
     return (
         f"pictures of camera {camera} do not fit those of the others, by the depth of "
-        f"either: other rows, another moment or another place{found}"
+        f"either: other rows{rows}, another moment or another place, or its recorded place is wrong"
     )
 
 

@@ -36,8 +36,8 @@ QUOTIENT_MEANS: Final = (
 )
 NOT_TESTED: Final = (
     "Not tested here, see `stereogenbench audit`: the sensor's height, the baselines recorded "
-    "beside the poses, colours, depth that is off by a pixel or lies where there is no texture, "
-    "and all other frames."
+    "beside the poses, noise in depth, depth of one camera that is off by a pixel or lies where "
+    "there is no texture, and all other frames."
 )
 _DB_NOTE: Final = (
     "dB of the quotient and the kind count small differences under a tight cap: they "
@@ -154,7 +154,8 @@ def _row(answer: Answer) -> tuple[str, str, str, str, str]:
     notes = [answer.note] if answer.note else []
     is_wrong = answer.status == "wrong"
     if answer.behind is not None and math.isfinite(answer.behind.mean_db):
-        notes.insert(0, f"{'declared is ' * is_wrong}{_gain_words(answer.behind)} worse")
+        by_shape = ", told by the shape of disparity" if answer.behind.by_shape else ""
+        notes.insert(0, f"{'declared is ' * is_wrong}{_gain_words(answer.behind)} worse{by_shape}")
     status = answer.status.upper() if is_wrong else answer.status
     return answer.topic, answer.declared, answer.found or "?", status, "; ".join(notes)
 

@@ -320,7 +320,9 @@ class Verdict:
     def contradicted(self) -> list[str]:
         """What pictures contradict, in words: what is declared, and files of single cameras."""
         answers = [
-            f"{answer.topic} {answer.found}, not {answer.declared}"
+            f"{answer.topic} {answer.found}"
+            # The unit that is declared is one of three lengths of which any may be wrong.
+            + (f", not {answer.declared}" if answer.topic != QUOTIENT else "")
             for answer in self.answers
             if answer.status == "wrong"
         ]
@@ -377,7 +379,7 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
         choices = (
             f"if focal length and baselines are right: {line}",
             f"if unit and baselines are right: a focal length of {factor:.4g} x what is recorded",
-            f"if unit and focal length are right: baselines of {factor:.4g} x those of the poses",
+            f"if unit and focal length are right: baselines of {factor:.4g} x what is recorded",
         )[: 3 if first.best.form == first.declared.form else 1]
     return Verdict(
         scenes=tuple(scene.key for scene in scenes),
