@@ -11,11 +11,12 @@ import math
 import multiprocessing
 import os
 import sys
-import threading
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from multiprocessing.context import get_spawning_popen
 from multiprocessing.reduction import ForkingPickler
+from multiprocessing.sharedctypes import RawArray
 from typing import Any, Final, Literal, NamedTuple, Protocol, TypedDict, Unpack
 from weakref import WeakKeyDictionary
 
@@ -55,36 +56,6 @@ class RepeatedEpochWarning(UserWarning):
     """A second pass draws the same random frames and transforms, or has the same order."""
 
 
-_BLOCK: Final = 1 << 13
-"""Numbers in a block of shared memory. A block is an open file, so the numbers of a process are in
-few: a process may have thousands of datasets, and not as many files."""
-
-
-class _Block:
-    """What is left of this process's last block; a fork begins its own."""
-
-    def __init__(self) -> None:
-        self.lock, self.rest = threading.Lock(), torch.empty(0, dtype=torch.int64, device="cpu")
-
-    def take(self, count: int) -> torch.Tensor:
-        """Return so many shared numbers, all 0."""
-        with self.lock:
-            if len(self.rest) < count:
-                # Whatever mode or default device the user has set, and without torch's threads, of
-                # which a fork has none; new memory is 0.
-                storage = torch.UntypedStorage._new_shared(8 * max(count, _BLOCK))
-                with torch.inference_mode(mode=False):
-                    self.rest = torch.empty(0, dtype=torch.int64, device="cpu").set_(storage)
-            taken, self.rest = self.rest[:count], self.rest[count:]
-        return taken
-
-
-_block = _Block()
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_block.__init__)  # type: ignore[misc]
-
-
 def users_level() -> int:
     """Return the stack level of a caller's warning that is neither this package's nor torch's."""
     frame, level = sys._getframe(1), 1
@@ -101,54 +72,46 @@ class SharedNumbers:
     process that was forked or spawned as another rank.
     """
 
-    def __init__(self, numbers: Sequence[int], *, tensor: torch.Tensor | None = None) -> None:
-        """Begin with these numbers, or with those of the owner that started this worker."""
-        self._owner = os.getpid()
-        self._tensor = _block.take(len(numbers)) if tensor is None else tensor
-        for place, number in enumerate(numbers):
-            self._tensor[place] = number
+    def __init__(self, numbers: Sequence[int]) -> None:
+        """Begin with these numbers.
 
-    @classmethod
-    def of_owner(cls, tensor: torch.Tensor, owner: int) -> "SharedNumbers":
-        """Return the numbers that another process owns."""
-        numbers = cls((), tensor=tensor)
-        numbers._owner = owner
-        return numbers
+        The standard library keeps those of a process in few open files, though it may have
+        thousands of datasets.
+        """
+        self._owner, self._shared = os.getpid(), RawArray("q", list(numbers))
 
     @property
-    def owner(self) -> int:
-        """The process whose workers share these numbers."""
-        return self._owner
-
-    @property
-    def tensor(self) -> torch.Tensor:
-        """The numbers, (n,) int64."""
-        if self._owner != os.getpid() and not self._is_worker_of_owner:
-            self.__init__(self._tensor.tolist())  # type: ignore[misc]
-        return self._tensor
-
-    @property
-    def _is_worker_of_owner(self) -> bool:
-        parent = multiprocessing.parent_process()
-        return get_worker_info() is not None and parent is not None and parent.pid == self._owner
+    def _numbers(self) -> Any:
+        if self._owner != os.getpid():
+            parent = multiprocessing.parent_process()
+            started_by = None if get_worker_info() is None or parent is None else parent.pid
+            if started_by != self._owner:
+                self._owner, self._shared = os.getpid(), RawArray("q", self._shared[:])
+        return self._shared
 
     def __getitem__(self, place: int) -> int:
         """Return a number."""
-        return int(self.tensor[place])
+        number: int = self._numbers[place]
+        return number
 
     def __setitem__(self, place: int, number: int) -> None:
         """Change a number for all processes."""
-        self.tensor[place] = number
+        self._numbers[place] = number
+
+    def __iter__(self) -> Iterator[int]:
+        """Yield all numbers."""
+        yield from self._numbers
+
+    def clear(self) -> None:
+        """Set all of them to 0."""
+        self._numbers[:] = [0] * len(self._numbers)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return what a copy is made from: numbers of its own."""
-        return SharedNumbers, (self.tensor.tolist(),)
-
-
-# For processes of this machine alone, such as workers that are spawned.
-ForkingPickler.register(
-    SharedNumbers, lambda numbers: (SharedNumbers.of_owner, (numbers.tensor, numbers.owner))
-)
+        """Return what a copy is made from: these numbers, in a process that is being started."""
+        shared = self._numbers
+        if get_spawning_popen() is None:
+            return SharedNumbers, (shared[:],)
+        return object.__new__, (SharedNumbers,), {"_owner": self._owner, "_shared": shared}
 
 
 class SharedEpoch:

@@ -109,7 +109,7 @@ class StereoPairStream(IterableDataset[Sample]):
         """Let the next pass of each worker begin at a global batch of an epoch."""
         self.pairs.set_epoch(epoch)
         self._set_to[0], self._set_to[1] = epoch, start
-        self._begun.tensor.zero_()
+        self._begun.clear()
         self._latest = None
 
     @property
@@ -207,7 +207,7 @@ class StereoPairStream(IterableDataset[Sample]):
             given = latest.taken * self.batches.batch_size + latest.part
             own = {"start": latest.start, "samples_given": given, **self._place}
             return self.batches.state_at(*latest.position) | own
-        if latest is None and get_worker_info() is None and self._begun.tensor.any():
+        if latest is None and get_worker_info() is None and any(self._begun):
             raise StateError(
                 "worker processes iterate this stream and read ahead: pass the number of "
                 "batches the loop has taken, state_dict(batches=...), or use the loader of "
