@@ -253,7 +253,7 @@ def derive_scene(
 
 
 def _open_source(source: MemberSource, scene: Scene, name: str) -> VideoFile:
-    """Return a source video: its path, or or its bytes in memory where they have a checksum."""
+    """Return a source video: its path, or its bytes in memory where they have a checksum."""
     opened, member = source.open(scene, name), scene.member(name)
     if isinstance(opened, Path):
         if member.crc32 is None:

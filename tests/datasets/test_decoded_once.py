@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from stereogenbench_data import SceneIndex, StereoPairs
@@ -28,15 +29,15 @@ def of_real_size(small_release):
 
 @pytest.fixture
 def tasks(monkeypatch):
-    """For each scene the workers that were given samples of it, as the loader deals them."""
+    """For each run of each group the workers that were given samples of it."""
     given = {}
 
     class Recording(loading.PartedBatches):
         def _parts(self, batch, number):
+            firsts = self._of_all_ranks.runs.first_sample
             for part in (parts := super()._parts(batch, number)):
-                for sample in part.batch:
-                    run = (batch.number % 8, sample // 7)
-                    given.setdefault(run, set()).add(part.share.worker)
+                for run in np.searchsorted(firsts, part.batch, side="right").tolist():
+                    given.setdefault((batch.group, run), set()).add(part.share.worker)
             return parts
 
     monkeypatch.setattr(loading, "PartedBatches", Recording)
@@ -68,7 +69,7 @@ def test_each_frame_is_decoded_about_once(of_real_size, selection, workers, came
     assert len(shown) <= found.frames_used <= len(shown) + 6 * 8 * 2 * cameras
     # Each open video was begun inside, and its decoder is some frames ahead: a run, at the most.
     assert 0 <= found.packets_decoded - found.frames_used < 64 * cameras * 7
-    assert all(len(of_scene) == 1 for of_scene in tasks.values() if not selection)
+    assert all(len(workers) == 1 for workers in tasks.values())
 
 
 def test_the_order_is_the_same_for_any_number_of_workers(of_real_size):
@@ -87,20 +88,17 @@ def test_the_order_is_the_same_for_any_number_of_workers(of_real_size):
     assert orders == [orders[0]] * 5
 
 
-@pytest.mark.parametrize(("batch_size", "most"), [(8, 1), (1, 3)])
+@pytest.mark.parametrize(("selection", "most"), [({}, 1), ({"pairs": "all"}, 3)])
 def test_whole_runs_are_dealt_to_workers_where_nothing_is_shuffled(
-    of_real_size, tasks, batch_size, most
+    of_real_size, tasks, selection, most
 ):
-    """Where half a run of 7 frames for each worker is on its way; else batches in turn."""
-    pairs = StereoPairs(of_real_size, frames="all", fields=("__key__",))
-    for number, _ in enumerate(pairs.loader(batch_size, num_workers=3, shuffle=False)):
+    """Where an eighth of a run for each worker is on its way; else batches in turn."""
+    pairs = StereoPairs(of_real_size, frames="all", fields=("__key__",), **selection)
+    for number, _ in enumerate(pairs.loader(5, num_workers=3, shuffle=False)):
         if number == 100:
             break
-    runs = {}
-    for (_, run), workers in tasks.items():
-        runs.setdefault(run, set()).update(workers)
 
-    assert max(map(len, runs.values())) == most
+    assert max(map(len, tasks.values())) == most
 
 
 def test_a_loader_says_where_its_workers_time_goes(of_real_size):

@@ -12,7 +12,9 @@ import warnings
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from multiprocessing import popen_spawn_posix
 from multiprocessing.context import set_spawning_popen
+from multiprocessing.reduction import ForkingPickler
 
 import numpy as np
 import pytest
@@ -202,9 +204,11 @@ def test_a_notebook_without_a_transform_of_its_own_may_spawn(
     monkeypatch.setitem(sys.modules, "__main__", types.ModuleType("__main__"))
     pairs = StereoPairs(indexed_release, transform=transform)
 
-    set_spawning_popen(types.SimpleNamespace(method="spawn"))
+    child = object.__new__(popen_spawn_posix.Popen)
+    child.duplicate_for_child = os.dup
+    set_spawning_popen(child)
     try:
-        sent = pickle.dumps(pairs)
+        sent = ForkingPickler.dumps(pairs)
     finally:
         set_spawning_popen(None)
     assert len(pickle.loads(sent)) == len(pairs)
