@@ -143,18 +143,21 @@ def part_as_made(made: MadePart) -> MadePart:
     return made
 
 
-class Making(NamedTuple):
-    """How batches are made of samples.
+@dataclass(slots=True)
+class Making:
+    """How a loader's batches are made of samples, and what was done for them.
 
     Attributes:
         collate_fn: Makes a batch of samples, in the process that trains.
         buffers: Whether a batch may lie in its slot.
-        layout: Where fields lie in a slot; None where no batch has told.
+        layout: Where fields lie in a slot; None until the first batch has told.
+        work: What workers have done, in all passes.
     """
 
     collate_fn: Callable[[list[Sample]], Any]
     buffers: Buffers
-    layout: Layout | None
+    layout: Layout | None = None
+    work: Work = field(default_factory=Work)
 
 
 @dataclass(slots=True)
@@ -166,20 +169,12 @@ class _Coming:
 
     count: int
     slot: int | None
-    layout: Layout | None
     parts: list[MadePart] = field(default_factory=list)
     whole: Any = None
 
 
 class PartedBatches:
-    """The batches of one pass on their way: dealt to workers in parts, and put together.
-
-    Attributes:
-        layout: Where fields lie in a slot; None before the first batch has come.
-        work: What the workers have done.
-    """
-
-    layout: Layout | None
+    """The batches of one pass on their way: dealt to workers in parts, and put together."""
 
     def __init__(
         self,
@@ -202,7 +197,6 @@ class PartedBatches:
             before: The pass that the same workers served before. Its slots are free once torch has
                 waited for them, which is when it asks for the first task.
         """
-        self.layout, self.work = making.layout, Work()
         self._batches, self._of_all_ranks, self._share = batches, of_all_ranks, share
         self._memory, self._making, self._before = memory, making, before
         self._pass, self._due = next(_passes), 0
@@ -216,7 +210,7 @@ class PartedBatches:
             self._before = None
         nothing = BatchPart(_NOTHING, [], self._share, (self._pass, _FILLER))
         for number, batch in enumerate(self._batches):
-            while self.layout is None and number > 0:
+            while self._making.layout is None and number > 0:
                 yield from [nothing] * self._share.workers
             yield from self._parts(batch, number)
 
@@ -224,14 +218,14 @@ class PartedBatches:
         """Return a batch's tasks, one for each worker."""
         if not isinstance(batch, EpochBatch):
             batch = EpochBatch(batch, epoch=0)
-        share, layout = self._share, self.layout
+        share, layout = self._share, self._making.layout
         worker_of = np.full(len(batch), number % share.workers)
         if batch.number is not None:
             worker_of = self._of_all_ranks.workers_of(batch, share)
         if layout is not None and (not layout.fields or layout.samples < len(batch)):
             layout = None
         slot = None if layout is None else self._memory.take()
-        self._coming[number] = _Coming(len(batch), slot, layout)
+        self._coming[number] = _Coming(len(batch), slot)
         parts = []
         if batch.number is not None:
             batch.open_runs = -(-batch.open_runs // share.workers)
@@ -273,7 +267,7 @@ class PartedBatches:
         coming = self._coming[made.key[1]]
         coming.parts.append(made)
         if made.work is not None:
-            self.work.add(made.work)
+            self._making.work.add(made.work)
         is_failed = any(part.failed is not None for part in coming.parts)
         is_whole = len(coming.parts) == self._share.workers
         if pinned and is_whole and not is_failed and self._making.collate_fn is collate:
@@ -281,7 +275,7 @@ class PartedBatches:
 
     def _put_together(self, coming: _Coming, *, pinned: bool) -> Any:
         """Return a batch all of whose parts have come."""
-        slot, layout = coming.slot, coming.layout
+        slot, layout = coming.slot, self._making.layout
         failures = [part.failed for part in coming.parts if part.failed is not None]
         if failures:
             if slot is not None:
@@ -306,8 +300,9 @@ class PartedBatches:
             for place in in_slot:
                 own = {name: tensor[place] for name, tensor in tensors.items()} | rows[place]
                 rows[place] = {name: own[name] for name in layout.fields}
-        if self.layout is None:
-            self.layout = Layout.of_samples(rows, count=self._of_all_ranks.rule.batch_size)
+        if layout is None:
+            size = self._of_all_ranks.rule.batch_size
+            self._making.layout = Layout.of_samples(rows, count=size)
         batch = self._making.collate_fn(rows)
         return pin_memory(batch) if pinned else batch
 

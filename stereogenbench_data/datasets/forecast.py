@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from itertools import chain, islice, repeat
 from typing import Any, Final
 
-from stereogenbench_data.datasets.batches import WorkerShare
+from stereogenbench_data.datasets.batches import EpochBatch, WorkerShare
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.index.table import SceneIndex
@@ -214,9 +214,10 @@ def planned_bytes(pairs: StereoPairs, batch_size: int, *, workers: int) -> tuple
         decoder = SampleLoader(index, pairs.request, check="metadata", frames="shared", ahead=ahead)
         decoder.keep_open(videos, frames=frames, scenes=scenes)
         share = WorkerShare(0, 1, worker, workers, "streams")
-        decoder.expect(own.steps_of_epoch(share))
+        before_first = EpochBatch((), epoch=0, number=-share.batches_apart)
+        decoder.expect(own.steps(before_first, (), share))
         most = -(-_MOST_PLANNED // workers)
-        for step in islice(own.steps_of_epoch(share), most):
+        for step in islice(own.steps(before_first, (), share), most):
             decoder.begin(step.address)
             decoder.end(step.address)
             samples += 1

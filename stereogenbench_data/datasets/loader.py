@@ -27,6 +27,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property, partial
 from multiprocessing import connection, get_context, resource_tracker
 from multiprocessing.context import BaseContext
@@ -46,7 +47,7 @@ from torch.utils.data import (
     get_worker_info,
 )
 
-from stereogenbench_data.datasets.batch_buffers import BatchMemory, Layout, collate
+from stereogenbench_data.datasets.batch_buffers import BatchMemory, collate
 from stereogenbench_data.datasets.batch_parts import Making, PartedBatches, part_as_made
 from stereogenbench_data.datasets.batches import (
     EpochBatches,
@@ -135,13 +136,6 @@ class Workers:
             return set()
         return {process.pid for process in self._context.processes if process.pid is not None}
 
-    def take_work(self, loader: DataLoader[Any]) -> Work:
-        """Return what the workers have done for a loader since this was asked before."""
-        if self.parted is None or self._loader() is not loader:
-            return Work()
-        work, self.parted.work = self.parted.work, Work()
-        return work
-
     @property
     def is_of_this_process(self) -> bool:
         """Whether this process started them, and not one that it was forked from."""
@@ -159,7 +153,7 @@ class Workers:
                 loader.batches.of_all_ranks,
                 loader.share,
                 memory=self._memory,
-                making=Making(loader.collate_fn, loader.dataset.buffers.kind, loader.layout),
+                making=loader.making,
                 before=self.parted,
             )
             self._due.tasks = self.parted.tasks()
@@ -615,8 +609,7 @@ class PairsLoader(DataLoader[Any]):
         self._begun_passes = 0
         self._pass_began_s = self._passed_s = self._waited_s = 0.0
         self._persistent: Workers | None = None
-        self._work = Work()
-        self.layout: Layout | None = None
+        self.making = Making(self.collate_fn, dataset.buffers.kind)
         self._set_sampler()
         dataset.read_by(batches, self.share)
 
@@ -730,10 +723,8 @@ class PairsLoader(DataLoader[Any]):
 
     def work(self) -> Work:
         """Return what was done for this loader, by its workers or this process, in all passes."""
-        self._work.add(self.dataset.take_work())
-        for each in _running:
-            self._work.add(each.take_work(self))
-        return copy.copy(self._work)
+        self.making.work.add(self.dataset.take_work())
+        return copy.copy(self.making.work)
 
     @cached_property
     def _mixing(self) -> str:
@@ -806,8 +797,9 @@ class PairsLoader(DataLoader[Any]):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy needs: it has passes and workers of its own."""
-        own = {"_persistent": None, "_begun_passes": 0, "sampler": None, "_work": Work()}
-        return self.__dict__ | own | {"batches": copy.copy(self.batches)}
+        own = {"_persistent": None, "_begun_passes": 0, "sampler": None}
+        making = replace(self.making, work=Work())
+        return self.__dict__ | own | {"batches": copy.copy(self.batches), "making": making}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Become a copy."""
@@ -926,8 +918,6 @@ class LoaderPass(Iterator[Any]):
                     raise
                 loader._forget(workers)
                 raise death from error
-        if workers.parted is not None:
-            loader.layout = workers.parted.layout
         loader._waited_s += perf_counter() - asked_s
         loader._passed_s = perf_counter() - loader._pass_began_s
         begun.taken += 1
@@ -977,7 +967,6 @@ class LoaderPass(Iterator[Any]):
         if self._pass is None or workers is None:
             return
         self._loader._end(self._pass)
-        self._loader._work.add(workers.take_work(self._loader))
         if self._pid == os.getpid() and self._loader.num_workers == 0:
             self._loader.dataset.stop_fetching()
         if workers is not self._loader._persistent:

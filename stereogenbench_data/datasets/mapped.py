@@ -204,7 +204,8 @@ class _MappedScenes(Dataset[Sample]):
         self._of_all_ranks: GlobalBatches | None = None
         self._share, self._stop = WorkerShare(0, 1, 0, 1, "batches"), 0
         self._next_batch: tuple[int, int] | None = None
-        self._open_runs: tuple[Any, dict[int, int]] = None, {}
+        self._pass_read: int | None = None
+        self._open_runs: dict[int, int] = {}
         self._memory: BatchMemory | None = None
         self._idle_since_s = 0.0
 
@@ -336,10 +337,10 @@ class _MappedScenes(Dataset[Sample]):
                     self._next_batch[1] + task.share.world_size,
                 )
             return MadePart(task.key, [])
-        if self._open_runs[0] != task.key[0]:
+        if self._pass_read != task.key[0]:
             # What an earlier pass has open is not wanted any more.
             self._loader.close()
-            self._open_runs = task.key[0], {}
+            self._pass_read, self._open_runs = task.key[0], {}
         places = range(len(batch))
         made = make_part(
             task, self._memory, lambda of_place: self._load(batch, places, of_place, task.share)
@@ -360,7 +361,7 @@ class _MappedScenes(Dataset[Sample]):
 
     def _keep_open(self, batch: EpochBatch) -> None:
         """Keep as many videos open as the groups have runs open that this process reads."""
-        known = self._open_runs[1]
+        known = self._open_runs
         if batch.number is not None and known.get(batch.group) != batch.open_runs:
             known[batch.group] = batch.open_runs
             scenes = sum(known.values())
@@ -395,11 +396,6 @@ class _MappedScenes(Dataset[Sample]):
                 own = known.workers_of(batch, share) == share.worker
                 batch = batch.at(np.flatnonzero(own).tolist())
             reading = batch
-
-    def steps_of_epoch(self, share: WorkerShare) -> Iterator[Step]:
-        """Yield what a worker reads in epoch 0 of the batches that this dataset is read by."""
-        before = EpochBatch((), epoch=0, number=share.rank - share.batches_apart)
-        return self.steps(before, (), share)
 
     def _address(self, number: int, batch: EpochBatch) -> Address:
         address = self.plan.locate(number % len(self.plan), epoch=batch.epoch, group=batch.group)
@@ -477,7 +473,7 @@ class _MappedScenes(Dataset[Sample]):
             twin.shared_epoch = SharedEpoch(epoch)
             twin._is_watched = False
         twin._of_all_ranks = twin._next_batch = None
-        twin._open_runs = None, {}
+        twin._open_runs = {}
         return twin
 
     def read_by(self, batches: EpochBatches, share: WorkerShare) -> None:

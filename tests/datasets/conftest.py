@@ -8,6 +8,7 @@ import subprocess
 import imageio_ffmpeg
 import pytest
 import torch
+from torch.utils.data import default_collate
 
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.media import depth
@@ -24,6 +25,23 @@ def small_index(small_release):
 def keyed(small_index):
     """All adjacent pairs of all frames, 140 samples of 4 scenes, with no field but their key."""
     return StereoPairs(small_index, fields=("__key__",), pairs="adjacent", frames="all")
+
+
+TRUE_FIELDS = ("left", "disparity", "baseline_m", "frame_index", "__key__")
+"""What `truth` has."""
+
+
+@pytest.fixture(scope="session")
+def truth(small_index):
+    """Each sample of adjacent pairs by its key, read one by one."""
+    pairs = StereoPairs(small_index, fields=TRUE_FIELDS, pairs="adjacent", frames="all")
+    return {sample["__key__"]: sample for sample in pairs}
+
+
+def is_true(batch, truth):
+    """Return whether the samples of a batch are those of their keys, bit for bit."""
+    expected = default_collate([truth[key] for key in batch["__key__"]])
+    return same(batch, {name: expected[name] for name in batch})
 
 
 @pytest.fixture

@@ -10,28 +10,14 @@ from torch.utils.data import DataLoader, default_collate
 from stereogenbench_data import MediaError, StereoPairs
 from stereogenbench_data.datasets import batch_parts
 from stereogenbench_data.datasets import loader as loading
-from tests.datasets.conftest import keys_of, same
-
-FIELDS = ("left", "disparity", "baseline_m", "frame_index", "__key__")
+from tests.datasets.conftest import TRUE_FIELDS, is_true, keys_of, same
 
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
 
 
 @pytest.fixture
 def pairs(small_index):
-    return StereoPairs(small_index, fields=FIELDS, pairs="adjacent", frames="all")
-
-
-@pytest.fixture(scope="module")
-def truth(small_index):
-    """Each sample by its key, read one by one."""
-    pairs = StereoPairs(small_index, fields=FIELDS, pairs="adjacent", frames="all")
-    return {sample["__key__"]: sample for sample in pairs}
-
-
-def is_true(batch, truth):
-    """Return whether a batch has the samples of its keys."""
-    return same(batch, default_collate([truth[key] for key in batch["__key__"]]))
+    return StereoPairs(small_index, fields=TRUE_FIELDS, pairs="adjacent", frames="all")
 
 
 @pytest.mark.parametrize("workers", [1, 3, 4])
@@ -69,7 +55,12 @@ class ShrinkSome:
 
 
 def test_samples_of_several_shapes_come_as_they_are_to_a_collate_function(small_index, truth):
-    options = {"fields": FIELDS, "pairs": "adjacent", "frames": "all", "transform": ShrinkSome()}
+    options = {
+        "fields": TRUE_FIELDS,
+        "pairs": "adjacent",
+        "frames": "all",
+        "transform": ShrinkSome(),
+    }
     pairs = StereoPairs(small_index, **options)
     expected = {sample["__key__"]: sample for sample in pairs}
     shapes = set()
@@ -94,7 +85,7 @@ class Fail:
 
 @pytest.mark.parametrize("workers", [1, 2, 4])
 def test_of_several_damaged_files_the_first_samples_error_comes(small_index, workers):
-    options = {"fields": FIELDS, "pairs": "adjacent", "frames": "all"}
+    options = {"fields": TRUE_FIELDS, "pairs": "adjacent", "frames": "all"}
     keyed = StereoPairs(small_index, fields=("__key__",), pairs="adjacent", frames="all")
     late = [
         [key for key in keys if int(key.rpartition("/")[2]) >= 4]

@@ -17,12 +17,11 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-import torch
 from torch.utils.data import DataLoader
 
 from stereogenbench_data import PassError, StereoPairs, StereoPairStream, WorkerError
 from stereogenbench_data.datasets import loader as loading
-from tests.datasets.conftest import flat, fork_and, keys_of
+from tests.datasets.conftest import flat, fork_and, is_true, keys_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
 
@@ -34,19 +33,6 @@ FIELDS = ("left", "frame_index", "__key__")
 @pytest.fixture
 def pairs(small_index):
     return StereoPairs(small_index, fields=FIELDS, pairs="adjacent", frames="all")
-
-
-@pytest.fixture(scope="module")
-def truth(small_index):
-    """Each sample's picture by its key, read one by one."""
-    pairs = StereoPairs(small_index, fields=FIELDS, pairs="adjacent", frames="all")
-    return {sample["__key__"]: sample["left"] for sample in pairs}
-
-
-def wrong(batch, truth):
-    """Return how many pictures of a batch are not those of their keys."""
-    samples = zip(batch["__key__"], batch["left"], strict=True)
-    return sum(not torch.equal(left, truth[key]) for key, left in samples)
 
 
 @pytest.mark.parametrize(("workers", "inner"), [(0, 6), (1, 15), (2, 1)])
@@ -63,7 +49,7 @@ def test_a_pass_within_a_pass_takes_nothing_from_it(pairs, truth, workers, inner
             assert loader.state_dict()["batches_consumed"] in (number + 1, inner)
 
     assert outer == expected
-    assert sum(wrong(batch, truth) for batch in held) == 0
+    assert all(is_true(batch, truth) for batch in held)
 
 
 def test_workers_that_persist_tell_the_older_of_two_passes_that_it_is_over(pairs):
@@ -110,7 +96,7 @@ def test_a_copy_of_a_loader_has_passes_of_its_own(pairs, truth, copied):
 
     assert keys_of(other) == keys_of(pairs.loader(9))
     taken += batches
-    assert sum(wrong(batch, truth) for batch in taken) == 0
+    assert all(is_true(batch, truth) for batch in taken)
     assert keys_of(taken) == keys_of(pairs.loader(9))
 
 
@@ -141,7 +127,7 @@ def test_a_fork_that_lets_go_of_a_batch_leaves_it_to_its_parent(pairs, small_ind
             assert fork_and(lambda: [held.clear(), gc.collect()]) == 0
 
     assert len(held) == 15
-    assert sum(wrong(batch, truth) for batch in held) == 0
+    assert all(is_true(batch, truth) for batch in held)
 
 
 def test_a_fork_keeps_its_batches_while_the_parent_goes_on(pairs, truth):
@@ -155,7 +141,7 @@ def test_a_fork_keeps_its_batches_while_the_parent_goes_on(pairs, truth):
     child = os.fork()
     if child == 0:
         os.read(reader, 1)
-        os._exit(wrong(batch, truth))
+        os._exit(not is_true(batch, truth))
     del batch
     for after in batches:
         del after
@@ -194,7 +180,7 @@ def test_a_fork_may_begin_a_pass_of_its_own(pairs, truth):
     for number, batch in enumerate(loader):
         found.append(batch)
         if number == 3:
-            assert fork_and(lambda: sum(wrong(other, truth) for other in loader) and 1 / 0) == 0
+            assert fork_and(lambda: all(is_true(other, truth) for other in loader) or 1 / 0) == 0
 
     assert keys_of(found) == keys_of(pairs.loader(9))
 
