@@ -5,22 +5,20 @@ from stereogenbench_data.bridges.matching import to_torchvision as to_torchvisio
 from stereogenbench_data.datasets.batch_buffers import collate as collate
 from stereogenbench_data.datasets.batch_buffers import to_device as to_device
 from stereogenbench_data.datasets.batches import EpochBatches as EpochBatches
-from stereogenbench_data.datasets.batches import IdleWorkersWarning as IdleWorkersWarning
-from stereogenbench_data.datasets.batches import OpenVideosWarning as OpenVideosWarning
-from stereogenbench_data.datasets.batches import (
-    RepeatedDecodingWarning as RepeatedDecodingWarning,
-)
-from stereogenbench_data.datasets.batches import RepeatedEpochWarning as RepeatedEpochWarning
-from stereogenbench_data.datasets.batches import UnsharedRanksWarning as UnsharedRanksWarning
 from stereogenbench_data.datasets.derive import DERIVE_FIELDS as DERIVE_FIELDS
 from stereogenbench_data.datasets.derive import DERIVED_FIELDS as DERIVED_FIELDS
 from stereogenbench_data.datasets.derive import derive as derive
+from stereogenbench_data.datasets.division import IdleWorkersWarning as IdleWorkersWarning
+from stereogenbench_data.datasets.division import OpenVideosWarning as OpenVideosWarning
+from stereogenbench_data.datasets.division import RepeatedDecodingWarning as RepeatedDecodingWarning
+from stereogenbench_data.datasets.division import UnsharedRanksWarning as UnsharedRanksWarning
 from stereogenbench_data.datasets.forecast import forecast as forecast
 from stereogenbench_data.datasets.loader import PairsLoader as PairsLoader
 from stereogenbench_data.datasets.mapped import MixedSplitsWarning as MixedSplitsWarning
 from stereogenbench_data.datasets.mapped import SceneViews as SceneViews
 from stereogenbench_data.datasets.mapped import SeekTableWarning as SeekTableWarning
 from stereogenbench_data.datasets.mapped import StereoPairs as StereoPairs
+from stereogenbench_data.datasets.shared import RepeatedEpochWarning as RepeatedEpochWarning
 from stereogenbench_data.datasets.streamed import StereoPairStream as StereoPairStream
 from stereogenbench_data.errors import DescriptorError as DescriptorError
 from stereogenbench_data.errors import EvaluationError as EvaluationError

@@ -24,12 +24,13 @@ IncompleteSceneWarning   index.table          some scenes of the data cannot be 
 AssumptionWarning        index.table          files are not as the paper prints them
 OddSceneWarning          samples.fields       selected scenes differ from what the release promises
 SwappedSizeWarning       samples.fields       a size looks like (width, height)
-OpenVideosWarning        datasets.batches     more videos are needed than may be open
-RepeatedDecodingWarning  datasets.batches     several processes decode the same videos
-IdleWorkersWarning       datasets.batches     a loader has more workers than open scenes
+OpenVideosWarning        datasets.division    more videos are needed than may be open
+RepeatedDecodingWarning  datasets.division    several processes decode the same videos
+IdleWorkersWarning       datasets.division    a loader has more workers than open scenes
 FewerPairsWarning        selection.filters    the data hold some cameras alone
 MixedSplitsWarning       datasets.mapped      train and eval scenes come together
-RepeatedEpochWarning     datasets.batches     a pass repeats the random frames of another
+UnsharedRanksWarning     datasets.division    several ranks read all batches each
+RepeatedEpochWarning     datasets.shared      a pass repeats the random frames of another
 
 Each error takes one message, so the error of a DataLoader worker is raised again as the same class
 in the main process. Messages show URLs without logins and queries.
@@ -40,6 +41,7 @@ An `OSError` has one cure, wherever it occurs: `cure_of` looks it up by its numb
 
 import errno
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
@@ -57,6 +59,7 @@ _AS_PATH: Final = re.compile(
     r"\b(https?|s3a?|hf|ftps?|sftp|ssh|smb|gs|gcs|az|abfss?|webhdfs):/(?!/)([^\s'\"]+)"
 )
 """A URL that was taken for a path, which has one slash."""
+_OURS_OR_TORCH: Final = frozenset({__name__.partition(".")[0], "torch"})
 _LOGIN_IN_PATH: Final = re.compile(r"(?<=/)[^/@:]*:[^/@]*@")
 _AUTHORITY_END: Final = re.compile(r"[/\\?#]")
 _PORT: Final = re.compile(r"[^:]*(?::[0-9]*)?|\[.*", re.ASCII)
@@ -256,3 +259,11 @@ def explain_os_errors(
         raise
     except OSError as error:
         raise kind(describe_os_error(what, error, otherwise)) from error
+
+
+def users_level() -> int:
+    """Return the stack level of a caller's warning that is neither this package's nor torch's."""
+    frame, level = sys._getframe(1), 1
+    while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in _OURS_OR_TORCH:
+        frame, level = frame.f_back, level + 1
+    return level

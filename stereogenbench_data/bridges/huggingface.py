@@ -5,8 +5,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Self, Unpack
 
 from stereogenbench_data.bridges.in_memory import SampleOptions, columns, samples_of, to_arrays
-from stereogenbench_data.datasets.batches import SharedEpoch
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
+from stereogenbench_data.datasets.shared import SharedEpoch
 from stereogenbench_data.errors import (
     FieldError,
     SelectionError,

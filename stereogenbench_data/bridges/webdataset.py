@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Unpack
 
 from stereogenbench_data.bridges.in_memory import SampleOptions, samples_of
-from stereogenbench_data.datasets.batches import SharedEpoch
+from stereogenbench_data.datasets.shared import SharedEpoch
 from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS, Sample
 from stereogenbench_data.selection.filters import SceneFilters, require_options
 

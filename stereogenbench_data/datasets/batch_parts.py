@@ -32,7 +32,8 @@ from stereogenbench_data.datasets.batch_buffers import (
     collate,
     to_tensors,
 )
-from stereogenbench_data.datasets.batches import EpochBatch, GlobalBatches, WorkerShare
+from stereogenbench_data.datasets.batches import EpochBatch, GlobalBatches
+from stereogenbench_data.datasets.division import WorkerShare
 from stereogenbench_data.errors import StereoGenBenchError
 from stereogenbench_data.samples.fields import Allocate, Sample
 from stereogenbench_data.samples.load import Work

@@ -2,225 +2,39 @@
 
 A position is an epoch and how many of its batches are consumed, counted over all ranks. Each `Pass`
 counts what was taken of it. `Passes` says where the next one begins and which one a state is of.
-Workers see the epoch through shared memory, and those that are spawned the rows of an index, too.
 """
 
 import copy
 import itertools
-import math
-import multiprocessing
-import os
 import sys
-import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from multiprocessing.context import get_spawning_popen
-from multiprocessing.reduction import ForkingPickler
-from multiprocessing.sharedctypes import RawArray
-from typing import Any, Final, Literal, NamedTuple, Protocol, TypedDict, Unpack
-from weakref import WeakKeyDictionary
+from dataclasses import dataclass
+from typing import Any, Final, Literal, Protocol, Unpack
 
 import numpy as np
-import pyarrow as pa
-import torch
-import torch.distributed
-from torch.utils.data import Sampler, get_worker_info
+from torch.utils.data import Sampler
 
+from stereogenbench_data.datasets.division import (
+    WorkerShare,
+    groups_of_rank,
+    require_group,
+    torchs_group,
+)
+from stereogenbench_data.datasets.epoch_rule import EpochOptions, fitting_rule
+from stereogenbench_data.datasets.shared import SharedEpoch, require_epoch
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.fields import Stream
-from stereogenbench_data.samples.load import OPEN_STREAMS
-from stereogenbench_data.schema.release import CAMERA_COUNT
-from stereogenbench_data.selection.filters import require_options, whole_number
+from stereogenbench_data.selection.filters import require_options
 from stereogenbench_data.selection.order import (
     ORDER_VERSION,
-    DropLast,
     EpochOrder,
     Numbers,
     OrderRule,
     Runs,
-    groups_for,
     last_batch,
-    open_runs_for,
     rank_share,
-    usual_groups,
 )
 from stereogenbench_data.selection.plan import Plan
-
-_rows: Final[WeakKeyDictionary[SceneIndex, torch.Tensor]] = WeakKeyDictionary()
-"""The rows of each index that was sent to other processes, laid out once."""
-_OURS_OR_TORCH: Final = frozenset({__name__.partition(".")[0], "torch"})
-
-
-class RepeatedEpochWarning(UserWarning):
-    """A second pass draws the same random frames and transforms, or has the same order."""
-
-
-def users_level() -> int:
-    """Return the stack level of a caller's warning that is neither this package's nor torch's."""
-    frame, level = sys._getframe(1), 1
-    while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in _OURS_OR_TORCH:
-        frame, level = frame.f_back, level + 1
-    return level
-
-
-class SharedNumbers:
-    """Whole numbers of which running workers see every change.
-
-    The workers of the process that made them have the same numbers, however they are started. Any
-    other copy has numbers of its own, which its own workers share: by `copy`, by pickle, or in a
-    process that was forked or spawned as another rank.
-    """
-
-    def __init__(self, numbers: Sequence[int]) -> None:
-        """Begin with these numbers.
-
-        The standard library keeps those of a process in few open files, though it may have
-        thousands of datasets.
-        """
-        self._owner, self._shared = os.getpid(), RawArray("q", list(numbers))
-
-    @property
-    def _numbers(self) -> Any:
-        if self._owner != os.getpid():
-            parent = multiprocessing.parent_process()
-            started_by = None if get_worker_info() is None or parent is None else parent.pid
-            if started_by != self._owner:
-                self._owner, self._shared = os.getpid(), RawArray("q", self._shared[:])
-        return self._shared
-
-    def __getitem__(self, place: int) -> int:
-        """Return a number."""
-        number: int = self._numbers[place]
-        return number
-
-    def __setitem__(self, place: int, number: int) -> None:
-        """Change a number for all processes."""
-        self._numbers[place] = number
-
-    def __iter__(self) -> Iterator[int]:
-        """Yield all numbers."""
-        yield from self._numbers
-
-    def clear(self) -> None:
-        """Set all of them to 0."""
-        self._numbers[:] = [0] * len(self._numbers)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Return what a copy is made from: these numbers, in a process that is being started."""
-        shared = self._numbers
-        if get_spawning_popen() is None:
-            return SharedNumbers, (shared[:],)
-        return object.__new__, (SharedNumbers,), {"_owner": self._owner, "_shared": shared}
-
-
-class SharedEpoch:
-    """The epoch that a dataset draws random frames and transforms for, as all its workers see it.
-
-    torch's own `DataLoader` makes passes of the same epoch until one is set, so each would draw the
-    same random frames and transforms. The first sample that any process draws in an epoch is
-    watched; the process that draws it again warns, once. A copy has an epoch of its own.
-    """
-
-    def __init__(self, epoch: int = 0) -> None:
-        """Begin at an epoch that was never set, with no sample watched."""
-        self._numbers = SharedNumbers([epoch, 0])
-        self._watched = SharedNumbers([-1, -1, 0])  # epoch and sample, and whether it was told
-        self._ended: tuple[OrderRule, int, int] | None = None
-        self._ended_by, self._was_told = 0, False
-
-    @property
-    def value(self) -> int:
-        """The epoch, from 0."""
-        return self._numbers[0]
-
-    @property
-    def times_set(self) -> int:
-        """How often it was set."""
-        return self._numbers[1]
-
-    def set(self, epoch: int) -> None:
-        """Go to an epoch.
-
-        Raises:
-            SelectionError: If it is not a whole number from 0.
-        """
-        self._numbers[0] = require_epoch(epoch)
-        self._numbers[1] += 1
-
-    def mark_drawn(self, numbers: Sequence[int], *, epoch: int, dataset: object) -> None:
-        """Take random samples as drawn, and warn if the watched one is drawn again.
-
-        Args:
-            numbers: The samples.
-            epoch: Their epoch.
-            dataset: What draws them, for the warning.
-        """
-        watched, marked = self._watched, hash((epoch, self.times_set))
-        if watched[0] != marked and numbers:
-            watched[1], watched[0] = numbers[0], marked
-        elif watched[1] in numbers and not watched[2]:
-            watched[2] = 1
-            warnings.warn(
-                f"{dataset!r} is read by torch's own DataLoader, and samples of epoch {epoch} "
-                "come a second time, with the same random frames and transforms. If this is "
-                "another pass, call set_epoch(epoch) before each, or use StereoPairs(...)"
-                ".loader(...), whose every pass is of the next epoch. A sampler that draws with "
-                "replacement repeats samples within a pass, and that changes nothing.",
-                RepeatedEpochWarning,
-                stacklevel=users_level(),
-            )
-
-    def mark_ended(self, rule: OrderRule, *, loader: int) -> None:
-        """Take a pass of the dataset's epoch as ended: its order, and the number of its loader."""
-        self._ended, self._ended_by = (rule, self.value, self.times_set), loader
-
-    def mark_begun(self, rule: OrderRule, *, loader: int) -> None:
-        """Warn, once, where another loader has ended the same pass of the dataset's epoch."""
-        is_again = self._ended == (rule, self.value, self.times_set)
-        if is_again and self._ended_by != loader and not self._was_told:
-            self._was_told = True
-            warnings.warn(
-                f"a new loader repeats epoch {self.value} of the loader before it: the same order, "
-                "random frames and transforms. Make the loader once, before the loop over epochs: "
-                "each of its passes is of the next epoch. Or call set_epoch(epoch) of the dataset, "
-                "or of the new loader, before each pass.",
-                RepeatedEpochWarning,
-                stacklevel=users_level(),
-            )
-
-
-def require_epoch(epoch: int) -> int:
-    """Return the number of an epoch.
-
-    Raises:
-        SelectionError: If it is not a whole number from 0.
-    """
-    whole = whole_number(epoch)
-    if whole is None or not 0 <= whole < 2**63:
-        raise SelectionError(f"an epoch is a whole number from 0, got {epoch!r}.")
-    return whole
-
-
-def _parted(index: SceneIndex) -> tuple[Any, ...]:
-    table, rest = index.parted()
-    if index not in _rows:
-        sink = pa.BufferOutputStream()
-        with pa.ipc.new_stream(sink, table.schema) as stream:
-            stream.write_table(table)
-        _rows[index] = torch.frombuffer(bytearray(sink.getvalue()), dtype=torch.uint8)
-        _rows[index].share_memory_()
-    return _joined, (_rows[index], rest)
-
-
-def _joined(rows: torch.Tensor, rest: dict[str, Any]) -> SceneIndex:
-    with pa.ipc.open_stream(pa.py_buffer(rows.numpy())) as stream:
-        return SceneIndex.of_parts(stream.read_all(), rest)
-
-
-# For processes of this machine alone: a plain pickle of an index holds its rows.
-ForkingPickler.register(SceneIndex, _parted)
-
 
 State = dict[str, Any]
 """A position: a flat dict of numbers and texts, which JSON and `torch.save` take."""
@@ -240,48 +54,6 @@ _DIGESTS: Final = {
 
 Position = tuple[int, int]
 """An epoch, and how many of its global batches are consumed."""
-
-
-class EpochOptions(TypedDict, total=False):
-    """How an epoch is ordered and divided among ranks.
-
-    Attributes:
-        seed: The seed of the order, the same on all ranks; that of the dataset if left out.
-        rank: Whose batches these are, from 0. By default torch.distributed's rank, or 0 where it is
-            not initialised.
-        world_size: How many ranks there are. By default torch.distributed's world size, or 1.
-        shuffle: Whether samples are shuffled, by default; False gives them by their numbers.
-        drop_last: What happens to the epoch's last batches. True, the default of a shuffled order:
-            each rank gets as many batches, all of them full; what is left over is dropped (see
-            `EpochBatches.left_out`). False, the default otherwise: every sample exactly once; the
-            last batch may be short, and ranks may differ by one batch. "pad": each rank gets as
-            many full batches and no sample is left out; samples from the epoch's start fill up,
-            marked in the field ``is_padding`` (batch,) bool.
-        shuffle_groups: How many groups of scenes are shuffled separately, for ranks: batch n is of
-            group n mod shuffle_groups. If left out 8, or fewer with larger batches, pictures or
-            fewer scenes, raised to a multiple of the ranks; a state keeps it, and goes on with it
-            under other ranks. A number that is given counts.
-        open_scenes: The shuffle buffer, counted in scenes: how many each group interleaves. If left
-            out, about 64 of all groups together, or a batch where that is more (with few scenes a
-            few more), but of large pictures no more than about 3.6 GB of decoders hold: of
-            1280x1280 pixels 64 with one pair a scene, and 17 with all pairs. Fewer take less memory
-            and shuffle less well. A rank has those of its groups open, shared out among its
-            workers.
-        open_frames: How many neighbouring frames of each open scene are interleaved, where several
-            samples show a frame (all pairs). A batch then shows more moments, and their pictures
-            and depth stay in memory. If left out, as many as a batch has samples of an open scene,
-            within 2 GB: 2 with all pairs of 1280x1280 pixels and a batch of 32, 1 with one pair a
-            scene.
-    """
-
-    seed: int
-    rank: int
-    world_size: int
-    shuffle: bool
-    drop_last: DropLast
-    shuffle_groups: int
-    open_scenes: int
-    open_frames: int
 
 
 class EpochBatch(list[int]):
@@ -324,30 +96,6 @@ class EpochBatch(list[int]):
         if self.is_padding is not None:
             part.is_padding = [self.is_padding[place] for place in places]
         return part
-
-
-class WorkerShare(NamedTuple):
-    """Which samples of its rank's batches one of a rank's workers decodes.
-
-    Attributes:
-        rank: The rank, from 0.
-        world_size: How many ranks there are.
-        worker: The worker, from 0.
-        workers: How many the rank has.
-        of: "streams": those of its own streams, of every batch, as `EpochOrder.workers_of` deals
-            them. "batches": all of every batch in turn.
-    """
-
-    rank: int
-    world_size: int
-    worker: int
-    workers: int
-    of: Literal["streams", "batches"]
-
-    @property
-    def batches_apart(self) -> int:
-        """How far the numbers of two batches lie apart that it decodes one after the other."""
-        return self.world_size * (self.workers if self.of == "batches" else 1)
 
 
 @dataclass(eq=False)
@@ -561,12 +309,6 @@ class GlobalBatches:
         return self.__dict__ | {"_order": None}
 
 
-def groups_of_rank(groups: int, rank: int, world_size: int) -> range:
-    """Return the shuffle groups that a rank's batches are of."""
-    apart = math.gcd(groups, world_size)
-    return range(rank % apart, groups, apart)
-
-
 class OrderedSamples(Protocol):
     """What `EpochBatches` asks of a dataset: its samples by number, and the epoch that it is at."""
 
@@ -637,7 +379,7 @@ class EpochBatches(Sampler[list[int]]):
             return
         self.dataset = dataset
         plan, self._options = dataset.plan, options
-        self.rank, self.world_size = _require_group(options.get("rank"), options.get("world_size"))
+        self.rank, self.world_size = require_group(options.get("rank"), options.get("world_size"))
         self.rule = fitting_rule(
             dataset.index, plan, batch_size, options, world_size=self.world_size
         )
@@ -758,7 +500,7 @@ class EpochBatches(Sampler[list[int]]):
         Raises:
             SelectionError: If torch.distributed was initialised after these batches were made.
         """
-        group = _group()
+        group = torchs_group()
         if group is not None:
             self.require_group(*group)
         return rank_share(start, self.end(start), rank=self.rank, world_size=self.world_size)
@@ -923,188 +665,3 @@ def require_count(state: Mapping[str, Any], name: str, *, most: int | None = Non
     if most is not None and value > most:
         raise StateError(f"the state's {name} is {value}, and there are {most}. {_STATES}")
     return value
-
-
-def _group() -> tuple[int, int] | None:
-    """Return rank and world size as torch.distributed says, None where it is not initialised."""
-    if torch.distributed.is_available() and torch.distributed.is_initialized():
-        return torch.distributed.get_rank(), torch.distributed.get_world_size()
-    return None
-
-
-class UnsharedRanksWarning(UserWarning):
-    """Several ranks were started, and nothing tells their numbers, so each gets all batches."""
-
-
-def _require_group(rank: int | None, world_size: int | None) -> tuple[int, int]:
-    """Return rank and world size, given or as torch.distributed says."""
-    if rank is None and world_size is None:
-        group, ranks = _group(), os.environ.get("WORLD_SIZE", "")
-        if group is None and ranks.isdecimal() and int(ranks) > 1 and get_worker_info() is None:
-            warnings.warn(
-                f"WORLD_SIZE says that {ranks} ranks were started, and there is no process group, "
-                f"so each of them reads all batches. Make loaders after init_process_group, or "
-                f"give rank= and world_size=; rank=0, world_size=1 reads all without a word.",
-                UnsharedRanksWarning,
-                stacklevel=4,
-            )
-        return group or (0, 1)
-    numbers = whole_number(rank), whole_number(world_size)
-    if numbers[0] is None or numbers[1] is None or not 0 <= numbers[0] < numbers[1]:
-        raise SelectionError(
-            f"rank must be a number from 0 below world_size, and both be given: got rank={rank!r}, "
-            f"world_size={world_size!r}."
-        )
-    return numbers[0], numbers[1]
-
-
-SPARE_FILES = 128
-"""Open files that are left to everything else."""
-
-RANK_BYTES: Final = 3_600_000_000
-"""Memory for the open scenes of a rank, where nobody asks for a number of them."""
-
-_DECODER_BYTES: Final = 17
-"""Of a camera's decoders for each pixel: 12.6 of H.264 with its reference pictures, 4.3 of FFV1,
-measured at 1280x1280."""
-
-_KEPT_BYTES: Final = 4
-"""Of the current picture and what is measured in it, kept for each pixel for other pairs."""
-
-FRAMES_BYTES: Final = 2_000_000_000
-"""Memory for further frames of a rank's open scenes, where several samples show one."""
-
-_FRAME_BYTES: Final = 6
-"""Of a further frame for each pixel: the picture, stored depth and where it is measured."""
-
-
-class OpenVideosWarning(UserWarning):
-    """More videos are needed at a time than this process may open: some are opened repeatedly."""
-
-
-class RepeatedDecodingWarning(UserWarning):
-    """Several processes read the same shuffle group, so each of them decodes its videos."""
-
-
-class IdleWorkersWarning(UserWarning):
-    """A loader has more workers than open scenes, so some have nothing to do."""
-
-
-def warn_of_division(batches: EpochBatches, share: WorkerShare, *, videos_per_scene: int) -> None:
-    """Warn where processes decode the same videos, have nothing to do, or may not open enough.
-
-    Args:
-        batches: The batches of a rank.
-        share: How they are divided among its workers.
-        videos_per_scene: How many videos of an open scene are read.
-    """
-    if not (batches.rule.shuffle and videos_per_scene):
-        return
-    order = batches.of_all_ranks.order(0)
-    readers = share.world_size * (share.workers if share.of == "batches" else 1)
-    groups = groups_of_rank(order.groups, share.rank, readers)
-    open_scenes = sum(map(order.streams, groups))
-    together, scenes = readers // math.gcd(order.groups, readers), len(order.runs.pairs)
-    cure = "Use fewer ranks or a smaller batch_size: ranks times batch at most the scenes."
-    is_avoidable = True
-    if share.of == "batches":
-        cure = "Use pairs.loader(...), whose workers share the videos out, or shuffle_groups="
-        cure += f"{readers}, which is another order."
-        is_avoidable = readers * batches.batch_size <= scenes
-    if together > 1 and is_avoidable and order.runs.lengths.max() > 1:
-        warnings.warn(
-            f"every video is decoded {together} times, as {readers} processes read {order.groups} "
-            f"shuffle groups of {scenes} runs of frames. {cure}",
-            RepeatedDecodingWarning,
-            stacklevel=users_level(),
-        )
-    if share.of == "streams":
-        if share.workers > open_scenes:
-            warnings.warn(
-                f"{share.workers - open_scenes} of {share.workers} workers have nothing to do: a "
-                f"rank has {open_scenes} scenes open at a time, and one worker decodes a scene. "
-                f"Use num_workers={open_scenes}, or open_scenes="
-                f"{-(-share.workers // len(groups))} where there are as many scenes.",
-                IdleWorkersWarning,
-                stacklevel=users_level(),
-            )
-        open_scenes = -(-open_scenes // share.workers)
-    wanted, allowed = open_scenes * videos_per_scene, videos_allowed()
-    if wanted > allowed:
-        warnings.warn(
-            f"up to {wanted} videos would be open at a time, and this process may open {allowed}: "
-            "they will be closed and opened again, which is slow. Raise the limit (`ulimit -n "
-            f"{wanted + SPARE_FILES}`), use more workers, or fewer open_scenes than "
-            f"{batches.rule.open_scenes}.",
-            OpenVideosWarning,
-            stacklevel=users_level(),
-        )
-
-
-def videos_allowed() -> int:
-    """Return how many videos this process may have open."""
-    return max(OPEN_STREAMS, _most_files() - SPARE_FILES)
-
-
-def fitting_rule(
-    index: SceneIndex, plan: Plan, batch_size: int, options: EpochOptions, *, world_size: int
-) -> OrderRule:
-    """Return a rule with as many open scenes and frames as fit into the memory of a rank.
-
-    They depend on the selected pairs and the stored size of their pictures alone, not on fields or
-    workers, and on ranks only in that they share the groups out. What a user asks for counts
-    instead.
-
-    Raises:
-        SelectionError: If an option is out of its range.
-    """
-    rule = OrderRule(
-        batch_size, seed=options.get("seed", plan.seed), shuffle=options.get("shuffle", True)
-    )
-    rows, runs = plan.scene_rows, plan.runs
-    shares_moments = bool((runs.pairs > 1).any())
-    pixels = (index.column("image_width_px")[rows] * index.column("image_height_px")[rows]).max()
-    of_cameras = int(pixels) * videos_per_scene(plan, frozenset({"source_rgb", "target_rgb"}))
-    # About what the decoders of an open scene take, at the most.
-    scene_bytes = of_cameras * (_DECODER_BYTES + (_KEPT_BYTES if shares_moments else 0))
-    size, fitting = rule.batch_size, max(2, RANK_BYTES // max(1, scene_bytes))
-    usual = groups_for(runs, batch_size=size, fitting=fitting, world_size=world_size)
-    rule = replace(
-        rule,
-        shuffle_groups=options.get("shuffle_groups", usual),
-        open_scenes=options.get("open_scenes", size),
-    )
-    groups = rule.groups_of(runs.lengths)
-    if "open_scenes" not in options:
-        wanted = open_runs_for(runs, batch_size=size, fitting=fitting, groups=groups)
-        rule = replace(rule, open_scenes=wanted)
-    frames = 1
-    if shares_moments:
-        of_rank = min(groups, usual_groups(batch_size=size, fitting=fitting))
-        further = FRAMES_BYTES // max(1, of_rank * rule.open_scenes * of_cameras * _FRAME_BYTES)
-        frames = max(1, min(1 + further, -(-size // rule.open_scenes)))
-    return replace(rule, open_frames=options.get("open_frames", frames))
-
-
-def _most_files() -> int:
-    """Return how many files this process may open; 512 where the system does not say."""
-    try:
-        import resource
-    except ImportError:
-        return 512
-    return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-
-
-def videos_per_scene(plan: Plan, streams: frozenset[Stream]) -> int:
-    """Return how many videos the samples of one scene are made from, at the most."""
-    pairs = plan.pairs
-    scene = np.repeat(np.arange(len(plan.scene_rows)), np.diff(plan.first_pair))
-    used = np.zeros((len(plan.scene_rows), 2, CAMERA_COUNT), dtype=bool)
-    for kind, suffix in enumerate(("rgb", "depth")):
-        if f"source_{suffix}" in streams:
-            used[scene, kind, pairs.source] = True
-        if f"target_{suffix}" in streams:
-            for targets in pairs.targets.T:
-                there = targets >= 0
-                used[scene[there], kind, targets[there]] = True
-    return int(used.sum(axis=(1, 2)).max())

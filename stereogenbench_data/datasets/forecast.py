@@ -25,7 +25,8 @@ from dataclasses import dataclass
 from itertools import chain, islice, repeat
 from typing import Any, Final
 
-from stereogenbench_data.datasets.batches import EpochBatch, WorkerShare
+from stereogenbench_data.datasets.batches import EpochBatch
+from stereogenbench_data.datasets.division import WorkerShare
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.index.table import SceneIndex

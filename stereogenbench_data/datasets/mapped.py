@@ -24,20 +24,17 @@ from stereogenbench_data.datasets.batch_parts import BatchPart, MadePart, make_p
 from stereogenbench_data.datasets.batches import (
     EpochBatch,
     EpochBatches,
-    EpochOptions,
     GlobalBatches,
     Passes,
-    SharedEpoch,
-    WorkerShare,
-    videos_allowed,
-    videos_per_scene,
-    warn_of_division,
 )
+from stereogenbench_data.datasets.division import WorkerShare, videos_allowed, warn_of_division
+from stereogenbench_data.datasets.epoch_rule import EpochOptions, videos_per_scene
 from stereogenbench_data.datasets.loader import (
     LoaderOptions,
     PairsLoader,
     accelerates_epoch,
 )
+from stereogenbench_data.datasets.shared import SharedEpoch
 from stereogenbench_data.errors import (
     FieldError,
     MediaError,
@@ -480,7 +477,8 @@ class _MappedScenes(Dataset[Sample]):
         """Expect these batches, divided in this way: what comes next is fetched ahead."""
         self._of_all_ranks, self._share, self._stop = batches.of_all_ranks, share, batches.end()
         self._next_batch = None
-        warn_of_division(batches, share, videos_per_scene=self._videos_per_scene)
+        order = batches.of_all_ranks.order(0)
+        warn_of_division(order, share, videos_per_scene=self._videos_per_scene)
 
     @cached_property
     def _videos_per_scene(self) -> int:

@@ -9,18 +9,16 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from stereogenbench_data.datasets.batches import (
     EpochBatches,
-    EpochOptions,
     Pass,
     Position,
-    RepeatedEpochWarning,
-    SharedNumbers,
     State,
-    WorkerShare,
     require_count,
-    users_level,
 )
+from stereogenbench_data.datasets.division import WorkerShare
+from stereogenbench_data.datasets.epoch_rule import EpochOptions
 from stereogenbench_data.datasets.mapped import Data, PairsOptions, StereoPairs
-from stereogenbench_data.errors import StateError
+from stereogenbench_data.datasets.shared import RepeatedEpochWarning, SharedNumbers
+from stereogenbench_data.errors import StateError, users_level
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.selection.filters import require_options, split_options
 

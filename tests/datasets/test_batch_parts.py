@@ -9,7 +9,6 @@ from torch.utils.data import DataLoader, default_collate
 
 from stereogenbench_data import MediaError, StereoPairs
 from stereogenbench_data.datasets import batch_parts
-from stereogenbench_data.datasets import loader as loading
 from tests.datasets.conftest import TRUE_FIELDS, is_true, keys_of, same
 
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
@@ -166,4 +165,4 @@ def test_what_is_on_its_way_is_bounded_by_the_batches_ahead(pairs):
     parted = batches._workers.parted
 
     assert 0 < len(parted._coming) <= 2 * 1 + 1
-    assert isinstance(parted, loading.PartedBatches)
+    assert isinstance(parted, batch_parts.PartedBatches)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stereogenbench_data import SceneIndex, StereoPairs
-from stereogenbench_data.datasets import loader as loading
+from stereogenbench_data.datasets import workers as processes
 from tests.datasets.conftest import keys_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
@@ -32,7 +32,7 @@ def tasks(monkeypatch):
     """For each run of each group the workers that were given samples of it."""
     given = {}
 
-    class Recording(loading.PartedBatches):
+    class Recording(processes.PartedBatches):
         def _parts(self, batch, number):
             firsts = self._of_all_ranks.runs.first_sample
             for part in (parts := super()._parts(batch, number)):
@@ -40,7 +40,7 @@ def tasks(monkeypatch):
                     given.setdefault((batch.group, run), set()).add(part.share.worker)
             return parts
 
-    monkeypatch.setattr(loading, "PartedBatches", Recording)
+    monkeypatch.setattr(processes, "PartedBatches", Recording)
     return given
 
 

@@ -17,7 +17,7 @@ from stereogenbench_data import (
     SceneIndex,
     StereoPairs,
 )
-from stereogenbench_data.datasets.batches import (
+from stereogenbench_data.datasets.division import (
     IdleWorkersWarning,
     OpenVideosWarning,
     RepeatedDecodingWarning,

@@ -20,7 +20,7 @@ import pytest
 from torch.utils.data import DataLoader
 
 from stereogenbench_data import PassError, StereoPairs, StereoPairStream, WorkerError
-from stereogenbench_data.datasets import loader as loading
+from stereogenbench_data.datasets import workers as processes
 from tests.datasets.conftest import flat, fork_and, is_true, keys_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
@@ -304,7 +304,7 @@ def test_an_error_ends_its_pass_and_says_so_to_who_asks_on(small_index):
 
 @pytest.mark.parametrize("hanging", [2, 9])
 def test_a_worker_that_hangs_in_its_fork_is_forked_again(small_index, monkeypatch, hanging):
-    monkeypatch.setattr(loading, "_BEGUN_WITHIN_S", 1.0)
+    monkeypatch.setattr(processes, "_BEGUN_WITHIN_S", 1.0)
     pairs = StereoPairs(small_index, split="train", fields=("__key__",))
     expected = sorted(sample["__key__"] for sample in pairs)
     forks = []

@@ -1,0 +1,156 @@
+"""How an epoch is divided among ranks and their workers, and what is told where that is costly."""
+
+import math
+import os
+import warnings
+from typing import Literal, NamedTuple
+
+import torch.distributed
+from torch.utils.data import get_worker_info
+
+from stereogenbench_data.errors import SelectionError, users_level
+from stereogenbench_data.samples.load import OPEN_STREAMS
+from stereogenbench_data.selection.filters import whole_number
+from stereogenbench_data.selection.order import EpochOrder
+
+SPARE_FILES = 128
+"""Open files that are left to everything else."""
+
+
+class WorkerShare(NamedTuple):
+    """Which samples of its rank's batches one of a rank's workers decodes.
+
+    Attributes:
+        rank: The rank, from 0.
+        world_size: How many ranks there are.
+        worker: The worker, from 0.
+        workers: How many the rank has.
+        of: "streams": those of its own streams, of every batch, as `EpochOrder.workers_of` deals
+            them. "batches": all of every batch in turn.
+    """
+
+    rank: int
+    world_size: int
+    worker: int
+    workers: int
+    of: Literal["streams", "batches"]
+
+    @property
+    def batches_apart(self) -> int:
+        """How far the numbers of two batches lie apart that it decodes one after the other."""
+        return self.world_size * (self.workers if self.of == "batches" else 1)
+
+
+def groups_of_rank(groups: int, rank: int, world_size: int) -> range:
+    """Return the shuffle groups that a rank's batches are of."""
+    apart = math.gcd(groups, world_size)
+    return range(rank % apart, groups, apart)
+
+
+def torchs_group() -> tuple[int, int] | None:
+    """Return rank and world size as torch.distributed says, None where it is not initialised."""
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        return torch.distributed.get_rank(), torch.distributed.get_world_size()
+    return None
+
+
+class UnsharedRanksWarning(UserWarning):
+    """Several ranks were started, and nothing tells their numbers, so each gets all batches."""
+
+
+def require_group(rank: int | None, world_size: int | None) -> tuple[int, int]:
+    """Return rank and world size, given or as torch.distributed says."""
+    if rank is None and world_size is None:
+        group, ranks = torchs_group(), os.environ.get("WORLD_SIZE", "")
+        if group is None and ranks.isdecimal() and int(ranks) > 1 and get_worker_info() is None:
+            warnings.warn(
+                f"WORLD_SIZE says that {ranks} ranks were started, and there is no process group, "
+                f"so each of them reads all batches. Make loaders after init_process_group, or "
+                f"give rank= and world_size=; rank=0, world_size=1 reads all without a word.",
+                UnsharedRanksWarning,
+                stacklevel=users_level(),
+            )
+        return group or (0, 1)
+    numbers = whole_number(rank), whole_number(world_size)
+    if numbers[0] is None or numbers[1] is None or not 0 <= numbers[0] < numbers[1]:
+        raise SelectionError(
+            f"rank must be a number from 0 below world_size, and both be given: got rank={rank!r}, "
+            f"world_size={world_size!r}."
+        )
+    return numbers[0], numbers[1]
+
+
+class OpenVideosWarning(UserWarning):
+    """More videos are needed at a time than this process may open: some are opened repeatedly."""
+
+
+class RepeatedDecodingWarning(UserWarning):
+    """Several processes read the same shuffle group, so each of them decodes its videos."""
+
+
+class IdleWorkersWarning(UserWarning):
+    """A loader has more workers than open scenes, so some have nothing to do."""
+
+
+def warn_of_division(order: EpochOrder, share: WorkerShare, *, videos_per_scene: int) -> None:
+    """Warn where processes decode the same videos, have nothing to do, or may not open enough.
+
+    Args:
+        order: The order of an epoch.
+        share: How they are divided among its workers.
+        videos_per_scene: How many videos of an open scene are read.
+    """
+    if not (order.rule.shuffle and videos_per_scene):
+        return
+    readers = share.world_size * (share.workers if share.of == "batches" else 1)
+    groups = groups_of_rank(order.groups, share.rank, readers)
+    open_scenes = sum(map(order.streams, groups))
+    together, scenes = readers // math.gcd(order.groups, readers), len(order.runs.pairs)
+    cure = "Use fewer ranks or a smaller batch_size: ranks times batch at most the scenes."
+    is_avoidable = True
+    if share.of == "batches":
+        cure = "Use pairs.loader(...), whose workers share the videos out, or shuffle_groups="
+        cure += f"{readers}, which is another order."
+        is_avoidable = readers * order.rule.batch_size <= scenes
+    if together > 1 and is_avoidable and order.runs.lengths.max() > 1:
+        warnings.warn(
+            f"every video is decoded {together} times, as {readers} processes read {order.groups} "
+            f"shuffle groups of {scenes} runs of frames. {cure}",
+            RepeatedDecodingWarning,
+            stacklevel=users_level(),
+        )
+    if share.of == "streams":
+        if share.workers > open_scenes:
+            warnings.warn(
+                f"{share.workers - open_scenes} of {share.workers} workers have nothing to do: a "
+                f"rank has {open_scenes} scenes open at a time, and one worker decodes a scene. "
+                f"Use num_workers={open_scenes}, or open_scenes="
+                f"{-(-share.workers // len(groups))} where there are as many scenes.",
+                IdleWorkersWarning,
+                stacklevel=users_level(),
+            )
+        open_scenes = -(-open_scenes // share.workers)
+    wanted, allowed = open_scenes * videos_per_scene, videos_allowed()
+    if wanted > allowed:
+        warnings.warn(
+            f"up to {wanted} videos would be open at a time, and this process may open {allowed}: "
+            "they will be closed and opened again, which is slow. Raise the limit (`ulimit -n "
+            f"{wanted + SPARE_FILES}`), use more workers, or fewer open_scenes than "
+            f"{order.rule.open_scenes}.",
+            OpenVideosWarning,
+            stacklevel=users_level(),
+        )
+
+
+def videos_allowed() -> int:
+    """Return how many videos this process may have open."""
+    return max(OPEN_STREAMS, _most_files() - SPARE_FILES)
+
+
+def _most_files() -> int:
+    """Return how many files this process may open; 512 where the system does not say."""
+    try:
+        import resource
+    except ImportError:
+        return 512
+    return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
