@@ -37,8 +37,12 @@ from stereogenbench_data.errors import StorageError as StorageError
 from stereogenbench_data.errors import SynthesisError as SynthesisError
 from stereogenbench_data.errors import WorkerError as WorkerError
 from stereogenbench_data.evaluation.controls import score_controls as score_controls
+from stereogenbench_data.evaluation.disparity import disparity_tables as disparity_tables
+from stereogenbench_data.evaluation.disparity import evaluate_disparity as evaluate_disparity
 from stereogenbench_data.evaluation.evaluate import evaluate as evaluate
 from stereogenbench_data.evaluation.inputs import export_inputs as export_inputs
+from stereogenbench_data.evaluation.metrics.disparity import DisparityError as DisparityError
+from stereogenbench_data.evaluation.protocol import DisparityProtocol as DisparityProtocol
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol as EvaluationProtocol
 from stereogenbench_data.evaluation.report import write_report as write_report
 from stereogenbench_data.evaluation.tables import tables_of as tables_of

@@ -20,6 +20,8 @@ from matplotlib.figure import Figure
 from network import StereoNetwork
 from PIL import Image
 
+from stereogenbench_data import DisparityError
+
 WIDEST = 800
 # Left view, right view, disparity of the left view; {} is the folder's name. Disparity stored as
 # whole numbers is multiplied: full size is 1800 px wide in 2003, and about 1300 in 2006.
@@ -99,6 +101,14 @@ def by_network(network: StereoNetwork, left: np.ndarray, right: np.ndarray) -> n
         return network(*views)[0, 0].numpy()
 
 
+def errors(found: np.ndarray, truth: np.ndarray, scored: np.ndarray) -> tuple[float, float]:
+    """Return the mean error in px, and the share of scored pixels that are more than 2 px wrong."""
+    error = DisparityError()
+    error.update(*map(torch.from_numpy, (found, truth, scored)))
+    measures = error.compute()
+    return measures["epe"], measures["bad_2"]
+
+
 def cell(scores: np.ndarray) -> str:
     """Return the error in px and the share over 2 px of runs, (runs, 2), for the table."""
     texts = []
@@ -134,8 +144,7 @@ def main() -> None:
         shown = [(name, left), ("measured", truth)]
         for method, runs in methods.items():
             predicted = [predict(left, right) for predict in runs]
-            wrong = np.stack([np.abs(each - truth)[scored] for each in predicted])
-            scores[method].append(np.stack([wrong.mean(1), (wrong > 2).mean(1)], axis=1))
+            scores[method].append(np.array([errors(each, truth, scored) for each in predicted]))
             shown.append((method, predicted[0]))
         for tile, (title, picture) in zip(row, shown, strict=True):
             tile.imshow(picture, vmin=0, vmax=truth.max(), cmap="turbo")

@@ -19,6 +19,7 @@ from network import StereoNetwork
 from stereogenbench_data import (
     ColorJitter,
     Compose,
+    DisparityError,
     Eraser,
     HorizontalFlip,
     PairsLoader,
@@ -53,15 +54,13 @@ def on_device(loader: PairsLoader) -> Iterator[dict[str, torch.Tensor]]:
 def held_out_error(network: StereoNetwork, validation: PairsLoader) -> float:
     """Return the mean error in pixels over what both cameras see."""
     network.eval()
-    error = count = 0.0
+    error = DisparityError(max_disparity_px=network.max_disparity)
     for batch in on_device(validation):
-        scored = batch["valid"] & batch["visible"] & (batch["disparity"] < network.max_disparity)
         with torch.no_grad():
-            wrong = network(batch["left"], batch["right"]) - batch["disparity"]
-        error += float(wrong.abs()[scored].sum())
-        count += float(scored.sum())
+            found = network(batch["left"], batch["right"])
+        error.update(found, batch["disparity"], batch["valid"] & batch["visible"])
     network.train()
-    return error / count
+    return error.compute()["epe"]
 
 
 def main() -> None:

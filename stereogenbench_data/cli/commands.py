@@ -15,7 +15,7 @@ from stereogenbench_data.cli.conventions import conventions
 from stereogenbench_data.cli.doctor import doctor
 from stereogenbench_data.cli.download import download
 from stereogenbench_data.cli.errors import ErrorsReported
-from stereogenbench_data.cli.evaluate import controls, inputs, score
+from stereogenbench_data.cli.evaluate import controls, disparity, inputs, score
 from stereogenbench_data.cli.export_clips import clips
 from stereogenbench_data.cli.export_views import colmap, moge, ply, transforms
 from stereogenbench_data.cli.forecast import forecast
@@ -40,7 +40,10 @@ _GROUPS: Final[dict[str, tuple[str, tuple[Callable[..., None], ...]]]] = {
         "Write scenes in the layouts of other projects.",
         (clips, colmap, transforms, ply, moge),
     ),
-    "eval": ("Score a method by the paper's protocol.", (inputs, score, controls)),
+    "eval": (
+        "Score right views by the paper's protocol, or disparity.",
+        (inputs, score, controls, disparity),
+    ),
     "publish": ("Describe shards and put them on the Hub.", (croissant, card, upload)),
 }
 """Groups of commands: what each is for, and its commands."""

@@ -1,4 +1,4 @@
-"""``stereogenbench eval inputs``, ``score``, ``controls``: scores by the paper's protocol.
+"""``stereogenbench eval inputs``, ``score``, ``controls``, ``disparity``: scores of a method.
 
 They share their options: scenes, pairs and frames, metrics and models, the report.
 """
@@ -228,6 +228,67 @@ def score(  # noqa: PLR0913 - one parameter an option
             **selection,
         )
     report.write(folder, [scores], tables_of([scores], by=by or ()))
+
+
+@grouped
+def disparity(  # noqa: PLR0913 - one parameter an option
+    source: DataOptions,
+    predictions: Annotated[
+        Path,
+        typer.Argument(help="Folder of disparity maps, SCENE/00-01/000.pfm, .png, .npy, .npz."),
+    ],
+    *,
+    name: Annotated[str | None, option("Name of the method [the folder's name].")] = None,
+    chosen: ScoredOptions,
+    size: Annotated[
+        Any,
+        option(
+            "--size", "Width x height of what is scored [as stored].", parser=size_of, metavar="WxH"
+        ),
+    ] = None,
+    max_disparity: Annotated[
+        float | None,
+        option("Leave out pixels whose true disparity is this or more.", metavar="PX"),
+    ] = None,
+    by: Annotated[
+        list[str] | None,
+        option("Also score by focal_mm, character, ... May be repeated.", metavar="COLUMN"),
+    ] = None,
+    allow_missing: Annotated[int, option("Most pairs without usable maps.", min=0)] = 0,
+    report: ReportOptions,
+    work: WorkOptions,
+) -> None:
+    """Score the disparity that a method finds in the left views.
+
+    PREDICTIONS holds a folder for each pair, SCENE/00-01 or the item's name, with a map for each
+    frame: PFM, KITTI's PNG, npy or npz, positive pixels of the scored size. The report (Markdown,
+    LaTeX, JSON, CSV, plots) and partial results go to --out [evaluation/NAME-disparity]. To
+    continue a stopped run, run it again.
+
+    Example: `stereogenbench eval disparity shards/ maps/`
+    """
+    from stereogenbench_data.evaluation.disparity import disparity_tables, evaluate_disparity
+    from stereogenbench_data.evaluation.protocol import DisparityProtocol
+
+    selection, called = chosen.selection(), name or predictions.resolve().name
+    folder = report.out or Path("evaluation") / f"{called}-disparity"
+    index = source.open()
+    columns = list(dict.fromkeys(["map_name", *(by or ())]))
+    for column in columns:
+        index.column(column)  # refuses an unknown one before the work
+    with progress_bar("scoring", unit="frames") as progress:
+        scores = evaluate_disparity(
+            index,
+            predictions,
+            name=called,
+            protocol=DisparityProtocol(size=size, max_disparity_px=max_disparity),
+            out=folder / "partial",
+            **work.options(),
+            allow_missing=allow_missing,
+            progress=progress,
+            **selection,
+        )
+    report.write(folder, [scores], disparity_tables([scores], by=columns))
 
 
 @grouped

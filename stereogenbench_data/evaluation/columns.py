@@ -36,6 +36,23 @@ EXPLAIN_A_FIT: Final = {
 }
 """What explains a fit of SD: the attribute of a `ScaleFit`, its label and decimals."""
 
+QUANTILES: Final = {"a50": 0.50, "a90": 0.90, "a95": 0.95, "a99": 0.99}
+"""Quantiles of the error of disparity, by their columns."""
+
+BAD_PX: Final = {"bad_0.5": 0.5, "bad_1": 1.0, "bad_2": 2.0, "bad_3": 3.0, "bad_4": 4.0}
+"""Errors of disparity that are counted as bad, by their columns."""
+
+DISPARITY_COLUMNS: Final[dict[str, Column]] = {
+    "epe": Column("EPE px, answered", "lower", 3),
+    "rms": Column("RMS px, answered", "lower", 3),
+    **{name: Column(f"{name.upper()} px, answered", "lower", 3) for name in QUANTILES},
+    **{name: Column(f"bad {limit:g}, scored", "lower", 4) for name, limit in BAD_PX.items()},
+    "d1": Column("D1, scored", "lower", 4),
+    "invalid": Column("invalid, scored", "lower", 4),
+    "beyond": Column("left out, valid", "neither", 4),
+}
+"""Where disparity is scored: the measure, and of which pixels; `metrics.disparity` defines them."""
+
 COLUMNS: Final[dict[str, Column]] = {
     "psnr": Column("PSNR", "higher", 2),
     "ssim": Column("SSIM", "higher", 4),
@@ -60,6 +77,7 @@ COLUMNS: Final[dict[str, Column]] = {
         for fit, words in _SD_FITS.items()
         for name, (label, digits) in EXPLAIN_A_FIT.items()
     },
+    **DISPARITY_COLUMNS,
 }
 """Columns of frames, headline columns first; `frame_metrics` says how each is computed."""
 

@@ -24,6 +24,7 @@ from stereogenbench_data.evaluation.evaluate import (
 )
 from stereogenbench_data.evaluation.predictions import PairFrames, Read, open_frames
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
+from stereogenbench_data.evaluation.scene_scores import fields_of
 from stereogenbench_data.evaluation.tables import CONTROL, Scores
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Sample
@@ -145,7 +146,12 @@ def score_controls(
     require_options(score_controls, options)
     protocol = protocol or EvaluationProtocol()
     index, scenes = select_pairs(
-        data, protocol, inputs=(), options=options, conventions=conventions
+        data,
+        fields_of(protocol),
+        size=protocol.size,
+        depth=protocol.depth,
+        options=options,
+        conventions=conventions,
     )
     donors = derangement(sorted({pairs[0].scene for pairs in scenes.values()}), seed=seed)
     run = Run(

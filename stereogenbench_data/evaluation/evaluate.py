@@ -9,18 +9,18 @@ stopped evaluation goes on:
 
 import hashlib
 import tempfile
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, fields
 from io import BytesIO
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any, Final, Unpack
+from typing import Any, Final, Generic, Unpack
 
 import torch
 
 from stereogenbench_data.datasets.mapped import Data, StereoPairs, opened
-from stereogenbench_data.engine import LOCAL, ProcessPool
+from stereogenbench_data.engine import LOCAL, Advance, ProcessPool
 from stereogenbench_data.errors import (
     EvaluationError,
     PredictionError,
@@ -40,9 +40,11 @@ from stereogenbench_data.evaluation.predictions import (
     PairFrames,
     PredictionFolder,
     PredictionSource,
+    Size,
 )
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, require_tier
 from stereogenbench_data.evaluation.scene_scores import (
+    How,
     PairScores,
     SceneScores,
     SceneWork,
@@ -56,6 +58,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import JobKind, WorkOptions, do_items, job_folder
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
+from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import may_pass, require_options
 from stereogenbench_data.selection.plan import Random, Selection
@@ -146,7 +149,12 @@ def evaluate(
             )
         source = PredictionFolder(name or root.name, root)
     index, scenes = select_pairs(
-        data, protocol, inputs=source.inputs, options=options, conventions=conventions
+        data,
+        (*fields_of(protocol), *source.inputs),
+        size=protocol.size,
+        depth=protocol.depth,
+        options=options,
+        conventions=conventions,
     )
     (scores,) = score_pairs(Run(index, scenes, protocol, (source,), known.name), options)
     return scores
@@ -158,9 +166,10 @@ ScoredPairs = Mapping[int, Sequence[PairFrames]]
 
 def select_pairs(
     data: Data,
-    protocol: EvaluationProtocol,
+    fields: Sequence[str],
     *,
-    inputs: Sequence[str],
+    size: Size | None,
+    depth: DepthEncoding | None,
     options: Mapping[str, Any],
     conventions: str | Path | Conventions | None = None,
 ) -> tuple[SceneIndex, ScoredPairs]:
@@ -168,8 +177,9 @@ def select_pairs(
 
     Args:
         data: What `StereoPairs` takes.
-        protocol: Which fields, at which size.
-        inputs: Fields that are needed besides those of the protocol.
+        fields: The fields of a sample that are needed.
+        size: (height, width) at which they are; None for the stored size.
+        depth: A depth contract instead of the one that files and release state.
         options: The selection; `RunOptions` among it are ignored.
         conventions: As for `StereoPairs`.
 
@@ -181,27 +191,39 @@ def select_pairs(
     """
     selection = {name: options[name] for name in options.keys() - RunOptions.__optional_keys__}
     selection.setdefault("frames", "all")
-    wanted = may_pass(selection)
-    data = opened(data, selection, conventions, rows="read")
-    lost = [] if data.is_from_file else [
-        f"{key}: {why}"
-        for key, why in data.broken.items()
-        if wanted is None or wanted(parse_scene_key(key))
-    ]  # fmt: skip
-    _require_whole(data, len(lost), *lost[:1])
-    data.require_released("The evaluation")
+    data = _whole_data(data, selection, conventions)
     # Tables group pairs by their baselines, whatever metrics and inputs need.
-    needed = (*fields_of(protocol), *inputs, "baseline_m")
     dataset = StereoPairs(
         data,
-        fields=tuple(dict.fromkeys(needed)),
-        size=protocol.size,
-        depth=protocol.depth,
+        fields=tuple(dict.fromkeys((*fields, "baseline_m"))),
+        size=size,
+        depth=depth,
         **selection,
     )
-    plan, index = dataset.plan, dataset.index
-    _require_whole(index, dataset.left_out, "the warning says why.")
-    chosen, windows = plan.pairs, plan.windows
+    _require_whole(dataset.index, dataset.left_out, "the warning says why.")
+    _require_single_frames(dataset, selection)
+    return dataset.index, _pairs_of_scenes(dataset, size)
+
+
+def _whole_data(
+    data: Data, selection: Mapping[str, Any], conventions: str | Path | Conventions | None
+) -> SceneIndex:
+    """Return the index of data none of whose selected scenes is lost."""
+    wanted = may_pass(selection)
+    index = opened(data, selection, conventions, rows="read")
+    lost = [] if index.is_from_file else [
+        f"{key}: {why}"
+        for key, why in index.broken.items()
+        if wanted is None or wanted(parse_scene_key(key))
+    ]  # fmt: skip
+    _require_whole(index, len(lost), *lost[:1])
+    index.require_released("The evaluation")
+    return index
+
+
+def _require_single_frames(dataset: StereoPairs, selection: Mapping[str, Any]) -> None:
+    """Raise unless samples are single frames, the same for every method, from left to right."""
+    chosen, windows = dataset.plan.pairs, dataset.plan.windows
     if windows.is_clip or isinstance(windows, Random):
         raise EvaluationError(
             f"frames must be 'all', 'first', numbers of frames or ('every', k), so that every "
@@ -209,16 +231,22 @@ def select_pairs(
         )
     if chosen.targets.shape[1] != 1 or (chosen.source > chosen.targets[:, 0]).any():
         raise EvaluationError(
-            f"a right view is generated from the view to its left; got pairs "
+            f"pairs are scored from the left view to the right one; got pairs "
             f"{selection.get('pairs', 'primary')!r}, direction "
             f"{selection.get('direction', 'left to right')!r}: choose pairs='primary', 'adjacent', "
             f"'all' or (left, right) numbers."
         )
+
+
+def _pairs_of_scenes(dataset: StereoPairs, size: Size | None) -> ScoredPairs:
+    plan, index = dataset.plan, dataset.index
+    chosen, windows = plan.pairs, plan.windows
     scenes: dict[int, list[PairFrames]] = {int(row): [] for row in plan.scene_rows}
     for row, left, right in zip(
         chosen.row.tolist(), chosen.source.tolist(), chosen.targets[:, 0].tolist(), strict=True
     ):
         scene = index.scene(row)
+        stored = scene.rig.image_height_px, scene.rig.image_width_px
         scenes[row].append(
             PairFrames(
                 scene=scene.id.key,
@@ -228,11 +256,11 @@ def select_pairs(
                     for number in range(windows.count(scene.frames))
                 ),
                 scene_frames=scene.frames,
-                size=protocol.size,
-                stored_size=(scene.rig.image_height_px, scene.rig.image_width_px),
+                size=size or stored,
+                stored_size=stored,
             )
         )
-    return index, scenes
+    return scenes
 
 
 def _require_whole(index: SceneIndex, lost: int, why: str = "") -> None:
@@ -245,8 +273,8 @@ def _require_whole(index: SceneIndex, lost: int, why: str = "") -> None:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Run:
+@dataclass(frozen=True)
+class Run(Generic[How]):
     """What is scored and how, and what identifies its results.
 
     Attributes:
@@ -261,14 +289,16 @@ class Run:
 
     index: SceneIndex
     scenes: ScoredPairs
-    protocol: EvaluationProtocol
+    protocol: How
     sources: tuple[PredictionSource, ...]
     tier: str
     donors: Mapping[str, str] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
 
 
-def score_pairs(run: Run, options: RunOptions | EvaluationOptions) -> list[Scores]:
+def score_pairs(
+    run: Run[EvaluationProtocol], options: RunOptions | EvaluationOptions
+) -> list[Scores]:
     """Return the scores of every source; scenes that ``out`` holds scores of are not scored again.
 
     Raises:
@@ -278,46 +308,73 @@ def score_pairs(run: Run, options: RunOptions | EvaluationOptions) -> list[Score
         StorageError: If data or results cannot be read or written.
         ExtraError: If a package or weights that a metric needs are not there.
     """
-    pairs = [pair for pairs in run.scenes.values() for pair in pairs]
-    folders = [str(each.root) for each in run.sources if isinstance(each, PredictionFolder)]
+    protocol = run.protocol
     try:
-        settings = settings_of(run.protocol)
+        settings = settings_of(protocol)
         state = {
-            "format": FORMAT,
-            "tier": run.tier,
-            "methods": [source.name for source in run.sources],
-            "data": run.index.digest,
-            "frames": sorted({pair.frames for pair in pairs}),
-            "pairs": sorted({pair.pair for pair in pairs}),
             "settings": settings,
             "matchers": [
                 place_of(matcher)
-                for matcher in (run.protocol.keypoint_matcher, run.protocol.stereo_matcher)
+                for matcher in (protocol.keypoint_matcher, protocol.stereo_matcher)
             ],
-            **({"predictions": folders} if folders else {}),
-            **run.settings,
         }
-        with ExitStack() as stack:
-            given = options.get("out") or stack.enter_context(
-                tempfile.TemporaryDirectory(prefix="stereogenbench-")
-            )
-            out = Path(given)
-            if run.protocol.device != "cpu" and isinstance(
-                options.get("engine", LOCAL), ProcessPool
-            ):
-                options = {**options, "workers": options.get("workers") or 1}
-            stack.enter_context(job_folder(out, state, kind=EVALUATION))
-            _score_missing_scenes(run, out, options)
+        if protocol.device != "cpu" and isinstance(options.get("engine", LOCAL), ProcessPool):
+            options = {**options, "workers": options.get("workers") or 1}
+        with scored_scenes(run, score_scene, state, options) as out:
             return [_scores(run, out, source.name, settings) for source in run.sources]
     finally:
         model_of.cache_clear()
 
 
-def _score_missing_scenes(run: Run, out: Path, options: RunOptions | EvaluationOptions) -> None:
+ScoreScene = Callable[[SceneWork[Any], Advance], tuple[str, SceneScores]]
+"""Returns a scene's key and its scores, and tells how many frames of pairs it has scored since."""
+
+
+@contextmanager
+def scored_scenes(
+    run: Run[Any],
+    score: ScoreScene,
+    state: Mapping[str, Any],
+    options: RunOptions | EvaluationOptions,
+) -> Iterator[Path]:
+    """Score what is not scored yet, and yield the folder that holds all scenes' scores.
+
+    Args:
+        run: What is scored.
+        score: How a scene is.
+        state: What scores depend on, besides what the run says.
+        options: How it is run.
+    """
+    pairs = [pair for pairs in run.scenes.values() for pair in pairs]
+    folders = [str(each.root) for each in run.sources if hasattr(each, "root")]
+    whole = {
+        "format": FORMAT,
+        "tier": run.tier,
+        "methods": [source.name for source in run.sources],
+        "data": run.index.digest,
+        "frames": sorted({pair.frames for pair in pairs}),
+        "pairs": sorted({pair.pair for pair in pairs}),
+        **state,
+        **({"predictions": folders} if folders else {}),
+        **run.settings,
+    }
+    with ExitStack() as stack:
+        given = options.get("out") or stack.enter_context(
+            tempfile.TemporaryDirectory(prefix="stereogenbench-")
+        )
+        out = Path(given)
+        stack.enter_context(job_folder(out, whole, kind=EVALUATION))
+        _score_missing_scenes(run, score, out, options)
+        yield out
+
+
+def _score_missing_scenes(
+    run: Run[Any], score: ScoreScene, out: Path, options: RunOptions | EvaluationOptions
+) -> None:
     """Score what is not scored yet, and keep each scene's scores as soon as it is done."""
     allowed = options.get("allow_missing", 0)
     stamps: dict[str, dict[tuple[str, Pair], str]] = {}
-    works: list[SceneWork] = []
+    works: list[SceneWork[Any]] = []
     missing: list[str] = []
     problems: list[str] = []
     done_frames = 0
@@ -352,7 +409,7 @@ def _score_missing_scenes(run: Run, out: Path, options: RunOptions | EvaluationO
         _write_scene(out, scene, scores)
 
     do_items(
-        score_scene,
+        score,
         works,
         name=lambda work: work.scene,
         keep=keep,
@@ -414,13 +471,33 @@ def _read_scene(out: Path, scene: str) -> SceneScores:
     return scores
 
 
-def _scores(run: Run, out: Path, name: str, settings: Mapping[str, Any]) -> Scores:
+def _scores(
+    run: Run[EvaluationProtocol], out: Path, name: str, settings: Mapping[str, Any]
+) -> Scores:
     """Return what a source scored; one scene's frames and features are in memory at a time."""
-    index, means = run.index, []
+    means = []
     gathered: dict[tuple[Labels, str], tuple[FeatureStatistics, FeatureStatistics]] = {}
+    for pair_means, scores in pair_scores(run, out, name):
+        means.append(pair_means)
+        columns = (run.index.column(each)[pair_means.row] for each in ("subset", "family"))
+        subset, family = columns
+        branch: Labels = (subset or "", family)
+        for metric in scores.predicted if pair_means.is_primary else ():
+            sides = scores.predicted[metric], scores.target[metric]
+            if (branch, metric) in gathered:
+                before = gathered[branch, metric]
+                sides = before[0].merged(sides[0]), before[1].merged(sides[1])
+            gathered[branch, metric] = sides
+    distances: dict[Labels, dict[str, FrechetDistance]] = {}
+    for (branch, metric), sides in gathered.items():
+        distances.setdefault(branch, {})[metric] = frechet_distance(*sides)
+    return Scores(name, run.tier, run.protocol, settings, run.index, tuple(means), distances)
+
+
+def pair_scores(run: Run[Any], out: Path, name: str) -> Iterator[tuple[PairMeans, PairScores]]:
+    """Yield what a source scored of each pair, scene by scene, averaged over frames and in full."""
     for row, pairs in run.scenes.items():
-        scene = index.scene(row)
-        branch: Labels = (scene.id.subset or "", scene.id.family)
+        scene = run.index.scene(row)
         found = _read_scene(out, scene.id.key)
         if not found:
             raise StorageError(
@@ -429,27 +506,15 @@ def _scores(run: Run, out: Path, name: str, settings: Mapping[str, Any]) -> Scor
             )
         for each in pairs:
             scores = found[name, each.pair]
-            is_primary = each.pair == scene.rig.primary_pair
-            means.append(
-                PairMeans(
-                    row=row,
-                    scene=each.scene,
-                    pair=each.pair,
-                    is_primary=is_primary,
-                    baseline_cm=scene.rig.baseline_cm(*each.pair),
-                    frames=len(each.frames),
-                    tallies=tallies(scores.columns),
-                    problem=scores.problem,
-                    views_sha256=scores.views_sha256,
-                )
+            means = PairMeans(
+                row=row,
+                scene=each.scene,
+                pair=each.pair,
+                is_primary=each.pair == scene.rig.primary_pair,
+                baseline_cm=scene.rig.baseline_cm(*each.pair),
+                frames=len(each.frames),
+                tallies=tallies(scores.columns),
+                problem=scores.problem,
+                views_sha256=scores.views_sha256,
             )
-            for metric in scores.predicted if is_primary else ():
-                sides = scores.predicted[metric], scores.target[metric]
-                if (branch, metric) in gathered:
-                    before = gathered[branch, metric]
-                    sides = before[0].merged(sides[0]), before[1].merged(sides[1])
-                gathered[branch, metric] = sides
-    distances: dict[Labels, dict[str, FrechetDistance]] = {}
-    for (branch, metric), sides in gathered.items():
-        distances.setdefault(branch, {})[metric] = frechet_distance(*sides)
-    return Scores(name, run.tier, run.protocol, settings, index, tuple(means), distances)
+            yield means, scores

@@ -25,12 +25,7 @@ from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.evaluate import select_pairs
 from stereogenbench_data.evaluation.predictions import PairFrames, frame_name, open_frames
-from stereogenbench_data.evaluation.protocol import (
-    PAPER_SIZE,
-    EvaluationProtocol,
-    Tier,
-    require_tier,
-)
+from stereogenbench_data.evaluation.protocol import PAPER_SIZE, Tier, require_tier
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import (
     JobKind,
@@ -40,6 +35,7 @@ from stereogenbench_data.jobs import (
     job_folder,
     named_errors,
 )
+from stereogenbench_data.samples.fields import require_size
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import require_options
@@ -93,9 +89,9 @@ def export_inputs(
     """
     require_options(export_inputs, options)
     known, root = require_tier(tier), Path(out)
-    protocol = EvaluationProtocol(metrics=("psnr",), size=size, depth=depth)
+    size = require_size(size)
     index, scenes = select_pairs(
-        data, protocol, inputs=known.inputs, options=options, conventions=conventions
+        data, known.inputs, size=size, depth=depth, options=options, conventions=conventions
     )
     wanted = [pair for pairs in scenes.values() for pair in pairs]
     settings = {

@@ -129,8 +129,15 @@ def open_frames(
         )
 
 
-def find_prediction(root: Path, wanted: PairFrames) -> Path:
-    """Return the folder of pictures or the video that holds a pair's prediction.
+def find_prediction(
+    root: Path, wanted: PairFrames, *, suffixes: Sequence[str] = VIDEO_SUFFIXES
+) -> Path:
+    """Return the folder of frames or the video that holds a pair's prediction.
+
+    Args:
+        root: The predictions.
+        wanted: The pair.
+        suffixes: Those of videos; none where a folder alone can hold it.
 
     Raises:
         PredictionError: If there is none, or more than one.
@@ -139,7 +146,7 @@ def find_prediction(root: Path, wanted: PairFrames) -> Path:
     named = [
         candidate
         for place in places
-        for candidate in (place, *(place.with_name(place.name + end) for end in VIDEO_SUFFIXES))
+        for candidate in (place, *(place.with_name(place.name + end) for end in suffixes))
     ]
     found = [path for path in named if path.is_dir() or (path.suffix and path.is_file())]
     if len(found) == 1:
@@ -149,7 +156,8 @@ def find_prediction(root: Path, wanted: PairFrames) -> Path:
             f"{wanted.label}: has several predictions, {found[0]} and {found[1]}: keep one."
         )
     raise PredictionError(
-        f"{wanted.label}: has no prediction in {root}; expected a folder or video "
+        f"{wanted.label}: has no prediction in {root}; expected a "
+        f"{'folder or video' if suffixes else 'folder'} "
         f"{places[0].relative_to(root)} or {places[1].name}."
     )
 

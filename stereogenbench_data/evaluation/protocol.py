@@ -75,6 +75,44 @@ def require_tier(name: object) -> Tier:
 
 
 @dataclass(frozen=True, slots=True)
+class DisparityProtocol:
+    """How disparity is scored.
+
+    Attributes:
+        size: (height, width) in pixels at which it is; None: at the stored size of the scenes.
+        max_disparity_px: Pixels whose true disparity is this or more are left out, and counted in
+            the column "beyond"; None scores all.
+        depth: A depth contract instead of the one that files and release state.
+        batch_frames: How many frames a callable is given at a time.
+    """
+
+    size: tuple[int, int] | None = None
+    max_disparity_px: float | None = None
+    depth: DepthEncoding | None = None
+    batch_frames: int = 8
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.size is not None:
+            object.__setattr__(self, "size", require_size(self.size))
+        if self.max_disparity_px is not None and not self.max_disparity_px > 0:
+            raise EvaluationError(
+                f"max_disparity_px must be above 0, got {self.max_disparity_px!r}."
+            )
+        if self.batch_frames < 1:
+            raise EvaluationError(f"batch_frames must be at least 1, got {self.batch_frames}.")
+
+    @property
+    def plotted(self) -> tuple[str, ...]:
+        """The columns that are drawn against the baseline."""
+        return ("epe", "bad_2", "d1")
+
+    def label(self, column: str) -> str:
+        """Return what tables call a column."""
+        return COLUMNS[column].label
+
+
+@dataclass(frozen=True, slots=True)
 class EvaluationProtocol:
     """What is computed and how.
 
@@ -111,6 +149,11 @@ class EvaluationProtocol:
         """The columns of every frame, in the order of `COLUMNS`."""
         filled = {name for metric in self.metrics for name in FRAME_METRICS.get(metric, ())}
         return tuple(name for name in COLUMNS if name in filled)
+
+    @property
+    def plotted(self) -> tuple[str, ...]:
+        """The columns that are drawn against the baseline."""
+        return tuple(name for name in self.columns if COLUMNS[name].better != "neither")
 
     def label(self, column: str) -> str:
         """Return what tables call a column: with the backend, of a model of one's own its class."""

@@ -18,6 +18,7 @@ from stereogenbench_data.evaluation.predictions import pair_name
 from stereogenbench_data.evaluation.protocol import PROTOCOL_VERSION, TIERS
 from stereogenbench_data.evaluation.tables import (
     CONTROL,
+    DISPARITY,
     Cell,
     PairMeans,
     Scores,
@@ -69,7 +70,8 @@ def page(results: Sequence[Scores], tables: Sequence[Table]) -> str:
     """Return an evaluation as a Markdown page: what was scored, the tables, every choice."""
     first = results[0]
     names = ", ".join(markdown_text(one.name) for one in results)
-    tier = "" if first.tier == CONTROL else f", tier {first.tier}: {TIERS[first.tier].meaning}"
+    is_tier = first.tier in TIERS
+    tier = f", tier {first.tier}: {TIERS[first.tier].meaning}" if is_tier else ""
     lines = [
         f"# {names}{tier}",
         "",
@@ -82,7 +84,8 @@ def page(results: Sequence[Scores], tables: Sequence[Table]) -> str:
         lines.append(
             f"- {markdown_text(one.name)}: {counted(covered['pairs'], 'pair')} of "
             f"{counted(covered['scenes'], 'scene')}, {counted(covered['frames'], 'frame')}, "
-            f"right views sha256 {one.views_sha256}"
+            f"{'disparity maps' if first.tier == DISPARITY else 'right views'} sha256 "
+            f"{one.views_sha256}"
             + (f", {counted(len(missing), 'pair')} missing" if missing else "")
         )
         lines += [f"  - missing: {markdown_text(each)}" for each in missing[:_GAPS_SHOWN]]
@@ -141,8 +144,8 @@ def write_plots(folder: Path, results: Sequence[Scores]) -> list[Path]:
     except ImportError as error:
         raise missing_extra("plots", "plots", error) from None
     written = []
-    for column, facts in COLUMNS.items():
-        if facts.better == "neither" or not any(_scored(one.pairs, column) for one in results):
+    for column in results[0].protocol.plotted:
+        if not any(_scored(one.pairs, column) for one in results):
             continue
         figure = Figure(figsize=_SIZE_IN, layout="constrained")
         _draw(figure.add_subplot(), results, column)
@@ -189,7 +192,7 @@ def _draw(axes: Any, results: Sequence[Scores], column: str) -> None:
         axes.set_yscale("symlog", linthresh=0.1)
     axes.set_xlabel("baseline in cm")
     axes.set_ylabel(f"{protocol.label(column)} ({facts.better} is better)")
-    shown = "calibration controls" if tier == CONTROL else f"tier {tier}"
+    shown = {CONTROL: "calibration controls", DISPARITY: "all pixels"}.get(tier, f"tier {tier}")
     axes.set_title(f"{protocol.label(column)} by baseline, {shown}", fontsize=11)
     axes.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
 

@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any, Final
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -85,15 +85,21 @@ def settings_of(protocol: EvaluationProtocol) -> dict[str, Any]:
         "depth": "as the files state" if protocol.depth is None else repr(protocol.depth),
         "metrics": list(protocol.metrics),
         "averages": "frames first, then scenes; intervals are Student's over scenes",
-        "versions": {},
+        "versions": versions(),
     }
-    for package in _VERSIONS:
-        with suppress(PackageNotFoundError):
-            settings["versions"][package] = version(package)
     for name in protocol.metrics:
         row = FRAME_METRIC_ROWS.get(name)
         settings[name] = dict(row.settings(protocol) if row else model_of(protocol, name).settings)
     return settings
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of this package and of those that scores are computed with."""
+    found = {}
+    for package in _VERSIONS:
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
 
 
 class CachedKeypoints:
@@ -259,8 +265,12 @@ SceneScores = dict[tuple[str, Pair], PairScores]
 """The scores of a scene, by the source's name and the pair."""
 
 
-@dataclass(frozen=True, slots=True)
-class SceneWork:
+How = TypeVar("How")
+"""The protocol: of right views, or of disparity."""
+
+
+@dataclass(frozen=True)
+class SceneWork(Generic[How]):
     """One scene to score.
 
     Attributes:
@@ -272,7 +282,7 @@ class SceneWork:
 
     index: SceneIndex
     pairs: tuple[PairFrames, ...]
-    protocol: EvaluationProtocol
+    protocol: How
     sources: tuple[PredictionSource, ...]
 
     @property
@@ -281,7 +291,9 @@ class SceneWork:
         return self.pairs[0].scene
 
 
-def score_scene(work: SceneWork, after_frames: Advance) -> tuple[str, SceneScores]:
+def score_scene(
+    work: SceneWork[EvaluationProtocol], after_frames: Advance
+) -> tuple[str, SceneScores]:
     """Return a scene's key, and the scores of each source and pair of it.
 
     Args:

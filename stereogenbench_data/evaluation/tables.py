@@ -23,7 +23,11 @@ from stereogenbench_data.errors import EvaluationError, missing_extra
 from stereogenbench_data.evaluation.columns import COLUMNS, FRAME_METRICS
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.metrics.scale import LEAST_R2, SD_OF_THE_PAPER
-from stereogenbench_data.evaluation.protocol import PAPER_SIZE, EvaluationProtocol
+from stereogenbench_data.evaluation.protocol import (
+    PAPER_SIZE,
+    DisparityProtocol,
+    EvaluationProtocol,
+)
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import (
     BASELINE_BINS,
@@ -232,6 +236,9 @@ Labels = tuple[str, ...]
 CONTROL: Final = "control"
 """The tier of calibration controls."""
 
+DISPARITY: Final = "disparity"
+"""What stands for the tier where disparity is scored: a method is given both views."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scores:
@@ -239,7 +246,7 @@ class Scores:
 
     Attributes:
         name: What tables call it.
-        tier: "G0", "G1", "G2" or "control".
+        tier: "G0", "G1", "G2", "control" or "disparity".
         protocol: How it was scored.
         settings: The same with every choice of every metric, as plain values.
         index: The index of the scenes.
@@ -249,7 +256,7 @@ class Scores:
 
     name: str
     tier: str
-    protocol: EvaluationProtocol
+    protocol: EvaluationProtocol | DisparityProtocol
     settings: Mapping[str, Any]
     index: SceneIndex
     pairs: tuple[PairMeans, ...]
@@ -395,7 +402,7 @@ class Table:
     name: str
     title: str
     keys: tuple[str, ...]
-    protocol: EvaluationProtocol
+    protocol: EvaluationProtocol | DisparityProtocol
     columns: tuple[str, ...]
     rows: tuple[TableRow, ...]
     notes: tuple[str, ...] = ()
@@ -432,31 +439,32 @@ def table_of(results: Sequence[Scores], name: str, *, form: TableForm | None = N
         form: What it shows.
     """
     first, form = results[0], form or TABLES[name]
+    protocol = first.protocol
+    if isinstance(protocol, DisparityProtocol):
+        raise EvaluationError("scores of disparity have tables of their own: `disparity_tables`.")
     scored_rows = {pair.row for one in results for pair in one.pairs if not pair.problem}
     scored = "all" if name == "controls" else "some"
     differs = release_difference(first.index, scored_rows, scored=scored) if form.paper else ""
-    rows = _rows(results, form, differs=differs)
+    rows = rows_of(results, form, differs=differs)
     explains = name == "explanations"
-    columns = [
-        each for each in first.protocol.columns if (COLUMNS[each].better == "neither") == explains
-    ]
+    columns = [each for each in protocol.columns if (COLUMNS[each].better == "neither") == explains]
     if name == "branches":
         distances = {
             metric for one in results for each in one.distances.values() for metric in each
         }
-        columns += [each for each in first.protocol.metrics if each in distances]
+        columns += [each for each in protocol.metrics if each in distances]
     return Table(
         name=name,
         title=form.title if first.tier == CONTROL else f"{form.title} (tier {first.tier})",
         keys=form.keys,
-        protocol=first.protocol,
+        protocol=protocol,
         columns=tuple(columns),
         rows=tuple(rows),
-        notes=tuple(_notes(results, rows, columns, form=form, differs=differs)),
+        notes=tuple(_notes(protocol, results, rows, columns, form=form, differs=differs)),
     )
 
 
-def _rows(results: Sequence[Scores], form: TableForm, *, differs: str) -> list[TableRow]:
+def rows_of(results: Sequence[Scores], form: TableForm, *, differs: str = "") -> list[TableRow]:
     """Return the rows of groups in the order of tables: every method's, then the paper's."""
     label_of = [_labels_by(key, results) for key in form.keys]
     groups_of = [
@@ -574,6 +582,7 @@ def _notes_of_odd_cells(rows: Sequence[TableRow], columns: Sequence[str]) -> lis
 
 
 def _notes(
+    protocol: EvaluationProtocol,
     results: Sequence[Scores],
     rows: Sequence[TableRow],
     columns: Sequence[str],
@@ -582,7 +591,7 @@ def _notes(
     differs: str,
 ) -> list[str]:
     """Return the notes of a table: its sources, and what is not comparable."""
-    protocol, of_frames = results[0].protocol, [each for each in columns if each in COLUMNS]
+    of_frames = [each for each in columns if each in COLUMNS]
     paper = [row for row in rows if row.source == "paper"]
     notes = []
     if any(column.startswith("sd_filtered") for column in of_frames):

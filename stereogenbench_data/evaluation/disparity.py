@@ -1,0 +1,316 @@
+"""Score the disparity that a method finds: end-point error, bad pixels, D1, by regions and ranges.
+
+The second scorer beside `evaluate`, which scores right views: the same selection, resumable
+results, averages and tables. What is measured is said in `metrics.disparity`.
+"""
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Unpack
+
+import numpy as np
+import torch
+
+from stereogenbench_data.datasets.mapped import Data
+from stereogenbench_data.engine import LOCAL, Advance
+from stereogenbench_data.errors import EvaluationError, PredictionError
+from stereogenbench_data.evaluation.disparity_maps import CalledMatcher, DisparityFolder, Matcher
+from stereogenbench_data.evaluation.evaluate import (
+    EvaluationOptions,
+    Run,
+    pair_scores,
+    scored_scenes,
+    select_pairs,
+)
+from stereogenbench_data.evaluation.metrics.disparity import (
+    COLUMNS_OF_FRAMES,
+    D1_PX,
+    D1_SHARE,
+    MEASURES,
+    RANGES_PX,
+    REGIONS,
+    frame_scores,
+)
+from stereogenbench_data.evaluation.predictions import PairFrames, PredictionSource, open_frames
+from stereogenbench_data.evaluation.protocol import DisparityProtocol
+from stereogenbench_data.evaluation.scene_scores import (
+    RESIZE,
+    PairScores,
+    SceneScores,
+    SceneWork,
+    versions,
+)
+from stereogenbench_data.evaluation.tables import (
+    DISPARITY,
+    PairMeans,
+    Scores,
+    Table,
+    TableForm,
+    TableRow,
+    cell,
+    require_comparable,
+    rows_of,
+)
+from stereogenbench_data.samples.fields import PAIR_FIELDS, Sample
+from stereogenbench_data.schema.conventions import Conventions
+from stereogenbench_data.selection.filters import require_options
+
+_TRUTH: Final = ("disparity", "valid", "visible", "frame_index")
+_SHOWN: Final = ("epe", "rms", "bad_1", "bad_2", "bad_3", "d1", "invalid")
+"""The columns of tables whose rows are groups of pairs."""
+_DENOMINATORS: Final = (
+    "EPE, RMS and quantiles (A50 to A99) are over answered pixels; bad, D1 and invalid over scored "
+    "pixels, where no answer is bad. Nothing is filled, clipped or pooled over frames."
+)
+
+
+def evaluate_disparity(
+    data: Data,
+    predictions: str | Path | Matcher,
+    *,
+    name: str | None = None,
+    protocol: DisparityProtocol | None = None,
+    conventions: str | Path | Conventions | None = None,
+    **options: Unpack[EvaluationOptions],
+) -> Scores:
+    """Score the disparity of a method and return its scores, for `disparity_tables`.
+
+    Args:
+        data: What `StereoPairs` takes: a folder of scenes or shards, its URL, an index.
+        predictions: A folder of disparity maps of left views (see `disparity_maps` for its layout);
+            or a callable that is given ``left`` and ``right``, uint8 (n, 3, h, w), some frames of
+            one pair in order, and returns floats (n, h, w) or (n, 1, h, w), px, nan or inf where it
+            has no answer. Disparity is positive: x_right = x_left - disparity.
+        name: What tables call the method; else the folder's or the callable's name. A callable
+            whose results ``out`` keeps must be given one.
+        protocol: At which size, and which pixels; the stored size and all unless given.
+        conventions: How the files of a folder are read, as for `StereoPairs`.
+        **options: How it is run (`RunOptions`) and what is scored (`Selection`).
+
+    Raises:
+        EvaluationError: If a prediction is missing, or is not what it must be, naming it; if
+            ``out`` holds results of other settings, predictions or names.
+        SelectionError: If nothing matches the selection.
+    """
+    require_options(evaluate_disparity, options)
+    protocol = protocol or DisparityProtocol()
+    source: PredictionSource
+    if callable(predictions):
+        called = name or str(getattr(predictions, "__name__", type(predictions).__name__))
+        if options.get("out") and not name:
+            raise EvaluationError(
+                f"{options['out']}: is to keep the scores of {called}, and another method may be "
+                f"called so, too. Pass name=..., another for each method, parameter and checkpoint."
+            )
+        source = CalledMatcher(called, predictions)
+        options["workers"], options["engine"] = 1, LOCAL
+    else:
+        root = Path(predictions).resolve()
+        if not root.is_dir():
+            raise EvaluationError(
+                f"{root}: is not a folder. Pass the folder that holds the disparity maps."
+            )
+        source = DisparityFolder(name or root.name, root, protocol.max_disparity_px)
+    index, scenes = select_pairs(
+        data,
+        (*_TRUTH, *source.inputs),
+        size=protocol.size,
+        depth=protocol.depth,
+        options=options,
+        conventions=conventions,
+    )
+    settings = _settings_of(protocol)
+    run = Run(index, scenes, protocol, (source,), DISPARITY)
+    with scored_scenes(run, score_disparity, {"settings": settings}, options) as out:
+        pairs = tuple(means for means, _ in pair_scores(run, out, source.name))
+    return Scores(source.name, run.tier, protocol, settings, index, pairs)
+
+
+def _settings_of(protocol: DisparityProtocol) -> dict[str, Any]:
+    """Return every choice that the scores depend on, as plain values."""
+    size, most = protocol.size, protocol.max_disparity_px
+    return {
+        "size": "as stored" if size is None else f"{size[1]}x{size[0]}",
+        "resize": "none" if size is None else RESIZE,
+        "depth": "as the files state" if protocol.depth is None else repr(protocol.depth),
+        "scored": "valid pixels" if most is None else f"valid pixels below {most:g} px",
+        "measures": list(MEASURES),
+        "d1": f"error above {D1_PX:g} px and above {D1_SHARE:.0%} of the true disparity",
+        "denominators": _DENOMINATORS,
+        "averages": "pixels first, then frames, then scenes; intervals are Student's over scenes",
+        "versions": versions(),
+    }
+
+
+@dataclass(slots=True)
+class _PairErrors:
+    """Gathers the scores of one method's disparity of one pair."""
+
+    scores: PairScores
+    pixels: Any
+
+    def add(self, maps: Sequence[Any], samples: Sequence[Sample], most_px: float | None) -> None:
+        for found, sample in zip(maps, samples, strict=True):
+            self.pixels.update(np.ascontiguousarray(found, dtype="<f8").data)
+            truth = {name: torch.from_numpy(sample[name][0]) for name in _TRUTH[:3]}
+            numbers = frame_scores(
+                torch.from_numpy(np.ascontiguousarray(found)),
+                truth["disparity"],
+                valid=truth["valid"],
+                visible=truth["visible"],
+                max_disparity_px=most_px,
+            )
+            for name, number in numbers.items():
+                self.scores.columns[name].append(number)
+
+
+def score_disparity(
+    work: SceneWork[DisparityProtocol], after_frames: Advance
+) -> tuple[str, SceneScores]:
+    """Return a scene's key, and the scores of each method and pair of it.
+
+    Args:
+        work: What to score.
+        after_frames: Called with how many frames of pairs were scored since; it may raise to
+            stop the work.
+
+    Raises:
+        StorageError: If a file of the data is missing or altered.
+        MediaError: If a video of the data does not decode.
+    """
+    protocol = work.protocol
+    row = list(work.index.column("key")).index(work.scene)
+    needed = {*_TRUTH, *(each for source in work.sources for each in source.inputs)}
+    fields = tuple(name for name in PAIR_FIELDS if name in needed)
+    gathered = {
+        (source.name, wanted.pair): _PairErrors(
+            PairScores({name: [] for name in COLUMNS_OF_FRAMES}), hashlib.sha256()
+        )
+        for source in work.sources
+        for wanted in work.pairs
+    }
+    with ExitStack() as stack:
+        stack.enter_context(_one_thread())
+        load = stack.enter_context(
+            open_frames(work.index, fields, size=protocol.size, depth=protocol.depth)
+        )
+        reads = [(each.name, stack.enter_context(each.open(work.index))) for each in work.sources]
+        for batch in _batches(work.pairs, protocol.batch_frames):
+            for wanted, frames in batch:
+                samples = [load(row, wanted.pair, frame) for frame in frames]
+                for name, read in reads:
+                    found = gathered[name, wanted.pair]
+                    if found.scores.problem:
+                        continue
+                    try:
+                        maps = read(wanted, samples)
+                        found.add(maps, samples, protocol.max_disparity_px)
+                    except PredictionError as problem:
+                        found.scores = PairScores(problem=str(problem))
+                    except EvaluationError as problem:
+                        found.scores = PairScores(problem=f"{wanted.label}: {name}: {problem}")
+                after_frames(len(frames))
+    for found in gathered.values():
+        found.scores.views_sha256 = "" if found.scores.problem else found.pixels.hexdigest()
+    return work.scene, {place: found.scores for place, found in gathered.items()}
+
+
+def _batches(
+    pairs: Sequence[PairFrames], size: int
+) -> Iterator[list[tuple[PairFrames, tuple[int, ...]]]]:
+    """Yield some frames of every pair, which share cameras, and then those after them."""
+    for start in range(0, len(pairs[0].frames), size):
+        yield [(wanted, wanted.frames[start : start + size]) for wanted in pairs]
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let torch compute on the calling thread alone: sums are then the same to the last digit."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def disparity_tables(
+    results: Sequence[Scores], *, by: Sequence[str] = ("map_name",)
+) -> list[Table]:
+    """Return the tables of scored disparity: by groups of pairs, regions and true disparity.
+
+    Args:
+        results: Each method's scores (`evaluate_disparity`).
+        by: Columns of the index to stratify by, besides branches and baselines.
+
+    Raises:
+        EvaluationError: If the methods were scored in different ways, or on other data, or if the
+            index has no such column with one value a scene.
+    """
+    require_comparable(results)
+    branch = ("subset", "family")
+    has_others = any(not pair.is_primary for one in results for pair in one.pairs)
+    forms = {
+        "branches": TableForm("Evaluation branches, primary pairs", branch),
+        "bins_primary": TableForm("Baseline in cm, primary pairs", (*branch, "baseline")),
+    }
+    if has_others:
+        forms["bins_all"] = TableForm("Baseline in cm, all pairs", (*branch, "baseline"), "all")
+    forms |= {f"by_{each}": TableForm(f"By {each}, primary pairs", (*branch, each)) for each in by}
+    tables = [
+        _table(results, name, form.title, form.keys, _SHOWN, rows_of(results, form))
+        for name, form in forms.items()
+    ]
+    regions = {"all": "", **{region: f"_{region}" for region in REGIONS}}
+    ranges = {part: f"_{part}" for part in RANGES_PX}
+    title = "What the right camera sees, all pairs"
+    tables.append(
+        _table(results, "regions", title, ("region",), MEASURES, _parts(results, regions))
+    )
+    title = "True disparity in px, all pairs"
+    rows = _parts(results, ranges)
+    tables.append(_table(results, "ranges", title, ("disparity",), MEASURES, rows))
+    return tables
+
+
+def _table(
+    results: Sequence[Scores],
+    name: str,
+    title: str,
+    keys: tuple[str, ...],
+    columns: Sequence[str],
+    rows: Sequence[TableRow],
+) -> Table:
+    protocol: Any = results[0].protocol
+    notes, shown = [_DENOMINATORS], tuple(columns)
+    if protocol.max_disparity_px is not None and name == "branches":
+        shown = (*columns, "beyond")
+        notes.append(f"Left out are valid pixels from {protocol.max_disparity_px:g} px on.")
+    return Table(name, f"{title} (disparity)", keys, protocol, shown, tuple(rows), tuple(notes))
+
+
+def _parts(results: Sequence[Scores], parts: Mapping[str, str]) -> list[TableRow]:
+    """Return a row for each part of the pixels of all pairs, of every method; none of no pixel."""
+    rows = []
+    for part, ending in parts.items():
+        for one in results:
+            scored = [pair for pair in one.pairs if not pair.problem]
+            there: list[PairMeans] = [
+                pair for pair in scored if pair.tallies[f"invalid{ending}"].finite
+            ]
+            if there:
+                rows.append(
+                    TableRow(
+                        source="scored",
+                        method=one.name,
+                        labels=(part,),
+                        scenes=len({pair.scene for pair in there}),
+                        frames=sum(pair.tallies[f"invalid{ending}"].finite for pair in there),
+                        missing=len(one.pairs) - len(scored),
+                        values={name: cell(there, f"{name}{ending}") for name in MEASURES},
+                    )
+                )
+    return rows
