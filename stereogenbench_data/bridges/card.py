@@ -2,65 +2,30 @@
 
 ``load_dataset("ORG/NAME", "Uniform", split="train", streaming=True)`` reads from its YAML head
 which shards to load, and that videos stay bytes. The rest is for people: the template `card.md`.
-
-The Hub's viewer shows one row a scene, with a small picture. It reads all configs of a card in the
-format of the first one, which is of tars, so the rows are tars too: a member for each column.
-
-    viewer/train.tar              train/Uniform/Town/scene_000001.preview.jpg, ...map.txt, ...
-    viewer/eval_seen_map.tar      eval/MapSeenInTrain/Uniform/Town/scene_000000.preview.jpg, ...
 """
 
 import fnmatch
-import io
-import json
-import tarfile
 from collections import Counter
-from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from PIL import Image
 
 from stereogenbench_data.bridges import dataset_facts
 from stereogenbench_data.bridges.in_memory import columns
-from stereogenbench_data.bridges.picture import draw_sheet, pair_tiles
-from stereogenbench_data.datasets.mapped import StereoPairs
-from stereogenbench_data.engine import Advance, Progress, advance_of
 from stereogenbench_data.errors import DescriptorError, explain_os_errors, needs_extra
-from stereogenbench_data.geometry.camera import rig_intrinsics
+from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.records import Scene, SceneId
+from stereogenbench_data.schema.records import SceneId
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     CAMERA_PAIRS,
     TRAINING_JSON,
 )
 from stereogenbench_data.schema.text import counted, markdown_text
-from stereogenbench_data.sources.files import open_atomic, write_atomic
-
-_COLUMNS: Final[dict[str, tuple[str, Callable[[Scene], Any]]]] = {
-    "map.txt": ("string", lambda scene: scene.id.map_name),
-    "family.txt": ("string", lambda scene: scene.id.family),
-    "description.txt": ("string", lambda scene: scene.caption),
-    "shard.txt": ("string", lambda scene: next(iter(scene.members.values())).path),
-    "frames.json": ("int64", lambda scene: scene.frames),
-    "width_px.json": ("int64", lambda scene: scene.rig.image_width_px),
-    "height_px.json": ("int64", lambda scene: scene.rig.image_height_px),
-    "focal_mm.json": ("float64", lambda scene: scene.rig.focal_mm),
-    "shortest_baseline_cm.json": ("float64", lambda scene: min(scene.rig.baselines_cm)),
-    "longest_baseline_cm.json": ("float64", lambda scene: max(scene.rig.baselines_cm)),
-}
-FEATURES: Final[dict[str, str]] = {
-    "preview.jpg": "image",
-    **{name: kind for name, (kind, _) in _COLUMNS.items()},
-    "__key__": "string",
-    "__url__": "string",
-}
-"""Columns and their types, as `datasets` writes them."""
-_WIDEST_PX: Final = 240
-_MARK: Final = "stereogenbench.index"
+from stereogenbench_data.sources.files import write_atomic
+from stereogenbench_data.sources.location import is_remote, local_path
+from stereogenbench_data.sources.members import require_own_files
 
 
 def split_name(scene: SceneId) -> str:
@@ -68,93 +33,9 @@ def split_name(scene: SceneId) -> str:
     return scene.split if scene.subset is None else f"{scene.split}_{scene.subset}"
 
 
-def viewer_tar(split: str) -> str:
-    """Return the path of a split's tar below the shards."""
-    return f"viewer/{split}.tar"
-
-
-def viewer_tars(index: SceneIndex) -> dict[str, list[int]]:
-    """Return the scenes' rows of the index for each tar, by its path below the shards."""
-    rows: dict[str, list[int]] = {}
-    for row in range(len(index)):
-        path = viewer_tar(split_name(index.scene(row).id))
-        rows.setdefault(path, []).append(row)
-    return rows
-
-
-def write_viewer_rows(
-    index: SceneIndex, folder: Path, *, progress: Progress | None = None
-) -> list[Path]:
-    """Write a tar of rows for each split below a folder of shards, and return their paths.
-
-    A tar that was written from the same index is left as it is.
-
-    Args:
-        index: The index of the shards.
-        folder: The folder below which ``viewer/`` is written.
-        progress: Called with (scenes done, scenes in all).
-
-    Raises:
-        DescriptorError: If a file cannot be written.
-        StorageError, MediaError: If a scene's pictures cannot be read.
-    """
-    rows_of = {folder / name: rows for name, rows in viewer_tars(index).items()}
-    advance = advance_of(progress, total=len(index))
-    cannot = f"{folder / 'viewer'}: cannot be written"
-    with explain_os_errors(cannot, "Check the disk.", kind=DescriptorError):
-        for path, rows in rows_of.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if _digest_of(path) == index.digest:
-                advance(len(rows))
-            else:
-                _write(index, rows, path, advance=advance)
-    return [*rows_of]
-
-
-def _digest_of(path: Path) -> str:
-    """Return the digest of the index that a tar was written from, empty if there is no such tar."""
-    try:
-        with tarfile.open(path) as tar:
-            return tar.pax_headers.get(_MARK, "")
-    except (FileNotFoundError, tarfile.TarError):
-        return ""
-
-
-def _write(index: SceneIndex, rows: list[int], path: Path, *, advance: Advance) -> None:
-    rig = index.scene(rows[0]).rig
-    width = min(_WIDEST_PX, rig.image_width_px)
-    size = (round(rig.image_height_px * width / rig.image_width_px), width)
-    pairs = StereoPairs(
-        index, frames=[0], size=size, check="metadata",
-        split=sorted(set(index.column("split").tolist())),
-        fields=("left", "right", "disparity", "valid", "baseline_m"),
-    )  # fmt: skip
-    options: dict[str, Any] = {"format": tarfile.PAX_FORMAT, "pax_headers": {_MARK: index.digest}}
-    with (
-        closing(pairs),
-        open_atomic(path) as file,
-        tarfile.open(fileobj=file, mode="w", **options) as tar,
-    ):
-        for row in rows:
-            scene, picture = index.scene(row), io.BytesIO()
-            fx_px = rig_intrinsics(scene.rig).fx_px * width / scene.rig.image_width_px
-            sheet = draw_sheet([], [pair_tiles(pairs[row], fx_px=fx_px)], width_px=width)
-            Image.fromarray(sheet).save(picture, format="JPEG", quality=85)
-            contents = {"preview.jpg": picture.getvalue()}
-            for name, (kind, value) in _COLUMNS.items():
-                text = value(scene) if kind == "string" else json.dumps(value(scene))
-                contents[name] = text.encode()
-            for name, content in contents.items():
-                member = tarfile.TarInfo(f"{scene.id.key}.{name}")
-                member.size = len(content)
-                tar.addfile(member, io.BytesIO(content))
-            advance(1)
-
-
 CARD_NAME: Final = "README.md"
 MARK: Final = "<!-- made by stereogenbench publish card -->"
 """Marks a card that this package wrote. A README.md without it is never overwritten."""
-_SCENES: Final = "scenes"
 _TASKS: Final = ("depth-estimation", "image-to-image", "image-to-video", "image-to-3d")
 """Tasks that the Hub lists for datasets; it hides video-to-video there."""
 _TAGS: Final = (
@@ -174,7 +55,7 @@ _RESPONSIBLE_USE: Final = (
 
 
 def card(index: SceneIndex, *, repository: str, about: dataset_facts.About | None = None) -> str:
-    """Return the card of shards, whose config "scenes" is what `viewer` writes beside them.
+    """Return the card of shards.
 
     Args:
         index: The index of the shards.
@@ -217,24 +98,24 @@ def write_card(
     *,
     repository: str,
     about: dataset_facts.About | None = None,
-    progress: Progress | None = None,
 ) -> Path:
-    """Write the card beside the shards, and the scenes that the Hub's viewer shows.
+    """Write the card, and check that a client of the Hub would upload the shards' own files alone.
 
     Args:
         index: The index of the shards.
         folder: Where to write.
         repository: "ORG/NAME" on the Hub.
         about: As for `card`.
-        progress: Called with (scenes done, scenes in all) while pictures of scenes are written.
 
     Raises:
         ExtraError: If huggingface_hub is not installed.
         DescriptorError: If a file cannot be written, the folder has another README.md, or who made
             the scenes is not known.
-        StorageError, MediaError: If a scene's pictures cannot be read.
+        StorageError: If a shard leads out of its folder by a link, which would be followed.
     """
     path = folder / CARD_NAME
+    if not is_remote(index.root):
+        require_own_files(local_path(index.root), [*index.shards, INDEX_NAME])
     text = card(index, repository=repository, about=about)
     cannot = f"{path}: cannot be written"
     with explain_os_errors(cannot, "Choose another place with --out.", kind=DescriptorError):
@@ -243,7 +124,6 @@ def write_card(
                 f"{path}: exists and was not written by this package. Move it away, or add "
                 f"{MARK!r} to it to have it replaced."
             )
-        write_viewer_rows(index, folder, progress=progress)
         write_atomic(path, text.encode())
     return path
 
@@ -262,7 +142,6 @@ def _head(index: SceneIndex, facts: dataset_facts.Facts, configs: _Configs) -> d
     members = index.scene(0).members
     videos = sorted(name for name in members if name.startswith("cam_"))
     own = columns(videos, of_training=TRAINING_JSON in members)
-    features = {name: FEATURES if name == _SCENES else own for name in configs}
     return {
         "pretty_name": facts["name"],
         **(other if licence is None else {"license": licence}),
@@ -283,15 +162,15 @@ def _head(index: SceneIndex, facts: dataset_facts.Facts, configs: _Configs) -> d
         "dataset_info": [
             {
                 "config_name": config,
-                "features": [{"name": name, "dtype": kind} for name, kind in kinds.items()],
+                "features": [{"name": name, "dtype": kind} for name, kind in own.items()],
             }
-            for config, kinds in features.items()
+            for config in configs
         ],
     }
 
 
 def _configs(index: SceneIndex) -> _Configs:
-    """Return config to split to patterns of tars: a config for all, one a family, the scenes."""
+    """Return config to split to patterns of tars: a config for all, and one a family."""
     found: dict[str, dict[str, set[str]]] = {"all": {}}
     for row in range(len(index)):
         scene = index.scene(row)
@@ -303,7 +182,7 @@ def _configs(index: SceneIndex) -> _Configs:
     for config in ["all", *sorted(found.keys() - {"all"})]:
         names = sorted(found[config], key=lambda split: (split != "train", split))
         configs[config] = {split: _patterns(found[config][split], index) for split in names}
-    return configs | {_SCENES: {split: [viewer_tar(split)] for split in configs["all"]}}
+    return configs
 
 
 def _patterns(paths: set[str], index: SceneIndex) -> list[str]:

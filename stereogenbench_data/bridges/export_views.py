@@ -1,12 +1,11 @@
-"""Export scenes to what reads several views: COLMAP, nerfstudio and gsplat, PLY, MoGe.
+"""Export scenes to what reads several views: COLMAP, nerfstudio and gsplat, PLY.
 
     OUT/export.json                        the layout and the settings, the same for all of OUT
     OUT/<key of a scene>/frame_000/...     the views of one moment
-    OUT/.index.txt                         of MoGe: its folders
 
 Each of these folders is written beside its place and renamed, so that a stopped run goes on and a
 killed one leaves nothing that is incomplete. Each writer of a format states its own axes and pixel
-centres; all but MoGe's put the world's origin at the centre of the first camera, and say in
+centres, puts the world's origin at the centre of the first camera, and say in
 ``stereogenbench.json`` how to come back to the scene's world.
 """
 
@@ -21,7 +20,6 @@ from typing import Any, Final, Literal, Unpack
 import numpy as np
 from jaxtyping import Float64, Int64
 from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 
 from stereogenbench_data.bridges.exports import depth_setting, training_filters
 from stereogenbench_data.bridges.multiview import (
@@ -41,16 +39,12 @@ from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters, require_options, whole_number
 from stereogenbench_data.selection.plan import Address, FramesSpec
-from stereogenbench_data.sources.files import write_atomic
 
 ABOUT_JSON: Final = "stereogenbench.json"
 """What a folder shows, and the way back to the scene's world."""
-INDEX_TXT: Final = ".index.txt"
-"""MoGe's list of its folders."""
 
 _FAST: Final = 1
 """zlib's level of the PNGs: three times as fast as the default, a tenth larger."""
-_JPEG_QUALITY: Final = 95
 _OPENGL_FROM_OPENCV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 _Z_UP_FROM_Y_DOWN: Final = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -244,52 +238,12 @@ def _write_points(path: Path, images: Sequence[PosedImage], points: int | None) 
         file.writelines(cloud.tobytes() for cloud in clouds)
 
 
-def write_moge(folder: Path, images: Sequence[PosedImage], points: int | None) -> None:
-    """Write a folder a picture: ``image.jpg``, ``depth.png``, ``meta.json``.
-
-    Depth is 16 bits on a logarithmic scale between the nearest and the farthest of the picture, 0
-    where it is not measured. Intrinsics are those of a picture of width and height 1.
-
-    Source: microsoft/MoGe, docs/train.md, moge/utils/io.py.
-    """
-    for image in images:
-        place = folder / f"cam_{image.camera:02d}"
-        place.mkdir()
-        Image.fromarray(image.rgb).save(place / "image.jpg", quality=_JPEG_QUALITY, subsampling=0)
-        _write_log_depth(place / "depth.png", image.depth_m)
-        height, width = image.size
-        meta = {
-            "intrinsics": (np.diag([1 / width, 1 / height, 1.0]) @ image.intrinsics).tolist(),
-            "scene": image.scene,
-            "camera": image.camera,
-            "frame": image.frame,
-        }
-        _write_json(place / "meta.json", meta)
-
-
-Layout = Literal["colmap", "transforms", "ply", "moge"]
+Layout = Literal["colmap", "transforms", "ply"]
 WRITERS: Final[Mapping[Layout, ViewWriter]] = {
     "colmap": write_colmap,
     "transforms": write_transforms,
     "ply": write_ply,
-    "moge": write_moge,
 }
-
-
-def _write_log_depth(path: Path, depth_m: Any) -> None:
-    """Write depth as MoGe reads it: near ** (1 - t) * far ** t, where t = (number - 1) / 65533."""
-    measured = depth_m > 0
-    near_m, far_m = 1.0, 1.1
-    if measured.any():
-        near_m = float(depth_m[measured].min())
-        far_m = max(float(depth_m[measured].max()), near_m * 1.1)
-    numbers = np.zeros(depth_m.shape, dtype=np.uint16)
-    place = np.log(depth_m[measured].astype(np.float64) / near_m) / np.log(far_m / near_m)
-    numbers[measured] = 1 + np.round(np.clip(place, 0, 1) * 65533).astype(np.uint16)
-    about = PngInfo()
-    about.add_text("near", repr(near_m))
-    about.add_text("far", repr(far_m))
-    Image.fromarray(numbers).save(path, pnginfo=about, compress_level=_FAST)
 
 
 def _write_png(path: Path, image: PosedImage) -> None:
@@ -335,7 +289,7 @@ def export_views(
         data: What `StereoPairs` takes.
         out: The folder to write into.
         layout: "colmap": COLMAP's text model, which gsplat reads too; "transforms": nerfstudio's
-            ``transforms.json``; "ply": point clouds; "moge": the training folders of MoGe.
+            ``transforms.json``; "ply": point clouds.
         **options: Which scenes and views, and how (`ViewExportOptions`).
 
     Raises:
@@ -400,18 +354,12 @@ def export_views(
             done=len(cameras) * (len(folders) - sum(len(work.addresses) for work in works)),
             total=len(cameras) * len(folders),
         )
-        if layout == "moge":
-            # All that are there, and not what a killed run left.
-            found = (path.parent.relative_to(root).as_posix() for path in root.rglob("meta.json"))
-            whole = sorted(folder for folder in found if ".unfinished" not in folder)
-            with named_errors(root):
-                write_atomic(root / INDEX_TXT, "".join(f"{each}\n" for each in whole).encode())
     return [*folders]
 
 
 def _points(layout: Layout, points: Any) -> int | None:
-    """Return how many points are taken from each picture, None for all; MoGe takes none."""
-    if layout == "moge" or points == "all":
+    """Return how many points are taken from each picture, None for all."""
+    if points == "all":
         return None
     points = USUAL_POINTS[layout] if points is None else points
     number = whole_number(points)

@@ -17,12 +17,12 @@ from stereogenbench_data.cli.download import download
 from stereogenbench_data.cli.errors import ErrorsReported
 from stereogenbench_data.cli.evaluate import controls, disparity, inputs, score
 from stereogenbench_data.cli.export_clips import clips
-from stereogenbench_data.cli.export_views import colmap, moge, ply, transforms
+from stereogenbench_data.cli.export_views import colmap, ply, transforms
 from stereogenbench_data.cli.forecast import forecast
 from stereogenbench_data.cli.index import index
 from stereogenbench_data.cli.options import option
 from stereogenbench_data.cli.pack import pack, unpack, verify
-from stereogenbench_data.cli.publish import card, croissant, upload
+from stereogenbench_data.cli.publish import card, croissant
 from stereogenbench_data.cli.show import show
 from stereogenbench_data.cli.stats import stats
 from stereogenbench_data.cli.synth import synth
@@ -38,13 +38,13 @@ _COMMANDS: Final[dict[str, tuple[Callable[..., None], ...]]] = {
 _GROUPS: Final[dict[str, tuple[str, tuple[Callable[..., None], ...]]]] = {
     "export": (
         "Write scenes in the layouts of other projects.",
-        (clips, colmap, transforms, ply, moge),
+        (clips, colmap, transforms, ply),
     ),
     "eval": (
         "Score right views by the paper's protocol, or disparity.",
         (inputs, score, controls, disparity),
     ),
-    "publish": ("Describe shards and put them on the Hub.", (croissant, card, upload)),
+    "publish": ("Describe shards for the Hub.", (croissant, card)),
 }
 """Groups of commands: what each is for, and its commands."""
 

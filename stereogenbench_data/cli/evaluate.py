@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import (
     DataOptions,
     JsonOption,
@@ -105,47 +104,19 @@ class ReportOptions:
         Path | None,
         option("--out", "-o", "Folder of the report and of partial results.", metavar="DIR"),
     ] = None
-    compare: Annotated[
-        Path | None,
-        option(
-            "Scores to be reproduced; the exit status is 1 if these differ.",
-            metavar="RESULTS.json",
-            exists=True,
-            dir_okay=False,
-        ),
-    ] = None
     as_json: JsonOption = False
 
     def write(self, folder: Path, results: "Sequence[Scores]", tables: "Sequence[Table]") -> None:
-        """Print the report as a page or as JSON, write its files, and compare it.
+        """Print the report as a page or as JSON, and write its files."""
+        from stereogenbench_data.evaluation.report import document, page, write_report
 
-        Raises:
-            typer.Exit: If it is not what it is compared with.
-        """
-        from stereogenbench_data.evaluation.report import differences, document, page, write_report
-        from stereogenbench_data.jobs import read_json
-
-        there = None
-        if self.compare is not None:  # The files that are written next may replace it.
-            there = read_json(self.compare, cure="Give the results.json of an evaluation.")
-        content = document(results, tables)
         if self.as_json:
-            typer.echo(json.dumps(content, allow_nan=False))
+            typer.echo(json.dumps(document(results, tables), allow_nan=False))
         else:
             typer.echo(page(results, tables).rstrip())
         files = write_report(folder, results, tables)
         names = ", ".join(str(path.relative_to(folder)) for path in files)
         typer.echo(f"{folder}: {names}", err=True)
-        if there is None:
-            return
-        differing = differences(json.loads(json.dumps(content)), there)
-        for text in differing[:20]:
-            typer.echo(f"differs: {text}", err=True)
-        if differing:
-            typer.echo(f"{self.compare}: {counted(len(differing), 'difference')}", err=True)
-            raise typer.Exit(FINDINGS)
-        same = "the same data, protocol, weights, right views and numbers"
-        typer.echo(f"{self.compare}: reproduced, {same}", err=True)
 
 
 @grouped

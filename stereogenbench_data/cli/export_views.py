@@ -1,4 +1,4 @@
-"""``stereogenbench export colmap``, ``transforms``, ``ply``, ``moge``: several views, as files."""
+"""``stereogenbench export colmap``, ``transforms``, ``ply``: several views, as files."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -86,19 +86,6 @@ def ply(source: DataOptions, out: OutArgument, *, chosen: FolderOptions, work: W
     Example: `stereogenbench export ply shards/ clouds/ --points all`
     """
     _export(source, out, chosen, work, layout="ply")
-
-
-@grouped
-def moge(source: DataOptions, out: OutArgument, *, chosen: ViewOptions, work: WorkOptions) -> None:
-    """Write the training folders of MoGe.
-
-    Each holds image.jpg, depth.png and meta.json; .index.txt lists them. In MoGe's configuration of
-    this dataset set "depth_unit": 1.0, as depth is metric, and "finite_depth_mask": "only_known". A
-    stopped run goes on if it is run again.
-
-    Example: `stereogenbench export moge shards/ moge/ --frames every:10`
-    """
-    _export(source, out, chosen, work, layout="moge")
 
 
 def _export(

@@ -1,4 +1,4 @@
-"""``stereogenbench publish croissant``, ``card``, ``upload``: describe shards and upload them."""
+"""``stereogenbench publish croissant``, ``card``: describe shards for those who upload them."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -7,7 +7,6 @@ import typer
 
 from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import ShardsArgument, flag, grouped, option
-from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted
 
 if TYPE_CHECKING:
@@ -101,8 +100,9 @@ def card(
 ) -> None:
     """Write the dataset card of shards.
 
-    The Hub shows it, and `datasets` reads its configurations. With --out, the rows that the Hub's
-    viewer shows are written beside it, in `viewer/`.
+    The Hub shows it, and `datasets` reads its configurations. With --out, shards that lead out of
+    their folder by a link are refused. Upload with the Hub's own
+    `hf upload ORG/NAME packed/ --repo-type dataset`.
 
     Example: `stereogenbench publish card packed/ ORG/NAME -o packed/`
     """
@@ -114,26 +114,4 @@ def card(
     if out is None:
         typer.echo(card_text(index, repository=repository, about=_stated(about)), nl=False)
         return
-    with progress_bar("picturing", unit="scenes") as progress:
-        path = write_card(
-            index, out, repository=repository, about=_stated(about), progress=progress
-        )
-    typer.echo(str(path))
-
-
-def upload(
-    shards: ShardsArgument, repository: RepositoryArgument, *, about: AboutOption = None
-) -> None:
-    """Upload shards with card and descriptor to the Hub.
-
-    It needs the extra 'hub'. The card and the descriptor are written into the folder first. Log in
-    with `hf auth login`. To continue a stopped run, run it again.
-
-    Example: `stereogenbench publish upload packed/ ORG/NAME`
-    """
-    from stereogenbench_data.bridges.upload import upload as uploaded
-
-    # The Hub's client has progress bars of its own.
-    with progress_bar("picturing", unit="scenes") as progress:
-        report = uploaded(Path(shards), repository, about=_stated(about), progress=progress)
-    typer.echo(f"{counted(report.files, 'file')}: StereoPairs({report.url!r})")
+    typer.echo(str(write_card(index, out, repository=repository, about=_stated(about))))

@@ -1,22 +1,18 @@
 """The dataset card: for people, and for `datasets`."""
 
-import io
 import json
 import os
 import re
 import shutil
 import subprocess
 import sys
-import tarfile
 from pathlib import Path
 
-import numpy as np
 import pytest
 import yaml
-from PIL import Image
 
 from stereogenbench_data import SceneIndex
-from stereogenbench_data.bridges.card import MARK, card, write_card, write_viewer_rows
+from stereogenbench_data.bridges.card import MARK, card, write_card
 from stereogenbench_data.errors import DescriptorError
 from tests.servers.failing_server import serving
 from tests.servers.hub import REPOSITORY, HubHandler
@@ -34,9 +30,7 @@ for name, split in json.loads(sys.argv[2]):
         [row["__key__"], type(row["cam_00_depth.mkv"]).__name__, len(row["cam_00_depth.mkv"])]
         for row in rows
     ]
-scenes = list(load_dataset(sys.argv[1], "scenes", split="eval_unseen_map", streaming=True))
-scenes = [row | {"preview.jpg": row["preview.jpg"].format} for row in scenes]
-print(json.dumps({"videos": found, "scenes": scenes}))
+print(json.dumps(found))
 """
 
 
@@ -53,11 +47,8 @@ def head(sample_card):
 def test_every_family_is_a_config_with_its_splits_and_all_has_every_shard_once(head):
     configs = {each["config_name"]: each["data_files"] for each in head["configs"]}
 
-    assert list(configs) == ["all", "IPD_Gaussian", "Pairwise_Uniform", "Uniform", "scenes"]
+    assert list(configs) == ["all", "IPD_Gaussian", "Pairwise_Uniform", "Uniform"]
     assert [each["config_name"] for each in head["configs"] if each.get("default")] == ["all"]
-    assert [each["split"] for each in configs["scenes"]] == [
-        each["split"] for each in configs["all"]
-    ]
     splits = [each["split"] for each in configs["Uniform"]]
     assert splits == ["train", "eval_seen_map", "eval_unseen_map"]
     assert configs["Pairwise_Uniform"] == [
@@ -100,15 +91,7 @@ def test_load_dataset_finds_configs_and_splits_and_leaves_videos_as_bytes(tmp_pa
         )  # fmt: skip
 
     assert done.returncode == 0, done.stderr[-3000:]
-    found = json.loads(done.stdout)["videos"]
-    rows = json.loads(done.stdout)["scenes"]
-    assert [row["__key__"] for row in rows] == [
-        f"eval/MapUnseenInTrain/{family}/SynthYard/scene_000000"
-        for family in ("IPD_Gaussian", "Uniform")
-    ]
-    assert {(row["map.txt"], row["frames.json"], row["preview.jpg"]) for row in rows} == {
-        ("SynthYard", 81, "JPEG")
-    }
+    found = json.loads(done.stdout)
     assert len(found["None train"]) == 4, "without a config: all families"
     index = SceneIndex.open(SAMPLE)
     scenes = {index.scene(row).id.key: index.scene(row) for row in range(len(index))}
@@ -118,26 +101,6 @@ def test_load_dataset_finds_configs_and_splits_and_leaves_videos_as_bytes(tmp_pa
     for key, kind, size in (row for rows in found.values() for row in rows):
         assert kind == "bytes"
         assert size == scenes[key].members["cam_00_depth.mkv"].size
-
-
-def test_the_rows_of_the_viewer_are_written_once_for_an_index(small_shards, tmp_path):
-    index = SceneIndex.open(small_shards)
-
-    paths = write_viewer_rows(index, tmp_path)
-    before = [path.stat().st_mtime_ns for path in paths]
-    again = [path.stat().st_mtime_ns for path in write_viewer_rows(index, tmp_path)]
-    other = write_viewer_rows(SceneIndex.open(SAMPLE), tmp_path)
-
-    assert again == before
-    assert [path.name for path in other] == [
-        "eval_seen_map.tar", "eval_unseen_map.tar", "train.tar",
-    ]  # fmt: skip
-    with tarfile.open(tmp_path / "viewer" / "train.tar") as tar:
-        names = [name for name in tar.getnames() if name.endswith(".preview.jpg")]
-        pictures = [Image.open(io.BytesIO(tar.extractfile(name).read())) for name in names]
-    assert len(names) == 4
-    assert {picture.format for picture in pictures} == {"JPEG"}
-    assert min(np.asarray(picture).std() for picture in pictures) > 10
 
 
 def test_a_card_is_replaced_but_another_readme_is_not(tmp_path):

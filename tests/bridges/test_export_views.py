@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from stereogenbench_data import DepthEncoding, SceneViews
-from stereogenbench_data.bridges.export_views import export_views, quaternion_wxyz, write_moge
-from stereogenbench_data.bridges.multiview import PosedImage
+from stereogenbench_data.bridges.export_views import export_views, quaternion_wxyz
 from stereogenbench_data.errors import FieldError, SelectionError, StorageError
 from stereogenbench_data.geometry.pose import rotation_from_quaternion_xyzw
 from stereogenbench_data.index.table import SceneIndex
@@ -172,67 +171,7 @@ def test_points_of_a_cloud_lie_on_their_pixels_at_the_depth_of_the_contract(
     assert len(world) == 0
 
 
-def read_moge_depth(path):
-    """Read depth as MoGe's `read_depth` does."""
-    with Image.open(path) as file:
-        near, far = float(file.info["near"]), float(file.info["far"])
-        numbers = np.array(file)
-    assert numbers.dtype == np.uint16
-    place = (numbers.astype(np.float32) - 1) / 65533
-    depth = near ** (1 - place) * far**place
-    depth[numbers == 0] = np.nan
-    depth[numbers == 65535] = np.inf
-    return depth
-
-
-def test_moges_folders_hold_depth_picture_and_normalised_intrinsics(
-    detailed_release, moment, tmp_path
-):
-    exported(detailed_release, tmp_path, layout="moge")
-    names = (tmp_path / ".index.txt").read_text().splitlines()
-    moment_folder = "train/IPD_Gaussian/SynthStage/scene_000000/frame_000"
-
-    assert names == [f"{moment_folder}/cam_{camera:02d}" for camera in range(6)]
-    for camera, name in enumerate(names):
-        folder = tmp_path / name
-        depth = read_moge_depth(folder / "depth.png")
-        expected = moment["depth"][camera, 0].numpy()
-        np.testing.assert_array_equal(np.isnan(depth), expected == 0)
-        np.testing.assert_allclose(depth[expected > 0], expected[expected > 0], rtol=1e-4)
-        with Image.open(folder / "image.jpg") as file:
-            picture = np.asarray(file).astype(int)
-        apart = np.abs(picture - moment["image"][camera].permute(1, 2, 0).numpy())
-        assert apart.mean() < 4
-        meta = json.loads((folder / "meta.json").read_text())
-        scaled = np.diag([1 / 160, 1 / 160, 1]) @ moment["intrinsics"].numpy()
-        np.testing.assert_allclose(meta["intrinsics"], scaled)
-        pixels, _ = measured_pixels(expected)
-        rays = np.column_stack([pixels / 160, np.ones(len(pixels))])
-        points = rays @ np.linalg.inv(meta["intrinsics"]).T * depth[expected > 0][:, None]
-        assert np.abs(pixels_of(points, lens_of(moment)) - pixels).max() < CLOSE_PX
-        assert (meta["camera"], meta["frame"]) == (camera, 0)
-
-
-@pytest.mark.parametrize(
-    ("values", "close"),
-    [
-        pytest.param([0.1, 6553.5], 1e-4, id="the nearest and the farthest that can be stored"),
-        pytest.param([4.0, 4.0], 1e-6, id="a wall"),
-        pytest.param([0.0, 2.5], 1e-6, id="one pixel"),
-        pytest.param([0.0, 0.0], 0, id="nothing measured"),
-    ],
-)
-def test_moges_depth_is_read_back_whatever_its_range(tmp_path, values, close):
-    depth_m = np.array([values], dtype=np.float32)
-    picture = np.zeros((1, 2, 3), dtype=np.uint8)
-    posed = PosedImage("train/a/b/c", 0, 0, picture, depth_m, np.eye(3), np.eye(4))
-    write_moge(tmp_path, [posed], None)
-
-    found = read_moge_depth(tmp_path / "cam_00" / "depth.png")
-    np.testing.assert_allclose(np.nan_to_num(found, nan=0.0), depth_m, rtol=close)
-
-
-@pytest.mark.parametrize("layout", ["colmap", "moge"])
+@pytest.mark.parametrize("layout", ["colmap", "ply"])
 def test_what_was_exported_before_is_kept(indexed_release, tmp_path, layout):
     options = {"layout": layout, "frames": [0, 4], "size": (32, 32)}
     folders = exported(indexed_release, tmp_path, **options)
@@ -265,19 +204,6 @@ def test_an_export_that_was_killed_goes_on_and_is_whole(indexed_release, tmp_pat
         assert folder.suffix or (folder / "transforms.json").is_file()
     assert len(exported(indexed_release, killed, **options)) == 6
     assert files_of(killed) == files_of(expected)
-
-
-def test_moges_index_keeps_what_was_exported_before(indexed_release, tmp_path):
-    exported(indexed_release, tmp_path, layout="moge", family="Uniform")
-    left = tmp_path / ".scene.unfinished" / "cam_00"  # as a killed run leaves it
-    left.mkdir(parents=True)
-    (left / "meta.json").touch()
-    exported(indexed_release, tmp_path, layout="moge", family="IPD_Gaussian", frames=[2])
-    names = (tmp_path / ".index.txt").read_text().splitlines()
-
-    assert names == sorted(names)
-    assert len(names) == 18
-    assert all((tmp_path / name / "meta.json").is_file() for name in names)
 
 
 def test_a_folder_holds_one_kind_of_export_of_the_same_data(

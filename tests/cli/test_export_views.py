@@ -15,7 +15,6 @@ USUAL = ("--size", "16x16", "--workers", "1")
         ("colmap", "sparse/0/points3D.txt"),
         ("transforms", "transforms.json"),
         ("ply", "points.ply"),
-        ("moge", "cam_00/depth.png"),
     ],
 )
 def test_training_scenes_are_exported(indexed_release, tmp_path, name, file):
@@ -31,7 +30,7 @@ def test_training_scenes_are_exported(indexed_release, tmp_path, name, file):
     ("split", "folders"), [(("--split", "all"), 4), (("--split", "eval"), 1), ((), 3)]
 )
 def test_all_splits_are_exported_where_all_are_asked_for(indexed_release, tmp_path, split, folders):
-    done = invoke("export", "moge", indexed_release, tmp_path, *USUAL, *split)
+    done = invoke("export", "ply", indexed_release, tmp_path, *USUAL, *split)
 
     assert done.stdout == f"{tmp_path}: {folders} folders\n".replace("1 folders", "1 folder")
 

@@ -152,7 +152,6 @@ def test_a_log_gets_progress_line_by_line_as_time_passes(printed_progress):
         "unpack nowhere out",
         "verify nowhere",
         "publish croissant nowhere -o out/croissant.json",
-        "publish upload nowhere a/b",
         "download nowhere -o out",
         "show nowhere -o out/sheet.png",
         "audit nowhere -o out/audit.md",

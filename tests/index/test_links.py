@@ -5,7 +5,7 @@ import shutil
 import pytest
 
 from stereogenbench_data import StereoPairs
-from stereogenbench_data.bridges.upload import upload
+from stereogenbench_data.bridges.card import write_card
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import DESCRIPTION_TXT
@@ -79,7 +79,7 @@ def test_a_snapshot_of_the_hubs_cache_is_passed_on(small_release, tmp_path):
     assert pack(snapshot, tmp_path / "out", workers=1).index is not None
 
 
-def test_a_shard_that_lies_elsewhere_is_not_uploaded(small_release, tmp_path):
+def test_shards_one_of_which_lies_elsewhere_have_no_card(small_release, tmp_path):
     pytest.importorskip("huggingface_hub")
     shards = tmp_path / "shards"
     pack(small_release, shards, workers=1)
@@ -87,5 +87,6 @@ def test_a_shard_that_lies_elsewhere_is_not_uploaded(small_release, tmp_path):
     link_away(shards, name, to=tmp_path / "elsewhere.tar")
 
     with pytest.raises(StorageError, match=rf"{name}: leads out of {shards} by a link"):
-        upload(shards, "org/name")
+        write_card(SceneIndex.open(shards), shards, repository="org/name")
+    assert not (shards / "README.md").exists()
     assert (shards / name).is_symlink()
