@@ -2,6 +2,7 @@
 
 from stereogenbench_data.bridges.matching import to_raft_stereo as to_raft_stereo
 from stereogenbench_data.bridges.matching import to_torchvision as to_torchvision
+from stereogenbench_data.bridges.picture import show as show
 from stereogenbench_data.datasets.batch_buffers import collate as collate
 from stereogenbench_data.datasets.batch_buffers import to_device as to_device
 from stereogenbench_data.datasets.batches import EpochBatches as EpochBatches

@@ -1,7 +1,7 @@
 """Samples as pictures to look at: coloured maps, anaglyphs, and sheets of captioned tiles."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from stereogenbench_data.errors import FieldError
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.sources.files import open_output
 
@@ -136,6 +137,75 @@ def pair_tiles(
         Tile("left", channels_last(arrays["left"])),
         Tile(f"right, {baseline_m * 100:.2f} cm", channels_last(arrays["right"])),
         Tile(caption, painted, scale=scale, labels=labels, shrink="nearest"),
+    )
+
+
+def show(sample: Mapping[str, Any], *, width_px: int = 240) -> Image.Image:
+    """Return a sample, or the first samples of a batch, as a picture, which notebooks display.
+
+    Pictures are shown as they are; disparity and depth in colours from far (blue) to near (red),
+    grey where they are not measured; masks white where they hold. Of batches, clips and several
+    views up to six are shown, a row a field.
+
+    Args:
+        sample: What a dataset gives, or a loader.
+        width_px: The width of each tile.
+
+    Raises:
+        FieldError: If it has no picture, map or mask.
+    """
+    arrays = {name: np.asarray(value) for name, value in sample.items() if _is_map(value)}
+    if not arrays:
+        raise FieldError(
+            "nothing to show: the sample has no picture, map or mask among its fields."
+        )
+    key = sample.get("__key__")
+    title = [key] if isinstance(key, str) else []
+    rows = [
+        [
+            _tile(name, each, _valid(arrays, name, place))
+            for place, each in enumerate(array.reshape(-1, *array.shape[-3:])[:_TILES])
+        ]
+        for name, array in arrays.items()
+    ]
+    if max(map(len, rows)) == 1:
+        rows = [[tile for row in rows for tile in row]]
+    rows.sort(key=len, reverse=True)
+    return Image.fromarray(draw_sheet(title, rows, width_px=width_px))
+
+
+_TILES: Final = 6
+
+
+def _is_map(value: Any) -> bool:
+    """Return whether a field is shown: (..., 3, h, w) pictures, (..., 1, h, w) maps and masks."""
+    shape = tuple(getattr(value, "shape", ()))
+    return len(shape) >= 3 and shape[-3] in (1, 3) and min(shape[-2:]) > 4
+
+
+def _valid(arrays: Mapping[str, Any], name: str, place: int) -> Any:
+    """Return where a map is measured."""
+    array = arrays[name]
+    own = array.reshape(-1, *array.shape[-3:])[place]
+    mask = arrays.get("valid") if name == "disparity" else None
+    if mask is not None and mask.shape == array.shape:
+        return mask.reshape(-1, *mask.shape[-3:])[place][0]
+    return np.isfinite(own[0]) & (own[0] != 0)
+
+
+def _tile(name: str, array: Any, measured: Any) -> Tile:
+    if array.shape[0] == 3 and array.dtype == np.uint8:
+        return Tile(name, channels_last(array))
+    if array.shape[0] == 3:
+        scaled = np.clip(np.nan_to_num(array), 0, 1) * 255
+        return Tile(name, channels_last(scaled.round().astype(np.uint8)))
+    if array.dtype == bool:
+        return Tile(name, np.repeat(array[0][..., None] * np.uint8(255), 3, axis=2))
+    kind: Literal["linear", "log"] = "log" if "depth" in name else "linear"
+    scale = ColourScale.of(array[0], measured=measured, kind=kind)
+    painted = scale.paint(np.where(measured, array[0], scale.low), measured=measured)
+    return Tile(
+        name, painted, scale=scale, labels=(lambda value: f"{value:.3g}",), shrink="nearest"
     )
 
 

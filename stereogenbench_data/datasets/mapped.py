@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Final, Literal, Self, TypedDict, Unpack, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypedDict, Unpack, get_args
 
 import numpy as np
 from torch.utils.data import Dataset, get_worker_info
@@ -34,6 +34,7 @@ from stereogenbench_data.datasets.loader import (
     PairsLoader,
     accelerates_epoch,
 )
+from stereogenbench_data.datasets.overview import as_html, in_one_line, pairs_table
 from stereogenbench_data.datasets.shared import SharedEpoch
 from stereogenbench_data.errors import (
     FieldError,
@@ -85,6 +86,9 @@ from stereogenbench_data.selection.plan import (
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.fetch_ahead import FETCH_AHEAD_BYTES, FetchAhead
 from stereogenbench_data.sources.location import is_remote
+
+if TYPE_CHECKING:
+    import pandas
 
 Data = str | Path | SceneIndex
 
@@ -156,7 +160,10 @@ class _MappedScenes(Dataset[Sample]):
     Attributes:
         left_out: How many scenes were selected and cannot give what is requested.
         is_random: Whether the samples of an epoch may differ from those of another.
+        chosen: Split, pairs or cameras, and frames, as chosen or by default; for people.
     """
+
+    chosen: Mapping[str, Any] = {}
 
     def __init__(
         self, index: SceneIndex, plan: Plan, request: Request, options: ReadOptions
@@ -513,8 +520,19 @@ class _MappedScenes(Dataset[Sample]):
 
     def __repr__(self) -> str:
         """Return a summary."""
-        samples, scenes = counted(len(self), "sample"), counted(len(self.plan.scene_rows), "scene")
-        return f"<{type(self).__name__}: {samples} of {scenes}, {self.index.where}>"
+        return in_one_line(type(self).__name__, self.index, self.plan, self.request, self.chosen)
+
+    def _repr_html_(self) -> str:
+        """Return a summary for a notebook."""
+        return as_html(repr(self), self.index, self.plan)
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """Return the selected pairs as a table, a row each, with what the index says of them.
+
+        Raises:
+            ExtraError: If pandas is not installed.
+        """
+        return pairs_table(self.index, self.plan)
 
 
 class StereoPairs(_MappedScenes):
@@ -563,6 +581,8 @@ class StereoPairs(_MappedScenes):
         layout: Layout = "stacked" if str(selection.get("pairs")) == "sweep" else "single"
         request = parse_request("pairs", layout, fields=fields, options=reading)
         super().__init__(index, plan, request, reading)
+        usual = {"split": None, "pairs": "primary", "frames": "first"}
+        self.chosen = usual | {name: each for name, each in selection.items() if name in usual}
 
 
 class SceneViews(_MappedScenes):
@@ -606,6 +626,7 @@ class SceneViews(_MappedScenes):
         plan = plan_views(index, cameras=cameras, frames=frames, seed=seed, filters=filters)
         _warn_of_mixed_splits(index, plan, filters)
         super().__init__(index, plan, request, reading)
+        self.chosen = {"split": filters.get("split"), "cameras": cameras, "frames": frames}
 
 
 def opened(

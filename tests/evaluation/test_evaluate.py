@@ -417,8 +417,11 @@ def test_distances_between_sets_are_of_branches(
     ("options", "message"),
     [
         ({"frames": ("clips", 2)}, "frames must be 'all', 'first', numbers of frames"),
-        ({"pairs": "sweep"}, r"right view .* choose pairs='primary', 'adjacent'"),
-        ({"direction": "right_to_left"}, r"right view .* choose pairs='primary', 'adjacent'"),
+        ({"pairs": "sweep"}, r"left view .* choose pairs='primary', 'adjacent'"),
+        (
+            {"direction": "right_to_left"},
+            r"left view .* choose pairs='primary', 'adjacent'",
+        ),
         ({"predictions": Path("nowhere")}, r"nowhere: is not a folder\. Pass "),
     ],
 )
