@@ -17,7 +17,7 @@ from stereogenbench_data.schema.release import (
     FAMILIES,
     SCENE_COUNTS,
 )
-from stereogenbench_data.schema.text import markdown_table, markdown_text
+from stereogenbench_data.schema.text import counted, markdown_table, markdown_text
 from stereogenbench_data.selection.filters import PAIR_NUMBER, SceneFilters, filter_scenes, in_bin
 
 ADJACENT_COLUMNS: Final = [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]
@@ -332,6 +332,25 @@ def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
         ]
         text += _section(title, [("", "figure", "paper", "here", "source"), *rows])
     return "\n".join(text) + "\n"
+
+
+def screen(
+    found: Statistics, lines: Sequence[Line]
+) -> tuple[str, list[tuple[str, list[Sequence[str]]]]]:
+    """Return what a screen shows of statistics: a verdict, and tables with their titles."""
+    verdict = f"{counted(found.scenes, 'scene')} of {found.root}"
+    differing = [line for line in lines if not line.agrees]
+    if lines:
+        agreeing = len(lines) - len(differing)
+        verdict += f": {agreeing} of {len(lines)} figures of the paper agree"
+    rows = [(each.item, each.paper, each.ours) for each in differing]
+    parts: list[tuple[str, list[Sequence[str]]]] = [
+        ("Scenes", [*_count_rows(found)]),
+        ("Adjacent baselines (cm)", [*_spread_rows(found.branches, "adjacent_cm")]),
+    ]
+    if rows:
+        parts.append(("Differs from the paper", [("figure", "paper", "here"), *rows]))
+    return f"{verdict}.", parts
 
 
 def _section(title: str, rows: Iterable[Sequence[str]]) -> list[str]:

@@ -16,6 +16,7 @@ from stereogenbench_data.cli.options import (
     option,
 )
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.screen import print_report
 from stereogenbench_data.cli.writing import write_report
 
 _ALL = "all"
@@ -45,7 +46,7 @@ def audit(  # noqa: PLR0913 - one parameter an option
     Example: `stereogenbench audit shards/ --scenes 20 -o audit.md`
     """
     from stereogenbench_data.audit.geometry import audit as geometry_audit
-    from stereogenbench_data.audit.geometry.table import audit_markdown
+    from stereogenbench_data.audit.geometry.table import audit_markdown, screen
 
     if out is not None and out.is_dir():
         raise typer.BadParameter(
@@ -71,7 +72,11 @@ def audit(  # noqa: PLR0913 - one parameter an option
             index, sample=scenes, frames=frames, progress=progress, **options
         )
     document, markdown = json.dumps(report.to_json(), indent=1), audit_markdown(report)
-    typer.echo(document if as_json else markdown.rstrip())
+    if as_json:
+        typer.echo(document)
+    else:
+        rest = f"Whole report: {out}" if out else "-o FILE.md writes the whole report."
+        print_report(*screen(report), whole=markdown, rest=rest)
     if out is not None:
         write_report(out, document if out.suffix == ".json" else markdown)
     if report.findings:

@@ -23,6 +23,7 @@ from stereogenbench_data.cli.options import (
     size_of,
 )
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.screen import print_report
 from stereogenbench_data.evaluation.columns import METRICS, OFFLINE_METRICS, require_metrics
 from stereogenbench_data.schema.text import counted
 
@@ -107,13 +108,21 @@ class ReportOptions:
     as_json: JsonOption = False
 
     def write(self, folder: Path, results: "Sequence[Scores]", tables: "Sequence[Table]") -> None:
-        """Print the report as a page or as JSON, and write its files."""
-        from stereogenbench_data.evaluation.report import document, page, write_report
+        """Print the report as a page, a screen or JSON, and write its files."""
+        from stereogenbench_data.evaluation.report import (
+            document,
+            page,
+            transposed,
+            verdict,
+            write_report,
+        )
 
         if self.as_json:
             typer.echo(json.dumps(document(results, tables), allow_nan=False))
         else:
-            typer.echo(page(results, tables).rstrip())
+            shown = [(each.title, transposed(each)) for each in tables]
+            rest = f"Whole report: {folder / 'report.md'}"
+            print_report(verdict(results), shown, whole=page(results, tables), rest=rest)
         files = write_report(folder, results, tables)
         names = ", ".join(str(path.relative_to(folder)) for path in files)
         typer.echo(f"{folder}: {names}", err=True)
@@ -209,7 +218,6 @@ def disparity(  # noqa: PLR0913 - one parameter an option
         typer.Argument(help="Folder of disparity maps, SCENE/00-01/000.pfm, .png, .npy, .npz."),
     ],
     *,
-    name: Annotated[str | None, option("Name of the method [the folder's name].")] = None,
     chosen: ScoredOptions,
     size: Annotated[
         Any,
@@ -233,7 +241,7 @@ def disparity(  # noqa: PLR0913 - one parameter an option
 
     PREDICTIONS holds a folder for each pair, SCENE/00-01 or the item's name, with a map for each
     frame: PFM, KITTI's PNG, npy or npz, positive pixels of the scored size. The report (Markdown,
-    LaTeX, JSON, CSV, plots) and partial results go to --out [evaluation/NAME-disparity]. To
+    LaTeX, JSON, CSV, plots) and partial results go to --out [evaluation/FOLDER-disparity]. To
     continue a stopped run, run it again.
 
     Example: `stereogenbench eval disparity shards/ maps/`
@@ -241,7 +249,7 @@ def disparity(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.evaluation.disparity import disparity_tables, evaluate_disparity
     from stereogenbench_data.evaluation.protocol import DisparityProtocol
 
-    selection, called = chosen.selection(), name or predictions.resolve().name
+    selection, called = chosen.selection(), predictions.resolve().name
     folder = report.out or Path("evaluation") / f"{called}-disparity"
     index = source.open()
     columns = list(dict.fromkeys(["map_name", *(by or ())]))
@@ -251,7 +259,6 @@ def disparity(  # noqa: PLR0913 - one parameter an option
         scores = evaluate_disparity(
             index,
             predictions,
-            name=called,
             protocol=DisparityProtocol(size=size, max_disparity_px=max_disparity),
             out=folder / "partial",
             **work.options(),

@@ -13,6 +13,7 @@ from stereogenbench_data.cli.options import (
     SourceOptions,
     grouped,
 )
+from stereogenbench_data.cli.screen import print_report
 from stereogenbench_data.cli.writing import write_report
 
 
@@ -30,7 +31,12 @@ def stats(
 
     Example: `stereogenbench stats shards/ -o stats.md`
     """
-    from stereogenbench_data.audit.statistics import compared, statistics, statistics_markdown
+    from stereogenbench_data.audit.statistics import (
+        compared,
+        screen,
+        statistics,
+        statistics_markdown,
+    )
 
     filters: Any = chosen.filters()
     found = statistics(source.open(), **filters)
@@ -38,6 +44,10 @@ def stats(
     document = found.to_json() | {"paper": [asdict(line) for line in lines]}
     text = json.dumps(document, indent=1)
     markdown = statistics_markdown(found, lines)
-    typer.echo(text if as_json else markdown.rstrip())
+    if as_json:
+        typer.echo(text)
+    else:
+        rest = f"Whole report: {out}" if out else "-o FILE.md writes the whole report."
+        print_report(*screen(found, lines), whole=markdown, rest=rest)
     if out is not None:
         write_report(out, text if out.suffix == ".json" else markdown)

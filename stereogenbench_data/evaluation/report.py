@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from itertools import cycle
@@ -249,6 +250,64 @@ def latex(table: Table) -> str:
         r"\bottomrule \end{tabular} \end{table}",
     ]
     return "\n".join(lines) + "\n"
+
+
+def transposed(table: Table) -> list[list[str]]:
+    """Return what was scored of a table as cells, a row a column of it: few methods have many.
+
+    The paper's rows are left out.
+    """
+    scored = [row for row in table.rows if row.source == "scored"]
+    has_several = len({row.method for row in scored}) > 1
+    heads = [
+        " ".join([*([row.method] if has_several else []), *filter(None, row.labels)])
+        for row in scored
+    ]
+    lines = [["", *heads], ["scenes, frames", *(f"{row.scenes}, {row.frames}" for row in scored)]]
+    if any(row.missing for row in scored):
+        lines.append(["pairs missing", *(str(row.missing) for row in scored)])
+    for name in table.columns:
+        cells = (_cell_text(table, row.values, name) for row in scored)
+        lines.append([heading(table, name), *cells])
+    return lines
+
+
+def verdict(results: Sequence[Scores]) -> str:
+    """Return in a line or two what was scored; of controls, what the rendered target is best in."""
+    first = results[0]
+    if first.tier == CONTROL:
+        return _verdict_of_controls(results)
+    told = []
+    for one in results:
+        covered = _coverage(one)
+        missing = f", {counted(len(covered['missing']), 'pair')} missing" * bool(covered["missing"])
+        told.append(
+            f"{one.name}: {counted(covered['pairs'], 'pair')} of "
+            f"{counted(covered['scenes'], 'scene')} scored, "
+            f"{counted(covered['frames'], 'frame')}{missing}."
+        )
+    return "\n".join(told)
+
+
+def _verdict_of_controls(results: Sequence[Scores]) -> str:
+    """Return in which columns the rendered target, the first control, scores best."""
+    target, *others = results
+    best: list[str] = []
+    worse: list[str] = []
+    for name in target.protocol.plotted:
+        sign = -1 if COLUMNS[name].better == "lower" else 1
+        means = [sign * _mean(one, name) for one in (target, *others)]
+        is_best = not any(mean > means[0] for mean in means[1:])
+        (best if is_best else worse).append(target.protocol.label(name))
+    told = f"The {target.name} scores best in {len(best)} of {len(best) + len(worse)} columns"
+    return f"{told}; not in {', '.join(worse)}." if worse else f"{told}."
+
+
+def _mean(one: Scores, column: str) -> float:
+    """Return a column's mean, infinite where every frame is."""
+    found = cell([pair for pair in one.pairs if not pair.problem], column)
+    mean: float = math.nan if found.mean is None else found.mean
+    return math.inf if found.mean is None and found.infinite else mean
 
 
 def _texts(table: Table) -> list[list[str]]:

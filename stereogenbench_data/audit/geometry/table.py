@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from textwrap import shorten
 from typing import Any, Final
 
 import numpy as np
@@ -22,6 +23,7 @@ from stereogenbench_data.schema.release import FRAME_COUNT, VIDEO_FILES
 from stereogenbench_data.schema.text import counted, markdown_table, markdown_text
 
 _LISTED: Final = 500
+_SHORT: Final = 50
 
 
 def table_rows(scenes: Sequence[SceneAudit], findings: Sequence[Finding]) -> tuple[AuditRow, ...]:
@@ -159,6 +161,28 @@ def audit_markdown(report: AuditReport) -> str:
     lines += _listed("Not testable", [str(each) for each in report.untested])
     lines += _listed("Notes", list(report.notes))
     return "\n".join(lines) + "\n"
+
+
+def screen(report: AuditReport) -> tuple[str, list[tuple[str, list[Sequence[str]]]]]:
+    """Return what a screen shows of a report: the verdict, what was found, and what has a limit."""
+    audited = f"{report.scenes_audited} of {counted(report.scenes_there, 'scene')}"
+    checks: dict[str, list[Finding]] = {}
+    for each in report.findings:
+        checks.setdefault(each.check, []).append(each)
+    found: list[Sequence[str]] = [("finding", "scenes", "the first")]
+    for check, findings in checks.items():
+        first = findings[0]
+        where = "/".join(part for part in (first.scene, first.member) if part)
+        scenes = len({each.scene for each in findings})
+        found.append((check, str(scenes), f"{where}: {' '.join(first.found.split())}"))
+    limits: list[Sequence[str]] = [("check", "quantity", "here", "limit")]
+    limits += [
+        (row.check, shorten(row.quantity, _SHORT, placeholder="..."), row.ours, row.limit)
+        for row in report.rows
+        if row.limit
+    ]
+    parts = [("Findings", found)] if checks else []
+    return f"{_verdict(report)}. {audited} audited.", [*parts, ("Worst of all scenes", limits)]
 
 
 def _verdict(report: AuditReport) -> str:
