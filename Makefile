@@ -7,6 +7,7 @@ PYTEST_ARGS ?=
 CONSTRAINTS := constraints/$(VERSIONS).txt
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+DEMO := .venv-demo
 
 SAMPLE := build/sample
 SYNTH := $(BIN)/stereogenbench synth $(SAMPLE)/release --size 72 --frames 81 --depth-unit-m 0.01
@@ -20,8 +21,15 @@ shards/index.parquet:
 		"read. Run make in a clone of the repository." >&2
 	@exit 1
 
-demo: shards/index.parquet $(READY)
-	$(BIN)/python examples/train.py
+# The package and matplotlib are all that it needs; tests and lint need many times as much.
+demo: shards/index.parquet $(DEMO)/.ready
+	$(DEMO)/bin/python examples/train.py
+
+$(DEMO)/.ready: pyproject.toml $(CONSTRAINTS)
+	$(PYTHON) -m venv $(DEMO)
+	$(DEMO)/bin/python -m pip install --quiet --disable-pip-version-check \
+		--constraint $(CONSTRAINTS) --editable ".[plots]"
+	touch $@
 
 # Tests wait for a quarter of their time, so there is a process more for every two cores; each
 # computes with one thread.
@@ -83,4 +91,4 @@ $(READY): pyproject.toml $(CONSTRAINTS)
 	touch $@
 
 clean:
-	rm -rf $(VENV) .venv-blender demo build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(DEMO) .venv-blender demo build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis

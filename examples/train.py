@@ -5,6 +5,7 @@ the size of the training pictures. The curve and three predictions go to demo/tr
 """
 
 import argparse
+import os
 import time
 from pathlib import Path
 
@@ -64,6 +65,9 @@ def main() -> None:
     options.add_argument("--steps", type=int, default=300)
     given = options.parse_args()
     torch.manual_seed(given.seed)
+    # Threads that wait for one another beside busy workers would take the cores from them.
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    torch.set_num_threads(max(1, (cores or 1) // 2))
     request = SynthRequest(
         family="IPD_Gaussian", split="eval", map_name=MAPS, scenes=3, size_px=160, frames=2, seed=7
     )
@@ -76,7 +80,7 @@ def main() -> None:
         SHARDS, split="train", pairs="all", baseline_cm=(8, 60), frames=("every", 4),
         fields=FIELDS, transform=Compose([HorizontalFlip(), RandomCrop(64, 64)]),
     )  # fmt: skip
-    loader = pairs.loader(BATCH, num_workers=2, seed=given.seed)
+    loader = pairs.loader(BATCH, num_workers=1 if (cores or 1) < 4 else 2, seed=given.seed)
     print(f"training on {len(pairs)} pairs, validating on {len(held_out)} of three other scenes")
 
     network = SmallStereo(MAX_DISPARITY)

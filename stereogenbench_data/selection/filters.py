@@ -131,7 +131,8 @@ class SceneFilters(TypedDict, total=False):
         valid_depth_ratio: Range of the share of measured depth pixels, known only for an index
             that was made with it.
         min_frames: The fewest frames that a scene may have, so that clips of that length fit.
-        caption: Whole words that must all occur in the caption, in any case and order.
+        caption: Whole words that must all occur in the caption, in any case and order; of several
+            such texts, those of one.
     """
 
     split: str | Sequence[str] | None
@@ -144,7 +145,7 @@ class SceneFilters(TypedDict, total=False):
     focal_mm: Range | None
     valid_depth_ratio: Range | None
     min_frames: int | None
-    caption: str | None
+    caption: str | Sequence[str] | None
 
 
 _TEXT_COLUMNS = {name: name for name in ("split", "subset", "family", "character", "animation")} | {
@@ -257,17 +258,31 @@ def _apply(
         fewest = require_whole("min_frames", wanted, least=1)
         return frames >= fewest, lambda: f"{frames.min()} to {frames.max()}."
     if name == "caption":
-        if not isinstance(wanted, str) or not wanted.split():
-            raise SelectionError(f"caption must be one or more words, got {wanted!r}.")
-        words = wanted.lower().split()
-        whole = [re.compile(rf"(?<!\w){re.escape(word)}(?!\w)") for word in words]
+        texts = [wanted] if isinstance(wanted, str) else wanted
+        is_list = isinstance(texts, list | tuple) and len(texts) > 0
+        if not is_list or not all(isinstance(text, str) and text.split() for text in texts):
+            raise SelectionError(
+                f"caption must be one or more words, or a list of such texts, got {wanted!r}."
+            )
         captions = [str(caption).lower() for caption in index.column("caption")[rows]]
+        # Every word of one of the texts, each whole.
+        patterns = [
+            [re.compile(rf"(?<!\w){re.escape(word)}(?!\w)") for word in text.lower().split()]
+            for text in texts
+        ]
         keep = np.array(
-            [all(word.search(caption) for word in whole) for caption in captions], dtype=bool
+            [
+                any(all(word.search(caption) for word in words) for words in patterns)
+                for caption in captions
+            ],
+            dtype=bool,
         )
         written = counted(sum(map(bool, captions)), "scene")
-        every = "all of " * (len(words) > 1) + ", ".join(map(_quoted, words))
-        return keep, lambda: f"captions of {written}, none with {every}."
+        asked = " or ".join(
+            "all of " * (" " in text.strip()) + ", ".join(map(_quoted, text.lower().split()))
+            for text in texts
+        )
+        return keep, lambda: f"captions of {written}, none with {asked}."
     filters = SceneFilters.__annotations__
     raise SelectionError(
         f"there is no filter {name!r}{did_you_mean(name, filters)} There are {', '.join(filters)}."

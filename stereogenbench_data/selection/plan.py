@@ -94,6 +94,18 @@ def balanced(
     return np.sort(np.concatenate(drawn))
 
 
+def _few(count: int, *, limit: int, seed: int) -> Int64[np.ndarray, " n"]:
+    """Return the places of a draw of pairs, ascending; a larger one holds those of a smaller one.
+
+    Raises:
+        SelectionError: If the limit is no whole number from 1, or more than there are.
+    """
+    if require_whole("limit", limit, least=1) > count:
+        raise SelectionError(f"limit={limit}, and the selection has {counted(count, 'pair')}.")
+    generator = np.random.default_rng(np.random.SeedSequence((seed, 0xFE3)))
+    return np.sort(generator.permutation(count)[:limit])
+
+
 def _strata(baselines_cm: Float64[np.ndarray, " n"], *, by: Balance) -> Int64[np.ndarray, " n"]:
     if by == "bins":
         order = list(BASELINE_BINS)
@@ -364,7 +376,8 @@ batches would hardly be mixed better."""
 class PairOptions(TypedDict, total=False):
     """Which pairs of a scene: see `choose_pairs`, and `balanced` for balance and limit.
 
-    A balanced subsample is the same in every epoch.
+    A limit alone draws as many pairs of all, as for few-shot training. A subsample is the same in
+    every epoch.
     """
 
     pairs: PairsSpec
@@ -518,9 +531,7 @@ def plan_pairs(index: SceneIndex, *, seed: int = 0, **selection: Unpack[Selectio
         found = baselines_cm(index, pairs)[:, 0]
         pairs = pairs[balanced(found, by=balance, limit=limit, seed=seed)]
     elif limit is not None:
-        raise SelectionError(
-            f"limit={limit} is the size of a balanced subsample: give balance too."
-        )
+        pairs = pairs[_few(len(pairs.row), limit=limit, seed=seed)]
     return _plan(index, pairs, windows=windows, seed=seed)
 
 

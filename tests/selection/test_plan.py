@@ -78,6 +78,35 @@ def test_the_cure_of_an_error_about_short_scenes_leaves_out_those_alone(index, f
     assert len(plan.scene_rows) == len(index) - 1
 
 
+def test_a_few_pairs_are_drawn_of_all_and_more_hold_fewer(index):
+    def drawn(limit, seed=0):
+        pairs = plan_pairs(index, pairs="all", limit=limit, seed=seed).pairs
+        columns = (pairs.row, pairs.source, pairs.targets[:, 0])
+        return {*zip(*(each.tolist() for each in columns), strict=True)}
+
+    few, more = drawn(7), drawn(30)
+
+    assert (len(few), len(more)) == (7, 30)
+    assert few < more
+    assert len({row for row, _, _ in more}) > 3
+    assert drawn(7, seed=1) != few
+    assert drawn(15 * len(index)) == drawn(None)
+
+
+def test_of_several_captions_one_has_to_fit(index):
+    def scenes(caption):
+        return plan_pairs(index, caption=caption).scene_rows.tolist()
+
+    courtyard, street = scenes("open sky"), scenes("street night")
+
+    assert scenes(["open sky", "night street"]) == sorted(courtyard + street)
+    assert scenes(["open sky", "open street"]) == courtyard
+    with pytest.raises(SelectionError, match=r"none with all of open, street or red"):
+        scenes(["open street", "red"])
+    with pytest.raises(SelectionError, match="a list of such texts"):
+        scenes([])
+
+
 def test_a_balanced_plan_draws_pairs_evenly(wide_index):
     plan = plan_pairs(
         wide_index, pairs="all", balance="bins", limit=40, baseline_cm=["[1,10)", "[10,30)"]
@@ -91,7 +120,8 @@ def test_a_balanced_plan_draws_pairs_evenly(wide_index):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"limit": 5}, "give balance too"),
+        ({"pairs": "all", "limit": 1000}, r"limit=1000, and the selection has \d+ pairs"),
+        ({"limit": 0}, "limit must be a whole number from 1"),
         ({"balance": "bins", "pairs": "sweep"}, "needs single pairs"),
         ({"pears": "all"}, "no filter 'pears'"),
     ],
