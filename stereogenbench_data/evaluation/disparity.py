@@ -285,10 +285,12 @@ def _table(
     rows: Sequence[TableRow],
 ) -> Table:
     protocol: Any = results[0].protocol
-    notes, shown = [_DENOMINATORS], tuple(columns)
-    if protocol.max_disparity_px is not None and name == "branches":
-        shown = (*columns, "beyond")
-        notes.append(f"Left out are valid pixels from {protocol.max_disparity_px:g} px on.")
+    notes, shown = [], tuple(columns)
+    if name == "branches":  # the first: what holds for all
+        notes.append(_DENOMINATORS)
+        if protocol.max_disparity_px is not None:
+            shown = (*columns, "beyond")
+            notes.append(f"Left out are valid pixels from {protocol.max_disparity_px:g} px on.")
     return Table(name, f"{title} (disparity)", keys, protocol, shown, tuple(rows), tuple(notes))
 
 
