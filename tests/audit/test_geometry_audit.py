@@ -260,6 +260,25 @@ def test_where_places_are_wrong_no_picture_is_called_late_without_the_other_caus
     assert all("a camera's place, or the lens" in found for found in told.values())
 
 
+def test_no_single_file_is_named_for_what_is_wrong_with_all(decidable_release, tmp_path):
+    report = made_wrong(
+        decidable_release, tmp_path, lambda folder: rewrite_depth(folder, tags=10.0)
+    )
+
+    assert {each.member for each in report.findings} == {""}
+    assert {each.check for each in report.findings} >= {"depth residual", "picture time"}
+
+
+def test_units_that_contradict_one_another_are_one_finding(indexed_release, tmp_path):
+    report = made_wrong(
+        indexed_release, tmp_path, lambda folder: rewrite_depth(folder, tags=10.0, cameras=[2])
+    )
+
+    (finding,) = report.findings
+    assert (finding.member, finding.check) == ("cam_*_depth.mkv", "unreadable")
+    assert "differ by a scale: 0.001, 0.001, 0.01, 0.001, 0.001, 0.001 m" in finding.found
+
+
 def without_texture(folder):
     for camera in range(6):
         rewrite_rgb(folder, camera, lambda seen: seen * 0 + 128)

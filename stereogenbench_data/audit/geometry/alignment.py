@@ -13,7 +13,7 @@ Pictures are only correlated, at the points that depth puts in the same place, a
 frames beside with them: whether each camera shows its own view and moment.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from statistics import median
 from typing import Any, Final, TypeVar
@@ -259,30 +259,40 @@ class AlignmentCheck:
     def figures(self) -> Iterator[Figure]:
         """Yield what all frames show."""
         known = {pair: each for pair, each in self._depth.items() if each.smooth >= _FEWEST_POINTS}
-        yield _of_pairs("see_through", {p: each.through / each.smooth for p, each in known.items()})
         near = {pair: each for pair, each in self._depth.items() if each.near >= _FEWEST_POINTS}
-        yield _of_pairs("depth_agreement", {p: each.rough / each.near for p, each in near.items()})
         residuals = {pair: each.percentile(_MOST_OF_PAIR) for pair, each in known.items()}
-        residuals = {pair: each for pair, each in residuals.items() if not np.isnan(each)}
-        yield _of_pairs("depth_residual", residuals)
+        of_pairs = {
+            "see_through": {pair: each.through / each.smooth for pair, each in known.items()},
+            "depth_agreement": {pair: each.rough / each.near for pair, each in near.items()},
+            "depth_residual": {p: each for p, each in residuals.items() if not np.isnan(each)},
+        }
+        motion = self._motion_figure()
+        off = {pair for each in of_pairs.items() for pair in _off(*each)}
+        # What is off elsewhere too, or over time in most cameras, is no single camera's.
+        suspects = {
+            camera for camera in range(CAMERA_COUNT)
+            if all(camera in pair for pair in off)
+            and not motion.value > CHECKS["motion_residual"].limit
+        }  # fmt: skip
+        for each in of_pairs.items():
+            yield _of_pairs(*each, suspects)
         seen = {camera for pair in known for camera in pair}
         yield from _untested("see_through", seen, "too few points of smooth surfaces")
-        yield from self._motion_figures()
-        yield from self._time_figures()
-        yield from self._content_figures()
+        yield motion
+        yield from self._time_figures(suspects)
+        yield from self._content_figures(suspects)
 
-    def _motion_figures(self) -> Iterator[Figure]:
+    def _motion_figure(self) -> Figure:
         moved_px = float(np.mean(self._moved_px)) if self._moved_px else 0.0
         if self._motion.smooth < _FEWEST_MOVED:
             why = "too few points of smooth surfaces, or one frame"
         elif moved_px < _STILL_PX:
             why = f"points move by {moved_px:.2f} px from one audited frame to the next"
         else:
-            yield Figure("motion_residual", "", self._motion.percentile(50))
-            return
-        yield Figure("motion_residual", where=why)
+            return Figure("motion_residual", "", self._motion.percentile(50))
+        return Figure("motion_residual", where=why)
 
-    def _content_figures(self) -> Iterator[Figure]:
+    def _content_figures(self, suspects: Set[int]) -> Iterator[Figure]:
         correlations = {pair: float(np.mean(each)) for pair, each in self._correlations.items()}
         odd, best = {}, {}
         for camera in range(CAMERA_COUNT):
@@ -291,11 +301,11 @@ class AlignmentCheck:
             if own and others:
                 odd[camera] = median(others) - max(own)
                 best[camera] = f"its best is {max(own):.2f}"
-        yield from _of_cameras("picture_odd", odd, best)
+        yield from _of_cameras("picture_odd", odd, best, suspects)
         seen = {camera for pair in correlations for camera in pair}
         yield from _untested("picture_odd", seen, "no texture, or no depth")
 
-    def _time_figures(self) -> Iterator[Figure]:
+    def _time_figures(self, suspects: Set[int]) -> Iterator[Figure]:
         gains: dict[int, dict[int, float]] = {}
         for (camera, lag), each in sorted(self._lags.items()):
             gains.setdefault(camera, {})[lag] = float(np.mean(each))
@@ -305,7 +315,7 @@ class AlignmentCheck:
             most[camera] = of[lag]
             beside[camera] = f"by those of the frame {'before' if lag < 0 else 'after'}"
             timed |= {camera} if min(of.values()) <= -_TELLS_TIME else set()
-        yield from _of_cameras("picture_lag", most, beside)
+        yield from _of_cameras("picture_lag", most, beside, suspects)
         why = "pictures of the neighbouring frames fit as well, or there are none"
         yield from _untested("picture_lag", timed, why)
 
@@ -316,10 +326,10 @@ def _off(quantity: str, values: Mapping[Key, float]) -> list[Key]:
     return [key for key, value in values.items() if most > limit and value > min(limit, most / 2)]
 
 
-def _of_pairs(quantity: str, values: Mapping[tuple[int, int], float]) -> Figure:
+def _of_pairs(quantity: str, values: Mapping[tuple[int, int], float], suspects: Set[int]) -> Figure:
     """Return the largest value of any pair, with the pairs that come near.
 
-    If the pairs that are off are all those of one camera, its file comes with it.
+    If the pairs that are off are all those of one suspect, its file comes with it.
     """
     most = max(values.values(), default=float("nan"))
     if not most > 0:
@@ -327,7 +337,7 @@ def _of_pairs(quantity: str, values: Mapping[tuple[int, int], float]) -> Figure:
     among = [pair for pair, value in values.items() if value > most / 2]
     off = _off(quantity, values)
     odd = (
-        depth_name(camera) for camera in range(CAMERA_COUNT)
+        depth_name(camera) for camera in suspects
         if len(off) > 1 and off == [pair for pair in values if camera in pair]
     )  # fmt: skip
     where = f"most in {', '.join(f'{a}-{b}' for a, b in among)}"
@@ -335,20 +345,20 @@ def _of_pairs(quantity: str, values: Mapping[tuple[int, int], float]) -> Figure:
 
 
 def _of_cameras(
-    quantity: str, values: Mapping[int, float], where: Mapping[int, str]
+    quantity: str, values: Mapping[int, float], where: Mapping[int, str], suspects: Set[int]
 ) -> Iterator[Figure]:
-    """Yield each camera's value with its pictures' file; one for all, if several are off.
+    """Yield each camera's value with its pictures' file; one for all, if not only a suspect is off.
 
     Pictures are compared where depth and poses put them, so wrong lenses, places or depth put
     several cameras off.
     """
     off = _off(quantity, values)
-    if len(off) <= 1:
+    if len(off) <= 1 and suspects >= set(off):
         for camera, value in values.items():
             yield Figure(quantity, rgb_name(camera), value, where[camera])
         return
     worst = max(off, key=lambda camera: values[camera])
-    those = f"in cameras {', '.join(map(str, off))}"
+    those = f"in camera{'s' * (len(off) > 1)} {', '.join(map(str, off))}"
     yield Figure(quantity, "", values[worst], f"{where[worst]}, {those}")
 
 

@@ -45,7 +45,7 @@ from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import MissingObject
 
 DEFAULT_FRAMES: Final = 5
-_FORMAT: Final = 7
+_FORMAT: Final = 8
 
 
 class AuditOptions(WorkOptions, SceneFilters, total=False):

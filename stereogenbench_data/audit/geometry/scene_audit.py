@@ -235,8 +235,10 @@ class _SceneCheck:
         """Decode one frame of all cameras, and add it to the checks."""
         depths: dict[int, MeasuredDepth] = {}
         stored: dict[int, Any] = {}
+        # Units that contradict one another are no single file's.
+        no_unit = all(self.files.encoding(c).unit_m is None for c in range(CAMERA_COUNT))
         for camera in range(CAMERA_COUNT):
-            name = depth_name(camera)
+            name = "cam_*_depth.mkv" if no_unit else depth_name(camera)
             read = self.files.attempt(name, self.files.depth, camera, frame)
             if read is not None:
                 stored[camera], depths[camera] = read
