@@ -1,7 +1,9 @@
 """Scenes with one thing wrong each: what the pictures say of them, and what they cannot say."""
 
+import json
 import math
 import re
+import shutil
 from dataclasses import replace
 from functools import cache
 
@@ -467,6 +469,79 @@ def test_what_is_wrong_with_files_of_one_camera_is_named(verdict_on, corrupt, wo
     assert verdict.encoding is None
     assert verdict.choices == ()
     assert "confirmed" not in {found.status for found in verdict.answers}
+
+
+WIDE = SynthRequest(family="Uniform", size_px=96, frames=9, seed=5, scenes=2)
+
+
+def of_another_scene(*names):
+    """Return the change that takes files from the other scene."""
+
+    def corrupt(folder, other):
+        for name in names:
+            shutil.copy(other / name, folder / name)
+
+    return corrupt
+
+
+def other_rig(folder, other):
+    """Take the other scene's poses, and record the baselines that they have."""
+    own, others = (json.loads((each / "trajectory.json").read_text()) for each in (folder, other))
+    (folder / "trajectory.json").write_text(json.dumps(own | {"frames": others["frames"]}))
+    place_cameras(folder, {})
+
+
+@pytest.fixture(scope="module")
+def two_wide_scenes(tmp_path_factory):
+    """Two scenes in which cameras see so much more than others that pairs as wide differ."""
+    root = tmp_path_factory.mktemp("wide")
+    first, second = synthesise(root, WIDE)
+    return root / second, root / first
+
+
+@pytest.mark.parametrize(
+    ("corrupt", "words"),
+    [
+        (lambda folder, _: place_cameras(folder, {3: 1.05}), "camera 3 .* px further right, .*"),
+        (lambda folder, _: place_cameras(folder, {3: 0.95}), "camera 3 .* px further left, .*"),
+        (lambda folder, _: pictures_of(3, lambda seen: np.roll(seen, 1, axis=2))(folder),
+         "camera 3 .* (0.9|1.0) px further right, another moment or another place, or its .*"),
+        (of_another_scene("cam_02_rgb.mp4", "cam_02_depth.mkv"), "camera 2 do not fit .*"),
+    ],
+    ids=["elsewhere", "elsewhere the other way", "one pixel aside", "another scene's"],
+)  # fmt: skip
+def test_no_camera_beside_the_wrong_one_is_named(two_wide_scenes, tmp_path, corrupt, words):
+    scene, other = two_wide_scenes
+    corrupt(copied(scene, tmp_path), other)
+
+    (verdict,) = diagnose(tmp_path, frames=2, workers=1).verdicts
+
+    (problem,) = verdict.contradicted
+    assert re.fullmatch(f"pictures of {words}", problem)
+
+
+def test_where_most_places_are_wrong_no_camera_is_named(two_wide_scenes, tmp_path):
+    scene, other = two_wide_scenes
+    other_rig(copied(scene, tmp_path), other)
+
+    (verdict,) = diagnose(tmp_path, frames=2, workers=1).verdicts
+
+    assert verdict.contradicted == [
+        "cameras disagree in places or columns of pictures, and no majority of them agrees"
+    ]
+
+
+def test_a_flip_accuses_depth_or_pictures():
+    rivals = tuple(Rival("flip", flip, Evidence(9.0, 0.1)) for flip in ("none", "vertical"))
+    verdict = judged(best=Hypothesis(flip="horizontal"), gain=Evidence(9.0, 0.1), rivals=rivals)
+
+    flip = answer(verdict, "flip of depth")
+
+    assert (flip.status, flip.found) == ("wrong", "horizontal")
+    assert flip.note == "or the pictures are flipped"
+    assert verdict.contradicted == [
+        "flip of depth horizontal, not none (or the pictures are flipped)"
+    ]
 
 
 def test_two_cameras_that_differ_are_both_named(verdict_on):

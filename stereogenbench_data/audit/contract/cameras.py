@@ -2,10 +2,12 @@
 
 A match of two pictures is judged twice, by the depth of either camera. In correct data both explain
 as many matches; wrong depth of one camera explains fewer, or differs in scale from the other. A
-problem of a picture (its rows do not align, it shows another moment) appears in all pairs of its
-camera, by either depth.
+problem of a picture (it is shifted, shows another moment, or was taken elsewhere than recorded)
+appears in all pairs of its camera, by either depth.
 
-The reference is the largest group of cameras that agree with one another, if it is the majority.
+The reference is the largest group of cameras that agree with one another, if it is the majority:
+else no camera is named. Shares of matches depend on what a pair sees, too, so a camera is named by
+them only if no other lacks nearly as many.
 """
 
 import itertools
@@ -15,10 +17,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from stereogenbench_data.audit.contract.hypotheses import LAGS, Hypothesis, Question
-from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames
+from stereogenbench_data.audit.contract.matching import FrameMatch, Points, SceneFrames
 from stereogenbench_data.audit.contract.scoring import (
     Pair,
     ScoredContract,
@@ -31,8 +33,8 @@ from stereogenbench_data.schema.text import counted
 LEAST_SHARE: Final = 0.5
 """Least share of a camera's matches with its neighbours that its depth must explain."""
 MOST_LOG_SCALE: Final = 0.005
-MOST_ROWS_PX: Final = 0.25
-"""Limits beyond which a camera differs from the others: scale of its depth, rows."""
+MOST_SHIFT_PX: Final = 0.25
+"""Limits beyond which a camera differs from the others: scale of its depth, shift of pictures."""
 _LEAST_DEFICIT: Final = 0.12
 _LEAST_UNLIKE: Final = 0.05
 """Least share of matches that a camera's pairs lack, compared with other pairs as wide: matches
@@ -78,7 +80,8 @@ class CameraCheck:
 
     Attributes:
         cameras: Figures of all six cameras; empty if no pair has enough matches.
-        problems: What is wrong with single cameras, in words; each names its camera.
+        problems: What is wrong with single cameras, in words; each names its camera, unless no
+            majority of cameras agrees.
     """
 
     cameras: tuple[CameraFigures, ...] = ()
@@ -112,8 +115,10 @@ class CameraCheck:
 class _Beside:
     """Two cameras: their matches of all frames, and what either camera's depth predicts.
 
-    ``near`` is the share of matches that each camera's depth explains, ``alike`` the share of those
-    that either explains in which the two depths agree.
+    ``near`` is the share of matches that each camera's depth explains. ``share`` is the share that
+    the better of the two explains if all matches are moved by what they are off in the middle,
+    ``across_px``, and ``row_px`` how much further down they are. ``alike`` is the share of those
+    that either explains so in which the two depths agree; nan if there are too few.
     """
 
     pair: Pair
@@ -124,11 +129,8 @@ class _Beside:
     log_ratio: float
     ratio_error: float
     row_px: float
-
-    @property
-    def share(self) -> float:
-        """The share of matches that the better of the two depths explains."""
-        return max(self.near.values())
+    across_px: float
+    share: float
 
 
 def check_cameras(
@@ -164,10 +166,19 @@ def check_cameras(
         f"matches, where theirs agree in {usual:.0%}"
         for camera, alike, usual in _behind(pairs, lambda beside: beside.alike, least=_LEAST_UNLIKE)
     }
-    scales, scale_problems = _scale_problems(pairs, most=max(MOST_LOG_SCALE, depth_step / 4))
-    rows = _row_problems(pairs)
+    scales, scale_problems, scale_doubt = _scale_problems(
+        pairs, most=max(MOST_LOG_SCALE, depth_step / 4)
+    )
+    clear = [beside for beside in pairs if beside.share >= LEAST_SHARE]
+    rows, row_doubt = _shifts(
+        {beside.pair: beside.row_px for beside in clear}, ("higher", "lower"), "rows of pictures"
+    )
+    across, across_doubt = _shifts(
+        {beside.pair: beside.across_px for beside in clear},
+        ("further left", "further right"), "places or columns of pictures",
+    )  # fmt: skip
     behind = _behind(pairs, lambda beside: beside.share, least=_LEAST_DEFICIT)
-    odd_pictures = {*rows, *(camera for camera, *_ in behind)}
+    odd_pictures = {*rows, *across, *(camera for camera, *_ in behind)}
     problems |= scale_problems
     for camera in set(range(CAMERA_COUNT)) - odd_pictures:
         better = _better_depth(
@@ -180,9 +191,10 @@ def check_cameras(
         problems[camera] = (
             f"pictures of camera {camera} are {when}, or its recorded place is wrong"
             if late
-            else _picture_problem(pairs, camera, rows.get(camera))
+            else _picture_problem(camera, rows.get(camera, ""), across.get(camera, ""))
         )
-    return CameraCheck(tuple(figures), tuple(problems[camera] for camera in sorted(problems)))
+    named = (problems[camera] for camera in sorted(problems))
+    return CameraCheck(tuple(figures), (*named, *scale_doubt, *row_doubt, *across_doubt))
 
 
 def _beside(
@@ -210,18 +222,35 @@ def _beside(
     near = np.abs(left_px - found) < first.grain_px, np.abs(right_px - found) < first.grain_px
     usable = left_px * right_px > 0
     log_ratio, ratio_error = _median(np.log(left_px[usable] / right_px[usable]))
-    either = near[0] | near[1]
+    moved = [_moved(found, predicted, first.grain_px) for predicted in (left_px, right_px)]
+    either = moved[0][1] | moved[1][1]
     allowed_px = _LEAST_AWAY * first.grain_px + 2 * depth_step * np.abs(right_px)
+    are_alike = (np.abs(left_px - right_px) < allowed_px)[either]
     return _Beside(
         pair=first.pair,
         width_m=abs(views.baseline_m(first, hypothesis)),
         count=len(found),
         near={pair: float(side.mean()) for pair, side in zip(first.pair, near, strict=True)},
-        alike=float((np.abs(left_px - right_px) < allowed_px)[either].sum() / max(either.sum(), 1)),
+        alike=float(are_alike.mean()) if len(are_alike) >= _FEWEST_MATCHES else math.nan,
         log_ratio=log_ratio,
         ratio_error=ratio_error,
         row_px=float(upward[either].sum() / max(steep[either].sum(), 1e-6)),
+        across_px=min((away_px for away_px, _ in moved), key=abs),
+        share=max(float(explained.mean()) for _, explained in moved),
     )
+
+
+def _moved(found: Points, predicted: Points, grain_px: int) -> tuple[float, Bool[np.ndarray, " n"]]:
+    """Return how far matches are off in the middle, and which are explained if all are moved so.
+
+    A shifted picture moves all alike, a camera elsewhere than recorded in proportion.
+    """
+    away_px = float(np.median(found - predicted))
+    ahead = found * predicted > 0
+    factor = float(np.median(found[ahead] / predicted[ahead])) if ahead.any() else 1.0
+    tries = predicted, predicted + away_px, factor * predicted
+    explained = (np.abs(found - each) < grain_px for each in tries)
+    return away_px, max(explained, key=lambda each: int(each.sum()))
 
 
 def _of(pairs: Sequence[_Beside], camera: int) -> list[_Beside]:
@@ -230,8 +259,10 @@ def _of(pairs: Sequence[_Beside], camera: int) -> list[_Beside]:
     return sorted(own, key=lambda beside: beside.width_m)
 
 
-def _scale_problems(pairs: Sequence[_Beside], *, most: float) -> tuple[list[float], dict[int, str]]:
-    """Return each camera's depth over that of the reference, and the cameras that differ."""
+def _scale_problems(
+    pairs: Sequence[_Beside], *, most: float
+) -> tuple[list[float], dict[int, str], list[str]]:
+    """Return each camera's depth over the reference's, the cameras that differ, and doubts."""
     # Disparity is inverse to depth: hence the sign.
     values = {beside.pair: -beside.log_ratio for beside in pairs}
     limits = {beside.pair: max(most, 4 * beside.ratio_error) for beside in pairs}
@@ -241,20 +272,20 @@ def _scale_problems(pairs: Sequence[_Beside], *, most: float) -> tuple[list[floa
         for camera, value in enumerate(logs)
         if abs(value) > min(max(limits.values()), 0.02)
     }
-    return [math.exp(value) for value in logs], _or_all(words, group, "scale of depth")
+    return [math.exp(value) for value in logs], *_by_majority(words, group, "scale of depth")
 
 
-def _row_problems(pairs: Sequence[_Beside]) -> dict[int, str]:
-    """Return the cameras whose pictures are too far up or down."""
-    values = {beside.pair: beside.row_px for beside in pairs}
-    levels, group = _levels(values, dict.fromkeys(values, MOST_ROWS_PX))
+def _shifts(
+    values: Mapping[Pair, float], ways: tuple[str, str], what: str
+) -> tuple[dict[int, str], list[str]]:
+    """Return how far the pictures of cameras are shifted, and doubts."""
+    levels, group = _levels(values, dict.fromkeys(values, MOST_SHIFT_PX))
     words = {
-        camera: f"pictures of camera {camera} are {abs(px):.1f} px "
-        f"{'higher' if px < 0 else 'lower'}"
-        for camera, px in enumerate(levels)
-        if abs(px) > MOST_ROWS_PX
+        camera: f"{abs(level):.1f} px {ways[level > 0]}"
+        for camera, level in enumerate(levels)
+        if abs(level) > MOST_SHIFT_PX
     }
-    return _or_all(words, group, "rows of pictures")
+    return _by_majority(words, group, what)
 
 
 def _behind(
@@ -262,30 +293,35 @@ def _behind(
 ) -> Iterator[tuple[int, float, float]]:
     """Yield cameras all of whose pairs have smaller shares than other pairs as wide.
 
-    The share of the camera's best pair, and of the best one without the camera, come with it.
+    Of several such cameras those stay that lack more than half as much as the one that lacks most:
+    a wrong camera makes a part of its neighbours' pairs wrong. The shares of the pair that lacks
+    least, and of the best one without the camera, come with it.
     """
+    known = [beside for beside in pairs if math.isfinite(share(beside))]
+    found: dict[int, list[tuple[float, float]]] = {}
     for camera in range(CAMERA_COUNT):
-        found = []
-        for beside in _of(pairs, camera):
+        for beside in _of(known, camera):
             others = [
-                share(other) for other in pairs
+                share(other) for other in known
                 if camera not in other.pair and other.width_m >= 0.9 * beside.width_m
             ]  # fmt: skip
             if others:
-                found.append((share(beside), max(others)))
-        if len(found) >= _NARROWEST and all(best - own > least for own, best in found):
-            yield camera, *max(found)
+                found.setdefault(camera, []).append((share(beside), max(others)))
+    lacks = {camera: [best - own for own, best in shares] for camera, shares in found.items()}
+    most = max((float(np.median(each)) for each in lacks.values()), default=0.0)
+    for camera, shares in found.items():
+        if len(shares) >= _NARROWEST and min(lacks[camera]) > max(least, most / 2):
+            yield camera, *min(shares, key=lambda each: each[1] - each[0])
 
 
-def _picture_problem(pairs: Sequence[_Beside], camera: int, row_problem: str | None) -> str:
+def _picture_problem(camera: int, row: str, across: str) -> str:
     """Return what is wrong with a camera's pictures."""
-    explained = max(beside.share for beside in _of(pairs, camera))
-    if row_problem is not None and explained >= LEAST_SHARE:
-        return f"{row_problem}, or show another moment"
-    rows = f" ({row_problem})" if row_problem else ""
+    if row and not across:
+        return f"pictures of camera {camera} are {row}, or show another moment"
+    shift = " and ".join(part for part in (across, row) if part) or "other rows"
     return (
         f"pictures of camera {camera} do not fit those of the others, by the depth of "
-        f"either: other rows{rows}, another moment or another place, or its recorded place is wrong"
+        f"either: {shift}, another moment or another place, or its recorded place is wrong"
     )
 
 
@@ -438,8 +474,10 @@ def _levels(
     return levels, largest
 
 
-def _or_all(words: dict[int, str], group: set[int], what: str) -> dict[int, str]:
-    """Return the words, or that cameras disagree if no majority of them agrees."""
+def _by_majority(
+    words: dict[int, str], group: set[int], what: str
+) -> tuple[dict[int, str], list[str]]:
+    """Return the words and no doubt; or no words, and a doubt, if no majority of cameras agrees."""
     if not words or len(group) >= _MAJORITY:
-        return words
-    return dict.fromkeys(words, f"cameras disagree in {what}, and no majority of them agrees")
+        return words, []
+    return {}, [f"cameras disagree in {what}, and no majority of them agrees"]

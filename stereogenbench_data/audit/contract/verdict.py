@@ -48,6 +48,7 @@ _WORDS: Final[dict[Any, str]] = {
     "ray": "the ray",
     "inverse": "inverse depth",
 }
+_OR_PICTURES: Final = "or the pictures are flipped"
 _MOST_NAMED: Final = 4
 
 
@@ -125,6 +126,7 @@ def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
         *([f"not tested, for lack of {want}: {', '.join(map(describe, untested))}"]
           if untested else []),
         *([f"lags beyond {max(LAGS)} frames are not examined"] if at_end else []),
+        *([_OR_PICTURES] if question == "flip" and best != declared else []),
     ])  # fmt: skip
     if best == declared:
         if close or lacking or not tested:
@@ -323,6 +325,7 @@ class Verdict:
             f"{answer.topic} {answer.found}"
             # The unit that is declared is one of three lengths of which any may be wrong.
             + (f", not {answer.declared}" if answer.topic != QUOTIENT else "")
+            + (f" ({_OR_PICTURES})" if answer.topic == TOPICS["flip"] else "")
             for answer in self.answers
             if answer.status == "wrong"
         ]
