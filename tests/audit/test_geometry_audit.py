@@ -269,6 +269,17 @@ def test_no_single_file_is_named_for_what_is_wrong_with_all(decidable_release, t
     assert {each.check for each in report.findings} >= {"depth residual", "picture time"}
 
 
+def test_no_file_is_called_late_where_pictures_of_another_camera_seem_late_too(tmp_path):
+    request = SynthRequest(family="Uniform", scenes=2, size_px=160, frames=9, seed=36)
+    (key,) = synthesise(tmp_path, request, part=(1, 2))
+    place_cameras(tmp_path / key, dict.fromkeys(range(6), 0.98))
+
+    (finding,) = audit(tmp_path, workers=1).findings
+
+    assert (finding.member, finding.check) == ("", "picture time")
+    assert "in camera 5 " in finding.found
+
+
 def test_units_that_contradict_one_another_are_one_finding(indexed_release, tmp_path):
     report = made_wrong(
         indexed_release, tmp_path, lambda folder: rewrite_depth(folder, tags=10.0, cameras=[2])

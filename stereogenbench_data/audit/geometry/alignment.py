@@ -315,7 +315,9 @@ class AlignmentCheck:
             most[camera] = of[lag]
             beside[camera] = f"by those of the frame {'before' if lag < 0 else 'after'}"
             timed |= {camera} if min(of.values()) <= -_TELLS_TIME else set()
-        yield from _of_cameras("picture_lag", most, beside, suspects)
+        gaining = {camera for camera, gain in most.items() if gain > 0}
+        alone = suspects if len(gaining) <= 1 else set[int]()
+        yield from _of_cameras("picture_lag", most, beside, alone)
         why = "pictures of the neighbouring frames fit as well, or there are none"
         yield from _untested("picture_lag", timed, why)
 
