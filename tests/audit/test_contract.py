@@ -531,6 +531,41 @@ def test_where_most_places_are_wrong_no_camera_is_named(two_wide_scenes, tmp_pat
     ]
 
 
+@pytest.fixture
+def verdict_on_map(tmp_path):
+    """Draw the scene of a seed in one of all maps, make one thing wrong, and return the verdict."""
+
+    def verdict_on_map(family, corrupt, *, seed, number):
+        request = SynthRequest(
+            family=family, map_name=RAY_CASTING.maps, size_px=96, frames=9, seed=seed, scenes=3
+        )
+        (key,) = synthesise(tmp_path, request, part=(number, 3))
+        corrupt(tmp_path / key)
+        (verdict,) = diagnose(tmp_path, workers=1).verdicts
+        return verdict
+
+    return verdict_on_map
+
+
+def test_a_camera_elsewhere_does_not_make_the_quotient_of_all_wrong(verdict_on_map):
+    verdict = verdict_on_map(
+        "IPD_Gaussian", lambda folder: place_cameras(folder, {5: 0.95}), seed=12, number=2
+    )
+
+    assert verdict.contradicted == []
+    assert answer(verdict, QUOTIENT).status == "cannot tell"
+
+
+def test_depth_is_not_accused_at_matches_that_are_false(verdict_on_map):
+    """The outermost camera is so far away that no other pair is as wide."""
+    verdict = verdict_on_map(
+        "Uniform", pictures_of(5, lambda seen: seen[:, ::-1]), seed=11, number=1
+    )
+
+    assert verdict.contradicted == []
+    assert verdict.unexplained_cameras == (5,)
+
+
 def test_a_flip_accuses_depth_or_pictures():
     rivals = tuple(Rival("flip", flip, Evidence(9.0, 0.1)) for flip in ("none", "vertical"))
     verdict = judged(best=Hypothesis(flip="horizontal"), gain=Evidence(9.0, 0.1), rivals=rivals)

@@ -118,7 +118,7 @@ class _Beside:
     ``near`` is the share of matches that each camera's depth explains. ``share`` is the share that
     the better of the two explains if all matches are moved by what they are off in the middle,
     ``across_px``, and ``row_px`` how much further down they are. ``alike`` is the share of those
-    that either explains so in which the two depths agree; nan if there are too few.
+    that either explains so in which the two depths agree.
     """
 
     pair: Pair
@@ -161,15 +161,16 @@ def check_cameras(
         count = sum(beside.count for beside in nearest)
         explained = sum(beside.count * beside.near[camera] for beside in nearest)
         figures.append(CameraFigures(camera, count, explained / count if count else math.nan))
+    # In other pairs matches are false, and what is compared has nothing in common.
+    clear = [beside for beside in pairs if beside.share >= LEAST_SHARE]
     problems = {
         camera: f"depth of camera {camera} agrees with that of the others in {alike:.0%} of the "
         f"matches, where theirs agree in {usual:.0%}"
-        for camera, alike, usual in _behind(pairs, lambda beside: beside.alike, least=_LEAST_UNLIKE)
+        for camera, alike, usual in _behind(clear, lambda beside: beside.alike, least=_LEAST_UNLIKE)
     }
     scales, scale_problems, scale_doubt = _scale_problems(
-        pairs, most=max(MOST_LOG_SCALE, depth_step / 4)
+        clear, most=max(MOST_LOG_SCALE, depth_step / 4)
     )
-    clear = [beside for beside in pairs if beside.share >= LEAST_SHARE]
     rows, row_doubt = _shifts(
         {beside.pair: beside.row_px for beside in clear}, ("higher", "lower"), "rows of pictures"
     )
@@ -179,10 +180,14 @@ def check_cameras(
     )  # fmt: skip
     behind = _behind(pairs, lambda beside: beside.share, least=_LEAST_DEFICIT)
     odd_pictures = {*rows, *across, *(camera for camera, *_ in behind)}
+    if row_doubt or across_doubt:
+        odd_pictures = set()
     problems |= scale_problems
+    shown = {beside.pair for beside in clear}
+    in_both = [match for match in matches if match.pair in shown]
     for camera in set(range(CAMERA_COUNT)) - odd_pictures:
         better = _better_depth(
-            views, matches, contract, camera, scale=scales[camera], depth_step=depth_step
+            views, in_both, contract, camera, scale=scales[camera], depth_step=depth_step
         )
         problems |= {camera: better} if better else {}
     for camera in odd_pictures:
@@ -225,13 +230,12 @@ def _beside(
     moved = [_moved(found, predicted, first.grain_px) for predicted in (left_px, right_px)]
     either = moved[0][1] | moved[1][1]
     allowed_px = _LEAST_AWAY * first.grain_px + 2 * depth_step * np.abs(right_px)
-    are_alike = (np.abs(left_px - right_px) < allowed_px)[either]
     return _Beside(
         pair=first.pair,
         width_m=abs(views.baseline_m(first, hypothesis)),
         count=len(found),
         near={pair: float(side.mean()) for pair, side in zip(first.pair, near, strict=True)},
-        alike=float(are_alike.mean()) if len(are_alike) >= _FEWEST_MATCHES else math.nan,
+        alike=float((np.abs(left_px - right_px) < allowed_px)[either].sum() / max(either.sum(), 1)),
         log_ratio=log_ratio,
         ratio_error=ratio_error,
         row_px=float(upward[either].sum() / max(steep[either].sum(), 1e-6)),
@@ -297,12 +301,11 @@ def _behind(
     a wrong camera makes a part of its neighbours' pairs wrong. The shares of the pair that lacks
     least, and of the best one without the camera, come with it.
     """
-    known = [beside for beside in pairs if math.isfinite(share(beside))]
     found: dict[int, list[tuple[float, float]]] = {}
     for camera in range(CAMERA_COUNT):
-        for beside in _of(known, camera):
+        for beside in _of(pairs, camera):
             others = [
-                share(other) for other in known
+                share(other) for other in pairs
                 if camera not in other.pair and other.width_m >= 0.9 * beside.width_m
             ]  # fmt: skip
             if others:
@@ -452,7 +455,7 @@ def _levels(
     """Return each camera's level from differences (first less second), and the reference group.
 
     The largest group of cameras that agree is at 0; the others are at their median difference
-    from it.
+    from it, or at 0 if only one pair shows it.
     """
     group = {camera: {camera} for camera in range(CAMERA_COUNT)}
     for pair, value in values.items():
@@ -468,9 +471,8 @@ def _levels(
             for pair, value in values.items()
             if camera in pair and (set(pair) - {camera}) <= largest and math.isfinite(value)
         ]
-        levels.append(
-            0.0 if camera in largest or not differences else float(np.median(differences))
-        )
+        is_odd = camera not in largest and len(differences) >= _NARROWEST
+        levels.append(float(np.median(differences)) if is_odd else 0.0)
     return levels, largest
 
 

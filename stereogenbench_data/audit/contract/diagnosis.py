@@ -4,6 +4,7 @@
 further change clearly improves. `diagnose_scene` reports how well that contract fits.
 """
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -31,6 +32,7 @@ from stereogenbench_data.audit.contract.scoring import (
     score_hypothesis,
     voted,
 )
+from stereogenbench_data.schema.release import CAMERA_COUNT
 
 LEAST_LOG_SCALE: Final = 0.01
 """A smaller error of the unit is not called wrong."""
@@ -298,8 +300,29 @@ class ContractSearch:
         if other.hypothesis != current.hypothesis or other.is_scaled <= current.is_scaled:
             return gain.is_clear()
         least = max(self._least_log_scale, self._bias) + LEAST_ERRORS * min(other.scale_error, 1e3)
-        is_sure = abs(math.log(other.scale)) > least
-        return is_sure and gain.is_clear(least_db=_LEAST_SCALE_DB, errors=_SCALE_ERRORS)
+        is_sure = abs(math.log(other.scale)) > least and _is_clear_scale(gain)
+        return is_sure and not self._depends_on_one_camera(other, current)
+
+    def _depends_on_one_camera(self, other: ScoredContract, current: ScoredContract) -> bool:
+        """Tell whether the current scale is better in all pairs without some camera.
+
+        A camera elsewhere than recorded gives its own pairs another scale.
+        """
+        for camera in range(CAMERA_COUNT):
+            kept = [camera not in match.pair for match in self._matches]
+            worse, better = (
+                replace(each, errors=[*itertools.compress(each.errors, kept)])
+                for each in (other, current)
+            )
+            rest = [*itertools.compress(self._matches, kept)]
+            if _is_clear_scale(evidence(rest, better, worse)):
+                return True
+        return False
+
+
+def _is_clear_scale(gain: Evidence) -> bool:
+    """Tell whether a difference in scale alone is believed."""
+    return gain.is_clear(least_db=_LEAST_SCALE_DB, errors=_SCALE_ERRORS)
 
 
 def _checked(
