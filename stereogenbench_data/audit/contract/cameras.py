@@ -168,26 +168,31 @@ def check_cameras(
         f"matches, where theirs agree in {usual:.0%}"
         for camera, alike, usual in _behind(clear, lambda beside: beside.alike, least=_LEAST_UNLIKE)
     }
-    scales, scale_problems, scale_doubt = _scale_problems(
-        clear, most=max(MOST_LOG_SCALE, depth_step / 4)
-    )
-    rows, row_doubt = _shifts(
-        {beside.pair: beside.row_px for beside in clear}, ("higher", "lower"), "rows of pictures"
-    )
-    across, across_doubt = _shifts(
-        {beside.pair: beside.across_px for beside in clear},
-        ("further left", "further right"), "places or columns of pictures",
-    )  # fmt: skip
+    most = max(MOST_LOG_SCALE, depth_step / 4)
+    limits = {beside.pair: max(most, 4 * beside.ratio_error) for beside in clear}
+    least = min(max(limits.values(), default=most), 0.02)
+    # Disparity is inverse to depth: hence the sign.
+    ratios = {beside.pair: -beside.log_ratio for beside in clear}
+    logs, doubts = _levels(ratios, limits, "scale of depth", least=least)
+    problems |= {
+        camera: f"depth of camera {camera} is {math.exp(log):.4g} x that of the others"
+        for camera, log in enumerate(logs)
+        if abs(log) > least
+    }
+    limits = dict.fromkeys(limits, MOST_SHIFT_PX)
+    rows = {beside.pair: beside.row_px for beside in clear}
+    across = {beside.pair: beside.across_px for beside in clear}
+    down_px, unsure = _levels(rows, limits, "rows of pictures")
+    right_px, more = _levels(across, limits, "places or columns of pictures")
     behind = _behind(pairs, lambda beside: beside.share, least=_LEAST_DEFICIT)
-    odd_pictures = {*rows, *across, *(camera for camera, *_ in behind)}
-    if row_doubt or across_doubt:
+    shifted = np.abs([down_px, right_px]).max(axis=0) > MOST_SHIFT_PX
+    odd_pictures = {*np.flatnonzero(shifted).tolist(), *(camera for camera, *_ in behind)}
+    if unsure or more:
         odd_pictures = set()
-    problems |= scale_problems
-    shown = {beside.pair for beside in clear}
-    in_both = [match for match in matches if match.pair in shown]
+    in_both = [match for match in matches if match.pair in limits]
     for camera in set(range(CAMERA_COUNT)) - odd_pictures:
         better = _better_depth(
-            views, in_both, contract, camera, scale=scales[camera], depth_step=depth_step
+            views, in_both, contract, camera, scale=math.exp(logs[camera]), depth_step=depth_step
         )
         problems |= {camera: better} if better else {}
     for camera in odd_pictures:
@@ -196,10 +201,10 @@ def check_cameras(
         problems[camera] = (
             f"pictures of camera {camera} are {when}, or its recorded place is wrong"
             if late
-            else _picture_problem(camera, rows.get(camera, ""), across.get(camera, ""))
+            else _picture_problem(camera, down_px[camera], right_px[camera])
         )
     named = (problems[camera] for camera in sorted(problems))
-    return CameraCheck(tuple(figures), (*named, *scale_doubt, *row_doubt, *across_doubt))
+    return CameraCheck(tuple(figures), (*named, *doubts, *unsure, *more))
 
 
 def _beside(
@@ -263,35 +268,6 @@ def _of(pairs: Sequence[_Beside], camera: int) -> list[_Beside]:
     return sorted(own, key=lambda beside: beside.width_m)
 
 
-def _scale_problems(
-    pairs: Sequence[_Beside], *, most: float
-) -> tuple[list[float], dict[int, str], list[str]]:
-    """Return each camera's depth over the reference's, the cameras that differ, and doubts."""
-    # Disparity is inverse to depth: hence the sign.
-    values = {beside.pair: -beside.log_ratio for beside in pairs}
-    limits = {beside.pair: max(most, 4 * beside.ratio_error) for beside in pairs}
-    logs, group = _levels(values, limits)
-    words = {
-        camera: f"depth of camera {camera} is {math.exp(value):.4g} x that of the others"
-        for camera, value in enumerate(logs)
-        if abs(value) > min(max(limits.values()), 0.02)
-    }
-    return [math.exp(value) for value in logs], *_by_majority(words, group, "scale of depth")
-
-
-def _shifts(
-    values: Mapping[Pair, float], ways: tuple[str, str], what: str
-) -> tuple[dict[int, str], list[str]]:
-    """Return how far the pictures of cameras are shifted, and doubts."""
-    levels, group = _levels(values, dict.fromkeys(values, MOST_SHIFT_PX))
-    words = {
-        camera: f"{abs(level):.1f} px {ways[level > 0]}"
-        for camera, level in enumerate(levels)
-        if abs(level) > MOST_SHIFT_PX
-    }
-    return _by_majority(words, group, what)
-
-
 def _behind(
     pairs: Sequence[_Beside], share: Callable[[_Beside], float], *, least: float
 ) -> Iterator[tuple[int, float, float]]:
@@ -301,7 +277,7 @@ def _behind(
     a wrong camera makes a part of its neighbours' pairs wrong. The shares of the pair that lacks
     least, and of the best one without the camera, come with it.
     """
-    found: dict[int, list[tuple[float, float]]] = {}
+    found: dict[int, list[tuple[float, float, float]]] = {}
     for camera in range(CAMERA_COUNT):
         for beside in _of(pairs, camera):
             others = [
@@ -309,19 +285,25 @@ def _behind(
                 if camera not in other.pair and other.width_m >= 0.9 * beside.width_m
             ]  # fmt: skip
             if others:
-                found.setdefault(camera, []).append((share(beside), max(others)))
-    lacks = {camera: [best - own for own, best in shares] for camera, shares in found.items()}
-    most = max((float(np.median(each)) for each in lacks.values()), default=0.0)
-    for camera, shares in found.items():
-        if len(shares) >= _NARROWEST and min(lacks[camera]) > max(least, most / 2):
-            yield camera, *min(shares, key=lambda each: each[1] - each[0])
+                own, best = share(beside), max(others)
+                found.setdefault(camera, []).append((best - own, own, best))
+    most = max((float(np.median(each, axis=0)[0]) for each in found.values()), default=0.0)
+    for camera, each in found.items():
+        lack, own, best = min(each)
+        if len(each) >= _NARROWEST and lack > max(least, most / 2):
+            yield camera, own, best
 
 
-def _picture_problem(camera: int, row: str, across: str) -> str:
-    """Return what is wrong with a camera's pictures."""
-    if row and not across:
-        return f"pictures of camera {camera} are {row}, or show another moment"
-    shift = " and ".join(part for part in (across, row) if part) or "other rows"
+def _picture_problem(camera: int, down_px: float, right_px: float) -> str:
+    """Return what is wrong with a camera's pictures, which are shifted by so much."""
+    shifts = [
+        f"{abs(px):.1f} px {ways[px > 0]}"
+        for px, *ways in ((right_px, "further left", "further right"), (down_px, "higher", "lower"))
+        if abs(px) > MOST_SHIFT_PX
+    ]
+    if shifts and abs(right_px) <= MOST_SHIFT_PX:
+        return f"pictures of camera {camera} are {shifts[0]}, or show another moment"
+    shift = " and ".join(shifts) or "other rows"
     return (
         f"pictures of camera {camera} do not fit those of the others, by the depth of "
         f"either: {shift}, another moment or another place, or its recorded place is wrong"
@@ -450,12 +432,17 @@ def _median(values: Float64[np.ndarray, " n"]) -> tuple[float, float]:
 
 
 def _levels(
-    values: Mapping[Pair, float], limits: Mapping[Pair, float]
-) -> tuple[list[float], set[int]]:
-    """Return each camera's level from differences (first less second), and the reference group.
+    values: Mapping[Pair, float],
+    limits: Mapping[Pair, float],
+    what: str,
+    *,
+    least: float = MOST_SHIFT_PX,
+) -> tuple[list[float], list[str]]:
+    """Return each camera's level from differences (first less second), and doubts.
 
     The largest group of cameras that agree is at 0; the others are at their median difference
-    from it, or at 0 if only one pair shows it.
+    from it, or at 0 if only one pair shows it. If it is no majority and some level is beyond
+    ``least``, all are at 0 and a doubt says so.
     """
     group = {camera: {camera} for camera in range(CAMERA_COUNT)}
     for pair, value in values.items():
@@ -473,13 +460,6 @@ def _levels(
         ]
         is_odd = camera not in largest and len(differences) >= _NARROWEST
         levels.append(float(np.median(differences)) if is_odd else 0.0)
-    return levels, largest
-
-
-def _by_majority(
-    words: dict[int, str], group: set[int], what: str
-) -> tuple[dict[int, str], list[str]]:
-    """Return the words and no doubt; or no words, and a doubt, if no majority of cameras agrees."""
-    if not words or len(group) >= _MAJORITY:
-        return words, []
-    return {}, [f"cameras disagree in {what}, and no majority of them agrees"]
+    if len(largest) < _MAJORITY and max(map(abs, levels)) > least:
+        return [0.0] * CAMERA_COUNT, [f"cameras disagree in {what}, and no majority of them agrees"]
+    return levels, []

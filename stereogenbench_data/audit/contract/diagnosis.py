@@ -4,7 +4,6 @@
 further change clearly improves. `diagnose_scene` reports how well that contract fits.
 """
 
-import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -300,28 +299,17 @@ class ContractSearch:
         if other.hypothesis != current.hypothesis or other.is_scaled <= current.is_scaled:
             return gain.is_clear()
         least = max(self._least_log_scale, self._bias) + LEAST_ERRORS * min(other.scale_error, 1e3)
-        is_sure = abs(math.log(other.scale)) > least and _is_clear_scale(gain)
-        return is_sure and not self._depends_on_one_camera(other, current)
-
-    def _depends_on_one_camera(self, other: ScoredContract, current: ScoredContract) -> bool:
-        """Tell whether the current scale is better in all pairs without some camera.
-
-        A camera elsewhere than recorded gives its own pairs another scale.
-        """
-        for camera in range(CAMERA_COUNT):
-            kept = [camera not in match.pair for match in self._matches]
-            worse, better = (
-                replace(each, errors=[*itertools.compress(each.errors, kept)])
-                for each in (other, current)
-            )
-            rest = [*itertools.compress(self._matches, kept)]
-            if _is_clear_scale(evidence(rest, better, worse)):
-                return True
-        return False
+        if abs(math.log(other.scale)) <= least or not _is_clear_scale(gain):
+            return False
+        # A camera elsewhere than recorded gives its own pairs another scale, and no others.
+        without = (
+            evidence(self._matches, current, other, left_out=camera)
+            for camera in range(CAMERA_COUNT)
+        )
+        return not any(map(_is_clear_scale, without))
 
 
 def _is_clear_scale(gain: Evidence) -> bool:
-    """Tell whether a difference in scale alone is believed."""
     return gain.is_clear(least_db=_LEAST_SCALE_DB, errors=_SCALE_ERRORS)
 
 

@@ -221,7 +221,11 @@ def score_hypothesis(
 
 
 def evidence(
-    matches: Sequence[FrameMatch], better: ScoredContract, worse: ScoredContract
+    matches: Sequence[FrameMatch],
+    better: ScoredContract,
+    worse: ScoredContract,
+    *,
+    left_out: int | None = None,
 ) -> Evidence:
     """Return by how many dB one contract explains a scene better than another.
 
@@ -230,6 +234,8 @@ def evidence(
     depth (another unit, ray) differ a little at many pixels: there a pixel counts at most
     a small part of the cap, so that wrong matches do not outweigh it. Others (lag, order, flips)
     differ much at some pixels, which count in full.
+
+    The pairs of a camera that is ``left_out`` do not count.
 
     The error is the smaller of two: one from the differences between views (a pair in a frame),
     which is large if some cameras are wrong; and a jackknife over parts of the picture, each left
@@ -240,6 +246,8 @@ def evidence(
     sums = np.zeros((2, 0, SIDE_CELLS**2))
     orders_differ = better.hypothesis.order != worse.hypothesis.order
     for match, low, high in zip(matches, better.errors, worse.errors, strict=True):
+        if left_out in match.pair:
+            continue
         if orders_differ and better.hypothesis.reads_alike(
             worse.hypothesis, left=match.left, right=match.right
         ):

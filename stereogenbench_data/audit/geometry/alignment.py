@@ -269,11 +269,9 @@ class AlignmentCheck:
         motion = self._motion_figure()
         off = {pair for each in of_pairs.items() for pair in _off(*each)}
         # What is off elsewhere too, or over time in most cameras, is no single camera's.
-        suspects = {
-            camera for camera in range(CAMERA_COUNT)
-            if all(camera in pair for pair in off)
-            and not motion.value > CHECKS["motion_residual"].limit
-        }  # fmt: skip
+        suspects = set(range(CAMERA_COUNT)).intersection(*off)
+        if motion.value > CHECKS["motion_residual"].limit:
+            suspects = set()
         for each in of_pairs.items():
             yield _of_pairs(*each, suspects)
         seen = {camera for pair in known for camera in pair}
@@ -315,9 +313,9 @@ class AlignmentCheck:
             most[camera] = of[lag]
             beside[camera] = f"by those of the frame {'before' if lag < 0 else 'after'}"
             timed |= {camera} if min(of.values()) <= -_TELLS_TIME else set()
-        gaining = {camera for camera, gain in most.items() if gain > 0}
-        alone = suspects if len(gaining) <= 1 else set[int]()
-        yield from _of_cameras("picture_lag", most, beside, alone)
+        if sum(gain > 0 for gain in most.values()) > 1:
+            suspects = set()
+        yield from _of_cameras("picture_lag", most, beside, suspects)
         why = "pictures of the neighbouring frames fit as well, or there are none"
         yield from _untested("picture_lag", timed, why)
 
