@@ -273,9 +273,9 @@ def _behind(
 ) -> Iterator[tuple[int, float, float]]:
     """Yield cameras all of whose pairs have smaller shares than other pairs as wide.
 
-    Of several such cameras those stay that lack more than half as much as the one that lacks most:
-    a wrong camera makes a part of its neighbours' pairs wrong. The shares of the pair that lacks
-    least, and of the best one without the camera, come with it.
+    A camera is left out if some pair of it lacks less than half of what another camera's pairs
+    typically do: a wrong camera makes a part of its neighbours' pairs wrong. The shares of the pair
+    that lacks least, and of the best one without the camera, come with it.
     """
     found: dict[int, list[tuple[float, float, float]]] = {}
     for camera in range(CAMERA_COUNT):
@@ -287,9 +287,10 @@ def _behind(
             if others:
                 own, best = share(beside), max(others)
                 found.setdefault(camera, []).append((best - own, own, best))
-    most = max((float(np.median(each, axis=0)[0]) for each in found.values()), default=0.0)
+    typical = {camera: float(np.median(each, axis=0)[0]) for camera, each in found.items()}
     for camera, each in found.items():
         lack, own, best = min(each)
+        most = max((typical[other] for other in typical if other != camera), default=0.0)
         if len(each) >= _NARROWEST and lack > max(least, most / 2):
             yield camera, own, best
 
