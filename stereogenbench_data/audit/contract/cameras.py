@@ -35,6 +35,8 @@ LEAST_SHARE: Final = 0.5
 MOST_LOG_SCALE: Final = 0.005
 MOST_SHIFT_PX: Final = 0.25
 """Limits beyond which a camera differs from the others: scale of its depth, shift of pictures."""
+_REFINED: Final = 4
+"""So often the shift is taken anew, of the matches that the one before explains."""
 _LEAST_DEFICIT: Final = 0.12
 _LEAST_UNLIKE: Final = 0.05
 """Least share of matches that a camera's pairs lack, compared with other pairs as wide: matches
@@ -179,7 +181,8 @@ def check_cameras(
         for camera, log in enumerate(logs)
         if abs(log) > least
     }
-    limits = dict.fromkeys(limits, MOST_SHIFT_PX)
+    # The more matches are false, the more they move the middle.
+    limits = {beside.pair: MOST_SHIFT_PX / beside.share**2 for beside in clear}
     rows = {beside.pair: beside.row_px for beside in clear}
     across = {beside.pair: beside.across_px for beside in clear}
     down_px, unsure = _levels(rows, limits, "rows of pictures")
@@ -255,6 +258,10 @@ def _moved(found: Points, predicted: Points, grain_px: int) -> tuple[float, Bool
     A shifted picture moves all alike, a camera elsewhere than recorded in proportion.
     """
     away_px = float(np.median(found - predicted))
+    # Of false matches, which are few, most lie on one side.
+    for _ in range(_REFINED):
+        near = np.abs(found - predicted - away_px) < grain_px
+        away_px = float(np.median((found - predicted)[near])) if near.any() else away_px
     ahead = found * predicted > 0
     factor = float(np.median(found[ahead] / predicted[ahead])) if ahead.any() else 1.0
     tries = predicted, predicted + away_px, factor * predicted
