@@ -37,7 +37,8 @@ from stereogenbench_data.index.learning import (
 from stereogenbench_data.index.scene_folder import IncompleteScene
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import PAIR_FIELDS, VIEW_FIELDS
-from stereogenbench_data.schema.conventions import Conventions, DepthAs, PosesAs, Shape, write_toml
+from stereogenbench_data.schema.conventions import Conventions, write_toml
+from stereogenbench_data.schema.declaration import Declaration, DepthAs, PosesAt
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.text import counted
@@ -215,8 +216,8 @@ def _alike_once(surveyed: Survey) -> list[str]:
     if unread:
         told.append(
             f"nobody reads these keys of baseline.json: {', '.join(unread[:12])}. If one is what "
-            f"is missing, add its table to the file, such as [focal_length], [field_of_view] or "
-            f'[sensor_width] with place = "{unread[0]}", and test it with --check'
+            f"is missing, say so in a file: format = 2, then its table, such as "
+            f'[focal_length] with place = "{unread[0]}", and test it with --check'
         )
     return told
 
@@ -256,11 +257,11 @@ def _diagnosed(
 
 def _with_measured_depth(
     surveyed: Survey,
-    shape: Shape,
+    shape: Declaration,
     teaching: Sequence[Scene],
     others: Sequence[Scene],
     how: dict[str, Any],
-) -> tuple[Shape, DoctorReport | None]:
+) -> tuple[Declaration, DoctorReport | None]:
     """Return a shape with the depth contract that pictures confirm, as far as they do.
 
     The doctor's report by that contract comes with it.
@@ -302,8 +303,12 @@ _SHARES: Final = "share of pixels whose depth is found in another frame"
 
 
 def _with_decided_poses(
-    surveyed: Survey, shape: Shape, scene: Scene, report: DoctorReport | None, notes: list[str]
-) -> Shape:
+    surveyed: Survey,
+    shape: Declaration,
+    scene: Scene,
+    report: DoctorReport | None,
+    notes: list[str],
+) -> Declaration:
     """Return a shape with the reading of poses that depth confirms, or as it is.
 
     Args:
@@ -319,7 +324,7 @@ def _with_decided_poses(
     chosen = worlds[0].chosen if len(worlds) == 1 else ""
     if chosen:
         notes += figures
-        return replace(shape, poses=PosesAs.of_reading(chosen))
+        return replace(shape, poses=PosesAt.of_reading(chosen))
     fields = (PAIR_FIELDS | VIEW_FIELDS).items()
     refused = ", ".join(name for name, each in fields if "world" in each.held_up_by)
     why = "" if figures else "no pictures were compared, and "

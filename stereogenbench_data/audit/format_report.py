@@ -19,9 +19,9 @@ from stereogenbench_data.index.tree import SceneFolder, folder_of
 from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.schema.document import parse_object
 from stereogenbench_data.schema.parse import parse_scene_key
-from stereogenbench_data.schema.quantities import UNITS_M, words
 from stereogenbench_data.schema.release import FAMILIES, METADATA_FILES
 from stereogenbench_data.schema.text import counted
+from stereogenbench_data.schema.units import UNITS_M, words
 
 _FORM_WORDS: Final = UNITS_M.keys() | {
     "unreal", "rotator", "rotators", "quaternion", "quaternions", "euler", "matrix", "degrees",

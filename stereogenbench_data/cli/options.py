@@ -257,7 +257,8 @@ class DataOptions(SourceOptions):
 
     def stated(self) -> "Conventions | None":
         """Return the conventions, with the losses of depth that are accepted."""
-        from stereogenbench_data.schema.conventions import Conventions, DepthAs, Shape
+        from stereogenbench_data.schema.conventions import Conventions
+        from stereogenbench_data.schema.declaration import Declaration, DepthAs
         from stereogenbench_data.schema.records import DepthEncoding
 
         accepted: Any = {*(self.accept or ())}
@@ -265,7 +266,7 @@ class DataOptions(SourceOptions):
         if not accepted:
             return stated
         shapes = []
-        for shape in (Shape(),) if stated is None else stated.shapes:
+        for shape in (Declaration(),) if stated is None else stated.shapes:
             depth = shape.depth or DepthAs(encoding=DepthEncoding())
             accept = depth.encoding.accept | accepted
             depth = replace(depth, encoding=replace(depth.encoding, accept=accept))

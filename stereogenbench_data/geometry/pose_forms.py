@@ -21,8 +21,8 @@ from stereogenbench_data.geometry.pose import (
     rotation_from_quaternion_xyzw,
     rotation_from_rotator_deg,
 )
-from stereogenbench_data.schema.quantities import UNITS_M
 from stereogenbench_data.schema.trajectory import Block, RecordedPoses
+from stereogenbench_data.schema.units import UNITS_M
 
 TOLERANCE: Final = 1e-3
 """How far a quaternion's norm may be from 1, and a matrix from orthonormal."""

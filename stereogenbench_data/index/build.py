@@ -46,7 +46,8 @@ from stereogenbench_data.index.tree import (
 )
 from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.media.heads import END_BYTES, Asked
-from stereogenbench_data.schema.conventions import Conventions, Shape, depth_of
+from stereogenbench_data.schema.conventions import Conventions, depth_of
+from stereogenbench_data.schema.declaration import Declaration
 from stereogenbench_data.schema.document import brief
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Remark, Scene, SceneId, remarks_told
@@ -69,10 +70,10 @@ Checksums = Literal["none", "all"]
 ALIKE: Final = 20
 """How many scenes that are broken for one reason show that it is the format."""
 FORMAT_CURE: Final = (
-    "Names that are understood stand in docs/release.md. For others, write where a quantity stands "
+    "Files are read by the keys that the paper prints. For others, write where a quantity stands "
     "into a file of conventions: `stereogenbench conventions {root} -o c.toml` lists the keys that "
-    'nobody reads; add a table, such as [field_of_view] with place = "$.camera_intrinsics.angle", '
-    "and give the file as conventions= or --conventions."
+    'nobody reads; add a table, such as [focal_length] with place = "$.lens.f" and unit = "mm", '
+    "and give the file as conventions= or --conventions. docs/release.md has examples."
 )
 _MOST_UNTOLD: Final = 2500
 """More requests are told: the Hub answers 3,000 in five minutes."""
@@ -139,7 +140,7 @@ class Tree:
         is_marked: Whether some scene, wanted or not, is known to have its completion mark.
         cache: Where what is found out is kept.
         remote: What lists the files behind the URL; None on this machine.
-        conventions: Where quantities stand in the files; what they do not state is found.
+        conventions: Where quantities stand in the files; what they do not state is the release's.
         valid_depth: Whether depth pictures are decoded, see `walk`.
         checksums: Whether rows hold checksums, see `walk`.
         reads: Whether of videos on this machine only heads are read, or all.
@@ -209,7 +210,7 @@ class Tree:
         return {scene.map_name for scene in scenes if scene.split == "train"}
 
     @property
-    def stated(self) -> Shape | None:
+    def stated(self) -> Declaration | None:
         """What conventions state of all scenes."""
         return None if self.conventions is None else self.conventions.shapes[0]
 

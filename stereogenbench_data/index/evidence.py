@@ -21,12 +21,12 @@ from stereogenbench_data.geometry.camera import recorded_intrinsics
 from stereogenbench_data.geometry.pose import OPENCV_FROM_UNREAL, CameraPoses
 from stereogenbench_data.geometry.pose_forms import Reading, readings
 from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
-from stereogenbench_data.schema.conventions import PosesAs
-from stereogenbench_data.schema.quantities import UNITS_M
+from stereogenbench_data.schema.declaration import PosesAt
 from stereogenbench_data.schema.records import Rig
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.schema.trajectory import RecordedPoses, record_poses
+from stereogenbench_data.schema.units import UNITS_M
 
 _DEVIATION_CM: Final = 0.1
 _DEVIATION_SHARE: Final = 0.001
@@ -89,7 +89,7 @@ class _Passed:
 
 
 def understood_poses(
-    text: bytes, rig: Rig, *, where: str, named: PosesAs | None = None
+    text: bytes, rig: Rig, *, where: str, named: PosesAt | None = None
 ) -> Understood:
     """Return the poses of a ``trajectory.json`` that fit a rig.
 
@@ -129,7 +129,7 @@ def understood_poses(
     )
 
 
-def _readings_as(recorded: RecordedPoses, named: PosesAs) -> Iterator[Reading]:
+def _readings_as(recorded: RecordedPoses, named: PosesAt) -> Iterator[Reading]:
     """Yield the readings that conventions name, in the unit that they name."""
     for reading in readings(recorded):
         if named.fits(reading.name):

@@ -25,14 +25,16 @@ from stereogenbench_data.index.scene_folder import (
 )
 from stereogenbench_data.index.tree import folder_of
 from stereogenbench_data.media.container import StreamFacts
-from stereogenbench_data.schema.conventions import (
+from stereogenbench_data.schema.conventions import Conventions, keys_unread
+from stereogenbench_data.schema.declaration import (
+    BUILT_IN,
     UNKNOWN,
-    Conventions,
+    Declaration,
     DepthAs,
-    PosesAs,
-    Shape,
+    PosesAt,
 )
-from stereogenbench_data.schema.parse import parse_scene_key, see_rig
+from stereogenbench_data.schema.document import parse_object
+from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import (
     DepthEncoding,
     DepthUnitSource,
@@ -63,7 +65,7 @@ class Examined:
 
     Attributes:
         key: The scene.
-        keys: The keys of its files, as `Shape.has` names them.
+        keys: The keys of its files, as `Declaration.has` names them.
         shape: What conventions would state about it.
         notes: For each table of the conventions, what was found and how it is known.
         unknown: Keys of ``baseline.json`` that nothing reads.
@@ -75,7 +77,7 @@ class Examined:
 
     key: str
     keys: frozenset[str]
-    shape: Shape
+    shape: Declaration
     notes: Notes
     unknown: list[str]
     depth: StreamFacts | None
@@ -143,17 +145,15 @@ def examine(root: str | Path, key: str, *, conventions: Conventions | None = Non
         raise
     except StereoGenBenchError as error:
         problem = str(error)
-    shape, notes, unknown = Shape(), Notes(), list[str]()
+    shape, notes, unknown = Declaration(), Notes(), list[str]()
     with suppress(StereoGenBenchError, KeyError):  # `Description` has told the problem
-        text, where = folder.read(BASELINE_JSON), f"{key}/{BASELINE_JSON}"
-        shape, notes, unknown = see_rig(text, where=where)
+        document = parse_object(folder.read(BASELINE_JSON), where=key)
+        declared = described.shape if described is not None else None
+        unknown = keys_unread(document, declared or BUILT_IN)
     if scene is not None and described is not None:
         _note_camera(scene, notes)
         named, notes["poses"] = _learned_poses(scene, described.understood)
-        # An image size that the videos contradict is not stated, as theirs counts.
-        at = {name: each for name, each in shape.at.items()
-              if not (scene.remark("size") and name.startswith("image_"))}  # fmt: skip
-        shape = replace(shape, at=at, poses=named)
+        shape = replace(shape, poses=named)
     depth = described.depths[0] if described is not None and described.depths else None
     notes["depth"] = [] if depth is None else _depth_notes(depth, scene)
     names = [name for name in (BASELINE_JSON, TRAJECTORY_JSON) if name in files]
@@ -167,7 +167,8 @@ def _note_camera(scene: Scene, notes: Notes) -> None:
     rig = scene.rig
     focal_px = rig.focal_mm / rig.sensor_width_mm * rig.image_width_px
     notes.setdefault("focal_length", []).append(
-        f"with the sensor's width, {focal_px:.6g} px in pictures {rig.image_width_px} px wide"
+        f"{rig.focal_mm:.6g} mm on a sensor {rig.sensor_width_mm:.6g} mm wide: {focal_px:.6g} px "
+        f"in pictures {rig.image_width_px} px wide"
     )
     left, right = rig.primary_pair
     apart_cm = (scene.lateral_m[right] - scene.lateral_m[left]) * 100
@@ -184,7 +185,7 @@ def _note_camera(scene: Scene, notes: Notes) -> None:
             notes.setdefault(table, []).append(scene.remark(about).removeprefix(f"{scene.id.key}/"))
 
 
-def _learned_poses(scene: Scene, found: Understood | None) -> tuple[PosesAs | None, list[str]]:
+def _learned_poses(scene: Scene, found: Understood | None) -> tuple[PosesAt | None, list[str]]:
     """Return how poses are read, and the evidence; None where it is not decided."""
     if found is None:
         reason = scene.remark("poses").replace(f"{scene.id.key}/", "")
@@ -205,7 +206,7 @@ def _learned_poses(scene: Scene, found: Understood | None) -> tuple[PosesAs | No
     others = dict.fromkeys(block.key for block in found.recorded.blocks)
     if not_read := [each for each in others if each not in read]:
         notes.append(f"numbers of six cameras that are not read: {', '.join(not_read[:6])}")
-    return None if scene.remark("world") else PosesAs.of_reading(name), notes
+    return None if scene.remark("world") else PosesAt.of_reading(name), notes
 
 
 def _depth_notes(facts: StreamFacts, scene: Scene | None) -> list[str]:
@@ -249,7 +250,7 @@ def learn(root: str | Path, examined: Sequence[Examined]) -> Learned:
     for each in teaching:
         groups.setdefault(decided_by[each.keys].shape.text(), []).append(each)
     by_size = sorted(groups.values(), key=len, reverse=True)
-    shapes: list[tuple[Shape, list[Examined]]] = []
+    shapes: list[tuple[Declaration, list[Examined]]] = []
     for group in by_size:
         elsewhere = {key for other in by_size if other is not group for each in other
                      for key in each.keys}  # fmt: skip

@@ -32,7 +32,7 @@ from stereogenbench_data.index.rows import (
     SEEK_COLUMN,
     row_of,
 )
-from stereogenbench_data.schema.conventions import shape_of_text
+from stereogenbench_data.schema.conventions import declaration_of_text
 from stereogenbench_data.schema.document import MOST_LETTERS
 from stereogenbench_data.schema.records import REMARKS, Scene, ShardFacts
 from stereogenbench_data.schema.text import shortened
@@ -360,7 +360,7 @@ def require_sound(table: pa.Table, *, where: str) -> None:
             _require_allowed(name, pc.struct_field(values, name), allowed, where=where)
     for text in pc.unique(table.column("conventions")).drop_null().to_pylist():
         try:
-            shape_of_text(text)
+            declaration_of_text(text)
         except (SchemaError, ValueError, RecursionError) as error:
             raise _odd(where, "conventions", text, f"not understood ({error})") from error
 

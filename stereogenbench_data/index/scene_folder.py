@@ -55,20 +55,14 @@ from stereogenbench_data.media.depth_frames import CODEC_NAME
 from stereogenbench_data.media.heads import Heads, heads_of
 from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
 from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
-from stereogenbench_data.schema.conventions import (
-    UNKNOWN,
-    Conventions,
-    Shape,
-    keys_of,
-    shape_of_text,
-)
+from stereogenbench_data.schema.conventions import Conventions, declaration_of_text, keys_of
+from stereogenbench_data.schema.declaration import BUILT_IN, UNKNOWN, Declaration
 from stereogenbench_data.schema.depth_contract import Statement, stated_in_json
 from stereogenbench_data.schema.document import (
     brief,
     parse_object,
 )
 from stereogenbench_data.schema.parse import (
-    contradictions,
     is_of_family,
     parse_caption,
     parse_complete,
@@ -147,7 +141,7 @@ def describe_scene(
         key: The scene's path below it.
         valid_depth: "sample" decodes the first, middle and last depth picture of each camera, for
             the share of pixels that have a depth.
-        conventions: Where quantities stand and how they are read; what they do not state is found.
+        conventions: Where quantities stand and how they are read, in place of the release's.
         folder: Its folder, where that is listed already.
         videos: Names of the videos to open; None is all. The row then holds for these alone.
 
@@ -178,7 +172,7 @@ class Description:
         """List the files; a scene of training shards says what it was derived from."""
         self.folder, self.key, self.files = folder, key, folder.stamps()
         self.remarks: list[Remark] = []
-        self.shape: Shape | None = None
+        self.shape: Declaration | None = None
         self.facts: dict[str, StreamFacts] = {}
         self.depths: list[StreamFacts] = []
         self.understood: Understood | None = None
@@ -250,8 +244,6 @@ class Description:
         if self.unread:
             self.remark("videos", "; ".join(self.unread.values()))
         found = self.understood = self.poses(rig, frames)
-        known = frames if self.document is None else None
-        self.contradicted(rig, labels, known, found)
         poses, pose_form = (None, None) if found is None else (found.poses, found.form)
         frames = frames if poses is None else min(frames, poses.frame_count)
         used = ((name, facts) for name, facts in self.facts.items() if name in _DEPTHS)
@@ -284,19 +276,6 @@ class Description:
             seek_tables=packed_tables(self.tables),
         )
         return self.derived(scene)
-
-    def contradicted(
-        self, rig: Rig, labels: SceneLabels, frames: int | None, poses: Understood | None
-    ) -> None:
-        """Note what other JSON files state otherwise than the videos and ``baseline.json``."""
-        others = {} if poses is None else {TRAJECTORY_JSON: poses.recorded.head}
-        if COMPLETE_JSON in self.files:
-            with suppress(SchemaError):
-                text = self.folder.read(COMPLETE_JSON)
-                others[COMPLETE_JSON] = parse_object(text, where=self.where(COMPLETE_JSON))
-        for name, head in others.items():
-            where = self.where(name)
-            self.remarks += contradictions(head, rig, labels, where=where, frames=frames)
 
     def probe(self, opened: Collection[str] | None) -> None:
         """Find what videos are, where their packets lie, and why others cannot be opened.
@@ -352,11 +331,8 @@ class Description:
         size_px = next(((each.width_px, each.height_px) for each in self.facts.values()), None)
         if self.document is not None:
             size_px = self.document.source_size_px
-        frames = min((each.frames for each in self.facts.values()), default=None)
-        counts = {"cameras": CAMERA_COUNT, "frames": frames if self.document is None else None}
-        rig, labels, odd = parse_rig(
-            text, where=where, shape=self.shape, size_px=size_px, counts=counts
-        )
+        declared = self.shape or BUILT_IN
+        rig, labels, odd = parse_rig(text, where=where, declared=declared, size_px=size_px)
         family = parse_scene_key(self.key).family
         self.remarks += (*odd, *require_unit(rig, family=family, where=where))
         return rig, labels
@@ -564,7 +540,7 @@ class Description:
 
 
 def keys_in(folder: SceneFolder, names: Iterable[str]) -> frozenset[str]:
-    """Return the keys of a scene's files, as `Shape.has` names them, without unreadable ones."""
+    """Return the keys of a scene's files, as `keys_of` names them, without unreadable ones."""
     found: set[str] = set()
     for name in names:
         try:
@@ -676,23 +652,14 @@ def require_finished(
 
 
 def caption_of(texts: Mapping[str, bytes], *, key: str) -> tuple[str, tuple[Remark, ...]]:
-    """Return a scene's caption from its files: the detailed one, else the short one, else "".
-
-    That of the JSON counts, and a text file that does not hold it is a remark.
-    """
+    """Return a scene's caption from its files, that of the JSON if it has one; "" without any."""
     remarks: list[Remark] = []
-    found: dict[str, str] = {}
     for name in (each for each in DESCRIPTIONS if each in texts):
         caption, odd = parse_caption(texts[name], where=f"{key}/{name}")
         remarks += odd
         if caption:
-            found[name] = caption
-    stated, text = found.get(DESCRIPTION_JSON, ""), found.get(DESCRIPTION_TXT, "")
-    if text and " ".join(stated.split()) not in " ".join(text.split()):
-        remarks.append(
-            Remark("caption", f"{key}/{DESCRIPTION_TXT}: has another caption than the JSON beside")
-        )
-    return stated or text, tuple(remarks)
+            return caption, tuple(remarks)
+    return "", tuple(remarks)
 
 
 def merged_labels(labels: SceneLabels, marked: SceneLabels) -> SceneLabels:
@@ -708,7 +675,7 @@ def sized_as_videos(
     size_px: tuple[int, int],
     *,
     remarks: list[Remark],
-    shape: Shape | None,
+    shape: Declaration | None,
 ) -> Rig:
     """Return the rig for pictures of the videos' size; that in baseline.json does not count.
 
@@ -718,7 +685,7 @@ def sized_as_videos(
     known, now = (f"{w}x{h}" for w, h in (known_px, size_px))
     is_recorded = rig.image_size_source == "recorded"
     if is_recorded and known_px != size_px:
-        if shape is not None and not {"image_width", "image_height"}.isdisjoint(shape.at):
+        if shape is not None and not {"image_width", "image_height"}.isdisjoint(shape.stated):
             raise StorageError(
                 f"{key}: by the conventions pictures have {known} pixels, and all videos have "
                 f"{now}. Correct [image_width] and [image_height], or leave them out: the "
@@ -815,9 +782,9 @@ def described_again(
         The scene, or the row itself if its files cannot be used; and for each difference the
         file's name, empty for the scene's own path, and what it tells.
     """
-    shape, conventions = Shape(), None
+    shape, conventions = Declaration(), None
     if scene.conventions is not None:
-        shape = replace(shape_of_text(scene.conventions), has=())
+        shape = replace(declaration_of_text(scene.conventions), has=())
         conventions = Conventions((shape,))
     folder = MemberFolder(source, scene)
     try:

@@ -46,7 +46,8 @@ from stereogenbench_data.index.parquet import (
     write_index_file,
 )
 from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, scene_of
-from stereogenbench_data.schema.conventions import Conventions, Shape, shape_of_text
+from stereogenbench_data.schema.conventions import Conventions, declaration_of_text
+from stereogenbench_data.schema.declaration import Declaration
 from stereogenbench_data.schema.records import Scene, SceneId, ShardFacts, remarks_told
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON, VIDEO_FILES
 from stereogenbench_data.schema.text import counted, shortened
@@ -369,9 +370,9 @@ class SceneIndex:
         return self._columns[name]
 
     @property
-    def shapes(self) -> tuple[Shape, ...]:
+    def shapes(self) -> tuple[Declaration, ...]:
         """What conventions state about its scenes; () where they were described without any."""
-        return tuple(map(shape_of_text, self.categories("conventions")[0]))
+        return tuple(map(declaration_of_text, self.categories("conventions")[0]))
 
     def categories(self, name: str) -> tuple[list[str], np.ndarray]:
         """Return the different values of a column of texts, and which each scene has.

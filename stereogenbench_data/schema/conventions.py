@@ -1,228 +1,70 @@
-"""Conventions: where quantities stand in a data set's files and how they are read, as TOML.
+"""Files of conventions: declarations that replace tables of the built-in one, as TOML.
 
-A person may write such a file by hand, from nothing: what it does not state is found as ever. What
-it states is checked against everything else that the files say; a value that is known to be wrong
-is named as ``ignored``. The whole file concerns all scenes, or each table ``[[shape]]`` those whose
-files have the keys that it names.
+    format = 2
 
     [focal_length]
-    place = "$.camera_intrinsics.focal_length_mm"
+    place = "$.lens.f"
     unit = "mm"
+
+    [pairs]
+    rows = "$.gaps[]"
+    a = "i"
+    b = "j"
+    length = "d"
+    unit = "m"
 
     [depth]
     unit_m = 0.001
-    frame_lag = 1
+
+A table in a file replaces the built-in table whole; tables that are not in the file stay. The whole
+file concerns all scenes, or each table ``[[shape]]`` those whose files have the keys that it names.
+Files without a ``format`` are of an earlier one, and are read as declarations, too.
 """
 
 import difflib
 import functools
 import json
-import math
 import re
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, get_args
 
 from stereogenbench_data.errors import SchemaError, explain_os_errors
-from stereogenbench_data.schema.document import is_number, listed_keys, parse_object
-from stereogenbench_data.schema.quantities import (
-    OTHER_UNITS,
-    UNITS_M,
-    Stated,
-    as_stated,
-    steps_of,
-    value_at,
-    words,
+from stereogenbench_data.schema.declaration import (
+    BUILT_IN,
+    LABELS,
+    Declaration,
+    DepthAs,
+    NumberAt,
+    PairsAt,
+    PosesAt,
+    PrimaryPairAt,
 )
+from stereogenbench_data.schema.document import is_number, parse_object
+from stereogenbench_data.schema.places import place_at
 from stereogenbench_data.schema.records import DepthEncoding, DepthRisk, Scene
 from stereogenbench_data.schema.text import plain_line, shortened
+from stereogenbench_data.schema.units import ANGLES, PIXELS, UNITS_M, without_unit, words
 
 MAX_BYTES: Final = 2**18
 """The largest file of conventions that is read. One that was learned has some kilobytes."""
 
-UNKNOWN: Final = "unknown"
-"""The form of poses that nobody understands: rigs are assumed rectified, and poses are not read."""
-
 _MOST: Final = 64
-_LEAST_OFFSET_M: Final = 1e-4
 _LONGEST: Final = 500
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class At:
-    """Where a quantity stands in ``baseline.json``; `_KEYS` says what each table may have.
-
-    Attributes:
-        place: The JSON path of a number, or of the list or object that holds the baselines.
-        value: The number itself, for files that do not have it.
-        unit: Its unit; None takes that of the key, or the usual one.
-        left: The JSON path of the name or number of the primary pair's left camera.
-        right: That of the right camera.
-        ignored: JSON paths of other values of the quantity, which do not count.
-    """
-
-    place: str | None = None
-    value: float | None = None
-    unit: str | None = None
-    left: str | None = None
-    right: str | None = None
-    ignored: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PosesAs:
-    """How ``trajectory.json`` is read, as `geometry.pose_forms` names it.
-
-    Attributes:
-        location: The keys on the way to the locations; None where matrices hold them.
-        rotation: The keys on the way to the rotations or matrices.
-        form: The form of the rotations; "unknown" if nobody understands the poses.
-        axes: The axes of the cameras.
-        unit: The unit of locations; None takes the one that the file states.
-    """
-
-    location: str | None = None
-    rotation: str | None = None
-    form: str | None = None
-    axes: str | None = None
-    unit: str | None = None
-
-    @classmethod
-    def of_reading(cls, name: str) -> "PosesAs":
-        """Return what the name of a reading says, with its metres in a unit or without."""
-        name, _, unit_m = name.partition(" @ ")
-        places, _, rest = name.partition(": ")
-        location, _, rotation = places.rpartition(" and ")
-        form, axes = rest.split(", ")[:2]
-        known = (unit for unit, metres in UNITS_M.items() if math.isclose(metres, float(unit_m)))
-        unit, axes = next(known) if unit_m else None, axes.removesuffix(" axes")
-        return cls(location=location or None, rotation=rotation, form=form, axes=axes, unit=unit)
-
-    def fits(self, name: str) -> bool:
-        """Return whether the reading of a name is one of these."""
-        found = self.of_reading(name)
-        return all(
-            getattr(self, part) in (None, getattr(found, part))
-            for part in ("location", "rotation", "form", "axes")
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DepthAs:
-    """The depth contract.
-
-    Attributes:
-        encoding: The contract; its unit is None where files state theirs.
-        instead_of_tag_m: The unit that tags state and that is wrong, which ``unit_m`` replaces.
-    """
-
-    encoding: DepthEncoding
-    instead_of_tag_m: float | None = None
-
-    def require(self, unit_m: float, offset_m: float, *, where: str) -> None:
-        """Refuse what files state, if it is neither the contract's nor what that replaces.
-
-        Raises:
-            SchemaError: With both figures.
-        """
-        known_m, expected_m = self.instead_of_tag_m or self.encoding.unit_m, self.encoding.offset_m
-        told, is_replaced = "", self.instead_of_tag_m is not None
-        if known_m is not None and not math.isclose(unit_m, known_m):
-            told = (
-                f"{unit_m:g} m in a stored unit of depth, and the conventions expect {known_m:g} m"
-            )
-        elif not is_replaced and not math.isclose(offset_m, expected_m, abs_tol=_LEAST_OFFSET_M):
-            told = f"a range from {offset_m:g} m, and the conventions expect {expected_m:g} m"
-        if told:
-            raise SchemaError(
-                f"{where}: states {told}. Correct unit_m and offset_m in [depth]; or, if the files "
-                f"are known to be wrong, add instead_of_tag_m = {unit_m:g}."
-            )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Shape:
-    """What is stated about the scenes whose files have some keys.
-
-    Attributes:
-        has: Keys that tell these scenes from others, as `keys_of` names them; () is all scenes.
-        at: Where quantities of ``baseline.json`` stand, by the names of tables.
-        poses: How poses are read.
-        depth: The depth contract.
-    """
-
-    has: tuple[str, ...] = ()
-    at: Mapping[str, At] = field(default_factory=dict)
-    poses: PosesAs | None = None
-    depth: DepthAs | None = None
-
-    def table(self) -> dict[str, Any]:
-        """Return the shape as a TOML or JSON document has it."""
-        table: dict[str, Any] = {"has": list(self.has)} if self.has else {}
-        table |= {name: _plain_table(at) for name, at in self.at.items()}
-        if self.poses is not None:
-            table["poses"] = _plain_table(self.poses)
-        if self.depth is not None:
-            table["depth"] = _plain_table(self.depth.encoding)
-            if self.depth.instead_of_tag_m is not None:
-                table["depth"]["instead_of_tag_m"] = self.depth.instead_of_tag_m
-        return table
-
-    def text(self) -> str:
-        """Return the shape as one line of JSON, as an index keeps it beside each scene."""
-        return json.dumps(self.table(), sort_keys=True)
-
-    def known(self, document: dict[str, Any], *, where: str) -> dict[str, Stated]:
-        """Return the numbers that are stated, or stand where it is stated, by their quantities.
-
-        Raises:
-            SchemaError: If a place that is stated is not in the document.
-        """
-        known = {}
-        for name, quantity in NUMBERS.items():
-            at = self.at.get(name, At())
-            if at.place is not None:
-                value = value_stated(document, at.place, name, where=where)
-                known[quantity] = as_stated(Stated(value, at.unit or "", at.place))
-            elif at.value is not None:
-                known[quantity] = Stated(at.value, at.unit or "", f"[{name}] of the conventions")
-        return known
-
-    @property
-    def ignored(self) -> list[str]:
-        """The JSON paths of what does not count in ``baseline.json``."""
-        return [each for at in self.at.values() for each in at.ignored]
-
-
-def value_stated(document: dict[str, Any], path: str | None, table: str, *, where: str) -> Any:
-    """Return the value at a place that conventions state.
-
-    Raises:
-        SchemaError: If it is not in the document.
-    """
-    try:
-        return value_at(document, str(path))
-    except LookupError as error:
-        keys = plain_line(listed_keys(document))
-        raise SchemaError(
-            f"{where}: {plain_line(str(path))} is not in the file, and the conventions say that "
-            f"[{table}] stands there; its keys are: {keys}. Correct the place, or state another "
-            f"[[shape]] for such files."
-        ) from error
 
 
 @dataclass(frozen=True, slots=True)
 class Conventions:
-    """What a file of conventions states: one shape of files or several, the first that fits counts.
+    """What a file of conventions states: one declaration or several, the first that fits counts.
 
     Attributes:
         shapes: At least one.
         where: The file, for messages.
     """
 
-    shapes: tuple[Shape, ...]
+    shapes: tuple[Declaration, ...]
     where: str = field(default="conventions", compare=False)
 
     @classmethod
@@ -244,15 +86,15 @@ class Conventions:
             text = file.read(MAX_BYTES + 1)
         return parse_conventions(text, where=str(path))
 
-    def shape_of(self, keys: Callable[[], Collection[str]], *, where: str) -> Shape:
-        """Return the first shape that has nothing but keys of a scene.
+    def shape_of(self, keys: Callable[[], Collection[str]], *, where: str) -> Declaration:
+        """Return the first declaration that has nothing but keys of a scene.
 
         Args:
             keys: Returns the keys of the scene's files, as `keys_of` names them.
             where: The scene, for messages.
 
         Raises:
-            SchemaError: If no shape has these keys.
+            SchemaError: If none has these keys.
         """
         there: Collection[str] = () if not self.shapes[0].has else keys()
         for shape in self.shapes:
@@ -265,43 +107,16 @@ class Conventions:
         )
 
 
-NUMBERS: Final = {
-    "focal_length": "focal",
-    "sensor_width": "sensor_width",
-    "sensor_height": "sensor_height",
-    "field_of_view": "fov",
-    "focal_length_px": "focal_px",
-    "image_width": "image_width",
-    "image_height": "image_height",
-    "principal_x": "principal_x",
-    "principal_y": "principal_y",
-}
-"""The tables of quantities that are one number, and their names in `quantities.NAMES`."""
-
-_PIXELS: Final = ("px", "pixel", "pixels")
-_UNITS: Final[dict[str, tuple[str, ...]]] = {
-    "field_of_view": tuple(sorted(OTHER_UNITS - {*_PIXELS})),
-    **dict.fromkeys(
-        ("focal_length_px", "image_width", "image_height", "principal_x", "principal_y"), _PIXELS
-    ),
-}
-"""The units that a table may have, where it is no length."""
-
-_KEYS: Final = {
-    **dict.fromkeys(NUMBERS, "place value unit ignored"),
-    "baselines": "place unit ignored",
-    "primary_pair": "left right ignored",
-    "poses": "location rotation form axes unit",
-    "depth": "unit_m offset_m kind form frame_lag no_depth accept instead_of_tag_m",
-}
-"""The tables, and what each may have."""
+def declaration_of(scene: Scene) -> Declaration:
+    """Return where quantities stand in a scene's files by its row."""
+    return BUILT_IN if scene.conventions is None else declaration_of_text(scene.conventions)
 
 
 def depth_of(scene: Scene) -> DepthEncoding:
     """Return the depth contract of a scene by its conventions; what these leave out is usual."""
     if scene.conventions is None:
         return DepthEncoding()
-    shape = shape_of_text(scene.conventions)
+    shape = declaration_of(scene)
     return _USUAL if shape.depth is None else shape.depth.encoding
 
 
@@ -309,14 +124,15 @@ _USUAL: Final = DepthEncoding(source="conventions")
 
 
 @functools.lru_cache(maxsize=64)
-def shape_of_text(text: str) -> Shape:
-    """Return the shape that an index keeps beside a scene.
+def declaration_of_text(text: str) -> Declaration:
+    """Return the declaration that an index keeps beside a scene.
 
     Raises:
-        SchemaError: If the text is not a shape.
+        SchemaError: If the text is none.
     """
     where = "the conventions of a scene"
-    return _shape(parse_object(text.encode(errors="surrogatepass"), where=where), where)
+    table = parse_object(text.encode(errors="surrogatepass"), where=where)
+    return _declaration(table, where, format_=_format_of(table, where))
 
 
 def parse_conventions(text: bytes, *, where: str) -> Conventions:
@@ -340,9 +156,10 @@ def parse_conventions(text: bytes, *, where: str) -> Conventions:
         raise SchemaError(f"{where}: not UTF-8 (byte {error.start}). Save it as UTF-8.") from error
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
         raise SchemaError(f"{where}: not TOML: {error}. Correct that line.") from error
+    format_ = _format_of(document, where)
     tables = document.get("shape", [document])
-    if "shape" in document and len(document) > 1:
-        other = next(name for name in document if name != "shape")
+    if "shape" in document and document.keys() - {"shape", "format"}:
+        other = next(name for name in document if name not in ("shape", "format"))
         raise SchemaError(
             f"{where}: [{plain_line(shortened(other))}] stands beside [[shape]], so it is not told "
             f"which scenes it concerns. Write it as [shape.{plain_line(shortened(other))}] below "
@@ -353,42 +170,176 @@ def parse_conventions(text: bytes, *, where: str) -> Conventions:
         rule = f"shape must be 1 to {_MOST} tables, written [[shape]]"
         raise SchemaError(f"{where}: {rule}, found {_shown(tables)}.")
     places = [f"{where}: shape {at}" for at in range(1, len(tables) + 1)]
-    shapes = map(_shape, tables, places if len(tables) > 1 else [where])
+    shapes = (
+        _declaration(table, place, format_=format_)
+        for table, place in zip(tables, places if len(tables) > 1 else [where], strict=True)
+    )
     return Conventions(tuple(shapes), where)
 
 
-def _shape(table: dict[str, Any], where: str) -> Shape:
-    _require_known(table, ("has", *_KEYS), where=where)
+def _format_of(document: Mapping[str, Any], where: str) -> int:
+    """Return the format of a file of conventions: 1 where none is stated.
+
+    Raises:
+        SchemaError: If it is not known.
+    """
+    format_ = document.get("format", 1)
+    if format_ not in _TABLES or type(format_) is not int:
+        raise SchemaError(
+            f"{where}: format must be 2, found {_shown(format_)}. Write format = 2, or install the "
+            f"version of this package that wrote the file."
+        )
+    return int(format_)
+
+
+_OF_LENGTH: Final = ("focal_length", "sensor_width", "sensor_height")
+_OF_PIXELS: Final = ("image_width", "image_height", "principal_x", "principal_y")
+_OF_DEPTH: Final = "unit_m offset_m kind form frame_lag no_depth accept instead_of_tag_m"
+_TABLES: Final[Mapping[int, Mapping[str, str]]] = {
+    1: {
+        **dict.fromkeys((*_OF_LENGTH[:3], "field_of_view", "focal_length_px", *_OF_PIXELS),
+                        "place value unit ignored"),
+        "baselines": "place unit ignored",
+        "primary_pair": "left right ignored",
+        "poses": "location rotation form axes unit",
+        "depth": _OF_DEPTH,
+    },
+    2: {
+        "focal_length": "place value unit as optional",
+        **dict.fromkeys((*_OF_LENGTH[1:], *_OF_PIXELS), "place value unit optional"),
+        **dict.fromkeys(("pairs", "gaps"), "rows a b length unit first optional"),
+        "primary_pair": "left right optional",
+        "poses": "location rotation frame camera outer first step form axes unit",
+        "depth": _OF_DEPTH,
+    },
+}  # fmt: skip
+"""The tables of each format, and what each may have."""
+
+_NEEDED: Final = {
+    (1, "baselines"): ("place",), (1, "primary_pair"): ("left", "right"),
+    (2, "primary_pair"): ("left", "right"), (2, "pairs"): ("rows", "a", "b"),
+    (2, "gaps"): ("rows", "a", "b"),
+}  # fmt: skip
+
+_AS: Final = {"field of view": "field_of_view", "pixels": "focal_length_px"}
+"""What a focal length may be instead of a length, and the quantity that it is then."""
+
+
+def _declaration(table: Mapping[str, Any], where: str, *, format_: int) -> Declaration:
+    """Return what a table states, in place of the tables of the built-in declaration."""
+    known = _TABLES[format_]
+    _require_known(table, ("format", "has", *known), where=where)
     tables: dict[str, dict[str, Any]] = {}
-    for name in (each for each in table if each != "has"):
+    for name in (each for each in table if each not in ("has", "format")):
         content, place = table[name], f"{where}: [{name}]"
         if not isinstance(content, dict):
             raise SchemaError(f"{place} must be a table, found {_shown(content)}.")
-        _require_known(content, _KEYS[name].split(), where=place)
+        _require_known(content, known[name].split(), where=place)
         tables[name] = values = {
-            key: _checked(key, value, where=place) for key, value in content.items()
+            key: _checked(key, value, where=place, format_=format_)
+            for key, value in content.items()
         }
-        unit, known = values.get("unit"), _UNITS.get(name, UNITS_M)
-        if unit is not None and unit not in known:
-            options = ", ".join(sorted(known))
+        unit, units = values.get("unit"), _units_of(name, values)
+        if unit is not None and unit not in units:
+            options = ", ".join(sorted(units))
             raise SchemaError(f"{place}: unit must be one of {options}, found {_shown(unit)}.")
-        needed = {"baselines": ["place"], "primary_pair": ["left", "right"]}.get(name, [])
-        for key in needed:
+        for key in _NEEDED.get((format_, name), ()):
             if key not in values:
                 raise SchemaError(f"{place}: {key} is missing. Write a JSON path, such as $.pairs.")
         stated = values.keys() & {"place", "value"}
-        if name in NUMBERS and len(stated) != 1 and (stated or "ignored" not in values):
+        if "value" in known[name].split() and len(stated) != 1 and (
+            stated or not values.keys() & {"ignored", "optional"}
+        ):  # fmt: skip
             raise SchemaError(
                 f"{place} must have either a place, such as "
                 f'place = "$.camera_intrinsics.{name}", or the value that it has in every scene.'
             )
     poses, depth = tables.pop("poses", None), tables.pop("depth", None)
-    return Shape(
-        has=_checked("has", table.get("has", []), where=where),
-        at={name: At(**tables[name]) for name in _KEYS if name in tables},
-        poses=None if poses is None else PosesAs(**poses),
+    written = {
+        name: {key: list(value) if isinstance(value, tuple) else value
+               for key, value in values.items() if value not in ((), None)}
+        for name, values in tables.items()
+    }  # fmt: skip
+    return Declaration(
+        **(_by_earlier if format_ == 1 else _by_tables)(tables),
+        has=_checked("has", table.get("has", []), where=where, format_=format_),
+        poses=None if poses is None else PosesAt(**poses),
         depth=None if depth is None else _depth(depth, where=f"{where}: [depth]"),
+        stated=({} if format_ == 1 else {"format": format_}) | written,
     )
+
+
+def _units_of(name: str, values: Mapping[str, Any]) -> Collection[str]:
+    """Return the units that a table may have."""
+    as_ = _AS.get(values.get("as", ""), name)
+    if as_ == "field_of_view":
+        return ANGLES
+    return PIXELS if as_ in (*_OF_PIXELS, "focal_length_px") else UNITS_M
+
+
+def _by_tables(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the parts of a declaration that tables replace."""
+    numbers, parts = dict(BUILT_IN.numbers), dict[str, Any]()
+    for name, values in tables.items():
+        is_needed = not values.get("optional", False)
+        if name in ("pairs", "gaps"):
+            own = {key: value for key, value in values.items() if key != "optional"}
+            parts[name] = PairsAt(is_needed=is_needed, **own)
+        elif name == "primary_pair":
+            ends = (_listed(values[end]) for end in ("left", "right"))
+            left, right = ends
+            parts[name] = PrimaryPairAt(left=left, right=right, is_needed=is_needed)
+        elif {"place", "value"} & values.keys():
+            quantity = _AS.get(values.get("as", ""), name)
+            numbers.pop("focal_length", None) if name == "focal_length" else None
+            numbers[quantity] = _number(quantity, values, is_needed=is_needed)
+        else:
+            from_release = numbers[name]
+            numbers[name] = NumberAt(places=from_release.places, unit=from_release.unit)
+    return {"numbers": numbers} | parts
+
+
+def _by_earlier(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the parts of a declaration that tables of the first format replace.
+
+    What is not in such a file was found; now it stands where the paper prints it. A unit that is
+    not stated is that at the end of the key.
+    """
+    numbers, parts = dict(BUILT_IN.numbers), dict[str, Any]()
+    for name, values in tables.items():
+        place = values.get("place", "")
+        unit = values.get("unit") or without_unit(words(place.rpartition(".")[2]))[1]
+        if name == "baselines":
+            pairs_unit = unit if unit in UNITS_M else "cm"
+            printed = BUILT_IN.pairs.rows.removesuffix("[]")
+            parts["pairs"] = (
+                BUILT_IN.pairs if place == printed and unit == "cm"
+                else PairsAt(rows=place, unit=pairs_unit)
+            )  # fmt: skip
+            parts["gaps"] = None if place != printed else BUILT_IN.gaps
+        elif name == "primary_pair":
+            parts[name] = PrimaryPairAt(left=(values["left"],), right=(values["right"],))
+        elif {"place", "value"} & values.keys():
+            units = _units_of(name, values)
+            own = {**values, "unit": unit} if unit in units else {**values, "unit": None}
+            numbers[name] = _number(name, own, is_needed=True)
+    if {"field_of_view", "focal_length_px"} & tables.keys() and "focal_length" not in tables:
+        numbers["focal_length"] = NumberAt(places=numbers["focal_length"].places, unit="mm")
+    return {"numbers": numbers} | parts
+
+
+def _number(name: str, values: Mapping[str, Any], *, is_needed: bool) -> NumberAt:
+    usual = "mm" if name in _OF_LENGTH else "" if name == "field_of_view" else "px"
+    return NumberAt(
+        places=_listed(values.get("place", ())),
+        value=values.get("value"),
+        unit=values.get("unit") or usual,
+        is_needed=is_needed,
+    )
+
+
+def _listed(value: str | tuple[str, ...]) -> tuple[str, ...]:
+    return (value,) if isinstance(value, str) else value
 
 
 def _depth(values: dict[str, Any], *, where: str) -> DepthAs:
@@ -414,25 +365,70 @@ def _is_text(value: object) -> bool:
     return isinstance(value, str) and 0 < len(value) <= _LONGEST
 
 
+def _is_place(*axes: int) -> Callable[[object], bool]:
+    """Return what tells whether a value is a place in a document, with such a number of axes."""
+
+    def is_place(value: object) -> bool:
+        if not (_is_text(value) and str(value)[0] == "$" < str(value)):
+            return False
+        try:
+            return place_at(str(value)).axes in axes
+        except LookupError:
+            return False
+
+    return is_place
+
+
+def _is_row_part(value: object) -> bool:
+    if not (isinstance(value, str) and len(value) <= _LONGEST):
+        return False
+    try:
+        return value == "order" or place_at(value).axes == 0
+    except LookupError:
+        return False
+
+
+_PLACE: Final = "a JSON path, such as $.camera_intrinsics.focal_length_mm"
 _RULES: Final[tuple[tuple[str, Callable[[Any], bool], str], ...]] = (
-    ("kind form location rotation axes unit has accept", _is_text, "a text"),
-    ("place left right ignored", lambda value: _is_text(value) and value[0] == "$" < value,
-     "a JSON path, such as $.camera_intrinsics.focal_length_mm"),
+    ("kind form axes unit has accept", _is_text, "a text"),
+    ("as", lambda value: value in _AS, '"field of view" or "pixels"'),
+    ("outer", lambda value: value in ("frames", "cameras"), '"frames" or "cameras"'),
+    ("optional", lambda value: isinstance(value, bool), "true or false"),
+    ("first step", lambda value: type(value) is int and 0 <= value < 10**6, "a whole number"),
     ("value instead_of_tag_m", lambda value: is_number(value) and value > 0,
      "a number above zero"),
     ("unit_m offset_m frame_lag", lambda value: not isinstance(value, bool), "a number"),
     ("no_depth", lambda value: type(value) in (int, str), 'a stored number or "max"'),
 )  # fmt: skip
+_RULES_OF: Final[Mapping[int, tuple[tuple[str, Callable[[Any], bool], str], ...]]] = {
+    1: (
+        ("location rotation", _is_text, "a text"),
+        ("place left right ignored", _is_place(0), _PLACE),
+    ),
+    2: (
+        ("location rotation frame camera", _is_place(1, 2),
+         "a JSON path with the frames and the cameras, such as "
+         "$.frames[].cameras[].location[x,y,z]"),
+        ("rows", _is_place(1, 2),
+         "a JSON path that ends in [] or {}, such as $.pairwise_pairs[]"),
+        ("a b length", _is_row_part, 'a place below the row, such as "camera_index_a" or "#0"'),
+        ("place left right", _is_place(0), _PLACE),
+    ),
+}  # fmt: skip
 """What the value of a key must be, or each of a list."""
 _LISTS: Final = ("has", "accept", "ignored", "no_depth")
+_MAY_BE_LISTS: Final = ("place", "left", "right")
 
 
-def _checked(key: str, value: Any, *, where: str) -> Any:
+def _checked(key: str, value: Any, *, where: str, format_: int) -> Any:
     """Return the value of a key as records hold it."""
-    is_right, what = next((rule, what) for keys, rule, what in _RULES if key in keys.split())
+    rules = (*_RULES_OF[format_], *_RULES)
+    is_right, what = next((rule, what) for keys, rule, what in rules if key in keys.split())
     is_list = isinstance(value, list)
     values = value if is_list else [value]
-    if is_list != (key in _LISTS) or len(values) > _MOST or not all(map(is_right, values)):
+    may_be = key in _LISTS or (format_ > 1 and key in _MAY_BE_LISTS and bool(value))
+    is_of_kind = may_be if is_list else key not in _LISTS
+    if not is_of_kind or len(values) > _MOST or not all(map(is_right, values)):
         what = f"a list, and each {what}" if key in _LISTS else what
         raise SchemaError(f"{where}: {key} must be {what}, found {_shown(value)}.")
     if key == "accept":
@@ -449,17 +445,6 @@ def _shown(value: object) -> str:
     return plain_line(shortened(repr(value)))
 
 
-def _plain_table(record: Any) -> dict[str, Any]:
-    """Return the fields of a record that are not as usual, as TOML and JSON have them."""
-    usual, table = type(record)(), {}
-    for name in (each.name for each in fields(record) if each.name != "source"):
-        value = getattr(record, name)
-        if value != getattr(usual, name):
-            listed = sorted(value, key=str) if isinstance(value, frozenset) else value
-            table[name] = list(listed) if isinstance(value, tuple | frozenset) else value
-    return table
-
-
 def write_toml(conventions: Conventions, notes: Mapping[tuple[int, str], Iterable[str]]) -> str:
     """Return conventions as TOML that `parse_conventions` reads, with notes as comments.
 
@@ -470,19 +455,25 @@ def write_toml(conventions: Conventions, notes: Mapping[tuple[int, str], Iterabl
     """
     is_one = len(conventions.shapes) == 1 and not conventions.shapes[0].has
     lines = [*_comments(notes.get((-1, ""), ()))]
+    formats = {shape.tables().get("format", 1) for shape in conventions.shapes}
+    lines += [f"format = {max(formats)}"] if max(formats) > 1 else []
     for number, shape in enumerate(conventions.shapes):
         lines += ["", *_comments(notes.get((number, ""), ()))]
-        table = shape.table()
+        table = shape.tables()
+        table.pop("format", None)
         if not is_one:
             lines += ["[[shape]]"]
             lines += [f"has = {_toml(table.pop('has', []))}"]
         noted = [name for at, name in notes if at == number and name and name not in table]
-        for name in sorted({*table, *noted}, key=[*_KEYS].index):
+        for name in sorted({*table, *noted}, key=_ORDER.index):
             lines += ["", *_comments(notes.get((number, name), ()))]
             if name in table:
                 lines += [f"[{name}]" if is_one else f"[shape.{name}]"]
                 lines += [f"{key} = {_toml(value)}" for key, value in table[name].items()]
     return "\n".join(lines).strip() + "\n"
+
+
+_ORDER: Final = [*dict.fromkeys(name for tables in (_TABLES[2], _TABLES[1]) for name in tables)]
 
 
 def _comments(notes: Iterable[str]) -> Iterator[str]:
@@ -493,7 +484,7 @@ def _comments(notes: Iterable[str]) -> Iterator[str]:
 def _toml(value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_toml, value))}]"
-    if isinstance(value, str):
+    if isinstance(value, str | bool):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return repr(value)
 
@@ -520,14 +511,32 @@ def keys_of(node: Any, *, place: str = "$") -> set[str]:
     return found
 
 
-def place_of(path: str) -> str:
-    """Return a JSON path as `keys_of` names it.
+def keys_unread(document: dict[str, Any], declared: Declaration) -> list[str]:
+    """Return the keys of a ``baseline.json``, as `keys_of` names them, that a declaration ignores.
 
-    >>> place_of('$.pairwise_pairs[3].baseline_cm'), place_of('$.baselines["0-1"]')
-    ('$.pairwise_pairs[].baseline_cm', '$.baselines.#_#')
+    >>> keys_unread({"zoom": 3, "pairwise_pairs": [{"index": 7, "baseline_cm": 6.5}]}, BUILT_IN)
+    ['$.pairwise_pairs[].index', '$.zoom']
     """
-    named = (
-        "[]" if isinstance(step, int) else f".{re.sub('[0-9]+', '#', words(step))}"
-        for step in steps_of(path)
+    texts = [place for at in declared.numbers.values() for place in at.places]
+    texts += [place for places in LABELS.values() for place in places]
+    texts += [*declared.primary_pair.left, *declared.primary_pair.right]
+    for at in filter(None, (declared.pairs, declared.gaps)):
+        texts += [f"{at.rows}.{part}" for part in (at.a, at.b, at.length) if part]
+        texts += [] if at.a else [at.rows]
+    read = {_as_key(text) for text in texts}
+    above = {text for text in read if not text.endswith("]")}
+    return sorted(
+        key for key in keys_of(document)
+        if key not in read
+        and not any(key.startswith((f"{each}.", f"{each}[")) for each in above)
+        and not any(each.startswith(f"{key}[]") for each in read)
+    )  # fmt: skip
+
+
+def _as_key(text: str) -> str:
+    """Return a place as `keys_of` names it."""
+    steps = (
+        f".{re.sub('[0-9]+', '#', words(step))}" if isinstance(step, str) else "[]"
+        for step in place_at(text).steps
     )
-    return "$" + "".join(named)
+    return "$" + "".join(steps)

@@ -19,9 +19,10 @@ from typing import Any, Final, Literal
 
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.schema.document import is_number
-from stereogenbench_data.schema.quantities import UNITS_M, nodes_of, words
+from stereogenbench_data.schema.quantities import nodes_of
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.text import shortened
+from stereogenbench_data.schema.units import UNITS_M, words
 
 About = Literal[
     "unit", "length unit", "near", "far", "offset", "normalised", "other meaning", "unclear"

@@ -1,6 +1,6 @@
 """JSON documents that nobody has checked: from bytes to objects, and values as messages show them.
 
-What a document's values mean is found by `quantities`, and of poses by `trajectory`.
+What a document's values mean is said by `declaration`.
 """
 
 import json

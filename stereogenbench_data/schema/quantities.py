@@ -13,13 +13,13 @@ from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from decimal import Decimal
 from operator import itemgetter
 from types import MappingProxyType
 from typing import Any, Final
 
 from stereogenbench_data.schema.document import camera_of, child_path, is_number
 from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.schema.units import named_unit_m, without_unit, words
 
 NAMES: Final[dict[str, str]] = {
     "focal": "focal_length current_focal_length focal lens_focal_length lens f_mm",
@@ -80,20 +80,6 @@ LENS_PARAMS: Final = {
 """What stands where in COLMAP's ``params``, by its ``model`` and their number, in pixels."""
 _MATRIX_PLACES: Final = {"fx": 0, "fy": 4, "cx": 2, "cy": 5}
 
-UNITS_M: Final = {
-    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1e-3),
-    **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 1e-2),
-    **dict.fromkeys(("dm", "decimeter", "decimeters", "decimetre", "decimetres"), 1e-1),
-    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1.0),
-    **dict.fromkeys(("uu", "unreal_unit", "unreal_units"), 1e-2),
-    **dict.fromkeys(("inch", "inches"), 0.0254),
-    **dict.fromkeys(("ft", "foot", "feet"), 0.3048),
-}
-"""Metres in a unit of length; a unit of Unreal is a centimetre."""
-
-OTHER_UNITS: Final = frozenset({"px", "pixel", "pixels", "deg", "degree", "degrees", "rad",
-                                "radian", "radians"})  # fmt: skip
-"""Units of what is no length."""
 _TEXT_NUMBER: Final = re.compile(r"\s*([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([A-Za-z]*)\s*\Z")
 _DEEPEST: Final = 8
 _LONGEST: Final = 256
@@ -124,42 +110,6 @@ class Stated:
     name: str = ""
     parent: str = ""
     holder: Any = None
-
-    @property
-    def rounding(self) -> float:
-        """Half of the last digit that is written, for numbers; at least a float32's rounding.
-
-        >>> Stated(6.35, "", "$").rounding, Stated(7, "", "$").rounding
-        (0.005, 0.5)
-        """
-        exponent = Decimal(repr(self.value)).as_tuple().exponent
-        half = 0.5 * 10.0**exponent if isinstance(exponent, int) else 0.0
-        return max(half, float(abs(self.value)) * 2**-23)
-
-
-@functools.lru_cache(maxsize=4096)  # thousands of files have the same keys
-def words(key: str) -> str:
-    """Return a key in snake_case.
-
-    >>> words("focalLengthMM"), words("Sensor Width (mm)"), words("Cam-00")
-    ('focal_length_mm', 'sensor_width_mm', 'cam_00')
-    """
-    parted = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", key)
-    return re.sub(r"[^a-z0-9]+", "_", parted.lower()).strip("_")
-
-
-@functools.lru_cache(maxsize=4096)
-def without_unit(name: str) -> tuple[str, str]:
-    """Return a name in snake_case without the unit at its end, and the unit or "".
-
-    >>> without_unit("sensor_width_mm"), without_unit("roll_deg"), without_unit("m")
-    (('sensor_width', 'mm'), ('roll', 'deg'), ('m', ''))
-    """
-    head, _, last = name.rpartition("_")
-    last = "inch" if last == "in" else last
-    if head and (last in UNITS_M or last in OTHER_UNITS):
-        return head.removesuffix("_in"), last
-    return name, ""
 
 
 def nodes_of(document: Any) -> list[Stated]:
@@ -244,17 +194,6 @@ class Values:
         named = (each.value for each in self.stated("unit") if isinstance(each.value, str))
         known = map(named_unit_m, named)
         return next((unit_m for unit_m in known if unit_m is not None), None)
-
-
-def named_unit_m(text: str) -> float | None:
-    """Return the metres in the unit that a text begins with, or in the only one that it names.
-
-    >>> named_unit_m("cm, as in Unreal"), named_unit_m("Unreal units (1 uu = 1 cm)")
-    (0.01, 0.01)
-    """
-    named = words(text).split("_")
-    found = {UNITS_M[name] for name in (words(text), *named) if name in UNITS_M}
-    return UNITS_M.get(named[0], found.pop() if len(found) == 1 else None)
 
 
 @functools.lru_cache(maxsize=4096)

@@ -24,8 +24,9 @@ from stereogenbench_data.schema.document import (
     listed_keys,
     parse_document,
 )
-from stereogenbench_data.schema.quantities import Values, without_unit, words
+from stereogenbench_data.schema.quantities import Values
 from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.schema.units import without_unit, words
 
 _COUNTING: Final = re.compile(r"(.*?)(\d+)\Z")
 _SPEAKS_OF_FORM: Final = re.compile(

@@ -66,7 +66,7 @@ def test_scenes_that_conventions_leave_alike_unread_are_told_once_with_the_cure(
     assert (silent.exit_code, wrong.exit_code) == (1, 1)
     (unit_m,) = re.findall(r"write unit_m = ([0-9.]+) below \[depth\]", silent.stderr)
     assert float(unit_m) == pytest.approx(0.001, rel=0.005)
-    assert wrong.stderr.count("$.gaps is not in the file") == 1
+    assert wrong.stderr.count("$.gaps is missing") == 1
     assert "(1 alike)" in wrong.stderr
 
 

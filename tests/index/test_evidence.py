@@ -1,7 +1,6 @@
 """Poses in every form that the reader knows: read as the same poses, or refused."""
 
 import json
-import re
 
 import numpy as np
 import pytest
@@ -19,8 +18,7 @@ from stereogenbench_data.index.evidence import (
     agreed_forms,
     understood_poses,
 )
-from stereogenbench_data.schema.parse import contradictions
-from stereogenbench_data.schema.records import Rig, SceneLabels
+from stereogenbench_data.schema.records import Rig
 from tests.servers.scene_fixtures import frames_of
 
 PLACES_CM = np.array([0.0, 6.5, 19.0, 26.5, 60.0, 66.0])
@@ -258,58 +256,11 @@ def test_distances_in_one_ratio_to_the_baselines_are_stated_in_two_ways(factor, 
     assert caught.value.scale == pytest.approx(scale, rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("pair", "is_other"),
-    [([0, 1], False), ([1, 2], False), ([2, 3], True), ("Cam_01-Cam_00", True)],
-)
-def test_another_primary_pair_than_that_of_the_rig_is_told_with_its_place(pair, is_other):
-    found = understood(written("rotator", *TURNED, primary_stereo_pair=pair))
-
-    remarks = contradictions(found.recorded.head, RIG, SceneLabels(), where="trajectory.json")
-    told = "".join(remark.text for remark in remarks if remark.about == "pair")
-    assert ("trajectory.json: $.primary_stereo_pair states cameras" in told) == is_other
-
-
-@pytest.mark.parametrize(
-    ("stated", "told"),
-    [
-        ({"focal_length_mm": 40}, r"\$\.focal_length_mm: states another focal \(40 mm\)"),
-        ({"lens": {"K": [[80, 0, 32], [0, 80, 32], [0, 0, 1]]}}, r"\$\.lens\.K: .* 1\.25 focal"),
-        ({"fov_deg": 90.0}, r"\$\.fov_deg: .* 0\.5 focal lengths"),
-        ({"sensor_width_mm": 36.0}, r"\$\.sensor_width_mm: .*36\.0 mm.*23\.76 mm"),
-        ({"adjacent_baselines": [0.13, 0.25, 0.15, 0.67, 0.12], "unit": "m"},
-         r"cameras 0 and 1 is 13 cm here and 6\.5 cm at baseline\.json"),
-        ({"focal_length_mm": 32.5, "fov": 40.16, "adjacent_baselines_m": [0.065, 0.125]},
-         r"\A\Z"),
-        ({"pair_offsets_cm": {"0-1": -6.5}, "focal_length_mm": None}, r"\A\Z"),
-    ],
-    ids=["focal length", "matrix", "angle", "sensor", "baselines", "the same", "no lengths"],
-)  # fmt: skip
-def test_another_lens_or_baseline_beside_the_poses_is_told_with_both_values(stated, told):
-    found = contradictions(stated, RIG, SceneLabels(), where="scene/trajectory.json")
-
-    assert re.search(told, "".join(remark.text for remark in found))
-    assert {remark.about for remark in found} <= {"left"}
-
-
 def test_the_poses_of_another_rig_are_refused():
     rotators, places_cm = TURNED
 
     with pytest.raises(SchemaError, match=r"trajectory\.json: no reading of its poses fits"):
         understood(written("rotator", rotators, places_cm * np.linspace(1, 1.1, 6)[:, None]))
-
-
-def test_a_focal_length_that_changes_over_frames_is_refused():
-    document = json.loads(written("rotator", *TURNED))
-    for number, frame in enumerate(document["frames"]):
-        for camera in frame["cameras"]:
-            camera["focal_length_mm"] = 32.5 + number
-
-    head = understood(json.dumps(document).encode()).recorded.head
-    (remark,) = contradictions(head, RIG, SceneLabels(), where="trajectory.json")
-
-    assert remark.about == "left"
-    assert re.search(r"frames\[1\]\.\S+focal_length_mm: states another focal", remark.text)
 
 
 def test_a_left_camera_that_stands_on_the_right_is_a_contradiction():

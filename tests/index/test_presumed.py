@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 
 from stereogenbench_data import IncompleteSceneWarning, OddSceneWarning, StereoPairs
-from stereogenbench_data.errors import SchemaError, StorageError
+from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import build
-from stereogenbench_data.index.presumed import RigReader
 from stereogenbench_data.index.table import AssumptionWarning, SceneIndex
 from stereogenbench_data.index.tree import CACHE_VARIABLE
-from stereogenbench_data.schema.parse import parse_rig
 from tests.servers.scene_fixtures import documents
 
 KEYS = [f"train/Uniform/Map_{number % 4}/scene_{number:06d}" for number in range(68)]
@@ -273,34 +271,3 @@ def test_captions_are_read_where_scenes_are_chosen_by_them(tree):
     pairs = StereoPairs(tree, caption="horse", fields=["left"])
 
     assert pairs.index.column("key")[pairs.plan.scene_rows].tolist() == [ODD]
-
-
-@pytest.mark.parametrize(
-    "edit",
-    [
-        lambda document: None,
-        lambda document: document.update(unit="m"),
-        lambda document: document["camera_intrinsics"].update(focal_length_mm=-3.5),
-        lambda document: document["primary_stereo_pair"].update(right_camera="Town_9_Cam_03"),
-        lambda document: document["pairwise_pairs"][2].update(baseline_cm="many"),
-        lambda document: document.update(map_name="Another_Map"),
-    ],
-    ids=["nothing", "unit", "a negative length", "another camera", "a text", "another map"],
-)
-def test_many_alike_files_are_read_as_one_by_one(edit):
-    reader = RigReader()
-    for number in range(40):
-        text = json.dumps(baseline_of(number)).encode()
-        assert reader.read(text, where="w") == parse_rig(text, where="w")
-    document = baseline_of(90)
-    edit(document)
-    text = json.dumps(document).encode()
-
-    assert outcome(reader.read, text) == outcome(parse_rig, text)
-
-
-def outcome(read, text):
-    try:
-        return read(text, where="w")
-    except SchemaError as error:
-        return str(error)

@@ -401,7 +401,7 @@ def test_a_few_broken_scenes_of_a_tree_are_left_out_with_one_warning(make_scene,
         index = SceneIndex.open(root)
 
     assert len(caught) == 1
-    assert "scene_000002/baseline.json: 3 problems" in str(caught[0].message)
+    assert "scene_000002/baseline.json: 4 problems" in str(caught[0].message)
     assert len(index) == 3
 
 

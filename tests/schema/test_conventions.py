@@ -1,5 +1,6 @@
 """Files of conventions: what they may state, and what is refused with file, key, value and cure."""
 
+import itertools
 import re
 
 import pytest
@@ -8,13 +9,15 @@ from stereogenbench_data.errors import SchemaError, StorageError
 from stereogenbench_data.schema.conventions import (
     MAX_BYTES,
     Conventions,
+    declaration_of_text,
+    keys_unread,
     parse_conventions,
-    shape_of_text,
     write_toml,
 )
-from stereogenbench_data.schema.parse import parse_rig, see_rig
+from stereogenbench_data.schema.declaration import BUILT_IN
+from stereogenbench_data.schema.parse import parse_rig
 
-WHOLE = b"""
+EARLIER = b"""
 [[shape]]
 has = ["baseline.json: $.lens.mm"]
 
@@ -58,25 +61,97 @@ no_depth = []
 """
 
 
+WHOLE = b"""
+format = 2
+
+[[shape]]
+has = ["baseline.json: $.lens.f"]
+
+[shape.focal_length]
+place = ["$.lens.f", "$.lens.px~"]
+as = "pixels"
+
+[shape.sensor_width]
+value = 23.76
+unit = "mm"
+
+[shape.sensor_height]
+place = "$.lens.h"
+unit = "cm"
+optional = true
+
+[shape.pairs]
+rows = "$.gaps{}"
+a = "#0"
+b = "#1"
+length = "d"
+unit = "m"
+first = 1
+
+[shape.gaps]
+rows = "$.steps[]"
+a = "order"
+b = "order"
+length = ""
+
+[shape.primary_pair]
+left = ["$.pair.l", "$.pair[0]"]
+right = ["$.pair.r", "$.pair[1]"]
+optional = true
+
+[shape.poses]
+location = "$.frames{}.cams[].pose[0:3]"
+rotation = "$.frames{}.cams[].pose[3:7]"
+frame = "$.frames{}#"
+camera = "$.frames{}.cams[].name"
+outer = "frames"
+first = 1
+step = 2
+form = "quaternion wxyz"
+axes = "opencv"
+unit = "m"
+
+[shape.depth]
+unit_m = 0.01
+
+[[shape]]
+[shape.depth]
+frame_lag = 1
+"""
+
+
 def read(text):
     return parse_conventions(text, where="c.toml")
 
 
-def test_all_that_can_be_stated_is_read_and_written_again():
-    conventions = read(WHOLE)
+@pytest.mark.parametrize("text", [EARLIER, WHOLE], ids=["the earlier format", "format 2"])
+def test_all_that_can_be_stated_is_read_and_written_again(text):
+    conventions = read(text)
 
     written = write_toml(conventions, {(0, "depth"): ["a note\nof two lines"], (-1, ""): ["head"]})
 
     assert read(written.encode()) == conventions
     assert written.startswith("# head\n")
-    first, second = conventions.shapes
-    assert (first.has, first.at["sensor_width"].value) == (
+    texts = [shape.text() for shape in conventions.shapes]
+    assert [*map(declaration_of_text, texts)] == [*conventions.shapes]
+
+
+def test_files_of_the_earlier_format_are_declarations():
+    first, second = read(EARLIER).shapes
+    assert (first.has, first.numbers["sensor_width"].value) == (
         ("baseline.json: $.lens.mm",),
         23.76,
     )
+    assert first.numbers["focal_length"].places == ("$.lens.mm",)
+    assert second.numbers == BUILT_IN.numbers
     assert (first.depth.encoding.kind, first.depth.encoding.no_depth) == ("ray", (0, 7, "max"))
     assert (second.depth.encoding.frame_lag, second.depth.encoding.no_depth) == (1, ())
-    assert [shape_of_text(shape.text()) for shape in conventions.shapes] == [first, second]
+
+
+def test_a_text_beside_a_scene_of_an_earlier_index_is_written_as_it_was():
+    text = '{"depth": {"frame_lag": 1}, "focal_length": {"place": "$.f", "unit": "mm"}}'
+
+    assert declaration_of_text(text).text() == text
 
 
 @pytest.mark.parametrize(
@@ -93,6 +168,9 @@ def test_all_that_can_be_stated_is_read_and_written_again():
         pytest.param(b"[depth]\ninstead_of_tag_m = 1.0", "unit_m", id="instead of what"),
         pytest.param(b"[focal_length]\n", r"\[focal_length\].*place", id="neither place nor value"),
         pytest.param(b"[focal_length]\nplace='x'\n", "place.*JSON path.*'x'", id="no path"),
+        pytest.param(b"[focal_length]\nplace='$[\"\\x\"]'\n", "place.*JSON path", id="no escape"),
+        pytest.param(b"[focal_length]\nplace='$camera'\n", "place.*JSON path", id="no dot"),
+        pytest.param(b"[focal_length]\nplace='$.f[]'\n", "place.*JSON path", id="many values"),
         pytest.param(b"[focal_length]\nvalue=nan\n", "value.*nan", id="nan"),
         pytest.param(b"[focal_length]\nplace='$.f'\nunit='deg'", "unit.*deg", id="unit of angles"),
         pytest.param(b"[baselines]\nunit = 'cm'", r"\[baselines\].*place", id="no place"),
@@ -102,6 +180,18 @@ def test_all_that_can_be_stated_is_read_and_written_again():
         pytest.param(b"[depth]\nunit_m = \n", "line 2", id="no TOML"),
         pytest.param(b"x = " + b"[" * 9000 + b"]" * 9000, "not TOML", id="deep"),
         pytest.param(b"\xff\xfe", "not UTF-8", id="bytes"),
+        pytest.param(b"format = 3", "format must be 2, found 3", id="format"),
+        pytest.param(b"format = 2\n[baselines]", "baselines.*not known", id="of the other format"),
+        pytest.param(b"[pairs]\nrows = '$.p[]'", "pairs.*not known", id="without its format"),
+        pytest.param(b"format = 2\n[pairs]\nrows='$.p'\na='i'\nb='j'", "rows.*ends in", id="rows"),
+        pytest.param(b"format = 2\n[pairs]\nrows='$.p[]'\nb='j'", "pairs.*a is missing", id="a"),
+        pytest.param(b"format = 2\n[pairs]\nrows='$.p[]'\na='[]'\nb='j'", "a must be", id="part"),
+        pytest.param(
+            b"format = 2\n[poses]\nlocation='frames[].t'", "location.*JSON path", id="way"
+        ),
+        pytest.param(b"format = 2\n[image_width]\nplace='$..a'", "place.*JSON path", id="dots"),
+        pytest.param(b"format = 2\n[image_width]\nplace=[]", "place must be", id="no places"),
+        pytest.param(b"format = 2\n[focal_length]\nvalue=1\nas='mm'", "as must be", id="as"),
         pytest.param(b"#" * (MAX_BYTES + 1), f"{MAX_BYTES:,}", id="too large"),
     ],
 )
@@ -115,46 +205,133 @@ def test_a_file_that_is_not_there_is_named(tmp_path):
         Conventions.read(tmp_path / "none.toml")
 
 
-def test_a_rig_is_the_same_by_the_places_where_it_was_seen(rig_document, dumped):
-    text = dumped(rig_document)
-
-    shape, _, unknown = see_rig(text, where="b")
-
-    assert parse_rig(text, where="b", shape=shape) == parse_rig(text, where="b")
-    assert shape.at["focal_length"].place == "$.camera_intrinsics.focal_length_mm"
-    assert shape.at["baselines"].place == "$.pairwise_pairs"
-    assert unknown == []
-
-
-def test_keys_that_nobody_reads_are_seen(rig_document, dumped):
+def test_keys_that_nobody_reads_are_seen(rig_document):
     document = rig_document | {"exposure": {"shutter_7": 0.5}}
 
-    assert see_rig(dumped(document), where="b")[2] == ["$.exposure.shutter_#"]
+    assert keys_unread(document, BUILT_IN) == ["$.camera_count", "$.exposure.shutter_#", "$.unit"]
 
 
-def test_quantities_under_unknown_names_are_read_where_conventions_say(rig_document, dumped):
+def moved(document):
+    """The document with its lens, pairs and primary pair under other keys, in other units."""
+    camera = document.pop("camera_intrinsics")
+    document["optics"] = {"a": camera["focal_length_mm"] / 10, "b": [camera["sensor_width_mm"]]}
+    document["gaps"] = document.pop("pairwise_pairs")
+    document["who"] = document.pop("primary_stereo_pair")
+    return document
+
+
+EARLIER_MOVED = b"""
+[focal_length]
+place = "$.optics.a"
+unit = "cm"
+[sensor_width]
+place = "$.optics.b[0]"
+unit = "mm"
+[sensor_height]
+value = 17.82
+unit = "mm"
+[baselines]
+place = "$.gaps"
+[primary_pair]
+left = "$.who.left_camera"
+right = "$.who.right_camera"
+"""
+MOVED = b"format = 2" + EARLIER_MOVED.replace(
+    b'[baselines]\nplace = "$.gaps"',
+    b'[pairs]\nrows = "$.gaps[]"\na = "camera_index_a"\nb = "camera_index_b"\n'
+    b'length = "baseline_cm"',
+)
+
+
+@pytest.mark.parametrize("text", [EARLIER_MOVED, MOVED], ids=["the earlier format", "format 2"])
+def test_quantities_are_read_where_a_file_says(rig_document, dumped, text):
     expected = parse_rig(dumped(rig_document), where="b")[0]
-    camera = rig_document.pop("camera_intrinsics")
-    rig_document["optics"] = {"a": camera["focal_length_mm"] / 10, "b": [camera["sensor_width_mm"]]}
-    rig_document["gaps"] = rig_document.pop("pairwise_pairs")
-    rig_document["who"] = rig_document.pop("primary_stereo_pair")
-    (shape,) = read(
-        b'[focal_length]\nplace = "$.optics.a"\nunit = "cm"\n'
-        b'[sensor_width]\nplace = "$.optics.b[0]"\nunit = "mm"\n'
-        b'[sensor_height]\nvalue = 17.82\nunit = "mm"\n'
-        b'[baselines]\nplace = "$.gaps"\n'
-        b'[primary_pair]\nleft = "$.who.left_camera"\nright = "$.who.right_camera"\n'
-    ).shapes
 
-    assert parse_rig(dumped(rig_document), where="b", shape=shape)[0] == expected
+    (shape,) = read(text).shapes
+
+    assert parse_rig(dumped(moved(rig_document)), where="b", declared=shape)[0] == expected
 
 
-@pytest.mark.parametrize("place", ["$.none", "$.pairwise_pairs[99]", r'$["\x"]', r'$["\u12"]'])
+PLACES_CM = (0.0, 6.5, 13.25, 19.0, 26.0, 32.5)
+PAIRS = [(a, b, PLACES_CM[b] - PLACES_CM[a]) for a, b in itertools.combinations(range(6), 2)]
+
+
+@pytest.mark.parametrize(
+    ("written", "stated"),
+    [
+        ({f"{a}-{b}": cm for a, b, cm in PAIRS}, 'rows = "$.x{}"\na = "#0"\nb = "#1"'),
+        ([[f"Cam_{a:02d}", f"Cam_{b:02d}", cm / 100] for a, b, cm in PAIRS],
+         'rows = "$.x[]"\na = "[0]"\nb = "[1]"\nlength = "[2]"\nunit = "m"'),
+        ([{"of": f"{a + 1} to {b + 1}", "d": cm * 10} for a, b, cm in PAIRS],
+         'rows = "$.x[]"\na = "of#0"\nb = "of#1"\nlength = "d"\nunit = "mm"\nfirst = 1'),
+        ({f"cam_{a}": {f"cam_{b}": cm for c, b, cm in PAIRS if c == a} for a in range(5)},
+         'rows = "$.x{}{}"\na = "#0"\nb = "#1"'),
+        ([[abs(a - b) or 1.0 for b in PLACES_CM] for a in PLACES_CM],
+         'rows = "$.x[][]"\na = "#0"\nb = "#1"'),
+        ([b - a for a, b in itertools.pairwise(PLACES_CM)],
+         'rows = "$.x[]"\na = "order"\nb = "order"'),
+    ],
+    ids=["keys", "lists", "texts, from one", "names below names", "a matrix", "neighbours"],
+)  # fmt: skip
+def test_baselines_in_each_form_are_read_where_a_file_says(rig_document, dumped, written, stated):
+    rig_document["x"] = written
+    del rig_document["pairwise_pairs"]
+    (shape,) = read(f"format = 2\n[pairs]\n{stated}\n".encode()).shapes
+
+    rig = parse_rig(dumped(rig_document), where="b", declared=shape)[0]
+
+    assert rig.baselines_cm == pytest.approx([cm for _, _, cm in PAIRS])
+
+
+@pytest.mark.parametrize(
+    ("lens", "stated"),
+    [
+        ({"f": 875.4208754}, '[focal_length]\nplace = "$.lens.f"\nas = "pixels"'),
+        ({"f": 40.15832}, '[focal_length]\nplace = "$.lens.f"\nas = "field of view"'),
+        ({"f": 0.7008949}, '[focal_length]\nplace = "$.lens.f"\nas = "field of view"\nunit="rad"'),
+        ({"f": "3.25 cm"}, '[focal_length]\nplace = "$.lens.f~"\nunit = "cm"'),
+    ],
+    ids=["pixels", "degrees", "radians", "a text"],
+)
+def test_a_lens_in_each_form_is_read_where_a_file_says(rig_document, dumped, lens, stated):
+    rig_document["lens"] = lens
+    del rig_document["camera_intrinsics"]["focal_length_mm"]
+    (shape,) = read(f"format = 2\n{stated}\n".encode()).shapes
+
+    rig = parse_rig(dumped(rig_document), where="b", declared=shape)[0]
+
+    assert rig.focal_mm == pytest.approx(32.5, rel=1e-5)
+
+
+def test_without_a_sensor_that_of_the_release_is_assumed(rig_document, dumped):
+    rig_document["camera_intrinsics"] = {"fx": 875.4208754}
+    text = b'format = 2\n[focal_length]\nplace = "$.camera_intrinsics.fx"\nas = "pixels"'
+    (shape,) = read(text).shapes
+
+    rig, _, (remark,) = parse_rig(dumped(rig_document), where="b", declared=shape)
+
+    assert (rig.sensor_width_mm, rig.sensor_height_mm) == pytest.approx((23.76, 17.82))
+    assert rig.focal_mm == pytest.approx(32.5, rel=1e-5)
+    assert remark.about == "sensor"
+
+
+def test_a_primary_pair_that_need_not_be_there_is_the_first_two_cameras(rig_document, dumped):
+    del rig_document["primary_stereo_pair"]
+    text = b'format = 2\n[primary_pair]\nleft = "$.l"\nright = "$.r"\noptional = true'
+    (shape,) = read(text).shapes
+
+    rig, _, (remark,) = parse_rig(dumped(rig_document), where="b", declared=shape)
+
+    assert rig.primary_pair == (0, 1)
+    assert remark.about == "primary pair"
+
+
+@pytest.mark.parametrize("place", ["$.none", "$.pairwise_pairs[99]"])
 def test_a_place_that_a_file_does_not_have_is_named(rig_document, dumped, place):
     (shape,) = read(f"[focal_length]\nplace = '{place}'\n".encode()).shapes
 
-    with pytest.raises(SchemaError, match=rf"{re.escape(place)} is not in the file.*focal_length"):
-        parse_rig(dumped(rig_document), where="b", shape=shape)
+    with pytest.raises(SchemaError, match=rf"{re.escape(place)} is missing, where the focal len"):
+        parse_rig(dumped(rig_document), where="b", declared=shape)
 
 
 def test_the_only_number_beside_two_cameras_may_be_called_a_baseline(rig_document, dumped):
@@ -166,21 +343,8 @@ def test_the_only_number_beside_two_cameras_may_be_called_a_baseline(rig_documen
     ]
     (shape,) = read(b'[baselines]\nplace = "$.gaps"\nunit = "cm"\n').shapes
 
-    assert parse_rig(dumped(rig_document), where="b", shape=shape)[0] == expected
+    assert parse_rig(dumped(rig_document), where="b", declared=shape)[0] == expected
     for each in rig_document["gaps"]:
-        each["e"] = 1.0
-    with pytest.raises(SchemaError, match="the keys here are: d, e, i, j") as caught:
-        parse_rig(dumped(rig_document), where="b", shape=shape)
-    assert str(caught.value).count("the keys here are: d") == 1
-
-
-def test_another_value_of_a_quantity_counts_unless_it_is_ignored(rig_document, dumped):
-    rig_document["camera_intrinsics"]["focal_length"] = 50.0
-    stated = b'[focal_length]\nplace = "$.camera_intrinsics.focal_length_mm"\n'
-    ignoring = stated + b'ignored = ["$.camera_intrinsics.focal_length"]\n'
-
-    with pytest.raises(SchemaError, match=r"focal_length: .*50.*32\.5"):
-        parse_rig(dumped(rig_document), where="b", shape=read(stated).shapes[0])
-    rig, _, _ = parse_rig(dumped(rig_document), where="b", shape=read(ignoring).shapes[0])
-
-    assert rig.focal_mm == 32.5
+        each["e"] = 1.5
+    with pytest.raises(SchemaError, match="the keys here are: d, e, i, j"):
+        parse_rig(dumped(rig_document), where="b", declared=shape)

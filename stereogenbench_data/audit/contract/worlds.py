@@ -19,7 +19,7 @@ from stereogenbench_data.audit.geometry.reprojection import MeasuredDepth, repro
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.index.evidence import poses_as, same_poses, understood_poses
-from stereogenbench_data.schema.conventions import shape_of_text
+from stereogenbench_data.schema.conventions import declaration_of
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
@@ -71,7 +71,7 @@ class WorldVerdict:
 
 def is_stated(scene: Scene) -> bool:
     """Return whether conventions state how a scene's poses are read."""
-    return scene.conventions is not None and shape_of_text(scene.conventions).poses is not None
+    return declaration_of(scene).poses is not None
 
 
 def rival_readings(scene: Scene, text: bytes) -> tuple[str, ...]:

@@ -1,11 +1,11 @@
 """Consistency of what a scene's metadata records of its cameras; no picture is needed.
 
-Intrinsics recorded in pixels, of the rig, a camera or a frame, are compared with the paper's
-equation. The release's files record millimetres; `schema.quantities` finds pixels by their names.
+Intrinsics recorded in pixels are compared with the paper's equation. The release's files record
+millimetres; a declaration says where pixels may stand.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -14,26 +14,37 @@ import numpy as np
 from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses, rotation_angle_rad
 from stereogenbench_data.geometry.rig import rectification_residual_px
-from stereogenbench_data.schema.quantities import Values
+from stereogenbench_data.schema.declaration import BUILT_IN, Declaration
+from stereogenbench_data.schema.document import is_number
+from stereogenbench_data.schema.places import first_value
 from stereogenbench_data.schema.records import Rig
 from stereogenbench_data.schema.release import ADJACENT_PAIRS, CAMERA_PAIRS
 
 _QUANTITIES: Final = {
-    "fx_px": "focal_px", "fy_px": "focal_y_px", "cx_px": "principal_x", "cy_px": "principal_y",
+    "fx_px": "focal_length_px", "cx_px": "principal_x", "cy_px": "principal_y",
 }  # fmt: skip
+"""The parts of `Intrinsics` and the tables of a declaration that say where they stand in pixels."""
 
 
-def recorded_px(document: dict[str, Any]) -> Iterator[tuple[str, float]]:
-    """Yield the name (of `Intrinsics`) and value of each number in pixels, at any depth."""
-    values = Values(document)
+def recorded_px(
+    document: dict[str, Any], declared: Declaration = BUILT_IN
+) -> Iterator[tuple[str, float]]:
+    """Yield the name (of `Intrinsics`) and value of each number in pixels of a ``baseline.json``.
+
+    Args:
+        document: The file as parsed JSON.
+        declared: Where they stand in it.
+    """
     for name, quantity in _QUANTITIES.items():
-        for each in values.numbers(quantity):
-            # A focal length without a unit may be in millimetres.
-            if each.unit == "px" or (not each.unit and "focal" not in each.path.lower()):
-                yield name, float(each.value)
+        at = declared.numbers.get(quantity)
+        value = None if at is None else first_value(document, at.places)[1]
+        if is_number(value):
+            yield name, float(value)
 
 
-def rig_figures(rig: Rig, poses: CameraPoses, documents: list[dict[str, Any]]) -> dict[str, float]:
+def rig_figures(
+    rig: Rig, poses: CameraPoses, recorded: Iterable[tuple[str, float]]
+) -> dict[str, float]:
     """Return the figures of a scene's rig, by quantity.
 
     A recorded baseline agrees with the poses where their difference is within its own rounding.
@@ -41,7 +52,7 @@ def rig_figures(rig: Rig, poses: CameraPoses, documents: list[dict[str, Any]]) -
     Args:
         rig: What ``baseline.json`` records.
         poses: What ``trajectory.json`` records, over all frames.
-        documents: Both files as parsed JSON, to search for intrinsics in pixels.
+        recorded: The intrinsics in pixels that ``baseline.json`` records, too, by their names.
 
     Source: the StereoGenBench paper, fx = f_mm / sensor_width_mm * width_px, and its table of the
     geometry consistency audit.
@@ -50,12 +61,8 @@ def rig_figures(rig: Rig, poses: CameraPoses, documents: list[dict[str, Any]]) -
     fx_px = rig.focal_mm / rig.sensor_width_mm * rig.image_width_px
     fy_px = rig.focal_mm / rig.sensor_height_mm * rig.image_height_px
     expected = replace(intrinsics, fx_px=fx_px, fy_px=fy_px)
-    recorded = [
-        abs(value - getattr(expected, name))
-        for document in documents
-        for name, value in recorded_px(document)
-    ]
-    deviations = [abs(intrinsics.fx_px - fx_px), abs(intrinsics.fy_px - fy_px), *recorded]
+    deviations = [abs(intrinsics.fx_px - fx_px), abs(intrinsics.fy_px - fy_px)]
+    deviations += [abs(value - getattr(expected, name)) for name, value in recorded]
     left, right = (list(cameras) for cameras in zip(*CAMERA_PAIRS, strict=True))
     posed_cm = np.linalg.norm(poses.centres[:, right] - poses.centres[:, left], axis=-1)
     away_cm = np.abs(posed_cm * (poses.unit_m * 100) - np.array(rig.baselines_cm))

@@ -33,7 +33,7 @@ from stereogenbench_data.audit.geometry.reprojection import (
     pair_audit,
     reproject,
 )
-from stereogenbench_data.audit.geometry.rig_check import motion_px, rig_figures
+from stereogenbench_data.audit.geometry.rig_check import motion_px, recorded_px, rig_figures
 from stereogenbench_data.audit.scene_access import spread
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
@@ -43,8 +43,8 @@ from stereogenbench_data.index.evidence import poses_as
 from stereogenbench_data.media.depth import NO_DEPTH_UNIT, depth_frame_index
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.samples.load import Streams
-from stereogenbench_data.schema.conventions import depth_of
-from stereogenbench_data.schema.document import parse_document
+from stereogenbench_data.schema.conventions import declaration_of, depth_of
+from stereogenbench_data.schema.document import parse_object
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
@@ -210,19 +210,21 @@ class _SceneCheck:
         )
 
     def _metadata(self) -> tuple[list[Figure], CameraPoses | None]:
-        documents = []
+        recorded: list[tuple[str, float]] = []
+        declared = declaration_of(self.scene)
         poses: CameraPoses | None = None
         for name in (BASELINE_JSON, TRAJECTORY_JSON):
             text = self.files.attempt(name, self.files.text, name)
             if text is None:
                 continue
-            document = self.files.attempt(name, parse_document, text, where=name)
-            documents += [document] if isinstance(document, dict) else []
-            if name == TRAJECTORY_JSON:
+            if name == BASELINE_JSON:
+                document = self.files.attempt(name, parse_object, text, where=name)
+                recorded += [] if document is None else recorded_px(document, declared)
+            else:
                 poses = self.files.attempt(name, poses_as, text, self.scene.pose_form, where=name)
         if poses is None:
             return [], None
-        of_rig = rig_figures(self.scene.rig, poses, documents)
+        of_rig = rig_figures(self.scene.rig, poses, recorded)
         figures = [Figure(quantity, "", value) for quantity, value in of_rig.items()]
         if poses.frame_count >= self.scene.frames:
             return figures, poses
