@@ -108,8 +108,8 @@ _NO_DEPTH: Final = StreamFacts(CODEC_NAME, "gray16le", 0, 0, 0, 0.0, {})
 """What the index says of depth of a scene of training shards that has none."""
 _DEVIATION_CM: Final = 0.1
 _DEVIATION_SHARE: Final = 0.001
-_SCALE_OF_A_RIG: Final = 5.0
-"""Units of depth of one rig that differ by more are wrong; ranges of its streams may differ."""
+_SAME_UNIT: Final = 1.005
+"""Units of depth of one rig that differ by a larger factor are several, and not rounded."""
 _SQUARE: Final = 0.01
 """How far the sides of a pixel may differ, as a share: lengths of a sensor are rounded."""
 Difference = tuple[str, str]
@@ -477,7 +477,7 @@ class Description:
                 problems.append(str(error))
         known = [each for each in found if each is not None]
         units_m = [each.known_unit_m for each in known]
-        if units_m and max(units_m) > _SCALE_OF_A_RIG * min(units_m):
+        if units_m and max(units_m) > _SAME_UNIT * min(units_m):
             found = [None] * len(found)
             listed = ", ".join(
                 f"{each.known_unit_m:g}{' by default' if each.source == 'default' else ''}"
@@ -792,11 +792,9 @@ def described_again(
     except (SchemaError, MediaError, StorageError) as error:
         return scene, [_placed(folder.key, str(error))]
     by_videos = videos is None and {*scene.depth_unit_source} <= {"tag", "default"}
-    new = [
-        about
-        for about in ("frames", "poses", *(["depth"] if by_videos else []))
-        if now.remark(about) and not scene.remark(about)
-    ]
+    # What an earlier version understood and this one does not is taken from the row.
+    by_videos = by_videos and not now.remark("depth")
+    new = [about for about in ("frames", "poses") if now.remark(about) and not scene.remark(about)]
     new += ["videos"] if scene.members.keys() != now.members.keys() else []
     found = [_placed(folder.key, now.remark(about)) for about in new]
     # What is not compared is taken from the row.
@@ -807,7 +805,7 @@ def described_again(
         "frames": "frames" in new or (scene.remark("frames") and now.frames > scene.frames),
         "pose_form": lacks_poses or shape.poses is not None or {*forms} <= {*forms_now},
         **dict.fromkeys(_OF_POSES, lacks_poses),
-        **dict.fromkeys(_UNITS, "depth" in new or not by_videos),
+        **dict.fromkeys(_UNITS, not by_videos),
     }
     row = replace(now, **{part: getattr(scene, part) for part, is_kept in parts.items() if is_kept})
     if row.id.split == "eval" and not row.id.subset:

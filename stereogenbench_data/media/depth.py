@@ -316,14 +316,13 @@ def resolve_encoding(
     if override is not None and override.unit_m is not None:
         return replace(override, source="user")
     contract = override or DepthEncoding()
-    largest = largest_number(facts.pixel_format) or 2**16 - 1
     try:
-        found = agreed([*stated_in_tags(facts.tags, name=name), *stated], largest=largest)
+        found = agreed([*stated_in_tags(facts.tags, name=name), *stated])
     except SchemaError as error:
         raise MediaError(f"{error}. {DEPTH_CURES}") from error
     if found.unit_m is None:
         return contract.with_file_unit(DEFAULT_DEPTH_UNIT_M, source="default")
-    return contract.with_file_unit(found.unit_m, source=found.origin, offset_m=found.offset_m)
+    return contract.with_file_unit(found.unit_m, source=found.origin)
 
 
 def measured(

@@ -282,7 +282,8 @@ class Scene:
         pose_form: The names of the readings of its trajectory that the rig's geometry confirms,
             the chosen one first, joined by "|"; None for the one that the file itself names, and
             where poses are not understood.
-        conventions: What conventions state about its files, as `Declaration.text` writes it; None where it was described without any.
+        conventions: What conventions state about its files, as `Declaration.text` writes it; None
+            where it was described without any.
         members: File name to the place of its bytes. Depth packed by blosc2 has a name of its own,
             which `held_name` returns.
         seek_tables: Where the packets of its videos lie, as `media.seek_table` packs it; None where

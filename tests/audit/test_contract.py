@@ -581,7 +581,7 @@ def test_a_flip_accuses_depth_or_pictures():
 
 def test_two_cameras_that_differ_are_both_named(verdict_on):
     def corrupt(folder):
-        rewrite_depth(folder, tags=2.0, cameras=[1])
+        rewrite_depth(folder, scaled(2.0), cameras=[1])
         rewrite_depth(folder, scaled(1.2), cameras=[4])
 
     verdict = verdict_on(corrupt)
@@ -733,10 +733,9 @@ def test_scenes_with_different_contracts_get_verdicts_of_their_own(drawn, tmp_pa
 
 def test_depth_of_a_stated_range_is_confirmed(verdict_on):
     def normalise(folder):
-        tags = {"depth_near": "0.5 m", "depth_far": "60.5 m"}
-        rewrite_depth(folder, as_range(0.5, 60.5, unit_m=UNIT_M), tags=tags)
+        rewrite_depth(folder, as_range(0.5, 60.5, unit_m=UNIT_M), tags={})
 
-    verdict = verdict_on(normalise)
+    verdict = verdict_on(normalise, depth=DepthEncoding(unit_m=60 / 65535, offset_m=0.5))
 
     assert answer(verdict, QUOTIENT).status == "confirmed"
     assert verdict.fits

@@ -24,8 +24,6 @@ USERS = DepthEncoding(unit_m=0.02, kind="ray", source="tag")
     [
         pytest.param({"encoder": "Lavf"}, None, (0.1, 0, "default", "planar"), id="no unit"),
         pytest.param({"depth_scale": "0.001"}, None, (0.001, 0, "tag", "planar"), id="millimetres"),
-        pytest.param({"depth_near": "0.5 m", "depth_far": "4095.5 m"}, None,
-                     (1.0, 0.5, "tag", "planar"), id="a range over the format's largest number"),
         pytest.param({"depth_scale": "mm"}, USERS, (0.02, 0, "user", "ray"), id="the user's"),
     ],
 )  # fmt: skip
