@@ -39,6 +39,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import PAIR_FIELDS, VIEW_FIELDS
 from stereogenbench_data.schema.conventions import Conventions, write_toml
 from stereogenbench_data.schema.declaration import Declaration, DepthAs, PosesAt
+from stereogenbench_data.schema.depth_contract import MAY_BE_RANGE, NO_LENGTH
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.text import counted
@@ -324,7 +325,8 @@ def _with_decided_poses(
     chosen = worlds[0].chosen if len(worlds) == 1 else ""
     if chosen:
         notes += figures
-        return replace(shape, poses=PosesAt.of_reading(chosen))
+        form = PosesAt.of_reading(chosen)
+        return replace(shape, poses=replace(form, location=None, rotation=None))
     fields = (PAIR_FIELDS | VIEW_FIELDS).items()
     refused = ", ".join(name for name, each in fields if "world" in each.held_up_by)
     why = "" if figures else "no pictures were compared, and "
@@ -356,7 +358,10 @@ def _measured(
         if by_topic[TOPICS[question]].status == "wrong" and by_topic[TOPICS[question]].is_sure
     }
     sources = {source for scene in scenes for source in scene.depth_unit_source}
-    is_known = verdict.quotient_error <= MARGIN
+    told = " ".join(scene.remark("depth") for scene in scenes)
+    # Of numbers that are no plain lengths pictures would show a unit, too, and a wrong one.
+    is_plain = not any(why in told for why in (MAY_BE_RANGE, NO_LENGTH))
+    is_known = is_plain and verdict.quotient_error <= MARGIN
     if sources <= {"default", "unreadable"} and stated.unit_m is None and is_known:
         unit = Unit(verdict.quotient * report.scenes[0].unit_m, verdict.quotient_error)
         found["unit_m"] = unit.rounded_m

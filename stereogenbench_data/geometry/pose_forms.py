@@ -9,19 +9,23 @@ cameras with it, so that no picture is.
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float64
 
+from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.geometry.pose import (
     CameraPoses,
     nearest_rotation,
     rotation_from_quaternion_xyzw,
     rotation_from_rotator_deg,
 )
-from stereogenbench_data.schema.trajectory import Block, RecordedPoses
+from stereogenbench_data.schema.declaration import PosesAt
+from stereogenbench_data.schema.pose_search import RecordedPoses
+from stereogenbench_data.schema.text import shortened
+from stereogenbench_data.schema.trajectory import Block, read_block
 from stereogenbench_data.schema.units import UNITS_M
 
 TOLERANCE: Final = 1e-3
@@ -77,12 +81,14 @@ class Reading:
             3 more for axes that it does not name.
         is_named: Whether the file names the camera's axes; pitch, yaw and roll are Unreal's words.
         poses: The poses, with the unit that the file states, else nan metres.
+        at: Where they stand and their form.
     """
 
     name: str
     tier: int
     is_named: bool
     poses: CameraPoses
+    at: PosesAt
 
 
 def readings(recorded: RecordedPoses, *, only: str | None = None) -> Iterator[Reading]:
@@ -116,7 +122,53 @@ def readings(recorded: RecordedPoses, *, only: str | None = None) -> Iterator[Re
             poses = _read(turn, place, kind.split(), axes, unit_m)
             if poses is not None:
                 own_axes = named_axes or ({"unreal"} if turn.components == _ROTATOR else ())
-                yield Reading(name, tier, axes in own_axes, poses)
+                location = None if place is None else place.at.rotation
+                at = replace(turn.at, location=location, form=kind, axes=axes)
+                yield Reading(name, tier, axes in own_axes, poses, at)
+
+
+def poses_at(document: dict[str, Any], at: PosesAt, *, where: str) -> tuple[str, CameraPoses]:
+    """Return the poses of a ``trajectory.json`` where they are declared, and the reading's name.
+
+    Args:
+        document: The file as parsed JSON.
+        at: Where they stand, in which form; without a unit they have nan metres.
+        where: The file's path, for messages.
+
+    Raises:
+        SchemaError: If they do not stand there, or are not of this form.
+    """
+    turn = read_block(document, at, str(at.rotation), where=where)
+    place = None if at.location is None else read_block(document, at, at.location, where=where)
+    form = str(at.form)
+    kind = next((each for each in _kinds(turn) if form in (each, _short(each))), "")
+    if not kind or at.axes not in AXES:
+        raise SchemaError(
+            f"{where}: {at.rotation} is not of the form {shortened(form)!r} with "
+            f"{shortened(str(at.axes))!r} axes that the conventions state below [poses]: for these "
+            f"numbers there are {', '.join(_kinds(turn)) or 'no forms'}, with the axes "
+            f"{', '.join(AXES)}."
+        )
+    unit_m = np.nan if at.unit is None else UNITS_M[at.unit]
+    poses = _read(turn, place, kind.split(), at.axes, unit_m)
+    if poses is None:
+        raise SchemaError(
+            f"{where}: {at.rotation} has numbers that are no rotations of the form {form!r}. "
+            f"Correct [poses]."
+        )
+    where_read = turn.key if place is None else f"{place.key} and {turn.key}"
+    unit = (place or turn).unit
+    name = f"{where_read}: {kind}, {at.axes} axes" + (f", {unit}" if unit in UNITS_M else "")
+    return name, poses
+
+
+def _short(kind: str) -> str:
+    """Return a form as it may be written, as its components have names or one order.
+
+    >>> _short("rotator pitch yaw roll deg"), _short("quaternion xyzw")
+    ('rotator deg', 'quaternion')
+    """
+    return kind.replace(" pitch yaw roll", "").replace(" xyzw", "")
 
 
 def _read(

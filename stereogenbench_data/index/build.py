@@ -20,7 +20,7 @@ from typing import Any, Final, Literal
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, no_advance, require_workers
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
-from stereogenbench_data.index.evidence import agreed_forms
+from stereogenbench_data.index.evidence import Understood, agreed_forms, settled_poses
 from stereogenbench_data.index.rows import json_of, scene_of_json
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
@@ -47,14 +47,16 @@ from stereogenbench_data.index.tree import (
 from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.media.heads import END_BYTES, Asked
 from stereogenbench_data.schema.conventions import Conventions, depth_of
-from stereogenbench_data.schema.declaration import Declaration
+from stereogenbench_data.schema.declaration import BUILT_IN, Declaration
 from stereogenbench_data.schema.document import brief
-from stereogenbench_data.schema.parse import parse_scene_key
+from stereogenbench_data.schema.parse import parse_rig, parse_scene_key
 from stereogenbench_data.schema.records import Remark, Scene, SceneId, remarks_told
 from stereogenbench_data.schema.release import (
+    BASELINE_JSON,
     COMPLETE_JSON,
     METADATA_FILES,
     TRAIN_MAPS,
+    TRAJECTORY_JSON,
     VIDEO_FILES,
     Subset,
     depth_name,
@@ -79,6 +81,8 @@ _MOST_UNTOLD: Final = 2500
 """More requests are told: the Hub answers 3,000 in five minutes."""
 _MOST_UNTOLD_SCENES: Final = 100
 """Of more scenes of a folder it is told what reading them takes."""
+_SETTLED_BY: Final = 3
+"""Of how many scenes one must tell how poses are read, for all to be read so."""
 _TRIED: Final = 2
 """How many of them are described to know that; imports are part of the first."""
 _REQUESTS: Final = 2 * len(VIDEO_FILES) + len(METADATA_FILES)
@@ -146,6 +150,8 @@ class Tree:
         reads: Whether of videos on this machine only heads are read, or all.
         files: Key to files, of scenes whose files are listed.
         stamp: A digest of all this, which changes when a file is added, removed or changed.
+        settled: Where poses stand in all scenes and in which form; None where that is settled for
+            each scene.
     """
 
     root: Path | str
@@ -162,6 +168,25 @@ class Tree:
     reads: Literal["heads", "whole files"] = "heads"
     files: Mapping[str, Files] = field(default_factory=dict)
     stamp: str = ""
+    settled: Understood | None = None
+
+    def with_settled_poses(self) -> "Tree":
+        """Return the tree with how the first of its scenes that tells it has its poses.
+
+        Conventions of several shapes settle each scene by itself, and so do scenes behind a URL.
+        """
+        declared = self.stated or BUILT_IN
+        if self.remote is not None or declared.has or self.settled is not None:
+            return self
+        for key in self.keys[:_SETTLED_BY]:
+            with suppress(StereoGenBenchError, KeyError):
+                folder = self.folder(key)
+                rig, _, _ = parse_rig(folder.read(BASELINE_JSON), where=key, declared=declared)
+                text = folder.read(TRAJECTORY_JSON)
+                found = settled_poses(text, rig, where=key, named=declared.poses)
+                if len(found.names) == 1:
+                    return replace(self, settled=found)
+        return self
 
     def listed(self) -> "Tree":
         """Return the tree with the files of its scenes; where they cannot be listed, without."""
@@ -252,7 +277,7 @@ class Tree:
         if scene is None:
             scene = describe_scene(
                 self.root, folder.key, valid_depth=self.valid_depth, conventions=self.conventions,
-                folder=folder, videos=videos,
+                folder=folder, videos=videos, settled=self.settled,
             )  # fmt: skip
             if self.checksums == "all" and isinstance(folder, WholeFiles):
                 members = {
@@ -346,6 +371,7 @@ def walk_tree(
         progress(len(outcomes), total)
     if engine is LOCAL and len(pending) < POOL_FROM:
         workers = 1
+    tree = tree.with_settled_poses() if pending else tree
     bare = replace(tree, keys=(), refused={}, files={})
     tried: list[Outcome] = []
     if tree.remote is not None:

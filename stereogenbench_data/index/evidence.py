@@ -12,20 +12,27 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from stereogenbench_data.errors import GeometryError, SchemaError
 from stereogenbench_data.geometry.camera import recorded_intrinsics
 from stereogenbench_data.geometry.pose import OPENCV_FROM_UNREAL, CameraPoses
-from stereogenbench_data.geometry.pose_forms import Reading, readings
+from stereogenbench_data.geometry.pose_forms import Reading, poses_at, readings
 from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
-from stereogenbench_data.schema.declaration import PosesAt
-from stereogenbench_data.schema.records import Rig
+from stereogenbench_data.schema.conventions import declaration_of
+from stereogenbench_data.schema.declaration import BUILT_IN_POSES, PosesAt
+from stereogenbench_data.schema.pose_search import (
+    RecordedPoses,
+    recorded_at,
+    recorded_in,
+    stands,
+)
+from stereogenbench_data.schema.records import Rig, Scene
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from stereogenbench_data.schema.text import shortened
-from stereogenbench_data.schema.trajectory import RecordedPoses, record_poses
+from stereogenbench_data.schema.trajectory import first_frame, parse_trajectory
 from stereogenbench_data.schema.units import UNITS_M
 
 _DEVIATION_CM: Final = 0.1
@@ -66,7 +73,8 @@ class Understood:
         names: The readings that pass and move the cameras differently in the world, the one that
             was taken first.
         is_named: Whether the file itself names that one.
-        recorded: What the file records.
+        at: Where they stand and in which form.
+        unread: The keys of other numbers of six cameras.
         form: What the index keeps of it, for `poses_as`: None for the first form that the file
             itself names, if it is the only one to pass.
     """
@@ -74,8 +82,14 @@ class Understood:
     poses: CameraPoses
     names: tuple[str, ...]
     is_named: bool
-    recorded: RecordedPoses
+    at: PosesAt
+    unread: tuple[str, ...]
     form: str | None
+
+    @property
+    def first_frame(self) -> int:
+        """The least number that frames have, 0 where they have none."""
+        return self.at.first or 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,10 +102,11 @@ class _Passed:
     lateral_m: np.ndarray
 
 
-def understood_poses(
-    text: bytes, rig: Rig, *, where: str, named: PosesAt | None = None
-) -> Understood:
-    """Return the poses of a ``trajectory.json`` that fit a rig.
+def settled_poses(text: bytes, rig: Rig, *, where: str, named: PosesAt | None = None) -> Understood:
+    """Return the poses of a ``trajectory.json`` that fit a rig, and where they stand in which form.
+
+    Poses are looked for where the release's layout has them, and elsewhere where they do not stand
+    there or do not fit.
 
     Args:
         text: The file's bytes.
@@ -106,19 +121,58 @@ def understood_poses(
         SidesError: If its own form fits but for the side of the primary pair's left camera or one
             factor of all baselines.
     """
-    recorded = record_poses(text, where=where)
-    if named is None:
-        return _fitting(recorded, readings(recorded), rig, where=where)
-    found, own, reason = None, None, ""
+    document = parse_trajectory(text, where=where)
+    if named is not None:
+        return _as_named(document, named, rig, where=where)
+    if stands(document, BUILT_IN_POSES):
+        recorded = recorded_at(document, BUILT_IN_POSES, where=where)
+        try:
+            return _numbered(document, _fitting(recorded, readings(recorded), rig, where=where))
+        except SchemaError:
+            found = recorded_in(document, where=where)
+            if len(found.blocks) <= len(recorded.blocks):
+                raise
+            recorded = found
+    else:
+        recorded = recorded_in(document, where=where)
+    return _numbered(document, _fitting(recorded, readings(recorded), rig, where=where))
+
+
+def _numbered(document: dict[str, Any], found: Understood) -> Understood:
+    """Return poses with the number of their first frame."""
+    return replace(found, at=replace(found.at, first=first_frame(document, found.at)))
+
+
+def declared_poses(text: bytes, rig: Rig, *, where: str, settled: Understood) -> Understood:
+    """Return the poses of a ``trajectory.json`` as another scene's settled them.
+
+    Raises:
+        SchemaError: If they do not stand there, or do not fit the rig.
+    """
+    document = parse_trajectory(text, where=where)
+    name, poses = poses_at(document, settled.at, where=where)
+    reading = Reading(name, 0, settled.is_named, poses, settled.at)
+    found = _fitting(None, [reading], rig, where=where)
+    return replace(settled, poses=found.poses)
+
+
+def _as_named(document: dict[str, Any], named: PosesAt, rig: Rig, *, where: str) -> Understood:
+    """Return the poses of a document as conventions read them; `settled_poses` says more."""
+    if named.is_settled:
+        name, poses = poses_at(document, named, where=where)
+        found = _fitting(None, [Reading(name, 0, True, poses, named)], rig, where=where)  # noqa: FBT003
+        return _numbered(document, replace(found, form="|".join(found.names)))
+    recorded = recorded_in(document, where=where)
+    found_as, own, reason = None, None, ""
     try:
-        found = _fitting(recorded, _readings_as(recorded, named), rig, where=where)
+        found_as = _fitting(recorded, _readings_as(recorded, named), rig, where=where)
     except SchemaError as error:
         reason = str(error).removeprefix(f"{where}: ").rstrip(".?")
     with suppress(SchemaError):
         own = _fitting(recorded, readings(recorded), rig, where=where)
     own_poses = own.poses if own is not None and own.is_named else None
-    if found is not None and (own_poses is None or same_poses(found.poses, own_poses)):
-        return replace(found, form="|".join(found.names))
+    if found_as is not None and (own_poses is None or same_poses(found_as.poses, own_poses)):
+        return _numbered(document, replace(found_as, form="|".join(found_as.names)))
     reason = reason or "the file names another form, which fits as well and differs"
     fits = "" if own is None else f" What fits is: {shortened(own.names[0], 300)}."
     stated = ((name, getattr(named, name)) for name in ("rotation", "form", "axes", "unit"))
@@ -139,7 +193,7 @@ def _readings_as(recorded: RecordedPoses, named: PosesAt) -> Iterator[Reading]:
 
 
 def _fitting(
-    recorded: RecordedPoses, found: Iterable[Reading], rig: Rig, *, where: str
+    recorded: RecordedPoses | None, found: Iterable[Reading], rig: Rig, *, where: str
 ) -> Understood:
     """Return the poses of the first tier of readings that fit a rig, as `understood_poses` says."""
     failures: dict[str, str] = {}
@@ -198,11 +252,15 @@ def _fitting(
     )
     own_units_m = (taken.reading.poses.unit_m, _UNREAL_M)
     is_own = taken.reading is first and len(names) == 1 and taken.poses.unit_m in own_units_m
+    unit = next(name for name, unit_m in UNITS_M.items() if unit_m == taken.poses.unit_m)
+    blocks = () if recorded is None else recorded.blocks
+    read = names[0].partition(": ")[0].split(" and ")
     return Understood(
         taken.poses,
         names,
         is_named=taken.reading.is_named and taken.reading.tier == 0,
-        recorded=recorded,
+        at=replace(taken.reading.at, unit=unit),
+        unread=tuple(dict.fromkeys(block.key for block in blocks if block.key not in read)),
         form=None if is_own else "|".join(names),
     )
 
@@ -254,19 +312,46 @@ _LEVEL: Final = 0.35
 """The sine of 20 degrees: cameras of the release roll less, and look down by less than 70."""
 
 
+def poses_of(scene: Scene, text: bytes, *, where: str, form: str | None = None) -> CameraPoses:
+    """Return the poses of a scene's ``trajectory.json`` as its row of the index says.
+
+    Args:
+        scene: The row.
+        text: The file's bytes.
+        where: The file's path, for messages.
+        form: Another reading than the row's, by its name.
+
+    Raises:
+        SchemaError: If the file has no such poses.
+    """
+    at = declaration_of(scene).poses
+    own = (scene.pose_form or "").split("|")[0]
+    if at is None or not at.is_settled or (form is not None and form != own):
+        return poses_as(text, form or scene.pose_form, where=where)
+    _, poses = poses_at(parse_trajectory(text, where=where), at, where=where)
+    _, _, unit_m = own.rpartition(" @ ")
+    return replace(poses, unit_m=float(unit_m)) if unit_m else poses
+
+
 def poses_as(text: bytes, form: str | None, *, where: str) -> CameraPoses:
     """Return the poses of a ``trajectory.json`` by the form that an index row names.
 
     Args:
         text: The file's bytes.
-        form: `Scene.pose_form`; None takes the form that the file itself names.
+        form: `Scene.pose_form`, which names keys on the way; None takes the form that the file
+            itself names.
         where: The file's path, for messages.
 
     Raises:
         SchemaError: If the file has no poses of this form.
     """
-    recorded = record_poses(text, where=where)
+    document = parse_trajectory(text, where=where)
     name, _, unit_m = (form or "").split("|")[0].rpartition(" @ ")
+    is_built_in = not name or name.startswith(_BUILT_IN_KEYS)
+    if is_built_in and stands(document, BUILT_IN_POSES):
+        recorded = recorded_at(document, BUILT_IN_POSES, where=where)
+    else:
+        recorded = recorded_in(document, where=where)
     for reading in readings(recorded, only=name or None):
         if name:
             return replace(reading.poses, unit_m=float(unit_m))
@@ -276,6 +361,9 @@ def poses_as(text: bytes, form: str | None, *, where: str) -> CameraPoses:
         f"{where}: has no poses {f'of the form {shortened(name, 200)}' if name else 'at all'}. "
         f"Run `stereogenbench index` again."
     )
+
+
+_BUILT_IN_KEYS: Final = "frames[].cameras[].location and frames[].cameras[].rotation: rotator "
 
 
 def _checked(reading: Reading, rig: Rig) -> _Passed:

@@ -191,7 +191,7 @@ def _learned_poses(scene: Scene, found: Understood | None) -> tuple[PosesAt | No
         reason = scene.remark("poses").replace(f"{scene.id.key}/", "")
         unread = f'to train without poses and say so, write [poses] with form = "{UNKNOWN}"'
         return None, [unread, f"not understood: {reason}"]
-    poses, name = found.poses, found.names[0]
+    poses = found.poses
     steps = poses.centres[:, _RIGHT] - poses.centres[:, _LEFT]
     lengths_cm = np.linalg.norm(steps, axis=-1) * poses.unit_m * 100
     off_cm = np.abs(lengths_cm - np.array(scene.rig.baselines_cm)).max()
@@ -202,11 +202,9 @@ def _learned_poses(scene: Scene, found: Understood | None) -> tuple[PosesAt | No
         f"distances of the cameras are the baselines to {off_cm:.2g} cm in {len(steps)} frames",
         f"the cameras stand along the x axis of camera 0 to {across_cm:.2g} cm in frame 0",
     ]
-    read = set(name.partition(": ")[0].split(" and "))
-    others = dict.fromkeys(block.key for block in found.recorded.blocks)
-    if not_read := [each for each in others if each not in read]:
-        notes.append(f"numbers of six cameras that are not read: {', '.join(not_read[:6])}")
-    return None if scene.remark("world") else PosesAt.of_reading(name), notes
+    if found.unread:
+        notes.append(f"numbers of six cameras that are not read: {', '.join(found.unread[:6])}")
+    return None if scene.remark("world") else found.at, notes
 
 
 def _depth_notes(facts: StreamFacts, scene: Scene | None) -> list[str]:
@@ -263,7 +261,8 @@ def learn(root: str | Path, examined: Sequence[Examined]) -> Learned:
             )
             continue
         depth = _stated_depth(group)
-        shapes.append((replace(group[0].shape, has=has, depth=depth), group))
+        stated = {"format": 2}
+        shapes.append((replace(group[0].shape, has=has, depth=depth, stated=stated), group))
     shapes.sort(key=lambda pair: not pair[0].has)
     problems += [
         f"{group[0].key}: poses: {group[0].notes['poses'][-1]}"

@@ -193,6 +193,7 @@ def presumed_report(tree: Tree, baselines: Baselines) -> TreeReport | None:
         baselines: Whether each ``baseline.json`` is read; if not, what it says is presumed, too,
             unless the scenes that are read have different primary pairs.
     """
+    tree = tree.with_settled_poses()
     outcomes: dict[str, Outcome] = {}
     groups: dict[tuple[object, ...], list[_Metadata]] = {}
     for key, found in _metadata(tree, baselines):
@@ -388,6 +389,7 @@ class Presumption:
         self.is_remote = tree.remote is not None
         self.baselines = baselines
         # On a disk files are listed anew when a scene is needed, so they need not be kept.
+        tree = tree.with_settled_poses()
         self.tree = tree if self.is_remote else replace(tree, files={})
         self._agreed = agreed_forms(forms)
         self._ahead = FetchAhead()

@@ -30,8 +30,9 @@ from stereogenbench_data.index.clocks import require_one_clock
 from stereogenbench_data.index.evidence import (
     SidesError,
     Understood,
+    declared_poses,
+    settled_poses,
     shape_of,
-    understood_poses,
 )
 from stereogenbench_data.index.tree import FILES, Files, SceneFolder, folder_of
 from stereogenbench_data.media.container import (
@@ -122,7 +123,7 @@ class IncompleteScene(StorageError):
     """A scene that is not finished, or of which only metadata were fetched."""
 
 
-def describe_scene(
+def describe_scene(  # noqa: PLR0913 - each says what is known of the scene already
     root: str | Path,
     key: str,
     *,
@@ -130,6 +131,7 @@ def describe_scene(
     conventions: Conventions | None = None,
     folder: SceneFolder | None = None,
     videos: Collection[str] | None = None,
+    settled: Understood | None = None,
 ) -> Scene:
     """Return the index row of a finished scene.
 
@@ -144,6 +146,8 @@ def describe_scene(
         conventions: Where quantities stand and how they are read, in place of the release's.
         folder: Its folder, where that is listed already.
         videos: Names of the videos to open; None is all. The row then holds for these alone.
+        settled: How the poses of other scenes of the tree are read. A scene that they do not fit
+            is settled by itself, as all are without them.
 
     Raises:
         IncompleteScene: If the scene has no video at all.
@@ -151,7 +155,7 @@ def describe_scene(
             other or the conventions, or `SchemaError` or `MediaError` if one of them is not
             understood. All problems of all files are in one message.
     """
-    described = Description(folder or folder_of(root, key), key)
+    described = Description(folder or folder_of(root, key), key, settled)
     scene = described.scene(conventions, videos=videos)
     if valid_depth == "sample":
         return replace(scene, valid_depth_ratio=described.valid_depth_ratio(scene.frames))
@@ -168,9 +172,10 @@ class Description:
         understood: The poses; None where there are none.
     """
 
-    def __init__(self, folder: SceneFolder, key: str) -> None:
+    def __init__(self, folder: SceneFolder, key: str, settled: Understood | None = None) -> None:
         """List the files; a scene of training shards says what it was derived from."""
         self.folder, self.key, self.files = folder, key, folder.stamps()
+        self.settled = settled
         self.remarks: list[Remark] = []
         self.shape: Declaration | None = None
         self.facts: dict[str, StreamFacts] = {}
@@ -397,7 +402,7 @@ class Description:
         count = frames if found is None else found.poses.frame_count
         told = f"{where}: has poses of {count} frames, and the videos have {frames}"
         # Without the last frame poses are those of the others; without the first they are not.
-        fewest = 0 if found is None or found.recorded.first_frame else -MOST_EXTRA_FRAMES
+        fewest = 0 if found is None or found.first_frame else -MOST_EXTRA_FRAMES
         if not fewest <= count - frames <= MOST_EXTRA_FRAMES:
             found, reason = None, f"{told}."
         if found is None:
@@ -432,7 +437,10 @@ class Description:
             return None, f"{where}: is missing."
         try:
             text = self.folder.read(TRAJECTORY_JSON)
-            return understood_poses(text, rig, where=where, named=named), ""
+            if self.settled is not None:
+                with suppress(SchemaError):
+                    return declared_poses(text, rig, where=where, settled=self.settled), ""
+            return settled_poses(text, rig, where=where, named=named), ""
         except SidesError as error:
             family, scale = parse_scene_key(self.key).family, error.scale
             # Poses in a unit by which the rig would be of no scene of the family are wrong.

@@ -740,11 +740,11 @@ class SampleLoader:
         return stored if self._streams.kept_frames > 1 else replace(stored, derived=kept.derived)
 
     def _read_poses(self, scene: Scene) -> CameraPoses:
-        from stereogenbench_data.index.evidence import poses_as  # slow to import
+        from stereogenbench_data.index.evidence import poses_of  # slow to import
 
         text = self._source.read(scene, TRAJECTORY_JSON)
         where = self._source.label(scene, TRAJECTORY_JSON)
-        return poses_as(text, scene.pose_form, where=where)
+        return poses_of(scene, text, where=where)
 
 
 _loaders: Final[weakref.WeakSet[SampleLoader]] = weakref.WeakSet()

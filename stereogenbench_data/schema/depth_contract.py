@@ -126,10 +126,9 @@ def stated_in_tags(tags: Mapping[str, str], *, name: str) -> list[Statement]:
         if not _TECHNICAL.isdisjoint(parts):
             continue
         if not _RANGES.isdisjoint(parts) and re.search(r"\d", text):
-            why = "may be the range that stored numbers fill"
             is_offset = not {"offset", "bias"}.isdisjoint(parts)
             if not is_offset or re.search(r"[1-9]", text):
-                refused = _refused(place, text, "tag", why)
+                refused = _refused(place, text, "tag", MAY_BE_RANGE)
                 (found if is_offset else ranges).append(refused)
             continue
         statement = _stated("_".join(parts), text, place, "tag")
@@ -209,10 +208,10 @@ def _stated(key: str, text: str, place: str, origin: Origin) -> Statement | None
     is_scale = not _SCALES.isdisjoint(parts) or _ratio(key) is not None
     if low in ("false", "no", "none", "null", "") and not (low == "" and is_scale):
         is_planar = low == "false" and "planar" in parts
-        return _refused(place, text, origin, _NO_DEPTH) if is_planar else None
+        return _refused(place, text, origin, NO_LENGTH) if is_planar else None
     has_other = _OTHER_MEANING.search(f"{key} {words(text)}" if len(text) < _LONGEST else key)
     if has_other:
-        return _refused(place, text, origin, _NO_DEPTH)
+        return _refused(place, text, origin, NO_LENGTH)
     if is_scale:
         found = _unit(key, low, place, text, origin) if len(low) < _LONGEST else None
         return found or _refused(place, text, origin, _UNREAD)
@@ -227,7 +226,8 @@ def _stated(key: str, text: str, place: str, origin: Origin) -> Statement | None
     return _refused(place, text, origin, _UNREAD) if is_of_unit else None
 
 
-_NO_DEPTH: Final = "is no plain length along the optical axis"
+NO_LENGTH: Final = "is no plain length along the optical axis"
+MAY_BE_RANGE: Final = "may be the range that stored numbers fill"
 _UNREAD: Final = (
     f"does not tell the unit as a number of metres from {LEAST_UNIT_M:g} to {LARGEST_UNIT_M:g}"
 )

@@ -178,10 +178,10 @@ def _value(document: Any, place: Place) -> Any:
             document = document[step]
         else:
             return _NOTHING
-    return document if place.tail in ("", "key") else _at_end(document, place)
+    return document if place.tail in ("", "key") else at_end(document, place)
 
 
-def _at_end(value: Any, place: Place) -> Any:
+def at_end(value: Any, place: Place) -> Any:
     """Return what a place takes of the value to which its steps lead."""
     if place.tail == "slice" and type(value) is list:
         return value[slice(*place.part)]
@@ -278,6 +278,8 @@ def leaves_at(document: Any, place: Place, *, where: str, way: Sequence[Step] = 
     keys: list[str] = []
     steps = (*place.steps, *way)
     for number, step in enumerate(steps):
+        if not nodes:
+            raise SchemaError(f"{where}: {place.text} is empty")
         kind = list if type(step) is int or type(step) is Every else dict
         if not {*map(type, nodes)} <= {kind}:
             at = next(at for at, node in enumerate(nodes) if type(node) is not kind)

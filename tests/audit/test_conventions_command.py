@@ -80,23 +80,21 @@ def test_what_no_picture_can_test_is_told_beside_the_verdict(tmp_path):
     assert re.search(rf"{file}: .*no picture could test .*frame_lag = 2", result.stderr)
 
 
-def test_the_range_of_tags_is_learned_with_its_offset(detailed_release, tmp_path):
+def test_the_unit_of_a_range_is_not_measured_but_stated(detailed_release, tmp_path):
     root, out = tmp_path / "ranged", tmp_path / "conventions.toml"
     shutil.copytree(detailed_release, root, copy_function=shutil.copyfile)
     for folder in root.glob("*/*/*/scene_*"):
         tags = {"depth_near": "0.5 m", "depth_far": "70 m"}
         rewrite_depth(folder, as_range(0.5, 70, unit_m=0.001), tags=tags)
 
-    result = invoke("conventions", root, "-o", out, "--workers", 1)
+    learned = invoke("conventions", root, "-o", out, "--workers", 1)
 
-    assert result.exit_code == 0, result.output
-    (shape,) = Conventions.read(out).shapes
-    assert shape.depth.encoding.offset_m == 0.5
-    assert shape.depth.encoding.unit_m == pytest.approx(69.5 / 65535)
-    out.write_text(f"[depth]\nunit_m = {shape.depth.encoding.unit_m!r}\n")
-    assert re.search(
-        r"a range from 0\.5 m.* expect 0 m", invoke("conventions", root, "--check", out).stderr
-    )
+    assert learned.exit_code == 1
+    assert "may be the range that stored numbers fill" in out.read_text()
+    assert Conventions.read(out).shapes[0].depth is None
+    out.write_text(f"[depth]\nunit_m = {69.5 / 65535}\noffset_m = 0.5\n")
+    stated = invoke("conventions", root, "--check", out, "--workers", 1)
+    assert stated.exit_code == 0, stated.stderr
 
 
 def test_a_report_has_structure_and_no_content(shared_scenes, tmp_path):

@@ -10,7 +10,7 @@ from stereogenbench_data.audit.contract.worlds import judge_worlds
 from stereogenbench_data.datasets.mapped import SceneViews
 from stereogenbench_data.geometry.pose_forms import readings
 from stereogenbench_data.schema.conventions import Conventions
-from stereogenbench_data.schema.trajectory import record_poses
+from stereogenbench_data.schema.pose_search import recorded_in
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.audit.corruption import copied
@@ -66,7 +66,7 @@ def write_matrices(root, *, still=False):
     """Write the poses of a tree's only scene as matrices, OpenCV's, which nothing says."""
     (path,) = root.rglob("trajectory.json")
     document = json.loads(path.read_text())
-    as_unreal = next(readings(record_poses(path.read_bytes(), where="trajectory.json"))).poses
+    as_unreal = next(readings(recorded_in(document, where="trajectory.json"))).poses
     for frame, poses in enumerate(document["frames"]):
         for camera, pose in enumerate(poses["cameras"]):
             pose.pop("rotation"), pose.pop("location")

@@ -10,6 +10,7 @@ from stereogenbench_data.datasets.mapped import SceneViews, StereoPairs
 from stereogenbench_data.errors import FieldError, StereoGenBenchError, StorageError
 from stereogenbench_data.index.learning import chosen_scenes, examine, learn, tables_of_notes
 from stereogenbench_data.index.parquet import INDEX_NAME
+from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.index.table import AssumptionWarning, SceneIndex
 from stereogenbench_data.schema.conventions import parse_conventions, write_toml
 from stereogenbench_data.schema.records import DepthEncoding
@@ -121,6 +122,51 @@ def test_a_form_that_the_file_does_not_name_is_read_as_conventions_say(make_scen
 
     assert ": rotator roll pitch yaw deg, " in index.scene(0).pose_form
     assert index.scene(0).lateral_m == pytest.approx((0.0, 0.1, 0.25, 0.31, 0.6, 0.725))
+
+
+def as_columns(document):
+    """The poses of a trajectory.json as columns of each camera, which nothing searches for."""
+    frames = document.pop("frames")
+    poses = [[frame["cameras"][camera] for frame in frames] for camera in range(6)]
+    document["rigs"] = {
+        f"lens {camera}": {
+            key: {axis: [pose[key][axis] for pose in each] for axis in each[0][key]}
+            for key in ("location", "rotation")
+        }
+        for camera, each in enumerate(poses)
+    }
+
+
+COLUMNS = """
+format = 2
+[poses]
+location = "$.rigs{lens }.location[x[],y[],z[]]"
+rotation = "$.rigs{lens }.rotation[pitch[],yaw[],roll[]]"
+camera = "$.rigs{lens }#"
+outer = "cameras"
+form = "rotator deg"
+axes = "unreal"
+unit = "cm"
+"""
+
+
+def test_poses_are_read_where_a_file_says_and_shards_carry_it(make_scene, root, rewrite, tmp_path):
+    folder = make_scene()
+    how = {"fields": ("world_from_left",), "pairs": [(3, 4)], "frames": [2]}
+    plain = StereoPairs(root, **how)[0]["world_from_left"]
+    rewrite(folder / "trajectory.json", as_columns)
+    assert "no numbers of 6 cameras" in SceneIndex.open(root).scene(0).remark("poses")
+
+    index = SceneIndex.open(root, conventions=stated(COLUMNS))
+    index.write(root / INDEX_NAME)
+    pack(root, tmp_path / "shards", workers=1)
+
+    assert verify(tmp_path / "shards", workers=1).problems == ()
+    for data in (root, tmp_path / "shards"):
+        assert StereoPairs(data, **how)[0]["world_from_left"].equal(plain)
+    wrong = COLUMNS.replace("rotator deg", "quaternion wxyz")
+    with pytest.raises(StereoGenBenchError, match=r"rigs.*'quaternion wxyz'.*rotator pitch yaw"):
+        describe_scene(root, ONE, conventions=stated(wrong))
 
 
 def test_poses_that_nobody_understands_may_be_called_unknown(make_scene, root, rewrite):

@@ -13,10 +13,13 @@ from stereogenbench_data.geometry.pose import (
     CameraPoses,
     rotation_from_rotator_deg,
 )
+from stereogenbench_data.index import evidence
 from stereogenbench_data.index.evidence import (
     SidesError,
     agreed_forms,
-    understood_poses,
+    declared_poses,
+    poses_as,
+    settled_poses,
 )
 from stereogenbench_data.schema.records import Rig
 from tests.servers.scene_fixtures import frames_of
@@ -146,7 +149,7 @@ def truth(rotators, places_cm):
 
 
 def understood(text, rig=RIG):
-    return understood_poses(text, rig, where="trajectory.json")
+    return settled_poses(text, rig, where="trajectory.json")
 
 
 TURNED = path([(-12.0, 33.0, 2.0), (-14.0, 37.0, 1.0), (-15.0, 44.0, -3.0)])
@@ -200,6 +203,41 @@ def test_readings_that_only_pictures_can_tell_apart_are_all_named():
     names = understood(written("4x4", *TURNED, axes="opencv", unit="m")).names
 
     assert [name.rpartition(", ")[2].split()[0] for name in names] == ["opencv", "opengl"]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_what_is_settled_is_read_again_by_its_places_alone(form, monkeypatch):
+    axes = "unreal" if form in ROTATORS_ONLY else "opencv"
+    text = written(form, *TURNED, axes=axes, unit="m", coordinate_system=axes)
+    settled = understood(text)
+    monkeypatch.setattr(evidence, "recorded_in", None)
+
+    again = declared_poses(text, RIG, where="trajectory.json", settled=settled)
+
+    np.testing.assert_array_equal(again.poses.centres, settled.poses.centres)
+    turns = settled.poses.world_from_cam_rotations
+    np.testing.assert_array_equal(again.poses.world_from_cam_rotations, turns)
+    assert (again.form, again.names) == (settled.form, settled.names)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_poses_are_read_again_by_the_name_that_an_index_has(form):
+    axes = "unreal" if form in ROTATORS_ONLY else "opencv"
+    text = written(form, *TURNED, axes=axes, unit="m", coordinate_system=axes)
+
+    poses = poses_as(text, understood(text).form, where="trajectory.json")
+
+    np.testing.assert_allclose(motions(poses), truth(*TURNED), atol=1e-9)
+
+
+def test_frames_that_count_by_twos_are_frames_in_order():
+    document = json.loads(written("rotator", *TURNED))
+    for frame in document["frames"]:
+        frame["frame"] = 2 * frame.pop("frame_index") + 6
+
+    found = understood(json.dumps(document).encode())
+
+    assert (found.at.frame, found.at.first, found.at.step) == ("$.frames[].frame", 6, 2)
 
 
 angles = st.tuples(st.floats(-60, 60), st.floats(-180, 180), st.floats(-15, 15))

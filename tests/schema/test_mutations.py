@@ -9,7 +9,7 @@ from functools import partial
 import pytest
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.index.evidence import poses_as, understood_poses
+from stereogenbench_data.index.evidence import poses_as, settled_poses
 from stereogenbench_data.schema.parse import parse_caption, parse_complete, parse_rig
 
 VALUES = (
@@ -52,7 +52,7 @@ def parsers(rig_document, trajectory_document):
     return (
         (parse_rig, rig_document),
         (partial(poses_as, form=None), trajectory_document),
-        (partial(understood_poses, rig=rig), trajectory_document),
+        (partial(settled_poses, rig=rig), trajectory_document),
         (parse_complete, labels),
         (parse_caption, description),
     )

@@ -1,4 +1,4 @@
-"""trajectory.json: numbers are found by structure, and refused where they have no order."""
+"""trajectory.json: numbers are read where they stand, found by structure, and put in order."""
 
 import json
 import math
@@ -9,12 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.trajectory import record_poses
+from stereogenbench_data.schema.declaration import BUILT_IN_POSES, PosesAt
+from stereogenbench_data.schema.pose_search import recorded_at, recorded_in, stands
+from stereogenbench_data.schema.trajectory import parse_trajectory, read_block
 from tests.servers.scene_fixtures import frames_of
 
 
 def recorded(document):
-    return record_poses(json.dumps(document).encode(), where="trajectory.json")
+    text = json.dumps(document).encode()
+    return recorded_in(parse_trajectory(text, where="trajectory.json"), where="trajectory.json")
 
 
 def block(document, word):
@@ -143,7 +146,7 @@ def change(path, value):
     ("changes", "reason"),
     [
         (change(["frames"], ...), "no numbers of 6 cameras in each frame are in it"),
-        (change(["frames", 1, "cameras", 3], ...), "no numbers of 6 cameras"),
+        (change(["frames", 1, "cameras", 3], ...), r"frames\[1\]\.cameras has 5, and the first"),
         (change(["frames", 2, "frame_index"], 1), "frames must be .*, and 1 is there twice"),
         (change(["frames", 2, "frame_index"], 5), "frames must be .*, and there are 3 of 0 to 5"),
         (change(["frames", 1, "cameras", 3, "camera_index"], 2), "cameras must .*, and 2 is there"),
@@ -158,23 +161,91 @@ def test_poses_that_cannot_be_put_in_order_are_refused(trajectory_document, chan
         recorded(trajectory_document)
 
 
-def test_cameras_that_are_numbered_in_two_ways_are_refused(trajectory_document):
-    for frame in trajectory_document["frames"]:
-        for pose in frame["cameras"]:
-            pose["camera_name"] = f"Cam_{5 - pose['camera_index']:02d}"
-
-    with pytest.raises(SchemaError, match="camera_index and camera_name number cameras apart"):
-        recorded(trajectory_document)
-
-
 @pytest.mark.parametrize("value", [math.nan, "9", None, True, {}, [1], 10**400])
-def test_a_place_that_is_no_number_in_one_frame_is_no_number_at_all(trajectory_document, value):
+def test_a_pose_that_is_no_number_is_named_with_frame_and_camera(trajectory_document, value):
     trajectory_document["frames"][1]["cameras"][2]["location"]["x"] = value
 
-    blocks = recorded(trajectory_document).blocks
+    told = (
+        r"trajectory\.json: frame 1, camera 2: \$\.frames\[1\]\.cameras\[2\]\.location\.x must be"
+    )
+    with pytest.raises(SchemaError, match=told):
+        recorded_at(trajectory_document, BUILT_IN_POSES, where="trajectory.json")
 
-    locations = [each.values for each in blocks if "location" in each.words]
-    assert all(np.isnan(each).any() for each in locations)
+
+@pytest.mark.parametrize(
+    ("path", "told"),
+    [
+        (
+            ["frames", 1, "cameras", 3, "location", "y"],
+            r"frames\[1\]\.cameras\[3\]\.location has no y",
+        ),
+        (["frames", 2, "cameras"], r"frames\[2\] has no cameras; it is an object"),
+        (["frames", 2, "cameras", 0], r"frames\[2\]\.cameras has 5, and the first such has 6"),
+        (["frames", 1, "frame_index"], r"frames\[1\] has no frame_index"),
+    ],
+)
+def test_a_place_that_some_pose_does_not_have_is_named(trajectory_document, path, told):
+    change(path, ...)(trajectory_document)
+
+    assert stands(trajectory_document, BUILT_IN_POSES)
+    with pytest.raises(SchemaError, match=rf"trajectory\.json: \$\.{told}"):
+        recorded_at(trajectory_document, BUILT_IN_POSES, where="trajectory.json")
+
+
+def places(document):
+    """The locations of a document, (frame, 6, 3)."""
+    return np.array([[[*each["location"].values()] for each in frame["cameras"]]
+                     for frame in document["frames"]])  # fmt: skip
+
+
+DECLARED = {
+    "in the release's layout": (
+        lambda document: document,
+        {"frame": "$.frames[].frame_index", "camera": "$.frames[].cameras[].camera_index"},
+        "$.frames[].cameras[].location[x,y,z]",
+    ),
+    "columns of each camera": (
+        lambda document: {"cameras": [
+            {"name": f"Cam_{camera:02d}", "at": dict(zip("XYZ", columns.tolist(), strict=True))}
+            for camera, columns in enumerate(places(document).transpose(1, 2, 0))
+        ][::-1]},
+        {"camera": "$.cameras[].name", "outer": "cameras"},
+        "$.cameras[].at[X[],Y[],Z[]]",
+    ),
+    "texts below keys that count": (
+        lambda document: {f"frame_{2 * number + 1:04d}": {
+            f"view {camera}": {"t": "({}, {}, {})".format(*place)}
+            for camera, place in enumerate(poses)
+        } for number, poses in enumerate(places(document).tolist())},
+        {"frame": "${frame_}#", "camera": "${frame_}.{view }#", "first": 1, "step": 2},
+        "${frame_}.{view }.t~",
+    ),
+    "a part of a list, in rows": (
+        lambda document: {"rows": [
+            {"n": number, "c": camera, "pose": [*place, 9.0]}
+            for number, poses in enumerate(places(document).tolist())
+            for camera, place in enumerate(poses)
+        ][::-1]},
+        {"frame": "$.rows[].n", "camera": "$.rows[].c", "outer": "rows"},
+        "$.rows[].pose[0:3]",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("write", "how", "place"), DECLARED.values(), ids=[*DECLARED])
+def test_numbers_are_read_where_they_are_declared(trajectory_document, write, how, place):
+    document = json.loads(json.dumps(write(trajectory_document)))
+
+    found = read_block(document, PosesAt(**{"outer": "frames"} | how), place, where="t")
+
+    np.testing.assert_array_equal(found.values, places(trajectory_document))
+
+
+def test_frames_that_do_not_begin_or_grow_as_declared_are_refused(trajectory_document):
+    at = PosesAt(frame="$.frames[].frame_index", outer="frames", first=1)
+
+    with pytest.raises(SchemaError, match="frames must be numbered from 1 without a gap"):
+        read_block(trajectory_document, at, "$.frames[].cameras[].location[x,y,z]", where="t")
 
 
 def test_nan_under_a_key_that_nobody_reads_is_ignored(trajectory_document):

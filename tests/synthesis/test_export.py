@@ -12,8 +12,9 @@ from stereogenbench_data.geometry.pose import CameraPoses, rotation_from_rotator
 from stereogenbench_data.geometry.pose_forms import readings
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.schema.parse import parse_rig
+from stereogenbench_data.schema.pose_search import recorded_in
 from stereogenbench_data.schema.release import CAMERA_PAIRS
-from stereogenbench_data.schema.trajectory import record_poses
+from stereogenbench_data.schema.trajectory import parse_trajectory
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
 OPENCV_FROM_UNREAL = np.array([[0, 1, 0], [0, 0, -1], [1, 0, 0]])
@@ -24,8 +25,8 @@ def small(**changes):
 
 
 def poses_of(scene):
-    recorded = record_poses((scene.folder / "trajectory.json").read_bytes(), where="trajectory")
-    return next(readings(recorded)).poses
+    document = parse_trajectory((scene.folder / "trajectory.json").read_bytes(), where="t")
+    return next(readings(recorded_in(document, where="t"))).poses
 
 
 def rig_of(scene):

@@ -18,7 +18,7 @@ from stereogenbench_data.audit.contract.matching import SceneFrames
 from stereogenbench_data.audit.geometry.reprojection import MeasuredDepth, reproject
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.geometry.pose import CameraPoses
-from stereogenbench_data.index.evidence import poses_as, same_poses, understood_poses
+from stereogenbench_data.index.evidence import poses_of, same_poses, settled_poses
 from stereogenbench_data.schema.conventions import declaration_of
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
@@ -85,10 +85,10 @@ def rival_readings(scene: Scene, text: bytes) -> tuple[str, ...]:
     names = scene.pose_form.split("|") if scene.pose_form else []
     if names and is_stated(scene):
         with suppress(SchemaError):  # what conventions state is all that fits
-            names += understood_poses(text, scene.rig, where=where).names
+            names += settled_poses(text, scene.rig, where=where).names
     found: dict[str, CameraPoses] = {}
     for name in names:
-        poses = poses_as(text, name, where=where)
+        poses = poses_of(scene, text, where=where, form=name)
         if not any(same_poses(poses, other) for other in found.values()):
             found[name] = poses
     return tuple(found)
@@ -117,7 +117,7 @@ def explained_shares(views: SceneFrames, text: bytes, names: Sequence[str]) -> S
     }
     found = {}
     for name in names:
-        poses = poses_as(text, name, where=where)
+        poses = poses_of(views.scene, text, where=where, form=name)
         shares = []
         for camera in _CAMERAS:
             counts = np.zeros(2, dtype=np.int64)

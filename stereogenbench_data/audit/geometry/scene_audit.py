@@ -39,7 +39,7 @@ from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
-from stereogenbench_data.index.evidence import poses_as
+from stereogenbench_data.index.evidence import poses_of
 from stereogenbench_data.media.depth import NO_DEPTH_UNIT, depth_frame_index
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.samples.load import Streams
@@ -221,7 +221,7 @@ class _SceneCheck:
                 document = self.files.attempt(name, parse_object, text, where=name)
                 recorded += [] if document is None else recorded_px(document, declared)
             else:
-                poses = self.files.attempt(name, poses_as, text, self.scene.pose_form, where=name)
+                poses = self.files.attempt(name, poses_of, self.scene, text, where=name)
         if poses is None:
             return [], None
         of_rig = rig_figures(self.scene.rig, poses, recorded)
