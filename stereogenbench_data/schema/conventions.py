@@ -310,13 +310,9 @@ def _by_earlier(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         place = values.get("place", "")
         unit = values.get("unit") or without_unit(words(place.rpartition(".")[2]))[1]
         if name == "baselines":
-            pairs_unit = unit if unit in UNITS_M else "cm"
-            printed = BUILT_IN.pairs.rows.removesuffix("[]")
-            parts["pairs"] = (
-                BUILT_IN.pairs if place == printed and unit == "cm"
-                else PairsAt(rows=place, unit=pairs_unit)
-            )  # fmt: skip
-            parts["gaps"] = None if place != printed else BUILT_IN.gaps
+            parts["pairs"] = PairsAt(rows=place, unit=unit if unit in UNITS_M else "")
+            if place != BUILT_IN.pairs.rows.removesuffix("[]"):
+                parts["gaps"] = None
         elif name == "primary_pair":
             parts[name] = PrimaryPairAt(left=(values["left"],), right=(values["right"],))
         elif {"place", "value"} & values.keys():

@@ -50,7 +50,7 @@ class PairsAt:
             the three by the first row, as files of conventions of an earlier format need.
         b: That of the second camera.
         length: Below a row the place of the baseline; "" is the row itself.
-        unit: Its unit.
+        unit: Its unit; "" is that at the end of the key of a length that was found, or cm.
         first: The number of the first camera.
         is_needed: Whether a file without the rows is refused.
     """
@@ -174,12 +174,12 @@ _MATRICES: Final = tuple(f"$.{above}{name}" for above in ("camera_intrinsics.", 
                          for name in ("K", "camera_matrix"))  # fmt: skip
 
 
-def _in_pixels(name: str, of_point: str, at: str) -> NumberAt:
+def _in_pixels(name: str, of_point: tuple[str, ...], at: str) -> NumberAt:
     """Return where a number in pixels may stand: by itself, in a point, or in a camera matrix."""
     places = [
         f"$.{above}{name}{end}" for above in ("camera_intrinsics.", "") for end in ("", "_px")
     ]
-    places += [of_point] if of_point else []
+    places += [f"{_CAMERA}principal_point{end}{part}" for end in ("", "_px") for part in of_point]
     return NumberAt(places=(*places, *(f"{matrix}{at}" for matrix in _MATRICES)), unit="px")
 
 
@@ -189,9 +189,9 @@ _NUMBERS: Final[Mapping[str, NumberAt]] = {
     "sensor_height": NumberAt(places=(f"{_CAMERA}sensor_height_mm",), unit="mm"),
     "image_width": NumberAt(places=("$.image_width",), unit="px"),
     "image_height": NumberAt(places=("$.image_height",), unit="px"),
-    "focal_length_px": _in_pixels("fx", "", "[0][0]"),
-    "principal_x": _in_pixels("cx", f"{_CAMERA}principal_point[0]", "[0][2]"),
-    "principal_y": _in_pixels("cy", f"{_CAMERA}principal_point[1]", "[1][2]"),
+    "focal_length_px": _in_pixels("fx", (), "[0][0]"),
+    "principal_x": _in_pixels("cx", ("[0]", ".x"), "[0][2]"),
+    "principal_y": _in_pixels("cy", ("[1]", ".y"), "[1][2]"),
 }
 _PAIRS: Final = PairsAt(
     rows="$.pairwise_pairs[]", a="camera_index_a", b="camera_index_b", length="baseline_cm"
@@ -282,8 +282,3 @@ BUILT_IN_POSES: Final = PosesAt(
     outer="frames",
 )
 """Where poses stand in a scene in the release's layout; their form is settled."""
-
-
-def length_m(value: float, unit: str) -> float:
-    """Return a length in metres."""
-    return value * UNITS_M[unit]

@@ -25,6 +25,8 @@ Origin = Literal["tag", "metadata"]
 LEAST_UNIT_M: Final = 1e-5
 LARGEST_UNIT_M: Final = 1.0
 """Units of depth that can be: 16 bits of finer ones end at 0.7 m, coarser ones show no stereo."""
+_SMALL_M: Final = 0.2
+"""What is no larger under a key of depth may be a unit of it."""
 _SAME: Final = 0.005
 """Two statements agree within the rounding of either, which is at most this share."""
 _MOST_SHOWN: Final = 4
@@ -34,7 +36,8 @@ _MOST_NODES: Final = 20_000
 
 _SCALES: Final = frozenset(
     {"scale", "scales", "zscale", "scaling", "factor", "unit", "units", "quantum", "lsb",
-     "conversion", "multiplier", "divisor", "precision", "step", "quantization", "quantisation"}
+     "conversion", "gain", "coefficient", "multiplier", "divisor", "precision", "step",
+     "quantization", "quantisation"}
 )  # fmt: skip
 """Words of keys under which a unit of depth stands."""
 _RANGES: Final = frozenset(
@@ -221,8 +224,12 @@ def _stated(key: str, text: str, place: str, origin: Origin) -> Statement | None
         bool(named or of_scale) and _OF_STORED.search(f"{key} {low}") is not None
     )
     is_of_unit = is_of_unit or (not is_number(text) and low in UNITS_M)
-    if re.fullmatch(rf"[-+]?(?:{_NUMBER})", low):  # DEPTH_MM=1
-        is_of_unit = parts[-1] in UNITS_M and "depth" in parts and origin == "tag"
+    if re.fullmatch(rf"[-+]?(?:{_NUMBER})", low):  # DEPTH_MM=1, DEPTH_FOO=0.001, depth_foo_m: 0.001
+        is_small = 0 < abs(_parsed(low) or 0.0) * UNITS_M.get(parts[-1], 1.0) <= _SMALL_M
+        of_length = parts[-1] in UNITS_M
+        is_of_unit = is_small and of_length if origin == "metadata" else (
+            "depth" in parts and (is_small or of_length)
+        )  # fmt: skip
     return _refused(place, text, origin, _UNREAD) if is_of_unit else None
 
 

@@ -48,7 +48,7 @@ from stereogenbench_data.schema.release import (
     subset_of_folder,
 )
 from stereogenbench_data.schema.text import counted, shortened
-from stereogenbench_data.schema.units import UNITS_M, words
+from stereogenbench_data.schema.units import UNITS_M, without_unit, words
 
 _FOLDER: Final = re.compile(r"[!-\-0-\[\]-~](?:[ -\-0-\[\]-~]*[!-\-0-\[\]-~])?\Z")
 """Printable ASCII without dot, slash and backslash, and without a space at either end."""
@@ -414,13 +414,6 @@ class _RigFile:
         width_px, height_px = size_px
         if abs(x_px - 0.5) < _RATIO > abs(y_px - 0.5):
             return None  # in shares of the sides
-        if not (x_at and y_at and 1 < x_px < width_px and 1 < y_px < height_px):
-            self.problems.append(
-                f"{x_at or y_at}: the principal point ({x_px:g}, {y_px:g}) must be x and y in "
-                f"pixels of pictures of {width_px}x{height_px}: correct it, or state the place of "
-                f"their size below [image_width]"
-            )
-            return None
         off_x, off_y = x_px / width_px - 0.5, y_px / height_px - 0.5
         if abs(off_x) > _SHARE < abs(off_y) and abs(off_x - off_y) < _SHARE:
             self.problems.append(
@@ -428,6 +421,11 @@ class _RigFile:
                 f"these, of {width_px}x{height_px}. State their size as image_width and "
                 f"image_height"
             )
+        if not (x_at and y_at and 1 < x_px < width_px and 1 < y_px < height_px):
+            told = f"{x_at or y_at}: the principal point ({x_px:g}, {y_px:g}) must be x and y in "
+            told += f"pixels inside a picture of {width_px}x{height_px}"
+            self.remarks.append(Remark("principal point", f"{self._where}: {told}"))
+            return None
         is_centre = abs(x_px - width_px / 2) <= _CENTRE_PX >= abs(y_px - height_px / 2)
         return None if is_centre else (x_px, y_px)
 
@@ -628,7 +626,9 @@ def found_pairs(document: dict[str, Any], pairs: PairsAt) -> PairsAt:
             f"Say it in a file of conventions of format 2, below [pairs]: a, b and length"
         )
     a, b, length = names
-    return PairsAt(rows=rows, a=a, b=b, length=length, unit=pairs.unit)
+    own_unit = without_unit(words(length))[1]
+    unit = pairs.unit or (own_unit if own_unit in UNITS_M else "cm")
+    return PairsAt(rows=rows, a=a, b=b, length=length, unit=unit)
 
 
 def _row_keys(row: dict[str, Any], *, in_key: bool) -> list[str]:

@@ -36,6 +36,8 @@ _UNITS: Final = tuple(f"$.{name}" for name in ("unit", "units", "length_unit", "
                                                "location_unit", "position_unit"))  # fmt: skip
 _TRAILING: Final = ((4, 4), (3, 4), (3, 3), (16,), (12,), (9,), (4,), (3,))
 _DEEPEST: Final = 20
+_MOST_PLACES: Final = 40
+"""How many places of numbers are read: a pose has some few, and each is read through the file."""
 _MOST_HINTS: Final = 64
 
 
@@ -93,7 +95,7 @@ def recorded_in(document: dict[str, Any], *, where: str) -> RecordedPoses:
         except SchemaError as error:
             odd.append(str(error).removeprefix(f"{where}: ").rstrip("."))
     if not blocks:
-        reason = "; ".join(dict.fromkeys(odd)) or (
+        reason = "; ".join([*dict.fromkeys(odd)][:3]) or (
             f"no numbers of {CAMERA_COUNT} cameras in each frame are in it; the keys are: "
             f"{listed_keys(document)}"
         )
@@ -156,7 +158,7 @@ class _Axis:
 
 def places_in(document: dict[str, Any]) -> list[PosesAt]:
     """Return the places of numbers of six cameras in each frame, each as a rotation's."""
-    found = [*_places(document, "$", "", (), 0)]
+    found = [*itertools.islice(_places(document, "$", "", (), 0), _MOST_PLACES)]
     lists = [each for each in found if not str(each.rotation).endswith(",]")]
     order = document.get("camera_order")
     has_order = isinstance(order, list) and [*map(camera_of, order)].count(None) == 0

@@ -102,7 +102,8 @@ REMARKS: Final = {
     "labels": "labels that are not understood are left out",
     "caption": "captions that are not understood are left out; that of the JSON counts",
 }
-"""What a remark may be about, and what follows from it."""
+"""What a remark may be about, and what follows from it; of some, such as "lens" and "stated", only
+rows of earlier versions have remarks."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,7 +66,7 @@ DAMAGES = {
     ),
     "a pose without a camera": (
         "trajectory.json", lambda doc: doc["frames"][2]["cameras"].pop(1),
-        "no numbers of 6 cameras in each frame",
+        r"\$\.frames\[2\]\.cameras has 5, and the first such has 6",
     ),
     "poses that contradict the baselines": (
         "baseline.json",

@@ -11,6 +11,7 @@ from io import FileIO
 import pytest
 
 from stereogenbench_data.index import build as walk_module
+from stereogenbench_data.index import evidence
 from stereogenbench_data.index import tree as tree_module
 from stereogenbench_data.index.build import ManyReadsWarning, walk
 from stereogenbench_data.index.scene_folder import describe_scene
@@ -48,6 +49,29 @@ def test_every_scene_is_whole_incomplete_or_broken(alike_scenes, root):
     assert list(report.incomplete) == [keys[1]]
     assert list(report.broken) == [keys[2], "train/Uniform/scene.7"]
     assert "has no baseline.json" in report.broken[keys[2]]
+
+
+def test_poses_are_searched_for_once_and_then_read_where_they_stand(
+    alike_scenes, root, monkeypatch
+):
+    keys, searched = alike_scenes(4), []
+    for key in keys:
+        path = root / key / "trajectory.json"
+        document = json.loads(path.read_text())
+        for frame in document["frames"]:
+            frame["views"] = frame.pop("cameras")
+        path.write_text(json.dumps(document))
+    search = evidence.recorded_in
+    monkeypatch.setattr(
+        evidence, "recorded_in", lambda *args, **how: searched.append(0) or search(*args, **how)
+    )
+
+    scenes = walk(root, workers=1).scenes
+
+    assert len(searched) == 1
+    assert {scene.pose_form for scene in scenes} == {None}
+    assert all(scene.lateral_m[5] == pytest.approx(0.725) for scene in scenes)
+    assert not any(scene.remark("poses") for scene in scenes)
 
 
 def test_scenes_of_one_writer_read_their_poses_alike(alike_scenes, root):

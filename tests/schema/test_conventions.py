@@ -334,6 +334,29 @@ def test_a_place_that_a_file_does_not_have_is_named(rig_document, dumped, place)
         parse_rig(dumped(rig_document), where="b", declared=shape)
 
 
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [{"cam_a": f"Cam_{a:02d}", "cam_b": f"Cam_{b:02d}", "baseline_m": cm / 100}
+         for a, b, cm in PAIRS],
+        [{"camera_index_a": a, "camera_index_b": b, "baseline_cm": cm, "index": 3, "gap": b - a}
+         for a, b, cm in PAIRS],
+        {f"{a}-{b}": {"length_cm": cm} for a, b, cm in PAIRS},
+        {f"{a}-{b}": cm for a, b, cm in PAIRS},
+        [[a, b, cm] for a, b, cm in PAIRS],
+        [cm for a, b, cm in PAIRS if b == a + 1],
+    ],
+    ids=["names, metres", "the printed keys", "keys and objects", "keys", "lists", "neighbours"],
+)  # fmt: skip
+def test_a_file_of_the_earlier_format_names_the_list_of_baselines_alone(rig_document, dumped, rows):
+    rig_document["pairwise_pairs"] = rows
+    (shape,) = read(b'[baselines]\nplace = "$.pairwise_pairs"\n').shapes
+
+    rig = parse_rig(dumped(rig_document), where="b", declared=shape)[0]
+
+    assert rig.baselines_cm == pytest.approx([cm for _, _, cm in PAIRS])
+
+
 def test_the_only_number_beside_two_cameras_may_be_called_a_baseline(rig_document, dumped):
     expected = parse_rig(dumped(rig_document), where="b")[0]
     pairs = rig_document.pop("pairwise_pairs")

@@ -99,7 +99,8 @@ def test_the_ends_of_a_range_beside_a_scale_are_ignored():
 
 UNCLEAR = """
 scale= | scale=0 | scale=-1 | scale=nan | scale=x0.001 | units_per_meter=0.001 | DEPTH_MM=1
-DEPTH_UNIT=m | unit=furlong | scale=0.03937 in | scale=0.1; DEPTH_UNIT=mm | scale=0.1; unit=cm
+DEPTH_FOO=0.001 | DEPTH_UNIT=m
+unit=furlong | scale=0.03937 in | scale=0.1; DEPTH_UNIT=mm | scale=0.1; unit=cm
 DEPTH_SCALE=65.535 | DEPTH_SCALE=1 | scale=1.0 | depth_encoding=inverse; scale=655
 encoding=log; scale=0.001 | depth_type=euclidean; scale=0.001 | disparity_scale=16
 scale=0.001; offset=0.5 | max_depth=100 | normalized=1 | near=10; far=10000
@@ -127,6 +128,7 @@ def test_tags_that_do_not_tell_the_unit_are_refused_by_name(text):
 @pytest.mark.parametrize(
     "document",
     [
+        {"depth_resolution_m": 0.001},
         {"depth_encoding": "uint16 millimeters"},
         {"depth_description": "16-bit depth, 1 unit = 1 mm"},
         {"depth_normalization": "linear"},

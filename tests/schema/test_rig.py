@@ -166,7 +166,7 @@ LENGTH = r"pairwise_pairs\[3\]\.baseline_cm: must be a number above zero, found 
         (lens(sensor_width_mm=0.02376), r"0\.02376 mm.*e\+03 widths"),
         (lens(fx=920.0), r"intrinsics\.fx: means 1\.4375 focal.*focal_length_mm.* mean 1\.36785"),
         (keys(K=[[920.0, 0, 320], [0, 920.0, 240], [0, 0, 1]]), r"\$\.K\[0\]\[0\]: means 1\.4375"),
-        (lens(cx=960.0, cy=720.0), r"principal point \(960, 720\) must be .* of 640x480"),
+        (lens(cx=960.0, cy=720.0), r"by its principal point \(960, 720\) it is of .* 640x480"),
         (lens(cx=160.0, cy=120.0), r"by its principal point \(160, 120\) it is of other pictures"),
         (keys(image_width="640"), r"\$\.image_width: must be a number above zero, found '640'"),
         (keys(image_width=0.5), r"\$\.image_width: must be a whole number of pixels, found 0\.5"),
@@ -247,6 +247,7 @@ def test_baselines_outside_of_their_family_are_told(rig_document):
         ({"principal_point": [300.5, 250.0]}, (300.5, 250.0)),
         ({"cx": 300.5, "cy": 250.0}, (300.5, 250.0)),
         ({"cx_px": 300.5, "cy_px": 250.0}, (300.5, 250.0)),
+        ({"principal_point_px": {"x": 300.5, "y": 250}}, (300.5, 250.0)),
         ({"K": [[875.42, 0, 300.5], [0, 875.42, 250.0], [0, 0, 1]]}, (300.5, 250.0)),
         ({"cx": 320.5, "cy": 239.5}, None),
         ({"cx": 0.5, "cy": 0.5}, None),
@@ -261,6 +262,16 @@ def test_a_principal_point_is_read_where_it_is_in_pixels(rig_document, written, 
 
     assert rig.principal_point_px == point_px
     assert remarks == ()
+
+
+@pytest.mark.parametrize("written", [{"cx": 300.5}, {"cx": 1e9, "cy": 1}])
+def test_a_principal_point_outside_the_picture_is_told(rig_document, written):
+    lens(**written)(rig_document)
+
+    rig, _, (remark,) = read(rig_document)
+
+    assert rig.principal_point_px is None
+    assert remark.about == "principal point"
 
 
 def test_baselines_of_neighbours_add_up_to_the_others(rig_document):

@@ -248,6 +248,14 @@ def test_frames_that_do_not_begin_or_grow_as_declared_are_refused(trajectory_doc
         read_block(trajectory_document, at, "$.frames[].cameras[].location[x,y,z]", where="t")
 
 
+def test_a_pose_of_very_many_numbers_is_not_read_place_by_place(trajectory_document):
+    for frame in trajectory_document["frames"]:
+        for pose in frame["cameras"]:
+            pose |= {f"vector {number}": [1.0, 2.0, 3.0] for number in range(500)}
+
+    assert len(recorded(trajectory_document).blocks) <= 40
+
+
 def test_nan_under_a_key_that_nobody_reads_is_ignored(trajectory_document):
     for frame in trajectory_document["frames"]:
         frame["exposure"] = math.nan
