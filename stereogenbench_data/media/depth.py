@@ -65,8 +65,6 @@ _COLOUR_FORMAT: Final = re.compile(
     r"(?P<planes>gbrp|gbrap)(?P<bits>9|10|12|14|16)?(?P<order>le|be)?|"
     r"(?P<packed>[rgba0]{3,4})(?:24|(?P<wide>48|64)(?:le|be))?"
 )
-_DECIDED: Final = 4.0
-"""By how much the smoother of two orders of bytes must be smoother, to be the right one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +151,14 @@ def require_depth_stream(
         raise MediaError(
             f"{stored}, {why}: no DepthEncoding accepts it. Store depth as gray16le with FFV1."
         )
+    if layout.is_colour and layout.dtype == "u1" and not encoding.channels and (
+        encoding is not ANY_DEPTH
+    ):  # fmt: skip
+        raise MediaError(
+            f"{stored}, channels of colours with 8 bits each: if two of them hold the high and the "
+            f'low byte of a number, say which: DepthEncoding(channels="rg"), or channels = "rg" '
+            f"below [depth] in a file for --conventions. Else store depth as gray16le with FFV1."
+        )
     risks = {
         f"{layout.bits}-bit": layout.bits < 16,
         "lossy": is_lossy,
@@ -216,7 +222,7 @@ def read_depth_units(
     if isinstance(reader, DepthFrames):
         return reader.units(index)
     if layout.is_colour:
-        units = _units_of_channels(reader, index, layout)
+        units = _units_of_channels(reader, index, layout, encoding)
     else:
         numbers = plane_numbers(reader.frame(index), 0, dtype=layout.dtype)
         units = numbers.astype(np.uint16, copy=False)
@@ -225,20 +231,17 @@ def read_depth_units(
 
 
 def _units_of_channels(
-    reader: VideoReader, index: int, layout: DepthLayout
+    reader: VideoReader, index: int, layout: DepthLayout, encoding: DepthEncoding
 ) -> UInt16[np.ndarray, "h w"]:
-    """Return depth of three equal channels, or of its high and low byte in two of them.
-
-    Which byte is high is decided by the video's first frame, so that all frames are read alike.
-    """
+    """Return depth of three equal channels, or of its high and low byte in two of them."""
     red, green, blue = channels = _channels(reader, index, layout)
-    if layout.dtype == "u1":  # a 16-bit number may stand in two channels of 8 bits
-        order = _byte_order(_channels(reader, 0, layout), name=reader.name)
-        (other,) = {0, 1, 2}.difference(order)
-        if not _is_flat(channels[other]):
+    if layout.dtype == "u1":
+        high, low = ("rgb".index(each) for each in encoding.channels or "rg")
+        other = channels[3 - high - low]
+        if encoding is not ANY_DEPTH and not (other == other.flat[0]).all():
             raise _not_numbers(reader.name, f"frame {index} has a third channel with numbers")
-        high, low = (channels[place].astype(np.uint16) for place in order)
-        return high << 8 | low
+        both: UInt16[np.ndarray, "h w"] = channels[high].astype(np.uint16) << 8 | channels[low]
+        return both
     if not (np.array_equal(red, green) and np.array_equal(green, blue)):
         raise _not_numbers(reader.name, f"frame {index} has different numbers in its channels")
     return red.astype(np.uint16)
@@ -253,34 +256,6 @@ def _channels(
         planar = "gbrp" if layout.dtype == "u1" else "gbrp16le"
         frame = reader.scaler.reformat(frame, format=planar, threads=1)
     return tuple(plane_numbers(frame, plane, dtype=layout.dtype) for plane in RED_GREEN_BLUE)
-
-
-def _byte_order(channels: tuple[Shaped[np.ndarray, "h w"], ...], *, name: str) -> tuple[int, int]:
-    """Return the places of the high and the low byte.
-
-    Neighbouring pixels have nearly the same depth: with the bytes in their right order, numbers
-    differ far less from pixel to pixel than in the other order.
-
-    Raises:
-        MediaError: If the channels are colours, or the order cannot be told.
-    """
-    busy = [place for place, channel in enumerate(channels) if not _is_flat(channel)]
-    if len(busy) > 2:
-        raise _not_numbers(name, "all three of its channels of 8 bits have numbers")
-    if len(busy) < 2:
-        raise _not_numbers(name, "only one of its channels has numbers, a high or a low byte")
-    first, second = busy
-    steps = []
-    for high, low in ((first, second), (second, first)):
-        numbers = channels[high].astype(np.int32) << 8 | channels[low]
-        steps.append(float(np.abs(np.diff(numbers, axis=1)).mean()))
-    if max(steps) < _DECIDED * min(steps):
-        raise _not_numbers(name, "neither order of its two bytes gives smooth depth")
-    return (first, second) if steps[0] < steps[1] else (second, first)
-
-
-def _is_flat(channel: Shaped[np.ndarray, "h w"]) -> bool:
-    return bool((channel == channel.flat[0]).all())
 
 
 def _not_numbers(name: str, why: str) -> MediaError:
@@ -430,7 +405,8 @@ def packed_depth(
     """
     accepted = _ANY_BITS
     if size is not None and encoding is not None:
-        accepted = replace(_ANY_BITS, accept=_ANY_BITS.accept | encoding.accept)
+        accept = _ANY_BITS.accept | encoding.accept
+        accepted = replace(_ANY_BITS, accept=accept, channels=encoding.channels)
     chunks, digests, pts = [], [], []
     with open_video(video, name=name, frames=frames) as reader:
         facts = reader.facts

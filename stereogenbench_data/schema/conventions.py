@@ -194,7 +194,7 @@ def _format_of(document: Mapping[str, Any], where: str) -> int:
 
 _OF_LENGTH: Final = ("focal_length", "sensor_width", "sensor_height")
 _OF_PIXELS: Final = ("image_width", "image_height", "principal_x", "principal_y")
-_OF_DEPTH: Final = "unit_m offset_m kind form frame_lag no_depth accept instead_of_tag_m"
+_OF_DEPTH: Final = "unit_m offset_m kind form frame_lag no_depth accept channels instead_of_tag_m"
 _TABLES: Final[Mapping[int, Mapping[str, str]]] = {
     1: {
         **dict.fromkeys((*_OF_LENGTH[:3], "field_of_view", "focal_length_px", *_OF_PIXELS),
@@ -386,7 +386,7 @@ def _is_row_part(value: object) -> bool:
 
 _PLACE: Final = "a JSON path, such as $.camera_intrinsics.focal_length_mm"
 _RULES: Final[tuple[tuple[str, Callable[[Any], bool], str], ...]] = (
-    ("kind form axes unit has accept", _is_text, "a text"),
+    ("kind form axes unit has accept channels", _is_text, "a text"),
     ("as", lambda value: value in _AS, '"field of view" or "pixels"'),
     ("outer", lambda value: value in ("frames", "cameras"), '"frames" or "cameras"'),
     ("optional", lambda value: isinstance(value, bool), "true or false"),

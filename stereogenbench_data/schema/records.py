@@ -3,6 +3,7 @@
 A record contains the values of a file, with units in the names and nothing derived.
 """
 
+import itertools
 import sys
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -21,6 +22,8 @@ from stereogenbench_data.schema.text import counted
 DepthKind = Literal["planar", "ray"]
 DepthForm = Literal["depth", "inverse"]
 DepthRisk = Literal["8-bit", "9-bit", "10-bit", "12-bit", "14-bit", "lossy", "chroma"]
+CHANNELS: Final = ("", *map("".join, itertools.permutations("rgb", 2)))
+"""Which channels may hold the high and the low byte of depth."""
 DepthUnitSource = Literal["tag", "metadata", "default", "conventions", "unreadable"]
 
 
@@ -131,6 +134,8 @@ class DepthEncoding:
         unit_m: Metres in one stored unit. None means what the scene's files state, or the release's
             default of 0.1 m if they state nothing. With ``form="inverse"``, the depth in metres of
             the stored number 1: depth = unit_m / stored.
+        channels: Of numbers of 16 bits in two channels of 8, the high byte's and the low byte's:
+            "rg" is red and green. "" refuses such streams.
         offset_m: Depth in metres of the stored number 0, as a stream has it that was normalised to
             a range: depth = offset_m + unit_m * stored. It needs ``unit_m``.
         kind: "planar" is depth along the optical axis (z); "ray" is the distance from the
@@ -159,6 +164,7 @@ class DepthEncoding:
     accept: frozenset[DepthRisk] = frozenset()
     source: Literal["tag", "metadata", "default", "conventions", "user"] = "user"
     offset_m: float = 0.0
+    channels: str = ""
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
@@ -175,6 +181,7 @@ class DepthEncoding:
              "no_depth must contain whole numbers", self.no_depth),
             (self.kind in kinds, f"kind must be one of {kinds}", self.kind),
             (self.form in forms, f"form must be one of {forms}", self.form),
+            (self.channels in CHANNELS, f"channels must be one of {CHANNELS}", self.channels),
             (not unknown, f"accept may hold {get_args(DepthRisk)}", sorted(unknown)),
         ):  # fmt: skip
             if not is_right:
