@@ -58,7 +58,7 @@ from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_
 from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
 from stereogenbench_data.schema.conventions import Conventions, declaration_of_text, keys_of
 from stereogenbench_data.schema.declaration import BUILT_IN, UNKNOWN, Declaration
-from stereogenbench_data.schema.depth_contract import Statement, stated_in_json
+from stereogenbench_data.schema.depth_contract import UNREAD, Statement, stated_in_json
 from stereogenbench_data.schema.document import (
     brief,
     parse_object,
@@ -800,9 +800,13 @@ def described_again(
     except (SchemaError, MediaError, StorageError) as error:
         return scene, [_placed(folder.key, str(error))]
     by_videos = videos is None and {*scene.depth_unit_source} <= {"tag", "default"}
-    # What an earlier version understood and this one does not is taken from the row.
-    by_videos = by_videos and not now.remark("depth")
-    new = [about for about in ("frames", "poses") if now.remark(about) and not scene.remark(about)]
+    # What an earlier version understood and this one does not read is taken from the row.
+    by_videos = by_videos and not any(why in now.remark("depth") for why in UNREAD)
+    new = [
+        about
+        for about in ("frames", "poses", *(["depth"] if by_videos else []))
+        if now.remark(about) and not scene.remark(about)
+    ]
     new += ["videos"] if scene.members.keys() != now.members.keys() else []
     found = [_placed(folder.key, now.remark(about)) for about in new]
     # What is not compared is taken from the row.
@@ -813,7 +817,7 @@ def described_again(
         "frames": "frames" in new or (scene.remark("frames") and now.frames > scene.frames),
         "pose_form": lacks_poses or shape.poses is not None or {*forms} <= {*forms_now},
         **dict.fromkeys(_OF_POSES, lacks_poses),
-        **dict.fromkeys(_UNITS, not by_videos),
+        **dict.fromkeys(_UNITS, "depth" in new or not by_videos),
     }
     row = replace(now, **{part: getattr(scene, part) for part, is_kept in parts.items() if is_kept})
     if row.id.split == "eval" and not row.id.subset:

@@ -217,7 +217,7 @@ def _stated(key: str, text: str, place: str, origin: Origin) -> Statement | None
         return _refused(place, text, origin, NO_LENGTH)
     if is_scale:
         found = _unit(key, low, place, text, origin) if len(low) < _LONGEST else None
-        return found or _refused(place, text, origin, _UNREAD)
+        return found or _refused(place, text, origin, NOT_UNDERSTOOD)
     named = {*re.findall("[a-z]+", low)} & UNITS_M.keys()
     of_scale = _SPEAKS_OF_SCALE.search(low)
     is_of_unit = bool(named and of_scale) or (
@@ -230,14 +230,16 @@ def _stated(key: str, text: str, place: str, origin: Origin) -> Statement | None
         is_of_unit = is_small and of_length if origin == "metadata" else (
             "depth" in parts and (is_small or of_length)
         )  # fmt: skip
-    return _refused(place, text, origin, _UNREAD) if is_of_unit else None
+    return _refused(place, text, origin, NOT_UNDERSTOOD) if is_of_unit else None
 
 
 NO_LENGTH: Final = "is no plain length along the optical axis"
 MAY_BE_RANGE: Final = "may be the range that stored numbers fill"
-_UNREAD: Final = (
+NOT_UNDERSTOOD: Final = (
     f"does not tell the unit as a number of metres from {LEAST_UNIT_M:g} to {LARGEST_UNIT_M:g}"
 )
+UNREAD: Final = (NO_LENGTH, MAY_BE_RANGE, NOT_UNDERSTOOD)
+"""Why a statement is not read, other than that it contradicts another."""
 
 
 def _unit(key: str, low: str, place: str, text: str, origin: Origin) -> Statement | None:

@@ -174,8 +174,7 @@ def video_of(name, *, frames=7, unit_m=0.001):
     [
         (focal_changed, r"/baseline\.json: .* focal_mm "),
         (video_of("cam_01_rgb.mp4", frames=6), "11 have 7, but cam_01_rgb.mp4 has 6"),
-        (video_of("cam_05_depth.mkv", unit_m=0.0015), r"/cam_05_depth\.mkv: tells .* 0\.0015, .*"),
-        (video_of("cam_05_depth.mkv", unit_m=0.5), ": its cameras' units of depth differ"),
+        (video_of("cam_05_depth.mkv", unit_m=0.0015), ": its cameras' units of depth differ"),
     ],
 )
 def test_files_that_the_index_does_not_know_are_not_packed(tree, tmp_path, change, told):
