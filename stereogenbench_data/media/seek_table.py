@@ -250,7 +250,7 @@ def _gone_through(container: InputContainer, file: VideoFile) -> SeekTable | Non
     ends: list[int] = []
     keys: list[int] = []
     times: list[int] = []
-    ahead = 0
+    ahead, latest = 0, -(2**63)
     for packet in container.demux(stream):
         if packet.size == 0:
             continue
@@ -259,7 +259,9 @@ def _gone_through(container: InputContainer, file: VideoFile) -> SeekTable | Non
         if packet.is_keyframe:
             keys.append(len(ends))
         ends.append(packet.pos + _BLOCK_HEADER_BYTES + packet.size)
-        ahead = max(ahead, sum(time > packet.pts for time in times[-32:]))
+        if packet.pts < latest:
+            ahead = max(ahead, sum(time > packet.pts for time in times[-32:]))
+        latest = max(latest, packet.pts)
         times.append(packet.pts)
     entries = stream.index_entries
     if not ends or not len(entries):
