@@ -417,7 +417,7 @@ def _head(surveyed: Survey) -> list[str]:
         "Conventions: where quantities stand in the files of this dataset and how they are read.",
         f"Learned from {looked}; {others} of them verified what the others taught.",
         "Use it: StereoPairs(..., conventions='conventions.toml'), or --conventions of a command.",
-        "Edit it: what the data contradict is refused with the figures; what it leaves out is "
-        "found as ever. Test it: `stereogenbench conventions ROOT --check FILE`.",
+        "Edit it: what the data contradict is refused with the figures. Tables that it leaves out "
+        "are the release's. Test it: `stereogenbench conventions ROOT --check FILE`.",
         *(f"NOT SETTLED: {problem}" for problem in surveyed.problems),
     ]

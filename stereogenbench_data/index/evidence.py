@@ -5,6 +5,9 @@ side by side along the axis that points to their right, and the primary pair's l
 on the left. Evidence rejects, it does not choose: the form that the file names stays if it passes.
 Where none is named, or it fails, the other forms are tried; where several pass and differ, the
 fields on which they differ are refused. Pictures tell more: see `audit.contract.worlds`.
+
+`settled_poses` may search, and ends in a `PosesAt` with every place; `declared_poses` and
+`poses_of` read by one.
 """
 
 from collections import Counter
@@ -195,7 +198,7 @@ def _readings_as(recorded: RecordedPoses, named: PosesAt) -> Iterator[Reading]:
 def _fitting(
     recorded: RecordedPoses | None, found: Iterable[Reading], rig: Rig, *, where: str
 ) -> Understood:
-    """Return the poses of the first tier of readings that fit a rig, as `understood_poses` says."""
+    """Return the poses of the first tier of readings that fit a rig, as `settled_poses` says."""
     failures: dict[str, str] = {}
     scaled: list[SidesError] = []
     loose: list[_Passed] = []

@@ -1,4 +1,4 @@
-"""Learning conventions from some scenes: where quantities stand, by files and numbers alone.
+"""Learning conventions from some scenes: how poses and depth are read, by files and numbers alone.
 
 Scenes with the same keys have one decision, made by the first of them; decisions that are equal are
 one shape. Others then verify: described by the conventions, they must be what they are without.
