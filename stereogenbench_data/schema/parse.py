@@ -323,7 +323,7 @@ class _RigFile:
         keys = listed_keys([*self.document, *(f"camera_intrinsics.{key}" for key in inner)])
         self.problems.append(
             f"{' or '.join(places)} is missing, where {what} stands; the keys are: {keys}. If it "
-            f"stands elsewhere, say where in a file of conventions: {lines}"
+            f"stands elsewhere, say where in a file of conventions: format = 2, then {lines}"
         )
 
     def _number(self, name: str) -> tuple[str, float]:
