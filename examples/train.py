@@ -5,7 +5,6 @@ the size of the training pictures. The curve and three predictions go to demo/tr
 """
 
 import argparse
-import os
 import time
 from pathlib import Path
 
@@ -65,9 +64,7 @@ def main() -> None:
     options.add_argument("--steps", type=int, default=300)
     given = options.parse_args()
     torch.manual_seed(given.seed)
-    # Threads that wait for one another beside busy workers would take the cores from them.
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    torch.set_num_threads(max(1, (cores or 1) // 2))
+    torch.set_num_threads(max(1, torch.get_num_threads() // 2))  # the workers need cores, too
     request = SynthRequest(
         family="IPD_Gaussian", split="eval", map_name=MAPS, scenes=3, size_px=160, frames=2, seed=7
     )
@@ -80,7 +77,7 @@ def main() -> None:
         SHARDS, split="train", pairs="all", baseline_cm=(8, 60), frames=("every", 4),
         fields=FIELDS, transform=Compose([HorizontalFlip(), RandomCrop(64, 64)]),
     )  # fmt: skip
-    loader = pairs.loader(BATCH, num_workers=1 if (cores or 1) < 4 else 2, seed=given.seed)
+    loader = pairs.loader(BATCH, num_workers=min(2, torch.get_num_threads()), seed=given.seed)
     print(f"training on {len(pairs)} pairs, validating on {len(held_out)} of three other scenes")
 
     network = SmallStereo(MAX_DISPARITY)
@@ -105,7 +102,6 @@ def main() -> None:
             if step == given.steps:
                 break
     seconds, stats = time.perf_counter() - began, loader.stats()
-
     picture = DEMO / "training.png"
     draw(curve, network, held_out).savefig(picture, dpi=110)
     off = [f"{errors.gt(1).float().mean():.1%}" for errors in (before, after)]
