@@ -21,9 +21,10 @@ shards/index.parquet:
 		"read. Run make in a clone of the repository." >&2
 	@exit 1
 
-# The package and matplotlib are all that it needs; tests and lint need many times as much.
+# The package and matplotlib are all that it needs; tests and lint need many times as much. Threads of
+# torch that wait for one another beside busy workers shall not take the cores from them.
 demo: shards/index.parquet $(DEMO)/.ready
-	$(DEMO)/bin/python examples/train.py
+	OMP_WAIT_POLICY=PASSIVE $(DEMO)/bin/python examples/train.py
 
 $(DEMO)/.ready: pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv $(DEMO)

@@ -20,7 +20,7 @@ from stereogenbench_data.synthesis.request import SynthRequest
 DEMO, SHARDS = Path("demo"), Path(__file__).parents[1] / "shards"
 MAPS = ("SynthPark", "SynthStage", "SynthYard")
 FIELDS = ("left", "right", "disparity", "valid", "visible", "baseline_m", "scene")
-MAX_DISPARITY, BATCH, STEPS_BETWEEN_VALIDATIONS = 32, 8, 60
+MAX_DISPARITY, BATCH, STEPS_BETWEEN_VALIDATIONS = 32, 8, 50
 
 
 def held_out_errors(network: SmallStereo, validation: PairsLoader) -> torch.Tensor:
@@ -61,10 +61,9 @@ def draw(curve: dict[int, float], network: SmallStereo, held_out: StereoPairs) -
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("--seed", type=int, default=0)
-    options.add_argument("--steps", type=int, default=300)
+    options.add_argument("--steps", type=int, default=200)
     given = options.parse_args()
     torch.manual_seed(given.seed)
-    torch.set_num_threads(max(1, torch.get_num_threads() // 2))  # the workers need cores, too
     request = SynthRequest(
         family="IPD_Gaussian", split="eval", map_name=MAPS, scenes=3, size_px=160, frames=2, seed=7
     )
@@ -77,7 +76,8 @@ def main() -> None:
         SHARDS, split="train", pairs="all", baseline_cm=(8, 60), frames=("every", 4),
         fields=FIELDS, transform=Compose([HorizontalFlip(), RandomCrop(64, 64)]),
     )  # fmt: skip
-    loader = pairs.loader(BATCH, num_workers=min(2, torch.get_num_threads()), seed=given.seed)
+    workers = max(1, min(2, torch.get_num_threads() // 2))  # the training needs cores, too
+    loader = pairs.loader(BATCH, num_workers=workers, seed=given.seed)
     print(f"training on {len(pairs)} pairs, validating on {len(held_out)} of three other scenes")
 
     network = SmallStereo(MAX_DISPARITY)
