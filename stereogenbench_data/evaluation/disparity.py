@@ -15,13 +15,15 @@ import numpy as np
 import torch
 
 from stereogenbench_data.datasets.mapped import Data
-from stereogenbench_data.engine import LOCAL, Advance
+from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import EvaluationError, PredictionError
 from stereogenbench_data.evaluation.disparity_maps import CalledMatcher, DisparityFolder, Matcher
 from stereogenbench_data.evaluation.evaluate import (
     EvaluationOptions,
     Run,
+    called_name,
     pair_scores,
+    prediction_root,
     scored_scenes,
     select_pairs,
 )
@@ -99,20 +101,9 @@ def evaluate_disparity(
     protocol = protocol or DisparityProtocol()
     source: PredictionSource
     if callable(predictions):
-        called = name or str(getattr(predictions, "__name__", type(predictions).__name__))
-        if options.get("out") and not name:
-            raise EvaluationError(
-                f"{options['out']}: is to keep the scores of {called}, and another method may be "
-                f"called so, too. Pass name=..., another for each method, parameter and checkpoint."
-            )
-        source = CalledMatcher(called, predictions)
-        options["workers"], options["engine"] = 1, LOCAL
+        source = CalledMatcher(called_name(predictions, name, options), predictions)
     else:
-        root = Path(predictions).resolve()
-        if not root.is_dir():
-            raise EvaluationError(
-                f"{root}: is not a folder. Pass the folder that holds the disparity maps."
-            )
+        root = prediction_root(predictions, "disparity maps")
         source = DisparityFolder(name or root.name, root, protocol.max_disparity_px)
     index, scenes = select_pairs(
         data,

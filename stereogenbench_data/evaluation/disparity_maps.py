@@ -34,6 +34,7 @@ from stereogenbench_data.evaluation.predictions import (
     Read,
     find_prediction,
     frame_name,
+    returned,
     stamp_prediction,
 )
 from stereogenbench_data.index.table import SceneIndex
@@ -129,20 +130,10 @@ class CalledMatcher:
         yield self._read
 
     def _read(self, wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
-        given = self.method(
-            {
-                name: torch.from_numpy(np.stack([np.asarray(each[name]) for each in samples]))
-                for name in self.inputs
-            }
-        )
         expected, where = (len(samples), *wanted.size), f"{wanted.label}: {self.name}"
-        try:
-            maps = torch.as_tensor(given).detach().cpu()
-        except (RuntimeError, TypeError, ValueError) as error:
-            raise PredictionError(
-                f"{where} returned a {type(given).__name__} that is not one array ({error}); "
-                f"expected floats {expected}."
-            ) from error
+        maps = returned(
+            self.method, samples, self.inputs, where=where, expected=f"floats {expected}"
+        )
         if maps.dim() == 4 and maps.shape[1] == 1:
             maps = maps[:, 0]
         if maps.shape != expected or not maps.is_floating_point():

@@ -132,21 +132,9 @@ def evaluate(
     known = require_tier(tier)
     source: PredictionSource
     if callable(predictions):
-        called = name or str(getattr(predictions, "__name__", type(predictions).__name__))
-        if options.get("out") and not name:
-            raise EvaluationError(
-                f"{options['out']}: is to keep the scores of {called}, and another method may be "
-                f"called so, too. Pass name=..., another for each method, parameter and "
-                f"checkpoint, so that its scores are found again and no other's."
-            )
-        source = CalledMethod(called, predictions, known)
-        options["workers"], options["engine"] = 1, LOCAL
+        source = CalledMethod(called_name(predictions, name, options), predictions, known)
     else:
-        root = Path(predictions).resolve()
-        if not root.is_dir():
-            raise EvaluationError(
-                f"{root}: is not a folder. Pass the folder that holds the predicted right views."
-            )
+        root = prediction_root(predictions, "predicted right views")
         source = PredictionFolder(name or root.name, root)
     index, scenes = select_pairs(
         data,
@@ -158,6 +146,35 @@ def evaluate(
     )
     (scores,) = score_pairs(Run(index, scenes, protocol, (source,), known.name), options)
     return scores
+
+
+def called_name(method: Method, name: str | None, options: EvaluationOptions) -> str:
+    """Return what a callable is called, and let it be called in this process.
+
+    Raises:
+        EvaluationError: If its results are to be kept, and nothing tells them from another's.
+    """
+    called = name or str(getattr(method, "__name__", type(method).__name__))
+    if options.get("out") and not name:
+        raise EvaluationError(
+            f"{options['out']}: is to keep the scores of {called}, and another method may be "
+            f"called so, too. Pass name=..., another for each method, parameter and "
+            f"checkpoint, so that its scores are found again and no other's."
+        )
+    options["workers"], options["engine"] = 1, LOCAL
+    return called
+
+
+def prediction_root(predictions: str | Path, held: str) -> Path:
+    """Return the folder of predictions.
+
+    Raises:
+        EvaluationError: If it is none.
+    """
+    root = Path(predictions).resolve()
+    if not root.is_dir():
+        raise EvaluationError(f"{root}: is not a folder. Pass the folder that holds the {held}.")
+    return root
 
 
 ScoredPairs = Mapping[int, Sequence[PairFrames]]

@@ -350,6 +350,29 @@ class PredictionFolder:
             yield read
 
 
+def returned(
+    method: Method, samples: Sequence[Sample], inputs: Sequence[str], *, where: str, expected: str
+) -> torch.Tensor:
+    """Return what a callable returns of a batch of some fields of samples, on the processor.
+
+    Raises:
+        PredictionError: If it is not one array.
+    """
+    given = method(
+        {
+            name: torch.from_numpy(np.stack([np.asarray(each[name]) for each in samples]))
+            for name in inputs
+        }
+    )
+    try:
+        return torch.as_tensor(given).detach().cpu()
+    except (RuntimeError, TypeError, ValueError) as error:
+        raise PredictionError(
+            f"{where} returned a {type(given).__name__} that is not one array ({error}); "
+            f"expected {expected}."
+        ) from error
+
+
 @dataclass(frozen=True, slots=True)
 class CalledMethod:
     """A method that is called with batches of its tier's inputs.
@@ -380,21 +403,8 @@ class CalledMethod:
 
     def _read(self, wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
         """Return the method's right views as uint8 pictures of the evaluated size."""
-        inputs = [self.tier.inputs_of(sample) for sample in samples]
-        given = self.method(
-            {
-                name: torch.from_numpy(np.stack([np.asarray(each[name]) for each in inputs]))
-                for name in self.inputs
-            }
-        )
         expected, where = (len(samples), 3, *wanted.size), f"{wanted.label}: {self.name}"
-        try:
-            views = torch.as_tensor(given).detach().cpu()
-        except (RuntimeError, TypeError, ValueError) as error:
-            raise PredictionError(
-                f"{where} returned a {type(given).__name__} that is not one array ({error}); "
-                f"expected {expected}."
-            ) from error
+        views = returned(self.method, samples, self.inputs, where=where, expected=f"{expected}")
         if views.is_floating_point() and views.numel():
             low, high = float(views.min()), float(views.max())
             if not (low >= 0 and high <= 1):
