@@ -244,7 +244,12 @@ class BatchMemory:
 
     The process that trains owns it. Workers get it when they start, and write into the slots that
     tasks name. On Linux the file is memory; elsewhere it is a temporary file.
+
+    Attributes:
+        layout: Where fields lie in the slots, as a worker was told.
     """
+
+    layout: Layout | None = None
 
     def __init__(self, *, kept: int = 0, fd: int | None = None) -> None:
         """Begin with no slot.

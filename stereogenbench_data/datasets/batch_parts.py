@@ -50,15 +50,13 @@ class BatchPart(NamedTuple):
     Attributes:
         batch: The samples.
         places: The places of the batch where they belong.
-        share: Whose they are.
         key: The number of the pass, and of the batch in it.
         slot: Where to write them; None where they are sent.
-        layout: Where fields lie in the slot.
+        layout: Where fields lie in this slot and in those of later tasks; None once it was told.
     """
 
     batch: EpochBatch
     places: list[int]
-    share: WorkerShare
     key: tuple[int, int]
     slot: int | None = None
     layout: Layout | None = None
@@ -118,8 +116,8 @@ def make_part(
     """
     made = MadePart(task.key, task.places)
     arrays: BatchArrays | None = None
-    if memory is not None and task.slot is not None and task.layout is not None:
-        arrays = memory.arrays(task.slot, task.layout)
+    if memory is not None and task.slot is not None and memory.layout is not None:
+        arrays = memory.arrays(task.slot, memory.layout)
     of_place = None if arrays is None else (lambda n: arrays.of_sample(task.places[n]))
     try:
         for sample in load(of_place):
@@ -173,6 +171,11 @@ class _Coming:
     parts: list[MadePart] = field(default_factory=list)
     whole: Any = None
 
+    @property
+    def failures(self) -> list[tuple[int, StereoGenBenchError]]:
+        """The samples that could not be loaded, by their places, and why."""
+        return [part.failed for part in self.parts if part.failed is not None]
+
 
 class PartedBatches:
     """The batches of one pass on their way: dealt to workers in parts, and put together."""
@@ -201,6 +204,7 @@ class PartedBatches:
         self._batches, self._of_all_ranks, self._share = batches, of_all_ranks, share
         self._memory, self._making, self._before = memory, making, before
         self._pass, self._due = next(_passes), 0
+        self._told: Layout | None = None
         self._coming: dict[int, _Coming] = {}
         _parted[self._pass] = self
 
@@ -209,7 +213,7 @@ class PartedBatches:
         if self._before is not None:
             self._before._discard()
             self._before = None
-        nothing = BatchPart(_NOTHING, [], self._share, (self._pass, _FILLER))
+        nothing = BatchPart(_NOTHING, [], (self._pass, _FILLER))
         for number, batch in enumerate(self._batches):
             while self._making.layout is None and number > 0:
                 yield from [nothing] * self._share.workers
@@ -227,17 +231,17 @@ class PartedBatches:
             layout = None
         slot = None if layout is None else self._memory.take()
         self._coming[number] = _Coming(len(batch), slot)
-        parts = []
         if batch.number is not None:
             batch.open_runs = -(-batch.open_runs // share.workers)
-        for worker in range(share.workers):
-            own, key = share._replace(worker=worker), (self._pass, number)
-            places = np.flatnonzero(worker_of == worker).tolist()
-            if places:
-                parts.append(BatchPart(batch.at(places), places, own, key, slot, layout))
-            else:
-                parts.append(BatchPart(_NOTHING, [], own, key))
-        return parts
+        places: list[list[int]] = [[] for _ in range(share.workers)]
+        for place, worker in enumerate(worker_of.tolist()):
+            places[worker].append(place)
+        untold, key = None if layout is self._told else layout, (self._pass, number)
+        self._told = layout or self._told
+        return [
+            BatchPart(batch.at(own) if own else _NOTHING, own, key, slot if own else None, untold)
+            for own in places
+        ]
 
     def next(self, results: Iterator[MadePart]) -> Any:
         """Return the next batch.
@@ -269,19 +273,17 @@ class PartedBatches:
         coming.parts.append(made)
         if made.work is not None:
             self._making.work.add(made.work)
-        is_failed = any(part.failed is not None for part in coming.parts)
-        is_whole = len(coming.parts) == self._share.workers
-        if pinned and is_whole and not is_failed and self._making.collate_fn is collate:
+        is_whole = pinned and len(coming.parts) == self._share.workers
+        if is_whole and self._making.collate_fn is collate and not coming.failures:
             coming.whole = self._put_together(coming, pinned=True)
 
     def _put_together(self, coming: _Coming, *, pinned: bool) -> Any:
         """Return a batch all of whose parts have come."""
         slot, layout = coming.slot, self._making.layout
-        failures = [part.failed for part in coming.parts if part.failed is not None]
-        if failures:
+        if coming.failures:
             if slot is not None:
                 self._memory.give_back(slot)
-            raise min(failures, key=lambda failure: failure[0])[1]
+            raise min(coming.failures, key=lambda failure: failure[0])[1]
         rows: list[Sample] = [{}] * coming.count
         for part in coming.parts:
             for place, sample in zip(part.places, part.samples, strict=True):

@@ -332,14 +332,15 @@ class _MappedScenes(Dataset[Sample]):
 
     def _made(self, task: BatchPart) -> MadePart:
         """Return what this worker makes of its part of a batch."""
-        began_s, batch = perf_counter(), task.batch
+        began_s, batch, memory = perf_counter(), task.batch, self._memory
+        if task.layout is not None and memory is not None:
+            memory.layout = task.layout
         if not batch:
             # What is fetched ahead goes on after a batch of which nothing is this worker's.
-            if self._next_batch is not None and not task.is_filler:
-                self._next_batch = (
-                    self._next_batch[0],
-                    self._next_batch[1] + task.share.world_size,
-                )
+            is_of_others = self._share.of == "streams" and not task.is_filler
+            if self._next_batch is not None and is_of_others:
+                epoch, number = self._next_batch
+                self._next_batch = epoch, number + self._share.batches_apart
             return MadePart(task.key, [])
         if self._pass_read != task.key[0]:
             # What an earlier pass has open is not wanted any more.
@@ -347,7 +348,7 @@ class _MappedScenes(Dataset[Sample]):
             self._pass_read, self._open_runs = task.key[0], {}
         places = range(len(batch))
         made = make_part(
-            task, self._memory, lambda of_place: self._load(batch, places, of_place, task.share)
+            task, memory, lambda of_place: self._load(batch, places, of_place, self._share)
         )
         made.work = self._loader.take_work()
         if self._idle_since_s:
@@ -355,9 +356,9 @@ class _MappedScenes(Dataset[Sample]):
         self._idle_since_s = perf_counter()
         return made
 
-    def begin_worker(self, memory: BatchMemory) -> None:
+    def begin_worker(self, worker: int, memory: BatchMemory) -> None:
         """Begin as a worker of a loader, whose batches lie in this memory."""
-        self._memory = memory
+        self._share, self._memory = self._share._replace(worker=worker), memory
 
     def take_work(self) -> Work:
         """Return what this process has done for samples since this was asked before."""

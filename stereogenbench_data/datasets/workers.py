@@ -249,7 +249,7 @@ class _Beginning(NamedTuple):
     def __call__(self, worker: int) -> None:
         _end_with_parent_alone()
         info: Any = get_worker_info()
-        info.dataset.begin_worker(self.memory)
+        info.dataset.begin_worker(worker, self.memory)
         if self.worker_init_fn is not None:
             self.worker_init_fn(worker)
 

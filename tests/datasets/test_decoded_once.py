@@ -35,9 +35,9 @@ def tasks(monkeypatch):
     class Recording(processes.PartedBatches):
         def _parts(self, batch, number):
             firsts = self._of_all_ranks.runs.first_sample
-            for part in (parts := super()._parts(batch, number)):
+            for worker, part in enumerate(parts := super()._parts(batch, number)):
                 for run in np.searchsorted(firsts, part.batch, side="right").tolist():
-                    given.setdefault((batch.group, run), set()).add(part.share.worker)
+                    given.setdefault((batch.group, run), set()).add(worker)
             return parts
 
     monkeypatch.setattr(processes, "PartedBatches", Recording)
