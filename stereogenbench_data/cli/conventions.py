@@ -11,7 +11,6 @@ from stereogenbench_data.cli.options import (
     RootArgument,
     SceneOptions,
     WorkOptions,
-    flag,
     grouped,
     option,
 )
@@ -28,9 +27,6 @@ def conventions(  # noqa: PLR0913 - one parameter an option
     check: Annotated[
         Path | None, option("--check", "Test these conventions; learn none.", metavar="FILE")
     ] = None,
-    report: Annotated[
-        bool, flag("--report", "Print the format without content, for a public issue.")
-    ] = False,
     scenes: Annotated[int, option("Scenes to read.", min=1)] = 20,
     pictures: Annotated[
         int, option("Scenes of a shape to measure by pictures, and to verify.", min=0)
@@ -48,12 +44,12 @@ def conventions(  # noqa: PLR0913 - one parameter an option
     Example: `stereogenbench conventions scenes/ -o conventions.toml`
     """
     from stereogenbench_data.audit.conventions import survey
-    from stereogenbench_data.audit.format_report import format_report
     from stereogenbench_data.schema.conventions import Conventions
 
-    if (check is not None or report) and out is not None:
-        what = "--check tests a file" if check is not None else "--report prints"
-        raise typer.BadParameter(f"{what} and writes none: leave it out.", param_hint="--out")
+    if check is not None and out is not None:
+        raise typer.BadParameter(
+            "--check tests a file and writes none: leave it out.", param_hint="--out"
+        )
     stated = None if check is None else Conventions.read(check)
     with progress_bar("reading scenes", unit="scenes") as progress:
         found = survey(
@@ -65,9 +61,7 @@ def conventions(  # noqa: PLR0913 - one parameter an option
             **work.options(),
             progress=progress,
         )
-    if report:
-        typer.echo(format_report(found))
-    elif check is None and out is None:
+    if check is None and out is None:
         typer.echo(found.toml, nl=False)
     usable = sum(each.scene is not None for each in found.examined)
     verified = "" if found.learned is None else f", {len(found.learned.verified)} verified the rest"

@@ -78,7 +78,7 @@ def test_conventions_that_cannot_be_written_leave_those_that_were_there(small_re
     words = ("conventions", small_release, "--scenes", "1", "--pictures", "0")
     with files_of_at_most(10):
         refused = invoke(*words, "-o", file)
-    both = invoke(*words, "--report", "-o", file)
+    both = invoke(*words, "--check", file, "-o", file)
 
     assert refused.exit_code == 2
     assert "conventions.toml (File too large)" in one_line(refused.stderr)
@@ -86,7 +86,7 @@ def test_conventions_that_cannot_be_written_leave_those_that_were_there(small_re
     assert file.read_text() == "[depth]\nunit_m = 0.001\n"
     assert [*tmp_path.iterdir()] == [file]
     assert both.exit_code == 2
-    assert "--out: --report prints and writes none: leave it out." in one_line(both.stderr)
+    assert "--out: --check tests a file and writes none: leave it out." in one_line(both.stderr)
 
 
 def test_a_statistic_is_printed_where_its_file_cannot_be_written(small_shards, tmp_path):
