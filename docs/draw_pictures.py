@@ -1,6 +1,6 @@
 """Draws clips.png and shuffle.png into pictures/: `draw_pictures.py CLIPS SCENES`, two data sets.
 
-The other pictures are of `show`, `doctor -o` and `eval score`; rig.svg is drawn by hand.
+The other pictures are of `show` and `eval score`; rig.svg is drawn by hand.
 """
 
 import sys

@@ -16,8 +16,7 @@ from stereogenbench_data.cli.options import (
     option,
 )
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.screen import print_report
-from stereogenbench_data.cli.writing import write_report
+from stereogenbench_data.cli.writing import print_and_write
 
 _ALL = "all"
 
@@ -71,13 +70,7 @@ def audit(  # noqa: PLR0913 - one parameter an option
         report = geometry_audit.audit(
             index, sample=scenes, frames=frames, progress=progress, **options
         )
-    document, markdown = json.dumps(report.to_json(), indent=1), audit_markdown(report)
-    if as_json:
-        typer.echo(document)
-    else:
-        rest = f"Whole report: {out}" if out else "-o FILE.md writes the whole report."
-        print_report(*screen(report), whole=markdown, rest=rest)
-    if out is not None:
-        write_report(out, document if out.suffix == ".json" else markdown)
+    document, text = json.dumps(report.to_json(), indent=1), audit_markdown(report)
+    print_and_write(screen(report), text=text, document=document, out=out, as_json=as_json)
     if report.findings:
         raise typer.Exit(FINDINGS)

@@ -16,7 +16,7 @@ from stereogenbench_data.cli.options import (
     option,
 )
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.writing import writing
+from stereogenbench_data.cli.writing import print_and_write
 
 
 @grouped
@@ -34,18 +34,16 @@ def doctor(  # noqa: PLR0913 - one parameter an option
 
     The doctor compares what the cameras of a scene see with what depth predicts: planar or ray,
     inverse, frame lag, camera order, flips, unit / (focal length x baseline), and each camera
-    beside the others. The declared contract is that of the files and of --conventions FILE. -o
-    writes a picture. The exit status is 0 if the declared contract
-    fits or the pictures cannot tell, 1 if another one is clearly better or a camera does not fit,
-    2 if the command failed.
+    beside the others. The declared contract is that of the files and of --conventions FILE. It
+    prints text; --out also writes it to a file (as JSON if the name ends with .json). The exit
+    status is 0 if the declared contract fits or the pictures cannot tell, 1 if another one is
+    clearly better or a camera does not fit, 2 if the command failed.
 
-    Example: `stereogenbench doctor scenes/ -o doctor.png`
+    Example: `stereogenbench doctor scenes/ -o doctor.txt`
     """
     from stereogenbench_data.audit.contract.doctor import diagnose
-    from stereogenbench_data.audit.contract.report import doctor_json, doctor_lines, draw_report
+    from stereogenbench_data.audit.contract.report import doctor_json, doctor_lines, screen
 
-    if out is not None and out.suffix.lower() != ".png":
-        raise typer.BadParameter(f"{out}: name a picture, *.png.", param_hint="--out")
     filters: Any = chosen.filters()
     index = source.open()
     with progress_bar("examining", unit="scenes") as progress:
@@ -57,11 +55,7 @@ def doctor(  # noqa: PLR0913 - one parameter an option
             progress=progress,
             filters=filters,
         )
-    document = json.dumps(doctor_json(report), indent=2) if as_json else None
-    typer.echo(document or "\n".join(doctor_lines(report)))
-    if out is not None:
-        with writing(out):
-            draw_report(out, report, index)
-        typer.echo(f"\npicture: {out}", err=as_json)
+    document, text = json.dumps(doctor_json(report), indent=2), "\n".join(doctor_lines(report))
+    print_and_write(screen(report), text=text, document=document, out=out, as_json=as_json)
     if report.is_wrong:
         raise typer.Exit(FINDINGS)

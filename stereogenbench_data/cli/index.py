@@ -1,6 +1,7 @@
 """``stereogenbench index``: walk a released tree once, so that it opens at once afterwards."""
 
 import json
+import sys
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,6 +23,7 @@ from stereogenbench_data.cli.options import (
     option,
 )
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.screen import print_report
 from stereogenbench_data.errors import explain_os_errors
 from stereogenbench_data.schema.text import counted, plain_line
 
@@ -105,18 +107,30 @@ def index(  # noqa: PLR0913 - one parameter an option
         }
         typer.echo(json.dumps(document, indent=2))
         raise typer.Exit(status)
-    for title, lines in (
-        (f"{len(report.incomplete)} incomplete, left out", _reasons(report.incomplete)),
-        (f"{len(report.broken)} broken, left out", _reasons(report.broken)),
-        (counted(len(report.notes), "note"), report.notes),
-    ):
-        if lines:
+    made = (
+        f"{target}: {counted(len(report.scenes), 'scene')}" if report.scenes
+        else f"{shown(root)}: no scene is complete, so there is nothing to index"
+    )  # fmt: skip
+    lists = [
+        (title, lines)
+        for title, lines in (
+            (f"{len(report.broken)} broken, left out", _reasons(report.broken)),
+            (f"{len(report.incomplete)} incomplete, left out", _reasons(report.incomplete)),
+            (counted(len(report.notes), "note"), list(report.notes)),
+        )
+        if lines
+    ]
+    if not (sys.stdout.isatty() and sys.stderr.isatty()):
+        for title, lines in lists:
             _tell(f"{title}:", *(f"  {line}" for line in lines))
-    if not report.scenes:
-        _tell(f"{shown(root)}: no scene is complete, so there is nothing to index")
-        raise typer.Exit(status)
-    typer.echo(f"{target}: {counted(len(report.scenes), 'scene')}")
-    if is_remote(root) or target.parent.resolve() != local_path(root).resolve():
+    if lists and sys.stdout.isatty():
+        verdict = "; ".join([made, *(title for title, _ in lists)])
+        tables = [("", [(title,), *([line] for line in lines)]) for title, lines in lists]
+        print_report(verdict, tables, whole="", rest="--json prints all that was left out.")
+    else:
+        typer.echo(plain_line(made), err=not report.scenes)
+    is_apart = is_remote(root) or target.parent.resolve() != local_path(root).resolve()
+    if report.scenes and is_apart:
         _tell(
             f"its data are not beside it: open it as SceneIndex.open({str(target)!r}, "
             f"root={full_place(root)!r}), or with --root {full_place(root)}"

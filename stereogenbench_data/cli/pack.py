@@ -1,6 +1,7 @@
 """``stereogenbench pack``, ``verify``, ``unpack``: released trees into tar shards, and back."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -12,6 +13,7 @@ from stereogenbench_data.cli.options import (
     DataOptions,
     JsonOption,
     OutArgument,
+    OutOption,
     PartOption,
     SceneOptions,
     ShardsArgument,
@@ -23,11 +25,14 @@ from stereogenbench_data.cli.options import (
     option,
 )
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.screen import Part
+from stereogenbench_data.cli.writing import print_and_write
 from stereogenbench_data.schema.text import counted, plain_line
 
 if TYPE_CHECKING:
     from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.shards.training import TrainingSettings
+    from stereogenbench_data.shards.verify import Problem
 
 
 @grouped
@@ -128,11 +133,13 @@ def verify(
     shards: ShardsArgument,
     *,
     deep: Annotated[bool, flag("--deep", "Decode every video, and count its frames.")] = False,
+    out: OutOption = None,
     as_json: JsonOption = False,
     work: WorkOptions,
 ) -> None:
     """Read every byte of shards, and list what is wrong.
 
+    --out also writes the list to a file (as JSON if the name ends with .json).
     The exit status is 0 if nothing is wrong, 1 if something is, 2 if they cannot be verified.
 
     Example: `stereogenbench verify shards/ --deep`
@@ -143,21 +150,31 @@ def verify(
         report = verified(
             shards, mode="decode" if deep else "bytes", **work.options(), progress=progress
         )
-    if as_json:
-        typer.echo(json.dumps(asdict(report), indent=2))
-    else:
-        for problem in report.problems:
-            typer.echo(plain_line(str(problem)))
-        decoded = f", {counted(report.videos_decoded, 'video')} decoded" if deep else ""
-        if report.derived:
-            typer.echo(plain_line(f"{report.root}: {report.derived}"))
-        typer.echo(
-            f"{report.root}: {counted(report.shards, 'shard')}, {counted(report.scenes, 'scene')}, "
-            f"{counted(report.members, 'member')}, {report.bytes / 1e6:.1f} MB{decoded}; "
-            f"{counted(len(report.problems), 'problem')}"
-        )
+    decoded = f", {counted(report.videos_decoded, 'video')} decoded" if deep else ""
+    told = [
+        f"{report.root}: {counted(report.shards, 'shard')}, {counted(report.scenes, 'scene')}, "
+        f"{counted(report.members, 'member')}, {report.bytes / 1e6:.1f} MB{decoded}; "
+        f"{counted(len(report.problems), 'problem')}",
+        *([f"{report.root}: {report.derived}"] if report.derived else []),
+    ]
+    print_and_write(
+        (". ".join(told), _problems_by_kind(report.problems)),
+        text="\n".join(map(plain_line, [*told, *map(str, report.problems)])),
+        document=json.dumps(asdict(report), indent=2),
+        out=out,
+        as_json=as_json,
+    )
     if report.problems:
         raise typer.Exit(FINDINGS)
+
+
+def _problems_by_kind(problems: "Sequence[Problem]") -> list[Part]:
+    """Return the table of what is wrong, a row a kind; none if nothing is."""
+    kinds: dict[str, list[Problem]] = {}
+    for each in problems:
+        kinds.setdefault(each.kind, []).append(each)
+    rows = [(kind, str(len(found)), str(found[0])) for kind, found in kinds.items()]
+    return [("", [("problem", "count", "the first"), *rows])] if rows else []
 
 
 def unpack(shards: ShardsArgument, out: OutArgument) -> None:

@@ -4,8 +4,6 @@ import json
 from dataclasses import asdict
 from typing import Any
 
-import typer
-
 from stereogenbench_data.cli.options import (
     JsonOption,
     OutOption,
@@ -13,8 +11,7 @@ from stereogenbench_data.cli.options import (
     SourceOptions,
     grouped,
 )
-from stereogenbench_data.cli.screen import print_report
-from stereogenbench_data.cli.writing import write_report
+from stereogenbench_data.cli.writing import print_and_write
 
 
 @grouped
@@ -42,12 +39,10 @@ def stats(
     found = statistics(source.open(), **filters)
     lines = compared(found)
     document = found.to_json() | {"paper": [asdict(line) for line in lines]}
-    text = json.dumps(document, indent=1)
-    markdown = statistics_markdown(found, lines)
-    if as_json:
-        typer.echo(text)
-    else:
-        rest = f"Whole report: {out}" if out else "-o FILE.md writes the whole report."
-        print_report(*screen(found, lines), whole=markdown, rest=rest)
-    if out is not None:
-        write_report(out, text if out.suffix == ".json" else markdown)
+    print_and_write(
+        screen(found, lines),
+        text=statistics_markdown(found, lines),
+        document=json.dumps(document, indent=1),
+        out=out,
+        as_json=as_json,
+    )

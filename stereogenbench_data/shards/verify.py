@@ -36,6 +36,12 @@ _FETCH_BOTH: Final = "Fetch the shard and its index again, or pack them again."
 _SHOWN: Final = 3
 
 
+Kind = Literal[
+    "missing", "not in the index", "unreadable", "altered", "cut short", "misplaced",
+    "contradicts the index", "does not decode",
+]  # fmt: skip
+
+
 @dataclass(frozen=True, slots=True, order=True)
 class Problem:
     """What is wrong where, and what to do; a scene or member that does not apply is empty."""
@@ -43,13 +49,18 @@ class Problem:
     shard: str
     scene: str
     member: str
+    kind: Kind
     found: str
     cure: str
 
+    @property
+    def place(self) -> tuple[str, ...]:
+        """Where it is: the shard, and in it the scene and the member if it has them."""
+        return tuple(part for part in (self.shard, self.scene, self.member) if part)
+
     def __str__(self) -> str:
         """Return it as one line."""
-        where = ": ".join(part for part in (self.shard, self.scene, self.member) if part)
-        return f"{where}: {self.found}. {self.cure}".replace("\n", " ")
+        return f"{': '.join(self.place)}: {self.found}. {self.cure}".replace("\n", " ")
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,10 +73,10 @@ class _ExpectedShard:
     scenes: list[Scene] = field(default_factory=list)
     members: dict[str, Member] = field(default_factory=dict)
 
-    def problem(self, name: str, found: str, cure: str = _FETCH_AGAIN) -> Problem:
+    def problem(self, name: str, kind: Kind, found: str, cure: str = _FETCH_AGAIN) -> Problem:
         """Return a problem of a member by its whole name, or of the shard for an empty name."""
         scene, _, member = name.partition(".")
-        return Problem(self.shard, scene, member, found, cure)
+        return Problem(self.shard, scene, member, kind, found, cure)
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,10 +187,10 @@ def _folder_problems(index: SceneIndex, expected: dict[str, _ExpectedShard]) -> 
         if not each.path.is_file():
             scenes = counted(len(each.scenes), "scene")
             what = "is not a file" if each.shard in there else "is missing"
-            yield each.problem("", f"{what}, with {scenes}")
+            yield each.problem("", "missing", f"{what}, with {scenes}")
     for name in sorted(there - expected.keys()):
         if name.endswith(".tar"):
-            yield Problem(name, "", "", "is not in the index", _WRONG_INDEX)
+            yield Problem(name, "", "", "not in the index", "is not in the index", _WRONG_INDEX)
 
 
 # One shard: every byte, what lies where, and its metadata.
@@ -203,14 +214,15 @@ def _check_shard(expected: _ExpectedShard, after_bytes: Advance) -> tuple[list[P
         misindexed = [*_misindexed(expected, sound)]
     except OSError as error:
         reason = f"cannot be read ({error.strerror or error})"
-        return [expected.problem("", reason, cure_of(error, _FETCH_AGAIN))], set()
+        return [expected.problem("", "unreadable", reason, cure_of(error, _FETCH_AGAIN))], set()
     if size != facts.size:
         what = "it is cut short" if size < facts.size else "something was added"
         text = f"has {size} bytes, and the index says {facts.size}: {what}"
-        problems.append(expected.problem("", text))
+        kind: Kind = "cut short" if size < facts.size else "altered"
+        problems.append(expected.problem("", kind, text))
     elif not problems and found != facts.sha256:
         text = f"has sha256 {found[:16]}..., and the index says {facts.sha256[:16]}..., though"
-        problems.append(expected.problem("", f"{text} its files are sound"))
+        problems.append(expected.problem("", "altered", f"{text} its files are sound"))
     return problems + misindexed, sound
 
 
@@ -229,10 +241,10 @@ def _check_members(expected: _ExpectedShard, size: int) -> tuple[list[Problem], 
             continue
         indexed = "has none" if member.crc32 is None else f"says {member.crc32:08x}"
         text = f"its bytes have crc32 {crc32:08x}, and the index {indexed}"
-        problems.append(expected.problem(name, text))
+        problems.append(expected.problem(name, "altered", text))
     for scene, names in lost.items():
         text = f"{len(names)} of its files are not whole ({_few(sorted(names))})"
-        problems.append(expected.problem(scene, text))
+        problems.append(expected.problem(scene, "cut short", text))
     return problems, sound
 
 
@@ -245,7 +257,7 @@ def _check_places(expected: _ExpectedShard) -> Iterator[Problem]:
     differing = listed.items() ^ indexed.items()
     for name, _ in sorted(differing, key=lambda item: item[1])[:1]:
         text = "its header in the tar is damaged, or the index does not name it"
-        yield expected.problem(name, text)
+        yield expected.problem(name, "misplaced", text)
 
 
 def _misindexed(expected: _ExpectedShard, sound: set[str]) -> Iterator[Problem]:
@@ -255,7 +267,9 @@ def _misindexed(expected: _ExpectedShard, sound: set[str]) -> Iterator[Problem]:
         if sound.issuperset(f"{scene.id.key}.{name}" for name in scene.members):
             _, differences = described_again(scene, source)
             for name, difference in differences:
-                yield Problem(expected.shard, scene.id.key, name, difference, _FETCH_BOTH)
+                yield expected.problem(
+                    f"{scene.id.key}.{name}", "contradicts the index", difference, _FETCH_BOTH
+                )
 
 
 def _few(names: list[str]) -> str:
@@ -286,6 +300,8 @@ def _decode(work: tuple[str, Scene, list[str]], after_bytes: Advance) -> list[Pr
             cure = "Pack the scene again from an undamaged video."
             if isinstance(error, OSError):
                 cure = cure_of(error, cure)
-            problems.append(Problem(member.path, scene.id.key, name, reason, cure))
+            problems.append(
+                Problem(member.path, scene.id.key, name, "does not decode", reason, cure)
+            )
         after_bytes(member.size)
     return problems

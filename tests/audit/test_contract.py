@@ -183,7 +183,7 @@ def test_a_wrong_quotient_does_not_accuse_the_unit():
         is_scaled=True, scale=1.05, scale_error=1e-3, other_kind_scale=1.05, gain=Evidence(9.0, 0.1)
     )
 
-    assert verdict.contradicted == ["unit / (focal length x baseline) 0.95238 x declared ± 0.28%"]
+    assert verdict.contradicted == ["depth scale 0.95238 x declared ± 0.28%"]
 
 
 @pytest.mark.parametrize("question", TOPICS)

@@ -4,6 +4,7 @@ import fcntl
 import os
 import pty
 import re
+import shutil
 import struct
 import sys
 import termios
@@ -49,11 +50,11 @@ def release(small_release):
 @pytest.mark.parametrize(
     ("words", "first", "last"),
     [
-        (("stats", "{release}"), "4 scenes of ", "-o FILE.md writes the whole report."),
+        (("stats", "{release}"), "4 scenes of ", "-o FILE writes the whole report."),
         (
             ("audit", "{release}", "--per-scene", "2", "--workers", "1"),
             r"(Nothing wrong found|WRONG).*4 of 4 scenes audited\.",
-            "-o FILE.md writes the whole report.",
+            "-o FILE writes the whole report.",
         ),
         (
             ("eval", "controls", "{release}", "--split", "all", "--frames", "0", "--metrics",
@@ -75,6 +76,48 @@ def test_a_report_is_one_screen(release, tmp_path, words, first, last):
     assert max(map(len, lines[:-1])) <= COLUMNS
     whole = invoke(*given).stdout
     assert len(whole) > 2 * len("\n".join(lines))
+
+
+def test_the_doctor_says_first_what_is_wrong(small_release):
+    lines = on_a_terminal(
+        "doctor", small_release, "--scenes", "2", "--per-scene", "1", "--workers", "1"
+    )
+
+    assert lines[0].startswith(("FITS", "CANNOT TELL"))
+    assert lines[-1] == "-o FILE writes the whole report."
+    assert len(lines) <= LINES
+    assert max(map(len, lines)) <= COLUMNS
+
+
+def test_damaged_shards_are_told_by_kinds_of_damage(small_shards, tmp_path):
+    shards, file = shutil.copytree(small_shards, tmp_path / "shards"), tmp_path / "problems.txt"
+    for tar in shards.glob("*.tar"):
+        content = bytearray(tar.read_bytes())
+        content[2000::5000] = bytes(255 - each for each in content[2000::5000])
+        tar.write_bytes(content)
+    lines = on_a_terminal("verify", shards, "--workers", "1", "-o", file)
+
+    count = int(re.search(r"; (\d+) problems", " ".join(lines))[1])
+    (row,) = (line.split() for line in lines if line.startswith(" altered"))
+    assert row[1] == str(count)
+    assert lines[-1] == f"Whole report: {file}"
+    assert len(lines) <= LINES
+    assert len(file.read_text().splitlines()) == 1 + count
+
+
+def test_an_index_that_leaves_scenes_out_says_how_many_and_why(small_release, tmp_path):
+    root = shutil.copytree(small_release, tmp_path / "tree", copy_function=shutil.copyfile)
+    for path in root.rglob("baseline.json"):
+        path.write_text("[")
+    lines = on_a_terminal("index", root, "-o", root / "index.parquet", "--workers", "1")
+    piped = invoke("index", root, "-o", root / "index.parquet", "--workers", "1")
+
+    shown = " ".join(" ".join(lines).split())
+    assert "nothing to index; 4 broken, left out" in shown
+    assert lines[-1] == "--json prints all that was left out."
+    assert len(lines) <= LINES
+    assert max(map(len, lines)) <= COLUMNS
+    assert piped.stderr.count("baseline.json") >= 4
 
 
 def test_what_does_not_fit_is_counted(capsys, monkeypatch):

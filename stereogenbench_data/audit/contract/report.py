@@ -1,38 +1,19 @@
-"""The doctor's report: as lines of text, the verdict first, as JSON, and as a picture."""
+"""The doctor's report: as text, the verdict first, as one screen, and as JSON."""
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
-from pathlib import Path
+from dataclasses import asdict
 from typing import Any, Final
 
-import numpy as np
-from jaxtyping import Bool, UInt8
-
-from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis
-from stereogenbench_data.audit.contract.doctor import DiagnosisTask, DoctorReport
-from stereogenbench_data.audit.contract.hypotheses import Hypothesis
-from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames
+from stereogenbench_data.audit.contract.doctor import DoctorReport
 from stereogenbench_data.audit.contract.scoring import Gain
 from stereogenbench_data.audit.contract.verdict import QUOTIENT, Answer, Verdict, encoding_line
 from stereogenbench_data.audit.geometry.records import plain
-from stereogenbench_data.audit.scene_access import source_of
-from stereogenbench_data.bridges.picture import (
-    ColourScale,
-    Tile,
-    channels_last,
-    draw_sheet,
-    write_png,
-)
-from stereogenbench_data.errors import SelectionError
-from stereogenbench_data.geometry.projection import Projection, backward_warp
-from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.selection.filters import filter_scenes
 
 QUOTIENT_MEANS: Final = (
-    "Disparity shows only the quotient unit / (focal length x baseline). No picture tells which of "
-    "the three is wrong, or whether two of them cancel out."
+    "Depth scale is unit / (focal length x baseline), which is all that disparity shows of the "
+    "three: no picture tells which of them is wrong, or whether two of them cancel out."
 )
 NOT_TESTED: Final = (
     "Not tested here, see `stereogenbench audit`: the sensor's height, the baselines recorded "
@@ -40,10 +21,11 @@ NOT_TESTED: Final = (
     "there is no texture, and all other frames."
 )
 _DB_NOTE: Final = (
-    "dB of the quotient and the kind count small differences under a tight cap: they "
-    "are not comparable with dB of flips, lags and orders."
+    "dB of the depth scale and of the ray count small differences under a tight cap: they are not "
+    "comparable with dB of flips, lags and orders."
 )
 _NAMED: Final = 6
+_HEAD: Final = ("question", "declared", "pictures say", "", "next best")
 _READINGS: Final = (
     "Several readings of the poses fit the rigs; pixels whose depth is found in other frames:"
 )
@@ -67,14 +49,48 @@ def doctor_lines(report: DoctorReport) -> list[str]:
         lines.append("")
         if len(report.verdicts) > 1:
             lines.append(f"{counted(len(verdict.scenes), 'scene')}: {', '.join(verdict.scenes)}")
-        rows = [("question", "declared", "pictures say", "", "next best")]
-        rows += [_row(answer) for answer in verdict.answers]
+        rows = [_HEAD, *map(_row, verdict.answers)]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines += ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
         lines += ["", *_conclusion(verdict), *_tested(verdict), NOT_TESTED]
     if len(silent) < len(report.scenes):
         lines += ["", QUOTIENT_MEANS, _DB_NOTE]
     return lines + [line for each in report.worlds for line in ("", _READINGS, *each.lines)]
+
+
+def screen(report: DoctorReport) -> tuple[str, list[tuple[str, list[Sequence[str]]]]]:
+    """Return what a screen shows of a report: the verdict, what follows, and each answer."""
+    parts: list[tuple[str, list[Sequence[str]]]] = []
+    if len(report.verdicts) == 1:
+        (verdict,) = report.verdicts
+        follows = [*_conclusion(verdict), *_tested(verdict)]
+        answers = [(*_row(each)[:-1], _doubt(each)) for each in verdict.answers]
+        parts.append(("", [("what follows",), *([line] for line in follows)]))
+        parts.append(("", [(*_HEAD[:-1], ""), *answers]))
+    else:
+        rows = [(_scenes(each), _in_a_line(each)) for each in report.verdicts]
+        parts.append(("", [("scenes", "pictures say"), *rows]))
+    for each in report.worlds:
+        parts.append((_READINGS, [("explained",), *([line] for line in each.lines)]))
+    unjudged = report.left_out | {each.key: each.problem for each in report.scenes if each.problem}
+    if unjudged:
+        parts.append(("", [("not judged", "why"), *unjudged.items()]))
+    return _headline(report), parts
+
+
+def _doubt(answer: Answer) -> str:
+    return "" if answer.status == "confirmed" else answer.note
+
+
+def _in_a_line(verdict: Verdict) -> str:
+    if verdict.is_wrong:
+        return f"WRONG: {'; '.join(verdict.contradicted)}"
+    return "fits" if verdict.fits else f"undecided: {', '.join(_open(verdict))}"
+
+
+def _scenes(verdict: Verdict) -> str:
+    more = len(verdict.scenes) - 1
+    return f"{verdict.scenes[0]}{f' and {more} more' if more else ''}"
 
 
 def _headline(report: DoctorReport) -> str:
@@ -114,7 +130,7 @@ def _conclusion(verdict: Verdict) -> Iterator[str]:
     if any(answer.status == "wrong" for answer in verdict.answers):
         yield f"Another contract is {_gain_words(verdict.gain)} better than the declared one."
     if verdict.choices:
-        yield "One of these explains the quotient; the pictures cannot tell which:"
+        yield "One of these explains the depth scale; the pictures cannot tell which:"
         yield from (f"  - {choice}" for choice in verdict.choices)
     if verdict.encoding is not None:
         yield f"Paste: {encoding_line(verdict.encoding)}"
@@ -186,83 +202,3 @@ def doctor_json(report: DoctorReport) -> dict[str, Any]:
         "left_out": report.left_out,
     })  # fmt: skip
     return document
-
-
-_NOT_KNOWN: Final = 255
-_TILE_PX: Final = 400
-_DIFFERENCES: Final = ColourScale(0.0, 80.0)
-
-
-def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
-    """Write the picture of the scene with the most to report.
-
-    It shows the left and right pictures, the right one warped to the left by the declared and by
-    the best contract, and the differences.
-
-    Raises:
-        SelectionError: If no scene was judged.
-    """
-    if not report.scenes:
-        raise SelectionError(
-            f"{report.data}: no scene was judged, so there is nothing to draw. Choose other scenes."
-        )
-    diagnosis = max(
-        report.scenes,
-        key=lambda each: (
-            not each.problem, bool(each.check.problems), each.gain.mean_db, each.matches
-        ),
-    )  # fmt: skip
-    (row,) = filter_scenes(index, {"scenes": diagnosis.key})
-    (verdict,) = [each for each in report.verdicts if diagnosis.key in each.scenes]
-    scene = index.scene(int(row))
-    task = DiagnosisTask(scene, source_of(index, scene), 1, verdict.declared)
-    with task.scene_frames() as views:
-        matches = views.frame_matches(frames=task.frames)
-        rows = _view_tiles(views, matches, diagnosis)
-    told = "; ".join(verdict.contradicted) or "nothing contradicts the declared contract"
-    if diagnosis.problem:
-        told = f"cannot tell ({diagnosis.problem})"
-    write_png(path, draw_sheet([f"{diagnosis.key}: {told}"], rows, width_px=_TILE_PX))
-
-
-def _view_tiles(
-    views: SceneFrames, matches: Sequence[FrameMatch], diagnosis: SceneDiagnosis
-) -> list[list[Tile]]:
-    match = max(matches, key=lambda match: (match.left, match.right) == views.primary)
-    left, right = (
-        channels_last(views.rgb(match.frame, file)) for file in (match.left, match.right)
-    )
-    is_scaled = diagnosis.is_scaled or diagnosis.best.form != diagnosis.declared.form
-    best_scale = diagnosis.scale if is_scaled else 1.0
-    rows = []
-    for name, picture, words, hypothesis, scale in (
-        ("left", left, "declared", diagnosis.declared, 1.0),
-        ("right", right, "best", diagnosis.best, best_scale),
-    ):
-        warped, known = _warped(views, match, hypothesis, scale)
-        away = np.abs(left.astype(np.float32) - warped).mean(axis=-1)
-        painted = _DIFFERENCES.paint(away, measured=known)
-        rows.append([
-            Tile(f"{name} (frame {match.frame}, cam {match.left} and {match.right})", picture),
-            Tile(f"right, warped by the {words} contract", warped),
-            Tile(f"|left - warped|, {words}", painted, shrink="nearest"),
-        ])  # fmt: skip
-    return rows
-
-
-def _warped(
-    views: SceneFrames, match: FrameMatch, hypothesis: Hypothesis, scale: float
-) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Return the right picture warped to the left, and where depth and picture are known."""
-    size = views.intrinsics.height_px, views.intrinsics.width_px
-    rows, columns = np.indices(size).reshape(2, -1)
-    predicted = views.predicted(replace(match, rows=rows, columns=columns), hypothesis)
-    if predicted is None:
-        return np.full((*size, 3), _NOT_KNOWN, dtype=np.uint8), np.zeros(size, dtype=bool)
-    disparity_px, known = predicted
-    landing_px = (columns + 0.5 - scale * disparity_px).reshape(size)
-    landing = Projection(u_px=landing_px, v_px=None, depth_m=np.ones(size))
-    warped, inside = backward_warp(views.rgb(match.frame, match.right), landing)
-    shown = known.reshape(size) & inside
-    pixels = channels_last(warped.round().astype(np.uint8))
-    return np.where(shown[..., None], pixels, np.uint8(_NOT_KNOWN)), shown

@@ -182,7 +182,8 @@ MARGIN: Final = 0.02
 """A quotient is confirmed if its 95 % interval is within this share of the declared one."""
 _LEAST_TOLERANCE: Final = 0.005
 
-QUOTIENT: Final = "unit / (focal length x baseline)"
+QUOTIENT: Final = "depth scale"
+"""Unit / (focal length x baseline), which is all that disparity shows of the three."""
 _SOURCES: Final = {
     "tag": "by the files' tag", "metadata": "by the scene's JSON", "default": "by default",
     "user": "as given", "conventions": "by the conventions",
