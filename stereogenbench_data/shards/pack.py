@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of, no_advance
+from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of, no_advance
 from stereogenbench_data.errors import ShardError, explain_os_errors
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
@@ -106,15 +106,8 @@ def pack(  # noqa: PLR0913 - each is an option of the command
     if depth_codec == "blosc2" or training is not None:
         blosc2_module()
     plan = plan_shards(index, target_bytes, depth_codec=depth_codec, training=training, rows=rows)
-    if not is_remote(plan.root):
-        packed_scenes = (scene for shard in plan.shards for scene in shard.scenes)
-        sources = {file.path for scene in packed_scenes for file in scene.members.values()}
-        require_own_files(plan.root, sorted(sources))
     out = Path(out)
-    with explain_os_errors(
-        f"{out}: cannot be written to", "Pack into another folder.", kind=ShardError
-    ):
-        _claim_folder(plan, out)
+    _claim(plan, out)
     plan_tasks = [
         ShardTask(
             shard,
@@ -134,28 +127,14 @@ def pack(  # noqa: PLR0913 - each is an option of the command
     advance(0)
     if training is not None and len(tasks) < (workers or os.cpu_count() or 1):
         # Fewer shards than processes: these share the scenes, and the shards are packed after.
-        scenes = [(task, scene) for task in tasks for scene in task.shard.scenes]
-        derived = engine.map(
-            derive_task,
-            scenes,
-            name=lambda work: f"{work[0].target}: {work[1].id.key}",
-            workers=workers,
-            advance=advance,
-        )
-        deque(derived, maxlen=0)
+        _derive(tasks, engine, workers, advance)
         advance = no_advance  # all was counted
     packed = set(
         engine.map(
             pack_task, tasks, name=lambda task: str(task.target), workers=workers, advance=advance
         )
     )
-    found = {task.shard.name: find_packed(task) for task in plan_tasks}
-    shards = {name: index for name, index in found.items() if index is not None}
-    missing = tuple(name for name in found if name not in shards)
-    if not missing:
-        for task in plan_tasks:
-            shutil.rmtree(task.derived, ignore_errors=True)  # of a run killed after its last shard
-        _write_index(shards, out)
+    missing = _finish(plan_tasks, out)
     names = [task.shard.name for task in part_tasks]
     return PackReport(
         part=tuple(names),
@@ -164,6 +143,49 @@ def pack(  # noqa: PLR0913 - each is an option of the command
         index=None if missing else out / INDEX_NAME,
         scenes=sum(len(task.shard.scenes) for task in plan_tasks),
     )
+
+
+def _claim(plan: ShardPlan, out: Path) -> None:
+    """Write the plan into the folder; refuse before anything else is written.
+
+    Raises:
+        StorageError: If a file of the release leads out of it.
+        ShardError: If the folder cannot be written to, is in the release, or is of another plan.
+    """
+    if not is_remote(plan.root):
+        packed_scenes = (scene for shard in plan.shards for scene in shard.scenes)
+        sources = {file.path for scene in packed_scenes for file in scene.members.values()}
+        require_own_files(plan.root, sorted(sources))
+    with explain_os_errors(
+        f"{out}: cannot be written to", "Pack into another folder.", kind=ShardError
+    ):
+        _claim_folder(plan, out)
+
+
+def _derive(
+    tasks: Sequence[ShardTask], engine: Engine, workers: int | None, advance: Advance
+) -> None:
+    """Derive the scenes of training shards, each by a process of its own."""
+    scenes = [(task, scene) for task in tasks for scene in task.shard.scenes]
+    derived = engine.map(
+        derive_task,
+        scenes,
+        name=lambda work: f"{work[0].target}: {work[1].id.key}",
+        workers=workers,
+        advance=advance,
+    )
+    deque(derived, maxlen=0)
+
+
+def _finish(tasks: Sequence[ShardTask], out: Path) -> tuple[str, ...]:
+    """Write the index if all shards of a plan are there; return the names of those that are not."""
+    found = {task.shard.name: find_packed(task) for task in tasks}
+    shards = {name: index for name, index in found.items() if index is not None}
+    if len(shards) == len(found):
+        for task in tasks:
+            shutil.rmtree(task.derived, ignore_errors=True)  # of a run killed after its last shard
+        _write_index(shards, out)
+    return tuple(name for name in found if name not in shards)
 
 
 def _write_index(shards: Mapping[str, SceneIndex], out: Path) -> None:
