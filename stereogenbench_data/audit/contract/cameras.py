@@ -14,43 +14,24 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from stereogenbench_data.audit.contract import limits
 from stereogenbench_data.audit.contract.hypotheses import LAGS, Hypothesis, Question
-from stereogenbench_data.audit.contract.matching import FrameMatch, Points, SceneFrames
+from stereogenbench_data.audit.contract.row_matches import FrameMatch, Points, SceneFrames
 from stereogenbench_data.audit.contract.scoring import (
     Pair,
     ScoredContract,
     sample_along_rows,
-    voted,
 )
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.text import counted
 
-LEAST_SHARE: Final = 0.5
-"""Least share of a camera's matches with its neighbours that its depth must explain."""
-MOST_LOG_SCALE: Final = 0.005
-MOST_SHIFT_PX: Final = 0.25
-"""Limits beyond which a camera differs from the others: scale of its depth, shift of pictures."""
 _REFINED: Final = 4
 """So often the shift is taken anew, of the matches that the one before explains."""
-_LEAST_DEFICIT: Final = 0.12
-_LEAST_UNLIKE: Final = 0.05
-"""Least share of matches that a camera's pairs lack, compared with other pairs as wide: matches
-that either depth explains, and those of them in which both depths agree (2 % in correct data)."""
-_LEAST_AWAY: Final = 0.25
-"""Two depths of a point agree if their disparities differ by fewer pixels."""
-_LEAST_GAIN: Final = 0.01
-_LEAST_CLOSED: Final = 1 / 3
-"""Least share of the points lacking that another reading of a camera's depth must explain."""
-_GAIN_ERRORS: Final = 5.0
-"""About 90 readings are tried in a scene, so 3 standard errors occur by chance."""
-_LEAST_LEAD: Final = 1.1
-"""How many times as much the right lag of a camera's pictures explains as the next best."""
-_FEWEST_MATCHES: Final = 100
 _NARROWEST: Final = 2
 _ROWS_BESIDE: Final = 2
 _MAJORITY: Final = CAMERA_COUNT // 2 + 1
@@ -73,7 +54,7 @@ class CameraFigures:
     @property
     def is_tested(self) -> bool:
         """Whether there were enough matches to judge it."""
-        return self.matches >= _FEWEST_MATCHES and math.isfinite(self.agreement)
+        return self.matches >= limits.FEWEST_OF_CAMERA and math.isfinite(self.agreement)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,12 +90,12 @@ class CameraCheck:
         return tuple(
             figures.camera
             for figures in self.cameras
-            if figures.is_tested and figures.agreement < LEAST_SHARE
+            if figures.is_tested and figures.agreement < limits.LEAST_SHARE
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Beside:
+class CameraPairStats:
     """Two cameras: their matches of all frames, and what either camera's depth predicts.
 
     ``near`` is the share of matches that each camera's depth explains. ``share`` is the share that
@@ -164,35 +145,37 @@ def check_cameras(
         explained = sum(beside.count * beside.near[camera] for beside in nearest)
         figures.append(CameraFigures(camera, count, explained / count if count else math.nan))
     # In other pairs matches are false, and what is compared has nothing in common.
-    clear = [beside for beside in pairs if beside.share >= LEAST_SHARE]
+    clear = [beside for beside in pairs if beside.share >= limits.LEAST_SHARE]
     problems = {
         camera: f"depth of camera {camera} agrees with that of the others in {alike:.0%} of the "
         f"matches, where theirs agree in {usual:.0%}"
-        for camera, alike, usual in _behind(clear, lambda beside: beside.alike, least=_LEAST_UNLIKE)
+        for camera, alike, usual in _behind(
+            clear, lambda beside: beside.alike, least=limits.LEAST_UNLIKE
+        )
     }
-    most = max(MOST_LOG_SCALE, depth_step / 4)
-    limits = {beside.pair: max(most, 4 * beside.ratio_error) for beside in clear}
-    least = min(max(limits.values(), default=most), 0.02)
+    most = max(limits.MOST_LOG_SCALE, depth_step / 4)
+    bounds = {beside.pair: max(most, 4 * beside.ratio_error) for beside in clear}
+    least = min(max(bounds.values(), default=most), 0.02)
     # Disparity is inverse to depth: hence the sign.
     ratios = {beside.pair: -beside.log_ratio for beside in clear}
-    logs, doubts = _levels(ratios, limits, "scale of depth", least=least)
+    logs, doubts = _levels(ratios, bounds, "scale of depth", least=least)
     problems |= {
         camera: f"depth of camera {camera} is {math.exp(log):.4g} x that of the others"
         for camera, log in enumerate(logs)
         if abs(log) > least
     }
     # The more matches are false, the more they move the middle.
-    limits = {beside.pair: MOST_SHIFT_PX / beside.share**2 for beside in clear}
+    bounds = {beside.pair: limits.MOST_SHIFT_PX / beside.share**2 for beside in clear}
     rows = {beside.pair: beside.row_px for beside in clear}
     across = {beside.pair: beside.across_px for beside in clear}
-    down_px, unsure = _levels(rows, limits, "rows of pictures")
-    right_px, more = _levels(across, limits, "places or columns of pictures")
-    behind = _behind(pairs, lambda beside: beside.share, least=_LEAST_DEFICIT)
-    shifted = np.abs([down_px, right_px]).max(axis=0) > MOST_SHIFT_PX
+    down_px, unsure = _levels(rows, bounds, "rows of pictures")
+    right_px, more = _levels(across, bounds, "places or columns of pictures")
+    behind = _behind(pairs, lambda beside: beside.share, least=limits.LEAST_DEFICIT)
+    shifted = np.abs([down_px, right_px]).max(axis=0) > limits.MOST_SHIFT_PX
     odd_pictures = {*np.flatnonzero(shifted).tolist(), *(camera for camera, *_ in behind)}
     if unsure or more:
         odd_pictures = set()
-    in_both = [match for match in matches if match.pair in limits]
+    in_both = [match for match in matches if match.pair in bounds]
     for camera in set(range(CAMERA_COUNT)) - odd_pictures:
         better = _better_depth(
             views, in_both, contract, camera, scale=math.exp(logs[camera]), depth_step=depth_step
@@ -215,7 +198,7 @@ def _beside(
     both: Sequence[tuple[FrameMatch, FrameMatch]],
     contract: ScoredContract,
     depth_step: float,
-) -> _Beside | None:
+) -> CameraPairStats | None:
     """Return what a pair's matches of all frames show, seen from either side; None if too few."""
     parts = []
     hypothesis, scale = contract.hypothesis, contract.scale
@@ -228,7 +211,7 @@ def _beside(
         parts.append([
             part[known] for part in (*predicted, here.matched_px, *_row_terms(views, here))
         ])  # fmt: skip
-    if not parts or sum(len(part[0]) for part in parts) < _FEWEST_MATCHES:
+    if not parts or sum(len(part[0]) for part in parts) < limits.FEWEST_OF_CAMERA:
         return None
     left_px, right_px, found, upward, steep = map(np.concatenate, zip(*parts, strict=True))
     first = both[0][0]
@@ -237,8 +220,8 @@ def _beside(
     log_ratio, ratio_error = _median(np.log(left_px[usable] / right_px[usable]))
     moved = [_moved(found, predicted, first.grain_px) for predicted in (left_px, right_px)]
     either = moved[0][1] | moved[1][1]
-    allowed_px = _LEAST_AWAY * first.grain_px + 2 * depth_step * np.abs(right_px)
-    return _Beside(
+    allowed_px = _allowed_px(first, right_px, depth_step)
+    return CameraPairStats(
         pair=first.pair,
         width_m=abs(views.baseline_m(first, hypothesis)),
         count=len(found),
@@ -250,6 +233,13 @@ def _beside(
         across_px=min((away_px for away_px, _ in moved), key=abs),
         share=max(float(explained.mean()) for _, explained in moved),
     )
+
+
+def _allowed_px(match: FrameMatch, disparity_px: Points, depth_step: float) -> Points:
+    """Return how far apart the disparities of two depths of a point may be."""
+    least_px = limits.MOST_APART_PX * match.grain_px
+    allowed_px: Points = least_px + 2 * depth_step * np.abs(disparity_px)
+    return allowed_px
 
 
 def _moved(found: Points, predicted: Points, grain_px: int) -> tuple[float, Bool[np.ndarray, " n"]]:
@@ -269,14 +259,14 @@ def _moved(found: Points, predicted: Points, grain_px: int) -> tuple[float, Bool
     return away_px, max(explained, key=lambda each: int(each.sum()))
 
 
-def _of(pairs: Sequence[_Beside], camera: int) -> list[_Beside]:
+def _of(pairs: Sequence[CameraPairStats], camera: int) -> list[CameraPairStats]:
     """Return a camera's pairs, the narrowest first."""
     own = [beside for beside in pairs if camera in beside.pair]
     return sorted(own, key=lambda beside: beside.width_m)
 
 
 def _behind(
-    pairs: Sequence[_Beside], share: Callable[[_Beside], float], *, least: float
+    pairs: Sequence[CameraPairStats], share: Callable[[CameraPairStats], float], *, least: float
 ) -> Iterator[tuple[int, float, float]]:
     """Yield cameras all of whose pairs have smaller shares than other pairs as wide.
 
@@ -307,9 +297,9 @@ def _picture_problem(camera: int, down_px: float, right_px: float) -> str:
     shifts = [
         f"{abs(px):.1f} px {ways[px > 0]}"
         for px, *ways in ((right_px, "further left", "further right"), (down_px, "higher", "lower"))
-        if abs(px) > MOST_SHIFT_PX
+        if abs(px) > limits.MOST_SHIFT_PX
     ]
-    if shifts and abs(right_px) <= MOST_SHIFT_PX:
+    if shifts and abs(right_px) <= limits.MOST_SHIFT_PX:
         return f"pictures of camera {camera} are {shifts[0]}, or show another moment"
     shift = " and ".join(shifts) or "other rows"
     return (
@@ -322,7 +312,7 @@ def _late_by(
     views: SceneFrames,
     matches: Sequence[FrameMatch],
     contract: ScoredContract,
-    pairs: Sequence[_Beside],
+    pairs: Sequence[CameraPairStats],
     camera: int,
 ) -> int:
     """Return by how many frames a camera's pictures are late, 0 if no lag explains them."""
@@ -338,8 +328,8 @@ def _late_by(
     first, second = sorted(LAGS, key=lambda lag: -counts[lag][0])[:2]
     explained, found = counts[first]
     usual = max((each.share for each in pairs if camera not in each.pair), default=1.0)
-    is_ahead = explained > _LEAST_LEAD * counts[second][0]
-    return first if is_ahead and explained > (usual - _LEAST_DEFICIT) * found else 0
+    is_ahead = explained > limits.LEAST_LEAD * counts[second][0]
+    return first if is_ahead and explained > (usual - limits.LEAST_DEFICIT) * found else 0
 
 
 def _better_depth(
@@ -351,10 +341,11 @@ def _better_depth(
     scale: float,
     depth_step: float,
 ) -> str:
-    """Return, in words, another reading of a camera's depth that explains clearly more.
+    """Return, in words, a lag, flip or other file that explains a camera's depth clearly better.
 
-    A reading explains the points at which it agrees with the other camera's depth: depth agrees
-    more sharply with depth than with matches, some of which are wrong.
+    The depth as it is counts with the scale that was found for it. A reading explains the points
+    at which it agrees with the other camera's depth: depth agrees more sharply with depth than
+    with matches, some of which are wrong.
     """
     hypothesis = contract.hypothesis
     both = zip(matches[::2], matches[1::2], strict=True)
@@ -364,8 +355,6 @@ def _better_depth(
     def shares(
         read: Hypothesis, *, file: int | None = None, factor: float = 1.0
     ) -> Float64[np.ndarray, " matches"]:
-        if read.form != hypothesis.form:  # another form of depth has a scale of its own
-            factor = voted(views, [here for here, _ in sides], read)[0] / contract.scale
         found = np.full(len(sides), np.nan)
         for place, (here, there) in enumerate(sides):
             mine = views.predicted(here, read, depth_file=file)
@@ -373,28 +362,29 @@ def _better_depth(
             if mine is not None and theirs is not None and (known := mine[1] & theirs[1]).any():
                 expected_px = -contract.scale * theirs[0][known]
                 away_px = contract.scale * factor * mine[0][known] - expected_px
-                allowed_px = _LEAST_AWAY * here.grain_px + 2 * depth_step * np.abs(expected_px)
+                allowed_px = _allowed_px(here, expected_px, depth_step)
                 found[place] = float((np.abs(away_px) < allowed_px).mean())
         return found
 
-    readings: list[tuple[str, Hypothesis, dict[str, Any]]] = [  # the simplest first
-        (f"is {scale:.4g} x that of the others", hypothesis, {"factor": scale}),
-        *((f"fits better {fits.format(getattr(other, question))}", other, {})
-          for question, fits in _READINGS.items() for other in hypothesis.alternatives(question)),
-        *((f"fits worse than that of file {file} does in its place", hypothesis, {"file": file})
-          for file in range(CAMERA_COUNT) if file != hypothesis.depth_file(camera)),
-    ]  # fmt: skip
-    now, best, most = shares(hypothesis), "", 0.0
-    for words, read, how in readings:
-        gain, is_clear = _gain(shares(read, **how), now)
-        if is_clear and gain > most + _LEAST_GAIN * bool(best):
+    now, best, most = shares(hypothesis, factor=scale), "", 0.0
+    readings = [
+        (f"fits better {fits.format(getattr(other, question))}", shares(other))
+        for question, fits in _READINGS.items()
+        for other in hypothesis.alternatives(question)
+    ] + [
+        (f"fits worse than that of file {file} does in its place", shares(hypothesis, file=file))
+        for file in range(CAMERA_COUNT)
+        if file != hypothesis.depth_file(camera)
+    ]
+    for words, explained in readings:  # the simplest first
+        gain, is_clear = _gain(explained, now)
+        if is_clear and gain > most + limits.LEAST_GAIN * bool(best):
             best, most = f"depth of camera {camera} {words}", gain
     return best
 
 
 _READINGS: Final[dict[Question, str]] = {
-    "frame_lag": "with a lag of {:+d} frames", "flip": "flipped ({})", "form": "as {} depth",
-    "kind": "along the {}",
+    "frame_lag": "with a lag of {:+d} frames", "flip": "flipped ({})",
 }  # fmt: skip
 
 
@@ -407,7 +397,9 @@ def _gain(
         return 0.0, False
     mean, error = float(gains.mean()), float(gains.std(ddof=1)) / math.sqrt(len(gains))
     lacking = 1 - float(np.nanmean(worse))
-    return mean, mean > max(_LEAST_GAIN, _LEAST_CLOSED * lacking, _GAIN_ERRORS * error)
+    return mean, mean > max(
+        limits.LEAST_GAIN, limits.LEAST_CLOSED * lacking, limits.GAIN_ERRORS * error
+    )
 
 
 def _row_terms(
@@ -441,10 +433,10 @@ def _median(values: Float64[np.ndarray, " n"]) -> tuple[float, float]:
 
 def _levels(
     values: Mapping[Pair, float],
-    limits: Mapping[Pair, float],
+    bounds: Mapping[Pair, float],
     what: str,
     *,
-    least: float = MOST_SHIFT_PX,
+    least: float = limits.MOST_SHIFT_PX,
 ) -> tuple[list[float], list[str]]:
     """Return each camera's level from differences (first less second), and doubts.
 
@@ -454,7 +446,7 @@ def _levels(
     """
     group = {camera: {camera} for camera in range(CAMERA_COUNT)}
     for pair, value in values.items():
-        if abs(value) <= limits[pair]:
+        if abs(value) <= bounds[pair]:
             joined = group[pair[0]] | group[pair[1]]
             for camera in joined:
                 group[camera] = joined

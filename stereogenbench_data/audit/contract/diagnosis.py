@@ -7,49 +7,41 @@ further change clearly improves. `diagnose_scene` reports how well that contract
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, Final
 
 import numpy as np
 
+from stereogenbench_data.audit.contract import limits
 from stereogenbench_data.audit.contract.cameras import CameraCheck, check_cameras
 from stereogenbench_data.audit.contract.hypotheses import QUESTIONS, Hypothesis, Question
-from stereogenbench_data.audit.contract.matching import (
+from stereogenbench_data.audit.contract.row_matches import (
     FrameMatch,
     SceneFrames,
     disparity_px,
     relative_step,
 )
 from stereogenbench_data.audit.contract.scoring import (
-    LEAST_ERRORS,
-    Evidence,
+    NOTHING,
+    Gain,
     RayPower,
     ScoredContract,
-    evidence,
     fit_scale,
+    gain_of,
     ray_power,
     score_hypothesis,
     voted,
 )
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
-LEAST_LOG_SCALE: Final = 0.01
-"""A smaller error of the unit is not called wrong."""
-BIAS_PX: Final = 0.1
-"""Systematic error of disparity, by interpolation on small pictures."""
-_NOTHING: Final = Evidence(math.nan, math.inf)
-
 
 @dataclass(frozen=True, slots=True)
 class Rival:
-    """Another answer to one question, with a scale of its own.
-
-    ``behind`` is by how much the best contract is better.
-    """
+    """Another answer to one question, with a scale of its own."""
 
     question: Question
     answer: Any
-    behind: Evidence
+    lead_of_best: Gain
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +80,7 @@ class SceneDiagnosis:
     scale: float = 1.0
     scale_error: float = math.inf
     other_kind_scale: float = math.nan
-    gain: Evidence = _NOTHING
+    gain: Gain = NOTHING
     rivals: tuple[Rival, ...] = ()
     disparity_px: float = math.inf
     depth_step: float = 0.0
@@ -101,20 +93,12 @@ def allowed_log_scale(depth_step: float) -> float:
     Rounding to coarse steps moves the mean of 1 / depth by about the step squared; a quarter of a
     step allows for truncation.
     """
-    return max(LEAST_LOG_SCALE, depth_step / 4 + depth_step**2)
+    return max(limits.LEAST_LOG_SCALE, depth_step / 4 + depth_step**2)
 
 
-_COARSEST_STEP: Final = 0.5
-"""A scene with larger relative steps of stored depth is not judged."""
-_LEAST_SCALE_DB: Final = 0.02
-_SCALE_ERRORS: Final = 1.5
-"""A scale is also judged by its own standard error, so its score needs to prove less."""
 _MOST_CHANGES: Final = 4
 _PROMISING: Final = 4
 """How many exchanges of cameras are tried with a scale of their own."""
-FEWEST_MATCHES: Final = 200
-_LEAST_PARALLAX_PX: Final = 0.3
-"""Smaller disparities (root mean square) are noise."""
 
 
 class ContractSearch:
@@ -125,7 +109,7 @@ class ContractSearch:
         views: SceneFrames,
         matches: Sequence[FrameMatch],
         *,
-        least_log_scale: float = LEAST_LOG_SCALE,
+        least_log_scale: float = limits.LEAST_LOG_SCALE,
     ) -> None:
         """Take frame matches, and the error of log(unit) that is not called wrong."""
         self._views = views
@@ -134,8 +118,9 @@ class ContractSearch:
         near = views.neighbours(Hypothesis())
         # The pairs next but one serve the comparison of cameras.
         self._matches = [match for match in matches if match.pair in near] or list(matches)
-        self._bias = BIAS_PX / max(disparity_px(matches), 1e-6)
-        self._fitted: dict[tuple[Hypothesis, bool], ScoredContract] = {}
+        self._bias = limits.BIAS_PX / max(disparity_px(matches), 1e-6)
+        self._fitted = cache(partial(fit_scale, views, self._matches))
+        self._unscaled = cache(partial(score_hypothesis, views, self._matches))
         self._promising = cache(self._find_promising)
         self._power = cache(self._find_power)
         self._moved_px = cache(self._find_moved_px)
@@ -143,11 +128,7 @@ class ContractSearch:
 
     def candidate(self, hypothesis: Hypothesis, *, is_scaled: bool = True) -> ScoredContract:
         """Return a contract, its scale fitted or as declared."""
-        if (hypothesis, is_scaled) not in self._fitted:
-            fit = fit_scale if is_scaled else score_hypothesis
-            found = fit(self._views, self._matches, hypothesis)
-            self._fitted[hypothesis, is_scaled] = replace(found, is_scaled=is_scaled)
-        return self._fitted[hypothesis, is_scaled]
+        return self._fitted(hypothesis) if is_scaled else self._unscaled(hypothesis)
 
     def best(self) -> ScoredContract:
         """Return the contract with the fewest changes that no further change clearly improves."""
@@ -255,25 +236,25 @@ class ContractSearch:
                 found.append(Rival(question, answer, self.gain(best, other)))
         return tuple(found)
 
-    def without_parallax(self, best: ScoredContract) -> Evidence:
+    def without_parallax(self, best: ScoredContract) -> Gain:
         """Return by how much a contract is better than infinite depth everywhere."""
         flat = score_hypothesis(self._views, self._matches, best.hypothesis, scale=1e-12)
-        return evidence(self._matches, best, flat)
+        return gain_of(self._matches, best, flat)
 
-    def gain(self, better: ScoredContract, worse: ScoredContract) -> Evidence:
+    def gain(self, better: ScoredContract, worse: ScoredContract) -> Gain:
         """Return by how much one contract is better than another.
 
-        A lag that moves predictions by less than `BIAS_PX` was not tested.
+        A lag that moves predictions by less than `limits.BIAS_PX` was not tested.
         """
         if better.hypothesis.changes_from(worse.hypothesis) == ("frame_lag",):
             moved_px = self._moved_px(better.hypothesis, worse.hypothesis.frame_lag)
-            if better.scale * moved_px < BIAS_PX:
-                return _NOTHING
-        found = evidence(self._matches, better, worse)
+            if better.scale * moved_px < limits.BIAS_PX:
+                return NOTHING
+        found = gain_of(self._matches, better, worse)
         kind = better.hypothesis.kind
         only_kind = better.hypothesis.changes_from(worse.hypothesis) == ("kind",)
         # Coarse depth has a shape of its own.
-        is_fine = self._least_log_scale <= LEAST_LOG_SCALE
+        is_fine = self._least_log_scale <= limits.LEAST_LOG_SCALE
         if is_fine and only_kind and worse.is_scaled >= better.is_scaled:
             shape_kind = self._power(better.hypothesis.changed("kind", "planar")).kind
             if shape_kind is not None and (shape_kind != kind or found.mean_db > 0):
@@ -298,19 +279,21 @@ class ContractSearch:
         gain = self.gain(other, current)
         if other.hypothesis != current.hypothesis or other.is_scaled <= current.is_scaled:
             return gain.is_clear()
-        least = max(self._least_log_scale, self._bias) + LEAST_ERRORS * min(other.scale_error, 1e3)
+        least = max(self._least_log_scale, self._bias) + limits.LEAST_ERRORS * min(
+            other.scale_error, 1e3
+        )
         if abs(math.log(other.scale)) <= least or not _is_clear_scale(gain):
             return False
         # A camera elsewhere than recorded gives its own pairs another scale, and no others.
         without = (
-            evidence(self._matches, current, other, left_out=camera)
+            gain_of(self._matches, current, other, left_out=camera)
             for camera in range(CAMERA_COUNT)
         )
         return not any(map(_is_clear_scale, without))
 
 
-def _is_clear_scale(gain: Evidence) -> bool:
-    return gain.is_clear(least_db=_LEAST_SCALE_DB, errors=_SCALE_ERRORS)
+def _is_clear_scale(gain: Gain) -> bool:
+    return gain.is_clear(least_db=limits.LEAST_SCALE_DB, errors=limits.SCALE_ERRORS)
 
 
 def _checked(
@@ -354,7 +337,7 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         declared=declared,
         best=declared,
     )
-    if scene.matches < FEWEST_MATCHES:
+    if scene.matches < limits.FEWEST_MATCHES:
         problem = (
             f"only {scene.matches:,} pixels were found in both pictures: they have no texture, or "
             f"show different things"
@@ -366,10 +349,10 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         depth_step=relative_step(units[known]),
         disparity_px=disparity_px(matches),
     )
-    if scene.depth_step > _COARSEST_STEP:
+    if scene.depth_step > limits.COARSEST_STEP:
         problem = f"stored depth is too coarse: its steps are {scene.depth_step:.0%} of it"
         return replace(scene, problem=problem)
-    if scene.disparity_px < _LEAST_PARALLAX_PX:
+    if scene.disparity_px < limits.LEAST_PARALLAX_PX:
         problem = f"too little parallax: disparities are of {scene.disparity_px:.2f} px"
         return replace(scene, problem=problem)
     search = ContractSearch(views, matches, least_log_scale=allowed_log_scale(scene.depth_step))

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from stereogenbench_data.audit.contract import limits
 from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis, diagnose_scene
-from stereogenbench_data.audit.contract.matching import SceneFrames
+from stereogenbench_data.audit.contract.row_matches import SceneFrames
 from stereogenbench_data.audit.contract.verdict import Verdict, group_by_contract, judge
 from stereogenbench_data.audit.contract.worlds import (
     Shares,
@@ -38,8 +39,6 @@ from stereogenbench_data.schema.release import CAMERA_COUNT, TRAJECTORY_JSON
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.sources.members import MemberSource
 
-MOST_RESIDUAL_PX: Final = 0.5
-"""Rigs with a larger rectification residual are left out: they need more than disparity."""
 _MOST_KEPT_PIXELS: Final = 5 * 2**20
 """How much of each video stays decoded: every lag for small pictures."""
 
@@ -129,7 +128,7 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
             or "not all videos of its six cameras are there, and the doctor compares all"
         )
         for row, residual, whole in zip(rows, residual_px, is_whole, strict=True)
-        if not (whole and residual <= MOST_RESIDUAL_PX)
+        if not (whole and residual <= limits.MOST_RESIDUAL_PX)
     }  # fmt: skip
     if not is_whole.any():
         key, reason = next(iter(left_out.items()))
@@ -137,7 +136,7 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
             f"{index.where}: no scene has all videos of its six cameras, and the doctor compares "
             f"all. The first: {key}: {reason}. Fetch them again, or download the other cameras too."
         )
-    usable = rows[is_whole & (residual_px <= MOST_RESIDUAL_PX)]
+    usable = rows[is_whole & (residual_px <= limits.MOST_RESIDUAL_PX)]
     chosen = usable[list(spread(len(usable), scenes))]
     tasks = [
         DiagnosisTask(scene, source_of(index, scene), frames, depth or depth_of(scene))

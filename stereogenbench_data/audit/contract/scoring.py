@@ -1,6 +1,6 @@
 """How well a contract explains pictures, in dB, how certain a difference is, and the best scale.
 
-A contract's score are the squared differences of the pictures after the warp. `evidence` compares
+A contract's score are the squared differences of the pictures after the warp. `gain_of` compares
 scores in one scene; `pooled` takes several scenes together.
 
 The ratios of found to predicted disparities vote for a scale, which needs no starting value. Robust
@@ -21,8 +21,9 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from stereogenbench_data.audit.contract import limits
 from stereogenbench_data.audit.contract.hypotheses import Hypothesis
-from stereogenbench_data.audit.contract.matching import (
+from stereogenbench_data.audit.contract.row_matches import (
     SIDE_CELLS,
     FrameMatch,
     Points,
@@ -31,38 +32,45 @@ from stereogenbench_data.audit.contract.matching import (
 from stereogenbench_data.audit.geometry.picture_check import Luma
 from stereogenbench_data.schema.records import DepthKind
 
-LEAST_DB: Final = 0.15
-"""Smaller mean differences, which interpolation and codecs cause, are not believed."""
-LEAST_DB_ELSEWHERE: Final = 0.4
-"""The same between contracts that read depth elsewhere (lag, order, flip) or in another form: with
-small disparities interpolation alone causes 0.3 dB between neighbouring lags."""
-LEAST_ERRORS: Final = 3.0
 NORMAL_975: Final = 1.96
-_FEW_VIEWS: Final = 1.2
-"""A standard error from n views counts 1 + 1.2 / (n - 2) times, which is Student's t to 2 %."""
-_LEAST_ERROR_DB: Final = 1e-3
+_FEWEST_PARTS: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
-    """By how many dB one contract is better than another in one scene.
+class Gain:
+    """By how many dB one contract is better than another, in one scene or in several.
 
     Attributes:
-        mean_db: The mean difference.
-        error_db: Its standard error, the smaller of two estimates; the search uses it.
-        by_shape: Whether the shape of disparity over the picture decides for this contract; None
-            if it does not decide.
+        mean_db: The mean difference; nan for nothing to compare.
+        error_db: Its standard error.
+        by_shape: Whether the shape of disparity over the picture decides for this contract,
+            however few dB it makes; None if it does not decide.
         least_db: Smaller differences are not believed.
-        wide_db: The larger estimate of the error; intervals use it.
     """
 
     mean_db: float
     error_db: float
     by_shape: bool | None = None
-    least_db: float = LEAST_DB
-    wide_db: float | None = None
+    least_db: float = limits.LEAST_DB
 
-    def is_clear(self, *, least_db: float | None = None, errors: float = LEAST_ERRORS) -> bool:
+    @property
+    def low_db(self) -> float:
+        """The lower end of the 95 % interval."""
+        return self.mean_db - NORMAL_975 * self.error_db
+
+    @property
+    def high_db(self) -> float:
+        """The upper end of the 95 % interval."""
+        return self.mean_db + NORMAL_975 * self.error_db
+
+    @property
+    def is_excluded(self) -> bool:
+        """Whether the other contract is excluded: the whole interval is beyond the margin."""
+        return bool(self.by_shape) or self.low_db >= self.least_db
+
+    def is_clear(
+        self, *, least_db: float | None = None, errors: float = limits.LEAST_ERRORS
+    ) -> bool:
         """Tell whether the difference is large and certain enough to be believed."""
         if self.by_shape is not None:
             return self.by_shape
@@ -70,30 +78,8 @@ class Evidence:
         return self.mean_db >= max(least, errors * self.error_db)
 
 
-@dataclass(frozen=True, slots=True)
-class Gain:
-    """The difference in dB of one scene or of several, with its 95 % confidence interval.
-
-    Attributes:
-        mean_db: The mean, weighted by how certain each scene is; nan for nothing to compare.
-        low_db: Lower end.
-        high_db: Upper end.
-        is_clear: Whether the difference may be believed.
-        by_shape: Whether the shape of disparity decides, however few dB it makes.
-        margin_db: How far the interval must be from 0 to confirm.
-    """
-
-    mean_db: float
-    low_db: float
-    high_db: float
-    is_clear: bool
-    by_shape: bool = False
-    margin_db: float = LEAST_DB
-
-    @property
-    def is_excluded(self) -> bool:
-        """Whether the other answer is excluded: the whole interval is beyond the margin."""
-        return self.by_shape or self.low_db >= self.margin_db
+NOTHING: Final = Gain(math.nan, math.inf)
+"""Nothing was compared."""
 
 
 def weighted_mean(
@@ -114,35 +100,33 @@ def weighted_mean(
     return mean, float(floored.min() / math.sqrt(precision.sum()))
 
 
-def pooled(scenes: Sequence[Evidence]) -> Gain:
-    """Return the mean over scenes.
-
-    It is clear if it is clear in some scene and its opposite in none, or if the mean is: one scene
-    rules out an answer for all with the same contract, even if the others show nothing (such as a
-    lag where nothing moves).
-    """
+def pooled(scenes: Sequence[Gain]) -> Gain:
+    """Return the mean over scenes, weighted by how certain each is; `NOTHING` for no scenes."""
     tested = [scene for scene in scenes if math.isfinite(scene.mean_db)]
-    wide_db = [scene.error_db if scene.wide_db is None else scene.wide_db for scene in tested]
+    if not tested:
+        return NOTHING
     mean_db, error_db = weighted_mean(
-        [scene.mean_db for scene in tested], wide_db, least=_LEAST_ERROR_DB
+        [scene.mean_db for scene in tested],
+        [scene.error_db for scene in tested],
+        least=limits.LEAST_ERROR_DB,
     )
-    low_db, high_db = mean_db - NORMAL_975 * error_db, mean_db + NORMAL_975 * error_db
-    least_db = max((scene.least_db for scene in tested), default=LEAST_DB)
-    against = (replace(scene, mean_db=-scene.mean_db) for scene in tested if scene.by_shape is None)
-    is_clear = any(scene.is_clear() for scene in tested) or (
-        len(tested) > 1 and mean_db >= least_db and low_db > 0
-    )
-    is_opposed = any(scene.is_clear() for scene in against)
-    return Gain(
-        mean_db, low_db, high_db, is_clear and not is_opposed,
-        by_shape=any(scene.by_shape for scene in tested), margin_db=least_db,
-    )  # fmt: skip
+    least_db = max(scene.least_db for scene in tested)
+    by_shape = any(scene.by_shape for scene in tested) or None
+    return Gain(mean_db, error_db, by_shape, least_db)
 
 
-_FEWEST_POINTS = 40
-_FEWEST_CELLS = 3
-_FINE_CAP = 0.05
-_SMALLEST = 1e-6
+def is_ruled_out(scenes: Sequence[Gain]) -> bool:
+    """Tell whether another contract is clearly worse in some scene or on average.
+
+    The opposite must be clear in no scene. So one scene rules out an answer for all with the same
+    contract, even if the others show nothing (such as a lag where nothing moves).
+    """
+    opposite = (replace(each, mean_db=-each.mean_db) for each in scenes if each.by_shape is None)
+    is_clear = any(each.is_clear() for each in (*scenes, pooled(scenes)))
+    return is_clear and not any(each.is_clear() for each in opposite)
+
+
+_SMALLEST: Final = 1e-6
 Pair = tuple[int, int]
 
 
@@ -196,7 +180,6 @@ def score_hypothesis(
     hypothesis: Hypothesis,
     *,
     scale: float = 1.0,
-    scale_error: float = math.inf,
 ) -> ScoredContract:
     """Return a contract's score on the frame matches of a scene.
 
@@ -217,16 +200,16 @@ def score_hypothesis(
             capped = np.where(inside, np.minimum(square, match.cap), match.cap)
             squares[known] = capped[known]
         errors.append(squares)
-    return ScoredContract(hypothesis, scale, scale_error, errors)
+    return ScoredContract(hypothesis, scale, math.inf, errors)
 
 
-def evidence(
+def gain_of(
     matches: Sequence[FrameMatch],
     better: ScoredContract,
     worse: ScoredContract,
     *,
     left_out: int | None = None,
-) -> Evidence:
+) -> Gain:
     """Return by how many dB one contract explains a scene better than another.
 
     Only pixels for which both predict something are compared, in the views that they do not read
@@ -237,12 +220,11 @@ def evidence(
 
     The pairs of a camera that is ``left_out`` do not count.
 
-    The error is the smaller of two: one from the differences between views (a pair in a frame),
-    which is large if some cameras are wrong; and a jackknife over parts of the picture, each left
-    out of all views at once, which is large if only some parts matter (such as moving ones).
+    The error is that of a jackknife over parts of the picture, each left out of all views (a pair
+    in a frame) at once: so it is large where only some parts matter, such as moving ones.
     """
     same_places = better.hypothesis.changed("kind", worse.hypothesis.kind) == worse.hypothesis
-    share = _FINE_CAP if same_places else 1.0
+    share = limits.FINE_CAP if same_places else 1.0
     sums = np.zeros((2, 0, SIDE_CELLS**2))
     orders_differ = better.hypothesis.order != worse.hypothesis.order
     for match, low, high in zip(matches, better.errors, worse.errors, strict=True):
@@ -253,7 +235,7 @@ def evidence(
         ):
             continue
         both = np.isfinite(low) & np.isfinite(high)
-        if both.sum() >= _FEWEST_POINTS:
+        if both.sum() >= limits.FEWEST_POINTS:
             cells = [
                 np.bincount(
                     match.cells[both],
@@ -264,24 +246,15 @@ def evidence(
             ]
             sums = np.concatenate([sums, np.array(cells)[:, None]], axis=1)
     if sums.shape[1] == 0:
-        return Evidence(math.nan, math.inf)
+        return NOTHING
     ours, theirs = sums.sum(axis=-1, keepdims=True)
     used = sums.sum(axis=(0, 1)) > 0
-    parts, views = int(used.sum()), sums.shape[1]
-    errors = [math.inf]
-    if parts >= _FEWEST_CELLS:
+    parts, error_db = int(used.sum()), math.inf
+    if parts >= _FEWEST_PARTS:
         without = _mean_db(ours - sums[0][:, used], theirs - sums[1][:, used])
-        errors.append(math.sqrt((parts - 1) * float(without.var())))
-    if views >= 3:
-        each = _mean_db(ours[None, :, 0], theirs[None, :, 0])
-        few = 1 + _FEW_VIEWS / (views - 2)
-        errors.append(few * float(each.std(ddof=1)) / math.sqrt(views))
-    least_db = LEAST_DB if same_places else LEAST_DB_ELSEWHERE
-    finite = [error for error in errors if math.isfinite(error)]
-    return Evidence(
-        float(_mean_db(ours, theirs)[0]), min(errors), least_db=least_db,
-        wide_db=max(finite, default=math.inf),
-    )  # fmt: skip
+        error_db = math.sqrt((parts - 1) * float(without.var()))
+    least_db = limits.LEAST_DB if same_places else limits.LEAST_DB_ELSEWHERE
+    return Gain(float(_mean_db(ours, theirs)[0]), error_db, least_db=least_db)
 
 
 def _mean_db(ours: np.ndarray, theirs: np.ndarray) -> Float64[np.ndarray, " k"]:
@@ -322,13 +295,11 @@ def fit_scale(
     views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis
 ) -> ScoredContract:
     """Return a hypothesis with the scale that explains the pictures best."""
-    terms = _fit_terms(views, matches, hypothesis)
-    if not terms:
-        return score_hypothesis(views, matches, hypothesis)
-    (log_scale,), (error,) = _refined(views, terms, [math.log(_voted_scale(*_joined(terms)))])
-    return score_hypothesis(
-        views, matches, hypothesis, scale=math.exp(log_scale), scale_error=error
-    )
+    terms, log_scale, error = _fit_terms(views, matches, hypothesis), 0.0, math.inf
+    if terms:
+        (log_scale,), (error,) = _refined(views, terms, [math.log(_voted_scale(*_joined(terms)))])
+    scored = score_hypothesis(views, matches, hypothesis, scale=math.exp(log_scale))
+    return replace(scored, scale_error=error, is_scaled=True)
 
 
 def _fit_terms(
@@ -459,10 +430,6 @@ def _solved(
     return step, spread
 
 
-_RAY_BIAS: Final = 0.15
-"""Systematic error of the power; up to 0.19 was measured at long focal lengths."""
-
-
 @dataclass(frozen=True, slots=True)
 class RayPower:
     """The power of the ray's length, and its standard error."""
@@ -473,12 +440,12 @@ class RayPower:
     @property
     def kind(self) -> DepthKind | None:
         """The kind of depth, None if the power is uncertain or near neither 0 nor 1."""
-        doubt = _RAY_BIAS + LEAST_ERRORS * self.error
+        doubt = limits.RAY_BIAS + limits.LEAST_ERRORS * self.error
         if not abs(self.power - 0.5) > doubt:
             return None
         kind: DepthKind = "ray" if self.power > 0.5 else "planar"
         away = self.power - (1 if kind == "ray" else 0)
-        return kind if abs(away) <= 2 * _RAY_BIAS + LEAST_ERRORS * self.error else None
+        return kind if abs(away) <= 2 * limits.RAY_BIAS + limits.LEAST_ERRORS * self.error else None
 
 
 def ray_power(

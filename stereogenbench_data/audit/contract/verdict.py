@@ -6,25 +6,19 @@ disparity shows one quotient: unit / (focal length x baseline). `judge` answers 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
-from stereogenbench_data.audit.contract.cameras import LEAST_SHARE
-from stereogenbench_data.audit.contract.diagnosis import (
-    BIAS_PX,
-    LEAST_LOG_SCALE,
-    Rival,
-    SceneDiagnosis,
-    allowed_log_scale,
-)
+from stereogenbench_data.audit.contract import limits
+from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis, allowed_log_scale
 from stereogenbench_data.audit.contract.hypotheses import LAGS, QUESTIONS, Question
 from stereogenbench_data.audit.contract.scoring import (
-    LEAST_ERRORS,
     NORMAL_975,
     Gain,
+    is_ruled_out,
     pooled,
     weighted_mean,
 )
@@ -88,70 +82,91 @@ def _no_answer(scenes: Sequence[SceneDiagnosis], topic: str, declared: str) -> A
 
 
 def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> Answer:
-    """Return the answer to one question, and how far the next best answer is behind.
-
-    The declared answer is confirmed only if all others were tested and lost in every scene. For
-    lags, the two neighbours are enough: the further a lag is from the right one, the worse it fits.
-    """
+    """Return the answer to one question, and how far the next best answer is behind."""
     first = scenes[0]
     declared, best = (getattr(part, question) for part in (first.declared, first.best))
     blank = _no_answer(scenes, TOPICS[question], describe(declared))
     if blank.note:
         return blank
-    rivals = [rival for rival in first.rivals if rival.question == question]
-    gains = {rival.answer: behind(scenes, rival) for rival in rivals}
-    tested = {answer: gain for answer, gain in gains.items() if not math.isnan(gain.mean_db)}
-    close = [answer for answer, gain in tested.items() if not gain.is_clear]
-    untested = [answer for answer in gains if answer not in tested]
-    lacking = [
-        answer for answer in untested
-        if question != "frame_lag" or min(abs(answer - lag) for lag in [best, *close]) == 1
-    ]  # fmt: skip
-    # By how much each scene's own best contract is better than each other answer.
-    each_gain = [
-        (rival.answer, pooled([other.behind]))
-        for rival in rivals if rival.answer in tested
-        for scene in scenes for other in scene.rivals
-        if (other.question, other.answer) == (rival.question, rival.answer)
-    ]  # fmt: skip
-    nearest = min((gain for _, gain in each_gain), key=lambda gain: gain.low_db, default=None)
-    doubtful = list(dict.fromkeys(answer for answer, gain in each_gain if not gain.is_excluded))
-    is_sure = not (close or lacking or doubtful) and bool(tested)
+    gains = gains_of(scenes, question)
+    states = {answer: _state(each) for answer, each in gains.items()}
+    untested = [answer for answer, state in states.items() if state == "untested"]
+    if question == "frame_lag":
+        states = _lag_states(states, declared=declared, best=best)
+    left = [
+        answer for answer, state in states.items() if state != "excluded" and answer != declared
+    ]
+    worst: State = max(states.values(), key=_STATES.index, default="untested")
+    is_changed = best != declared
+    status = _STATUS[is_changed, states.get(declared, "untested") if is_changed else worst]
     at_end = question == "frame_lag" and abs(best) == max(LAGS)
     want = "frames or of motion" if question == "frame_lag" else "depth where it would be"
-    is_near = best == declared and not (close or lacking)
-    words = "; ".join([
-        *([f"not excluded by the margin: {_named(doubtful)}"] if is_near and doubtful else []),
-        *([f"fit alike: {_named([best, *close])}"] if close else []),
-        *([f"not tested, for lack of {want}: {', '.join(map(describe, untested))}"]
-          if untested else []),
-        *([f"lags beyond {max(LAGS)} frames are not examined"] if at_end else []),
-        *([_OR_PICTURES] if question == "flip" and best != declared else []),
-    ])  # fmt: skip
-    if best == declared:
-        if close or lacking or not tested:
-            return replace(blank, behind=nearest, note=words)
-        status: Status = "confirmed" if is_sure else "not contradicted"
-        return replace(
-            blank, found=describe(best), status=status, behind=nearest, note=words, is_sure=is_sure
-        )
-    # To be called wrong the declared answer must be behind; to be pasted, by the margin too.
-    of_declared = gains.get(declared)
-    is_behind = of_declared is not None and (of_declared.by_shape or of_declared.low_db > 0)
-    if question == "frame_lag":
-        # The further a lag is from the right one, the worse it fits: where lags on both sides of
-        # the declared one are not excluded, it is not excluded either.
-        sides = {answer > declared for answer in [best, *close, *doubtful] if answer != declared}
-        is_behind = is_behind and len(sides) == 1
-    if declared in close or not is_behind:
-        note = f"{describe(best)} fits best, but not surely better"
-        return replace(blank, behind=of_declared, note=f"{note}; {words}" if words else note)
-    others = [answer for answer in [*close, *lacking, *doubtful] if answer != declared]
-    found = " or ".join(describe(answer) for answer in dict.fromkeys([best, *others]))
-    return replace(
-        blank, found=f"{found} or beyond" if at_end else found, status="wrong",
-        behind=of_declared, note=words, is_sure=is_sure and not at_end,
+    close = [answer for answer, state in states.items() if state == "close"]
+    notes = {
+        f"{describe(best)} fits best, but not surely better": is_changed and status != "wrong",
+        f"not excluded by the margin: {_named(left)}": status == "not contradicted",
+        f"fit alike: {_named([best, *close])}": close,
+        f"not tested, for lack of {want}: {', '.join(map(describe, untested))}": untested,
+        f"lags beyond {max(LAGS)} frames are not examined": at_end,
+        _OR_PICTURES: question == "flip" and is_changed,
+    }
+    found = " or ".join(map(describe, [best, *left] if is_changed else [best]))
+    lows = [gain for each in gains.values() for gain in each if not math.isnan(gain.mean_db)]
+    return Answer(
+        blank.topic,
+        blank.declared,
+        found="" if status == "cannot tell" else f"{found} or beyond" if at_end else found,
+        status=status,
+        behind=pooled(gains.get(declared, ())) if is_changed
+        else min(lows, key=lambda gain: gain.low_db, default=None),
+        note="; ".join(note for note, is_said in notes.items() if is_said),
+        is_sure=worst == "excluded" and not at_end,
     )  # fmt: skip
+
+
+State = Literal["excluded", "behind", "close", "untested"]
+"""How an answer that is not the best stands: excluded by the margin in every scene, or clearly
+behind, or not clearly behind, or not compared."""
+_STATES: Final = get_args(State)
+_STATUS: Final[dict[tuple[bool, State], Status]] = {
+    (False, "excluded"): "confirmed",
+    (False, "behind"): "not contradicted",
+    (False, "close"): "cannot tell",
+    (False, "untested"): "cannot tell",
+    (True, "excluded"): "wrong",
+    (True, "behind"): "wrong",
+    (True, "close"): "cannot tell",
+    (True, "untested"): "cannot tell",
+}
+"""By whether another answer than the declared one is best, and by how the declared one stands, or
+of the others the one that stands best."""
+
+
+def _state(scenes: Sequence[Gain]) -> State:
+    """Return how an answer stands by how far it is behind in each scene."""
+    tested = [gain for gain in scenes if not math.isnan(gain.mean_db)]
+    if not tested:
+        return "untested"
+    if not is_ruled_out(tested):
+        return "close"
+    return "excluded" if all(gain.is_excluded for gain in tested) else "behind"
+
+
+def _lag_states(states: Mapping[int, State], *, declared: int, best: int) -> dict[int, State]:
+    """Return how lags stand: the further one is from the right one, the worse it fits.
+
+    So a lag that was not tested matters only beside one that fits. The declared lag is not excluded
+    where lags on both sides of it are not.
+    """
+    fitting = [best, *(lag for lag, state in states.items() if state == "close")]
+    kept = {
+        lag: state for lag, state in states.items()
+        if state != "untested" or lag == declared
+        or min(abs(lag - other) for other in fitting) == 1
+    }  # fmt: skip
+    possible = [best, *(lag for lag, state in states.items() if state in ("behind", "close"))]
+    sides = {lag > declared for lag in possible if lag != declared}
+    return kept | ({declared: "close"} if len(sides) > 1 and best != declared else {})
 
 
 def _named(answers: Sequence[Any]) -> str:
@@ -160,15 +175,13 @@ def _named(answers: Sequence[Any]) -> str:
     return f"{words} and {more} more" if more > 0 else words
 
 
-def behind(scenes: Sequence[SceneDiagnosis], rival: Rival) -> Gain:
-    """Return by how much the scenes' common best contract is better than another answer."""
-    return pooled([
-        other.behind
-        for scene in scenes
-        for other in scene.rivals
-        if (other.question, other.answer) == (rival.question, rival.answer)
-        and scene.best == scenes[0].best
-    ])  # fmt: skip
+def gains_of(scenes: Sequence[SceneDiagnosis], question: Question) -> dict[Any, list[Gain]]:
+    """Return by how much the scenes' common best contract is better than each other answer."""
+    gains: dict[Any, list[Gain]] = {}
+    for rival in (rival for scene in scenes if scene.best == scenes[0].best
+                  for rival in scene.rivals if rival.question == question):  # fmt: skip
+        gains.setdefault(rival.answer, []).append(rival.lead_of_best)
+    return gains
 
 
 def describe(answer: Any) -> str:
@@ -176,11 +189,7 @@ def describe(answer: Any) -> str:
     return _WORDS.get(answer, f"{answer}")
 
 
-_BIAS: Final = 0.002
-"""Systematic error of a quotient, as a share, by interpolation and rounding."""
-MARGIN: Final = 0.02
-"""A quotient is confirmed if its 95 % interval is within this share of the declared one."""
-_LEAST_TOLERANCE: Final = 0.005
+MARGIN: Final = limits.MARGIN
 
 QUOTIENT: Final = "depth scale"
 """Unit / (focal length x baseline), which is all that disparity shows of the three."""
@@ -217,7 +226,11 @@ def _common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
     fitted = [scene for scene in scenes if math.isfinite(scene.scale_error)]
     coarse = max(allowed_log_scale(scene.depth_step) for scene in scenes)
     seen_px = max(scene.disparity_px for scene in scenes)
-    bias = coarse if coarse > LEAST_LOG_SCALE else max(_BIAS, BIAS_PX / seen_px)
+    bias = (
+        coarse
+        if coarse > limits.LEAST_LOG_SCALE
+        else max(limits.SCALE_BIAS, limits.BIAS_PX / seen_px)
+    )
     if not fitted:
         return Unit(scenes[0].unit_m / scenes[0].scale, math.inf)
     logs = [math.log(scene.unit_m / scene.scale) for scene in fitted]
@@ -258,11 +271,11 @@ def _quotient(scenes: Sequence[SceneDiagnosis], unit: Unit) -> Answer:
 def _doubt(first: SceneDiagnosis, unit: Unit, *, found: str) -> str:
     """Return why the declared quotient is not confirmed although none is clearly better, if so."""
     off = abs(math.log(unit.metres / first.unit_m))
-    is_coarse = allowed_log_scale(first.depth_step) > LEAST_LOG_SCALE
+    is_coarse = allowed_log_scale(first.depth_step) > limits.LEAST_LOG_SCALE
     why = "depth is stored in too large steps" if is_coarse else "too little parallax"
     if off + unit.uncertainty > MARGIN:
         return f"{found}: the 95 % interval reaches beyond {MARGIN:.0%}: {why}"
-    if off > max(unit.uncertainty, _LEAST_TOLERANCE):
+    if off > max(unit.uncertainty, limits.LEAST_TOLERANCE):
         return f"{found} fits best, but is not clearly better"
     return ""
 
@@ -272,11 +285,11 @@ def _kind_explains_scale(scenes: Sequence[SceneDiagnosis]) -> bool:
     first = scenes[0]
     if first.best != first.declared or not first.is_scaled:
         return False
-    if any(behind(scenes, rival).is_clear for rival in first.rivals if rival.question == "kind"):
+    if any(map(is_ruled_out, gains_of(scenes, "kind").values())):
         return False
     return all(
         abs(math.log(scene.other_kind_scale))
-        <= allowed_log_scale(scene.depth_step) + LEAST_ERRORS * min(scene.scale_error, 1.0)
+        <= allowed_log_scale(scene.depth_step) + limits.LEAST_ERRORS * min(scene.scale_error, 1.0)
         for scene in scenes
         if scene.other_kind_scale > 0
     )
@@ -364,7 +377,7 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
     unexplained = {camera for scene in scenes for camera in scene.check.unexplained}
     wrong = [answer for answer in answers if answer.status == "wrong"]
     explains = not (first.problem or unexplained) and all(
-        scene.check.agreement >= LEAST_SHARE for scene in scenes
+        scene.check.agreement >= limits.LEAST_SHARE for scene in scenes
     )
     is_measured = bool(quotient.found)
     pasted = _pasted(first, declared, unit_m=declared.unit_m)
@@ -456,7 +469,7 @@ def _fits(scene: SceneDiagnosis, leader: SceneDiagnosis) -> bool:
         # Problems of single cameras are the scene's own.
         return False
     error = allowed_log_scale(max(scene.depth_step, leader.depth_step))
-    error += LEAST_ERRORS * min(scene.scale_error, 1.0)
+    error += limits.LEAST_ERRORS * min(scene.scale_error, 1.0)
     if _is_changed(scene):
         units = (found.unit_m / found.scale for found in (scene, leader))
         same_unit = abs(math.log(next(units) / next(units))) <= error
@@ -464,7 +477,7 @@ def _fits(scene: SceneDiagnosis, leader: SceneDiagnosis) -> bool:
     if not _is_changed(leader):
         return True
     ruled_out = {
-        (rival.question, rival.answer) for rival in scene.rivals if rival.behind.is_clear()
+        (rival.question, rival.answer) for rival in scene.rivals if rival.lead_of_best.is_clear()
     }
     changed = leader.best.changes_from(leader.declared)
     if any((question, getattr(leader.best, question)) in ruled_out for question in changed):

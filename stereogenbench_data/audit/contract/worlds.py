@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from stereogenbench_data.audit.contract.matching import SceneFrames
+from stereogenbench_data.audit.contract.row_matches import SceneFrames
 from stereogenbench_data.audit.geometry.reprojection import MeasuredDepth, reproject
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.geometry.pose import CameraPoses
