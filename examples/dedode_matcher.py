@@ -15,7 +15,7 @@ import kornia
 import numpy as np
 import torch
 
-from stereogenbench_data.evaluation.metrics.matching import KEYPOINTS, RATIO, mutual_matches
+from stereogenbench_data.evaluation.metrics.keypoint_matches import KEYPOINTS, RATIO, mutual_matches
 from stereogenbench_data.evaluation.models.loading import Keypoints, load_file
 
 

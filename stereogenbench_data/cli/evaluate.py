@@ -30,6 +30,7 @@ from stereogenbench_data.schema.text import counted
 if TYPE_CHECKING:
     from stereogenbench_data.evaluation.protocol import EvaluationProtocol
     from stereogenbench_data.evaluation.tables import Scores, Table
+    from stereogenbench_data.index.table import SceneIndex
 
 
 _METRICS = "How metrics are computed"
@@ -95,6 +96,24 @@ class ProtocolOptions:
             device=self.device,
             weights=self.weights,
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroupOptions:
+    """What else scores are grouped by, and how many may be missing."""
+
+    by: Annotated[
+        list[str] | None,
+        option("Also score by map_name, focal_mm, ... May be repeated.", metavar="COLUMN"),
+    ] = None
+    allow_missing: Annotated[int, option("Most pairs without usable predictions.", min=0)] = 0
+
+    def columns(self, index: "SceneIndex", *first: str) -> list[str]:
+        """Return the columns, those named first included; refuse an unknown one before the work."""
+        columns = list(dict.fromkeys([*first, *(self.by or ())]))
+        for column in columns:
+            index.column(column)
+        return columns
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,11 +187,7 @@ def score(  # noqa: PLR0913 - one parameter an option
     name: Annotated[str | None, option("Name of the method [the folder's name].")] = None,
     chosen: ScoredOptions,
     scoring: ProtocolOptions,
-    by: Annotated[
-        list[str] | None,
-        option("Also score by map_name, focal_mm, ... May be repeated.", metavar="COLUMN"),
-    ] = None,
-    allow_missing: Annotated[int, option("Most pairs without a usable right view.", min=0)] = 0,
+    groups: GroupOptions,
     report: ReportOptions,
     work: WorkOptions,
 ) -> None:
@@ -192,8 +207,7 @@ def score(  # noqa: PLR0913 - one parameter an option
     called = name or predictions.resolve().name
     folder = report.out or Path("evaluation") / f"{called}-{tier}"
     index = source.open()
-    for column in by or ():
-        index.column(column)  # refuses an unknown one before the work
+    columns = groups.columns(index)
     with progress_bar("scoring", unit="frames") as progress:
         scores = evaluate(
             index,
@@ -203,11 +217,11 @@ def score(  # noqa: PLR0913 - one parameter an option
             protocol=protocol,
             out=folder / "partial",
             **work.options(device=scoring.device),
-            allow_missing=allow_missing,
+            allow_missing=groups.allow_missing,
             progress=progress,
             **selection,
         )
-    report.write(folder, [scores], tables_of([scores], by=by or ()))
+    report.write(folder, [scores], tables_of([scores], by=columns))
 
 
 @grouped
@@ -229,11 +243,7 @@ def disparity(  # noqa: PLR0913 - one parameter an option
         float | None,
         option("Leave out pixels whose true disparity is this or more.", metavar="PX"),
     ] = None,
-    by: Annotated[
-        list[str] | None,
-        option("Also score by focal_mm, character, ... May be repeated.", metavar="COLUMN"),
-    ] = None,
-    allow_missing: Annotated[int, option("Most pairs without usable maps.", min=0)] = 0,
+    groups: GroupOptions,
     report: ReportOptions,
     work: WorkOptions,
 ) -> None:
@@ -252,9 +262,7 @@ def disparity(  # noqa: PLR0913 - one parameter an option
     selection, called = chosen.selection(), predictions.resolve().name
     folder = report.out or Path("evaluation") / f"{called}-disparity"
     index = source.open()
-    columns = list(dict.fromkeys(["map_name", *(by or ())]))
-    for column in columns:
-        index.column(column)  # refuses an unknown one before the work
+    columns = groups.columns(index, "map_name")
     with progress_bar("scoring", unit="frames") as progress:
         scores = evaluate_disparity(
             index,
@@ -262,7 +270,7 @@ def disparity(  # noqa: PLR0913 - one parameter an option
             protocol=DisparityProtocol(size=size, max_disparity_px=max_disparity),
             out=folder / "partial",
             **work.options(),
-            allow_missing=allow_missing,
+            allow_missing=groups.allow_missing,
             progress=progress,
             **selection,
         )
@@ -281,8 +289,9 @@ def controls(
     """Score a perfect, a copied, a wrong and a random right view.
 
     The controls are the rendered target, the left view, the view of the next camera (02 for 01),
-    and the right view of another scene. The report shows the paper's own controls beside them. It
-    goes to --out [evaluation/controls]. To continue a stopped run, run it again.
+    and the right view of another scene. On the whole eval split the report shows the paper's own
+    controls beside them. It goes to --out [evaluation/controls]. To continue a stopped run, run
+    it again.
 
     Example: `stereogenbench eval controls shards/ --frames every:20`
     """

@@ -17,7 +17,11 @@ import torch
 from stereogenbench_data.datasets.mapped import Data
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import EvaluationError, PredictionError
-from stereogenbench_data.evaluation.disparity_maps import CalledMatcher, DisparityFolder, Matcher
+from stereogenbench_data.evaluation.disparity_maps import (
+    DisparityFolder,
+    Matcher,
+    accept_disparity,
+)
 from stereogenbench_data.evaluation.evaluate import (
     EvaluationOptions,
     Run,
@@ -36,7 +40,12 @@ from stereogenbench_data.evaluation.metrics.disparity import (
     REGIONS,
     frame_scores,
 )
-from stereogenbench_data.evaluation.predictions import PairFrames, PredictionSource, open_frames
+from stereogenbench_data.evaluation.predictions import (
+    CalledMethod,
+    PairFrames,
+    PredictionSource,
+    open_frames,
+)
 from stereogenbench_data.evaluation.protocol import DisparityProtocol
 from stereogenbench_data.evaluation.scene_scores import (
     RESIZE,
@@ -50,9 +59,9 @@ from stereogenbench_data.evaluation.tables import (
     PairMeans,
     Scores,
     Table,
-    TableForm,
     TableRow,
     cell,
+    forms_of,
     require_comparable,
     rows_of,
 )
@@ -101,7 +110,8 @@ def evaluate_disparity(
     protocol = protocol or DisparityProtocol()
     source: PredictionSource
     if callable(predictions):
-        source = CalledMatcher(called_name(predictions, name, options), predictions)
+        called = called_name(predictions, name, options)
+        source = CalledMethod(called, predictions, ("left", "right"), accept_disparity)
     else:
         root = prediction_root(predictions, "disparity maps")
         source = DisparityFolder(name or root.name, root, protocol.max_disparity_px)
@@ -242,18 +252,9 @@ def disparity_tables(
             index has no such column with one value a scene.
     """
     require_comparable(results)
-    branch = ("subset", "family")
-    has_others = any(not pair.is_primary for one in results for pair in one.pairs)
-    forms = {
-        "branches": TableForm("Evaluation branches, primary pairs", branch),
-        "bins_primary": TableForm("Baseline in cm, primary pairs", (*branch, "baseline")),
-    }
-    if has_others:
-        forms["bins_all"] = TableForm("Baseline in cm, all pairs", (*branch, "baseline"), "all")
-    forms |= {f"by_{each}": TableForm(f"By {each}, primary pairs", (*branch, each)) for each in by}
     tables = [
         _table(results, name, form.title, form.keys, _SHOWN, rows_of(results, form))
-        for name, form in forms.items()
+        for name, form in forms_of(results, by).items()
     ]
     regions = {"all": "", **{region: f"_{region}" for region in REGIONS}}
     ranges = {part: f"_{part}" for part in RANGES_PX}

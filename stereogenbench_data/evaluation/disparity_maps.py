@@ -34,7 +34,6 @@ from stereogenbench_data.evaluation.predictions import (
     Read,
     find_prediction,
     frame_name,
-    returned,
     stamp_prediction,
 )
 from stereogenbench_data.index.table import SceneIndex
@@ -106,43 +105,15 @@ class DisparityFolder:
             )
 
 
-@dataclass(frozen=True, slots=True)
-class CalledMatcher:
-    """A method that is called with batches of both views.
-
-    Attributes:
-        name: What tables call the method.
-        method: The callable.
-        inputs: The fields of a sample that it is given.
-    """
-
-    name: str
-    method: Matcher
-    inputs: tuple[str, ...] = ("left", "right")
-
-    def stamp(self, wanted: PairFrames) -> str:
-        """Return the name: a change of what a callable computes cannot be seen."""
-        return f"called {self.name}"
-
-    @contextmanager
-    def open(self, index: SceneIndex) -> Iterator[Read]:
-        """Yield a function that calls the method."""
-        yield self._read
-
-    def _read(self, wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
-        expected, where = (len(samples), *wanted.size), f"{wanted.label}: {self.name}"
-        maps = returned(
-            self.method, samples, self.inputs, where=where, expected=f"floats {expected}"
+def accept_disparity(returned: torch.Tensor, given: tuple[int, int, int]) -> torch.Tensor:
+    """Return disparity that a callable returned, as float64 (n, h, w)."""
+    maps = returned[:, 0] if returned.dim() == 4 and returned.shape[1] == 1 else returned
+    if maps.shape != given or not maps.is_floating_point():
+        raise ValueError(
+            f"{returned.dtype} {tuple(returned.shape)}; expected floats {given}, or with an axis "
+            f"of 1 after the first"
         )
-        if maps.dim() == 4 and maps.shape[1] == 1:
-            maps = maps[:, 0]
-        if maps.shape != expected or not maps.is_floating_point():
-            raise PredictionError(
-                f"{where} was given {len(samples)} frames and returned {maps.dtype} "
-                f"{tuple(maps.shape)}; expected floats {expected}, or with an axis of 1 after the "
-                f"first."
-            )
-        return list(maps.to(torch.float64).numpy())
+    return maps.to(torch.float64)
 
 
 def _file_of(folder: Path, frame: int, wanted: PairFrames) -> Path:

@@ -132,7 +132,8 @@ def evaluate(
     known = require_tier(tier)
     source: PredictionSource
     if callable(predictions):
-        source = CalledMethod(called_name(predictions, name, options), predictions, known)
+        called = called_name(predictions, name, options)
+        source = CalledMethod(called, predictions, known.inputs)
     else:
         root = prediction_root(predictions, "predicted right views")
         source = PredictionFolder(name or root.name, root)

@@ -31,7 +31,6 @@ from stereogenbench_data.errors import (
     cure_of,
     describe_os_error,
 )
-from stereogenbench_data.evaluation.protocol import Tier
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.video import VideoReader, probe, read_rgb
 from stereogenbench_data.samples.fields import Request, Sample
@@ -350,47 +349,41 @@ class PredictionFolder:
             yield read
 
 
-def returned(
-    method: Method, samples: Sequence[Sample], inputs: Sequence[str], *, where: str, expected: str
-) -> torch.Tensor:
-    """Return what a callable returns of a batch of some fields of samples, on the processor.
+Accept = Callable[[torch.Tensor, tuple[int, int, int]], torch.Tensor]
+"""Takes what a callable returned, and (n, h, w) of what it was given; returns n answers, or raises
+ValueError with what was found and what is expected."""
 
-    Raises:
-        PredictionError: If it is not one array.
-    """
-    given = method(
-        {
-            name: torch.from_numpy(np.stack([np.asarray(each[name]) for each in samples]))
-            for name in inputs
-        }
-    )
-    try:
-        return torch.as_tensor(given).detach().cpu()
-    except (RuntimeError, TypeError, ValueError) as error:
-        raise PredictionError(
-            f"{where} returned a {type(given).__name__} that is not one array ({error}); "
-            f"expected {expected}."
-        ) from error
+
+def accept_views(returned: torch.Tensor, given: tuple[int, int, int]) -> torch.Tensor:
+    """Return right views that a callable returned, as uint8."""
+    count, height, width = given
+    expected = f"uint8, or floats of 0 to 1, {(count, 3, height, width)}"
+    if returned.is_floating_point() and returned.numel():
+        low, high = float(returned.min()), float(returned.max())
+        if not (low >= 0 and high <= 1):
+            raise ValueError(f"floats of {low:g} to {high:g}; expected 0 to 1, or uint8")
+        precise = returned.to(torch.promote_types(returned.dtype, torch.float32))
+        returned = (precise * 255).round().to(torch.uint8)
+    if returned.shape != (count, 3, height, width) or returned.dtype != torch.uint8:
+        raise ValueError(f"{returned.dtype} {tuple(returned.shape)}; expected {expected}")
+    return returned
 
 
 @dataclass(frozen=True, slots=True)
 class CalledMethod:
-    """A method that is called with batches of its tier's inputs.
+    """A method that is called with batches of frames.
 
     Attributes:
         name: What tables call the method.
         method: The callable.
-        tier: What it is given.
+        inputs: Fields of a sample that it is given.
+        accept: Checks what it returns.
     """
 
     name: str
     method: Method
-    tier: Tier
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Fields of a sample that it needs."""
-        return self.tier.inputs
+    inputs: tuple[str, ...]
+    accept: Accept = accept_views
 
     def stamp(self, wanted: PairFrames) -> str:
         """Return the name: a change of what a callable computes cannot be seen."""
@@ -402,20 +395,22 @@ class CalledMethod:
         yield self._read
 
     def _read(self, wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
-        """Return the method's right views as uint8 pictures of the evaluated size."""
-        expected, where = (len(samples), 3, *wanted.size), f"{wanted.label}: {self.name}"
-        views = returned(self.method, samples, self.inputs, where=where, expected=f"{expected}")
-        if views.is_floating_point() and views.numel():
-            low, high = float(views.min()), float(views.max())
-            if not (low >= 0 and high <= 1):
-                raise PredictionError(
-                    f"{where} returned floats of {low:g} to {high:g}; expected 0 to 1, or uint8."
-                )
-            precise = views.to(torch.promote_types(views.dtype, torch.float32))
-            views = (precise * 255).round().to(torch.uint8)
-        if views.shape != expected or views.dtype != torch.uint8:
+        """Return what the method answers, frame by frame."""
+        given = {
+            name: torch.from_numpy(np.stack([np.asarray(each[name]) for each in samples]))
+            for name in self.inputs
+        }
+        answer = self.method(given)
+        where = f"{wanted.label}: {self.name}"
+        try:
+            tensor = torch.as_tensor(answer).detach().cpu()
+        except (RuntimeError, TypeError, ValueError) as error:
             raise PredictionError(
-                f"{where} was given {len(samples)} frames and returned {views.dtype} "
-                f"{tuple(views.shape)}; expected uint8, or floats of 0 to 1, {expected}."
-            )
-        return list(views.numpy())
+                f"{where} returned a {type(answer).__name__} that is not one array ({error})."
+            ) from error
+        try:
+            return list(self.accept(tensor, (len(samples), *wanted.size)).numpy())
+        except ValueError as error:
+            raise PredictionError(
+                f"{where} was given {len(samples)} frames and returned {error}."
+            ) from None

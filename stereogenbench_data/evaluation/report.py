@@ -39,7 +39,7 @@ _ARROWS: Final = {"higher": "↑", "lower": "↓", "neither": ""}
 _LATEX: Final = {
     "\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$",
     "{": r"\{", "}": r"\}", "±": r"$\pm$", "↑": r"$\uparrow$", "↓": r"$\downarrow$",
-    "∞": r"$\infty$", "†": r"$^\dagger$", "‡": r"$^\ddagger$", "≤": r"$\le$",
+    "∞": r"$\infty$", "≤": r"$\le$",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$", "|": "$|$",
     "[": "{[}", "*": "{*}",
 }  # fmt: skip
@@ -237,9 +237,9 @@ def markdown(table: Table) -> str:
 
 
 def latex(table: Table) -> str:
-    """Return a table in LaTeX, for the package booktabs; its caption has the notes."""
+    """Return a table in LaTeX, for the package booktabs; its notes stand in the page alone."""
     escapes = str.maketrans(_LATEX)
-    caption = " ".join([f"{table.title}.", *table.notes]).translate(escapes)
+    caption = f"{table.title}.".translate(escapes)
     head, *rows = (" & ".join(each.translate(escapes) for each in row) for row in _texts(table))
     left = "l" * (1 + len(table.keys))
     lines = [
@@ -338,15 +338,16 @@ def _cell_text(table: Table, values: Mapping[str, Value], column: str) -> str:
         case FrechetDistance(value=None, samples=samples):
             return f"{ABSENT} (N {min(samples)})"
         case FrechetDistance(value=distance, samples=samples, dim=dim, underdetermined=is_under):
-            compared, mark = ("≤", " !") if is_under else (">", "")
-            return f"{distance:.2f} (N {min(samples)} {compared} D {dim}){mark}"
+            compared, remark = ("≤", ": biased upwards") if is_under else (">", "")
+            return f"{distance:.2f} (N {min(samples)} {compared} D {dim}{remark})"
         case Cell() as found:
             remarks = _remarks(found, column, values)
             text = _number_text(found, column)
             return f"{text} ({', '.join(remarks)})" if remarks else text
         case printed:
             text = printed.replace("inf", "∞")
-            return f"{text} †" if column in COLUMNS and COLUMNS[column].backend else text
+            has_backend = column in COLUMNS and COLUMNS[column].backend
+            return f"{text} (by the paper's matcher)" if has_backend else text
 
 
 def _number_text(found: Cell, column: str) -> str:
@@ -354,7 +355,7 @@ def _number_text(found: Cell, column: str) -> str:
     digits = COLUMNS[column].digits
     text = "∞" if found.infinite and not found.undefined else ABSENT
     if found.mean is not None:
-        text = f"{found.mean:.{digits}f}{' ‡' if found.loose else ''}"
+        text = f"{found.mean:.{digits}f}"
         text += "" if found.ci95 is None else f" ± {found.ci95:.{digits}f}"
         text += f" [{found.median:.{digits}f}]" if column in HEAVY_TAILED else ""
     return text
@@ -372,7 +373,7 @@ def _remarks(found: Cell, column: str, values: Mapping[str, Value]) -> list[str]
         case Cell(mean=float(share)) if column in HEAVY_TAILED and share > 0:
             told.append(f"{share:.1%} beyond range")
     if column == "p_psnr" and (ceiling_db := exceeded_ceiling(values)) is not None:
-        told.append(f"above the target's {ceiling_db:.2f}")
+        told.append(f"above the target's {ceiling_db:.2f}, so not better")
     return told
 
 

@@ -20,7 +20,7 @@ from av.video.reformatter import VideoReformatter
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import EvaluationError, PredictionError
 from stereogenbench_data.evaluation.columns import EXPLAIN_A_FIT, LEARNED
-from stereogenbench_data.evaluation.metrics import matching, pixels, scale
+from stereogenbench_data.evaluation.metrics import keypoint_matches, pixels, scale
 from stereogenbench_data.evaluation.metrics.frechet import FeatureStatistics
 from stereogenbench_data.evaluation.models.loading import (
     KeypointMatcher,
@@ -158,9 +158,9 @@ class TargetFrame:
         return pixels.outside_window(self.sample["disparity"][0], self.sample["valid"][0])
 
     @cached_property
-    def matches(self) -> matching.TargetMatches:
+    def matches(self) -> keypoint_matches.TargetMatches:
         """The matches of left and rendered right view."""
-        return matching.target_matches(self.left, self.right, matcher=self.matcher)
+        return keypoint_matches.target_matches(self.left, self.right, matcher=self.matcher)
 
 
 def _p_psnr(picture: Any, target: TargetFrame, protocol: EvaluationProtocol) -> dict[str, float]:
@@ -174,7 +174,7 @@ def _p_psnr(picture: Any, target: TargetFrame, protocol: EvaluationProtocol) -> 
 
 
 def _e_match(picture: Any, target: TargetFrame, protocol: EvaluationProtocol) -> dict[str, float]:
-    return matching.match_error(picture, against=target.matches, matcher=target.matcher)
+    return keypoint_matches.match_error(picture, against=target.matches, matcher=target.matcher)
 
 
 def _sd(picture: Any, target: TargetFrame, protocol: EvaluationProtocol) -> dict[str, float]:
@@ -220,7 +220,8 @@ FRAME_METRIC_ROWS: Final[dict[str, FrameMetric]] = {
         lambda protocol: pixels.SSIM_SETTINGS,
     ),
     "e_match": FrameMetric(
-        _e_match, lambda protocol: matching.match_settings(model_of(protocol, "keypoint_matcher"))
+        _e_match,
+        lambda protocol: keypoint_matches.match_settings(model_of(protocol, "keypoint_matcher")),
     ),
     "p_psnr": FrameMetric(_p_psnr, lambda protocol: pixels.PATCH_SETTINGS, ("disparity", "valid")),
     "sd": FrameMetric(

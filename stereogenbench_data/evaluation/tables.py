@@ -22,7 +22,7 @@ from stereogenbench_data.audit.paper_numbers import PaperRow, PaperTable, paper_
 from stereogenbench_data.errors import EvaluationError, missing_extra
 from stereogenbench_data.evaluation.columns import COLUMNS, FRAME_METRICS
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
-from stereogenbench_data.evaluation.metrics.scale import LEAST_R2, SD_OF_THE_PAPER
+from stereogenbench_data.evaluation.metrics.scale import LEAST_R2
 from stereogenbench_data.evaluation.protocol import (
     PAPER_SIZE,
     DisparityProtocol,
@@ -297,6 +297,29 @@ SOURCES: Final[dict[PaperTable, str]] = {
 """Where each table of scores stands in the paper: its LaTeX label and what it is."""
 
 
+def paper_difference(
+    results: Sequence[Scores], protocol: EvaluationProtocol, *, scored: str = "some"
+) -> str:
+    """Return why the paper's rows cannot stand beside scores, empty if they can.
+
+    Args:
+        results: Each method's scores.
+        protocol: How they were scored.
+        scored: As for `release_difference`.
+    """
+    pairs = [pair for one in results for pair in one.pairs if not pair.problem]
+    differs = release_difference(results[0].index, {pair.row for pair in pairs}, scored=scored)
+    if differs:
+        return f"these scores are of {differs}"
+    frames, (height, width) = {pair.frames for pair in pairs}, protocol.size
+    if (height, width) == PAPER_SIZE and frames <= {FRAME_COUNT}:
+        return ""
+    return (
+        f"it scores {FRAME_COUNT} frames a scene at {PAPER_SIZE[1]}x{PAPER_SIZE[0]}, this "
+        f"{', '.join(map(str, sorted(frames)))} at {width}x{height}"
+    )
+
+
 def release_difference(index: SceneIndex, rows: Collection[int], *, scored: str = "some") -> str:
     """Return how scored scenes differ from those that the paper scored, empty if they do not.
 
@@ -420,14 +443,20 @@ def tables_of(results: Sequence[Scores], *, by: Sequence[str] = ()) -> list[Tabl
             if the index has no such column with one value a scene.
     """
     require_comparable(results)
-    has_others = any(not pair.is_primary for one in results for pair in one.pairs)
-    names = ["branches", "bins_primary", *(["bins_all"] if has_others else [])]
-    forms = {each: TableForm(f"By {each}, primary pairs", (*_BRANCH, each)) for each in by}
+    forms = forms_of(results, by)
     return [
-        *(table_of(results, name) for name in names),
-        *(table_of(results, f"by_{column}", form=form) for column, form in forms.items()),
+        *(table_of(results, name, form=form) for name, form in forms.items()),
         table_of(results, "explanations"),
     ]
+
+
+def forms_of(results: Sequence[Scores], by: Sequence[str]) -> dict[str, TableForm]:
+    """Return the forms of tables by branch, by baseline and by columns of the index, by name."""
+    has_others = any(not pair.is_primary for one in results for pair in one.pairs)
+    names = ["branches", "bins_primary", *(["bins_all"] if has_others else [])]
+    by_column = {f"by_{each}": TableForm(f"By {each}, primary pairs", (*_BRANCH, each))
+                 for each in by}  # fmt: skip
+    return {name: TABLES[name] for name in names} | by_column
 
 
 def table_of(results: Sequence[Scores], name: str, *, form: TableForm | None = None) -> Table:
@@ -442,10 +471,9 @@ def table_of(results: Sequence[Scores], name: str, *, form: TableForm | None = N
     protocol = first.protocol
     if isinstance(protocol, DisparityProtocol):
         raise EvaluationError("scores of disparity have tables of their own: `disparity_tables`.")
-    scored_rows = {pair.row for one in results for pair in one.pairs if not pair.problem}
     scored = "all" if name == "controls" else "some"
-    differs = release_difference(first.index, scored_rows, scored=scored) if form.paper else ""
-    rows = rows_of(results, form, differs=differs)
+    differs = paper_difference(results, protocol, scored=scored) if form.paper else ""
+    rows = rows_of(results, form._replace(paper=()) if differs else form)
     explains = name == "explanations"
     columns = [each for each in protocol.columns if (COLUMNS[each].better == "neither") == explains]
     if name == "branches":
@@ -460,11 +488,20 @@ def table_of(results: Sequence[Scores], name: str, *, form: TableForm | None = N
         protocol=protocol,
         columns=tuple(columns),
         rows=tuple(rows),
-        notes=tuple(_notes(protocol, results, rows, columns, form=form, differs=differs)),
+        notes=_notes(form, rows, differs=differs),
     )
 
 
-def rows_of(results: Sequence[Scores], form: TableForm, *, differs: str = "") -> list[TableRow]:
+def _notes(form: TableForm, rows: Sequence[TableRow], *, differs: str) -> tuple[str, ...]:
+    """Return where the rows of the paper stand there, or why they are left out."""
+    if differs:
+        return (f"The paper's rows are left out: {differs}.",)
+    if not any(row.source == "paper" for row in rows):
+        return ()
+    return (f"Rows of the paper as printed: {'; '.join(SOURCES[each] for each in form.paper)}.",)
+
+
+def rows_of(results: Sequence[Scores], form: TableForm) -> list[TableRow]:
     """Return the rows of groups in the order of tables: every method's, then the paper's."""
     label_of = [_labels_by(key, results) for key in form.keys]
     groups_of = [
@@ -481,7 +518,7 @@ def rows_of(results: Sequence[Scores], form: TableForm, *, differs: str = "") ->
     ):
         where = dict(zip(form.keys, labels, strict=True)) | {"tier": results[0].tier}
         paper = [
-            _paper_row(row, labels, differs=differs)
+            _paper_row(row, labels)
             for name in form.paper
             for row in paper_table(name)
             if all(where.get(key, value) == value for key, value in row.items())
@@ -535,7 +572,7 @@ def _row(one: Scores, labels: Labels, pairs: Sequence[PairMeans]) -> TableRow:
     )
 
 
-def _paper_row(row: PaperRow, labels: Labels, *, differs: str) -> TableRow:
+def _paper_row(row: PaperRow, labels: Labels) -> TableRow:
     """Return a row of one of the paper's tables, its numbers as printed."""
     printed = {}
     for name in (*FRAME_METRICS, "fid", "fvd"):
@@ -545,7 +582,7 @@ def _paper_row(row: PaperRow, labels: Labels, *, differs: str) -> TableRow:
             printed[headline] = f"{value} ± {interval}" if interval else value
     return TableRow(
         source="paper",
-        method=f"{row.get('method') or row['control']} (paper{', other scenes' * bool(differs)})",
+        method=f"{row.get('method') or row['control']} (paper)",
         labels=labels,
         scenes=int(row["n_scenes"]) if "n_scenes" in row else None,
         frames=int(row["n_frames"]) if "n_frames" in row else None,
@@ -560,74 +597,3 @@ def exceeded_ceiling(values: Mapping[str, Value]) -> float | None:
         case Cell(mean=float(own_db)), Cell(mean=float(ceiling_db)) if own_db > ceiling_db:
             return ceiling_db
     return None
-
-
-def _notes_of_odd_cells(rows: Sequence[TableRow], columns: Sequence[str]) -> list[str]:
-    """Return what to know of cells that are not to be read as the others."""
-    notes = []
-    cells = [row.values.get(column) for row in rows for column in columns]
-    if any(isinstance(each, Cell) and each.loose for each in cells):
-        notes.append(
-            f"‡ In so many frames the line explains less than {LEAST_R2:.0%} of the true "
-            f"disparity's variance (R2 below {LEAST_R2:g}), as for a repeated left view or an "
-            f"unlike picture. Its slope, and so SD, may then be any number."
-        )
-    if "p_psnr" in columns and any(exceeded_ceiling(row.values) is not None for row in rows):
-        notes.append(
-            "P-PSNR asks how well patches of the left view are found again. A view that repeats "
-            "the left one has more of it than the rendered target: above the target's is not "
-            "better."
-        )
-    return notes
-
-
-def _notes(
-    protocol: EvaluationProtocol,
-    results: Sequence[Scores],
-    rows: Sequence[TableRow],
-    columns: Sequence[str],
-    *,
-    form: TableForm,
-    differs: str,
-) -> list[str]:
-    """Return the notes of a table: its sources, and what is not comparable."""
-    of_frames = [each for each in columns if each in COLUMNS]
-    paper = [row for row in rows if row.source == "paper"]
-    notes = []
-    if any(column.startswith("sd_filtered") for column in of_frames):
-        notes.append(f"SD: {SD_OF_THE_PAPER}.")
-    if paper and differs:
-        notes.append(
-            f"NOT COMPARABLE WITH THE PAPER: these scores are not of the release's evaluation "
-            f"scenes, but of {differs}. Its rows are of other pictures: nothing here is better or "
-            f"worse than they."
-        )
-    if paper:
-        sources = "; ".join(SOURCES[each] for each in form.paper)
-        notes.append(f"Rows of the paper as printed: {sources}.")
-    others = [
-        protocol.label(column)
-        for column in of_frames
-        if any(column in row.values for row in paper) and COLUMNS[column].backend
-    ]
-    if others:
-        notes.append(
-            f"† The paper measures this by its own build of DeDoDe (E_match) or FoundationStereo "
-            f"(SD). That what the head of the column names ({', '.join(others)}) answers as that "
-            f"does is not known: not comparable."
-        )
-    notes += _notes_of_odd_cells(rows, columns)
-    frames = {pair.frames for one in results for pair in one.pairs if not pair.problem}
-    if paper and (protocol.size != PAPER_SIZE or frames - {FRAME_COUNT}):
-        (height, width), ours = protocol.size, ", ".join(map(str, sorted(frames)))
-        notes.append(
-            f"The paper scores {FRAME_COUNT} frames a scene at {PAPER_SIZE[1]}x{PAPER_SIZE[0]}, "
-            f"this {ours} at {width}x{height}: not comparable."
-        )
-    found = [row.values.get(each) for row in rows for each in columns]
-    if any(isinstance(each, FrechetDistance) and each.underdetermined for each in found):
-        notes.append(
-            "! No more samples than dimensions: the distance is biased upwards, and more so the "
-            "fewer samples there are."
-        )
-    return notes

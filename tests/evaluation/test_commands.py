@@ -23,7 +23,7 @@ def test_predictions_are_scored_and_reported(scenes, other_views, tmp_path):
 
     assert shown.exit_code == 0, shown.output
     assert "# next camera, tier G1: calibrated target camera" in shown.stdout
-    assert "StereoSpace (paper, other scenes) | seen_map | Uniform" in shown.stdout
+    assert "The paper's rows are left out: " in shown.stdout
     assert "By map_name" in shown.stdout
     assert {path.name for path in out.iterdir()} == {
         "results.json", "report.md", "tables.tex", "pairs.csv", "plots", "partial",
@@ -84,8 +84,8 @@ def test_inputs_are_exported(scenes, tmp_path):
     assert len(list((tmp_path / "in").glob("*/left/*.png"))) == 6
 
 
-def test_controls_stand_beside_the_papers(scenes, tmp_path):
+def test_controls_are_scored_by_name(scenes, tmp_path):
     shown = run("eval", "controls", scenes, "--frames", "first", "--out", tmp_path, *SMALL)
 
     assert shown.exit_code == 0, shown.output
-    assert "rendered target (paper, other scenes)" in shown.stdout
+    assert "| rendered target | " in shown.stdout

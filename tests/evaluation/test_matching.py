@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from stereogenbench_data.evaluation.metrics.matching import (
+from stereogenbench_data.evaluation.metrics.keypoint_matches import (
     match_error,
     mutual_matches,
     target_matches,

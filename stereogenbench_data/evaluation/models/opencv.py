@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from stereogenbench_data.errors import EvaluationError, missing_extra
-from stereogenbench_data.evaluation.metrics.matching import KEYPOINTS, RATIO, mutual_matches
+from stereogenbench_data.evaluation.metrics.keypoint_matches import KEYPOINTS, RATIO, mutual_matches
 from stereogenbench_data.evaluation.models.loading import Keypoints, Picture, Settings
 
 _DESCRIPTOR_DIM: Final = 128
