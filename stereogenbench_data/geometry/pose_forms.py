@@ -1,16 +1,18 @@
 """How a trajectory's numbers may be read as poses: one list of forms.
 
-A file names its form by keys (``pitch``, ``qw``, ``world_to_camera``) and by texts
-(``rotation_representation``). That is a hint: `readings` yields what fits the hints first, then the
-others, and `index.evidence` keeps those that the rig's geometry confirms. All become poses in
-Unreal's axes: left-handed, x forward, y right, z up; a right-handed world is mirrored as a whole,
-cameras with it, so that no picture is.
+A file of conventions may state any of them. Where none is stated, `readings` yields those that are
+settled: rotators in degrees, quaternions and matrices on Unreal's axes, or on those that the file
+itself names. Its keys and texts (``rotation_representation``) are a hint: what fits them comes
+first, and `index.evidence` keeps what the rig's geometry confirms. All become poses in Unreal's
+axes: left-handed, x forward, y right, z up; a right-handed world is mirrored as a whole, cameras
+with it, so that no picture is.
 """
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from operator import itemgetter
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -23,9 +25,10 @@ from stereogenbench_data.geometry.pose import (
     rotation_from_rotator_deg,
 )
 from stereogenbench_data.schema.declaration import PosesAt
-from stereogenbench_data.schema.pose_search import RecordedPoses
+from stereogenbench_data.schema.places import place_at
+from stereogenbench_data.schema.pose_search import RecordedPoses, places_in
 from stereogenbench_data.schema.text import shortened
-from stereogenbench_data.schema.trajectory import Block, read_block
+from stereogenbench_data.schema.trajectory import Block, named, read_block, shown_key
 from stereogenbench_data.schema.units import UNITS_M
 
 TOLERANCE: Final = 1e-3
@@ -43,6 +46,11 @@ _NO_POSE: Final = {
     "scale", "scale3d", "velocity", "forward", "up", "right", "target", "lookat", "color",
     "relative", "local", "character", "subject", "intrinsics", "intrinsic", "k", "look", "focus",
 }  # fmt: skip
+_FROM_WORLD: Final = (
+    "w2c", "world_to_cam", "world2cam", "cam_from_world", "camera_from_world", "extrinsic",
+    "view_matrix",
+)  # fmt: skip
+_ORDERS: Final = frozenset({"xyzw", "wxyz", "pitchyawroll", "rollpitchyaw", "pyr", "rpy"})
 
 AXES: Final[dict[str, tuple[tuple[int, int], ...]]] = {
     "unreal": ((0, 1), (1, 1), (2, 1)),
@@ -52,23 +60,7 @@ AXES: Final[dict[str, tuple[tuple[int, int], ...]]] = {
     "pytorch3d": ((2, 1), (0, -1), (1, 1)),
 }
 """Of which columns of a camera's rotation, with which sign, are forward, right and up. Blender's
-cameras are those of OpenGL. PyTorch3D's are OpenCV's upside down, with left and right exchanged: so
-these are tried only where a file names them."""
-
-_ALIASES: Final = {
-    "gltf": "opengl",
-    "blender": "opengl", "gl": "opengl", "nerf": "opengl", "cv": "opencv", "colmap": "opencv",
-    "ue": "unreal", "ue4": "unreal", "ue5": "unreal", "rotator": "unreal",
-}  # fmt: skip
-_FROM_CAMERA: Final = (
-    "c2w", "camera_to_world", "cam_to_world", "world_from_cam", "cam2world", "camera2world",
-    "matrix_world", "world_from_camera",
-)  # fmt: skip
-_FROM_WORLD: Final = (
-    "w2c", "world_to_camera", "world_to_cam", "cam_from_world", "world2cam", "world2camera",
-    "extrinsic", "camera_from_world", "view_matrix", "colmap",
-    "tvec", "rvec", "qvec",
-)  # fmt: skip
+cameras are those of OpenGL. PyTorch3D's are OpenCV's upside down, with left and right exchanged."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,54 +69,69 @@ class Reading:
 
     Attributes:
         name: What the form is, for people and for the index.
-        tier: 0 if it is what the file names, 1 if it fits what it names, 2 for the other forms;
-            3 more for axes that it does not name.
-        is_named: Whether the file names the camera's axes; pitch, yaw and roll are Unreal's words.
+        tier: 0 if it is what the file names, 1 if it fits what it names, 2 for the other forms.
         poses: The poses, with the unit that the file states, else nan metres.
         at: Where they stand and their form.
     """
 
     name: str
     tier: int
-    is_named: bool
     poses: CameraPoses
     at: PosesAt
 
 
-def readings(recorded: RecordedPoses, *, only: str | None = None) -> Iterator[Reading]:
+def readings(
+    recorded: RecordedPoses,
+    *,
+    forms: Literal["settled", "all"] = "settled",
+    axes: Collection[str] = (),
+) -> Iterator[Reading]:
     """Yield the readings of recorded numbers, those that the file names first.
 
     Args:
         recorded: The numbers.
-        only: The name of the one reading that is wanted.
+        forms: Those that are settled, or all that a file of conventions may state.
+        axes: The axes of cameras that may be; () for those that the file names, else Unreal's.
     """
-    hints = _hints(recorded)
-    named_axes = hints & {*AXES}
+    own = axes or sorted(recorded.hints & {*AXES}) or ["unreal"]
     blocks = [block for block in recorded.blocks if not block.words & _NO_POSE]
-    places = [b for b in blocks if b.values.shape[2:] == (3,)
-              and b.components not in (_ROTATOR, ("rx", "ry", "rz"))
+    places = [b for b in blocks if _is_place(b)
               and (b.words & _LOCATION or (b.components and not b.words & _ROTATION))]  # fmt: skip
-    forms = []
-    for turn, axes in itertools.product(blocks, AXES):
-        if axes == "pytorch3d" and axes not in hints:
-            continue
-        has_place = turn.values.shape[2:] in ((4, 4), (16,), (3, 4), (12,))
-        for kind, place in itertools.product(_kinds(turn), [None] if has_place else places):
-            if place is not turn:
-                forms.append((_tier(turn, kind.split(), axes, hints), turn, place, kind, axes))
-    for tier, turn, place, kind, axes in sorted(forms, key=lambda form: form[0]):
-        where = turn.key if place is None else f"{place.key} and {turn.key}"
-        name, unit = f"{where}: {kind}, {axes} axes", (place or turn).unit
-        unit_m = np.nan if recorded.unit_m is None else recorded.unit_m
-        if unit in UNITS_M:
-            name, unit_m = f"{name}, {unit}", UNITS_M[unit]
-        if only is None or name == only:
-            poses = _read(turn, place, kind.split(), axes, unit_m)
-            if poses is not None:
-                own_axes = named_axes or ({"unreal"} if turn.components == _ROTATOR else ())
-                location = None if place is None else place.at.rotation
-                at = replace(turn.at, location=location, form=kind, axes=axes)
-                yield Reading(name, tier, axes in own_axes, poses, at)
+    has_rotators = any(block.components == _ROTATOR for block in blocks)
+    found = []
+    for turn in blocks:
+        is_rotator = turn.components == _ROTATOR
+        for kind, each in itertools.product(
+            _kinds(turn), ["unreal"] if is_rotator and not axes else own
+        ):
+            said = recorded.hints | turn.words
+            if forms == "all" or _is_settled(kind.split(), turn.unit, said):
+                tier = _tier(turn, kind.split(), said)
+                tier = max(tier, 1) if has_rotators and not is_rotator else tier
+                of_turn = [None] if _holds_places(turn) else places
+                found += [(tier, turn, place, kind, each) for place in of_turn if place is not turn]
+    for tier, turn, place, kind, each in sorted(found, key=itemgetter(0)):
+        stated = UNITS_M.get((place or turn).unit, recorded.unit_m)
+        poses = _read(turn, place, kind.split(), each, np.nan if stated is None else stated)
+        if poses is not None:
+            location = None if place is None else place.at.rotation
+            at = replace(turn.at, location=location, form=kind, axes=each)
+            yield Reading(_name(turn, place, kind, each), tier, poses, at)
+
+
+def _name(turn: Block, place: Block | None, kind: str, axes: str) -> str:
+    where = turn.key if place is None else f"{place.key} and {turn.key}"
+    unit = (place or turn).unit
+    return f"{where}: {kind}, {axes} axes" + (f", {unit}" if unit in UNITS_M else "")
+
+
+def _is_place(block: Block) -> bool:
+    named_turns = (_ROTATOR, ("rx", "ry", "rz"))
+    return block.values.shape[2:] == (3,) and block.components not in named_turns
+
+
+def _holds_places(block: Block) -> bool:
+    return block.values.shape[2:] in ((4, 4), (16,), (3, 4), (12,))
 
 
 def poses_at(document: dict[str, Any], at: PosesAt, *, where: str) -> tuple[str, CameraPoses]:
@@ -156,10 +163,34 @@ def poses_at(document: dict[str, Any], at: PosesAt, *, where: str) -> tuple[str,
             f"{where}: {at.rotation} has numbers that are no rotations of the form {form!r}. "
             f"Correct [poses]."
         )
-    where_read = turn.key if place is None else f"{place.key} and {turn.key}"
-    unit = (place or turn).unit
-    name = f"{where_read}: {kind}, {at.axes} axes" + (f", {unit}" if unit in UNITS_M else "")
-    return name, poses
+    return _name(turn, place, kind, at.axes), poses
+
+
+def poses_named(document: dict[str, Any], name: str, *, where: str) -> CameraPoses:
+    """Return the poses of a ``trajectory.json`` by the name of a reading, as an index has it.
+
+    Raises:
+        SchemaError: If the file has no poses of this name.
+    """
+    at = PosesAt.of_reading(name)
+    found = [
+        read_block(document, each, str(each.rotation), where=where)
+        for each in places_in(document)
+        if shown_key(named(place_at(str(each.rotation)))[0]) in (at.location, at.rotation)
+    ]
+    turns = [block for block in found if block.key == at.rotation and at.form in _kinds(block)]
+    places = [block for block in found if block.key == at.location and _is_place(block)]
+    for turn, place in itertools.product(turns, places if at.location else [None]):
+        unit_m = np.nan if at.unit is None else UNITS_M[at.unit]
+        poses = None if place is turn or at.axes not in AXES else _read(
+            turn, place, str(at.form).split(), at.axes, unit_m
+        )  # fmt: skip
+        if poses is not None:
+            return poses
+    raise SchemaError(
+        f"{where}: has no poses of the form {shortened(name, 200)}. Run `stereogenbench index` "
+        f"again."
+    )
 
 
 def _short(kind: str) -> str:
@@ -256,14 +287,6 @@ _ANGLES: Final = {
 }  # fmt: skip
 
 
-def _hints(recorded: RecordedPoses) -> frozenset[str]:
-    found = recorded.hints | {_ALIASES[hint] for hint in recorded.hints if hint in _ALIASES}
-    is_of_rotators = any(block.components == _ROTATOR for block in recorded.blocks)
-    if is_of_rotators and any("right_hand" in hint for hint in found):
-        return (found | {"ros"}) - {"unreal"}  # as Unreal's, with y to the left
-    return found
-
-
 _KINDS: Final = (
     "rotator pitch yaw roll", "rotator roll pitch yaw", "euler x y z", "vector",
     "quaternion xyzw", "quaternion wxyz", "matrix c2w columns", "matrix c2w rows",
@@ -293,52 +316,22 @@ def _kinds(block: Block) -> list[str]:
     return kinds
 
 
-def _tier(block: Block, kind: list[str], axes: str, hints: frozenset[str]) -> int:
-    """Return 0 for what the file names, 1 for what fits what it names, 2 for other forms.
+def _is_settled(kind: list[str], unit: str, said: Collection[str]) -> bool:
+    """Return whether a form may be settled on; others are for files of conventions to state."""
+    if kind[0] == "rotator":
+        is_rad = unit.startswith("rad") or any(word.startswith("rad") for word in said)
+        return ("rad" in kind) == is_rad
+    return kind[0] == "matrix" or (kind[0] == "quaternion" and "w2c" not in kind)
 
-    Other axes than the file names come after all of these. Where it names none, Unreal's come first
-    in forms that fit, and all else is of one rank: what is not named must be the only one to pass.
-    """
-    said = hints | block.words
+
+def _tier(block: Block, kind: list[str], said: frozenset[str]) -> int:
+    """Return 0 for what the file names, 1 for what fits what it names, 2 for other forms."""
     text = "_".join(("", *(key for key in block.name if key != "*"), *sorted(said)))
-    is_from_camera = any(f"_{word}" in text for word in _FROM_CAMERA)
-    is_from_world = not is_from_camera and any(f"_{word}" in text for word in _FROM_WORLD)
-    is_vector = kind[0] == "vector" and not block.unit.startswith("deg")
-    is_rad = is_vector or block.unit.startswith("rad") or any(w.startswith("rad") for w in said)
-    fits = is_from_world == ("w2c" in kind) and (
-        kind[0] not in _ANGLES or ("rad" in kind) == is_rad
-    )
-    named_kinds = {each for each, names in _KIND_WORDS.items() if names & hints}
-    tier = _form_tier(block, kind, said) if fits else 2
-    if tier == 0 and named_kinds and kind[0] not in named_kinds:
-        tier = 1
-    named_axes = {*AXES} & hints
-    if named_axes:
-        is_denied = not fits and (is_from_camera or is_from_world)  # what it names is wrong, then
-        return tier if axes in named_axes or is_denied else tier + 3
-    return tier if axes == "unreal" else 2
-
-
-def _form_tier(block: Block, kind: list[str], said: frozenset[str]) -> int:
-    """Return whether a file names a form by its components, its order, or the word for it."""
-    said_orders = _ORDERS & said or ({"wxyz"} if said & {"qvec", "colmap"} else set())
+    if any(f"_{word}" in text for word in _FROM_WORLD) != ("w2c" in kind):
+        return 2
     if kind[0] == "matrix":
         return 2 if kind[2] == "rows" else 0
-    if block.components in (_ROTATOR, ("qx", "qy", "qz", "qw")):
+    if block.components:
         return 0
-    if kind[0] == "quaternion":
-        return 0 if block.components or kind[1] in said_orders else 2 if said_orders else 1
-    if kind[0] == "vector":
-        return 0 if _KIND_WORDS["vector"] & said else 2
-    own = {"".join(kind[1:4]), "".join(name[0] for name in kind[1:4])}
-    return 0 if said_orders & own else 2 if said_orders or kind[0] == "euler" else 1
-
-
-_ORDERS: Final = frozenset({"xyzw", "wxyz", "pitchyawroll", "rollpitchyaw", "pyr", "rpy", "xyz"})
-_KIND_WORDS: Final = {
-    "quaternion": {"quaternion", "quaternions", "quat"},
-    "matrix": {"matrix", "matrices"},
-    "rotator": {"rotator", "rotators", "euler"},
-    "euler": {"euler"},
-    "vector": {"rodrigues", "rotvec", "rvec", "vector", "axisangle"},
-}
+    own = {"".join(kind[1:4]), kind[1], "".join(name[0] for name in kind[1:4])}
+    return 0 if _ORDERS & said & own else 2 if _ORDERS & said else 1

@@ -3,7 +3,7 @@
 Distances between the cameras must be the recorded baselines in every frame, the cameras must stand
 side by side along the axis that points to their right, and the primary pair's left camera must be
 on the left. Evidence rejects, it does not choose: the form that the file names stays if it passes.
-Where none is named, or it fails, the other forms are tried; where several pass and differ, the
+Where it fails, the other forms that are settled are tried; where several pass and differ, the
 fields on which they differ are refused. Pictures tell more: see `audit.contract.worlds`.
 
 `settled_poses` may search, and ends in a `PosesAt` with every place; `declared_poses` and
@@ -12,26 +12,20 @@ fields on which they differ are refused. Pictures tell more: see `audit.contract
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from stereogenbench_data.errors import GeometryError, SchemaError
 from stereogenbench_data.geometry.camera import recorded_intrinsics
 from stereogenbench_data.geometry.pose import OPENCV_FROM_UNREAL, CameraPoses
-from stereogenbench_data.geometry.pose_forms import Reading, poses_at, readings
+from stereogenbench_data.geometry.pose_forms import AXES, Reading, poses_at, poses_named, readings
 from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
 from stereogenbench_data.schema.conventions import declaration_of
-from stereogenbench_data.schema.declaration import BUILT_IN_POSES, PosesAt
-from stereogenbench_data.schema.pose_search import (
-    RecordedPoses,
-    recorded_at,
-    recorded_in,
-    stands,
-)
+from stereogenbench_data.schema.declaration import PosesAt
+from stereogenbench_data.schema.pose_search import RecordedPoses, recorded_in
 from stereogenbench_data.schema.records import Rig, Scene
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from stereogenbench_data.schema.text import shortened
@@ -75,18 +69,14 @@ class Understood:
         poses: The poses.
         names: The readings that pass and move the cameras differently in the world, the one that
             was taken first.
-        is_named: Whether the file itself names that one.
         at: Where they stand and in which form.
-        unread: The keys of other numbers of six cameras.
-        form: What the index keeps of it, for `poses_as`: None for the first form that the file
+        form: What the index keeps of it, for `poses_of`: None for the first form that the file
             itself names, if it is the only one to pass.
     """
 
     poses: CameraPoses
     names: tuple[str, ...]
-    is_named: bool
     at: PosesAt
-    unread: tuple[str, ...]
     form: str | None
 
     @property
@@ -95,55 +85,51 @@ class Understood:
         return self.at.first or 0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Passed:
-    """A reading that fits a rig, and how far the rig is from its x axis, as a sine."""
-
-    reading: Reading
-    poses: CameraPoses
-    off: float
-    lateral_m: np.ndarray
-
-
 def settled_poses(text: bytes, rig: Rig, *, where: str, named: PosesAt | None = None) -> Understood:
     """Return the poses of a ``trajectory.json`` that fit a rig, and where they stand in which form.
-
-    Poses are looked for where the release's layout has them, and elsewhere where they do not stand
-    there or do not fit.
 
     Args:
         text: The file's bytes.
         rig: The rig of the scene.
         where: The file's path, for messages.
-        named: How conventions read them, which must pass; a form that the file itself names and
-            that passes, too, may not contradict it.
+        named: How conventions read them; what it leaves open is settled.
 
     Raises:
         SchemaError: If no reading of its numbers passes, or several pass and disagree about where
-            the cameras stand to each other, or not as conventions say; it says what was tried.
+            the cameras stand to each other; it says what was tried.
         SidesError: If its own form fits but for the side of the primary pair's left camera or one
             factor of all baselines.
     """
     document = parse_trajectory(text, where=where)
-    if named is not None:
-        return _as_named(document, named, rig, where=where)
-    if stands(document, BUILT_IN_POSES):
-        recorded = recorded_at(document, BUILT_IN_POSES, where=where)
-        try:
-            return _numbered(document, _fitting(recorded, readings(recorded), rig, where=where))
-        except SchemaError:
-            found = recorded_in(document, where=where)
-            if len(found.blocks) <= len(recorded.blocks):
-                raise
-            recorded = found
-    else:
-        recorded = recorded_in(document, where=where)
-    return _numbered(document, _fitting(recorded, readings(recorded), rig, where=where))
+    odd: tuple[str, ...] = ()
+    try:
+        if named is not None and named.is_settled:
+            name, poses = poses_at(document, named, where=where)
+            found = iter([Reading(name, 0, poses, named)])
+        else:
+            recorded = recorded_in(document, where=where)
+            odd = recorded.odd
+            found = readings(recorded) if named is None else _readings_as(recorded, named)
+        settled = _fitting(found, rig, where=where)
+    except SchemaError as error:
+        if named is not None:
+            reason = str(error).rstrip(".?")
+            raise SchemaError(f"{reason}. Correct [poses], or leave it out.") from error
+        if isinstance(error, SidesError) or not odd:
+            raise
+        raise SchemaError(f"{where}: {odd[0]}.") from error
+    first = first_frame(document, settled.at)
+    form = settled.form if named is None else "|".join(settled.names)
+    return replace(settled, at=replace(settled.at, first=first), form=form)
 
 
-def _numbered(document: dict[str, Any], found: Understood) -> Understood:
-    """Return poses with the number of their first frame."""
-    return replace(found, at=replace(found.at, first=first_frame(document, found.at)))
+def _readings_as(recorded: RecordedPoses, named: PosesAt) -> Iterator[Reading]:
+    """Yield the readings that conventions name, in the unit that they name."""
+    axes = [named.axes] if named.axes in AXES else ()
+    for reading in readings(recorded, forms="all" if named.form else "settled", axes=axes):
+        if named.fits(reading.name):
+            unit_m = reading.poses.unit_m if named.unit is None else UNITS_M[named.unit]
+            yield replace(reading, tier=0, poses=replace(reading.poses, unit_m=unit_m))
 
 
 def declared_poses(text: bytes, rig: Rig, *, where: str, settled: Understood) -> Understood:
@@ -154,118 +140,62 @@ def declared_poses(text: bytes, rig: Rig, *, where: str, settled: Understood) ->
     """
     document = parse_trajectory(text, where=where)
     name, poses = poses_at(document, settled.at, where=where)
-    reading = Reading(name, 0, settled.is_named, poses, settled.at)
-    found = _fitting(None, [reading], rig, where=where)
+    found = _fitting([Reading(name, 0, poses, settled.at)], rig, where=where)
     return replace(settled, poses=found.poses)
 
 
-def _as_named(document: dict[str, Any], named: PosesAt, rig: Rig, *, where: str) -> Understood:
-    """Return the poses of a document as conventions read them; `settled_poses` says more."""
-    if named.is_settled:
-        name, poses = poses_at(document, named, where=where)
-        found = _fitting(None, [Reading(name, 0, True, poses, named)], rig, where=where)  # noqa: FBT003
-        return _numbered(document, replace(found, form="|".join(found.names)))
-    recorded = recorded_in(document, where=where)
-    found_as, own, reason = None, None, ""
-    try:
-        found_as = _fitting(recorded, _readings_as(recorded, named), rig, where=where)
-    except SchemaError as error:
-        reason = str(error).removeprefix(f"{where}: ").rstrip(".?")
-    with suppress(SchemaError):
-        own = _fitting(recorded, readings(recorded), rig, where=where)
-    own_poses = own.poses if own is not None and own.is_named else None
-    if found_as is not None and (own_poses is None or same_poses(found_as.poses, own_poses)):
-        return _numbered(document, replace(found_as, form="|".join(found_as.names)))
-    reason = reason or "the file names another form, which fits as well and differs"
-    fits = "" if own is None else f" What fits is: {shortened(own.names[0], 300)}."
-    stated = ((name, getattr(named, name)) for name in ("rotation", "form", "axes", "unit"))
-    described = ", ".join(f"{name} {value!r}" for name, value in stated if value is not None)
-    raise SchemaError(
-        f"{where}: the conventions read its poses as {shortened(described, 300)}, and that does "
-        f"not fit: {reason}.{fits} Correct [poses], or leave it out."
-    )
-
-
-def _readings_as(recorded: RecordedPoses, named: PosesAt) -> Iterator[Reading]:
-    """Yield the readings that conventions name, in the unit that they name."""
-    for reading in readings(recorded):
-        if named.fits(reading.name):
-            unit_m = reading.poses.unit_m if named.unit is None else UNITS_M[named.unit]
-            poses = replace(reading.poses, unit_m=unit_m)
-            yield replace(reading, tier=0, is_named=True, poses=poses)
-
-
-def _fitting(
-    recorded: RecordedPoses | None, found: Iterable[Reading], rig: Rig, *, where: str
-) -> Understood:
+def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
     """Return the poses of the first tier of readings that fit a rig, as `settled_poses` says."""
     failures: dict[str, str] = {}
-    scaled: list[SidesError] = []
-    loose: list[_Passed] = []
-    exact: list[_Passed] = []
-    reversed_: list[_Passed] = []
+    sides: list[SidesError] = []
+    loose: list[Reading] = []
+    exact: list[Reading] = []
     first = None
-    left, right = rig.primary_pair
-    for _, tier in groupby(found, key=lambda each: each.tier):
-        for reading in tier:
+    for tier, group in groupby(found, key=lambda each: each.tier):
+        for reading in group:
             first = first or reading
             try:
-                checked = _checked(reading, rig)
+                checked, off = _checked(reading, rig)
             except (GeometryError, SchemaError) as error:
                 failures.setdefault(str(error), reading.name)
-                scaled += [error] if reading.tier == 0 and isinstance(error, SidesError) else []
+                sides += [error] if tier == 0 and isinstance(error, SidesError) else []
                 continue
-            if checked.lateral_m[left] > checked.lateral_m[right]:
-                reversed_.append(checked)
-            else:
-                (exact if checked.off <= _EXACT else loose).append(checked)
-        if exact or any(each.reading.is_named and each.reading.tier == 0 for each in reversed_):
+            if off <= _EXACT:
+                exact.append(checked)
+            elif tier == 0:
+                loose.append(checked)
+        if exact or sides:
             break
-    passed = exact or [each for each in loose if each.reading.tier == 0][:1]
-    if reversed_ and not passed:
-        raise SidesError(
-            f"{where}: by its poses ({reversed_[0].reading.name}), camera {left} is to the right "
-            f"of camera {right}, and by baseline.json it is the left one. Correct one of them."
-        )
-    if scaled and not passed:
-        told = SidesError(f"{where}: {scaled[0]}. Correct the unit of one of them.")
-        told.scale = scaled[0].scale
+    passed = exact or loose[:1]
+    if sides and not passed:
+        told = SidesError(f"{where}: {sides[0]}. Correct one of them.")
+        told.scale = sides[0].scale
         raise told
-    if not passed:
+    if first is None or not passed:
         tried = "; ".join(f"{reason} ({name})" for reason, name in list(failures.items())[:_SHOWN])
         raise SchemaError(
             f"{where}: no reading of its poses fits the rig of baseline.json: "
             f"{tried or 'it has no location with a rotation'}. Is it another scene's, or its "
             f"unit wrong?"
         )
-    upright = [each for each in passed if each.reading.is_named or _is_upright(each.poses)]
-    passed = upright or passed
     taken = passed[0]
     others = [each for each in passed[1:] if not _same(each.poses, taken.poses, _rig_at)]
     if others:
-        listed = ", ".join(shortened(each.reading.name, 120) for each in (taken, *others)[:_SHOWN])
+        listed = ", ".join(shortened(each.name, 120) for each in (taken, *others)[:_SHOWN])
         raise SchemaError(
             f"{where}: several readings of its poses fit the rig and differ in how its cameras "
             f"stand to each other: {listed}. Name the right one in the file."
         )
     worlds = [taken, *(each for each in passed[1:]
                        if not _same(each.poses, taken.poses, _moved))]  # fmt: skip
-    names = tuple(
-        f"{each.reading.name} @ {each.poses.unit_m!r}".replace("|", "/") for each in worlds
-    )
-    own_units_m = (taken.reading.poses.unit_m, _UNREAL_M)
-    is_own = taken.reading is first and len(names) == 1 and taken.poses.unit_m in own_units_m
-    unit = next(name for name, unit_m in UNITS_M.items() if unit_m == taken.poses.unit_m)
-    blocks = () if recorded is None else recorded.blocks
-    read = names[0].partition(": ")[0].split(" and ")
-    return Understood(
-        taken.poses,
-        names,
-        is_named=taken.reading.is_named and taken.reading.tier == 0,
-        at=replace(taken.reading.at, unit=unit),
-        unread=tuple(dict.fromkeys(block.key for block in blocks if block.key not in read)),
-        form=None if is_own else "|".join(names),
-    )
+    names = tuple(f"{each.name} @ {each.poses.unit_m!r}".replace("|", "/") for each in worlds)
+    unit_m = taken.poses.unit_m
+    is_own = taken.name == first.name and len(names) == 1 and (
+        np.isfinite(first.poses.unit_m) or unit_m == _UNREAL_M
+    )  # fmt: skip
+    unit = next(name for name, metres in UNITS_M.items() if metres == unit_m)
+    form = None if is_own else "|".join(names)
+    return Understood(taken.poses, names, replace(taken.at, unit=unit), form)
 
 
 def agreed_forms(forms: Iterable[str]) -> dict[str, tuple[str, ...]]:
@@ -297,24 +227,6 @@ def shape_of(form: str) -> str:
     return form.split(": ")[0]
 
 
-def _is_upright(poses: CameraPoses) -> bool:
-    """Return whether no camera is upside down, in a world whose z axis must be the vertical one.
-
-    An axis may be vertical if the cameras' right stays level to it and their up does not lie flat.
-    """
-    right, up = (OPENCV_FROM_UNREAL.T @ poses.world_from_cam_rotations[..., column, None]
-                 for column in (0, 1))  # fmt: skip
-    may_be = [
-        np.abs(right[..., axis, 0]).max() < _LEVEL and np.abs(up[..., axis, 0]).min() > _LEVEL
-        for axis in range(3)
-    ]
-    return bool(may_be[1] or not may_be[2] or (up[..., 2, 0] < 0).all())
-
-
-_LEVEL: Final = 0.35
-"""The sine of 20 degrees: cameras of the release roll less, and look down by less than 70."""
-
-
 def poses_of(scene: Scene, text: bytes, *, where: str, form: str | None = None) -> CameraPoses:
     """Return the poses of a scene's ``trajectory.json`` as its row of the index says.
 
@@ -327,54 +239,24 @@ def poses_of(scene: Scene, text: bytes, *, where: str, form: str | None = None) 
     Raises:
         SchemaError: If the file has no such poses.
     """
-    at = declaration_of(scene).poses
-    own = (scene.pose_form or "").split("|")[0]
-    if at is None or not at.is_settled or (form is not None and form != own):
-        return poses_as(text, form or scene.pose_form, where=where)
-    _, poses = poses_at(parse_trajectory(text, where=where), at, where=where)
-    _, _, unit_m = own.rpartition(" @ ")
+    at, own = declaration_of(scene).poses, (scene.pose_form or "").split("|")[0]
+    name, _, unit_m = (form or own).rpartition(" @ ")
+    if at is not None and at.is_settled and (form or own) == own:
+        _, poses = poses_at(parse_trajectory(text, where=where), at, where=where)
+    elif name:
+        poses = poses_named(parse_trajectory(text, where=where), name, where=where)
+    else:
+        return settled_poses(text, scene.rig, where=where).poses
     return replace(poses, unit_m=float(unit_m)) if unit_m else poses
 
 
-def poses_as(text: bytes, form: str | None, *, where: str) -> CameraPoses:
-    """Return the poses of a ``trajectory.json`` by the form that an index row names.
-
-    Args:
-        text: The file's bytes.
-        form: `Scene.pose_form`, which names keys on the way; None takes the form that the file
-            itself names.
-        where: The file's path, for messages.
-
-    Raises:
-        SchemaError: If the file has no poses of this form.
-    """
-    document = parse_trajectory(text, where=where)
-    name, _, unit_m = (form or "").split("|")[0].rpartition(" @ ")
-    is_built_in = not name or name.startswith(_BUILT_IN_KEYS)
-    if is_built_in and stands(document, BUILT_IN_POSES):
-        recorded = recorded_at(document, BUILT_IN_POSES, where=where)
-    else:
-        recorded = recorded_in(document, where=where)
-    for reading in readings(recorded, only=name or None):
-        if name:
-            return replace(reading.poses, unit_m=float(unit_m))
-        is_stated = np.isfinite(reading.poses.unit_m)
-        return reading.poses if is_stated else replace(reading.poses, unit_m=_UNREAL_M)
-    raise SchemaError(
-        f"{where}: has no poses {f'of the form {shortened(name, 200)}' if name else 'at all'}. "
-        f"Run `stereogenbench index` again."
-    )
-
-
-_BUILT_IN_KEYS: Final = "frames[].cameras[].location and frames[].cameras[].rotation: rotator "
-
-
-def _checked(reading: Reading, rig: Rig) -> _Passed:
-    """Return a reading that fits a rig.
+def _checked(reading: Reading, rig: Rig) -> tuple[Reading, float]:
+    """Return a reading that fits a rig, in its unit, and how far that is off its x axis, as a sine.
 
     Raises:
         GeometryError: If the rig has no intrinsics.
-        SchemaError: If it does not fit; `SidesError` if all distances differ by one scale.
+        SchemaError: If it does not fit; `SidesError` if all distances differ by one scale, or the
+            primary pair's left camera is to the right of the right one.
     """
     poses = reading.poses
     steps = poses.centres[:, _RIGHT] - poses.centres[:, _LEFT]
@@ -430,7 +312,13 @@ def _checked(reading: Reading, rig: Rig) -> _Passed:
             f"the cameras look one way, and stand {np.degrees(np.arcsin(off)):.3g} degrees off "
             f"the axis to their right"
         )
-    return _Passed(reading, poses, off, lateral_m)
+    left, right = rig.primary_pair
+    if lateral_m[left] > lateral_m[right]:
+        raise SidesError(
+            f"by its poses ({reading.name}), camera {left} is to the right of camera {right}, and "
+            f"by baseline.json it is the left one"
+        )
+    return replace(reading, poses=poses), off
 
 
 _ROUGH: Final = 0.1

@@ -202,8 +202,6 @@ def _learned_poses(scene: Scene, found: Understood | None) -> tuple[PosesAt | No
         f"distances of the cameras are the baselines to {off_cm:.2g} cm in {len(steps)} frames",
         f"the cameras stand along the x axis of camera 0 to {across_cm:.2g} cm in frame 0",
     ]
-    if found.unread:
-        notes.append(f"numbers of six cameras that are not read: {', '.join(found.unread[:6])}")
     return None if scene.remark("world") else found.at, notes
 
 

@@ -273,12 +273,3 @@ def _plain_table(record: Any) -> dict[str, Any]:
 
 BUILT_IN: Final = Declaration()
 """The release's: the keys that the paper prints, and of the others those that must agree."""
-
-BUILT_IN_POSES: Final = PosesAt(
-    location="$.frames[].cameras[].location[x,y,z]",
-    rotation="$.frames[].cameras[].rotation[pitch,yaw,roll]",
-    frame="$.frames[].frame_index",
-    camera="$.frames[].cameras[].camera_index",
-    outer="frames",
-)
-"""Where poses stand in a scene in the release's layout; their form is settled."""

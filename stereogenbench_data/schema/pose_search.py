@@ -20,7 +20,7 @@ from stereogenbench_data.schema.document import (
     is_number,
     listed_keys,
 )
-from stereogenbench_data.schema.places import first_value, leaves_at, place_at
+from stereogenbench_data.schema.places import first_value
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.trajectory import COMPONENTS, Block, frame_of, read_block
 from stereogenbench_data.schema.units import named_unit_m, without_unit, words
@@ -49,36 +49,13 @@ class RecordedPoses:
         blocks: The numbers that may be part of poses.
         hints: The words of the texts in which a file says how they are to be read.
         unit_m: Metres in the unit that the file names for lengths, None without one.
+        odd: What is wrong with numbers that could not be read.
     """
 
     blocks: tuple[Block, ...]
     hints: frozenset[str]
     unit_m: float | None
-
-
-def recorded_at(document: dict[str, Any], at: PosesAt, *, where: str) -> RecordedPoses:
-    """Return the numbers of a ``trajectory.json`` that stand at declared places.
-
-    Raises:
-        SchemaError: If one does not stand there or is not understood; it is named.
-    """
-    texts = [text for text in (at.location, at.rotation) if text]
-    blocks = (read_block(document, at, text, where=where) for text in texts)
-    return RecordedPoses(tuple(blocks), hints_in(document), unit_in(document, where=where))
-
-
-def stands(document: dict[str, Any], at: PosesAt) -> bool:
-    """Return whether the first frame of a document has something at each of some places."""
-    frames = document.get("frames")
-    first = document | ({"frames": frames[:1]} if isinstance(frames, list) else {})
-    texts = [text for text in (at.location, at.rotation, at.frame, at.camera) if text]
-    try:
-        for place in map(place_at, texts):
-            for way in place.parts or ((),):
-                leaves_at(first, place, where="", way=way)
-    except SchemaError:
-        return False
-    return True
+    odd: tuple[str, ...]
 
 
 def recorded_in(document: dict[str, Any], *, where: str) -> RecordedPoses:
@@ -103,7 +80,8 @@ def recorded_in(document: dict[str, Any], *, where: str) -> RecordedPoses:
     numbered = [each for each in odd if "must be numbered" in each or " apart" in each]
     if numbered:
         raise SchemaError(f"{where}: {numbered[0]}.")
-    return RecordedPoses(tuple(blocks), hints_in(document), unit_in(document, where=where))
+    unit_m = unit_in(document, where=where)
+    return RecordedPoses(tuple(blocks), hints_in(document), unit_m, tuple(odd))
 
 
 def unit_in(document: dict[str, Any], *, where: str) -> float | None:
@@ -133,7 +111,8 @@ def hints_in(document: dict[str, Any]) -> frozenset[str]:
         if isinstance(value, dict) and len(value) < _MOST_HINTS:
             waiting += [(f"{name}_{words(key)}", inner) for key, inner in value.items()]
         elif isinstance(value, str) and len(value) < 200 and _SPEAKS_OF_FORM.search(name):
-            found |= {words(value), *words(value).split("_"), *name.split("_")}
+            parts = words(value).split("_")
+            found |= {*parts, *name.split("_"), *map("".join, itertools.pairwise(parts))}
         elif isinstance(value, list) and 0 < len(value) <= 4 and _SPEAKS_OF_FORM.search(name):
             found |= {"".join(map(str, value)).lower()}
     return frozenset(found)
@@ -242,7 +221,7 @@ def _are_rows(node: list[Any]) -> bool:
         return False
     cameras = _key_of(node, _CAMERA_KEYS, camera_of)
     frames = _key_of(node, tuple(key for key in _FRAME_KEYS if key != cameras), frame_of)
-    numbers = {camera_of(each[cameras]) for each in node} if cameras else set()
+    numbers = {camera_of(each.get(cameras)) for each in node} if cameras else set()
     return bool(frames) and len(numbers) == CAMERA_COUNT
 
 
@@ -305,15 +284,13 @@ def _numbers_at(
 def _key_of(
     elements: Sequence[Any], keys: Sequence[str], number_of: Callable[[object], int | None]
 ) -> str | None:
-    """Return the first likely key under which each element has a number."""
+    """Return the first likely key under which the first element has a number."""
     first = elements[0]
     if not isinstance(first, dict) or not all(isinstance(each, dict) for each in elements):
         return None
     named = {words(key): key for key in first}
-    return next(
-        (named[key] for key in keys if key in named
-         and all(number_of(each.get(named[key])) is not None for each in elements)), None
-    )  # fmt: skip
+    there = (named[key] for key in keys if key in named)
+    return next((key for key in there if number_of(first[key]) is not None), None)
 
 
 def _step(frames: _Axis, place: str | None) -> int | None:
@@ -321,7 +298,7 @@ def _step(frames: _Axis, place: str | None) -> int | None:
     if place is None or frames.is_keyed:
         return None
     key = _key_of(frames.elements, _FRAME_KEYS, frame_of)
-    numbers = sorted(frame_of(each[key]) or 0 for each in frames.elements)
+    numbers = sorted(frame_of(each.get(key)) or 0 for each in frames.elements)
     steps = {b - a for a, b in itertools.pairwise(numbers)}
     step = steps.pop() if len(steps) == 1 else 1
     return step if step > 1 else None

@@ -74,7 +74,12 @@ class Block:
     @property
     def key(self) -> str:
         """The keys as messages show them."""
-        return ".".join("[]" if key == "*" else key for key in self.name).replace(".[]", "[]")
+        return shown_key(self.name)
+
+
+def shown_key(name: Sequence[str]) -> str:
+    """Return keys on the way to numbers as messages and the names of readings have them."""
+    return ".".join("[]" if key == "*" else key for key in name).replace(".[]", "[]")
 
 
 def parse_trajectory(text: bytes, *, where: str) -> dict[str, Any]:

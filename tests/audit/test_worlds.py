@@ -63,7 +63,7 @@ def test_conventions_that_state_another_reading_are_wrong():
 
 
 def write_matrices(root, *, still=False):
-    """Write the poses of a tree's only scene as matrices, OpenCV's, which nothing says."""
+    """Write the poses of a tree's only scene as OpenCV's matrices, and say OpenGL or OpenCV."""
     (path,) = root.rglob("trajectory.json")
     document = json.loads(path.read_text())
     as_unreal = next(readings(recorded_in(document, where="trajectory.json"))).poses
@@ -71,7 +71,8 @@ def write_matrices(root, *, still=False):
         for camera, pose in enumerate(poses["cameras"]):
             pose.pop("rotation"), pose.pop("location")
             pose["pose"] = as_unreal.world_from_cam(0 if still else frame, camera).tolist()
-    path.write_text(json.dumps({"frames": document["frames"], "unit": "m"}))
+    said = {"coordinate_system": "OpenGL or OpenCV", "unit": "m"}
+    path.write_text(json.dumps(said | {"frames": document["frames"]}))
 
 
 def test_conventions_of_poses_that_depth_does_not_tell_stay_open_and_say_what_is_refused(

@@ -1,7 +1,6 @@
 """The walk over a tree: nothing is lost, and a second walk goes on where the first stopped."""
 
 import json
-import math
 import os
 import shutil
 import zlib
@@ -14,7 +13,6 @@ from stereogenbench_data.index import build as walk_module
 from stereogenbench_data.index import evidence
 from stereogenbench_data.index import tree as tree_module
 from stereogenbench_data.index.build import ManyReadsWarning, walk
-from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.index.tree import CACHE_VARIABLE
 from stereogenbench_data.media import heads as heads_module
 from stereogenbench_data.media.heads import Asked, heads_of
@@ -72,36 +70,6 @@ def test_poses_are_searched_for_once_and_then_read_where_they_stand(
     assert {scene.pose_form for scene in scenes} == {None}
     assert all(scene.lateral_m[5] == pytest.approx(0.725) for scene in scenes)
     assert not any(scene.remark("poses") for scene in scenes)
-
-
-def test_scenes_of_one_writer_read_their_poses_alike(alike_scenes, root):
-    """A camera that stands level at heading 0 fits two readings; others of its shape fit one."""
-    keys = alike_scenes(3)
-    for key, yaw_deg in zip(keys, (0.0, 25.0, 40.0), strict=True):
-        _write_matrices(root / key / "trajectory.json", yaw_deg=yaw_deg)
-
-    scenes = walk(root).scenes
-
-    assert describe_scene(root, keys[0]).remark("world")
-    assert len({scene.pose_form for scene in scenes}) == 1
-    assert [scene.remark("world", "poses") for scene in scenes] == ["", "", ""]
-
-
-def _write_matrices(path, *, yaw_deg):
-    """Replace a trajectory by one of Blender's matrices: a turned rig that stands still."""
-    document = json.loads(path.read_text())
-    sin, cos = math.sin(math.radians(yaw_deg)), math.cos(math.radians(yaw_deg))
-    right, up, back = (sin, -cos, 0.0), (0.0, 0.0, 1.0), (-cos, -sin, 0.0)
-    for frame in document["frames"]:
-        first = frame["cameras"][0]["location"].copy()
-        for pose in frame["cameras"]:
-            place = pose.pop("location")
-            along_m = math.dist(place.values(), first.values()) / 100
-            pose.pop("rotation")
-            columns = (right, up, back, tuple(1 + along_m * each for each in right))
-            pose["matrix"] = [[*row] for row in zip(*columns, strict=True)] + [[0, 0, 0, 1]]
-    path.unlink()
-    path.write_text(json.dumps(document | {"unit": "m"}))
 
 
 def test_worker_processes_find_what_one_process_finds(alike_scenes, root, monkeypatch):

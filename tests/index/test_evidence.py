@@ -1,6 +1,7 @@
 """Poses in every form that the reader knows: read as the same poses, or refused."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,14 +14,15 @@ from stereogenbench_data.geometry.pose import (
     CameraPoses,
     rotation_from_rotator_deg,
 )
+from stereogenbench_data.geometry.pose_forms import poses_named
 from stereogenbench_data.index import evidence
 from stereogenbench_data.index.evidence import (
     SidesError,
     agreed_forms,
     declared_poses,
-    poses_as,
     settled_poses,
 )
+from stereogenbench_data.schema.declaration import PosesAt
 from stereogenbench_data.schema.records import Rig
 from tests.servers.scene_fixtures import frames_of
 
@@ -87,6 +89,9 @@ FORMS = {
     "colmap": lambda p: p.vectors("qvec"),
 }  # fmt: skip
 ROTATORS_ONLY = {name for name in FORMS if name.startswith("ro") and name != "rows"}
+STATED = {"rvec": "vector rad w2c", "colmap": "quaternion wxyz w2c"}
+"""Forms that are read only where a file of conventions states them."""
+SETTLED = [form for form in FORMS if form not in STATED]
 
 
 class Written:
@@ -148,8 +153,9 @@ def truth(rotators, places_cm):
     return motions(CameraPoses(places_cm, 0.01, turns))
 
 
-def understood(text, rig=RIG):
-    return settled_poses(text, rig, where="trajectory.json")
+def understood(text, rig=RIG, **named):
+    at = PosesAt(**named) if named else None
+    return settled_poses(text, rig, where="trajectory.json", named=at)
 
 
 TURNED = path([(-12.0, 33.0, 2.0), (-14.0, 37.0, 1.0), (-15.0, 44.0, -3.0)])
@@ -165,8 +171,8 @@ def assert_read(text, path=TURNED, atol=1e-9):
 @pytest.mark.parametrize(
     ("form", "axes", "unit"),
     [
-        *((form, "unreal", unit) for form in FORMS for unit in ("cm", "m")),
-        *((form, axes, "m") for form in FORMS for axes in WORLDS
+        *((form, "unreal", unit) for form in SETTLED for unit in ("cm", "m")),
+        *((form, axes, "m") for form in SETTLED for axes in WORLDS
           if form not in ROTATORS_ONLY and axes != "unreal"),
     ],
 )  # fmt: skip
@@ -174,38 +180,27 @@ def test_each_form_is_read_in_each_unit_and_world_and_never_mirrored(form, axes,
     assert_read(written(form, *TURNED, axes=axes, unit=unit, coordinate_system=axes))
 
 
-def test_rotators_of_a_world_that_is_called_right_handed_are_not_mirrored():
-    rotators, places_cm = TURNED
-    mirror = np.array([1.0, -1.0, 1.0])
-    text = written(
-        "rotator", rotators * [1.0, -1.0, -1.0], places_cm * mirror,
-        coordinate_system="right-handed z-up",
-    )  # fmt: skip
+@pytest.mark.parametrize("axes", sorted(set(WORLDS) - {"unreal"}))
+@pytest.mark.parametrize("form", ["quaternion wxyz", "4x4", "inverse", *STATED])
+def test_what_nothing_names_is_refused_and_read_where_conventions_state_it(form, axes):
+    text = written(form, *TURNED, axes=axes, unit="m")
+    with pytest.raises(SchemaError, match=r"fits the rig|by its poses"):
+        understood(text)
 
-    assert_read(text)
+    found = understood(text, axes=axes, form=STATED.get(form))
 
-
-@pytest.mark.parametrize("form", sorted(set(FORMS) - ROTATORS_ONLY - {"R and t", "rvec", "colmap"}))
-def test_where_no_axes_are_named_cameras_stand_upright_in_a_world_whose_z_is_up(form):
-    assert_read(written(form, *TURNED, axes="opengl", unit="m"))
-
-
-def test_a_form_that_nothing_names_must_be_the_only_one_to_pass():
-    """Cameras along an axis of the world: a matrix and its inverse both fit the rig."""
-    along = path([(0.0, 0.0, 0.0), (0.0, 0.0, 0.0)])
-
-    found = understood(written("4x4", *along, axes="opengl", unit="m"))
-
-    assert len(found.names) > 1
+    np.testing.assert_allclose(motions(found.poses), truth(*TURNED), atol=1e-9)
 
 
 def test_readings_that_only_pictures_can_tell_apart_are_all_named():
-    names = understood(written("4x4", *TURNED, axes="opencv", unit="m")).names
+    text = written("4x4", *TURNED, axes="opencv", unit="m", world="from OpenGL to OpenCV, axes")
 
-    assert [name.rpartition(", ")[2].split()[0] for name in names] == ["opencv", "opengl"]
+    names = understood(text).names
+
+    assert {name.rpartition(", ")[2].split()[0] for name in names} == {"opencv", "opengl"}
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", SETTLED)
 def test_what_is_settled_is_read_again_by_its_places_alone(form, monkeypatch):
     axes = "unreal" if form in ROTATORS_ONLY else "opencv"
     text = written(form, *TURNED, axes=axes, unit="m", coordinate_system=axes)
@@ -220,13 +215,15 @@ def test_what_is_settled_is_read_again_by_its_places_alone(form, monkeypatch):
     assert (again.form, again.names) == (settled.form, settled.names)
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", SETTLED)
 def test_poses_are_read_again_by_the_name_that_an_index_has(form):
     axes = "unreal" if form in ROTATORS_ONLY else "opencv"
     text = written(form, *TURNED, axes=axes, unit="m", coordinate_system=axes)
 
-    poses = poses_as(text, understood(text).form, where="trajectory.json")
+    name, _, unit_m = understood(text).names[0].rpartition(" @ ")
+    poses = poses_named(json.loads(text), name, where="trajectory.json")
 
+    poses = replace(poses, unit_m=float(unit_m))
     np.testing.assert_allclose(motions(poses), truth(*TURNED), atol=1e-9)
 
 
@@ -292,6 +289,14 @@ def test_distances_in_one_ratio_to_the_baselines_are_stated_in_two_ways(factor, 
 
     scale = factor * {"m": 100, "mm": 0.1, "cm": 1}[unit]
     assert caught.value.scale == pytest.approx(scale, rel=1e-6)
+
+
+def test_a_pose_that_is_no_number_is_named_with_frame_and_camera():
+    document = json.loads(written("rotator", *TURNED))
+    document["frames"][2]["cameras"][4]["rotation"]["yaw"] = None
+
+    with pytest.raises(SchemaError, match=r"frame 2, camera 4: .*rotation\.yaw must be a number"):
+        understood(json.dumps(document).encode())
 
 
 def test_the_poses_of_another_rig_are_refused():

@@ -9,7 +9,7 @@ from functools import partial
 import pytest
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.index.evidence import poses_as, settled_poses
+from stereogenbench_data.index.evidence import settled_poses
 from stereogenbench_data.schema.parse import parse_caption, parse_complete, parse_rig
 
 VALUES = (
@@ -51,7 +51,6 @@ def parsers(rig_document, trajectory_document):
     description = {"short_caption": "A yard.", "detailed_caption": "A yard.", "tags": ["yard"]}
     return (
         (parse_rig, rig_document),
-        (partial(poses_as, form=None), trajectory_document),
         (partial(settled_poses, rig=rig), trajectory_document),
         (parse_complete, labels),
         (parse_caption, description),
