@@ -10,12 +10,11 @@ a file of conventions says what holds, below ``[depth]``.
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.document import child_path, is_number
+from stereogenbench_data.schema.document import child_path
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.schema.units import UNITS_M, words
@@ -28,7 +27,7 @@ LARGEST_UNIT_M: Final = 1.0
 _SMALL_M: Final = 0.2
 """What is no larger under a key of depth may be a unit of it."""
 _SAME: Final = 0.005
-"""Two statements agree within the rounding of either, which is at most this share."""
+"""By what share two statements may differ: either may be rounded."""
 _MOST_SHOWN: Final = 4
 _DEEPEST: Final = 8
 _MOST_NODES: Final = 20_000
@@ -64,10 +63,8 @@ _OF_STORED: Final = re.compile(r"depth|stored|value|uint|pixel|raw|\bz\b|\bv\b|=
 _SPEAKS_OF_SCALE: Final = re.compile(
     r"scal(?:e|ed|ing)\b|\bunits?\b|\bfactor|multipl|divid|\bper\b"
 )
-_NUMBER: Final = r"\d+(?:[.,]\d+)?(?:e[-+]?\d+)?|\.\d+(?:e[-+]?\d+)?"
-_VALUE: Final = re.compile(
-    rf"(?P<number>[-+]?(?:{_NUMBER})(?:\s*[/:]\s*(?:{_NUMBER}))?)?\s*(?P<rest>[a-z _/]*)"
-)
+_NUMBER: Final = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
+_VALUE: Final = re.compile(rf"(?P<number>{_NUMBER})?\s*(?P<rest>[a-z _/]*)")
 _BESIDE: Final = re.compile(
     r"(?:/|per|each)? *(?:(?:stored|depth|pixel|raw)[ _])?"
     r"(?:units?|counts?|values?|pixels?|lsb|levels?|steps?|ticks?)?"
@@ -88,7 +85,6 @@ class Statement:
         origin: A tag of the video, or JSON of the scene.
         is_word: Whether it is a word for a unit, without a number.
         is_bare: Whether no unit stands beside the number.
-        rounding: Half of the last digit written, as a share of the value.
         problem: Why depth is refused because of it; "" where it is a unit.
     """
 
@@ -98,7 +94,6 @@ class Statement:
     origin: Origin
     is_word: bool = False
     is_bare: bool = False
-    rounding: float = 0.0
     problem: str = ""
 
     def __str__(self) -> str:
@@ -223,9 +218,9 @@ def _stated(key: str, text: str, place: str, origin: Origin) -> Statement | None
     is_of_unit = bool(named and of_scale) or (
         bool(named or of_scale) and _OF_STORED.search(f"{key} {low}") is not None
     )
-    is_of_unit = is_of_unit or (not is_number(text) and low in UNITS_M)
-    if re.fullmatch(rf"[-+]?(?:{_NUMBER})", low):  # DEPTH_MM=1, DEPTH_FOO=0.001, depth_foo_m: 0.001
-        is_small = 0 < abs(_parsed(low) or 0.0) * UNITS_M.get(parts[-1], 1.0) <= _SMALL_M
+    is_of_unit = is_of_unit or low in UNITS_M
+    if re.fullmatch(_NUMBER, low):  # DEPTH_MM=1, DEPTH_FOO=0.001, depth_foo_m: 0.001
+        is_small = 0 < abs(float(low)) * UNITS_M.get(parts[-1], 1.0) <= _SMALL_M
         of_length = parts[-1] in UNITS_M
         is_of_unit = is_small and of_length if origin == "metadata" else (
             "depth" in parts and (is_small or of_length)
@@ -253,28 +248,20 @@ def _unit(key: str, low: str, place: str, text: str, origin: Origin) -> Statemen
     if not _BESIDE.fullmatch(rest.removeprefix(named).strip()):
         return None
     shown = shortened(repr(text))
-    number = _parsed(match["number"])
-    if number is None:
-        is_unit = named and match["number"] is None
-        values = (UNITS_M[named],) if is_unit else ()
-        return Statement(values, place, shown, origin, is_word=True) if values else None
-    ratio, last = _ratio(key), key.split("_")[-1]
+    if match["number"] is None:
+        return Statement((UNITS_M[named],), place, shown, origin, is_word=True) if named else None
+    number, ratio, last = float(match["number"]), _ratio(key), key.split("_")[-1]
     unit_m = UNITS_M.get(named) or (UNITS_M.get(last) if "_" in key else None)
     if ratio is not None:
         is_inverse, of_m = ratio
         readings = [of_m / number] if is_inverse and number > 0 else [number * of_m]
-    elif "divisor" in key.split("_"):
-        readings = [1.0 / number] if number > 0 else []
     else:
         readings = [number * (unit_m or 1.0)]
         if unit_m is None and number > 1 and number.is_integer():
             readings.append(1.0 / number)  # stored units in a metre
     possible = tuple(each for each in readings if LEAST_UNIT_M <= each <= LARGEST_UNIT_M)
-    digits = len(f"{number:.12g}".replace(".", "").lstrip("0").partition("e")[0].rstrip("0"))
     is_bare = unit_m is None and ratio is None
-    rounding = 0.5 * 10.0 ** (1 - digits)
-    found = Statement(possible, place, shown, origin, is_bare=is_bare, rounding=rounding)
-    return found if possible else None
+    return Statement(possible, place, shown, origin, is_bare=is_bare) if possible else None
 
 
 def _ratio(key: str) -> tuple[bool, float] | None:
@@ -289,17 +276,6 @@ def _ratio(key: str) -> tuple[bool, float] | None:
         if found and (above is None) != (below is None):
             is_per = link == "per"
             return (is_per == (above is None), above or below or 1.0)
-    return None
-
-
-def _parsed(text: str | None) -> float | None:
-    """Return a number or a ratio of two; a comma may stand for the point."""
-    if text is None:
-        return None
-    above, _, below = re.sub(r"\s", "", text).replace(",", ".").replace(":", "/").partition("/")
-    with suppress(ValueError, ZeroDivisionError):
-        number = float(above) / (float(below) if below else 1.0)
-        return number if is_number(number) else None
     return None
 
 
@@ -323,13 +299,9 @@ def agreed(statements: Sequence[Statement]) -> StatedDepth:
         return StatedDepth()
     if all(each.is_bare and each.values == (1.0,) for each in everything):
         _refuse("may mean a metre, or that stored numbers are not scaled", everything)
-    best = min(everything, key=lambda each: (len(each.values), each.rounding))
-    for unit_m in best.values:
-        shares = [min(_SAME, max(each.rounding + best.rounding, 1e-6)) for each in everything]
-        if all(
-            any(abs(value - unit_m) <= share * unit_m for value in each.values)
-            for each, share in zip(everything, shares, strict=True)
-        ):
+    for unit_m in min(everything, key=lambda each: len(each.values)).values:
+        if all(any(abs(value - unit_m) <= _SAME * unit_m for value in each.values)
+               for each in everything):  # fmt: skip
             is_tagged = any(each.origin == "tag" for each in everything)
             return StatedDepth(unit_m, origin="tag" if is_tagged else "metadata")
     _refuse("contradict each other", everything)

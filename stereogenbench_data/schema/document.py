@@ -22,9 +22,6 @@ MOST_LETTERS: Final = 2**16
 _SHOWN: Final = 20
 _LARGEST_INT: Final = 2**53
 _PLAIN_KEY: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
-_CAMERA_NAME: Final = re.compile(
-    r"(?:cam(?:era)?[ _-]?|\A|_)([0-9]{1,6})(?:_rgb\.mp4|_depth\.mkv)?\Z", re.IGNORECASE
-)
 
 
 def require_text_size(size_bytes: int, *, where: str) -> None:
@@ -147,15 +144,3 @@ def is_number(value: object) -> TypeGuard[int | float]:
     if type(value) is int:
         return abs(value) < _LARGEST_INT
     return type(value) is float and math.isfinite(value)
-
-
-def camera_of(value: object) -> int | None:
-    """Return the number of the camera that an index or a name stands for, None for other values.
-
-    >>> camera_of("Town_scene_7_Cam_03"), camera_of("Camera 2"), camera_of(4), camera_of("left")
-    (3, 2, 4, None)
-    """
-    if isinstance(value, str):
-        named = _CAMERA_NAME.search(value)
-        return int(named[1]) if named else None
-    return int(value) if is_number(value) and float(value).is_integer() else None

@@ -7,7 +7,7 @@ from which `schema.trajectory` reads the numbers of all. Settling alone searches
 
 import itertools
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -15,14 +15,13 @@ from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.schema.declaration import PosesAt
 from stereogenbench_data.schema.document import (
     brief,
-    camera_of,
     child_path,
     is_number,
     listed_keys,
 )
 from stereogenbench_data.schema.places import first_value
 from stereogenbench_data.schema.release import CAMERA_COUNT
-from stereogenbench_data.schema.trajectory import COMPONENTS, Block, frame_of, read_block
+from stereogenbench_data.schema.trajectory import COMPONENTS, Block, number_of, read_block
 from stereogenbench_data.schema.units import named_unit_m, without_unit, words
 
 _COUNTING: Final = re.compile(r"(.*?)[0-9]{1,9}\Z", re.DOTALL)
@@ -140,7 +139,7 @@ def places_in(document: dict[str, Any]) -> list[PosesAt]:
     found = [*itertools.islice(_places(document, "$", "", (), 0), _MOST_PLACES)]
     lists = [each for each in found if not str(each.rotation).endswith(",]")]
     order = document.get("camera_order")
-    has_order = isinstance(order, list) and [*map(camera_of, order)].count(None) == 0
+    has_order = isinstance(order, list) and [*map(number_of, order)].count(None) == 0
     named = "$.camera_order[]" if has_order and len(order or ()) == CAMERA_COUNT else None
     return [
         replace(each, rotation=str(each.rotation).replace(",]", "]"), camera=each.camera or named)
@@ -219,9 +218,9 @@ def _are_rows(node: list[Any]) -> bool:
     first = node[0]
     if not isinstance(first, dict) or len(node) <= CAMERA_COUNT or len(node) % CAMERA_COUNT:
         return False
-    cameras = _key_of(node, _CAMERA_KEYS, camera_of)
-    frames = _key_of(node, tuple(key for key in _FRAME_KEYS if key != cameras), frame_of)
-    numbers = {camera_of(each.get(cameras)) for each in node} if cameras else set()
+    cameras = _key_of(node, _CAMERA_KEYS)
+    frames = _key_of(node, tuple(key for key in _FRAME_KEYS if key != cameras))
+    numbers = {number_of(each.get(cameras)) for each in node} if cameras else set()
     return bool(frames) and len(numbers) == CAMERA_COUNT
 
 
@@ -244,8 +243,8 @@ def _numbered(text: str, axes: tuple[_Axis, ...]) -> Iterator[PosesAt]:
     """Yield a place with how its frames and cameras are numbered, if six of an axis are cameras."""
     outer, inner = axes
     if outer is inner:
-        camera = _key_of(outer.elements, _CAMERA_KEYS, camera_of)
-        frame = _key_of(outer.elements, tuple(k for k in _FRAME_KEYS if k != camera), frame_of)
+        camera = _key_of(outer.elements, _CAMERA_KEYS)
+        frame = _key_of(outer.elements, tuple(k for k in _FRAME_KEYS if k != camera))
         places = (child_path(outer.path, key) for key in (str(frame), str(camera)))
         yield PosesAt(rotation=text, outer="rows", frame=next(places), camera=next(places))
         return
@@ -261,29 +260,25 @@ def _numbered(text: str, axes: tuple[_Axis, ...]) -> Iterator[PosesAt]:
         "frame" in cameras.owner and "cam" not in cameras.owner
     ):
         return
-    frame = _numbers_at(frames, _FRAME_KEYS, frame_of)
+    frame = _numbers_at(frames, _FRAME_KEYS)
     yield PosesAt(
         rotation=text,
         outer="cameras" if is_outer else "frames",
-        camera=_numbers_at(cameras, _CAMERA_KEYS, camera_of),
+        camera=_numbers_at(cameras, _CAMERA_KEYS),
         frame=frame,
         step=_step(frames, frame),
     )
 
 
-def _numbers_at(
-    axis: _Axis, keys: Sequence[str], number_of: Callable[[object], int | None]
-) -> str | None:
+def _numbers_at(axis: _Axis, keys: Sequence[str]) -> str | None:
     """Return where the elements of an axis have their numbers; None where they have none."""
     if axis.is_keyed:
         return f"{axis.path}#"
-    key = _key_of(axis.elements, keys, number_of)
+    key = _key_of(axis.elements, keys)
     return None if key is None else child_path(axis.path, key)
 
 
-def _key_of(
-    elements: Sequence[Any], keys: Sequence[str], number_of: Callable[[object], int | None]
-) -> str | None:
+def _key_of(elements: Sequence[Any], keys: Sequence[str]) -> str | None:
     """Return the first likely key under which the first element has a number."""
     first = elements[0]
     if not isinstance(first, dict) or not all(isinstance(each, dict) for each in elements):
@@ -297,8 +292,8 @@ def _step(frames: _Axis, place: str | None) -> int | None:
     """Return by how much the numbers of frames grow, None for 1."""
     if place is None or frames.is_keyed:
         return None
-    key = _key_of(frames.elements, _FRAME_KEYS, frame_of)
-    numbers = sorted(frame_of(each.get(key)) or 0 for each in frames.elements)
+    key = _key_of(frames.elements, _FRAME_KEYS)
+    numbers = sorted(number_of(each.get(key)) or 0 for each in frames.elements)
     steps = {b - a for a, b in itertools.pairwise(numbers)}
     step = steps.pop() if len(steps) == 1 else 1
     return step if step > 1 else None

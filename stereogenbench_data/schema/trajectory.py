@@ -15,7 +15,7 @@ from jaxtyping import Float64, Int64
 
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.schema.declaration import PosesAt
-from stereogenbench_data.schema.document import brief, camera_of, is_number, parse_document
+from stereogenbench_data.schema.document import brief, is_number, parse_document
 from stereogenbench_data.schema.places import (
     Entries,
     Every,
@@ -209,10 +209,9 @@ def _ordered(
         SchemaError: If frames or cameras are numbered twice or with a gap, or are not six.
     """
     numbers = {
-        what: None if text is None else _counted(document, text, number_of, where=where)
-        for what, text, number_of in (("frames", at.frame, frame_of),
-                                      ("cameras", at.camera, camera_of))
-    }  # fmt: skip
+        what: None if text is None else _counted(document, text, where=where)
+        for what, text in (("frames", at.frame), ("cameras", at.camera))
+    }
     frames, cameras = numbers["frames"], numbers["cameras"]
     if frames is not None and cameras is not None and at.outer == "rows":
         order = np.lexsort((cameras, frames))
@@ -248,16 +247,14 @@ def first_frame(document: dict[str, Any], at: PosesAt) -> int | None:
     """Return the least number that frames have, None where they have none."""
     if at.frame is None:
         return None
-    return int(_counted(document, at.frame, frame_of, where="").min())
+    return int(_counted(document, at.frame, where="").min())
 
 
 def _is_counting(order: Int64[np.ndarray, " n"]) -> bool:
     return bool((order == np.arange(len(order))).all())
 
 
-def _counted(
-    document: dict[str, Any], text: str, number_of: Any, *, where: str
-) -> Int64[np.ndarray, "..."]:
+def _counted(document: dict[str, Any], text: str, *, where: str) -> Int64[np.ndarray, "..."]:
     """Return the numbers of frames or cameras at a place, by its axes."""
     place = place_at(text)
     leaves, lengths = leaves_at(document, place, where=where)
@@ -292,7 +289,13 @@ def _order(numbers: np.ndarray, what: str, at: PosesAt, where: str) -> np.ndarra
     return order
 
 
-def frame_of(value: object) -> int | None:
-    """Return the number that a frame's number or name ends in, None for other values."""
-    match = _COUNTING.match(value[-64:]) if isinstance(value, str) else None
-    return int(match[2]) if match else None if isinstance(value, str) else camera_of(value)
+def number_of(value: object) -> int | None:
+    """Return the number that a name of a frame or a camera ends in, or is; None for other values.
+
+    >>> number_of("Town_scene_7_Cam_03"), number_of("frame 2"), number_of(4), number_of("left")
+    (3, 2, 4, None)
+    """
+    if isinstance(value, str):
+        match = _COUNTING.match(value[-64:])
+        return int(match[2]) if match else None
+    return int(value) if is_number(value) and float(value).is_integer() else None

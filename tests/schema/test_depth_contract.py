@@ -20,7 +20,7 @@ def of_json(document):
 MILLIMETRES = """
 scale=0.001 | depth_scale=1000 | DEPTH_UNIT=mm | unit=0.001 m | depth_unit=1 mm | scale=1e-3 m
 meters_per_unit=0.001 | units_per_meter=1000 | UNITSPERMETER=1000 | DEPTHSCALEMM=1
-scale=1/1000 | scale=1:1000 | scale=0,001 | depth_scale_cm=0.1 | depth_scale=0.001 m/unit
+depth_scale_cm=0.1 | depth_scale=0.001 m/unit
 depth_units=millimeters | depth_unit=millimeters per count | scale=0.001 m per unit
 depth_to_meters=0.001 | m_to_depth=1000 | scale_factor=1000 | DEPTH_DIVISOR=1000
 depth_multiplier=0.001 | DEPTH_M_PER_LSB=0.001 | DEPTH_MM_PER_UNIT=1 | depth_precision=1mm
@@ -99,7 +99,7 @@ def test_the_ends_of_a_range_beside_a_scale_are_ignored():
 
 UNCLEAR = """
 scale= | scale=0 | scale=-1 | scale=nan | scale=x0.001 | units_per_meter=0.001 | DEPTH_MM=1
-DEPTH_FOO=0.001 | DEPTH_UNIT=m
+DEPTH_FOO=0.001 | DEPTH_UNIT=m | scale=1/1000 | scale=0,001
 unit=furlong | scale=0.03937 in | scale=0.1; DEPTH_UNIT=mm | scale=0.1; unit=cm
 DEPTH_SCALE=65.535 | DEPTH_SCALE=1 | scale=1.0 | depth_encoding=inverse; scale=655
 encoding=log; scale=0.001 | depth_type=euclidean; scale=0.001 | disparity_scale=16
