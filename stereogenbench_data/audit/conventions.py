@@ -9,7 +9,7 @@ import functools
 import json
 import re
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -18,11 +18,13 @@ from stereogenbench_data.audit.contract.doctor import DoctorReport, diagnose
 from stereogenbench_data.audit.contract.verdict import (
     MARGIN,
     QUOTIENT,
+    STRETCH,
     TOPICS,
     Unit,
     Verdict,
     encoding_line,
 )
+from stereogenbench_data.audit.proposals import MOST, Candidate, proposed
 from stereogenbench_data.audit.scene_access import spread
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import StereoGenBenchError, StorageError
@@ -36,12 +38,13 @@ from stereogenbench_data.index.learning import (
 )
 from stereogenbench_data.index.scene_folder import IncompleteScene
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.index.tree import folder_of
 from stereogenbench_data.samples.fields import PAIR_FIELDS, VIEW_FIELDS
 from stereogenbench_data.schema.conventions import Conventions, write_toml
 from stereogenbench_data.schema.declaration import Declaration, DepthAs, PosesAt
 from stereogenbench_data.schema.depth_contract import MAY_BE_RANGE, NO_LENGTH
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
-from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.schema.release import BASELINE_JSON, CAMERA_COUNT, TRAJECTORY_JSON
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.location import is_remote, shown
 
@@ -70,6 +73,7 @@ class Survey:
         poses: What depth says of readings of the poses, where several fit.
         notes: The comments of the file, as `write_toml` takes them.
         untested: What the user's conventions state of depth and no picture could test.
+        candidates: The best of each table that might be stated.
     """
 
     root: str
@@ -80,6 +84,23 @@ class Survey:
     poses: list[str] = field(default_factory=list)
     notes: dict[tuple[int, str], list[str]] = field(default_factory=dict)
     untested: tuple[str, ...] = ()
+    candidates: list[Candidate] = field(default_factory=list)
+
+    @property
+    def settled(self) -> dict[str, bool]:
+        """For each part of a scene's files whether it is settled."""
+        scenes = [each.scene for each in self.examined]
+        known = [scene for scene in scenes if scene is not None]
+        is_read = len(known) == len(scenes)
+        shapes = () if self.learned is None else self.learned.conventions.shapes
+        stated = all(shape.depth and shape.depth.encoding.unit_m for shape in shapes) and shapes
+        is_odd = any(problem.startswith("depth") for problem in self.problems)
+        has_unit = not any("unreadable" in scene.depth_unit_source for scene in known)
+        return {
+            BASELINE_JSON: is_read,
+            "poses": is_read and not any(s.remark("poses", "world", "left") for s in known),
+            "depth": is_read and not is_odd and bool(has_unit or stated),
+        }
 
     @property
     def toml(self) -> str:
@@ -159,6 +180,8 @@ def _untested(report: DoctorReport) -> Iterator[str]:
         for name, value in _changed(verdict.declared).items():
             if status[_TOPICS[name]] == "cannot tell":
                 yield f"{name} = {value}"
+        if status[STRETCH] == "cannot tell":
+            yield STRETCH
 
 
 def _changed(encoding: DepthEncoding) -> dict[str, str]:
@@ -184,6 +207,8 @@ def _learning(
         teaching = [each.scene for each in group if each.scene is not None]
         keys_there = {each.keys for each in group}
         others = [each.scene for each in learned.verified if each.keys in keys_there and each.scene]
+        if not teaching or teaching[0].remark("poses", "left"):
+            _note_candidates(surveyed, number, group[0].key)
         lines, before = surveyed.notes.setdefault((number, "depth"), []), len(surveyed.verdicts)
         report = None
         if pictured and teaching:
@@ -199,6 +224,19 @@ def _learning(
     surveyed = replace(surveyed, problems=_alike_once(surveyed))
     surveyed.notes[-1, ""] = _head(surveyed)
     return surveyed
+
+
+def _note_candidates(surveyed: Survey, number: int, key: str) -> None:
+    """Add what might be stated about a scene's files to the notes, as tables to uncomment."""
+    folder = folder_of(surveyed.root, key)
+    with suppress(StereoGenBenchError, KeyError):
+        moves = folder.read(TRAJECTORY_JSON) if TRAJECTORY_JSON in folder.stamps() else None
+        for group in proposed(folder.read(BASELINE_JSON), moves, where=key):
+            notes = surveyed.notes.setdefault((number, group[0].table), [])
+            for at, each in enumerate(group[:MOST]):
+                notes += ["", f"candidate {at + 1} of {len(group)}, without '# ' in front:"]
+                notes += each.lines
+            surveyed.candidates.append(group[0])
 
 
 def _alike_once(surveyed: Survey) -> list[str]:

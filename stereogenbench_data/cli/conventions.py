@@ -1,7 +1,7 @@
 """``stereogenbench conventions``: how a dataset's files are read, learned once or tested."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +17,9 @@ from stereogenbench_data.cli.options import (
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import write_report
 from stereogenbench_data.schema.text import counted, plain_line
+
+if TYPE_CHECKING:
+    from stereogenbench_data.audit.conventions import Survey
 
 
 @grouped
@@ -68,12 +71,29 @@ def conventions(  # noqa: PLR0913 - one parameter an option
     typer.echo(f"{counted(usable, 'scene')} of {len(found.examined)} read{verified}", err=True)
     told = [f"depth: {line}" for line in found.verdicts] + found.poses
     told += [f"NOT SETTLED: {line}" for line in found.problems]
-    typer.echo("".join(f"{plain_line(line)}\n" for line in told), err=True, nl=False)
-    if check is not None:
-        untested = f"; no picture could test {', '.join(found.untested)}" if found.untested else ""
-        typer.echo(f"{check}: {'contradicted' if found.problems else 'fits'}{untested}", err=True)
-    elif out is not None:
+    if out is not None:
         write_report(out, found.toml)
-        typer.echo(f"{out}: use it with --conventions, or StereoPairs(..., conventions=)", err=True)
+        told.append(f"{out}: written")
+    typer.echo("".join(f"{plain_line(line)}\n" for line in told), err=True, nl=False)
+    typer.echo(
+        _last_line(found, root=root, file=check or out, is_check=check is not None), err=True
+    )
     if found.problems:
         raise typer.Exit(FINDINGS)
+
+
+def _last_line(found: "Survey", *, root: str, file: Path | None, is_check: bool) -> str:
+    """Return what is settled, what is not, and the next command."""
+    untested = f"; no picture could test {', '.join(found.untested)}" if found.untested else ""
+    if is_check:
+        told = f"{file}: {'contradicted' if found.problems else 'fits'}{untested}"
+    else:
+        by_state = [", ".join(name for name, is_settled in found.settled.items()
+                              if is_settled == wanted) for wanted in (True, False)]  # fmt: skip
+        told = f"settled: {by_state[0] or 'nothing'}; not settled: {by_state[1] or 'nothing'}"
+        told = told if by_state[1] or not found.problems else f"{told} but what is told above"
+    name = file or "conventions.toml"
+    if found.problems:
+        edit = "correct" if is_check else "uncomment a candidate in" if found.candidates else "edit"
+        return f"{told}. Next: {edit} {name}, then stereogenbench conventions {root} --check {name}"
+    return f"{told}. Next: stereogenbench show {root} --conventions {name} -o first.png"

@@ -12,6 +12,7 @@ fields on which they differ are refused. Pictures tell more: see `audit.contract
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Final
@@ -142,6 +143,37 @@ def declared_poses(text: bytes, rig: Rig, *, where: str, settled: Understood) ->
     name, poses = poses_at(document, settled.at, where=where)
     found = _fitting([Reading(name, 0, poses, settled.at)], rig, where=where)
     return replace(settled, poses=found.poses)
+
+
+def every_fitting(text: bytes, rig: Rig, *, where: str) -> list[tuple[PosesAt, str]] | None:
+    """Return how the numbers of a ``trajectory.json`` may be poses of a rig, in any form and axes.
+
+    Args:
+        text: The file's bytes.
+        rig: The rig.
+        where: The file's path, for messages.
+
+    Returns:
+        Each form that fits and moves the cameras differently, with the name of its reading; None
+        where one is settled without being stated.
+
+    Raises:
+        SchemaError: If it has no numbers of six cameras.
+    """
+    document = parse_trajectory(text, where=where)
+    recorded = recorded_in(document, where=where)
+    with suppress(SchemaError):
+        if len(_fitting(readings(recorded), rig, where=where).names) == 1:
+            return None
+    fitting: list[Reading] = []
+    for reading in readings(recorded, forms="all", axes=[*AXES]):
+        with suppress(GeometryError, SchemaError):
+            checked, off = _checked(reading, rig)
+            is_new = not any(same_poses(checked.poses, each.poses) for each in fitting)
+            fitting += [checked] if off <= _EXACT and is_new else []
+    names = {metres: name for name, metres in reversed(UNITS_M.items()) if len(name) < 3}
+    return [(replace(each.at, unit=names[each.poses.unit_m], first=first_frame(document, each.at)),
+             f"{each.name} @ {each.poses.unit_m!r}") for each in fitting]  # fmt: skip
 
 
 def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:

@@ -32,7 +32,7 @@ from stereogenbench_data.audit.contract.scoring import (
     score_hypothesis,
     voted,
 )
-from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.schema.release import CAMERA_COUNT, DEFAULT_DEPTH_UNIT_M
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +66,11 @@ class SceneDiagnosis:
         disparity_px: Root mean square of the disparities found.
         depth_step: The `relative_step` of stored depths.
         check: How well each camera fits the best contract.
+        beside: By how much the declared contract is better than the release's default, 0.1 m a
+            unit without an offset; None where that is what is declared.
+        default_fits: Whether the default's own scale is that of the pictures.
+        stretch: By what factor unit and focal length explain the depth of other frames best, the
+            unit as pictures have it; nan where the clip does not tell.
     """
 
     key: str
@@ -85,6 +90,9 @@ class SceneDiagnosis:
     disparity_px: float = math.inf
     depth_step: float = 0.0
     check: CameraCheck = field(default_factory=CameraCheck)
+    beside: Gain | None = None
+    default_fits: bool = False
+    stretch: float = math.nan
 
 
 def allowed_log_scale(depth_step: float) -> float:
@@ -236,6 +244,26 @@ class ContractSearch:
                 found.append(Rival(question, answer, self.gain(best, other)))
         return tuple(found)
 
+    def beside_default(self) -> tuple[Gain | None, bool]:
+        """Return by how much the declared contract beats the release's default, and if that fits.
+
+        None where the default is what is declared.
+        """
+        views = self._views
+        now = views.scene.depth_encoding(views.primary[0], views.encoding)
+        if (views.unit_m(views.primary[0]), now.offset_m, now.form) == (
+            DEFAULT_DEPTH_UNIT_M, 0.0, "depth"
+        ):  # fmt: skip
+            return None, False
+        default = views.read_as(
+            replace(views.encoding, unit_m=DEFAULT_DEPTH_UNIT_M, offset_m=0.0, form="depth")
+        )
+        hypothesis = replace(self.declared.hypothesis, form="depth")
+        other = score_hypothesis(default, self._matches, hypothesis)
+        scaled = fit_scale(default, self._matches, hypothesis)
+        least = self._least_log_scale + limits.LEAST_ERRORS * min(scaled.scale_error, 1.0)
+        return gain_of(self._matches, self.declared, other), abs(math.log(scaled.scale)) <= least
+
     def without_parallax(self, best: ScoredContract) -> Gain:
         """Return by how much a contract is better than infinite depth everywhere."""
         flat = score_hypothesis(self._views, self._matches, best.hypothesis, scale=1e-12)
@@ -370,8 +398,11 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
     with_scale, of_other_kind = (
         search.candidate(hypothesis) for hypothesis in (best.hypothesis, other_kind)
     )
+    beside, default_fits = search.beside_default()
     return replace(
         scene,
+        beside=beside,
+        default_fits=default_fits,
         best=best.hypothesis,
         is_scaled=best.is_scaled,
         scale=with_scale.scale,

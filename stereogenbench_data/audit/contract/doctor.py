@@ -11,13 +11,14 @@ of them is wrong, and two wrong ones may cancel out.
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 from stereogenbench_data.audit.contract import limits
 from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis, diagnose_scene
 from stereogenbench_data.audit.contract.row_matches import SceneFrames
+from stereogenbench_data.audit.contract.stretch import stretch_of
 from stereogenbench_data.audit.contract.verdict import Verdict, group_by_contract, judge
 from stereogenbench_data.audit.contract.worlds import (
     Shares,
@@ -30,7 +31,7 @@ from stereogenbench_data.audit.contract.worlds import (
 from stereogenbench_data.audit.scene_access import source_of, spread
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.index.evidence import shape_of
+from stereogenbench_data.index.evidence import poses_of, shape_of
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import Streams
 from stereogenbench_data.schema.conventions import depth_of
@@ -180,4 +181,12 @@ def _diagnose(task: DiagnosisTask, after_bytes: Advance) -> tuple[SceneDiagnosis
             text = task.source.read(scene, TRAJECTORY_JSON)
             names = rival_readings(scene, text)
             shares = explained_shares(views, text, names) if len(names) > 1 else {}
-        return diagnose_scene(views, frames=task.frames), shares
+        diagnosis = diagnose_scene(views, frames=task.frames)
+        if not (diagnosis.problem or scene.remark("poses", "world", "left")):
+            text = task.source.read(scene, TRAJECTORY_JSON)
+            poses = poses_of(scene, text, where=scene.id.key)
+            if diagnosis.is_scaled and diagnosis.best == diagnosis.declared:
+                measured_m = diagnosis.unit_m / diagnosis.scale
+                views = views.read_as(replace(views.encoding, unit_m=measured_m))
+            diagnosis = replace(diagnosis, stretch=stretch_of(views, poses))
+        return diagnosis, shares

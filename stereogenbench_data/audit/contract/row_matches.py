@@ -10,6 +10,7 @@ pixels by a hypothesis.
 
 import itertools
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
@@ -215,6 +216,12 @@ class SceneFrames:
         self._streams = streams
         self._bands: dict[tuple[int, int], Luma] = {}
         self._stored: dict[tuple[FrameMatch, int, int], dict[Flip, _Numbers]] = {}
+
+    def read_as(self, encoding: DepthEncoding) -> "SceneFrames":
+        """Return the same pictures and stored numbers, read by another contract."""
+        other = copy(self)
+        other.encoding = encoding
+        return other
 
     @property
     def primary(self) -> tuple[int, int]:

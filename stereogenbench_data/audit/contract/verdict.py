@@ -6,7 +6,7 @@ disparity shows one quotient: unit / (focal length x baseline). `judge` answers 
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final, Literal, get_args
 
@@ -22,8 +22,9 @@ from stereogenbench_data.audit.contract.scoring import (
     pooled,
     weighted_mean,
 )
+from stereogenbench_data.audit.contract.stretch import STRETCH_MARGIN
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.schema.release import CAMERA_COUNT, DEFAULT_DEPTH_UNIT_M
 
 Status = Literal["confirmed", "not contradicted", "wrong", "cannot tell"]
 """Confirmed: in every scene a 95 % interval excludes every tested rival by a stated margin. Not
@@ -193,6 +194,8 @@ MARGIN: Final = limits.MARGIN
 
 QUOTIENT: Final = "depth scale"
 """Unit / (focal length x baseline), which is all that disparity shows of the three."""
+DEFAULT: Final = "beside the release's default"
+STRETCH: Final = "unit and focal length along the axis"
 _SOURCES: Final = {
     "tag": "by the files' tag", "metadata": "by the scene's JSON", "default": "by default",
     "user": "as given", "conventions": "by the conventions",
@@ -266,6 +269,43 @@ def _quotient(scenes: Sequence[SceneDiagnosis], unit: Unit) -> Answer:
         return replace(blank, declared="files not understood", found=found)
     note = f"the 95 % interval lies within {MARGIN:.0%} of what is declared"
     return replace(blank, found=found, status="confirmed", note=note)
+
+
+def _beside_default(scenes: Sequence[SceneDiagnosis]) -> Iterator[Answer]:
+    """Yield how the declared contract does beside the release's default, if it is another."""
+    if scenes[0].beside is None:
+        return
+    gain = pooled([scene.beside for scene in scenes if scene.beside is not None])
+    declared = f"{scenes[0].unit_m:g} m a unit"
+    blank = replace(_no_answer(scenes, DEFAULT, declared), behind=gain)
+    against = replace(gain, mean_db=-gain.mean_db)
+    default = f"{DEFAULT_DEPTH_UNIT_M:g} m a unit"
+    if not blank.note and gain.is_clear():
+        yield replace(blank, found=f"{declared}, not {default}", status="confirmed")
+    elif not blank.note and against.low_db > 0 and all(scene.default_fits for scene in scenes):
+        yield replace(blank, found=default, status="wrong", behind=against)
+    else:
+        yield blank
+
+
+def _along_axis(scenes: Sequence[SceneDiagnosis], quotient: Answer, unit: Unit) -> Answer:
+    """Return whether unit and focal length are wrong by one factor, which no pair shows."""
+    blank = _no_answer(scenes, STRETCH, "as recorded")
+    found = [scene.stretch for scene in scenes if math.isfinite(scene.stretch)]
+    if blank.note or quotient.status not in ("confirmed", "wrong"):
+        return replace(blank, note=blank.note or "not answered while the quotient is open")
+    if not found:
+        return replace(blank, note="no camera turns or advances by poses that are understood")
+    logs = np.log(found)
+    if logs.max() - logs.min() > STRETCH_MARGIN:
+        return replace(blank, note=f"scenes differ: {min(found):.3g} to {max(found):.3g} x")
+    focal, far = math.exp(float(np.median(logs))), abs(float(np.median(logs))) > STRETCH_MARGIN
+    if quotient.status == "confirmed" and not far:
+        told = f"{focal:.3g} x recorded"
+        return replace(blank, found=told, status="confirmed", note=f"to {STRETCH_MARGIN:.0%}")
+    told = f"unit {focal * unit.metres / scenes[0].unit_m:.3g} x and focal length {focal:.3g} x"
+    note = "by depth from frame to frame; a focal length is as wrong as a sensor's width, inversely"
+    return replace(blank, found=told, status="wrong", note=note)
 
 
 def _doubt(first: SceneDiagnosis, unit: Unit, *, found: str) -> str:
@@ -367,7 +407,7 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
     unit = _common_unit(scenes)
     hypothesis = [_question_answer(scenes, question) for question in QUESTIONS]
     quotient = _quotient(scenes, unit)
-    answers = (quotient, *hypothesis)
+    answers = (quotient, *_beside_default(scenes), *hypothesis, _along_axis(scenes, quotient, unit))
     problems = tuple(
         f"{scene.key}: {problem}" if len(scenes) > 1 else problem
         for scene in scenes

@@ -1,0 +1,138 @@
+"""Whether depth is right along the optical axis, too: pictures from the side do not show it.
+
+A scene that is stretched along the axis, its lens with it, has the disparities of the right one: a
+unit of depth and a focal length (or a sensor's width) that are wrong by one factor cancel out. A
+camera that turns or advances shows the factor. By its poses, which are in metres, a point of one
+frame lands where the depth of another frame says only without it.
+"""
+
+import math
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from stereogenbench_data.audit.contract.row_matches import SceneFrames
+from stereogenbench_data.audit.geometry.reprojection import moved_points
+from stereogenbench_data.geometry.camera import Intrinsics
+from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.media.depth import depth_m_from_units
+from stereogenbench_data.schema.release import CAMERA_COUNT
+
+_STEP: Final = 0.025
+_FACTORS: Final = np.exp(_STEP * np.arange(-28, 29))
+"""The factors that are tried: half to twice what is recorded."""
+STRETCH_MARGIN: Final = 0.06
+"""A smaller logarithm of the factor is not called wrong."""
+_BESIDE: Final = 4
+_LEAST_RISE: Final = 1.5
+"""How much larger the error must be by a tenth beside the best factor, for a clip that tells."""
+_CAMERAS: Final = (0, CAMERA_COUNT - 1)
+_PARTS: Final = (4, 2)
+_ACROSS: Final = 100
+"""How many points of a picture's side are moved."""
+_FEWEST: Final = 200
+
+
+def stretch_of(views: SceneFrames, poses: CameraPoses) -> float:
+    """Return by what factor unit and focal length explain the depth of other frames best.
+
+    Two cameras must say the same. It is nan where they do not, or where any factor fits alike, as
+    with cameras that stand still or only move sideways.
+
+    Args:
+        views: A scene, whose contract says how depth is read.
+        poses: Its poses.
+
+    Raises:
+        MediaError: If depth cannot be decoded.
+    """
+    steps = [_best(_errors(views, poses, camera)) for camera in _CAMERAS]
+    is_one = max(steps) - min(steps) <= _BESIDE
+    return float(np.exp(_STEP * np.mean(steps))) if is_one else math.nan
+
+
+def _best(errors: Float64[np.ndarray, " factors"]) -> float:
+    """Return how many steps from 1 the best factor is, nan where the errors do not tell."""
+    place = int(np.argmin(errors))
+    if not _BESIDE <= place < len(errors) - _BESIDE:
+        return math.nan
+    beside = min(errors[place - _BESIDE], errors[place + _BESIDE])
+    tells = math.isfinite(errors[place]) and beside > _LEAST_RISE * errors[place]
+    return float(place - len(errors) // 2) if tells else math.nan
+
+
+def _errors(views: SceneFrames, poses: CameraPoses, camera: int) -> Float64[np.ndarray, " factors"]:
+    """Return for each factor the median by which depth of one frame is off in another."""
+    lag = views.encoding.frame_lag
+    frames = [frame for frame in range(min(views.scene.frames, poses.frame_count))
+              if 0 <= frame + lag < views.scene.frames]  # fmt: skip
+    last = len(frames) - 1
+    moves = sorted({(first, first + step) for step in (last // part for part in _PARTS) if step
+                    for first in (0, last - step)})  # fmt: skip
+    lengths = {
+        at: _lengths_m(views, frames[at] + lag, camera)
+        for at in sorted({at for move in moves for at in move})
+    }
+    motions = [
+        np.linalg.inv(poses.world_from_cam(frames[later], camera))
+        @ poses.world_from_cam(frames[first], camera)
+        for first, later in moves
+    ]
+    errors = []
+    for factor in _FACTORS:
+        fx_px, fy_px = (factor * each for each in (views.intrinsics.fx_px, views.intrinsics.fy_px))
+        stretched = replace(views.intrinsics, fx_px=fx_px, fy_px=fy_px)
+        off = [
+            _off(factor * lengths[first], factor * lengths[later], stretched, motion,
+                 is_ray=views.encoding.kind == "ray")
+            for (first, later), motion in zip(moves, motions, strict=True)
+        ]  # fmt: skip
+        both = np.concatenate([np.empty(0), *off])
+        errors.append(float(np.median(both)) if len(both) >= _FEWEST else math.inf)
+    return np.array(errors)
+
+
+def _lengths_m(views: SceneFrames, frame: int, camera: int) -> Float32[np.ndarray, "h w"]:
+    """Return a frame's depth, of rays their lengths; 0 where it was not measured."""
+    units, measured = views.depth(frame, camera)
+    as_stated = views.scene.depth_encoding(camera, views.encoding)
+    encoding = replace(as_stated, kind="planar", unit_m=views.unit_m(camera))
+    lengths_m = depth_m_from_units(
+        units, measured=measured, encoding=encoding, intrinsics=views.intrinsics
+    )
+    return np.where(np.isfinite(lengths_m), lengths_m, np.float32(0))
+
+
+def _off(
+    here_m: Float32[np.ndarray, "h w"],
+    there_m: Float32[np.ndarray, "h w"],
+    camera: Intrinsics,
+    motion: Float64[np.ndarray, "4 4"],
+    *,
+    is_ray: bool,
+) -> Float64[np.ndarray, " n"]:
+    """Return by how much the logarithm of depth is off where points of a frame land in another."""
+    height, width = here_m.shape
+    step = max(1, math.ceil(min(height, width) / _ACROSS))
+    rows, columns = (each.ravel() for each in np.mgrid[step // 2 : height : step,
+                                                       step // 2 : width : step])  # fmt: skip
+    known = here_m[rows, columns] > 0
+    rows, columns = rows[known], columns[known]
+    depth_m = here_m[rows, columns] / _ray(rows, columns, camera, is_ray=is_ray)
+    u_px, v_px, expected_m = moved_points(columns + 0.5, rows + 0.5, depth_m, camera, motion)
+    inside = (expected_m > 0) & (u_px >= 0) & (u_px < width) & (v_px >= 0) & (v_px < height)
+    rows, columns = v_px[inside].astype(np.intp), u_px[inside].astype(np.intp)
+    found_m = there_m[rows, columns] / _ray(rows, columns, camera, is_ray=is_ray)
+    both = found_m > 0
+    return np.asarray(np.abs(np.log(expected_m[inside][both] / found_m[both])))
+
+
+def _ray(
+    rows: np.ndarray, columns: np.ndarray, camera: Intrinsics, *, is_ray: bool
+) -> Float64[np.ndarray, " n"]:
+    """Return the length of a pixel's ray to depth 1; 1 where depth is along the axis."""
+    x = (columns + 0.5 - camera.cx_px) / camera.fx_px
+    y = (rows + 0.5 - camera.cy_px) / camera.fy_px
+    return np.sqrt(1 + x**2 + y**2) if is_ray else np.ones(len(rows))
