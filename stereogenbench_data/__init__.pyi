@@ -13,9 +13,13 @@ from stereogenbench_data.datasets.division import IdleWorkersWarning as IdleWork
 from stereogenbench_data.datasets.division import OpenVideosWarning as OpenVideosWarning
 from stereogenbench_data.datasets.division import RepeatedDecodingWarning as RepeatedDecodingWarning
 from stereogenbench_data.datasets.division import UnsharedRanksWarning as UnsharedRanksWarning
+from stereogenbench_data.datasets.epoch_rule import EpochOptions as EpochOptions
 from stereogenbench_data.datasets.forecast import forecast as forecast
+from stereogenbench_data.datasets.loader import LoaderOptions as LoaderOptions
 from stereogenbench_data.datasets.loader import PairsLoader as PairsLoader
 from stereogenbench_data.datasets.mapped import MixedSplitsWarning as MixedSplitsWarning
+from stereogenbench_data.datasets.mapped import PairsOptions as PairsOptions
+from stereogenbench_data.datasets.mapped import ReadOptions as ReadOptions
 from stereogenbench_data.datasets.mapped import SceneViews as SceneViews
 from stereogenbench_data.datasets.mapped import SeekTableWarning as SeekTableWarning
 from stereogenbench_data.datasets.mapped import StereoPairs as StereoPairs
@@ -68,6 +72,8 @@ from stereogenbench_data.samples.transforms import Resize as Resize
 from stereogenbench_data.schema.conventions import Conventions as Conventions
 from stereogenbench_data.schema.records import DepthEncoding as DepthEncoding
 from stereogenbench_data.selection.filters import FewerPairsWarning as FewerPairsWarning
+from stereogenbench_data.selection.filters import SceneFilters as SceneFilters
+from stereogenbench_data.selection.plan import PairOptions as PairOptions
 from stereogenbench_data.sources.cache import ShardCache as ShardCache
 from stereogenbench_data.sources.retry import RetryPolicy as RetryPolicy
 

@@ -186,6 +186,9 @@ class WorkOptions(TypedDict, total=False):
     progress: Progress | None
 
 
+WORK_DEFAULTS: Final = WorkOptions(workers=None, engine=LOCAL, progress=None)
+
+
 def do_items(  # noqa: PLR0913 - what to do, how, and what is told of it
     task: Callable[[Work, Advance], Result],
     works: Sequence[Work],
@@ -209,7 +212,7 @@ def do_items(  # noqa: PLR0913 - what to do, how, and what is told of it
     """
     advance = advance_of(options.get("progress"), done=done, total=total)
     advance(0)
-    engine, workers = options.get("engine", LOCAL), options.get("workers")
+    engine, workers = options.get("engine", WORK_DEFAULTS["engine"]), options.get("workers")
     made = engine.map(task, works, name=name, workers=workers, advance=advance)
     with closing(made) as results:
         for result in results:

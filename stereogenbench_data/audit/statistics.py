@@ -18,7 +18,13 @@ from stereogenbench_data.schema.release import (
     SCENE_COUNTS,
 )
 from stereogenbench_data.schema.text import counted, markdown_table, markdown_text
-from stereogenbench_data.selection.filters import PAIR_NUMBER, SceneFilters, filter_scenes, in_bin
+from stereogenbench_data.selection.filters import (
+    PAIR_NUMBER,
+    SceneFilters,
+    filter_scenes,
+    in_bin,
+)
+from stereogenbench_data.selection.signatures import list_options
 
 ADJACENT_COLUMNS: Final = [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]
 _SPLITS: Final = ("train", "eval")
@@ -87,6 +93,7 @@ class Statistics:
         return document
 
 
+@list_options()
 def statistics(index: SceneIndex, **filters: Unpack[SceneFilters]) -> Statistics:
     """Return the statistics of an index, or of its scenes that pass filters.
 

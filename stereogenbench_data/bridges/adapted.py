@@ -7,10 +7,11 @@ from typing import Any, ClassVar, Generic, Literal, TypeVar, Unpack
 
 from torch.utils.data import Dataset, default_collate
 
-from stereogenbench_data.datasets.loader import LoaderOptions, PairsLoader
-from stereogenbench_data.datasets.mapped import Data, PairsOptions, StereoPairs
+from stereogenbench_data.datasets.loader import LOADER_DEFAULTS, LoaderOptions, PairsLoader
+from stereogenbench_data.datasets.mapped import PAIRS_DEFAULTS, Data, PairsOptions, StereoPairs
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.samples.fields import Sample
+from stereogenbench_data.selection.signatures import list_options
 
 Item = TypeVar("Item")
 
@@ -31,6 +32,7 @@ class AdaptedPairs(Dataset[Item], ABC, Generic[Item]):
     fields: ClassVar[tuple[str, ...]]
     frames: ClassVar[Literal["frame", "clip"]] = "frame"
 
+    @list_options(PAIRS_DEFAULTS)
     def __init__(self, data: Data, **options: Unpack[PairsOptions]) -> None:
         """Select the samples; no video is opened before the first item is asked for.
 
@@ -68,6 +70,7 @@ class AdaptedPairs(Dataset[Item], ABC, Generic[Item]):
         """Return several items in the order asked, each stream read forwards on the way."""
         return [self.item(sample) for sample in self.pairs.__getitems__(numbers)]
 
+    @list_options(LOADER_DEFAULTS)
     def loader(
         self, batch_size: int = 1, *, num_workers: int = 0, **options: Unpack[LoaderOptions]
     ) -> PairsLoader:

@@ -30,6 +30,7 @@ from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import (
+    WORK_DEFAULTS,
     WorkOptions,
     do_items,
     job_folder,
@@ -41,8 +42,19 @@ from stereogenbench_data.media.encoder import Encoding, VideoEncoder
 from stereogenbench_data.samples.fields import Request, Sample
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.selection.filters import SceneFilters, filter_scenes, require_options
-from stereogenbench_data.selection.plan import Address, FramesSpec, PairOptions, parse_frames
+from stereogenbench_data.selection.filters import (
+    SceneFilters,
+    filter_scenes,
+    require_options,
+)
+from stereogenbench_data.selection.plan import (
+    SELECTION_DEFAULTS,
+    Address,
+    FramesSpec,
+    PairOptions,
+    parse_frames,
+)
+from stereogenbench_data.selection.signatures import list_options
 from stereogenbench_data.sources.files import open_atomic, write_atomic
 
 Kind = Literal["right", "left", "warped", "mask", "grid"]
@@ -212,6 +224,11 @@ class ClipOptions(WorkOptions, SceneFilters, PairOptions, total=False):
     depth: DepthEncoding | None
 
 
+CLIP_DEFAULTS: Final = {
+    **WORK_DEFAULTS, "stride": 1, "captions": "plain", "encoding": Encoding(), "seed": 0,
+}  # fmt: skip
+
+
 class ClipReport(NamedTuple):
     """What an export did.
 
@@ -228,6 +245,7 @@ class ClipReport(NamedTuple):
     without_caption: int
 
 
+@list_options(SELECTION_DEFAULTS, CLIP_DEFAULTS)
 def export_clips(
     data: Data, out: str | Path, *, layout: LayoutName, **options: Unpack[ClipOptions]
 ) -> ClipReport:

@@ -33,12 +33,24 @@ from stereogenbench_data.datasets.mapped import Data, SceneViews
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.jobs import WorkOptions, atomic_folder, do_items, job_folder, named_errors
+from stereogenbench_data.jobs import (
+    WORK_DEFAULTS,
+    WorkOptions,
+    atomic_folder,
+    do_items,
+    job_folder,
+    named_errors,
+)
 from stereogenbench_data.samples.fields import Request
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.selection.filters import SceneFilters, require_options, whole_number
+from stereogenbench_data.selection.filters import (
+    SceneFilters,
+    require_options,
+    whole_number,
+)
 from stereogenbench_data.selection.plan import Address, FramesSpec
+from stereogenbench_data.selection.signatures import list_options
 
 ABOUT_JSON: Final = "stereogenbench.json"
 """What a folder shows, and the way back to the scene's world."""
@@ -277,6 +289,7 @@ class ViewExportOptions(WorkOptions, SceneFilters, total=False):
     depth: DepthEncoding | None
 
 
+@list_options({"cameras": "all", "frames": "first"}, WORK_DEFAULTS)
 def export_views(
     data: Data, out: str | Path, *, layout: Layout, **options: Unpack[ViewExportOptions]
 ) -> list[Path]:

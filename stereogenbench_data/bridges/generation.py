@@ -12,11 +12,12 @@ import torch
 from PIL import Image
 
 from stereogenbench_data.bridges.adapted import AdaptedPairs
-from stereogenbench_data.datasets.mapped import Data, PairsOptions
+from stereogenbench_data.datasets.mapped import PAIRS_DEFAULTS, Data, PairsOptions
 from stereogenbench_data.errors import FieldError, SelectionError
 from stereogenbench_data.geometry.projection import front_pixels, project_rectified
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
 from stereogenbench_data.samples.fields import Sample
+from stereogenbench_data.selection.signatures import list_options
 
 Layout = Literal["tchw", "cthw"]
 """The order of a clip's axes: time, channel, height, width; or channel first."""
@@ -50,6 +51,7 @@ class GenStereo(AdaptedPairs[dict[str, torch.Tensor]]):
 
     fields = ("left", "right", "disparity", "valid", "depth", "hole")
 
+    @list_options(PAIRS_DEFAULTS)
     def __init__(self, data: Data, **options: Unpack[PairsOptions]) -> None:
         """Select the samples; no video is opened before the first item is asked for.
 
@@ -125,6 +127,7 @@ class StereoClips(AdaptedPairs[dict[str, Any]]):
     )  # fmt: skip
     frames = "clip"
 
+    @list_options(PAIRS_DEFAULTS)
     def __init__(
         self,
         data: Data,

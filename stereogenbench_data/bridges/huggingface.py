@@ -29,6 +29,8 @@ from stereogenbench_data.schema.release import (
     TRAINING_JSON,
     VIDEO_FILES,
 )
+from stereogenbench_data.selection.plan import SELECTION_DEFAULTS
+from stereogenbench_data.selection.signatures import list_options
 
 _DEPTH_NAMES: Final[dict[str, Mapping[str, str]]] = {"mkv": {}, "b2frame": PACKED_DEPTH_NAMES}
 """Suffix of depth members to their names in shards, by released name."""
@@ -235,6 +237,7 @@ class RowDecoder:
         return [to_arrays(sample) for sample in found]
 
 
+@list_options(SELECTION_DEFAULTS, {"seed": 0})
 def decode(
     fields: Iterable[str] = DEFAULT_PAIR_FIELDS, **options: Unpack[SampleOptions]
 ) -> RowDecoder:

@@ -4,7 +4,8 @@ Each class takes what `StereoPairs` takes, except fields, and gives the items th
 training loop unpacks: their order, signs, dtypes, value ranges and rule of validity. Disparity is
 in pixels of the picture as resized and cropped, x_right = x_left - d.
 
->>> from stereogenbench_data.bridges.matching import RaftStereo
+>>> from stereogenbench_data.selection.signatures import list_options
+from stereogenbench_data.bridges.matching import RaftStereo
 >>> train = RaftStereo(getfixture("small_release"), split="train", pairs="all", frames="all")
 >>> for _, *data_blob in train.loader(batch_size=2):
 ...     image1, image2, flow, valid = data_blob
@@ -19,9 +20,10 @@ import numpy as np
 import torch
 
 from stereogenbench_data.bridges.adapted import AdaptedPairs, Item
-from stereogenbench_data.datasets.mapped import Data, PairsOptions
+from stereogenbench_data.datasets.mapped import PAIRS_DEFAULTS, Data, PairsOptions
 from stereogenbench_data.errors import FieldError, SelectionError
 from stereogenbench_data.samples.fields import Sample
+from stereogenbench_data.selection.signatures import list_options
 
 RaftItem = tuple[list[str], torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 """Names, image1, image2, flow, valid."""
@@ -97,6 +99,7 @@ def _taken_from(sample: Sample, *names: str) -> tuple[Any, ...]:
 class _LeftToRight(AdaptedPairs[Item]):
     """Items whose first view is the left one: the networks look for it there."""
 
+    @list_options(PAIRS_DEFAULTS)
     def __init__(self, data: Data, **options: Unpack[PairsOptions]) -> None:
         super().__init__(data, **options)
         index, pairs = self.pairs.index, self.pairs.plan.pairs
@@ -116,6 +119,7 @@ class _LeftToRight(AdaptedPairs[Item]):
 class _Limited(_LeftToRight[Item]):
     """Items that call pixels of large disparity not valid."""
 
+    @list_options(PAIRS_DEFAULTS)
     def __init__(
         self, data: Data, *, valid_below_px: float = LIMIT_PX, **options: Unpack[PairsOptions]
     ) -> None:

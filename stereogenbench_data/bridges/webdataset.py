@@ -1,7 +1,8 @@
 """A stage for ``webdataset`` pipelines that turns scenes into stereo samples.
 
 >>> import webdataset  # doctest: +SKIP
->>> from stereogenbench_data.bridges.webdataset import decode
+>>> from stereogenbench_data.selection.signatures import list_options
+from stereogenbench_data.bridges.webdataset import decode
 >>> stage = decode(("left", "disparity"), pairs="all", frames="all")
 >>> samples = webdataset.WebDataset(urls, shardshuffle=False).compose(stage)  # doctest: +SKIP
 """
@@ -13,6 +14,8 @@ from stereogenbench_data.bridges.in_memory import SampleOptions, samples_of
 from stereogenbench_data.datasets.shared import SharedEpoch
 from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS, Sample
 from stereogenbench_data.selection.filters import SceneFilters, require_options
+from stereogenbench_data.selection.plan import SELECTION_DEFAULTS
+from stereogenbench_data.selection.signatures import list_options
 
 
 class SceneDecoder:
@@ -56,6 +59,7 @@ class SceneDecoder:
                 yield sample
 
 
+@list_options(SELECTION_DEFAULTS, {"seed": 0})
 def decode(
     fields: Iterable[str] = DEFAULT_PAIR_FIELDS, **options: Unpack[SampleOptions]
 ) -> SceneDecoder:

@@ -20,7 +20,7 @@ from stereogenbench_data.datasets.division import (
     require_group,
     torchs_group,
 )
-from stereogenbench_data.datasets.epoch_rule import EpochOptions, fitting_rule
+from stereogenbench_data.datasets.epoch_rule import EPOCH_DEFAULTS, EpochOptions, fitting_rule
 from stereogenbench_data.datasets.shared import SharedEpoch, require_epoch
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
@@ -35,6 +35,7 @@ from stereogenbench_data.selection.order import (
     rank_share,
 )
 from stereogenbench_data.selection.plan import Plan
+from stereogenbench_data.selection.signatures import list_options
 
 State = dict[str, Any]
 """A position: a flat dict of numbers and texts, which JSON and `torch.save` take."""
@@ -347,6 +348,7 @@ class EpochBatches(Sampler[list[int]]):
         passes: Where its passes are: the position.
     """
 
+    @list_options(EPOCH_DEFAULTS)
     def __init__(
         self,
         dataset: OrderedSamples,

@@ -1,7 +1,7 @@
 """The rule of an epoch's order: what users ask for, and as many open scenes as fit into memory."""
 
 from dataclasses import replace
-from typing import Final, TypedDict
+from typing import Any, Final, TypedDict
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from stereogenbench_data.selection.order import (
     usual_groups,
 )
 from stereogenbench_data.selection.plan import Plan
+from stereogenbench_data.selection.signatures import Told
 
 RANK_BYTES: Final = 3_600_000_000
 """Memory for the open scenes of a rank, where nobody asks for a number of them."""
@@ -76,6 +77,19 @@ class EpochOptions(TypedDict, total=False):
     open_frames: int
 
 
+EPOCH_DEFAULTS: Final[dict[str, Any]] = {
+    "seed": Told("the dataset's"),
+    "rank": Told("torch.distributed's, or 0"),
+    "world_size": Told("torch.distributed's, or 1"),
+    "shuffle": True,
+    "drop_last": Told("as shuffle"),
+    "shuffle_groups": Told("at most 8, a multiple of the ranks"),
+    "open_scenes": Told("about 64 of all groups"),
+    "open_frames": Told("as fit into 2 GB"),
+}
+"""What is taken for options that are left out; `fitting_rule` computes the last ones."""
+
+
 def fitting_rule(
     index: SceneIndex, plan: Plan, batch_size: int, options: EpochOptions, *, world_size: int
 ) -> OrderRule:
@@ -89,7 +103,9 @@ def fitting_rule(
         SelectionError: If an option is out of its range.
     """
     rule = OrderRule(
-        batch_size, seed=options.get("seed", plan.seed), shuffle=options.get("shuffle", True)
+        batch_size,
+        seed=options.get("seed", plan.seed),
+        shuffle=options.get("shuffle", EPOCH_DEFAULTS["shuffle"]),
     )
     rows, runs = plan.scene_rows, plan.runs
     shares_moments = bool((runs.pairs > 1).any())

@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
+from inspect import signature
 from time import perf_counter
 from typing import Any, Final, NamedTuple, SupportsIndex
 
@@ -28,7 +29,7 @@ from stereogenbench_data.datasets.batch_buffers import collate
 from stereogenbench_data.datasets.batch_parts import Making
 from stereogenbench_data.datasets.batches import EpochBatches, Pass, State
 from stereogenbench_data.datasets.division import WorkerShare
-from stereogenbench_data.datasets.epoch_rule import EpochOptions
+from stereogenbench_data.datasets.epoch_rule import EPOCH_DEFAULTS, EpochOptions
 from stereogenbench_data.datasets.workers import Workers, pids_for
 from stereogenbench_data.errors import PassError, StateError, StereoGenBenchError
 from stereogenbench_data.samples.load import Work
@@ -51,6 +52,12 @@ class LoaderOptions(EpochOptions, total=False):
     prefetch_factor: int | None
     persistent_workers: bool
     collate_fn: Any
+
+
+LOADER_DEFAULTS: Final = {
+    name: each.default for name, each in signature(DataLoader.__init__).parameters.items()
+} | EPOCH_DEFAULTS
+"""Torch's own, and those of an epoch; without ``collate_fn`` batches are made in place."""
 
 
 class LoaderStats(NamedTuple):

@@ -30,6 +30,7 @@ from stereogenbench_data.datasets.batches import (
 from stereogenbench_data.datasets.division import WorkerShare, videos_allowed, warn_of_division
 from stereogenbench_data.datasets.epoch_rule import EpochOptions, videos_per_scene
 from stereogenbench_data.datasets.loader import (
+    LOADER_DEFAULTS,
     LoaderOptions,
     PairsLoader,
     accelerates_epoch,
@@ -74,6 +75,7 @@ from stereogenbench_data.selection.filters import (
     split_options,
 )
 from stereogenbench_data.selection.plan import (
+    SELECTION_DEFAULTS,
     Address,
     FramesSpec,
     Plan,
@@ -83,6 +85,7 @@ from stereogenbench_data.selection.plan import (
     plan_pairs,
     plan_views,
 )
+from stereogenbench_data.selection.signatures import list_options
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.fetch_ahead import FETCH_AHEAD_BYTES, FetchAhead
 from stereogenbench_data.sources.location import is_remote
@@ -138,8 +141,18 @@ class ReadOptions(TypedDict, total=False):
     fetch_ahead_bytes: int
 
 
+READ_DEFAULTS: Final = ReadOptions(
+    size=None, transform=None, depth=None, conventions=None, seed=0, cache=None, check="read",
+    buffers="reused", fetch_ahead_bytes=FETCH_AHEAD_BYTES,
+)  # fmt: skip
+"""How samples are read unless somebody says otherwise."""
+
+
 class PairsOptions(ReadOptions, Selection, total=False):
     """What `StereoPairs` takes, except data and fields."""
+
+
+PAIRS_DEFAULTS: Final = {**SELECTION_DEFAULTS, **READ_DEFAULTS}
 
 
 class ViewsOptions(ReadOptions, SceneFilters, total=False):
@@ -179,8 +192,8 @@ class _MappedScenes(Dataset[Sample]):
         self.plan = plan
         self.left_out = selected - len(plan.scene_rows)
         self.request = request
-        cache = options.get("cache")
-        ahead = FetchAhead(limit_bytes=options.get("fetch_ahead_bytes", FETCH_AHEAD_BYTES))
+        cache = options["cache"]
+        ahead = FetchAhead(limit_bytes=options["fetch_ahead_bytes"])
         if cache is not None:
             # Several processes fill it: what one fetches ahead must not evict what another needs.
             ahead.limit_bytes = min(ahead.limit_bytes, cache.limit_bytes // _OF_CACHE)
@@ -197,11 +210,11 @@ class _MappedScenes(Dataset[Sample]):
             index,
             request,
             cache=cache,
-            check=_check_of(options.get("check", "read"), plan),
+            check=_check_of(options["check"], plan),
             frames="shared" if (np.diff(plan.first_pair) > 1).any() else "used once",
             ahead=ahead if is_remote(index.root) else None,
         )
-        self.buffers = BatchBuffers(options.get("buffers", "reused"))
+        self.buffers = BatchBuffers(options["buffers"])
         self.shared_epoch = SharedEpoch()
         self.is_random = _is_random(plan, request)
         self._is_watched = self.is_random
@@ -430,6 +443,7 @@ class _MappedScenes(Dataset[Sample]):
             self._loader.release(address)
         return sample
 
+    @list_options(LOADER_DEFAULTS)
     def loader(
         self, batch_size: int = 1, *, num_workers: int = 0, **options: Unpack[LoaderOptions]
     ) -> PairsLoader:
@@ -548,6 +562,7 @@ class StereoPairs(_MappedScenes):
     torch.Size([1, 64, 64])
     """
 
+    @list_options(PAIRS_DEFAULTS)
     def __init__(
         self,
         data: Data,
@@ -575,15 +590,15 @@ class StereoPairs(_MappedScenes):
                 codec, chroma) and the depth contract does not accept it.
         """
         require_options(StereoPairs, options, elsewhere={"loader": options_of(self.loader)})
-        reading, selection = split_options(options, ReadOptions)
-        index = opened(data, selection, reading.get("conventions"))
-        plan = plan_pairs(index, seed=reading.get("seed", 0), **selection)
+        reading, selection = split_options({**READ_DEFAULTS, **options}, ReadOptions)
+        index = opened(data, selection, reading["conventions"])
+        plan = plan_pairs(index, seed=reading["seed"], **selection)
         _warn_of_mixed_splits(index, plan, selection)
         layout: Layout = "stacked" if str(selection.get("pairs")) == "sweep" else "single"
         request = parse_request("pairs", layout, fields=fields, options=reading)
         super().__init__(index, plan, request, reading)
-        usual = {"split": None, "pairs": "primary", "frames": "first"}
-        self.chosen = usual | {name: each for name, each in selection.items() if name in usual}
+        told = {"split": None, **SELECTION_DEFAULTS, **selection}
+        self.chosen = {name: told[name] for name in ("split", "pairs", "frames")}
 
 
 class SceneViews(_MappedScenes):
@@ -595,6 +610,7 @@ class SceneViews(_MappedScenes):
     The fields are in `stereogenbench_data.VIEW_FIELDS`.
     """
 
+    @list_options(READ_DEFAULTS)
     def __init__(
         self,
         data: Data,
@@ -620,10 +636,10 @@ class SceneViews(_MappedScenes):
             StorageError: If the data are not there, or hold more than a few broken scenes.
         """
         require_options(SceneViews, options, elsewhere={"loader": options_of(self.loader)})
-        reading, filters = split_options(options, ReadOptions)
+        reading, filters = split_options({**READ_DEFAULTS, **options}, ReadOptions)
         layout: Layout = "single" if str(cameras) == "each" else "stacked"
         request = parse_request("views", layout, fields=fields, options=reading)
-        index, seed = opened(data, filters, reading.get("conventions")), reading.get("seed", 0)
+        index, seed = opened(data, filters, reading["conventions"]), reading["seed"]
         plan = plan_views(index, cameras=cameras, frames=frames, seed=seed, filters=filters)
         _warn_of_mixed_splits(index, plan, filters)
         super().__init__(index, plan, request, reading)

@@ -15,12 +15,13 @@ from stereogenbench_data.datasets.batches import (
     require_count,
 )
 from stereogenbench_data.datasets.division import WorkerShare
-from stereogenbench_data.datasets.epoch_rule import EpochOptions
-from stereogenbench_data.datasets.mapped import Data, PairsOptions, StereoPairs
+from stereogenbench_data.datasets.epoch_rule import EPOCH_DEFAULTS, EpochOptions
+from stereogenbench_data.datasets.mapped import PAIRS_DEFAULTS, Data, PairsOptions, StereoPairs
 from stereogenbench_data.datasets.shared import RepeatedEpochWarning, SharedNumbers
 from stereogenbench_data.errors import StateError, users_level
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.selection.filters import require_options, split_options
+from stereogenbench_data.selection.signatures import list_options
 
 _MOST_WORKERS: Final = 4096
 """Workers for each of which a stream counts passes."""
@@ -48,6 +49,7 @@ class StereoPairStream(IterableDataset[Sample]):
     (4, 4)
     """
 
+    @list_options(PAIRS_DEFAULTS, EPOCH_DEFAULTS, {"seed": 0})
     def __init__(self, data: Data, batch_size: int, **options: Unpack[StreamOptions]) -> None:
         """Select the samples; no video is opened before the first sample is read.
 

@@ -17,6 +17,7 @@ import numpy as np
 from stereogenbench_data.datasets.mapped import Data
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.evaluate import (
+    EVALUATION_DEFAULTS,
     EvaluationOptions,
     Run,
     score_pairs,
@@ -31,6 +32,7 @@ from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.filters import require_options
+from stereogenbench_data.selection.signatures import list_options
 
 TARGET: Final = "rendered target"
 COPIED_LEFT: Final = "copied left"
@@ -123,6 +125,7 @@ def derangement(keys: Sequence[str], *, seed: int) -> dict[str, str]:
     return dict(zip(sorted(keys), donors, strict=True))
 
 
+@list_options(EVALUATION_DEFAULTS)
 def score_controls(
     data: Data,
     *,

@@ -23,6 +23,7 @@ from stereogenbench_data.evaluation.disparity_maps import (
     accept_disparity,
 )
 from stereogenbench_data.evaluation.evaluate import (
+    EVALUATION_DEFAULTS,
     EvaluationOptions,
     Run,
     called_name,
@@ -68,6 +69,7 @@ from stereogenbench_data.evaluation.tables import (
 from stereogenbench_data.samples.fields import PAIR_FIELDS, Sample
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.selection.filters import require_options
+from stereogenbench_data.selection.signatures import list_options
 
 _TRUTH: Final = ("disparity", "valid", "visible", "frame_index")
 _SHOWN: Final = ("epe", "rms", "bad_1", "bad_2", "bad_3", "d1", "invalid")
@@ -78,6 +80,7 @@ _DENOMINATORS: Final = (
 )
 
 
+@list_options(EVALUATION_DEFAULTS)
 def evaluate_disparity(
     data: Data,
     predictions: str | Path | Matcher,

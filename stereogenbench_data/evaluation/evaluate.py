@@ -55,13 +55,14 @@ from stereogenbench_data.evaluation.scene_scores import (
 )
 from stereogenbench_data.evaluation.tables import Labels, PairMeans, Scores, tallies
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.jobs import JobKind, WorkOptions, do_items, job_folder
+from stereogenbench_data.jobs import WORK_DEFAULTS, JobKind, WorkOptions, do_items, job_folder
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import may_pass, require_options
-from stereogenbench_data.selection.plan import Random, Selection
+from stereogenbench_data.selection.plan import SELECTION_DEFAULTS, Random, Selection
+from stereogenbench_data.selection.signatures import list_options
 from stereogenbench_data.sources.files import write_atomic
 
 EVALUATION: Final = JobKind("scores", "evaluation.json", ".evaluation.lock", EvaluationError)
@@ -96,6 +97,12 @@ class EvaluationOptions(RunOptions, Selection, total=False):
     """
 
 
+EVALUATION_DEFAULTS: Final = {
+    **SELECTION_DEFAULTS, **WORK_DEFAULTS, "frames": "all", "out": None, "allow_missing": 0,
+}  # fmt: skip
+
+
+@list_options(EVALUATION_DEFAULTS)
 def evaluate(
     data: Data,
     predictions: str | Path | Method,

@@ -28,6 +28,7 @@ from stereogenbench_data.evaluation.predictions import PairFrames, frame_name, o
 from stereogenbench_data.evaluation.protocol import PAPER_SIZE, Tier, require_tier
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import (
+    WORK_DEFAULTS,
     JobKind,
     WorkOptions,
     atomic_folder,
@@ -39,7 +40,8 @@ from stereogenbench_data.samples.fields import require_size
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import require_options
-from stereogenbench_data.selection.plan import Selection
+from stereogenbench_data.selection.plan import SELECTION_DEFAULTS, Selection
+from stereogenbench_data.selection.signatures import list_options
 
 INPUTS: Final = JobKind("inputs", "inputs.json", ".inputs.lock", EvaluationError)
 _FAST: Final = 1
@@ -59,6 +61,7 @@ class _ItemWork:
     folder: Path
 
 
+@list_options(SELECTION_DEFAULTS, WORK_DEFAULTS, {"frames": "all"})
 def export_inputs(
     data: Data,
     out: str | Path,

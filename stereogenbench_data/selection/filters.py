@@ -12,7 +12,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal, TypedDict, get_args
+from typing import Any, Final, Literal, TypedDict
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int8, Int64
@@ -47,8 +47,8 @@ def require_options(
     """Refuse options that a call does not have, naming the nearest, and all in their order.
 
     Args:
-        call: A function or a class, whose options are its keyword-only and optional parameters and
-            the keys of the typed dictionary that it unpacks.
+        call: A function or a class, whose options are its keyword-only and optional parameters:
+            `signatures.list_options` lists those of a typed dictionary.
         given: The names that the caller gave.
         elsewhere: Calls that a user may have meant, such as "loader", with their options.
 
@@ -77,10 +77,7 @@ def options_of(call: Callable[..., Any]) -> list[str]:
             and parameter.default is not inspect.Parameter.empty
         ):
             names.append(parameter.name)
-        if parameter.kind is inspect.Parameter.VAR_KEYWORD:
-            for unpacked in get_args(parameter.annotation):
-                names += unpacked.__annotations__
-    return list(dict.fromkeys(names))
+    return names
 
 
 def split_options(options: Mapping[str, Any], kind: Any) -> tuple[Any, Any]:

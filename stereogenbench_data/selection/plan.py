@@ -38,6 +38,7 @@ from stereogenbench_data.selection.filters import (
     whole_number,
 )
 from stereogenbench_data.selection.order import Runs
+from stereogenbench_data.selection.signatures import list_options
 
 Balance = Literal["bins", "log_baseline"]
 LOG_STRATA = 16
@@ -393,6 +394,13 @@ class Selection(SceneFilters, PairOptions, total=False):
     frames: FramesSpec
 
 
+SELECTION_DEFAULTS: Final = Selection(
+    pairs="primary", direction="left_to_right", baseline_cm=None, balance=None, limit=None,
+    frames="first",
+)  # fmt: skip
+"""What a selection takes unless it says otherwise; each filter lets every scene pass."""
+
+
 class Address(NamedTuple):
     """Where one sample comes from.
 
@@ -512,6 +520,7 @@ class Plan:
         )
 
 
+@list_options(SELECTION_DEFAULTS)
 def plan_pairs(index: SceneIndex, *, seed: int = 0, **selection: Unpack[Selection]) -> Plan:
     """Return the plan of a selection of pair samples.
 
@@ -520,9 +529,9 @@ def plan_pairs(index: SceneIndex, *, seed: int = 0, **selection: Unpack[Selectio
             seed is not a whole number from 0.
     """
     seed = require_whole("seed", seed, least=0)
-    chosen, filters = split_options(selection, PairOptions)
-    windows = parse_frames(filters.pop("frames", "first"))
-    balance, limit = chosen.pop("balance", None), chosen.pop("limit", None)
+    chosen, filters = split_options({**SELECTION_DEFAULTS, **selection}, PairOptions)
+    windows = parse_frames(filters.pop("frames"))
+    balance, limit = chosen.pop("balance"), chosen.pop("limit")
     # What is left are filters, whose names and values are checked there.
     pairs = choose_pairs(index, filter_scenes(index, filters), **chosen)
     if balance is not None:

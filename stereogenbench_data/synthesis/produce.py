@@ -21,10 +21,11 @@ from jaxtyping import Float64
 
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import SynthesisError, explain_os_errors
-from stereogenbench_data.jobs import WorkOptions, differing, do_items
+from stereogenbench_data.jobs import WORK_DEFAULTS, WorkOptions, differing, do_items
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
 from stereogenbench_data.selection.filters import require_options
+from stereogenbench_data.selection.signatures import list_options
 from stereogenbench_data.sources.files import try_locked
 from stereogenbench_data.synthesis.filters import Refusal
 from stereogenbench_data.synthesis.planning import Planned, plan_scene, propose
@@ -52,6 +53,7 @@ HOLDOUT: Final = ".holdout"
 """Where scenes are that a person refused, below the root."""
 
 
+@list_options(WORK_DEFAULTS, {"workers": 1})
 def synthesise(
     out: str | Path,
     request: SynthRequest,
@@ -103,6 +105,7 @@ def synthesise(
     return [key for _, key in sorted(there.items()) if key is not None]
 
 
+@list_options(WORK_DEFAULTS, {"workers": 1})
 def plan_scenes(
     out: str | Path,
     request: SynthRequest,

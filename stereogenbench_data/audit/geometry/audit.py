@@ -29,7 +29,7 @@ from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.rows import row_of
 from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
 from stereogenbench_data.index.tree import SceneFolder, TreeCache
-from stereogenbench_data.jobs import WorkOptions, do_items
+from stereogenbench_data.jobs import WORK_DEFAULTS, WorkOptions, do_items
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Scene
@@ -40,6 +40,7 @@ from stereogenbench_data.selection.filters import (
     require_options,
     split_options,
 )
+from stereogenbench_data.selection.signatures import list_options
 from stereogenbench_data.sources.location import is_remote, joined, local_path
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import MissingObject
@@ -52,6 +53,7 @@ class AuditOptions(WorkOptions, SceneFilters, total=False):
     """How an audit is run (`WorkOptions`), and of which scenes (`SceneFilters`)."""
 
 
+@list_options(WORK_DEFAULTS)
 def open_for_audit(
     data: str | Path,
     *,
@@ -99,6 +101,7 @@ def _is_plain_tree(data: str | Path) -> bool:
     return False
 
 
+@list_options(WORK_DEFAULTS)
 def audit(
     data: str | Path | SceneIndex,
     *,
