@@ -52,6 +52,7 @@ lint: $(READY)
 	$(BIN)/mypy
 
 docs: $(READY)
+	$(BIN)/python docs/generated_pages.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 # Draws its scenes first (20 minutes or so, kept in build/bench), then races for some 15 minutes.

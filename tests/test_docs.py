@@ -72,7 +72,7 @@ def test_the_page_of_commands_names_every_command_and_option(built):
 
 
 def test_the_tables_of_fields_in_the_file_are_those_of_the_code():
-    """`python docs/generated_pages.py` writes them anew."""
+    """`python docs/generated_pages.py tables` writes them anew."""
     page = (HOME / "docs" / "samples.md").read_text()
     pages = importlib.util.spec_from_file_location("pages", HOME / "docs" / "generated_pages.py")
     made = importlib.util.module_from_spec(pages)
