@@ -173,6 +173,9 @@ def write_site(folder: Path) -> None:
     """Write all pages and pictures that the site is built from; what stood there goes."""
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(HOME / "docs", folder, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
+    first = folder / "index.md"
+    text = with_install(first.read_text())
+    first.write_text(text.replace("../examples/tutorial.ipynb", "tutorial.md"))
     (folder / "commands.md").write_text(commands_page())
     (folder / "tutorial.md").write_text(notebook_page(NOTEBOOK, pictures=folder / "tutorial"))
     (folder / "reference").mkdir()
@@ -180,6 +183,18 @@ def write_site(folder: Path) -> None:
         (folder / "reference" / f"{name}.md").write_text(reference_page(title, modules))
     overview = folder / "api.md"
     overview.write_text(overview.read_text() + reference_overview())
+
+
+def with_install(markdown: str) -> str:
+    """Return a page with README's section on installing between its comments."""
+    readme = (HOME / "README.md").read_text()
+    section = readme.partition("\n## Install\n")[2].partition("\n## ")[0].strip()
+    return re.sub(
+        r"<!-- section Install of README.md -->.*?<!-- end of section -->",
+        lambda _: section.replace("](docs/", "]("),
+        markdown,
+        flags=re.DOTALL,
+    )
 
 
 def with_fields_tables(markdown: str) -> str:
@@ -247,8 +262,11 @@ def reference_overview() -> str:
 
 def _first_line(place: str, name: str) -> str:
     found = getattr(importlib.import_module(f"{_PACKAGE}.{place}"), name)
-    own = not isinstance(found, tuple | Mapping)
-    return (found.__doc__ or "").strip().splitlines()[0] if own else "A table of fields."
+    if isinstance(found, Mapping):
+        return "The table of all fields: shapes, dtypes and meanings."
+    if isinstance(found, tuple):
+        return "Names of fields."
+    return (found.__doc__ or "").strip().splitlines()[0]
 
 
 def _is_public(name: str) -> bool:

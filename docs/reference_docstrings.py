@@ -11,6 +11,8 @@ from typing import Any
 
 import griffe
 
+from stereogenbench_data.selection.signatures import Told
+
 _DOCTEST = re.compile(r"(?:^[ ]*>>> .*\n?(?:^[ ]*\S.*\n?)*)+", flags=re.MULTILINE)
 _PLACES = {"small_release": "scenes/", "detailed_release": "scenes/", "small_shards": "shards/"}
 """What a reader has where a test has a fixture."""
@@ -54,7 +56,7 @@ def _option(parameter: inspect.Parameter) -> griffe.Parameter:
         parameter.name,
         annotation=kind,
         kind=griffe.ParameterKind.keyword_only,
-        default=repr(parameter.default),
+        default="..." if isinstance(parameter.default, Told) else repr(parameter.default),
     )
 
 

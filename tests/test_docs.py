@@ -1,6 +1,7 @@
 """The documentation builds as a site; no page, link or docstring gives a warning."""
 
 import importlib.util
+import json
 import os
 import re
 import subprocess
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 import typer
 
+import stereogenbench_data
 from stereogenbench_data.cli.commands import app
 from tests.servers.tools import require_module, require_tool
 
@@ -17,11 +19,22 @@ HOME = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="module")
+def pages():
+    """The script that makes pages before the build."""
+    spec = importlib.util.spec_from_file_location("pages", HOME / "docs" / "generated_pages.py")
+    made = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(made)
+    return made
+
+
+@pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """The ended process of the build, and the folder of the site."""
+    """The ended process of the build, and the folder of the site, as `make docs` makes it."""
     for module in ("mkdocs", "material", "mkdocstrings"):
         require_module(module)
     site = tmp_path_factory.mktemp("site")
+    made = [sys.executable, "docs/generated_pages.py"]
+    subprocess.run(made, cwd=HOME, check=True, timeout=300)
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(site)],
         cwd=HOME, capture_output=True, text=True, check=False, timeout=300,
@@ -71,15 +84,83 @@ def test_the_page_of_commands_names_every_command_and_option(built):
             assert option in page or not option.startswith("--"), f"{name} {option}"
 
 
-def test_the_tables_of_fields_in_the_file_are_those_of_the_code():
+def test_the_tables_of_fields_in_the_file_are_those_of_the_code(pages):
     """`python docs/generated_pages.py tables` writes them anew."""
     page = (HOME / "docs" / "samples.md").read_text()
-    pages = importlib.util.spec_from_file_location("pages", HOME / "docs" / "generated_pages.py")
-    made = importlib.util.module_from_spec(pages)
-    pages.loader.exec_module(made)
 
-    assert made.with_fields_tables(page) == page
+    assert pages.with_fields_tables(page) == page
     assert page.count("| `world_from_cam` |") == 1
+
+
+def test_the_navigation_has_four_groups_and_every_page(built, pages):
+    text = (HOME / "mkdocs.yml").read_text()
+    navigation = text.partition("\nnav:\n")[2].partition("\nplugins:")[0]
+    made = {path.relative_to(HOME / "build" / "docs") for path in pages_of_the_site()}
+
+    assert re.findall(r"^  - (.+):$", navigation, re.MULTILINE) == [
+        "Tutorial", "How to", "Explanation", "Reference",
+    ]  # fmt: skip
+    assert {Path(each) for each in re.findall(r"[\w/]+\.md", navigation)} == made
+
+
+def pages_of_the_site():
+    """The pages that `build/docs` has after a build, but the one that the site leaves out."""
+    return {*(HOME / "build" / "docs").rglob("*.md")} - {
+        HOME / "build" / "docs" / "performance" / "tables.md"
+    }
+
+
+def test_the_reference_has_every_public_name_and_what_users_call(built, pages):
+    shown = "".join(
+        (built[1] / "reference" / page / "index.html").read_text() for page in pages.reference()
+    )
+    called = ("audit.geometry.audit.audit", "audit.contract.doctor.diagnose",
+              "audit.statistics.statistics", "synthesis.produce.synthesise",
+              "synthesis.request.SynthRequest", "bridges.picture.show")  # fmt: skip
+    places = {
+        name: getattr(stereogenbench_data, name).__module__
+        for name in stereogenbench_data.__all__
+        if hasattr(getattr(stereogenbench_data, name), "__module__")
+    }
+    wanted = [f"{place}.{name}" for name, place in places.items()]
+
+    assert [path for path in wanted if f'id="{path}"' not in shown] == []
+    assert [path for path in called if f'id="stereogenbench_data.{path}"' not in shown] == []
+    sizes = [len((built[1] / "reference" / page / "index.html").read_text())
+             for page in pages.reference()]  # fmt: skip
+    assert max(sizes) < 400_000
+
+
+def test_the_reference_lists_each_option_that_a_call_unpacks(built):
+    page = text_of(built[1], "reference/datasets")
+
+    assert "fetch_ahead_bytes" in page.partition("Stereo pairs of")[0]
+    assert "**options" not in page.partition("Stereo pairs of")[0]
+
+
+def test_the_tutorial_runs_and_shows_what_its_page_shows(pages, tmp_path, monkeypatch):
+    """`python docs/generated_pages.py notebook` keeps what it shows anew."""
+    for module in ("nbclient", "ipykernel", "matplotlib", "blosc2"):
+        require_module(module)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(each for each in sys.path if each))
+
+    ran = pages.executed(pages.NOTEBOOK, tmp_path)
+
+    shown = json.loads(pages.NOTEBOOK.read_text())["cells"]
+    assert [kinds_of(cell) for cell in ran["cells"]] == [kinds_of(cell) for cell in shown]
+    said = "".join(each["text"] for cell in ran["cells"] for each in cell.get("outputs", ())
+                   if "text" in each)  # fmt: skip
+    before, after = map(float, re.findall(r"trained +epe +([\d.]+) px", said))
+    assert after < before / 2
+    assert said.endswith("nothing wrong found\nTrue\n")
+
+
+def kinds_of(cell):
+    """What a cell of a notebook shows: lines of text, pictures."""
+    return [
+        len("".join(each["text"]).splitlines()) if "text" in each else sorted(each["data"])
+        for each in cell.get("outputs", ())
+    ]
 
 
 CUT_CODE = """

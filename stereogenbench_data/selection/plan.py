@@ -375,10 +375,19 @@ batches would hardly be mixed better."""
 
 
 class PairOptions(TypedDict, total=False):
-    """Which pairs of a scene: see `choose_pairs`, and `balanced` for balance and limit.
+    """Which pairs of a scene. A subsample is the same in every epoch.
 
-    A limit alone draws as many pairs of all, as for few-shot training. A subsample is the same in
-    every epoch.
+    Attributes:
+        pairs: "primary" (the default, one a scene), "adjacent" (5), "all" (15), one or several pairs
+            of camera numbers (left, right) or texts "left-right", or "sweep", the primary left view
+            with all views to its right in one sample.
+        direction: "left_to_right", the default: the left camera's pixels have the disparity.
+            "right_to_left": the right camera's, with negative disparity and baseline.
+        baseline_cm: A closed range in cm, or names of the paper's bins, such as "[10,30)".
+        balance: "bins" or "log_baseline": a subsample with as many pairs in each of the paper's
+            bins, or in each of 16 equal steps of the logarithm of the baseline.
+        limit: How many pairs the subsample has; alone, it draws them from all, as for few-shot
+            training.
     """
 
     pairs: PairsSpec
