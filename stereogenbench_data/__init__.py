@@ -1,4 +1,4 @@
-"""Train and evaluate on StereoGenBench: every stereo pair of six-camera scenes, right to the pixel.
+"""Train and evaluate on StereoGenBench: stereo pairs with disparity, masks and poses.
 
 Public names are imported when they are first used: what does not need torch starts without it.
 The names and their modules are listed in `__init__.pyi`. Nothing is imported at first, not

@@ -30,7 +30,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import DEPTH_CURES, NO_DEPTH_UNIT
 from stereogenbench_data.media.encoder import Encoding, VideoEncoder
 from stereogenbench_data.samples.fields import Request, Sample
-from stereogenbench_data.samples.load import SampleLoader
+from stereogenbench_data.samples.load import SampleDecoder
 from stereogenbench_data.schema.conventions import depth_of
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT, rgb_name
@@ -53,7 +53,7 @@ class SceneReader:
         """Prepare to read the data of an index; nothing is opened yet."""
         self.index = index
         self._lock = threading.Lock()
-        self._loaders: dict[Request, tuple[SampleLoader, threading.Lock]] = {}
+        self._loaders: dict[Request, tuple[SampleDecoder, threading.Lock]] = {}
 
     def pair(
         self, row: int, *, pair: tuple[int, int], frame: int, fields: tuple[str, ...]
@@ -95,7 +95,7 @@ class SceneReader:
             )
         with self._lock:
             if request not in self._loaders:
-                loader = SampleLoader(self.index, request)
+                loader = SampleDecoder(self.index, request)
                 loader.keep_open(OPEN_VIDEOS)
                 self._loaders[request] = loader, threading.Lock()
             loader, turn = self._loaders[request]

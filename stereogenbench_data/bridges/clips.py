@@ -40,7 +40,7 @@ from stereogenbench_data.jobs import (
 )
 from stereogenbench_data.media.encoder import Encoding, VideoEncoder
 from stereogenbench_data.samples.fields import Request, Sample
-from stereogenbench_data.samples.load import SampleLoader
+from stereogenbench_data.samples.load import SampleDecoder
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import (
     SceneFilters,
@@ -211,7 +211,7 @@ class ClipOptions(WorkOptions, SceneFilters, PairOptions, total=False):
         captions: "plain", or "with baseline" for captions that tell it.
         encoding: How videos are encoded; masks are lossless in any case.
         seed: That of a balanced subsample.
-        depth: A depth contract instead of the one that files and release state.
+        depth: A depth encoding instead of the one that files and release state.
     """
 
     length: int | None
@@ -477,7 +477,7 @@ def _write_clip(work: _ClipWork, advance: Advance) -> None:
 
 
 def _frames(work: _ClipWork, request: Request) -> Iterator[Sample]:
-    with closing(SampleLoader(work.index, request, check="opened")) as loader:
+    with closing(SampleDecoder(work.index, request, check="opened")) as loader:
         for frame in work.address.frames:
             yield loader.load(work.address._replace(frames=(frame,)), clip="frame")
 

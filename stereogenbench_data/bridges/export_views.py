@@ -42,7 +42,7 @@ from stereogenbench_data.jobs import (
     named_errors,
 )
 from stereogenbench_data.samples.fields import Request
-from stereogenbench_data.samples.load import SampleLoader
+from stereogenbench_data.samples.load import SampleDecoder
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import (
     SceneFilters,
@@ -279,7 +279,7 @@ class ViewExportOptions(WorkOptions, SceneFilters, total=False):
         size: (height, width) in pixels, or a text WIDTHxHEIGHT; None for the stored size.
         points: How many points are taken from each picture, "all" for every measured pixel; None
             for `USUAL_POINTS`.
-        depth: A depth contract instead of the one that files and release state.
+        depth: A depth encoding instead of the one that files and release state.
     """
 
     cameras: Sequence[int] | Literal["all"]
@@ -402,7 +402,7 @@ class _SceneWork:
 
 def _export_scene(work: _SceneWork, advance: Advance) -> None:
     """Write the missing folders of one scene, each whole or not at all."""
-    with closing(SampleLoader(work.index, work.request)) as loader:
+    with closing(SampleDecoder(work.index, work.request)) as loader:
         for folder, address in work.addresses.items():
             images = posed_images(loader.load(address, clip="frame"))
             with named_errors(folder), atomic_folder(folder) as unfinished:

@@ -23,5 +23,5 @@ def training_filters(options: Mapping[str, Any]) -> SceneFilters:
 
 
 def depth_setting(depth: DepthEncoding | None) -> dict[str, Any] | None:
-    """Return a depth contract as the settings of an export hold it, the same in every process."""
+    """Return a depth encoding as the settings of an export hold it, the same in every process."""
     return None if depth is None else asdict(depth) | {"accept": sorted(depth.accept)}

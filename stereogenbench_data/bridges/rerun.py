@@ -98,7 +98,7 @@ def log_scene(  # noqa: PLR0913 - each names one thing that a user chooses
         frames: Which frames, but no clips.
         size: (height, width) in pixels, or a text WIDTHxHEIGHT; None for the stored size, or as
             much smaller as it takes to be at most `USUAL_WIDTH_PX` wide.
-        depth: A depth contract instead of the one that files and release state.
+        depth: A depth encoding instead of the one that files and release state.
         progress: Called with (frames done, frames in all).
 
     Raises:

@@ -17,7 +17,7 @@ from stereogenbench_data.errors import FieldError, SelectionError
 from stereogenbench_data.geometry.arrays import take_pixels
 from stereogenbench_data.geometry.disparity import disparity_from_shifts, ray_per_planar
 from stereogenbench_data.geometry.projection import front_pixels
-from stereogenbench_data.samples.derive import Direction, once
+from stereogenbench_data.samples.derive import ViewPairMaps, once
 
 DERIVE_FIELDS: Final = (
     "image", "stored_depth", "depth_unit_m", "depth_offset_m", "no_depth", "depth_kind",
@@ -292,7 +292,7 @@ def _taken(values: torch.Tensor, places: Sequence[int]) -> torch.Tensor:
     return torch.stack([values[:, place] for place in places], dim=1)
 
 
-class _Pairs(Direction):
+class _Pairs(ViewPairMaps):
     """What follows from the depth of some source views for one target view each, (b, p, t, h, w).
 
     It does for tensors of many scenes what `PairGeometry` does for the arrays of one.
@@ -308,7 +308,7 @@ class _Pairs(Direction):
         self.is_rectified = moments.contract.rig == "rectified"
         self.is_inverse = moments.contract.form == "inverse"
 
-    def of_maps(self, numbers: torch.Tensor, *, like: torch.Tensor) -> torch.Tensor:
+    def broadcast_to_maps(self, numbers: torch.Tensor, *, like: torch.Tensor) -> torch.Tensor:
         """Return numbers (b, p) as they are broadcast to maps like these, in their dtype."""
         return _per_map(numbers).to(like.dtype)
 

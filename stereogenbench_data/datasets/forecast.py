@@ -30,7 +30,7 @@ from stereogenbench_data.datasets.division import WorkerShare
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.load import SampleLoader
+from stereogenbench_data.samples.load import SampleDecoder
 from stereogenbench_data.schema.release import VIDEO_FILES
 from stereogenbench_data.sources.fetch_ahead import CONNECTIONS, PlannedFetches
 from stereogenbench_data.sources.location import is_remote, joined
@@ -212,7 +212,9 @@ def planned_bytes(pairs: StereoPairs, batch_size: int, *, workers: int) -> tuple
     requests = count = samples = 0
     for worker in range(workers):
         ahead = PlannedFetches()
-        decoder = SampleLoader(index, pairs.request, check="metadata", frames="shared", ahead=ahead)
+        decoder = SampleDecoder(
+            index, pairs.request, check="metadata", frames="shared", ahead=ahead
+        )
         decoder.keep_open(videos, frames=frames, scenes=scenes)
         share = WorkerShare(0, 1, worker, workers, "streams")
         before_first = EpochBatch((), epoch=0, number=-share.batches_apart)

@@ -62,7 +62,7 @@ from stereogenbench_data.samples.fields import (
     require_importable,
     warn_if_swapped,
 )
-from stereogenbench_data.samples.load import OPEN_STREAMS, SampleLoader, StreamStats, Work
+from stereogenbench_data.samples.load import OPEN_STREAMS, SampleDecoder, StreamStats, Work
 from stereogenbench_data.schema.conventions import Conventions, depth_of
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_COUNT, DEFAULT_DEPTH_UNIT_M, depth_name
@@ -99,7 +99,7 @@ Check = Literal["read", "opened", "metadata"]
 """Which videos are compared with their checksums: see `StereoPairs`."""
 
 
-_OF_CACHE: Final = 16
+_CACHE_DIVISOR: Final = 16
 """The part of a cache that a process may fill ahead."""
 
 
@@ -111,7 +111,7 @@ class ReadOptions(TypedDict, total=False):
             they are decoded; intrinsics and disparity follow. None keeps the stored size.
             `SwappedSizeWarning` is given where the two look exchanged.
         transform: What changes pictures and cameras together, such as `Compose`.
-        depth: A depth contract instead of the one that files and release state.
+        depth: A depth encoding instead of the one that files and release state.
         conventions: Where quantities stand in the files and how they are read, as
             ``stereogenbench conventions`` writes it; see `SceneIndex.open`. ``depth`` counts more.
         seed: Seed of random frames, transforms and the balanced subsample; 0 if left out.
@@ -196,7 +196,7 @@ class _MappedScenes(Dataset[Sample]):
         ahead = FetchAhead(limit_bytes=options["fetch_ahead_bytes"])
         if cache is not None:
             # Several processes fill it: what one fetches ahead must not evict what another needs.
-            ahead.limit_bytes = min(ahead.limit_bytes, cache.limit_bytes // _OF_CACHE)
+            ahead.limit_bytes = min(ahead.limit_bytes, cache.limit_bytes // _CACHE_DIVISOR)
         if is_remote(index.root) and not index.load_seek_tables() and cache is None:
             warnings.warn(
                 f"{index.where} : its index does not say where the packets of videos lie, so a "
@@ -206,7 +206,7 @@ class _MappedScenes(Dataset[Sample]):
                 SeekTableWarning,
                 stacklevel=3,
             )
-        self._loader = SampleLoader(
+        self._loader = SampleDecoder(
             index,
             request,
             cache=cache,
@@ -587,7 +587,7 @@ class StereoPairs(_MappedScenes):
             FieldError: If a field does not exist, or a size is not one.
             StorageError: If the data are not there, or hold more than a few broken scenes.
             MediaError: If depth that a field needs cannot have been stored whole (8 bits, a lossy
-                codec, chroma) and the depth contract does not accept it.
+                codec, chroma) and the depth encoding does not accept it.
         """
         require_options(StereoPairs, options, elsewhere={"loader": options_of(self.loader)})
         reading, selection = split_options({**READ_DEFAULTS, **options}, ReadOptions)

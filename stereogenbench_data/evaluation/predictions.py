@@ -34,7 +34,7 @@ from stereogenbench_data.errors import (
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.video import VideoReader, probe, read_rgb
 from stereogenbench_data.samples.fields import Request, Sample
-from stereogenbench_data.samples.load import SampleLoader
+from stereogenbench_data.samples.load import SampleDecoder
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.plan import Address
 
@@ -122,7 +122,7 @@ def open_frames(
         depth: A depth contract instead of the one that files and release state.
     """
     request = Request(kind="pairs", fields=fields, layout="single", size=size, depth=depth)
-    with closing(SampleLoader(index, request)) as loader:
+    with closing(SampleDecoder(index, request)) as loader:
         yield lambda row, pair, frame: loader.load(
             Address(row, pair[0], (pair[1],), (frame,)), clip="frame"
         )

@@ -134,7 +134,7 @@ def require_depth_stream(
     Args:
         codec: What `depth_coding` returns.
         pixel_format: FFmpeg's name of the stored pixel format.
-        encoding: The depth contract.
+        encoding: The depth encoding.
         name: What messages call the file.
 
     Raises:
@@ -203,7 +203,7 @@ def read_depth_units(
     Args:
         reader: An open depth video, or depth packed by blosc2.
         index: Which frame of the file, from 0; `depth_frame_index` tells which an RGB frame needs.
-        encoding: The depth contract, which decides what streams are accepted.
+        encoding: The depth encoding, which decides what streams are accepted.
 
     Returns:
         uint16 (h, w), in stored units; read-only, of the decoded picture's own memory where that
@@ -307,7 +307,7 @@ def measured(
 
     Args:
         units: Stored numbers.
-        encoding: The depth contract.
+        encoding: The depth encoding.
         pixel_format: FFmpeg's name of the stored pixel format: "max" is its largest number.
     """
     largest = largest_number(pixel_format)
@@ -329,7 +329,7 @@ def depth_m_from_units(
     Args:
         units: Stored numbers.
         measured: Where depth was measured, see `measured`.
-        encoding: The depth contract.
+        encoding: The depth encoding.
         intrinsics: The camera of this picture, used for ``kind="ray"``.
 
     Returns:

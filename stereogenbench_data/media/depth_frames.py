@@ -54,7 +54,7 @@ _TOO_LATE: Final = 2**62
 _FIXED: Final = struct.Struct(">2x8sxixQ")
 """Magic, size of the header and of the whole file."""
 _MAGIC: Final = b"b2frame\0"
-_NOT_DESCRIBED: Final = (
+_HEADER_ERRORS: Final = (
     ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError,
 )  # fmt: skip
 
@@ -164,7 +164,7 @@ def frame_file(clip: StoredClip, chunks: Sequence[bytes]) -> bytes:
 def _described(header: bytes) -> tuple[StoredClip, list[int], list[int]]:
     """Return what the end of a header describes: the clip, and sizes and checksums of its chunks.
 
-    What is not so described raises one of `_NOT_DESCRIBED`.
+    What is not so described raises one of `_HEADER_ERRORS`.
     """
     start = header.find(b'{"format":')
     text = header[start:]
@@ -332,7 +332,7 @@ class DepthFrames(FrameReader):
             )
         try:
             self.clip, self._sizes, self._crc32s = _described(header[:size])
-        except _NOT_DESCRIBED as error:
+        except _HEADER_ERRORS as error:
             reason = shortened(str(error))
             raise _unfit(name, f"its description is malformed or incomplete ({reason})") from error
         clip, self.frames = self.clip, len(self._sizes)

@@ -46,7 +46,7 @@ _MOST_PACKETS: Final = 2**17
 _LARGEST_TABLES: Final = 64 * 2**20
 _MAGIC: Final = b"seek1"
 _LENGTH: Final = struct.Struct(">I")
-_NO_TABLES: Final = (
+_UNPACK_ERRORS: Final = (
     zlib.error, struct.error, ValueError, LookupError, TypeError, RecursionError, OverflowError,
 )  # fmt: skip
 """What bytes raise that are no packed tables."""
@@ -108,7 +108,7 @@ class SeekTable:
         return end + len(self.tail) == file_bytes if self.tail else end <= file_bytes
 
 
-class Position:
+class ReadCursor:
     """Where a reader of a video is: it tells which bytes each next frame needs.
 
     It does what `decoder.Decoder` does with the file. Where they differ, bytes are fetched one
@@ -368,7 +368,7 @@ def parse_tables(packed: bytes) -> dict[str, SeekTable]:
         (length,) = _LENGTH.unpack_from(content)
         content = content[_LENGTH.size :]
         return _parsed(json.loads(content[:length]), content[length:])
-    except _NO_TABLES:
+    except _UNPACK_ERRORS:
         return {}
 
 

@@ -1,15 +1,15 @@
 """The bytes of coming samples: planned in the order in which they will be read, fetched ahead.
 
-A `Position` for each open video follows what the decoder will do, so that each byte is fetched once
-as long as its video stays open. Where the order turns out to be another one, planning starts anew.
-Only data behind a URL are planned.
+A `ReadCursor` for each open video follows what the decoder will do, so that each byte is fetched
+once as long as its video stays open. Where the order turns out to be another one, planning starts
+anew. Only data behind a URL are planned.
 """
 
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import Final, NamedTuple, Protocol, Self
 
-from stereogenbench_data.media.seek_table import Position
+from stereogenbench_data.media.seek_table import ReadCursor
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.selection.plan import Address, Step
 from stereogenbench_data.sources.fetch_ahead import FetchAhead, Wanted
@@ -89,7 +89,7 @@ class ComingSamples:
         self._due: deque[_Planned] = deque()
         self._waiting: deque[_Planned] = deque()  # for their requests
         self._number = self._begun = 0
-        self._positions: OrderedDict[tuple[str, int, int], Position | None] = OrderedDict()
+        self._positions: OrderedDict[tuple[str, int, int], ReadCursor | None] = OrderedDict()
         self._read_texts: set[str] = set()
         self._begin_anew()
 

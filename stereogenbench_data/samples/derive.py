@@ -118,7 +118,7 @@ class SceneFacts:
     Attributes:
         scene: The row of the index.
         intrinsics: Of its pictures as they are decoded, before a transform.
-        encodings: The depth contract of each camera.
+        encodings: The depth encoding of each camera.
         url: Returns what holds one of its files: a shard, or the scene's folder.
         videos: The videos that were opened for it, where its row is presumed and behind a URL.
         poses: Its `CameraPoses`; None until they were read, or where nothing needs them.
@@ -155,7 +155,7 @@ def once(make: Callable[[Any], T]) -> T:
     return cast("T", property(get, doc=make.__doc__))
 
 
-class Direction:
+class ViewPairMaps:
     """What follows from the depth of source views for one target view each.
 
     Maps are (..., h, w): numpy arrays of one pair, or tensors of many. Disparity is
@@ -188,7 +188,7 @@ class Direction:
         """Compute nothing yet."""
         self.made: dict[str, Any] = {}
 
-    def of_maps(self, numbers: Any, *, like: Any) -> Any:
+    def broadcast_to_maps(self, numbers: Any, *, like: Any) -> Any:
         """Return numbers of one pair or of each as they are broadcast to maps like these."""
         del like
         return numbers
@@ -217,11 +217,13 @@ class Direction:
         u_px, _ = pixel_centres(self.depth_m, dtype=xp.float64)
         return xp.where(self.known, u_px - self.projection.u_px, 0.0)
 
-    def quantum_m(self, target: "Direction") -> Any:
+    def quantum_m(self, target: "ViewPairMaps") -> Any:
         """Return the coarser step between depths that the two cameras can store."""
         if self.is_inverse:
-            return self.depth_m**2 / self.of_maps(self.unit_m, like=self.depth_m)
-        return self.of_maps(self.coarser(self.unit_m, target.unit_m), like=self.projection.depth_m)
+            return self.depth_m**2 / self.broadcast_to_maps(self.unit_m, like=self.depth_m)
+        return self.broadcast_to_maps(
+            self.coarser(self.unit_m, target.unit_m), like=self.projection.depth_m
+        )
 
     @once
     def disparity_error(self) -> Any:
@@ -229,11 +231,11 @@ class Direction:
         shift_px_m = abs(self.shift_px_m)
         if self.is_inverse:
             known = array_namespace(self.known).astype(self.known, self.depth_m.dtype)
-            return known * self.of_maps(shift_px_m / self.unit_m / 2, like=self.depth_m)
+            return known * self.broadcast_to_maps(shift_px_m / self.unit_m / 2, like=self.depth_m)
         bound_px = disparity_error_px(
             self.depth_m,
-            shift_px_m=self.of_maps(shift_px_m, like=self.depth_m),
-            half_step_m=self.of_maps(self.unit_m / 2, like=self.depth_m),
+            shift_px_m=self.broadcast_to_maps(shift_px_m, like=self.depth_m),
+            half_step_m=self.broadcast_to_maps(self.unit_m / 2, like=self.depth_m),
         )
         return bound_px if self.is_rectified else bound_px * self.known
 
@@ -244,7 +246,7 @@ class Direction:
             self.projection, measured=self.measured, quantum_m=self.quantum_m(self)
         )
 
-    def visible(self, target: "Direction") -> Any:
+    def visible(self, target: "ViewPairMaps") -> Any:
         """Return what is visible in the target, by the depth of the way back."""
         return visible_in_target(
             self.projection,
@@ -255,11 +257,11 @@ class Direction:
         )
 
 
-class PairGeometry(Direction):
+class PairGeometry(ViewPairMaps):
     """Geometry from a source camera's depth to a target camera. Maps are (t, h, w).
 
     Attributes:
-        encoding: The depth contract of the source.
+        encoding: The depth encoding of the source.
     """
 
     def __init__(self, views: Views, facts: SceneFacts, *, source: int, target: int) -> None:
@@ -416,7 +418,7 @@ class PairGeometry(Direction):
         """What is visible in the target, decided by the source's own depth alone."""
         return self._shown_in_both(super().visible_from_source)
 
-    def visible(self, target: Direction) -> MapBool:
+    def visible(self, target: ViewPairMaps) -> MapBool:
         """Return what is visible in the target, by the depth of the target's own geometry."""
         return self._shown_in_both(super().visible(target))
 

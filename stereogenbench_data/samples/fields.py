@@ -340,7 +340,7 @@ class Request:
         fields: The fields, in order.
         layout: "single": of one target; "stacked": with an axis of targets in front.
         size: (height, width) to which the decoder scales, None for the stored size.
-        depth: A depth contract that overrides what the index says, or None.
+        depth: A depth encoding that overrides what the index says, or None.
         transform: What changes the views before fields are derived, or None.
     """
 

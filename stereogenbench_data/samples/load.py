@@ -267,7 +267,7 @@ class Streams:
             scene: The scene.
             name: The video, such as "cam_00_depth.mkv".
             index: Which frame of the file; `depth_frame_index` tells which an RGB frame needs.
-            encoding: The depth contract.
+            encoding: The depth encoding.
             size: (height, width) to take the nearest pixels of, None for the stored size.
             run: As for `rgb`.
 
@@ -368,7 +368,7 @@ KEPT_SCENES: Final = 256
 """Of so many scenes at least row and poses are kept (poses of 81 frames take 46 kB)."""
 
 
-class SampleLoader:
+class SampleDecoder:
     """Loads samples: flat dicts of numpy arrays and texts.
 
     Rows of the index, poses, open videos and their current frames are kept for later samples.
@@ -747,7 +747,7 @@ class SampleLoader:
         return poses_of(scene, text, where=where)
 
 
-_loaders: Final[weakref.WeakSet[SampleLoader]] = weakref.WeakSet()
+_loaders: Final[weakref.WeakSet[SampleDecoder]] = weakref.WeakSet()
 """The loaders of this process: a fork begins anew with each, before it has any other thread."""
 
 _inherited: Final[list[object]] = []

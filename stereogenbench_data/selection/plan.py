@@ -378,9 +378,9 @@ class PairOptions(TypedDict, total=False):
     """Which pairs of a scene. A subsample is the same in every epoch.
 
     Attributes:
-        pairs: "primary" (the default, one a scene), "adjacent" (5), "all" (15), one or several pairs
-            of camera numbers (left, right) or texts "left-right", or "sweep", the primary left view
-            with all views to its right in one sample.
+        pairs: "primary" (the default, one a scene), "adjacent" (5), "all" (15), one or several
+            pairs of camera numbers (left, right) or texts "left-right", or "sweep", the primary
+            left view with all views to its right in one sample.
         direction: "left_to_right", the default: the left camera's pixels have the disparity.
             "right_to_left": the right camera's, with negative disparity and baseline.
         baseline_cm: A closed range in cm, or names of the paper's bins, such as "[10,30)".

@@ -12,7 +12,7 @@ from typing import Any, Final, Literal, TypeVar
 
 from stereogenbench_data.errors import ShardError, StorageError, explain_os_errors
 from stereogenbench_data.media.container import SeekableFile
-from stereogenbench_data.media.seek_table import Position, SeekTable, parse_tables
+from stereogenbench_data.media.seek_table import ReadCursor, SeekTable, parse_tables
 from stereogenbench_data.schema.document import require_text_size
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.text import shortened
@@ -122,7 +122,7 @@ class MemberSource:
         """Whether whole files are fetched, and kept on disk."""
         return self._cache is not None
 
-    def position(self, scene: Scene, name: str, *, kept_frames: int) -> Position | None:
+    def position(self, scene: Scene, name: str, *, kept_frames: int) -> ReadCursor | None:
         """Return where a reader of one of a scene's videos stands that is not open.
 
         None if it is not known which bytes a frame needs, or all of them are fetched.
@@ -130,7 +130,7 @@ class MemberSource:
         if self._cache is not None:
             return None
         table = self._table(scene, scene.held_name(name))
-        return None if table is None else Position(table, kept_frames=kept_frames)
+        return None if table is None else ReadCursor(table, kept_frames=kept_frames)
 
     def wanted(
         self, scene: Scene, name: str, ranges: Iterable[tuple[int, int]] | None = None

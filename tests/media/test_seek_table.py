@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from stereogenbench_data.media.depth import packed_depth
 from stereogenbench_data.media.seek_table import (
-    Position,
+    ReadCursor,
     SeekTable,
     packed_tables,
     parse_tables,
@@ -82,7 +82,7 @@ def test_packets_lie_where_ffprobe_finds_them(videos, kind):
 def test_each_frame_is_read_from_the_bytes_that_it_needs_alone(videos, kind, frames):
     path = videos[kind]
     content, table = path.read_bytes(), read_seek_table(path, name=kind)
-    position, ranges, missed = Position(table), [], []
+    position, ranges, missed = ReadCursor(table), [], []
     needed = 0
 
     def ahead(at):
@@ -115,7 +115,7 @@ def test_packed_depth_has_a_table_of_its_chunks(videos):
     table = read_seek_table(io.BytesIO(content), name="cam_00_depth.b2frame")
 
     assert table.packets == FRAMES
-    position = Position(table)
+    position = ReadCursor(table)
     assert position.needed(7) == [(table.bounds[7], table.bounds[8])]
     assert position.needed(7) == []
     assert position.needed(3) == [(table.bounds[3], table.bounds[4])]
@@ -133,7 +133,7 @@ def test_far_away_the_packets_of_a_cluster_count_as_one(videos):
     assert abs(table.bounds[-1] - whole.bounds[-1]) <= 32
     assert table.fits(file_bytes=videos["depth.mkv"].stat().st_size)
     # A later frame lies somewhere in its cluster: all of that is kept until the last one is read.
-    position = Position(table)
+    position = ReadCursor(table)
     needed = [position.needed(frame) for frame in range(FRAMES)][2:]
     starts = [table.bounds[table.key_before(frame)] for frame in range(2, FRAMES)]
     assert [ranges[-1][0] for ranges in needed] == starts
@@ -199,7 +199,7 @@ def test_what_is_needed_holds_each_frame_from_where_its_decoding_can_begin(
         head=bytes(10),
     )
     frames = [frame % count for frame in frames]
-    position = Position(table)
+    position = ReadCursor(table)
     there, previous = set(), None
     for frame in frames:
         parts = position.needed(frame)
