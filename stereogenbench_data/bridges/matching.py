@@ -4,8 +4,7 @@ Each class takes what `StereoPairs` takes, except fields, and gives the items th
 training loop unpacks: their order, signs, dtypes, value ranges and rule of validity. Disparity is
 in pixels of the picture as resized and cropped, x_right = x_left - d.
 
->>> from stereogenbench_data.selection.signatures import list_options
-from stereogenbench_data.bridges.matching import RaftStereo
+>>> from stereogenbench_data.bridges.matching import RaftStereo
 >>> train = RaftStereo(getfixture("small_release"), split="train", pairs="all", frames="all")
 >>> for _, *data_blob in train.loader(batch_size=2):
 ...     image1, image2, flow, valid = data_blob

@@ -1,8 +1,7 @@
 """A stage for ``webdataset`` pipelines that turns scenes into stereo samples.
 
 >>> import webdataset  # doctest: +SKIP
->>> from stereogenbench_data.selection.signatures import list_options
-from stereogenbench_data.bridges.webdataset import decode
+>>> from stereogenbench_data.bridges.webdataset import decode
 >>> stage = decode(("left", "disparity"), pairs="all", frames="all")
 >>> samples = webdataset.WebDataset(urls, shardshuffle=False).compose(stage)  # doctest: +SKIP
 """

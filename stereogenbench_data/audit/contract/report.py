@@ -13,9 +13,9 @@ from stereogenbench_data.schema.text import counted
 
 QUOTIENT_MEANS: Final = (
     "Depth scale is unit / (focal length x baseline), which is all that disparity shows of the "
-    "three: a scene that is stretched along the axis looks right from the side. Depth from frame to "
-    "frame tells unit and focal length apart where a camera turns or advances; baselines and poses "
-    "that are wrong alike show nowhere."
+    "three: a scene that is stretched along the axis looks right from the side. Depth from frame "
+    "to frame tells unit and focal length apart where a camera turns or advances; baselines and "
+    "poses that are wrong alike show nowhere."
 )
 NOT_TESTED: Final = (
     "Not tested here, see `stereogenbench audit`: the sensor's height, the baselines recorded "
