@@ -20,7 +20,7 @@ from benchmarks.server import REPOSITORY, Network, serving
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.index.tree import CACHE_VARIABLE
+from stereogenbench_data.index.tree_cache import CACHE_VARIABLE
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 

@@ -42,11 +42,8 @@ from stereogenbench_data.media.encoder import Encoding, VideoEncoder
 from stereogenbench_data.samples.fields import Request, Sample
 from stereogenbench_data.samples.load import SampleDecoder
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.selection.filters import (
-    SceneFilters,
-    filter_scenes,
-    require_options,
-)
+from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import (
     SELECTION_DEFAULTS,
     Address,

@@ -44,11 +44,8 @@ from stereogenbench_data.jobs import (
 from stereogenbench_data.samples.fields import Request
 from stereogenbench_data.samples.load import SampleDecoder
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.selection.filters import (
-    SceneFilters,
-    require_options,
-    whole_number,
-)
+from stereogenbench_data.selection.filters import SceneFilters, whole_number
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import Address, FramesSpec
 from stereogenbench_data.selection.signatures import list_options
 

@@ -12,7 +12,8 @@ from typing import Any, Unpack
 from stereogenbench_data.bridges.in_memory import SampleOptions, samples_of
 from stereogenbench_data.datasets.shared import SharedEpoch
 from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS, Sample
-from stereogenbench_data.selection.filters import SceneFilters, require_options
+from stereogenbench_data.selection.filters import SceneFilters
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import SELECTION_DEFAULTS
 from stereogenbench_data.selection.signatures import list_options
 

@@ -24,7 +24,7 @@ from stereogenbench_data.datasets.epoch_rule import EPOCH_DEFAULTS, EpochOptions
 from stereogenbench_data.datasets.shared import SharedEpoch, require_epoch
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.selection.filters import require_options
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.order import (
     ORDER_VERSION,
     EpochOrder,

@@ -67,13 +67,8 @@ from stereogenbench_data.schema.conventions import Conventions, depth_of
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_COUNT, DEFAULT_DEPTH_UNIT_M, depth_name
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.selection.filters import (
-    SceneFilters,
-    may_pass,
-    options_of,
-    require_options,
-    split_options,
-)
+from stereogenbench_data.selection.filters import SceneFilters, may_pass
+from stereogenbench_data.selection.options import options_of, require_options, split_options
 from stereogenbench_data.selection.plan import (
     SELECTION_DEFAULTS,
     Address,

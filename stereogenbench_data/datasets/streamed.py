@@ -20,7 +20,7 @@ from stereogenbench_data.datasets.mapped import PAIRS_DEFAULTS, Data, PairsOptio
 from stereogenbench_data.datasets.shared import RepeatedEpochWarning, SharedNumbers
 from stereogenbench_data.errors import StateError, users_level
 from stereogenbench_data.samples.fields import Sample
-from stereogenbench_data.selection.filters import require_options, split_options
+from stereogenbench_data.selection.options import require_options, split_options
 from stereogenbench_data.selection.signatures import list_options
 
 _MOST_WORKERS: Final = 4096

@@ -31,7 +31,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.release import CAMERA_COUNT
-from stereogenbench_data.selection.filters import require_options
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.signatures import list_options
 
 TARGET: Final = "rendered target"

@@ -68,7 +68,7 @@ from stereogenbench_data.evaluation.tables import (
 )
 from stereogenbench_data.samples.fields import PAIR_FIELDS, Sample
 from stereogenbench_data.schema.conventions import Conventions
-from stereogenbench_data.selection.filters import require_options
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.signatures import list_options
 
 _TRUTH: Final = ("disparity", "valid", "visible", "frame_index")

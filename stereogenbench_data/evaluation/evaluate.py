@@ -60,7 +60,8 @@ from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.selection.filters import may_pass, require_options
+from stereogenbench_data.selection.filters import may_pass
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import SELECTION_DEFAULTS, Random, Selection
 from stereogenbench_data.selection.signatures import list_options
 from stereogenbench_data.sources.files import write_atomic

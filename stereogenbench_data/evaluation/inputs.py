@@ -39,7 +39,7 @@ from stereogenbench_data.jobs import (
 from stereogenbench_data.samples.fields import require_size
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.selection.filters import require_options
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import SELECTION_DEFAULTS, Selection
 from stereogenbench_data.selection.signatures import list_options
 

@@ -32,18 +32,17 @@ from stereogenbench_data.index.scene_folder import (
     unfinished,
 )
 from stereogenbench_data.index.tree import (
-    NOTHING_KEPT,
     Files,
     MisplacedScenes,
     RemoteFolder,
     RemoteTree,
     SceneFolder,
-    TreeCache,
     WholeFiles,
     find_scene_folders,
     in_parallel,
     stamp_of,
 )
+from stereogenbench_data.index.tree_cache import NOTHING_KEPT, TreeCache
 from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.media.heads import END_BYTES, Asked
 from stereogenbench_data.schema.conventions import Conventions, depth_of

@@ -20,8 +20,8 @@ import numpy as np
 from stereogenbench_data.errors import FieldError
 from stereogenbench_data.samples.derive import MapF32, PairSample, SceneFacts, Views
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.selection.filters import did_you_mean
 from stereogenbench_data.selection.plan import Address
+from stereogenbench_data.selection.spelling import did_you_mean
 
 Sample = dict[str, Any]
 """A flat dict of arrays (tensors, once in torch's hands) and texts, by the names of fields."""

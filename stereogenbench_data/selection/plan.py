@@ -34,9 +34,9 @@ from stereogenbench_data.selection.filters import (
     choose_pairs,
     filter_scenes,
     require_whole,
-    split_options,
     whole_number,
 )
+from stereogenbench_data.selection.options import split_options
 from stereogenbench_data.selection.order import Runs
 from stereogenbench_data.selection.signatures import list_options
 

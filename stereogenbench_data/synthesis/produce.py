@@ -24,7 +24,7 @@ from stereogenbench_data.errors import SynthesisError, explain_os_errors
 from stereogenbench_data.jobs import WORK_DEFAULTS, WorkOptions, differing, do_items
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
-from stereogenbench_data.selection.filters import require_options
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.signatures import list_options
 from stereogenbench_data.sources.files import try_locked
 from stereogenbench_data.synthesis.filters import Refusal

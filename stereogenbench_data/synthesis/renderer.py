@@ -14,7 +14,7 @@ from jaxtyping import Float64, UInt8
 
 from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
-from stereogenbench_data.selection.filters import did_you_mean
+from stereogenbench_data.selection.spelling import did_you_mean
 from stereogenbench_data.synthesis.proposal import Proposal
 
 Array = Any

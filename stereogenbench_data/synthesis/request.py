@@ -13,7 +13,7 @@ from stereogenbench_data.schema.release import (
     Split,
     Subset,
 )
-from stereogenbench_data.selection.filters import did_you_mean
+from stereogenbench_data.selection.spelling import did_you_mean
 
 RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from stereogenbench_data.audit.geometry import audit as geometry_audit
-from stereogenbench_data.index.tree import CACHE_VARIABLE
+from stereogenbench_data.index.tree_cache import CACHE_VARIABLE
 from tests.audit.corruption import copied, rewrite_rgb
 from tests.cli.command import invoke
 

@@ -13,7 +13,7 @@ import pytest
 from stereogenbench_data.audit.geometry.audit import audit, open_for_audit
 from stereogenbench_data.audit.geometry.table import audit_markdown, pooled_px
 from stereogenbench_data.errors import SelectionError
-from stereogenbench_data.index.tree import CACHE_VARIABLE
+from stereogenbench_data.index.tree_cache import CACHE_VARIABLE
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.audit.corruption import (

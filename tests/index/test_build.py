@@ -13,7 +13,7 @@ from stereogenbench_data.index import build as walk_module
 from stereogenbench_data.index import evidence
 from stereogenbench_data.index import tree as tree_module
 from stereogenbench_data.index.build import ManyReadsWarning, walk
-from stereogenbench_data.index.tree import CACHE_VARIABLE
+from stereogenbench_data.index.tree_cache import CACHE_VARIABLE
 from stereogenbench_data.media import heads as heads_module
 from stereogenbench_data.media.heads import Asked, heads_of
 

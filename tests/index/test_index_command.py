@@ -9,7 +9,7 @@ import pytest
 
 from stereogenbench_data.index import build as walk_module
 from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
-from stereogenbench_data.index.tree import CACHE_VARIABLE
+from stereogenbench_data.index.tree_cache import CACHE_VARIABLE
 from tests.cli.command import invoke, one_line
 
 

@@ -11,7 +11,7 @@ from stereogenbench_data import IncompleteSceneWarning, OddSceneWarning, StereoP
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import build
 from stereogenbench_data.index.table import AssumptionWarning, SceneIndex
-from stereogenbench_data.index.tree import CACHE_VARIABLE
+from stereogenbench_data.index.tree_cache import CACHE_VARIABLE
 from tests.servers.scene_fixtures import documents
 
 KEYS = [f"train/Uniform/Map_{number % 4}/scene_{number:06d}" for number in range(68)]

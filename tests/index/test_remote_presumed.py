@@ -10,7 +10,7 @@ import pytest
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import table as open_module
-from stereogenbench_data.index.tree import CACHE_VARIABLE
+from stereogenbench_data.index.tree_cache import CACHE_VARIABLE
 from tests.servers.hub import REPOSITORY, hub_serving
 
 HUB = f"hf://datasets/{REPOSITORY}@main"

@@ -28,18 +28,14 @@ from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.rows import row_of
 from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
-from stereogenbench_data.index.tree import SceneFolder, TreeCache
+from stereogenbench_data.index.tree import SceneFolder
+from stereogenbench_data.index.tree_cache import TreeCache
 from stereogenbench_data.jobs import WORK_DEFAULTS, WorkOptions, do_items
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Scene
-from stereogenbench_data.selection.filters import (
-    SceneFilters,
-    filter_scenes,
-    may_pass,
-    require_options,
-    split_options,
-)
+from stereogenbench_data.selection.filters import SceneFilters, filter_scenes, may_pass
+from stereogenbench_data.selection.options import require_options, split_options
 from stereogenbench_data.selection.signatures import list_options
 from stereogenbench_data.sources.location import is_remote, joined, local_path
 from stereogenbench_data.sources.remote import RemoteObject
