@@ -31,9 +31,21 @@ class ReferenceDocstrings(griffe.Extension):
         unpacked = [each for each in func.parameters if "Unpack[" in str(each.annotation)]
         for parameter in unpacked:
             del func.parameters[parameter.name]
+            if func.docstring is not None:
+                func.docstring.value = with_options(func.docstring.value, parameter.name)
             for each in inspect.signature(_found(func.path)).parameters.values():
                 if each.name not in func.parameters:
                     func.parameters.add(_option(each))
+
+
+def with_options(text: str, name: str) -> str:
+    """Return a docstring that tells of unpacked options before its arguments, as they are many."""
+    entry = re.search(rf"^    \*\*{name}: (.*\n?(?:^     +.*\n?)*)", text, flags=re.MULTILINE)
+    if entry is None:
+        return text
+    without = text[: entry.start()] + text[entry.end() :]
+    about = f"Options: {' '.join(entry[1].split())}"
+    return without.replace("Args:\n\n", "").replace("Args:\n", f"{about}\n\nArgs:\n")
 
 
 def _found(path: str) -> Any:
