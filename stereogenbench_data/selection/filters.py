@@ -94,7 +94,7 @@ def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray,
             continue
         keep, there = _apply(index, name, wanted, rows=rows)
         if not keep.any():
-            before = f" of those left by {', '.join(applied)}" if applied else ""
+            before = f" that {', '.join(applied)} left" if applied else ""
             raise SelectionError(
                 f"{filter_text(name, wanted)} matches none of {counted(len(rows), 'scene')}"
                 f"{before}; found {there()}{stale_note(index)}"

@@ -53,7 +53,7 @@ def test_a_filter_keeps_the_scenes_that_match(index, filters, expected):
         # What other filters left out is not taken for a misspelt value.
         (
             {"family": "Uniform", "map": "Town", "subset": "unseen_map"},
-            r"of those left by family Uni.*; found seen_map\.$",
+            r"that family Uni.* left; found seen_map\.$",
         ),
         ({"min_frames": 82}, r"min_frames 82 matches none of 9 .* 40 to 81\.$"),
         ({"min_frames": np.int16(82)}, "min_frames 82 matches none of 9"),
