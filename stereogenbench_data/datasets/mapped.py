@@ -442,7 +442,10 @@ class _MappedScenes(Dataset[Sample]):
     def loader(
         self, batch_size: int = 1, *, num_workers: int = 0, **options: Unpack[LoaderOptions]
     ) -> PairsLoader:
-        """Return a torch `DataLoader` whose order is the same for any number of ranks and workers.
+        """Return a torch `DataLoader` whose order never depends on its workers.
+
+        Nor does it depend on ranks that divide the shuffle groups; for other ranks it follows their
+        number at the first start, which a state keeps.
 
         Shuffled, as by default, samples that do not fill a batch of every rank are dropped at the
         end of an epoch (``drop_last=True``). With ``shuffle=False`` samples come in order and none
