@@ -13,7 +13,7 @@ import typer
 
 import stereogenbench_data
 from stereogenbench_data.cli.commands import app
-from tests.servers.tools import require_module, require_tool
+from tests.servers.tools import made_once, require_module, require_tool
 
 HOME = Path(__file__).resolve().parents[1]
 
@@ -29,18 +29,23 @@ def pages():
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """The ended process of the build, and the folder of the site, as `make docs` makes it."""
+    """The folder of the site as `make docs` makes it, and beside it what the build said."""
     for module in ("mkdocs", "material", "mkdocstrings"):
         require_module(module)
-    site = tmp_path_factory.mktemp("site")
-    made = [sys.executable, "docs/generated_pages.py"]
-    subprocess.run(made, cwd=HOME, check=True, timeout=300)
-    done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(site)],
-        cwd=HOME, capture_output=True, text=True, check=False, timeout=300,
-        env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
-    )  # fmt: skip
-    return done, site
+
+    def make(root):
+        root.mkdir()
+        made = [sys.executable, "docs/generated_pages.py"]
+        subprocess.run(made, cwd=HOME, check=True, timeout=300)
+        done = subprocess.run(
+            [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(root / "site")],
+            cwd=HOME, capture_output=True, text=True, check=False, timeout=300,
+            env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
+        )  # fmt: skip
+        (root / "build.log").write_text(f"{done.stderr}\nexit status {done.returncode}")
+
+    # One process of a run builds it, as the pages are made in a folder of the checkout.
+    return made_once(tmp_path_factory, "documentation", make) / "site"
 
 
 @pytest.fixture(scope="module")
@@ -63,15 +68,14 @@ def text_of(site, page):
 
 
 def test_the_strict_build_has_no_warning(built):
-    done, _ = built
+    said = built.with_name("build.log").read_text()
 
-    lines = [line for line in done.stderr.splitlines() if line.startswith(("WARNING", "ERROR"))]
-    assert lines == []
-    assert done.returncode == 0, done.stderr[-3000:]
+    assert [line for line in said.splitlines() if line.startswith(("WARNING", "ERROR"))] == []
+    assert said.endswith("\nexit status 0"), said[-3000:]
 
 
 def test_the_page_of_commands_names_every_command_and_option(built):
-    page = text_of(built[1], "commands")
+    page = text_of(built, "commands")
 
     commands = dict(typer.main.get_command(app).commands)
     for name, group in [*commands.items()]:
@@ -112,7 +116,7 @@ def pages_of_the_site():
 
 def test_the_reference_has_every_public_name_and_what_users_call(built, pages):
     shown = "".join(
-        (built[1] / "reference" / page / "index.html").read_text() for page in pages.reference()
+        (built / "reference" / page / "index.html").read_text() for page in pages.reference()
     )
     called = ("audit.geometry.audit.audit", "audit.contract.doctor.diagnose",
               "audit.statistics.statistics", "synthesis.produce.synthesise",
@@ -126,13 +130,13 @@ def test_the_reference_has_every_public_name_and_what_users_call(built, pages):
 
     assert [path for path in wanted if f'id="{path}"' not in shown] == []
     assert [path for path in called if f'id="stereogenbench_data.{path}"' not in shown] == []
-    sizes = [len((built[1] / "reference" / page / "index.html").read_text())
+    sizes = [len((built / "reference" / page / "index.html").read_text())
              for page in pages.reference()]  # fmt: skip
     assert max(sizes) < 400_000
 
 
 def test_the_reference_lists_each_option_that_a_call_unpacks(built):
-    page = text_of(built[1], "reference/datasets")
+    page = text_of(built, "reference/datasets")
 
     assert "fetch_ahead_bytes" in page.partition("Stereo pairs of")[0]
     assert "**options" not in page.partition("Stereo pairs of")[0]
@@ -177,10 +181,9 @@ return code.filter(each => each.scrollWidth > each.clientWidth).map(each => each
     ],
 )
 def test_no_line_of_code_is_cut_at_the_right_edge(built, browser, width_px, blocks):
-    _, site = built
     screen = {"width": width_px, "height": 900, "deviceScaleFactor": 1, "mobile": width_px < 500}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
-    pages = sorted(site.rglob("index.html"))
+    pages = sorted(built.rglob("index.html"))
     cut = {}
     for page in pages:
         browser.get(page.as_uri())
