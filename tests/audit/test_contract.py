@@ -441,7 +441,7 @@ def pictures_of(camera, change):
         (depth_of(0, lambda units: np.flip(units, 1)),
          r"depth of camera 0 fits better flipped \(vertical\)"),
         (lambda folder: rewrite_depth(folder, as_inverse(folder), cameras=[4]),
-         "depth of camera 4 fits better as inverse depth"),
+         r"depth of camera 4 fits worse than that of file \d does in its place"),
         (pictures_of(0, lambda pictures: np.roll(pictures, -1, axis=1)),
          r"pictures of camera 0 are [01]\.\d px higher, or show another moment"),
         (pictures_of(1, lambda pictures: pictures[:, :, ::-1]),
