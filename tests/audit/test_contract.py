@@ -171,10 +171,10 @@ def test_a_kind_that_less_than_the_margin_confirms_says_what_tells_it():
     scene = diagnosed(rivals=(Rival("kind", "ray", Gain(0.06, 0.01, by_shape=True)),))
     verdict = judge([scene], declared=DepthEncoding())
 
-    (line,) = [each for each in doctor_lines(DoctorReport("data", (scene,), (verdict,), {}))
-               if each.startswith("depth along")]  # fmt: skip
+    told, line = [each for each in doctor_lines(DoctorReport("data", (scene,), (verdict,), {}))
+                  if each.startswith("depth along")]  # fmt: skip
 
-    assert "confirmed" in line
+    assert "confirmed" in told
     assert line.endswith("0.06 dB (95 %: 0.04 to 0.08) worse, told by the shape of disparity")
 
 
@@ -256,19 +256,19 @@ def test_a_quotient_is_confirmed_if_its_interval_lies_within_the_margin(scale, e
 @pytest.mark.parametrize(
     ("scenes", "status"),
     [
-        # Mean and error.
-        ([(0.39, 0.125)], "not contradicted"),
-        ([(9.0, 0.1), (1.0, 0.1)], "confirmed"),
-        ([(9.0, 0.1), (0.5, 0.2)], "not contradicted"),
+        # Mean and its two errors: one for the search, a wider one for the interval.
+        ([(0.39, 0.10, 0.24)], "not contradicted"),
+        ([(9.0, 0.1, 0.1), (1.0, 0.1, 0.1)], "confirmed"),
+        ([(9.0, 0.1, 0.1), (0.5, 0.1, 0.2)], "not contradicted"),
     ],
 )
 def test_confirmed_never_stands_beside_an_interval_that_reaches_the_margin(scenes, status):
     diagnoses = [
         diagnosed(
             key=f"scene {number}",
-            rivals=(Rival("form", "inverse", Gain(mean, error, least_db=0.15)),),
+            rivals=(Rival("form", "inverse", Gain(mean, error, wide_db=wide)),),
         )
-        for number, (mean, error) in enumerate(scenes)
+        for number, (mean, error, wide) in enumerate(scenes)
     ]  # fmt: skip
 
     found = answer(judge(diagnoses, declared=DepthEncoding()), TOPICS["form"])

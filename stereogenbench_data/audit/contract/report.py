@@ -26,62 +26,50 @@ _DB_NOTE: Final = (
     "dB of the depth scale and of the ray count small differences under a tight cap: they are not "
     "comparable with dB of flips, lags and orders."
 )
-_NAMED: Final = 6
-_HEAD: Final = ("question", "declared", "pictures say", "", "next best")
 _READINGS: Final = (
     "Several readings of the poses fit the rigs; pixels whose depth is found in other frames:"
 )
+Part = tuple[str, list[Sequence[str]]]
+"""A table: its title, and its rows, the first one its head."""
 
 
 def doctor_lines(report: DoctorReport) -> list[str]:
     """Return a report as lines of text."""
-    views = sum(scene.views for scene in report.scenes)
-    matches = sum(scene.matches for scene in report.scenes)
-    lines = [
-        _headline(report),
-        f"{report.data}: {counted(len(report.scenes), 'scene')}, {counted(views, 'view')}, "
-        f"{matches:,} pixels found in both pictures",
-        *(f"left out: {key}: {reason}" for key, reason in [*report.left_out.items()][:_NAMED]),
-        *([f"left out: {more} more"] if (more := len(report.left_out) - _NAMED) > 0 else []),
-    ]
-    silent = [scene for scene in report.scenes if scene.problem]
-    if len(silent) < len(report.scenes):
-        lines += [f"{scene.key}: cannot tell: {scene.problem}" for scene in silent]
-    for verdict in report.verdicts:
-        lines.append("")
-        if len(report.verdicts) > 1:
-            lines.append(f"{counted(len(verdict.scenes), 'scene')}: {', '.join(verdict.scenes)}")
-        rows = [_HEAD, *map(_row, verdict.answers)]
+    verdict, parts = screen(report)
+    lines = [verdict]
+    for title, rows in parts:
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines += ["", *([title] if title else [])]
         lines += ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
-        lines += ["", *_conclusion(verdict), *_tested(verdict), NOT_TESTED]
-    if len(silent) < len(report.scenes):
-        lines += ["", QUOTIENT_MEANS, _DB_NOTE]
-    return lines + [line for each in report.worlds for line in ("", _READINGS, *each.lines)]
+    return lines
 
 
-def screen(report: DoctorReport) -> tuple[str, list[tuple[str, list[Sequence[str]]]]]:
-    """Return what a screen shows of a report: the verdict, what follows, and each answer."""
-    parts: list[tuple[str, list[Sequence[str]]]] = []
-    if len(report.verdicts) == 1:
-        (verdict,) = report.verdicts
+def screen(report: DoctorReport) -> tuple[str, list[Part]]:
+    """Return the verdict, and tables of everything else, the most important first."""
+    several = len(report.verdicts) > 1
+    rows = [(_scenes(each), _in_a_line(each)) for each in report.verdicts]
+    parts: list[Part] = [("", [("scenes", "pictures say"), *rows])] if several else []
+    for verdict in report.verdicts:
         follows = [*_conclusion(verdict), *_tested(verdict)]
-        answers = [(*_row(each)[:-1], _doubt(each)) for each in verdict.answers]
-        parts.append(("", [("what follows",), *([line] for line in follows)]))
-        parts.append(("", [(*_HEAD[:-1], ""), *answers]))
-    else:
-        rows = [(_scenes(each), _in_a_line(each)) for each in report.verdicts]
-        parts.append(("", [("scenes", "pictures say"), *rows]))
+        title = ", ".join(verdict.scenes) if several else ""
+        parts.append((title, [("what follows",), *([line] for line in follows)]))
+        parts.append(("", [_HEAD, *map(_row, verdict.answers)]))
     for each in report.worlds:
         parts.append((_READINGS, [("explained",), *([line] for line in each.lines)]))
     unjudged = report.left_out | {each.key: each.problem for each in report.scenes if each.problem}
     if unjudged:
         parts.append(("", [("not judged", "why"), *unjudged.items()]))
+    for verdict in report.verdicts:
+        behind = [(answer.topic, _behind(answer)) for answer in verdict.answers if answer.behind]
+        parts += [("", [("question", "next best"), *behind])] if behind else []
+    views = sum(scene.views for scene in report.scenes)
+    matches = sum(scene.matches for scene in report.scenes)
+    looked = (
+        f"{report.data}: {counted(len(report.scenes), 'scene')}, {counted(views, 'view')}, "
+        f"{matches:,} pixels found in both pictures"
+    )
+    parts.append(("", [("notes",), [looked], [QUOTIENT_MEANS], [_DB_NOTE], [NOT_TESTED]]))
     return _headline(report), parts
-
-
-def _doubt(answer: Answer) -> str:
-    return "" if answer.status == "confirmed" else answer.note
 
 
 def _in_a_line(verdict: Verdict) -> str:
@@ -168,14 +156,21 @@ def _cameras(cameras: Sequence[int]) -> str:
     return f"camera {words}" if len(cameras) == 1 else f"cameras {words}"
 
 
+_HEAD: Final = ("question", "declared", "pictures say", "", "why")
+
+
 def _row(answer: Answer) -> tuple[str, str, str, str, str]:
-    notes = [answer.note] if answer.note else []
-    is_wrong = answer.status == "wrong"
-    if answer.behind is not None and math.isfinite(answer.behind.mean_db):
-        by_shape = ", told by the shape of disparity" if answer.behind.by_shape else ""
-        notes.insert(0, f"{'declared is ' * is_wrong}{_gain_words(answer.behind)} worse{by_shape}")
-    status = answer.status.upper() if is_wrong else answer.status
-    return answer.topic, answer.declared, answer.found or "?", status, "; ".join(notes)
+    status = answer.status.upper() if answer.status == "wrong" else answer.status
+    return answer.topic, answer.declared, answer.found or "?", status, answer.note
+
+
+def _behind(answer: Answer) -> str:
+    """Return by how much the next best answer is worse, or the declared one that is wrong."""
+    if answer.behind is None or not math.isfinite(answer.behind.mean_db):
+        return "not compared"
+    declared = "declared is " if answer.status == "wrong" else ""
+    by_shape = ", told by the shape of disparity" if answer.behind.by_shape else ""
+    return f"{declared}{_gain_words(answer.behind)} worse{by_shape}"
 
 
 def _gain_words(gain: Gain) -> str:

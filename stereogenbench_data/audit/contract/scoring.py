@@ -34,6 +34,8 @@ from stereogenbench_data.schema.records import DepthKind
 
 NORMAL_975: Final = 1.96
 _FEWEST_PARTS: Final = 3
+_FEW_VIEWS: Final = 1.2
+"""A standard error from n views counts 1 + 1.2 / (n - 2) times, which is Student's t to 2 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,26 +44,33 @@ class Gain:
 
     Attributes:
         mean_db: The mean difference; nan for nothing to compare.
-        error_db: Its standard error.
+        error_db: Its standard error, the smaller of two estimates; the search uses it.
         by_shape: Whether the shape of disparity over the picture decides for this contract,
             however few dB it makes; None if it does not decide.
         least_db: Smaller differences are not believed.
+        wide_db: The larger estimate of the error, for intervals; None if there is one estimate.
     """
 
     mean_db: float
     error_db: float
     by_shape: bool | None = None
     least_db: float = limits.LEAST_DB
+    wide_db: float | None = None
+
+    @property
+    def interval_error_db(self) -> float:
+        """The standard error that intervals have."""
+        return self.error_db if self.wide_db is None else self.wide_db
 
     @property
     def low_db(self) -> float:
         """The lower end of the 95 % interval."""
-        return self.mean_db - NORMAL_975 * self.error_db
+        return self.mean_db - NORMAL_975 * self.interval_error_db
 
     @property
     def high_db(self) -> float:
         """The upper end of the 95 % interval."""
-        return self.mean_db + NORMAL_975 * self.error_db
+        return self.mean_db + NORMAL_975 * self.interval_error_db
 
     @property
     def is_excluded(self) -> bool:
@@ -107,7 +116,7 @@ def pooled(scenes: Sequence[Gain]) -> Gain:
         return NOTHING
     mean_db, error_db = weighted_mean(
         [scene.mean_db for scene in tested],
-        [scene.error_db for scene in tested],
+        [scene.interval_error_db for scene in tested],
         least=limits.LEAST_ERROR_DB,
     )
     least_db = max(scene.least_db for scene in tested)
@@ -121,8 +130,11 @@ def is_ruled_out(scenes: Sequence[Gain]) -> bool:
     The opposite must be clear in no scene. So one scene rules out an answer for all with the same
     contract, even if the others show nothing (such as a lag where nothing moves).
     """
+    together = pooled(scenes)
+    is_clear = any(each.is_clear() for each in scenes) or (
+        len(scenes) > 1 and together.mean_db >= together.least_db and together.low_db > 0
+    )
     opposite = (replace(each, mean_db=-each.mean_db) for each in scenes if each.by_shape is None)
-    is_clear = any(each.is_clear() for each in (*scenes, pooled(scenes)))
     return is_clear and not any(each.is_clear() for each in opposite)
 
 
@@ -220,8 +232,9 @@ def gain_of(
 
     The pairs of a camera that is ``left_out`` do not count.
 
-    The error is that of a jackknife over parts of the picture, each left out of all views (a pair
-    in a frame) at once: so it is large where only some parts matter, such as moving ones.
+    There are two estimates of the error: one from the differences between views (a pair in a
+    frame), which is large if some cameras are wrong; and a jackknife over parts of the picture, each
+    left out of all views at once, which is large if only some parts matter (such as moving ones).
     """
     same_places = better.hypothesis.changed("kind", worse.hypothesis.kind) == worse.hypothesis
     share = limits.FINE_CAP if same_places else 1.0
@@ -249,12 +262,21 @@ def gain_of(
         return NOTHING
     ours, theirs = sums.sum(axis=-1, keepdims=True)
     used = sums.sum(axis=(0, 1)) > 0
-    parts, error_db = int(used.sum()), math.inf
+    parts, views = int(used.sum()), sums.shape[1]
+    errors_db = []
     if parts >= _FEWEST_PARTS:
         without = _mean_db(ours - sums[0][:, used], theirs - sums[1][:, used])
-        error_db = math.sqrt((parts - 1) * float(without.var()))
-    least_db = limits.LEAST_DB if same_places else limits.LEAST_DB_ELSEWHERE
-    return Gain(float(_mean_db(ours, theirs)[0]), error_db, least_db=least_db)
+        errors_db.append(math.sqrt((parts - 1) * float(without.var())))
+    if views >= _FEWEST_PARTS:
+        each = _mean_db(ours[None, :, 0], theirs[None, :, 0])
+        few = 1 + _FEW_VIEWS / (views - 2)
+        errors_db.append(few * float(each.std(ddof=1)) / math.sqrt(views))
+    return Gain(
+        float(_mean_db(ours, theirs)[0]),
+        min(errors_db, default=math.inf),
+        least_db=limits.LEAST_DB if same_places else limits.LEAST_DB_ELSEWHERE,
+        wide_db=max(errors_db, default=math.inf),
+    )
 
 
 def _mean_db(ours: np.ndarray, theirs: np.ndarray) -> Float64[np.ndarray, " k"]:

@@ -98,8 +98,11 @@ def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
         answer for answer, state in states.items() if state != "excluded" and answer != declared
     ]
     worst: State = max(states.values(), key=_STATES.index, default="untested")
-    is_changed = best != declared
-    status = _STATUS[is_changed, states.get(declared, "untested") if is_changed else worst]
+    is_changed, of_declared = best != declared, pooled(gains.get(declared, ()))
+    decides = worst if not is_changed else states.get(declared, "untested")
+    if is_changed and not (of_declared.by_shape or of_declared.low_db > 0):
+        decides = "close"
+    status = _STATUS[is_changed, decides]
     at_end = question == "frame_lag" and abs(best) == max(LAGS)
     want = "frames or of motion" if question == "frame_lag" else "depth where it would be"
     close = [answer for answer, state in states.items() if state == "close"]
@@ -118,7 +121,7 @@ def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
         blank.declared,
         found="" if status == "cannot tell" else f"{found} or beyond" if at_end else found,
         status=status,
-        behind=pooled(gains.get(declared, ())) if is_changed
+        behind=of_declared if is_changed
         else min(lows, key=lambda gain: gain.low_db, default=None),
         note="; ".join(note for note, is_said in notes.items() if is_said),
         is_sure=worst == "excluded" and not at_end,
