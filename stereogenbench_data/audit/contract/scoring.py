@@ -233,8 +233,9 @@ def gain_of(
     The pairs of a camera that is ``left_out`` do not count.
 
     There are two estimates of the error: one from the differences between views (a pair in a
-    frame), which is large if some cameras are wrong; and a jackknife over parts of the picture, each
-    left out of all views at once, which is large if only some parts matter (such as moving ones).
+    frame), which is large if some cameras are wrong; and a jackknife over parts of the picture,
+    each left out of all views at once, which is large if only some parts matter (such as moving
+    ones).
     """
     same_places = better.hypothesis.changed("kind", worse.hypothesis.kind) == worse.hypothesis
     share = limits.FINE_CAP if same_places else 1.0
