@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from stereogenbench_data.audit.contract.doctor import DoctorReport, diagnose
+from stereogenbench_data.audit.contract.doctor import DiagnosisTask, DoctorReport, diagnose
 from stereogenbench_data.audit.contract.verdict import (
     MARGIN,
     QUOTIENT,
@@ -24,8 +24,9 @@ from stereogenbench_data.audit.contract.verdict import (
     Verdict,
     encoding_line,
 )
+from stereogenbench_data.audit.contract.worlds import LEAST_SHARE, explained_shares, judge_worlds
 from stereogenbench_data.audit.proposals import MOST, Candidate, proposed
-from stereogenbench_data.audit.scene_access import spread
+from stereogenbench_data.audit.scene_access import source_of, spread
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import StereoGenBenchError, StorageError
 from stereogenbench_data.index.learning import (
@@ -40,7 +41,7 @@ from stereogenbench_data.index.scene_folder import IncompleteScene
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.index.tree import folder_of
 from stereogenbench_data.samples.fields import PAIR_FIELDS, VIEW_FIELDS
-from stereogenbench_data.schema.conventions import Conventions, write_toml
+from stereogenbench_data.schema.conventions import Conventions, depth_of, write_toml
 from stereogenbench_data.schema.declaration import Declaration, DepthAs, PosesAt
 from stereogenbench_data.schema.depth_contract import MAY_BE_RANGE, NO_LENGTH
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
@@ -208,7 +209,8 @@ def _learning(
         keys_there = {each.keys for each in group}
         others = [each.scene for each in learned.verified if each.keys in keys_there and each.scene]
         if not teaching or teaching[0].remark("poses", "left"):
-            _note_candidates(surveyed, number, group[0].key)
+            scene = teaching[0] if teaching and pictured else None
+            _note_candidates(surveyed, number, group[0].key, scene)
         lines, before = surveyed.notes.setdefault((number, "depth"), []), len(surveyed.verdicts)
         report = None
         if pictured and teaching:
@@ -226,12 +228,19 @@ def _learning(
     return surveyed
 
 
-def _note_candidates(surveyed: Survey, number: int, key: str) -> None:
-    """Add what might be stated about a scene's files to the notes, as tables to uncomment."""
+def _note_candidates(surveyed: Survey, number: int, key: str, scene: Scene | None) -> None:
+    """Add what might be stated about a scene's files to the notes, as tables to uncomment.
+
+    Forms of poses are ranked by depth from frame to frame, if there is a scene to read it from.
+    """
     folder = folder_of(surveyed.root, key)
     with suppress(StereoGenBenchError, KeyError):
-        moves = folder.read(TRAJECTORY_JSON) if TRAJECTORY_JSON in folder.stamps() else None
-        for group in proposed(folder.read(BASELINE_JSON), moves, where=key):
+        moves = folder.read(TRAJECTORY_JSON) if TRAJECTORY_JSON in folder.stamps() else b""
+        for group in filter(None, proposed(folder.read(BASELINE_JSON), moves, where=key)):
+            if group[0].table == "poses" and scene is not None:
+                group = _by_depth(surveyed.root, scene, moves, group)
+                if not group:
+                    continue
             notes = surveyed.notes.setdefault((number, group[0].table), [])
             for at, each in enumerate(group[:MOST]):
                 notes += ["", f"candidate {at + 1} of {len(group)}, without '# ' in front:"]
@@ -239,26 +248,34 @@ def _note_candidates(surveyed: Survey, number: int, key: str) -> None:
             surveyed.candidates.append(group[0])
 
 
+def _by_depth(root: str, scene: Scene, text: bytes, group: Sequence[Candidate]) -> list[Candidate]:
+    """Return the forms of poses that depth does not contradict, the best first."""
+    index = SceneIndex.from_scenes([scene], root)
+    task = DiagnosisTask(scene, source_of(index, scene), 1, depth_of(scene))
+    with task.scene_frames() as views:
+        shares = explained_shares(views, text, [each.why for each in group])
+    verdict = judge_worlds([shares])
+    mean = {each.why: sum(shares[each.why]) / 2 for each in group}
+    told = "right by depth" if verdict.chosen else f"depth cannot tell: {verdict.reason}"
+    return [
+        replace(each, why=f"{mean[each.why]:.0%} of depth is found in other frames by it ({told}): "
+                          f"{each.why}")
+        for each in sorted(group, key=lambda each: mean[each.why], reverse=True)
+        if mean[each.why] >= LEAST_SHARE
+    ]  # fmt: skip
+
+
 def _alike_once(surveyed: Survey) -> list[str]:
-    """Return problems, one of those that are alike, and what may be stated about keys not read."""
+    """Return problems, one of those that are alike."""
     keys = sorted((each.key for each in surveyed.examined), key=len, reverse=True)
     alike: dict[str, list[str]] = {}
     for problem in surveyed.problems:
         plain = functools.reduce(lambda text, key: text.replace(key, ""), keys, problem)
         alike.setdefault(re.sub(r"[0-9.]+", "#", plain), []).append(" ".join(problem.split()))
-    told = [
+    return [
         f"{group[0]}{f' ({len(group) - 1} alike)' if len(group) > 1 else ''}"
         for group in alike.values()
     ]
-    unread = sorted({key for each in surveyed.examined if each.scene is None
-                     for key in each.unknown})  # fmt: skip
-    if unread:
-        told.append(
-            f"nobody reads these keys of baseline.json: {', '.join(unread[:12])}. If one is what "
-            f"is missing, say so in a file: format = 2, then its table, such as "
-            f'[focal_length] with place = "{unread[0]}", and test it with --check'
-        )
-    return told
 
 
 def _examined(

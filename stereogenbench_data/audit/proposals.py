@@ -32,6 +32,7 @@ MOST: Final = 3
 """How many candidates of a table are shown."""
 _MOST_NODES: Final = 2000
 _DEEPEST: Final = 6
+_LONGEST: Final = 40
 _LENSES: Final = (0.4, 6.0)
 """Focal lengths in widths of the sensor; the release has 0.76 to 3.6."""
 _FOCAL: Final = {"focal", "fl", "lens", "f", "zoom", "focallength"}
@@ -64,12 +65,12 @@ class Candidate:
         return [f"# {self.why}", f"[{self.table}]", *values]
 
 
-def proposed(baseline: bytes, trajectory: bytes | None, *, where: str) -> list[list[Candidate]]:
+def proposed(baseline: bytes, trajectory: bytes, *, where: str) -> list[list[Candidate]]:
     """Return candidates for what a scene's files do not say as the built-in declaration reads it.
 
     Args:
         baseline: The bytes of its ``baseline.json``.
-        trajectory: Those of its ``trajectory.json``; None without one.
+        trajectory: Those of its ``trajectory.json``; empty without one.
         where: The scene, for messages.
 
     Returns:
@@ -80,7 +81,7 @@ def proposed(baseline: bytes, trajectory: bytes | None, *, where: str) -> list[l
         SchemaError: If a file is no JSON object.
     """
     document = parse_trajectory(baseline, where=where)
-    moves = None if trajectory is None else parse_trajectory(trajectory, where=where)
+    moves = parse_trajectory(trajectory, where=where) if trajectory else None
     lacks = [name for name in ("focal_length", "sensor_width")
              if not first_value(document, BUILT_IN.numbers[name].places)[0]]  # fmt: skip
     groups = [*_lens(document, lacks)]
@@ -93,7 +94,7 @@ def proposed(baseline: bytes, trajectory: bytes | None, *, where: str) -> list[l
         groups.append([*_primary_pairs(document)])
     groups = [group[:MOST] for group in groups if group]
     rig = _rig_of(baseline, [group[0] for group in groups], where=where)
-    if rig is not None and trajectory is not None:
+    if rig is not None and trajectory:
         groups += _poses(trajectory, rig, where=where)
     return groups
 
@@ -135,7 +136,7 @@ def _numbers(document: dict[str, Any]) -> Iterator[tuple[str, str, float, str]]:
         name, unit = without_unit(name)
         if is_number(node) and node > 0:
             yield path, name, float(node), unit
-        elif isinstance(node, str) and len(node) < 20 and path[-1] != "]":
+        elif isinstance(node, str) and len(node) < _LONGEST and path[-1] != "]":
             found = value_at(document, f"{path}~")
             beside = words(node).split("_")[-1]
             if len(found) == 1 and found[0] > 0:
@@ -145,6 +146,9 @@ def _numbers(document: dict[str, Any]) -> Iterator[tuple[str, str, float, str]]:
 def _lens(document: dict[str, Any], lacks: list[str]) -> Iterator[list[Candidate]]:
     """Yield the candidates for focal length and sensor width, those that make a lens first."""
     found: dict[str, list[_Length]] = {name: [] for name in ("focal_length", "sensor_width")}
+    at, focal_px = first_value(document, BUILT_IN.numbers["focal_length_px"].places)
+    if at and is_number(focal_px):
+        found["focal_length"].append(_length("focal_length", at, focal_px, "px", "pixels"))
     for place, name, value, unit in _numbers(document):
         parts = {*name.split("_")}
         if parts & (_FOCAL | _ANGLE) and "px" not in parts:
@@ -164,9 +168,9 @@ def _lens(document: dict[str, Any], lacks: list[str]) -> Iterator[list[Candidate
         value = first_value(document, [printed])[1]
         found[name] = [_length(name, printed, value if is_number(value) else 0.0, "mm", "")]
     lenses = sorted(itertools.product(*found.values()), key=_is_odd_lens)
-    for at, name in enumerate(found):
+    for side, name in enumerate(found):
         if name in lacks:
-            yield [*{id(lens[at]): lens[at][1] for lens in lenses}.values()]
+            yield [*{id(lens[side]): lens[side][1] for lens in lenses}.values()]
 
 
 _Length = tuple[float, Candidate, float]
