@@ -155,16 +155,20 @@ def every_fitting(text: bytes, rig: Rig, *, where: str) -> list[tuple[PosesAt, s
 
     Returns:
         Each form that fits and moves the cameras differently, with the name of its reading; None
-        where one is settled without being stated.
+        where one is settled without being stated, or fits but for the side of the left camera.
 
     Raises:
         SchemaError: If it has no numbers of six cameras.
     """
     document = parse_trajectory(text, where=where)
     recorded = recorded_in(document, where=where)
-    with suppress(SchemaError):
+    try:
         if len(_fitting(readings(recorded), rig, where=where).names) == 1:
             return None
+    except SidesError:
+        return None
+    except SchemaError:
+        pass
     fitting: list[Reading] = []
     for reading in readings(recorded, forms="all", axes=[*AXES]):
         with suppress(GeometryError, SchemaError):
@@ -348,7 +352,8 @@ def _checked(reading: Reading, rig: Rig) -> tuple[Reading, float]:
     if lateral_m[left] > lateral_m[right]:
         raise SidesError(
             f"by its poses ({reading.name}), camera {left} is to the right of camera {right}, and "
-            f"by baseline.json it is the left one"
+            f"by baseline.json it is the left one (in a right-handed world, [poses] with "
+            f'axes = "ros" says so)'
         )
     return replace(reading, poses=poses), off
 
