@@ -41,8 +41,9 @@ def conventions(  # noqa: PLR0913 - one parameter an option
 
     Reads some scenes, spread over families, maps and keys of files, and says where each quantity
     stands, how it is read and how that is known; the doctor measures the depth of some by their
-    pictures. Other scenes verify it. Without -o the file is printed. Give it to any command with
-    --conventions. The exit status is 1 if something is not understood or contradicted.
+    pictures. Other scenes verify it. What is not settled has candidates as comments, best first.
+    Without -o the file is printed. Give it to any command with --conventions. The last line says
+    what is settled and what to do next; the exit status is 1 if something is not settled.
 
     Example: `stereogenbench conventions scenes/ -o conventions.toml`
     """
@@ -50,9 +51,8 @@ def conventions(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.schema.conventions import Conventions
 
     if check is not None and out is not None:
-        raise typer.BadParameter(
-            "--check tests a file and writes none: leave it out.", param_hint="--out"
-        )
+        reason = "--check tests a file and writes none: leave it out."
+        raise typer.BadParameter(reason, param_hint="--out")
     stated = None if check is None else Conventions.read(check)
     with progress_bar("reading scenes", unit="scenes") as progress:
         found = survey(
