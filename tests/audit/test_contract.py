@@ -20,7 +20,9 @@ from stereogenbench_data.audit.contract.report import doctor_lines
 from stereogenbench_data.audit.contract.row_matches import match_pairs
 from stereogenbench_data.audit.contract.scoring import Gain, is_ruled_out, pooled
 from stereogenbench_data.audit.contract.verdict import (
+    DEFAULT,
     QUOTIENT,
+    STRETCH,
     TOPICS,
     encoding_line,
     group_by_contract,
@@ -97,11 +99,13 @@ def test_a_right_contract_is_confirmed_question_by_question(verdict_on):
     assert not verdict.is_wrong
     assert {answer.topic: answer.status for answer in verdict.answers} == {
         QUOTIENT: "confirmed",
+        DEFAULT: "confirmed",
         "depth along": "confirmed",
         "stored is": "confirmed",
         "frame lag": "not contradicted",
         "left and right": "confirmed",
         "flip of depth": "confirmed",
+        STRETCH: "confirmed",
     }
     assert verdict.fits
     assert verdict.encoding is None
@@ -706,6 +710,18 @@ def test_the_contract_requested_about_may_be_given(verdict_on):
     assert 0.1 * verdict.quotient == pytest.approx(UNIT_M, rel=0.005)
     assert verdict.encoding is None
     assert verdict.choices[0].endswith(encoding_line(DepthEncoding(unit_m=UNIT_M)))
+
+
+def test_a_unit_and_a_sensor_that_are_wrong_alike_show_from_frame_to_frame(verdict_on):
+    def widen(folder):
+        scale_camera(folder, sensor_width_mm=1.4, sensor_height_mm=1.4)
+
+    verdict = verdict_on(widen, depth=DepthEncoding(unit_m=UNIT_M / 1.4))
+
+    assert answer(verdict, QUOTIENT).status == "confirmed"
+    assert wrong_topics(verdict) == {STRETCH}
+    focal = float(re.search(r"focal length ([0-9.]+) x", answer(verdict, STRETCH).found)[1])
+    assert focal == pytest.approx(1.4, rel=0.06)
 
 
 def test_scenes_with_different_contracts_get_verdicts_of_their_own(drawn, tmp_path):

@@ -23,11 +23,11 @@ from stereogenbench_data.schema.release import CAMERA_COUNT
 _STEP: Final = 0.025
 _FACTORS: Final = np.exp(_STEP * np.arange(-28, 29))
 """The factors that are tried: half to twice what is recorded."""
-STRETCH_MARGIN: Final = 0.06
+STRETCH_MARGIN: Final = 0.1
 """A smaller logarithm of the factor is not called wrong."""
-_BESIDE: Final = 4
-_LEAST_RISE: Final = 1.5
-"""How much larger the error must be by a tenth beside the best factor, for a clip that tells."""
+_BESIDE: Final = 8
+_LEAST_RISE: Final = 1.2
+"""How much larger the error must be by a fifth beside the best factor, for a clip that tells."""
 _CAMERAS: Final = (0, CAMERA_COUNT - 1)
 _PARTS: Final = (4, 2)
 _ACROSS: Final = 100
@@ -49,7 +49,7 @@ def stretch_of(views: SceneFrames, poses: CameraPoses) -> float:
         MediaError: If depth cannot be decoded.
     """
     steps = [_best(_errors(views, poses, camera)) for camera in _CAMERAS]
-    is_one = max(steps) - min(steps) <= _BESIDE
+    is_one = max(steps) - min(steps) <= _BESIDE / 2
     return float(np.exp(_STEP * np.mean(steps))) if is_one else math.nan
 
 
