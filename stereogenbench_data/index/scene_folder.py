@@ -57,7 +57,7 @@ from stereogenbench_data.media.heads import Heads, heads_of
 from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
 from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
 from stereogenbench_data.schema.conventions import Conventions, declaration_of_text, keys_of
-from stereogenbench_data.schema.declaration import BUILT_IN, UNKNOWN, Declaration
+from stereogenbench_data.schema.declaration import BUILT_IN, UNKNOWN, Declaration, PosesAt
 from stereogenbench_data.schema.depth_contract import UNREAD, Statement, stated_in_json
 from stereogenbench_data.schema.document import (
     brief,
@@ -796,6 +796,9 @@ def described_again(
         conventions = Conventions((shape,))
     folder = MemberFolder(source, scene)
     try:
+        if shape.poses is None and scene.pose_form:  # also a form that is not settled any more
+            shape = replace(shape, poses=PosesAt.of_reading(scene.pose_form.split("|")[0]))
+            conventions = Conventions((shape,))
         now = describe_scene("", folder.key, conventions=conventions, folder=folder, videos=videos)
     except (SchemaError, MediaError, StorageError) as error:
         return scene, [_placed(folder.key, str(error))]

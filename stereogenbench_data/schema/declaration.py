@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.schema.units import UNITS_M
 
 UNKNOWN: Final = "unknown"
@@ -113,13 +114,21 @@ class PosesAt:
 
     @classmethod
     def of_reading(cls, name: str) -> "PosesAt":
-        """Return what the name of a reading says, with its metres in a unit or without."""
-        name, _, unit_m = name.partition(" @ ")
+        """Return what the name of a reading says, with its metres in a unit or without.
+
+        Raises:
+            SchemaError: If it is the name of none.
+        """
         places, _, rest = name.partition(": ")
         location, _, rotation = places.rpartition(" and ")
-        form, axes = rest.split(", ")[:2]
-        known = (unit for unit, metres in UNITS_M.items() if math.isclose(metres, float(unit_m)))
-        unit, axes = next(known) if unit_m else None, axes.removesuffix(" axes")
+        rest, _, unit_m = rest.partition(" @ ")
+        try:
+            form, axes = rest.split(", ")[:2]
+            known = {unit: metres for unit, metres in UNITS_M.items()
+                     if unit_m and math.isclose(metres, float(unit_m))}  # fmt: skip
+        except ValueError as error:
+            raise SchemaError(f"{shortened(name)!r} names no reading of poses.") from error
+        unit, axes = next(iter(known), None), axes.removesuffix(" axes")
         return cls(location=location or None, rotation=rotation, form=form, axes=axes, unit=unit)
 
     def fits(self, name: str) -> bool:

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import pytest
 
+from stereogenbench_data.audit.scene_access import source_of
 from stereogenbench_data.datasets.mapped import SceneViews, StereoPairs
 from stereogenbench_data.errors import FieldError, StereoGenBenchError, StorageError
 from stereogenbench_data.index.learning import chosen_scenes, examine, learn, tables_of_notes
 from stereogenbench_data.index.parquet import INDEX_NAME
-from stereogenbench_data.index.scene_folder import describe_scene
+from stereogenbench_data.index.scene_folder import describe_scene, described_again
 from stereogenbench_data.index.table import AssumptionWarning, SceneIndex
 from stereogenbench_data.schema.conventions import parse_conventions, write_toml
 from stereogenbench_data.schema.records import DepthEncoding
@@ -135,6 +136,28 @@ def as_columns(document):
         }
         for camera, each in enumerate(poses)
     }
+
+
+def test_a_row_is_compared_by_the_form_that_it_names_also_if_nothing_settles_on_it(
+    make_scene, root, rewrite
+):
+    def as_matrices(document):
+        """OpenCV's matrices of cameras that look along the world's z axis."""
+        for frame in document["frames"]:
+            for pose in frame["cameras"]:
+                at = pose.pop("location")
+                del pose["rotation"]
+                pose["matrix"] = [[1, 0, 0, at["y"]], [0, 1, 0, 0], [0, 0, 1, at["x"]],
+                                  [0, 0, 0, 1]]  # fmt: skip
+
+    rewrite(make_scene() / "trajectory.json", as_matrices)
+    index = SceneIndex.open(root, conventions=stated('[poses]\naxes = "opencv"'))
+    row = replace(index.scene(0), conventions=None)
+
+    now, differences = described_again(row, source_of(index, row))
+
+    assert (now.pose_form, differences) == (row.pose_form, [])
+    assert "no reading" in SceneIndex.open(root).scene(0).remark("poses")
 
 
 COLUMNS = """
