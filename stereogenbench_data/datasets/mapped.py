@@ -45,7 +45,8 @@ from stereogenbench_data.errors import (
     text_without_secrets,
 )
 from stereogenbench_data.geometry.rig import RECTIFIED_PX
-from stereogenbench_data.index.table import MOST_LEFT_OUT, Rows, SceneIndex
+from stereogenbench_data.index.left_out import are_few
+from stereogenbench_data.index.table import Rows, SceneIndex
 from stereogenbench_data.media import depth
 from stereogenbench_data.samples.fields import (
     DEFAULT_PAIR_FIELDS,
@@ -192,7 +193,9 @@ class _MappedScenes(Dataset[Sample]):
         if cache is not None:
             # Several processes fill it: what one fetches ahead must not evict what another needs.
             ahead.limit_bytes = min(ahead.limit_bytes, cache.limit_bytes // _CACHE_DIVISOR)
-        if is_remote(index.root) and not index.load_seek_tables() and cache is None:
+        # A scene that was not opened yet is opened with its seek tables.
+        has_tables = index.unopened is not None or index.load_seek_tables()
+        if is_remote(index.root) and not has_tables and cache is None:
             warnings.warn(
                 f"{index.where} : its index does not say where the packets of videos lie, so a "
                 f"frame takes several requests, one after another, and nothing is fetched ahead. "
@@ -649,7 +652,7 @@ def opened(
     filters: Mapping[str, Any],
     conventions: str | Path | Conventions | None,
     *,
-    rows: Rows = "presumed",
+    rows: Rows = "settled",
 ) -> SceneIndex:
     """Return the index of some data; of a folder without one, of the scenes that may be chosen.
 
@@ -716,7 +719,7 @@ def _without_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> Plan
     """Return a plan without the few scenes that cannot give what is requested.
 
     These lack a video that others have, or a field of them is held up by what is not understood.
-    `OddSceneWarning` counts them and names the first.
+    `OddSceneWarning` counts them and names the first, unless opening the data told them all.
 
     Raises:
         StorageError: If they are more than a few; it names the field, the first scene and why.
@@ -738,12 +741,13 @@ def _without_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> Plan
         f"{index.where}: {counted(len(reasons), 'selected scene')} of {len(selected)} cannot give "
         f"what is asked for. The first: {index.column('key')[first]}: {reasons[first]}."
     )
-    if len(reasons) == len(selected) or len(reasons) > max(1, MOST_LEFT_OUT * len(selected)):
+    if len(reasons) == len(selected) or not are_few(len(reasons), of=len(selected)):
         raise StorageError(
             f"{told} Leave out that field, choose other pairs or scenes, or mend the files."
         )
-    if multiprocessing.parent_process() is None:
-        message = f"{told} Left out: {', '.join(index.column('key')[sorted(reasons)[:3]])}."
+    keys = index.column("key")
+    if multiprocessing.parent_process() is None and not index.lacking.issuperset(keys[[*reasons]]):
+        message = f"{told} Left out: {', '.join(keys[sorted(reasons)[:3]])}."
         warnings.warn(text_without_secrets(message), OddSceneWarning, stacklevel=4)
     return plan.without(index, sorted(reasons))
 
@@ -846,6 +850,7 @@ def _warn_of_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> None
             "projected through the poses, and no field holds what that moves up or down",
         )  # fmt: skip
         unknown = np.intersect1d(rows, index.remarked("poses"))
+        unknown = unknown[[key not in index.lacking for key in index.column("key")[unknown]]]
         reason = index.indexed_scene(int(unknown[0])).remark("poses") if len(unknown) else ""
         _warn(
             index, unknown,

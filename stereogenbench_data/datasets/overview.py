@@ -46,6 +46,7 @@ def in_one_line(
         "stored size" if size is None else f"size {size[1]}x{size[0]}",
         f"fields {', '.join(request.fields)}",
         index.where,
+        *([index.not_opened] if index.unopened is not None else []),
     ]
     return f"<{name}: {'; '.join(parts)}>"
 

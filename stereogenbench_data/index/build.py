@@ -6,10 +6,9 @@ The user's cache keeps the described scenes, so a killed run continues where it 
 import hashlib
 import json
 import os
-import re
 import warnings
-from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -18,18 +17,22 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, Final, Literal
 
+import numpy as np
+
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, no_advance, require_workers
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
 from stereogenbench_data.index.evidence import Understood, agreed_forms, settled_poses
+from stereogenbench_data.index.left_out import reasons_told
 from stereogenbench_data.index.rows import json_of, scene_of_json
 from stereogenbench_data.index.scene_folder import (
+    Description,
     IncompleteScene,
     ValidDepth,
-    as_agreed,
-    describe_scene,
+    held_name,
     missing_video,
     require_finished,
     unfinished,
+    with_common_pose_form,
 )
 from stereogenbench_data.index.tree import (
     Files,
@@ -52,6 +55,7 @@ from stereogenbench_data.schema.parse import parse_rig, parse_scene_key
 from stereogenbench_data.schema.records import Remark, Scene, SceneId, remarks_told
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
+    CAMERA_COUNT,
     COMPLETE_JSON,
     METADATA_FILES,
     TRAIN_MAPS,
@@ -59,8 +63,9 @@ from stereogenbench_data.schema.release import (
     VIDEO_FILES,
     Subset,
     depth_name,
+    rgb_name,
 )
-from stereogenbench_data.schema.text import counted
+from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.sources.location import is_remote, shown
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy
@@ -68,8 +73,6 @@ from stereogenbench_data.sources.retry import RetryPolicy
 _NAMED: Final = 6
 Checksums = Literal["none", "all"]
 
-ALIKE: Final = 20
-"""How many scenes that are broken for one reason show that it is the format."""
 FORMAT_CURE: Final = (
     "Files are read by the keys that the paper prints. For others, write where a quantity stands "
     "into a file of conventions: `stereogenbench conventions {root} -o c.toml` lists the keys that "
@@ -80,8 +83,10 @@ _MOST_UNTOLD: Final = 2500
 """More requests are told: the Hub answers 3,000 in five minutes."""
 _MOST_UNTOLD_SCENES: Final = 100
 """Of more scenes of a folder it is told what reading them takes."""
-_SETTLED_BY: Final = 3
-"""Of how many scenes one must tell how poses are read, for all to be read so."""
+_SETTLED_BY: Final = 20
+"""How many scenes of a tree settle how its scenes are read."""
+_SETTLED_BY_REMOTE: Final = 12
+"""How many do so behind a URL, where each takes nine requests."""
 _TRIED: Final = 2
 """How many of them are described to know that; imports are part of the first."""
 _REQUESTS: Final = 2 * len(VIDEO_FILES) + len(METADATA_FILES)
@@ -129,6 +134,12 @@ class Outcome:
     found: Scene | StereoGenBenchError
     has_mark: bool = True
 
+    @property
+    def lacks_poses(self) -> bool:
+        """Whether it is a scene whose poses cannot be used."""
+        found = self.found
+        return isinstance(found, Scene) and bool(found.remark("poses") or found.remark("left"))
+
 
 @dataclass(frozen=True, slots=True)
 class Tree:
@@ -139,7 +150,7 @@ class Tree:
         keys: The wanted scenes, sorted.
         refused: Path to reason and cure, for folders of misplaced scenes.
         is_part: Whether the user chose only some of the scenes.
-        others: The scenes that were not wanted.
+        ids: Every scene, wanted or not, by key; those of eval with their subsets.
         is_marked: Whether some scene, wanted or not, is known to have its completion mark.
         cache: Where what is found out is kept.
         remote: What lists the files behind the URL; None on this machine.
@@ -157,7 +168,7 @@ class Tree:
     keys: tuple[str, ...]
     refused: dict[str, str]
     is_part: bool
-    others: tuple[SceneId, ...]
+    ids: Mapping[str, SceneId]
     is_marked: bool
     cache: TreeCache
     remote: RemoteTree | None = None
@@ -169,22 +180,14 @@ class Tree:
     stamp: str = ""
     settled: Understood | None = None
 
-    def with_settled_poses(self) -> "Tree":
-        """Return the tree with how the first of its scenes that tells it has its poses.
-
-        Conventions of several shapes settle each scene by itself, and so do scenes behind a URL.
-        """
-        declared = self.stated or BUILT_IN
-        if self.remote is not None or declared.has or self.settled is not None:
-            return self
-        for key in self.keys[:_SETTLED_BY]:
-            with suppress(StereoGenBenchError, KeyError):
-                folder = self.folder(key)
-                rig, _, _ = parse_rig(folder.read(BASELINE_JSON), where=key, declared=declared)
-                text = folder.read(TRAJECTORY_JSON)
-                found = settled_poses(text, rig, where=key, named=declared.poses)
-                if len(found.names) == 1:
-                    return replace(self, settled=found)
+    def with_poses_of(self, key: str) -> "Tree":
+        """Return the tree with how one scene has its poses; that of conventions of one shape."""
+        folder, declared = self.folder(key), self.stated or BUILT_IN
+        with suppress(StereoGenBenchError):
+            rig, _, _ = parse_rig(folder.read(BASELINE_JSON), where=key, declared=declared)
+            text = folder.read(TRAJECTORY_JSON)
+            found = settled_poses(text, rig, where=key, named=declared.poses)
+            return replace(self, settled=found)
         return self
 
     def listed(self) -> "Tree":
@@ -230,8 +233,7 @@ class Tree:
 
     def train_maps(self) -> set[str]:
         """Return the maps of the scenes in train, wanted or not."""
-        scenes = [*map(parse_scene_key, self.keys), *self.others]
-        return {scene.map_name for scene in scenes if scene.split == "train"}
+        return {scene.map_name for scene in self.ids.values() if scene.split == "train"}
 
     @property
     def stated(self) -> Declaration | None:
@@ -271,32 +273,51 @@ class Tree:
         Raises:
             StorageError: If it cannot be used.
         """
+        return self.kept(self.name_of(folder, videos)) or self.opened(folder, videos)[0]
+
+    def opened(
+        self, folder: SceneFolder, videos: Collection[str] | None = None
+    ) -> tuple[Scene, Understood | None]:
+        """Return a scene as its files say, and its poses; the user's cache then holds it.
+
+        Raises:
+            StorageError: If it cannot be used.
+        """
         name = self.name_of(folder, videos)
-        scene = self.kept(name)
-        if scene is None:
-            scene = describe_scene(
-                self.root, folder.key, valid_depth=self.valid_depth, conventions=self.conventions,
-                folder=folder, videos=videos, settled=self.settled,
-            )  # fmt: skip
-            if self.checksums == "all" and isinstance(folder, WholeFiles):
-                members = {
-                    name: replace(each, crc32=folder.crc32(name))
-                    for name, each in scene.members.items()
-                }
-                scene = replace(scene, members=members)
-            self.cache.keep("scenes", name, json.dumps(json_of(scene)).encode())
-        return scene
+        described = Description(folder, folder.key, self.settled)
+        scene = described.scene(self.conventions, videos=videos, valid_depth=self.valid_depth)
+        if self.checksums == "all" and isinstance(folder, WholeFiles):
+            members = {
+                name: replace(each, crc32=folder.crc32(name))
+                for name, each in scene.members.items()
+            }
+            scene = replace(scene, members=members)
+        self.cache.keep("scenes", name, json.dumps(json_of(scene)).encode())
+        return scene, described.understood
+
+    def settling(
+        self,
+        folder: SceneFolder,
+        videos: Collection[str] | None,
+        *,
+        kept: Literal["used", "ignored"] = "used",
+    ) -> tuple[Outcome, Understood | None]:
+        """Return what becomes of a scene, and its poses if it was not kept."""
+        files: Files = {}
+        try:
+            files = folder.stamps()
+            if videos is not None and not all(held_name(files, name) in files for name in videos):
+                videos = None
+            scene = self.kept(self.name_of(folder, videos)) if kept == "used" else None
+            found = (scene, None) if scene is not None else self.opened(folder, videos)
+            return Outcome(folder.key, found[0], COMPLETE_JSON in files), found[1]
+        except StereoGenBenchError as error:
+            return Outcome(folder.key, error, not files or COMPLETE_JSON in files), None
 
     def outcome(self, folder: SceneFolder, advance: Advance = no_advance) -> Outcome:
         """Return what becomes of a scene whose files are all read, in a worker process too."""
         advance(0)
-        files: Files = {}
-        try:
-            files = folder.stamps()
-            return Outcome(folder.key, self.describe(folder), has_mark=COMPLETE_JSON in files)
-        except StereoGenBenchError as error:
-            has_mark = not files or COMPLETE_JSON in files
-            return Outcome(folder.key, error, has_mark=has_mark)
+        return self.settling(folder, None)[0]
 
 
 def walk(  # noqa: PLR0913 - each is an option of the command
@@ -330,8 +351,8 @@ def walk(  # noqa: PLR0913 - each is an option of the command
         retry: How slow a server may be.
 
     Raises:
-        StorageError: If there is no such scene below the root, or a worker process died; or if the
-            first `ALIKE` scenes are broken for one reason, so that it is the format of the files.
+        StorageError: If there is no such scene below the root, or a worker process died; or if none
+            of the scenes that settle how files are read can be used.
     """
     require_workers(workers)
     if checksums == "all" and is_remote(root):
@@ -355,23 +376,19 @@ def walk_tree(
 ) -> TreeReport:
     """Return every scene of a tree, and what is wrong with the others; see `walk`."""
     tree = tree if tree.remote is None or tree.files else tree.listed()
-    outcomes: dict[str, Outcome] = {}
-    total, pending = len(tree.keys), list[SceneFolder]()
-    # The rows are kept, which stand for the small files.
-    for folder in map(replace(tree, cache=NOTHING_KEPT).folder, tree.keys):
-        scene = None
-        with suppress(StorageError):  # of its folder: that is found again
-            scene = tree.kept(tree.name_of(folder))
-        if scene is None:
-            pending.append(folder)
-        else:
-            outcomes[folder.key] = Outcome(folder.key, scene, COMPLETE_JSON in scene.members)
+    outcomes, pending = _kept_scenes(tree)
+    total = len(tree.keys)
     if progress is not None:
         progress(len(outcomes), total)
+    if pending:
+        tree, opened = settle(tree, progress=progress)
+        if len(opened) >= min(_SETTLED_BY, _SETTLED_BY_REMOTE):
+            require_some(tree, opened.values())
+        outcomes |= {key: opened[key] for key in tree.keys if key in opened}
+        pending = [folder for folder in pending if folder.key not in opened]
     if engine is LOCAL and len(pending) < POOL_FROM:
         workers = 1
-    tree = tree.with_settled_poses() if pending else tree
-    bare = replace(tree, keys=(), refused={}, files={})
+    bare = replace(tree, keys=(), ids={}, refused={}, files={})
     tried: list[Outcome] = []
     if tree.remote is not None:
         size_bytes = sum(_asked_bytes(tree.files[each.key]) for each in pending)
@@ -383,11 +400,111 @@ def walk_tree(
     others = engine.map(bare.outcome, pending, name=lambda folder: folder.key, workers=workers)
     for outcome in chain(tried, others):
         outcomes[outcome.key] = outcome
-        if len(outcomes) == ALIKE:
-            require_not_all_alike(tree.root, outcomes.values())
         if progress is not None:
             progress(len(outcomes), total)
     return report_of(tree, outcomes)
+
+
+def _kept_scenes(tree: Tree) -> tuple[dict[str, Outcome], list[SceneFolder]]:
+    """Return the scenes that the user's cache holds, and the folders of the others."""
+    outcomes, pending = dict[str, Outcome](), list[SceneFolder]()
+    # The rows are kept, which stand for the small files.
+    for folder in map(replace(tree, cache=NOTHING_KEPT).folder, tree.keys):
+        scene = None
+        with suppress(StorageError):  # of its folder: that is found again
+            scene = tree.kept(tree.name_of(folder))
+        if scene is None:
+            pending.append(folder)
+        else:
+            outcomes[folder.key] = Outcome(folder.key, scene, COMPLETE_JSON in scene.members)
+    return outcomes, pending
+
+
+def settle(
+    tree: Tree,
+    *,
+    videos: Literal["all", "of one camera"] = "all",
+    progress: Progress | None = None,
+) -> tuple[Tree, dict[str, Outcome]]:
+    """Open some scenes of a tree: the same ones, whichever are wanted or were opened before.
+
+    Args:
+        tree: The tree.
+        videos: Which videos of each scene are opened: all, or those of another camera each time.
+        progress: Called after each scene with the number of scenes done and that of all.
+
+    Returns:
+        The tree with how most of these scenes have their poses, and what became of each, in order.
+
+    Raises:
+        StorageError: If no form of poses is that of most; it lists the forms.
+    """
+    keys = sorted(tree.ids)
+    count = _SETTLED_BY if tree.remote is None else _SETTLED_BY_REMOTE
+    places = np.unique(np.linspace(0, len(keys) - 1, count).astype(int)).tolist()
+    chosen = [tree.folder(keys[place]) for place in places]
+    names = [None if videos == "all" else (rgb_name(camera), depth_name(camera))
+             for camera in (place % CAMERA_COUNT for place in range(len(chosen)))]  # fmt: skip
+    opened: dict[str, tuple[Outcome, Understood | None]] = {}
+    several_shapes = bool((tree.stated or BUILT_IN).has)
+    if tree.remote is None:
+        guided = tree
+        for folder in chosen:
+            outcome, poses = guided.settling(folder, None)
+            if guided.settled is not None and outcome.lacks_poses:
+                outcome, poses = tree.settling(folder, None)
+            opened[folder.key] = outcome, poses
+            if progress is not None:
+                progress(len(opened), len(tree.ids))
+            if poses is not None and len(poses.names) == 1 and not several_shapes:
+                guided = replace(tree, settled=guided.settled or poses)
+    else:
+        found = in_parallel(lambda each: tree.settling(*each), zip(chosen, names, strict=True))
+        opened = {out.key: (out, poses) for out, poses in found}
+    outcomes = {key: outcome for key, (outcome, _) in opened.items()}
+    if several_shapes:
+        return tree, outcomes
+    return _with_common_poses(tree, chosen, names, opened)
+
+
+def _with_common_poses(
+    tree: Tree,
+    chosen: Sequence[SceneFolder],
+    names: Sequence[Collection[str] | None],
+    opened: Mapping[str, tuple[Outcome, Understood | None]],
+) -> tuple[Tree, dict[str, Outcome]]:
+    """Return a tree that reads poses as most of some scenes have them, and these read so."""
+    outcomes = {key: outcome for key, (outcome, _) in opened.items()}
+    posed = [out.found for out in outcomes.values()
+             if isinstance(out.found, Scene) and not out.lacks_poses]  # fmt: skip
+    forms = {scene.id.key: scene.pose_form for scene in posed}
+    plain = {scene.id.key: scene.pose_form for scene in posed if not scene.remark("world")}
+    if not plain:
+        return tree, outcomes
+    votes = Counter(plain.values()).most_common()
+    form, count = votes[0]
+    if 2 * count <= len(plain):
+        firsts = [next(key for key in plain if plain[key] == each) for each, _ in votes]
+        listed = "".join(
+            f"\n  {counted(number, 'scene')}, such as {key}: {shortened(each or _USUAL_FORM, 200)}"
+            for key, (each, number) in zip(firsts[:_NAMED], votes, strict=False)
+        )
+        raise StorageError(
+            f"{shown(tree.root)}: no form of poses is that of most scenes. Of those that were "
+            f"looked at{listed}\nWrite a [[shape]] for each kind into a file of conventions, with "
+            f"the keys that it has, and give the file as conventions= or --conventions."
+        )
+    guide = next(key for key in plain if plain[key] == form)
+    odd = [place for place, folder in enumerate(chosen) if forms.get(folder.key, form) != form]
+    if odd or len(tree.ids) > len(chosen):
+        settled = opened[guide][1]
+        tree = tree.with_poses_of(guide) if settled is None else replace(tree, settled=settled)
+    for place in odd:
+        outcomes[chosen[place].key] = tree.settling(chosen[place], names[place], kept="ignored")[0]
+    return tree, outcomes
+
+
+_USUAL_FORM: Final = "the form that the paper prints"
 
 
 class ManyReadsWarning(UserWarning):
@@ -485,8 +602,8 @@ def find_tree(
     remote = RemoteTree(RemoteObject(str(root), retry=retry)) if is_remote(root) else None
     keys, refused = find_scene_folders(Path(root)) if remote is None else remote.scenes()
     is_marked = remote is None and any(Path(root, key, COMPLETE_JSON).exists() for key in keys)
-    ids = [parse_scene_key(key) for key in keys]
-    chosen = [scene.key for scene in ids if wanted is None or wanted(scene)]
+    ids = _with_subsets(map(parse_scene_key, keys))
+    chosen = [key for key, scene in ids.items() if wanted is None or wanted(scene)]
     if not chosen and if_none == "refuse":
         there = sorted({key.rpartition("/")[0] for key in keys})
         more = f" and {len(there) - _NAMED} folders more" if len(there) > _NAMED else ""
@@ -500,7 +617,7 @@ def find_tree(
         tuple(chosen or keys),
         refused,
         is_part=wanted is not None and bool(chosen),
-        others=tuple(scene for scene in ids if chosen and wanted and not wanted(scene)),
+        ids=ids,
         is_marked=is_marked,
         cache=TreeCache(root, " ".join(shape.text() for shape in shapes)),
         remote=remote,
@@ -508,20 +625,38 @@ def find_tree(
     )
 
 
-def require_not_all_alike(root: str | Path, outcomes: Collection[Outcome]) -> None:
-    """Refuse a tree whose first scenes are broken for one reason: so are the others."""
-    reasons = {
-        "" if isinstance(out.found, Scene)
-        else re.sub(r"[0-9.]+", "#", str(out.found).replace(out.key, ""))
-        for out in outcomes
-    }  # fmt: skip
-    first = min(outcomes, key=lambda out: out.key).found
-    if len(reasons) == 1 and not isinstance(first, Scene | IncompleteScene):
-        raise StorageError(
-            f"{shown(root)}: the first {ALIKE} scenes cannot be used, all for one reason, so it is "
-            f"the format of the files and no single scene. The first: {first}\n"
-            f"{FORMAT_CURE.format(root=shown(root))}"
-        )
+def _with_subsets(scenes: Iterable[SceneId]) -> dict[str, SceneId]:
+    """Return scenes by key; those of eval whose path names no subset get it by their map.
+
+    It counts as seen if a scene of train has it, of this tree or of the release.
+    """
+    scenes = [*scenes]
+    maps = TRAIN_MAPS | {scene.map_name for scene in scenes if scene.split == "train"}
+
+    def subset(scene: SceneId) -> Subset | None:
+        if scene.split == "eval" and scene.subset is None:
+            return "seen_map" if scene.map_name in maps else "unseen_map"
+        return scene.subset
+
+    return {scene.key: replace(scene, subset=subset(scene)) for scene in scenes}
+
+
+def require_some(tree: Tree, outcomes: Collection[Outcome]) -> None:
+    """Refuse a tree if none of the scenes that were looked at can be used.
+
+    Raises:
+        StorageError: It tells each reason once; where it is the format of files, the cure.
+    """
+    if any(isinstance(out.found, Scene) for out in outcomes):
+        return
+    where = shown(tree.root)
+    told = reasons_told({out.key: str(out.found) for out in outcomes})
+    is_format = not all(isinstance(out.found, IncompleteScene) for out in outcomes)
+    cure = f"\n{FORMAT_CURE.format(root=where)}" if is_format else ""
+    raise StorageError(
+        f"{where}: none of the {counted(len(outcomes), 'scene')} that were looked at can be used:"
+        f"\n  {told}{cure}"
+    )
 
 
 def report_of(tree: Tree, of_keys: Mapping[str, Outcome]) -> TreeReport:
@@ -544,20 +679,14 @@ def report_of(tree: Tree, of_keys: Mapping[str, Outcome]) -> TreeReport:
         for path, reason in (error.refused if isinstance(error, MisplacedScenes)
                              else {key: str(error)}).items()
     }  # fmt: skip
-    maps = tree.train_maps() | TRAIN_MAPS
     found = [out.found for out in outcomes if isinstance(out.found, Scene)]
     agreed = agreed_forms(scene.pose_form for scene in found if scene.pose_form)
-    found = _without_unfetched([as_agreed(scene, agreed) for scene in found])
-    scenes, unnamed, labels = [], set(), []
-    for scene in found:
-        if scene.id.split == "eval" and scene.id.subset is None:
-            unnamed.add(scene.id.key.split("/")[1])
-            subset: Subset = "seen_map" if scene.id.map_name in maps else "unseen_map"
-            scenes.append(replace(scene, id=replace(scene.id, subset=subset)))
-        else:
-            scenes.append(scene)
-        if scene.labels.map_name not in (None, scene.id.map_name):
-            labels.append(f"{scene.id.key}: {brief(scene.labels.map_name)}")
+    found = _without_unfetched([with_common_pose_form(scene, agreed) for scene in found])
+    scenes = [replace(scene, id=tree.ids[scene.id.key]) for scene in found]
+    eval_keys = (key for key in tree.keys if key.startswith("eval/"))
+    unnamed = {key.split("/")[1] for key in eval_keys if parse_scene_key(key).subset is None}
+    labels = [f"{scene.id.key}: {brief(scene.labels.map_name)}" for scene in scenes
+              if scene.labels.map_name not in (None, scene.id.map_name)]  # fmt: skip
     subsets = [
         f"eval/{folder} names no subset; a scene there counts as seen_map if its map occurs in "
         f"train, of this tree or of the release, else as unseen_map"

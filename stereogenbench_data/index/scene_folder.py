@@ -146,8 +146,7 @@ def describe_scene(  # noqa: PLR0913 - each says what is known of the scene alre
         conventions: Where quantities stand and how they are read, in place of the release's.
         folder: Its folder, where that is listed already.
         videos: Names of the videos to open; None is all. The row then holds for these alone.
-        settled: How the poses of other scenes of the tree are read. A scene that they do not fit
-            is settled by itself, as all are without them.
+        settled: How the poses of the tree's scenes are read; without it they are searched for.
 
     Raises:
         IncompleteScene: If the scene has no video at all.
@@ -156,10 +155,7 @@ def describe_scene(  # noqa: PLR0913 - each says what is known of the scene alre
             understood. All problems of all files are in one message.
     """
     described = Description(folder or folder_of(root, key), key, settled)
-    scene = described.scene(conventions, videos=videos)
-    if valid_depth == "sample":
-        return replace(scene, valid_depth_ratio=described.valid_depth_ratio(scene.frames))
-    return scene
+    return described.scene(conventions, videos=videos, valid_depth=valid_depth)
 
 
 class Description:
@@ -192,6 +188,9 @@ class Description:
             names = tuple(name for name in names if PACKED_DEPTH_NAMES.get(name, name) in there)
         self.names = names
         require_finished(key, self.files, videos=names)
+        self.hollow = folder.hollow(self.files)
+        if BASELINE_JSON in self.hollow:
+            raise StorageError(self.hollow[BASELINE_JSON])
 
     def where(self, name: str) -> str:
         """Return a file's path, for messages."""
@@ -202,7 +201,11 @@ class Description:
         self.remarks.append(Remark(about, text))
 
     def scene(
-        self, conventions: Conventions | None, *, videos: Collection[str] | None = None
+        self,
+        conventions: Conventions | None,
+        *,
+        videos: Collection[str] | None = None,
+        valid_depth: ValidDepth = "skip",
     ) -> Scene:
         """Return the row; `describe_scene` says more."""
         problems: list[StereoGenBenchError] = []
@@ -272,12 +275,12 @@ class Description:
             depth_unit_source=sources,
             depth_codec=tuple(depth_coding(facts) for _, facts in depths),
             depth_pixel_format=tuple(facts.pixel_format for _, facts in depths),
-            valid_depth_ratio=None,
+            valid_depth_ratio=None if valid_depth == "skip" else self.valid_depth_ratio(frames),
             key_frames=self.common_key_frames(frames),
             remarks=as_kept(self.remarks),
             pose_form=pose_form,
             conventions=None if self.shape is None else self.shape.text(),
-            members=members_of(self.key, self.files, without=self.unread),
+            members=members_of(self.key, self.files, without={**self.unread, **self.hollow}),
             seek_tables=packed_tables(self.tables),
         )
         return self.derived(scene)
@@ -291,6 +294,8 @@ class Description:
             held = held_name(self.files, name)
             if held not in self.files:
                 self.unread[name] = missing_video(self.key, name)
+            elif held in self.hollow:
+                self.unread[held] = self.hollow[held]
             elif opened is None or name in opened:
                 video = self.folder.video(held)
                 try:
@@ -435,11 +440,12 @@ class Description:
             return None, f"{where}: {told}"
         if TRAJECTORY_JSON not in self.files:
             return None, f"{where}: is missing."
+        if TRAJECTORY_JSON in self.hollow:
+            return None, f"{self.hollow[TRAJECTORY_JSON]}."
         try:
             text = self.folder.read(TRAJECTORY_JSON)
             if self.settled is not None:
-                with suppress(SchemaError):
-                    return declared_poses(text, rig, where=where, settled=self.settled), ""
+                return declared_poses(text, rig, where=where, settled=self.settled), ""
             return settled_poses(text, rig, where=where, named=named), ""
         except SidesError as error:
             family, scale = parse_scene_key(self.key).family, error.scale
@@ -572,7 +578,7 @@ def missing_video(key: str, name: str) -> str:
     return f"{key}/{name}: is missing, and the scene is marked as complete"
 
 
-def as_agreed(scene: Scene, agreed: Mapping[str, tuple[str, ...]]) -> Scene:
+def with_common_pose_form(scene: Scene, agreed: Mapping[str, tuple[str, ...]]) -> Scene:
     """Return a scene whose poses are read as the scenes of its dataset agree (`agreed_forms`)."""
     if scene.pose_form is None:
         return scene
@@ -763,6 +769,10 @@ class MemberFolder(SceneFolder):
     def stamps(self) -> dict[str, tuple[int, int]]:
         """Return the size in bytes of each file."""
         return {name: (each.size, 0) for name, each in sorted(self._scene.members.items())}
+
+    def hollow(self, files: Files) -> dict[str, str]:
+        """Return no file: members are compared with their checksums."""
+        return {}
 
     def read(self, name: str) -> bytes:
         """Return a metadata file, whole and compared with its checksum."""

@@ -6,7 +6,7 @@ data's root and never lead out of it. `SceneIndex.open` makes one of any data:
     a file ─────────────────────┬─ read ── root of its data ── digest ── is it stale?
     a folder with an index file ┘
     a URL ──────── fetched ─────── read ────────────────────── digest
-    a folder or URL without one ── its scenes: read whole where they are few, presumed where many
+    a folder or URL without one ── its scenes: all opened where they are few, some where many
 
 An index file may come from a stranger: it opens data beside itself, and any other root is the
 user's own word. Conventions that are given for an index are compared with its rows (`_restated`).
@@ -15,6 +15,7 @@ tell, as copies and unpacked archives change dates; 7 ms for 8,493 scenes. What 
 is kept in the user's cache, and what was taken for granted of it is told in one line.
 """
 
+import copy
 import gc
 import warnings
 from collections import Counter
@@ -35,6 +36,7 @@ from stereogenbench_data.errors import (
 )
 from stereogenbench_data.index import compute as pc
 from stereogenbench_data.index.arrow import as_categories, as_numpy, one_array, table_digest
+from stereogenbench_data.index.left_out import are_few, listed, reasons_told
 from stereogenbench_data.index.parquet import (
     INDEX_NAME,
     IndexHead,
@@ -49,28 +51,31 @@ from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, scene_of
 from stereogenbench_data.schema.conventions import Conventions, declaration_of_text
 from stereogenbench_data.schema.declaration import Declaration
 from stereogenbench_data.schema.records import Scene, SceneId, ShardFacts, remarks_told
-from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON, VIDEO_FILES
+from stereogenbench_data.schema.release import (
+    CAMERA_COUNT,
+    COMPLETE_JSON,
+    TRAJECTORY_JSON,
+    VIDEO_FILES,
+)
 from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.sources.location import is_remote, joined, local_path, shown, split_name
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import MissingObject, RetryPolicy
 
 if TYPE_CHECKING:
-    from stereogenbench_data.index.build import Tree, TreeReport
-    from stereogenbench_data.index.presumed import Baselines, Presumption
+    from stereogenbench_data.index.build import Outcome, Tree, TreeReport
+    from stereogenbench_data.index.unopened import Baselines, UnopenedScenes
 
 MAX_INDEX_BYTES: Final = 256 * 2**20
 """The largest index that is fetched. One of 8,493 scenes has a few megabytes."""
+FEW_REMOTE: Final = 8
+"""Fewer scenes behind a URL are all opened."""
 MOST_REMOTE_SCENES: Final = 64
 """The most scenes behind a URL that are described when a tree without an index is opened."""
-MOST_LEFT_OUT: Final = 0.05
-"""The largest share of a tree's scenes that may be broken; one always may."""
 _LOOKED_AT: Final = 64
 """How many scenes tell what opening a tree takes for granted."""
 _READ_AGAIN: Final = 3
 """How many scenes' files are read again by the conventions."""
-_LONGEST_REASON: Final = 5000
-_SHOWN: Final = 10
 _NAMED: Final = 3
 _OF_BASELINES: Final = frozenset(
     {
@@ -79,7 +84,9 @@ _OF_BASELINES: Final = frozenset(
         "character", "animation", "aperture_fstop",
     }
 )  # fmt: skip
-"""Columns for which each ``baseline.json`` behind a URL is read."""
+"""Columns that only each ``baseline.json`` tells."""
+_REQUESTS_A_MINUTE: Final = 600
+"""The Hub answers 3,000 requests in five minutes."""
 
 
 class IncompleteSceneWarning(UserWarning):
@@ -91,11 +98,11 @@ class StaleIndexWarning(UserWarning):
 
 
 class AssumptionWarning(UserWarning):
-    """Files of a tree are not as the paper prints them, and something was taken for granted."""
+    """Something was taken for granted: of scenes that were not opened, or of odd files."""
 
 
-Rows = Literal["presumed", "read"]
-"""Whether the rows of many scenes without an index may be presumed; see `index.presumed`."""
+Rows = Literal["settled", "read"]
+"""Whether some of many scenes settle what the others have, or all are read (`index.unopened`)."""
 
 
 SeekTables: TypeAlias = pa.BinaryArray | Path | None
@@ -118,8 +125,9 @@ class SceneIndex:
             URLs are not checked.
         is_from_file: Whether it was read from an index file, so that scenes which it leaves out
             were left out on purpose.
-        presumption: What reads the scenes whose rows are presumed; None where all were read.
+        unopened: What opens the scenes that were not opened yet; None where all were.
         others: The scenes of a folder without an index that were not wanted when it was opened.
+        lacking: The keys of scenes that were told to lack a file when a folder was opened.
     """
 
     def __init__(
@@ -144,8 +152,10 @@ class SceneIndex:
         self._columns: dict[str, np.ndarray] = {}
         self._digest = head.digest
         self._seek_tables = seek_tables
-        self.presumption: Presumption | None = None
+        self.unopened: UnopenedScenes | None = None
         self.others: tuple[SceneId, ...] = ()
+        self.lacking: frozenset[str] = frozenset()
+        self.has_captions = True
 
     @classmethod
     def open(
@@ -156,7 +166,7 @@ class SceneIndex:
         retry: RetryPolicy | None = None,
         wanted: Callable[[SceneId], bool] | None = None,
         conventions: str | Path | Conventions | None = None,
-        rows: Rows = "presumed",
+        rows: Rows = "settled",
     ) -> "SceneIndex":
         """Open the index of some data.
 
@@ -177,14 +187,16 @@ class SceneIndex:
                 keep it, so that an index or shards made of this one need not be told again. Rows of
                 an index are not described again: files of some scenes are compared with them.
             rows: How many scenes (64 and more) of a folder without an index are opened. "read"
-                describes them all, in minutes for the whole release. "presumed" lists their files,
-                reads each ``baseline.json`` and describes a few; the others are presumed to be like
-                these, and `scene` describes them when they are needed. What was found out is
-                kept in the user's cache, for as long as the files stay as they are.
+                opens all, in minutes for the whole release. "settled" opens some 20 of all scenes;
+                frames, picture size, depth and poses of the others are taken to be as most of these
+                have them, and compared when `scene` opens them. On a disk each ``baseline.json`` is
+                read, behind a URL none (see `with_baselines`). What was found out is kept in the
+                user's cache, for as long as the files stay as they are.
 
-        Warns with `IncompleteSceneWarning` of scenes that were left out: it counts them and names
-        the first; and with `AssumptionWarning` of what was taken for granted, where the files of a
-        folder without an index are not as the paper prints them and no conventions are given.
+        Warns with `IncompleteSceneWarning` of scenes that were left out, or will be where the file
+        is needed that they lack: it counts them and names the first; and with `AssumptionWarning`
+        of what was taken for granted: of scenes that were not opened, and where files are not as
+        the paper prints them and no conventions are given.
 
         Raises:
             StorageError: If there are no such data, they hold no scene, the index is damaged or of
@@ -212,12 +224,19 @@ class SceneIndex:
             table = _restated(index._table, index._head, stated, retry=retry)
             if table is not index._table:
                 index._table, index._digest = table, table_digest(table)
-        if left_out := index.incomplete | index.broken:
-            told = text_without_secrets(f"{where}: {listed(left_out)}")
-            warnings.warn(told, IncompleteSceneWarning, stacklevel=2)
+        lacking = {} if index.is_from_file else _lacking(index)
+        index.lacking = frozenset(lacking)
+        left_out = index.incomplete | index.broken
+        if left_out or lacking:
+            told = [listed(left_out)] if left_out else []
+            if lacking:
+                what = f"{counted(len(lacking), 'scene')} left out where a file is needed"
+                told.append(f"{what}:\n  {reasons_told(lacking)}")
+            message = text_without_secrets(f"{where}: {'; '.join(told)}")
+            warnings.warn(message, IncompleteSceneWarning, stacklevel=2)
         if index.stale:
             warnings.warn(index.stale, StaleIndexWarning, stacklevel=2)
-        if not index.is_from_file and (assumed := _assumed_of(index._table, where=index.where)):
+        if not index.is_from_file and (assumed := _assumed_of(index)):
             warnings.warn(assumed, AssumptionWarning, stacklevel=2)
         return index
 
@@ -264,9 +283,77 @@ class SceneIndex:
         return cls(table, head, seek_tables=seek_tables_of(report.scenes))
 
     def __repr__(self) -> str:
-        """Return the root without secrets, and the number of scenes and shards."""
+        """Return the root without secrets, and how many scenes, shards and unopened scenes."""
         shards = f", {len(self.shards)} shards" if self.shards else ""
-        return f"<SceneIndex of {self.where!r}: {len(self)} scenes{shards}>"
+        unopened = f"; {self.not_opened}" if self.unopened is not None else ""
+        return f"<SceneIndex of {self.where!r}: {len(self)} scenes{shards}{unopened}>"
+
+    @property
+    def not_opened(self) -> str:
+        """How many scenes were not opened yet, and what is taken for granted of them."""
+        if self.unopened is None:
+            return ""
+        return self.unopened.told(self.indexed_scene(0), self.column("key").tolist())
+
+    def with_baselines(self) -> "SceneIndex":
+        """Return the index with what each ``baseline.json`` says: baselines, lenses and labels.
+
+        Of a tree behind a URL that takes a request a scene; of other data nothing is to be done.
+
+        Raises:
+            StorageError: If more than a few of them cannot be used.
+        """
+        unopened = self.unopened
+        if unopened is None or unopened.baselines == "read":
+            return self
+        index = _open_settled(unopened.tree, unopened.outcomes, "read")
+        assert index is not None  # training shards were told apart when the tree was opened
+        index.retry, index.others, index.lacking = self.retry, self.others, self.lacking
+        if new := {key: why for key, why in index.broken.items() if key not in self.broken}:
+            told = text_without_secrets(f"{self.where}: {listed(new)}")
+            warnings.warn(told, IncompleteSceneWarning, stacklevel=2)
+        return index
+
+    def with_captions(
+        self, file: str | None = None, *, scene: str = "$.scene", caption: str = "$.caption"
+    ) -> "SceneIndex":
+        """Return the index with the caption of each scene.
+
+        Args:
+            file: A file of JSON lines below the root that holds the captions of all scenes, such as
+                the merged summary that the paper names; None reads the description of each scene
+                that was not opened.
+            scene: Where a record has the path of its scene.
+            caption: Where a record has the caption.
+
+        Raises:
+            StorageError: If the file cannot be read, or a scene has no record.
+            SchemaError: If the file is not of JSON lines, or a place is none.
+        """
+        keys = self.column("key").tolist()
+        if file is not None:
+            from stereogenbench_data.index.captions import captions_of_file  # slow to import
+
+            places = {"scene": scene, "caption": caption}
+            found = captions_of_file(self.root, file, **places, retry=self.retry)
+            if lacking := [key for key in keys if key not in found]:
+                raise StorageError(
+                    f"{self.where}/{file}: has no record of {counted(len(lacking), 'scene')} of "
+                    f"{len(keys)}, such as {lacking[0]}; it has {len(found)}, such as "
+                    f"{shortened(next(iter(found), 'none'))}. Check the place {scene!r}."
+                )
+            captions = [found[key] for key in keys]
+        elif self.unopened is not None:
+            captions = self.unopened.captions(keys)
+        else:
+            return self
+        index = copy.copy(self)
+        index._digest = self.digest
+        index._columns = {}
+        column = SCHEMA.get_field_index("caption"), SCHEMA.field("caption")
+        index._table = self._table.set_column(*column, pa.array(captions, type=pa.string()))
+        index.has_captions = True
+        return index
 
     def write(self, path: str | Path) -> None:
         """Write the index as one Parquet file, whole or not at all.
@@ -275,12 +362,12 @@ class SceneIndex:
         where the root is.
 
         Raises:
-            StorageError: If the file cannot be written, or rows of it are presumed.
+            StorageError: If the file cannot be written, or scenes of it were not opened.
         """
-        if self.presumption is not None:
+        if self.unopened is not None:
             raise StorageError(
-                f"{self.where}: most of its rows are presumed, and an index must not be. Run "
-                f"`stereogenbench index {self.where}`, or open it with rows='read'."
+                f"{self.where}: most of its scenes were not opened, and an index holds opened "
+                f"ones. Run `stereogenbench index {self.where}`, or open it with rows='read'."
             )
         self.load_seek_tables()
         tables = None if isinstance(self._seek_tables, Path) else self._seek_tables
@@ -299,21 +386,20 @@ class SceneIndex:
         return int(self._table.num_rows)
 
     def scene(self, row: int, *, videos: Collection[str] = VIDEO_FILES) -> Scene:
-        """Return the scene of a row; where rows are presumed, as its files say.
+        """Return the scene of a row, as its files say if it was not opened yet.
 
         Args:
             row: The row.
-            videos: The videos that are needed; others of a presumed scene behind a URL are not
-                opened.
+            videos: The videos that are needed; others of such a scene behind a URL are not opened.
 
         Raises:
-            StorageError: If there is no such row, or the scene is not as presumed.
+            StorageError: If there is no such row, or the scene is not as its row says.
         """
         scene = self.indexed_scene(row)
-        return scene if self.presumption is None else self.presumption.described(scene, videos)
+        return scene if self.unopened is None else self.unopened.scene(scene, videos)
 
     def indexed_scene(self, row: int) -> Scene:
-        """Return what the index says of the scene of a row, presumed or not.
+        """Return what the index says of the scene of a row, opened or not.
 
         Raises:
             StorageError: If there is no such row.
@@ -352,22 +438,41 @@ class SceneIndex:
             float64 for ``baselines_cm``, (n, 6) for the columns with one value per camera.
 
         Raises:
-            StorageError: If there is no such column.
+            StorageError: If there is no such column, or it is of files behind a URL that were not
+                read.
         """
         if name not in self._columns:
-            if name in _OF_BASELINES and self.presumption is not None:
-                self._table, self.presumption = _with_baselines(self.presumption, self._table)
+            self._require_read(name)
             columns = [field.name for field in SCHEMA if not pa.types.is_list(field.type)]
             if name not in columns:
                 known = ", ".join(columns)
                 raise StorageError(f"the index has no column {name!r}; it has {known}.")
-            if name == "caption" and self.presumption is not None:
-                captions = self.presumption.captions(self.column("key"))
+            if name == "caption" and not self.has_captions and self.unopened is not None:
+                captions = self.unopened.captions(self.column("key"))
                 self._columns[name] = np.array(captions, dtype=object)
             else:
                 self._columns[name] = as_numpy(self._table.column(name))
             self._columns[name].setflags(write=False)
         return self._columns[name]
+
+    def _require_read(self, name: str) -> None:
+        """Refuse a column of files behind a URL that opening the tree did not read."""
+        unopened, call = self.unopened, ""
+        if unopened is not None and unopened.is_remote:
+            if name == "caption" and not self.has_captions:
+                call = "with_captions"
+            elif name in _OF_BASELINES and unopened.baselines != "read":
+                call = "with_baselines"
+        if call:
+            what = "description" if name == "caption" else "baseline.json"
+            minutes = -(-len(self) // _REQUESTS_A_MINUTE)
+            raise StorageError(
+                f"{self.where}: {name} stands in the {what} of each of {len(self):,} scenes, which "
+                f"were not read: that is {len(self):,} requests, on the Hub without a login some "
+                f"{counted(minutes, 'minute')}. Run `stereogenbench index {self.where} -o "
+                f"index.parquet` once and open that; or read them now: "
+                f"SceneIndex.open({self.where!r}).{call}()."
+            )
 
     @property
     def shapes(self) -> tuple[Declaration, ...]:
@@ -447,10 +552,10 @@ class SceneIndex:
     def digest(self) -> str:
         """A sha256 of the rows: the same on every machine and in every version."""
         if not self._digest:
-            presumption = self.presumption
-            if presumption is not None and presumption.is_remote:
+            unopened = self.unopened
+            if unopened is not None and unopened.is_remote:
                 # Its rows change once baselines are read.
-                self._digest = presumption.tree.stamp
+                self._digest = unopened.tree.stamp
             else:
                 self._digest = table_digest(self._table)
         return self._digest
@@ -714,15 +819,14 @@ def _open_tree(
 ) -> SceneIndex:
     """Return the scenes of a folder or URL in the released layout, without a few broken ones.
 
-    Those of a large folder are kept in the user's cache, and presumed where that is possible.
+    Of a large one some scenes are opened.
     """
     # What describes files takes long to import, and an index needs none of it.
-    from stereogenbench_data.index.build import POOL_FROM, find_tree, walk_tree
-    from stereogenbench_data.index.presumed import FEW_REMOTE
+    from stereogenbench_data.index.build import POOL_FROM, find_tree, settle, walk_tree
 
     with _no_collection():
         tree = find_tree(root, wanted=wanted, if_none="all", conventions=conventions, retry=retry)
-        is_large = len(tree.keys) >= (POOL_FROM if tree.remote is None else FEW_REMOTE)
+        is_large = len(tree.ids) >= (POOL_FROM if tree.remote is None else FEW_REMOTE)
         tree = tree.listed() if is_large else tree
 
     def read() -> SceneIndex:
@@ -732,30 +836,37 @@ def _open_tree(
         return _of_report(walk_tree(tree, workers=1))
 
     index = None
-    if is_large and rows == "presumed" and not (tree.stated and tree.stated.has):
-        index = _open_presumed(tree, "read" if tree.remote is None else "when needed")
-    index = index or (_once(tree, "read", read) if is_large else None) or read()
-    index.others = tree.others
+    if is_large and rows == "settled" and not (tree.stated and tree.stated.has):
+        is_near = tree.remote is None
+        settled, opened = settle(tree, videos="all" if is_near else "of one camera")
+        index = _open_settled(settled, opened, "read" if is_near else "not read")
+    index = index or (_cached_or_built(tree, "read", read) if is_large else None) or read()
+    wanted_keys = set(tree.keys)
+    index.others = tuple(each for key, each in tree.ids.items() if key not in wanted_keys)
     return index
 
 
-def _open_presumed(tree: "Tree", baselines: "Baselines") -> SceneIndex | None:
-    """Return the scenes of a tree, most of them presumed; None where nothing can be presumed."""
-    from stereogenbench_data.index.presumed import Presumption, presumed_report
+def _open_settled(
+    tree: "Tree", opened: "Mapping[str, Outcome]", baselines: "Baselines"
+) -> SceneIndex | None:
+    """Return the scenes of a tree of which some were opened; None where all must be."""
+    from stereogenbench_data.index.unopened import UnopenedScenes, unopened_report
 
-    def presumed() -> SceneIndex | None:
+    def settled() -> SceneIndex | None:
         with _no_collection():
-            report = presumed_report(tree, baselines)
+            report = unopened_report(tree, opened, baselines)
             return None if report is None else _of_report(report)
 
-    index = _once(tree, "presumed" if baselines == "read" else "listed", presumed)
+    index = _cached_or_built(tree, "settled" if baselines == "read" else "listed", settled)
     if index is not None:
-        forms = index._table.column("pose_form").drop_null().to_pylist()
-        index.presumption = Presumption(tree, forms=forms, baselines=baselines)
+        index.unopened = UnopenedScenes(tree, opened, baselines=baselines)
+        index.has_captions = False
     return index
 
 
-def _once(tree: "Tree", name: str, find: Callable[[], SceneIndex | None]) -> SceneIndex | None:
+def _cached_or_built(
+    tree: "Tree", name: str, find: Callable[[], SceneIndex | None]
+) -> SceneIndex | None:
     """Return the rows of a tree that an earlier opening has kept, or find and keep them."""
     name = f"{name}-{tree.stamp}"
     kept = tree.cache.table(name)
@@ -771,30 +882,12 @@ def _once(tree: "Tree", name: str, find: Callable[[], SceneIndex | None]) -> Sce
     return found
 
 
-def _with_baselines(presumption: "Presumption", table: pa.Table) -> "tuple[pa.Table, Presumption]":
-    """Return presumed rows once each ``baseline.json`` was read.
-
-    Raises:
-        StorageError: If one of them cannot be used, or read.
-    """
-    if presumption.baselines == "read":
-        return table, presumption
-    index = _open_presumed(presumption.tree, "read")
-    if index is None or index.presumption is None or index._table["key"] != table["key"]:
-        why = "" if index is None else listed(index.incomplete | index.broken)
-        raise StorageError(
-            f"{shown(presumption.tree.root)}: not all scenes are as was presumed: {why}. "
-            f"{presumption.cures()}"
-        )
-    return index._table, index.presumption
-
-
 def _require_few(tree: "Tree") -> None:
     """Refuse to describe many scenes behind a URL each time they are opened."""
     count, where = len(tree.keys), shown(tree.root)
     if count > MOST_REMOTE_SCENES:
         raise StorageError(
-            f"{where}: has no {INDEX_NAME}, its scenes cannot be presumed to be alike, and {count} "
+            f"{where}: has no {INDEX_NAME}, all its scenes must be opened, and {count} "
             f"are too many to fetch their headers each time. Index it once, or the part you need: "
             f"`stereogenbench index {where} -o index.parquet --split eval`, and open that file "
             f"with --root {where}, or SceneIndex.open('index.parquet', root=...)."
@@ -827,8 +920,7 @@ def _of_report(report: "TreeReport") -> SceneIndex:
         raise StorageError(
             f"{where}: no scene is complete: {listed(report.broken | report.incomplete)}{cure}"
         )
-    found = len(report.scenes) + len(report.broken)
-    if len(report.broken) > max(1, found * MOST_LEFT_OUT):
+    if not are_few(len(report.broken), of=len(report.scenes) + len(report.broken)):
         raise StorageError(
             f"{where}: {listed(report.broken)}\nRepair or remove them; or leave them out on "
             f"purpose: `stereogenbench index {where}` makes an index without them."
@@ -836,22 +928,31 @@ def _of_report(report: "TreeReport") -> SceneIndex:
     return SceneIndex.from_report(report)
 
 
-def _assumed_of(table: pa.Table, *, where: str) -> str:
-    """Return what was taken for granted, by some of the scenes whose files were all read."""
+def _lacking(index: SceneIndex) -> dict[str, str]:
+    """Return the scenes of a tree that lack a file which others have, and why."""
+    found: dict[str, str] = {}
+    for about in ("videos", "poses"):
+        rows = index.remarked(about)
+        if 2 * len(rows) < len(index):
+            for row in rows.tolist():
+                scene = index.indexed_scene(row)
+                if about == "videos" or TRAJECTORY_JSON not in scene.members:
+                    found.setdefault(scene.id.key, scene.remark(about))
+    return found
+
+
+def _assumed_of(index: SceneIndex) -> str:
+    """Return what was taken for granted about the scenes of a tree; "" if nothing."""
+    table, unopened = index._table, index.unopened
+    if unopened is not None:
+        odd = assumptions(unopened.opened[:_LOOKED_AT], where=index.where)
+        return (
+            f"{index.where}: {index.not_opened}. `stereogenbench index {index.where}` opens all."
+            + f" {odd}" * bool(odd)
+        )
     is_odd = pc.or_(pc.is_valid(table.column("pose_form")), pc.is_valid(table.column("remarks")))
     scenes = table.filter(is_odd).slice(0, _LOOKED_AT).to_pylist()
-    return assumptions(map(scene_of, scenes), where=where)
-
-
-def listed(left_out: Mapping[str, str]) -> str:
-    """Return how many scenes are left out, and the first of them with the reasons."""
-    lines = [
-        shortened(reason if key in reason else f"{key}: {reason}", _LONGEST_REASON)
-        for key, reason in sorted(left_out.items())[:_SHOWN]
-    ]
-    if len(left_out) > _SHOWN:
-        lines.append(f"and {len(left_out) - _SHOWN} more")
-    return "\n  ".join([f"{counted(len(left_out), 'scene')} cannot be used:", *lines])
+    return assumptions(map(scene_of, scenes), where=index.where)
 
 
 _ASSUMED: Final = (

@@ -120,24 +120,50 @@ class SceneFolder:
         Raises:
             StorageError: If the folder cannot be read; `MisplacedScenes` if scenes are below it.
         """
-        folder = Path(self._root, self.key)
+        folder = f"{self._root}/{self.key}"
         with (
             explain_os_errors(f"{folder}: cannot be read", "Fetch the scene again."),
             os.scandir(folder) as entries,
         ):
-            found = {entry.name: entry.stat() for entry in entries if is_read(entry.name)}
-        files = () if found else folder.rglob("*")
+            found = {entry.name: _stamp(entry) for entry in entries if is_read(entry.name)}
+        files = () if found else Path(folder).rglob("*")
         if deeper := {each.parent for each in files if each.name in _SCENE_FILES}:
             paths = (each.relative_to(self._root).as_posix() for each in deeper)
             refused = {path: refusal(str(self._root), path) for path in sorted(paths)}
             error = MisplacedScenes("\n".join(refused.values()))
             error.refused = refused
             raise error
-        # Times of modification can be set, as `tar` does; those of change cannot, but on Windows.
-        return {
-            name: (status.st_size, status.st_mtime_ns + status.st_ctime_ns)
-            for name, status in sorted(found.items())
+        return dict(sorted(found.items()))
+
+    def hollow(self, files: Files) -> dict[str, str]:
+        """Return the files that cannot hold what they should, as their listing shows, and why.
+
+        Args:
+            files: Of the scene, as `stamps` returns them.
+        """
+        small = {
+            name for name, (size, _) in files.items() if size < _LEAST_BYTES and name in _LARGE
         }
+        # Of one that was cut short, the end tells.
+        looked_at = sorted(small | ({TRAJECTORY_JSON} & files.keys()))
+        reasons = {name: self._why_hollow(name, files[name][0]) for name in looked_at}
+        return {name: f"{self.key}/{name}: {why}" for name, why in reasons.items() if why}
+
+    def _why_hollow(self, name: str, size: int) -> str:
+        path = Path(self._root, self.key, name)
+        if size == 0:
+            is_there = path.exists()
+            return "is empty: fetch it again" if is_there else "is a link to a file that is missing"
+        try:
+            with path.open("rb") as file:
+                is_pointer = size < _LEAST_BYTES and file.read(len(_POINTER)) == _POINTER
+                file.seek(-min(size, _END_OF_JSON), os.SEEK_END)
+                is_cut = name == TRAJECTORY_JSON and not file.read().rstrip().endswith((b"}", b"]"))
+        except OSError as error:
+            return f"cannot be read ({error.strerror})"
+        if is_pointer:
+            return "is a Git LFS pointer and not the file: run `git lfs pull`"
+        return "is cut short: fetch it again" if is_cut else ""
 
     def fetch(self, names: Iterable[str]) -> None:
         """Fetch files at a time, if they are behind a URL."""
@@ -159,6 +185,26 @@ class SceneFolder:
             StorageError: If it cannot be read.
         """
         return Path(self._root, self.key, name)
+
+
+_LEAST_BYTES: Final = 1024
+"""No video is smaller, and every Git LFS pointer is."""
+_POINTER: Final = b"version https://git-lfs"
+_END_OF_JSON: Final = 16
+_VIDEOS: Final = frozenset({*VIDEO_FILES, *PACKED_DEPTH_NAMES.values()})
+_LARGE: Final = _VIDEOS | {BASELINE_JSON, TRAJECTORY_JSON}
+
+
+def _stamp(entry: "os.DirEntry[str]") -> tuple[int, int]:
+    """Return the size of a file and a number that changes with it; a dangling link has no bytes."""
+    try:
+        status = entry.stat()
+    except OSError:
+        if not entry.is_symlink():
+            raise
+        return 0, 0
+    # Times of modification can be set, as `tar` does; those of change cannot, but on Windows.
+    return status.st_size, status.st_mtime_ns + status.st_ctime_ns
 
 
 class WholeFiles(SceneFolder):
@@ -230,6 +276,12 @@ class RemoteFolder(SceneFolder):
     def stamps(self) -> dict[str, tuple[int, int]]:
         """Return the size in bytes of each file, and a number that changes with it."""
         return dict(self._files)
+
+    def _why_hollow(self, name: str, size: int) -> str:
+        if size == 0:
+            return "is empty: upload it again"
+        is_video = name in _VIDEOS
+        return f"has {size} bytes, as a Git LFS pointer: upload the file itself" * is_video
 
     def fetch(self, names: Iterable[str]) -> None:
         """Fetch small files, and both ends of videos, at a time.

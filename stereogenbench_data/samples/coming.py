@@ -17,7 +17,7 @@ from stereogenbench_data.sources.members import MemberSource
 
 SCENES_AHEAD: Final = 8
 MOST_SCENES_AHEAD: Final = 48
-"""How many presumed scenes behind a URL are planned ahead of the one that is read, and how many are
+"""How many unopened scenes behind a URL are planned ahead of the one that is read, and how many are
 described ahead of these: at first, and at most, as each scene that was begun allows one more. Those
 that an order interleaves begin together, and end together, too."""
 
@@ -203,7 +203,7 @@ class ComingSamples:
 
 
 class DescribedAhead:
-    """The steps of an order over presumed scenes behind a URL, which are described ahead of them.
+    """The steps of an order over unopened scenes behind a URL, which are opened ahead of them.
 
     It ends for now where too many scenes are given that were not begun: describing costs requests.
     """

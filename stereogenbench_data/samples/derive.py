@@ -120,7 +120,7 @@ class SceneFacts:
         intrinsics: Of its pictures as they are decoded, before a transform.
         encodings: The depth encoding of each camera.
         url: Returns what holds one of its files: a shard, or the scene's folder.
-        videos: The videos that were opened for it, where its row is presumed and behind a URL.
+        videos: The videos that were opened for it, where it is behind a URL without an index.
         poses: Its `CameraPoses`; None until they were read, or where nothing needs them.
     """
 

@@ -8,7 +8,6 @@ its last picture. A stream that fails is closed, and opened again when next need
 import copy
 import os
 import threading
-import warnings
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -27,7 +26,6 @@ from stereogenbench_data.errors import (
     SchemaError,
     ShardError,
     StorageError,
-    text_without_secrets,
 )
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
@@ -46,7 +44,6 @@ from stereogenbench_data.samples.derive import SceneFacts, StoredDepth, Views
 from stereogenbench_data.samples.fields import (
     Allocate,
     Clip,
-    OddSceneWarning,
     Request,
     Sample,
     SampleWriter,
@@ -464,8 +461,8 @@ class SampleDecoder:
         """Take the samples that will be decoded next, so that their bytes are fetched ahead."""
         with self._lock:
             if self._coming is not None:
-                if self._index.presumption is not None:
-                    self._described = steps = DescribedAhead(steps, self._describe_soon)
+                if self._index.unopened is not None:
+                    self._described = steps = DescribedAhead(steps, self._open_soon)
                 self._coming.expect(steps)
 
     def begin(self, address: Address) -> None:
@@ -500,11 +497,11 @@ class SampleDecoder:
             self._streams.close()
             self._scenes.clear()
 
-    def _describe_soon(self, address: Address) -> None:
-        """Describe a sample's presumed scene in the background."""
-        if self._index.presumption is not None:
-            presumed = self._index.indexed_scene(address.row)
-            self._index.presumption.expect(presumed, self._videos(address))
+    def _open_soon(self, address: Address) -> None:
+        """Open a sample's scene in the background."""
+        if self._index.unopened is not None:
+            row = self._index.indexed_scene(address.row)
+            self._index.unopened.expect(row, self._videos(address))
 
     def _videos(self, address: Address) -> tuple[str, ...]:
         """Return the names of the videos that a sample needs."""
@@ -515,13 +512,12 @@ class SampleDecoder:
 
     def _known_scene(self, address: Address) -> SceneFacts:
         """Return what is known of a sample's scene; that of the last rows asked for is kept."""
-        row, presumption = address.row, self._index.presumption
+        row, unopened = address.row, self._index.unopened
         known = self._scenes.get(row)
-        is_far = presumption is not None and presumption.is_remote
+        is_far = unopened is not None and unopened.is_remote
         videos = self._videos(address) if is_far else ()
         if known is None or not known.videos.issuperset(videos):
             scene = self._index.scene(row, videos=videos or VIDEO_FILES)
-            self._require_as_presumed(row, scene)
             if self._coming is not None and not is_far:
                 scene = replace(scene, seek_tables=self._index.seek_tables(row))
             intrinsics = rig_intrinsics(scene.rig)
@@ -541,34 +537,6 @@ class SampleDecoder:
                 self._scenes.popitem(last=False)
         self._scenes.move_to_end(row)
         return known
-
-    def _require_as_presumed(self, row: int, scene: Scene) -> None:
-        """Refuse a scene that was presumed to give what is requested, and does not.
-
-        Where all rows were read, such scenes are no part of the plan. The first of those whose
-        poses are not understood, and not needed either, is told.
-        """
-        presumption, request = self._index.presumption, self._request
-        if presumption is None:
-            return
-        for name in request.fields:
-            for about in request.known[name].stopped_by:
-                if reason := scene.remark(about):
-                    raise StorageError(
-                        f"{self._index.where}: {scene.id.key} cannot give {name!r}: {reason}. "
-                        f"{presumption.cures()}"
-                    )
-        reason = scene.remark("poses")
-        if self._needs_of_poses == {"never"} or not reason or presumption.was_told:
-            return
-        if not self._index.indexed_scene(row).remark("poses"):
-            presumption.was_told = True
-            message = (
-                f"{self._index.where}: {scene.id.key} has poses that are not understood, so its "
-                f"rig is assumed rectified ({reason}). There may be more such scenes: "
-                f"`stereogenbench index {self._index.where}` tells all of them."
-            )
-            warnings.warn(text_without_secrets(message), OddSceneWarning, stacklevel=2)
 
     def load(
         self,

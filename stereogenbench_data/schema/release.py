@@ -54,6 +54,7 @@ METADATA_FILES: Final = (
 
 SEEN_MAP_FOLDER: Final = "MapSeenInTrain"
 _UNSEEN_MAP_FOLDER: Final = re.compile(r"unseen|not_?seen", re.IGNORECASE)
+_SEEN: Final = re.compile("seen", re.IGNORECASE)
 
 TRAIN_MAPS: Final = frozenset(
     {"AbandonedPowerPlant", "AssetsvilleTown", "Car_Dealer", "Downtown_West",
@@ -123,6 +124,6 @@ def baseline_bin(baseline_cm: float) -> str:
 
 def subset_of_folder(folder: str) -> Subset | None:
     """Return the subset of a folder under ``eval/``, None if its name does not tell."""
-    if folder == SEEN_MAP_FOLDER:
-        return "seen_map"
-    return "unseen_map" if _UNSEEN_MAP_FOLDER.search(folder) else None
+    if _UNSEEN_MAP_FOLDER.search(folder):
+        return "unseen_map"
+    return "seen_map" if _SEEN.search(folder) else None

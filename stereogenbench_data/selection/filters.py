@@ -130,7 +130,6 @@ def may_pass(filters: Mapping[str, Any]) -> Callable[[SceneId], bool] | None:
             any(str(part).strip("/").lower() in scene.key.lower() for part in wanted)
             if name == "scenes"
             else values[name] in wanted
-            or (name == "subset" and scene.split == "eval" and scene.subset is None)
             for name, wanted in of_path.items()
         )
 

@@ -14,8 +14,9 @@ from itertools import groupby
 from typing import Any, Final, Literal
 
 from stereogenbench_data.errors import ShardError
+from stereogenbench_data.index.left_out import are_few
 from stereogenbench_data.index.rows import row_of
-from stereogenbench_data.index.table import MOST_LEFT_OUT, IncompleteSceneWarning, SceneIndex
+from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
@@ -274,7 +275,7 @@ def _whole_rows(index: SceneIndex, rows: Sequence[int] | None) -> list[int]:
         f"{'lacks' if len(lacking) == 1 else 'lack'} a file. "
         f"The first: {reasons[lacking[0]].removesuffix('.')}."
     )
-    if len(lacking) == len(chosen) or len(lacking) > max(1, MOST_LEFT_OUT * len(chosen)):
+    if len(lacking) == len(chosen) or not are_few(len(lacking), of=len(chosen)):
         raise ShardError(
             f"{told} Fetch these scenes again or remove them, and run `stereogenbench index` again."
         )

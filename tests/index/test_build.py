@@ -122,10 +122,11 @@ def test_what_many_scenes_take_is_told_before_they_are_read(alike_scenes, root, 
     for path in (root / keys[0]).glob("cam_*"):
         with heads_of(path, name=path.name) as heads:
             asked += heads.asked
-    monkeypatch.setattr(walk_module, "_MOST_UNTOLD_SCENES", 5)
+    monkeypatch.setattr(walk_module, "_MOST_UNTOLD_SCENES", 4)
+    monkeypatch.setattr(walk_module, "_SETTLED_BY", 1)
 
-    size, reads = f"{asked.bytes * 4 / 1e6:.1f} MB", f"{asked.reads * 4} reads"
-    told = rf"{root}: reads the heads of all videos of 4 scenes, some {size} in {reads}, .* worker"
+    size, reads = f"{asked.bytes * 3 / 1e6:.1f} MB", f"{asked.reads * 3} reads"
+    told = rf"{root}: reads the heads of all videos of 3 scenes, some {size} in {reads}, .* worker"
     with pytest.warns(ManyReadsWarning, match=told):
         report = walk(root)
 
@@ -145,9 +146,10 @@ def test_files_are_read_through_where_a_disk_is_slow_to_find_them(alike_scenes, 
     monkeypatch.setattr(heads_module, "FileIO", SlowFile)
     for module in (walk_module, heads_module, tree_module):
         monkeypatch.setattr(module, "perf_counter", lambda: now_s[0])
-    monkeypatch.setattr(walk_module, "_MOST_UNTOLD_SCENES", 5)
+    monkeypatch.setattr(walk_module, "_MOST_UNTOLD_SCENES", 4)
+    monkeypatch.setattr(walk_module, "_SETTLED_BY", 1)
 
-    told = f"reads all files through of 3 scenes, some {size * 3 / 1e6:.1f} MB in 36 reads"
+    told = f"reads all files through of 2 scenes, some {size * 2 / 1e6:.1f} MB in 24 reads"
     with pytest.warns(ManyReadsWarning, match=told):
         report = walk(root)
 
@@ -155,15 +157,16 @@ def test_files_are_read_through_where_a_disk_is_slow_to_find_them(alike_scenes, 
 
 
 @pytest.mark.usefixtures("cache")
-def test_checksums_of_a_folder_go_on_where_they_were_stopped(alike_scenes, root):
+def test_checksums_of_a_folder_go_on_where_they_were_stopped(alike_scenes, root, monkeypatch):
     keys = alike_scenes(4)
+    monkeypatch.setattr(walk_module, "_SETTLED_BY", 1)
     bare = walk(root).scenes
 
     def stop(done, total):
         if done == 3:
             raise KeyboardInterrupt
 
-    told = "all files through of 2 scenes, some .* MB in 24 reads, which takes some [0-9]+ s by 1"
+    told = "all files through of 1 scenes, some .* MB in 12 reads, which takes some [0-9]+ s by 1"
     with (
         pytest.warns(ManyReadsWarning, match=told),
         pytest.raises(KeyboardInterrupt, match=r"^$"),

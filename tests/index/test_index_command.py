@@ -44,9 +44,12 @@ def test_commands_take_the_root_of_an_index_elsewhere(small_release, tmp_path):
     assert json.loads(taken.stdout)["root"] == str(small_release)
 
 
-def test_checksums_are_filled_by_the_command_and_only_for_a_folder(make_scene, root, run):
+def test_checksums_are_filled_by_the_command_and_only_for_a_folder(
+    make_scene, root, run, monkeypatch
+):
+    monkeypatch.setattr(walk_module, "_SETTLED_BY", 1)
     make_scene()
-    for number in (2, 3):
+    for number in (2, 3, 4):
         make_scene(f"train/Uniform/Car_Dealer/scene_{number:06d}")
 
     done = run(root, "--checksums")
@@ -120,17 +123,17 @@ def test_a_second_run_goes_on_where_one_was_stopped(make_scene, root, run, tmp_p
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     for number in range(3):
         make_scene(f"train/Uniform/Car_Dealer/scene_{number:06d}")
-    describe = walk_module.describe_scene
+    describe = walk_module.Description
     described = []
 
-    def stopping(place, key, **how):
+    def stopping(folder, key, settled):
         if key.endswith("2") and len(described) == 2:
             described.append("stopped")
             raise KeyboardInterrupt
         described.append(key)
-        return describe(place, key, **how)
+        return describe(folder, key, settled)
 
-    monkeypatch.setattr(walk_module, "describe_scene", stopping)
+    monkeypatch.setattr(walk_module, "Description", stopping)
 
     first, second = run(root), run(root)
 

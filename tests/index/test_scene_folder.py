@@ -105,7 +105,7 @@ def test_without_poses_the_primary_pair_tells_the_left_end(make_scene, root, rew
     places_m = [sign * place_m for place_m in (0.0, 0.1, 0.25, 0.31, 0.6, 0.725)]
     assert scene.lateral_m == pytest.approx(places_m, abs=1e-12)
     assert scene.rig_residual_px == 0
-    assert "looks truncated" in scene.remark("poses")
+    assert "is cut short" in scene.remark("poses")
 
 
 def test_cameras_whose_sides_are_contradicted_have_no_poses(described):

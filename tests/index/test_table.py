@@ -410,7 +410,7 @@ def test_twenty_scenes_that_fail_alike_are_told_as_a_format(make_scene, root):
         folder = make_scene(f"train/Uniform/Car_Dealer/scene_{number:06d}")
         (folder / "baseline.json").write_text('{"lens": {}}')
 
-    with pytest.raises(StorageError, match="first 20 scenes cannot be used, all for one reason"):
+    with pytest.raises(StorageError, match="none of the 20 scenes that were looked at can be used"):
         SceneIndex.open(root)
 
 

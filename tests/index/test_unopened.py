@@ -1,23 +1,28 @@
-"""Many scenes without an index: a few are read, the others are presumed and read when needed."""
+"""Many scenes without an index: some settle what the others have, which are opened when needed."""
 
 import json
 import os
+import re
 import shutil
 
 import numpy as np
 import pytest
 
-from stereogenbench_data import IncompleteSceneWarning, OddSceneWarning, StereoPairs
+from stereogenbench_data import IncompleteSceneWarning, StereoPairs
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import build
 from stereogenbench_data.index.table import AssumptionWarning, SceneIndex
 from stereogenbench_data.index.tree_cache import CACHE_VARIABLE
 from tests.servers.scene_fixtures import documents
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*not opened yet:UserWarning")
+
 KEYS = [f"train/Uniform/Map_{number % 4}/scene_{number:06d}" for number in range(68)]
 KEYS += [f"eval/MapSeenInTrain/Uniform/Map_0/scene_{number:06d}" for number in range(8)]
-ODD = "train/Uniform/Map_0/scene_000004"
-"""A scene that opening the tree does not look at."""
+ODD = "train/Uniform/Map_0/scene_000008"
+"""A scene that opening the tree does not open."""
+SETTLING = sorted(KEYS)[:: len(KEYS) - 1]
+"""The first and the last scene, which settle what others have."""
 
 
 def baseline_of(number):
@@ -90,18 +95,18 @@ def row_of(index, key):
     return index.column("key").tolist().index(key)
 
 
-def test_presumed_rows_are_those_that_reading_gives(whole_tree, read_index):
-    presumed, read = SceneIndex.open(whole_tree), read_index
+def test_rows_of_unopened_scenes_are_those_that_opening_gives(whole_tree, read_index):
+    unopened, read = SceneIndex.open(whole_tree), read_index
 
-    assert presumed.presumption is not None
-    assert read.presumption is None
+    assert unopened.unopened is not None
+    assert read.unopened is None
     for name in (
         "key", "subset", "frames", "focal_mm", "baselines_cm", "primary_left", "depth_unit_m",
         "depth_codec", "image_width_px", "character", "scene_label", "caption",
     ):  # fmt: skip
-        np.testing.assert_array_equal(presumed.column(name), read.column(name), err_msg=name)
-    np.testing.assert_allclose(presumed.column("lateral_m"), read.column("lateral_m"), atol=1e-9)
-    assert presumed.scene(row_of(presumed, ODD)) == read.scene(row_of(read, ODD))
+        np.testing.assert_array_equal(unopened.column(name), read.column(name), err_msg=name)
+    np.testing.assert_allclose(unopened.column("lateral_m"), read.column("lateral_m"), atol=1e-9)
+    assert unopened.scene(row_of(unopened, ODD)) == read.scene(row_of(read, ODD))
 
 
 def test_a_video_that_cannot_be_opened_ends_the_run(tree):
@@ -115,68 +120,127 @@ def test_a_video_that_cannot_be_opened_ends_the_run(tree):
 @pytest.mark.parametrize(
     ("how", "found"),
     [
-        ({"frames": 3}, "frames presumed 4, found 3"),
-        ({"tags": {"DEPTH_SCALE": "0.01"}}, r"unit of depth presumed \(0.001.*found \(0.01"),
+        ({"frames": 3}, "frames 3, and not 4"),
+        ({"tags": {"DEPTH_SCALE": "0.01"}}, r"unit of depth \(0.01, .*and not \(0.001, "),
     ],
 )
-def test_a_scene_that_contradicts_what_was_presumed_is_named(tree, video, how, found):
+def test_a_scene_unlike_those_that_were_opened_is_named(tree, video, how, found):
     for camera in range(6):
         put(tree / ODD / f"cam_{camera:02d}_depth.mkv", video("depth.mkv", **how))
         if "frames" in how:
             put(tree / ODD / f"cam_{camera:02d}_rgb.mp4", video("rgb.mp4", **how))
     index = SceneIndex.open(tree)
 
-    with pytest.raises(StorageError, match=rf"{ODD} is not as was presumed of it: .*{found}"):
+    with pytest.raises(
+        StorageError, match=rf"{ODD} is not as the scenes that were opened first: .*{found}"
+    ):
         index.scene(row_of(index, ODD))
 
 
-def test_pictures_of_another_size_are_read_at_their_own(tree, video):
+def test_pictures_of_another_size_end_the_run(tree, video):
     for camera in range(6):
         for kind in ("rgb.mp4", "depth.mkv"):
             put(tree / ODD / f"cam_{camera:02d}_{kind}", video(kind, size=(48, 64)))
-    with pytest.warns(AssumptionWarning, match="the videos' picture size counts"):
-        pairs = StereoPairs(tree, scenes=ODD, fields=["left", "intrinsics"], size=(12, 16))
-    with pytest.warns(AssumptionWarning, match="the videos' picture size counts"):
-        whole = StereoPairs(tree, split="train", map="Map_0", fields=["left"], size=(12, 16))
-    assert pairs.index.presumption is None  # one scene is read whole
+    index = SceneIndex.open(tree)
 
-    assert pairs[0]["left"].shape == (3, 12, 16)
-    assert whole.index.scene(row_of(whole.index, ODD)).rig.image_width_px == 64
+    with pytest.raises(StorageError, match=rf"{ODD} is .*picture size .*\(64, 48\), and not \(32"):
+        index.scene(row_of(index, ODD))
 
 
-def test_scenes_that_are_not_alike_are_all_read(tree, video):
-    for key in KEYS[:68:2]:
+def of_another_unit(tree, video, keys):
+    for key in keys:
         for camera in range(6):
             other = video("depth.mkv", tags={"DEPTH_SCALE": "0.01"})
             put(tree / key / f"cam_{camera:02d}_depth.mkv", other)
 
-    index = SceneIndex.open(tree)
 
-    assert index.presumption is None
-    assert sorted(set(index.column("depth_unit_m").ravel())) == [0.001, 0.01]
+@pytest.mark.parametrize("filters", [{}, {"split": "train"}, {"map": "Map_1"}])
+def test_without_a_majority_the_kinds_are_listed_whatever_is_filtered(tree, video, filters):
+    of_another_unit(tree, video, sorted(KEYS)[:38])
+
+    with pytest.raises(StorageError, match=r"There are 2:\n  1[0-9] scenes, such as .*0\.0*1"):
+        StereoPairs(tree, **filters)
 
 
-def test_what_the_listing_and_baseline_json_show_is_told_at_opening(tree):
-    (tree / KEYS[1] / "_scene_complete.json").unlink()
-    put(tree / KEYS[2] / "baseline.json", b'{"scene_label": "cu')
-    (tree / KEYS[3] / "cam_05_rgb.mp4").unlink()
+def test_the_majority_settles_and_odd_ones_are_left_out(tree, video):
+    of_another_unit(tree, video, SETTLING)
 
-    with pytest.warns(IncompleteSceneWarning, match=r"2 scenes cannot be used"):
+    with pytest.warns(IncompleteSceneWarning, match=r"2 scenes cannot be used:\n  .*is unlike 18"):
         index = SceneIndex.open(tree)
 
-    assert index.presumption is not None
-    assert (list(index.incomplete), list(index.broken)) == ([KEYS[1]], [KEYS[2]])
-    assert "cam_05_rgb.mp4" in index.indexed_scene(row_of(index, KEYS[3])).remark("videos")
+    assert set(index.column("depth_unit_m").ravel()) == {0.001}
+    assert list(index.broken) == SETTLING
 
 
-def test_where_no_scene_has_its_mark_all_are_presumed_and_that_is_told(tree):
+def test_opening_says_in_a_line_what_it_takes_for_granted_and_so_does_repr(whole_tree):
+    told = r"56 scenes of 76 not opened yet; taken to be as in 20 that were: 4 frames, 32x24 pixels"
+
+    with pytest.warns(AssumptionWarning, match=rf"{told}.*`stereogenbench index .*` opens all"):
+        index = SceneIndex.open(whole_tree)
+
+    assert re.search(told, repr(index))
+    assert "not opened yet" in repr(StereoPairs(index, split="train"))
+
+
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 9\n"
+
+
+def test_what_a_listing_or_json_shows_is_told_once_and_left_out_where_it_is_needed(tree):
+    keys = [key for key in KEYS if key not in SETTLING][:6]
+    put(tree / keys[1] / "cam_01_rgb.mp4", b"")
+    put(tree / keys[2] / "cam_01_rgb.mp4", POINTER)
+    (tree / keys[3] / "cam_01_rgb.mp4").unlink()
+    (tree / keys[3] / "cam_01_rgb.mp4").symlink_to(tree / "gone.mp4")
+    put(tree / keys[4] / "baseline.json", b'{"scene_label": "cu')
+    (tree / keys[5] / "_scene_complete.json").unlink()
+
+    with pytest.warns(IncompleteSceneWarning) as told:
+        pairs = StereoPairs(tree, fields=["left", "right"], split=("train", "eval"))
+
+    (message,) = [str(each.message) for each in told if "not opened" not in str(each.message)]
+    assert "2 scenes cannot be used" in message
+    assert "3 scenes left out where a file is needed" in message
+    for cause in ("is empty", "`git lfs pull`", "a link to a file that is missing"):
+        assert cause in message
+    assert (list(pairs.index.incomplete), list(pairs.index.broken)) == ([keys[5]], [keys[4]])
+    assert pairs.left_out == 3
+    assert len(pairs.plan.scene_rows) == len(KEYS) - 5
+    assert len(StereoPairs(pairs.index, pairs=(2, 3), fields=["left"]).plan.scene_rows) == 74
+
+
+def test_a_trajectory_that_was_cut_stops_only_fields_that_need_poses(tree):
+    path = tree / ODD / "trajectory.json"
+    put(path, path.read_bytes()[:-200])
+
+    with pytest.warns(IncompleteSceneWarning, match=rf"{ODD}/trajectory.json: is cut short"):
+        plain = StereoPairs(tree, split="train")
+    posed = StereoPairs(plain.index, split="train", fields=["left", "world_from_left"])
+    (number,) = np.flatnonzero(plain.index.column("key")[plain.plan.scene_rows] == ODD)
+
+    assert bool((plain[int(number)]["disparity"] > 0).any())
+    assert posed.left_out == 1
+
+
+def test_a_subset_is_that_of_the_whole_tree_whatever_is_filtered(tree):
+    """Without a subset in its path a scene of eval has that of its map in train."""
+    (tree / "eval/MapSeenInTrain").rename(tree / "eval/Test")
+    shutil.copytree(tree / ODD, tree / "eval/Test/Uniform/Elsewhere/scene_000001")
+
+    for filters in ({"split": "eval"}, {"subset": ["seen_map", "unseen_map"]}):
+        index = StereoPairs(tree, **filters).index
+        of_map = dict(zip(index.column("map_name"), index.column("subset"), strict=True))
+        assert of_map == {"Map_0": "seen_map", "Elsewhere": "unseen_map"}
+    assert len(StereoPairs(tree, subset="seen_map").plan.scene_rows) == 8
+
+
+def test_where_no_scene_has_its_mark_all_are_rows_and_that_is_told(tree):
     for key in KEYS:
         (tree / key / "_scene_complete.json").unlink()
 
     with pytest.warns(AssumptionWarning, match="_scene_complete"):
         index = SceneIndex.open(tree)
 
-    assert index.presumption is not None
+    assert index.unopened is not None
     assert len(index) == len(KEYS)
 
 
@@ -188,8 +252,8 @@ def test_more_than_a_few_broken_scenes_are_refused(tree):
         SceneIndex.open(tree)
 
 
-def test_a_table_that_is_presumed_is_not_written_as_an_index(whole_tree, tmp_path):
-    with pytest.raises(StorageError, match="rows are presumed"):
+def test_rows_of_unopened_scenes_are_not_written_as_an_index(whole_tree, tmp_path):
+    with pytest.raises(StorageError, match="were not opened"):
         SceneIndex.open(whole_tree).write(tmp_path / "index.parquet")
 
 
@@ -198,14 +262,14 @@ def test_a_second_opening_has_the_same_rows_without_a_cache_too(whole_tree, cach
     monkeypatch.setenv(CACHE_VARIABLE, "off")
     without = SceneIndex.open(whole_tree)
 
-    assert list(cache.rglob("presumed-*.parquet"))
+    assert list(cache.rglob("settled-*.parquet"))
     assert first.digest == second.digest == without.digest
     assert second.root == first.root
 
 
 def test_a_damaged_cache_is_ignored_and_written_anew(whole_tree, cache):
     digest = SceneIndex.open(whole_tree).digest
-    (kept,) = cache.rglob("presumed-*.parquet")
+    (kept,) = cache.rglob("settled-*.parquet")
     size = kept.stat().st_size
     kept.write_bytes(kept.read_bytes()[: size // 2])
 
@@ -227,7 +291,7 @@ def test_a_described_scene_is_kept_until_its_files_change(tree, cache, monkeypat
     row, video = row_of(index, ODD), tree / ODD / "cam_00_rgb.mp4"
     scene, status = index.scene(row), video.stat()
     with monkeypatch.context() as patched:
-        patched.setattr(build, "describe_scene", None)
+        patched.setattr(build.Tree, "opened", None)
         assert SceneIndex.open(tree).scene(row) == scene
     put(video, bytes(status.st_size))
     os.utime(video, ns=(status.st_atime_ns, status.st_mtime_ns))
@@ -251,18 +315,13 @@ def test_a_state_is_loaded_by_a_second_opening(whole_tree, cache, monkeypatch):
     assert next(iter(second))["scene"] == due
 
 
-def test_poses_that_are_not_understood_are_told_and_stop_only_fields_that_need_them(tree):
-    put(tree / ODD / "trajectory.json", trajectory_of(4) | {"frames": []})
-    plain = StereoPairs(tree, split="train", map=["Map_0", "Map_1", "Map_2", "Map_3"])
-    posed = StereoPairs(tree, split="train", fields=["left", "world_from_left"])
-    (number,) = np.flatnonzero(plain.index.column("key")[plain.plan.scene_rows] == ODD)
+def test_poses_of_another_form_end_the_run(tree):
+    put(tree / ODD / "trajectory.json", trajectory_of(8) | {"frames": []})
+    pairs = StereoPairs(tree, split="train", map=["Map_0", "Map_1", "Map_2", "Map_3"])
+    (number,) = np.flatnonzero(pairs.index.column("key")[pairs.plan.scene_rows] == ODD)
 
-    with pytest.warns(OddSceneWarning, match=ODD):
-        sample = plain[int(number)]
-
-    assert bool((sample["disparity"] > 0).any())
-    with pytest.raises(StorageError, match=rf"{ODD} cannot give 'world_from_left'"):
-        posed[int(number)]
+    with pytest.raises(StorageError, match=rf"{ODD}/trajectory.json.*stereogenbench index"):
+        pairs[int(number)]
 
 
 def test_captions_are_read_where_scenes_are_chosen_by_them(tree):

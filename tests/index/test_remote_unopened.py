@@ -1,4 +1,4 @@
-"""Many scenes on the Hub without an index: presumed by the listing, described when needed."""
+"""Many scenes on the Hub without an index: known by the listing, opened when needed."""
 
 import json
 import os
@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from stereogenbench_data import SceneIndex, StereoPairs
-from stereogenbench_data.errors import StorageError
+from stereogenbench_data.errors import SchemaError, StorageError
 from stereogenbench_data.index import table as open_module
 from stereogenbench_data.index.tree_cache import CACHE_VARIABLE
 from tests.servers.hub import REPOSITORY, hub_serving
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*not opened yet:UserWarning")
+
 HUB = f"hf://datasets/{REPOSITORY}@main"
 KEYS = [f"train/Uniform/Map_{number % 2}/scene_{number:06d}" for number in range(10)]
 KEYS += [f"eval/MapSeenInTrain/Uniform/Map_0/scene_{number:06d}" for number in range(40)]
-ODD = "eval/MapSeenInTrain/Uniform/Map_0/scene_000007"
+ODD = "eval/MapSeenInTrain/Uniform/Map_0/scene_000014"
 """A scene that opening the tree does not look at."""
-UNREAD = "eval/MapSeenInTrain/Uniform/Map_0/scene_000008"
-"""A scene with which a file of all scenes is not compared."""
 
 
 @pytest.fixture(scope="module")
@@ -72,21 +72,47 @@ def read_names(server, key):
 def test_rows_come_from_the_listing_and_a_few_scenes(hub, local):
     index = SceneIndex.open(HUB)
 
-    assert index.presumption is not None
+    assert index.unopened is not None
     assert not read_names(hub, ODD)
     for name in ("key", "subset", "frames", "primary_left", "depth_unit_m", "depth_codec"):
         np.testing.assert_array_equal(index.column(name), local.column(name), err_msg=name)
     assert requests(hub) < 300
 
 
-def test_baselines_are_read_where_a_selection_needs_them_and_the_digest_stays(hub, local):
+@pytest.mark.parametrize(
+    ("options", "needs"),
+    [
+        ({"baseline_cm": (1, 300)}, "baselines_cm stands in the baseline.json"),
+        (
+            {"balance": "baseline", "limit": 4, "pairs": "all"},
+            "baselines_cm stands in the baseline.json",
+        ),
+        ({"focal_mm": (1, 300)}, "focal_mm stands in the baseline.json"),
+        ({"caption": "room"}, "caption stands in the description"),
+    ],
+)
+def test_what_each_baseline_json_tells_is_an_error_with_the_cost_and_two_cures(hub, options, needs):
     index = SceneIndex.open(HUB)
-    digest = index.digest
+    asked = requests(hub)
 
-    np.testing.assert_array_equal(index.column("scene_label"), local.column("scene_label"))
-    np.testing.assert_array_equal(index.column("baselines_cm"), local.column("baselines_cm"))
+    told = rf"{needs} of each of 50 scenes.* 50 requests.* 1 minute\. Run `stereogenbench index hf:"
+    with pytest.raises(StorageError, match=rf"{told}.*; or read them now: .*\.with_[a-z]+\(\)"):
+        StereoPairs(index, split="eval", fields=["left"], **options)
+
+    assert requests(hub) == asked
+    assert "not opened yet" in repr(index)
+
+
+def test_baselines_are_read_when_that_is_asked_for_and_the_digest_stays(hub, local):
+    index = SceneIndex.open(HUB)
+
+    read = index.with_baselines()
+
+    np.testing.assert_array_equal(read.column("scene_label"), local.column("scene_label"))
+    np.testing.assert_array_equal(read.column("baselines_cm"), local.column("baselines_cm"))
     assert read_names(hub, ODD) == {"baseline.json"}
-    assert index.digest == digest
+    assert read.digest == index.digest
+    assert read.with_baselines() is read
 
 
 def test_samples_are_those_of_the_folder_and_only_their_videos_are_opened(hub, release):
@@ -130,9 +156,9 @@ def test_a_second_opening_asks_for_the_commit_alone(hub):
 
 
 @pytest.mark.parametrize("how", ["another pair", "no video"])
-def test_a_scene_that_contradicts_what_was_presumed_is_named(hub, release, how):
+def test_a_scene_unlike_those_that_were_opened_is_named(hub, release, how):
     place = release / ODD / ("baseline.json" if how == "another pair" else "cam_00_rgb.mp4")
-    text = "no video"
+    text = "no video" * 200
     if how == "another pair":
         document = json.loads(place.read_bytes())
         pair = document["primary_stereo_pair"]
@@ -143,74 +169,45 @@ def test_a_scene_that_contradicts_what_was_presumed_is_named(hub, release, how):
     pairs = StereoPairs(HUB, split="eval", fields=["left"], frames=[0])
     number = pairs.index.column("key").tolist().index(ODD)
 
-    with pytest.raises(StorageError, match=rf"{ODD} is not as was presumed.*stereogenbench index"):
+    with pytest.raises(
+        StorageError, match=rf"{ODD} is not as the scenes that were opened.*stereogenbench index"
+    ):
         pairs[number]
 
 
 @pytest.mark.usefixtures("hub")
-def test_too_many_scenes_are_not_all_described_each_time(monkeypatch):
+def test_too_many_scenes_are_not_all_opened_each_time(monkeypatch):
     monkeypatch.setattr(open_module, "MOST_REMOTE_SCENES", 49)
 
     with pytest.raises(StorageError, match=r" 50 are too many .*`stereogenbench index hf://"):
         SceneIndex.open(HUB, rows="read")
 
 
-def as_path(key, record):
-    return record | {"scene_path": f"/data/out/{key}"}
+def test_captions_come_from_each_description_or_from_one_file_of_all(hub, release, local):
+    lines = [json.dumps({"path": f"/data/out/{key}", "text": {"long": f"About {key}."}})
+             for key in KEYS]  # fmt: skip
+    (release / "metadata").mkdir()
+    (release / "metadata" / "all.jsonl").write_text("\n".join(lines))
+    index = SceneIndex.open(HUB)
+
+    of_file = index.with_captions("metadata/all.jsonl", scene="$.path", caption="$.text.long")
+
+    assert of_file.column("caption").tolist() == [f"About {key}." for key in sorted(KEYS)]
+    assert not read_names(hub, ODD)
+    assert of_file.digest == index.digest
+    assert index.with_captions().column("caption").tolist() == local.column("caption").tolist()
 
 
-def as_parts(key, record):
-    split, subset, *_ = key.split("/")
-    names = dict(zip(("family", "map", "scene"), key.split("/")[-3:], strict=True))
-    return record | names | {"split": split, "eval_subset": subset}
-
-
-def write_records(release, name, record_of):
-    """Write a file of all scenes, as records of their own ``baseline.json``."""
-    records = {key: record_of(key, json.loads((release / key / "baseline.json").read_text()))
-               for key in KEYS}  # fmt: skip
-    (release / "metadata").mkdir(exist_ok=True)
-    if name.endswith(".jsonl"):
-        text = "\n".join(json.dumps(record) for record in records.values())
-    else:
-        text = json.dumps({"version": 1, "scenes": records})
-    (release / "metadata" / name).write_text(text)
-
-
+@pytest.mark.usefixtures("hub")
 @pytest.mark.parametrize(
-    ("name", "record_of"),
-    [("all.jsonl", as_parts), ("scenes.json", lambda key, record: record)],
+    ("lines", "error", "told"),
+    [
+        ('{"scene": "train/a/b/c", "caption": "A."}', StorageError, "no record of 50 scenes of 50"),
+        ('{"scene": 7, "caption": "A."}', SchemaError, r"line 1: has no text at \$\.scene; it has"),
+    ],
 )
-def test_one_file_of_all_scenes_stands_for_each_baseline_json(hub, release, local, name, record_of):
-    write_records(release, name, record_of)
-    index = SceneIndex.open(HUB)
+def test_a_file_of_captions_that_does_not_fit_is_refused(release, lines, error, told):
+    (release / "all.jsonl").write_text(lines)
 
-    np.testing.assert_array_equal(index.column("scene_label"), local.column("scene_label"))
-    np.testing.assert_array_equal(index.column("baselines_cm"), local.column("baselines_cm"))
-    assert not read_names(hub, UNREAD)
-
-
-def scaled(key, record):
-    for pair in record["pairwise_pairs"]:
-        pair["baseline_cm"] *= 1.001
-    return as_path(key, record)
-
-
-@pytest.mark.parametrize("record_of", [scaled, lambda key, record: {"a": key}])
-def test_a_file_that_other_files_contradict_is_not_used(hub, release, local, record_of):
-    write_records(release, "scenes.jsonl", record_of)
-    (release / "metadata" / "notes.json").write_text("{")
-    index = SceneIndex.open(HUB)
-
-    np.testing.assert_array_equal(index.column("baselines_cm"), local.column("baselines_cm"))
-    assert read_names(hub, UNREAD) == {"baseline.json"}
-
-
-def test_captions_come_from_one_file_of_all_scenes(hub, release, local):
-    (drawn,) = {(release / key / "scene_description_qwen_dataset_level.json").read_bytes()
-                for key in KEYS}  # fmt: skip
-    write_records(release, "captions.jsonl", lambda key, _: as_path(key, json.loads(drawn)))
-    captions = SceneIndex.open(HUB).column("caption")
-
-    assert captions.tolist() == local.column("caption").tolist()
-    assert not read_names(hub, UNREAD)
+    with pytest.raises(error, match=told):
+        SceneIndex.open(HUB).with_captions("all.jsonl")
