@@ -1,5 +1,6 @@
 """The paper's statistics of an index: counts, baselines and focal lengths, beside its figures."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final, TypeVar, Unpack
@@ -79,6 +80,7 @@ class Statistics:
         families: Figures of each (split, subset, family) of the data.
         branches: Figures of each (split, family), the subsets of eval together.
         derived: What training shards were derived from, and how; empty for released data.
+        findings: What contradicts itself: maps of unseen_map that train has, too.
     """
 
     root: str
@@ -86,6 +88,7 @@ class Statistics:
     families: tuple[FamilyStatistics, ...]
     branches: tuple[FamilyStatistics, ...]
     derived: str = ""
+    findings: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the statistics as values for `json.dumps`."""
@@ -124,7 +127,19 @@ def statistics(index: SceneIndex, **filters: Unpack[SceneFilters]) -> Statistics
         families=tuple(families),
         branches=tuple(branches),
         derived=index.derivation if index.is_derived else "",
+        findings=tuple(_subset_findings(index)),
     )
+
+
+def _subset_findings(index: SceneIndex) -> Iterator[str]:
+    """Yield the maps of scenes of unseen_map that scenes of train have, too."""
+    found = index.seen_maps_called_unseen()
+    for name, count in Counter(found.values()).items():
+        first = next(key for key, own in found.items() if own == name)
+        yield (
+            f"{name} is a map of train, and {counted(count, 'scene')} of unseen_map "
+            f"{'has' if count == 1 else 'have'} it, such as {first}"
+        )
 
 
 def _family(
@@ -313,6 +328,7 @@ def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
     text = [
         f"# Statistics of {markdown_text(str(found.root))}",
         *([] if not found.derived else ["", f"These are {found.derived}."]),
+        *(line for each in found.findings for line in ("", f"**{markdown_text(each)}.**")),
         *_section("Scenes", _count_rows(found)),
         *_section("Adjacent baselines (cm)", _spread_rows(found.branches, "adjacent_cm")),
         *_section("Baselines of all 15 pairs (cm)", _spread_rows(found.branches, "all_pairs_cm")),
@@ -350,6 +366,7 @@ def screen(
     if lines:
         agreeing = len(lines) - len(differing)
         verdict += f": {agreeing} of {len(lines)} figures of the paper agree"
+    verdict += "".join(f". {each}" for each in found.findings)
     rows = [(each.item, each.paper, each.ours) for each in differing]
     parts: list[tuple[str, list[Sequence[str]]]] = [
         ("Scenes", [*_count_rows(found)]),

@@ -52,8 +52,8 @@ def index(  # noqa: PLR0913 - one parameter an option
     """Index a released tree, so that it opens at once.
 
     After an interruption, run the same command again to continue. Incomplete and broken scenes are
-    listed and left out; the exit status is 1 if a scene is broken. --split and --where family=NAME
-    or map=NAME restrict which scenes are read.
+    listed and left out, odd ones listed; the exit status is 1 if a scene is broken. --split and
+    --where family=NAME or map=NAME restrict which scenes are read.
 
     Example: `stereogenbench index scenes/`
     """
@@ -103,6 +103,7 @@ def index(  # noqa: PLR0913 - one parameter an option
             "scenes": len(report.scenes),
             "incomplete": report.incomplete,
             "broken": report.broken,
+            "odd": report.odd,
             "notes": report.notes,
         }
         typer.echo(json.dumps(document, indent=2))
@@ -116,6 +117,7 @@ def index(  # noqa: PLR0913 - one parameter an option
         for title, lines in (
             (f"{len(report.broken)} broken, left out", _reasons(report.broken)),
             (f"{len(report.incomplete)} incomplete, left out", _reasons(report.incomplete)),
+            (f"{len(report.odd)} odd, left out where that is needed", _reasons(report.odd)),
             (counted(len(report.notes), "note"), list(report.notes)),
         )
         if lines

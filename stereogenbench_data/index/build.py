@@ -108,6 +108,7 @@ class TreeReport:
         scenes: Every whole scene, by key.
         incomplete: Key to reason, for scenes without their completion mark or without any video.
         broken: Key (or path below the root) to what is wrong and what to do.
+        odd: Key to what is odd about it, for scenes in `scenes` that lack what most of them have.
         notes: What was assumed where the tree is ambiguous.
         is_part: Whether the user chose only some of the scenes.
     """
@@ -116,6 +117,7 @@ class TreeReport:
     scenes: tuple[Scene, ...]
     incomplete: dict[str, str]
     broken: dict[str, str]
+    odd: dict[str, str]
     notes: tuple[str, ...]
     is_part: bool
 
@@ -701,9 +703,22 @@ def report_of(tree: Tree, of_keys: Mapping[str, Outcome]) -> TreeReport:
         scenes=tuple(scenes),
         incomplete=incomplete,
         broken=dict(sorted((tree.refused | broken).items())),
+        odd=_odd_ones(scenes),
         notes=(*subsets, *named, *remarks_told(found), *_depth_notes(found)),
         is_part=tree.is_part,
     )
+
+
+def _odd_ones(scenes: Sequence[Scene]) -> dict[str, str]:
+    """Return what is odd about scenes and not about most others, by their keys."""
+    counts = Counter(remark.about for scene in scenes for remark in scene.remarks)
+    told = {
+        scene.id.key: "; ".join(
+            each.text for each in scene.remarks if 2 * counts[each.about] < len(scenes)
+        )
+        for scene in scenes
+    }
+    return {key: text for key, text in told.items() if text}
 
 
 def _without_unfetched(scenes: list[Scene]) -> list[Scene]:

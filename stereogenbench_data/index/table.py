@@ -514,6 +514,13 @@ class SceneIndex:
         rows = as_numpy(pc.list_parent_indices(lists))
         return np.bincount(rows[is_video], minlength=len(self))
 
+    def seen_maps_called_unseen(self) -> dict[str, str]:
+        """Return the scenes of unseen_map whose maps scenes of train have, too: key to map."""
+        maps, subsets = self.column("map_name"), self.column("subset")
+        of_train = {*maps[self.column("split") == "train"].tolist()}
+        rows = [row for row in np.flatnonzero(subsets == "unseen_map") if maps[row] in of_train]
+        return dict(zip(self.column("key")[rows].tolist(), maps[rows].tolist(), strict=True))
+
     @property
     def is_derived(self) -> bool:
         """Whether scenes of it were derived for training, with an error; released ones were not."""

@@ -14,6 +14,7 @@ from jaxtyping import Int64
 
 from stereogenbench_data.audit.geometry.records import (
     AuditReport,
+    Finding,
     SceneAudit,
     broken_finding,
     findings_of,
@@ -163,6 +164,11 @@ def audit(
         cache.forget(kind, name)
     audited = [found[scene.id.key] for scene in scenes]
     findings = [broken_finding(key, text) for key, text in sorted(broken.items())]
+    chosen = {scene.key for scene in audited}
+    findings += [
+        Finding(key, "", "subset", f"is of unseen_map, and train has scenes of its map {name}")
+        for key, name in index.seen_maps_called_unseen().items() if key in chosen
+    ]  # fmt: skip
     for scene in audited:
         findings += findings_of(scene)
     untested = [each for scene in audited for each in untested_of(scene)]

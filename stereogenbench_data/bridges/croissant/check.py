@@ -13,7 +13,7 @@ from logging.handlers import BufferingHandler
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.bridges.croissant.descriptor import Node
+from stereogenbench_data.bridges.croissant.descriptor import SEEN_AFTER_ALL, Node
 from stereogenbench_data.bridges.dataset_facts import blanks
 from stereogenbench_data.errors import DescriptorError, needs_extra
 
@@ -66,7 +66,7 @@ def check_descriptor(path: Path) -> list[str]:
             "@context: is missing, stands elsewhere or imports another one, which mlcroissant "
             "would fetch: write it out. Nothing else was checked"
         ]
-    return [*_validated(path), *_missing_properties(node)]
+    return [*_validated(path), *_missing_properties(node), *_contradicted_maps(node)]
 
 
 def _validated(path: Path) -> list[str]:
@@ -92,6 +92,16 @@ def _validated(path: Path) -> list[str]:
     texts += [record.getMessage() for record in heard.buffer]
     lines = [line.strip(" -") for text in texts for line in text.splitlines()]
     return [*dict.fromkeys(line for line in lines if line and not _HEADING.match(line))]
+
+
+def _contradicted_maps(node: Node) -> Iterator[str]:
+    """Yield the maps that train has, though scenes of the subset of unseen maps have them."""
+    sets = node.get("recordSet")
+    for each in sets if isinstance(sets, list) else ():
+        rows = each.get("data") if isinstance(each, dict) else None
+        for row in rows if isinstance(rows, list) else ():
+            if isinstance(row, dict) and row.get("maps/meaning") == SEEN_AFTER_ALL:
+                yield f"maps: {row.get('maps/name')!r:.100} is {SEEN_AFTER_ALL}"
 
 
 def _missing_properties(node: Node) -> Iterator[str]:

@@ -41,6 +41,9 @@ from stereogenbench_data.sources.location import is_remote, shown
 MOST_MEDIA_BYTES: Final = 1_000_000_000
 """Above this size of all shards, record sets of files use the smallest shard of each family."""
 
+SEEN_AFTER_ALL: Final = "in train, though scenes of unseen_map have it"
+"""The meaning of a map that contradicts the subset of its scenes."""
+
 _TEXT, _WHOLE, _NUMBER = pa.string(), pa.int64(), pa.float64()
 _SCENE_COLUMNS: Final = {
     "scene_id": ("key", _TEXT),
@@ -310,7 +313,14 @@ def _enumerations(index: SceneIndex | None) -> list[Node]:
     if index is None:
         return nodes
     train = set(index.column("map_name")[index.column("split") == "train"])
+    contradicted = {*index.seen_maps_called_unseen().values()}
     maps = sorted(set(index.column("map_name")))
+
+    def meaning(name: str) -> str:
+        if name in contradicted:
+            return SEEN_AFTER_ALL
+        return "in train" if name in train else "in eval alone"
+
     _, _, families, places = nodes
     known = {row["families/name"]: row["families/meaning"] for row in families["data"]}
     families["data"] = [
@@ -318,7 +328,10 @@ def _enumerations(index: SceneIndex | None) -> list[Node]:
         for name in sorted(set(index.column("family")))
     ]
     places["data"] = [
-        {"maps/name": name, "maps/meaning": "in train" if name in train else "in eval alone"}
+        {
+            "maps/name": name,
+            "maps/meaning": meaning(name),
+        }
         for name in maps
     ]
     return nodes
