@@ -57,7 +57,7 @@ def index(  # noqa: PLR0913 - one parameter an option
 
     Example: `stereogenbench index scenes/`
     """
-    from stereogenbench_data.index.build import ManyReadsWarning, walk
+    from stereogenbench_data.index.build import FORMAT_CURE, ManyReadsWarning, walk
     from stereogenbench_data.index.parquet import recorded_root
     from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.schema.conventions import Conventions
@@ -131,6 +131,8 @@ def index(  # noqa: PLR0913 - one parameter an option
         print_report(verdict, tables, whole="", rest="--json prints all that was left out.")
     else:
         typer.echo(plain_line(made), err=not report.scenes)
+    if report.broken and not report.scenes:
+        _tell(FORMAT_CURE.format(root=shown(root)))
     is_apart = is_remote(root) or target.parent.resolve() != local_path(root).resolve()
     if report.scenes and is_apart:
         _tell(
@@ -141,8 +143,15 @@ def index(  # noqa: PLR0913 - one parameter an option
 
 
 def _reasons(scenes: Mapping[str, str]) -> list[str]:
-    """Return a line for each scene that was left out, which says why."""
-    return [reason if key in reason else f"{key}: {reason}" for key, reason in scenes.items()]
+    """Return lines that say why scenes were left out: each reason once, with all its scenes."""
+    from stereogenbench_data.index.left_out import by_reason
+
+    lines: list[str] = []
+    for keys in by_reason(scenes):
+        reason = scenes[keys[0]]
+        lines += (reason if keys[0] in reason else f"{keys[0]}: {reason}").splitlines()
+        lines += [f"likewise {key}" for key in keys[1:]]
+    return lines
 
 
 def _tell(*lines: str) -> None:

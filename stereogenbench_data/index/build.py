@@ -21,7 +21,7 @@ import numpy as np
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, no_advance, require_workers
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
-from stereogenbench_data.index.evidence import Understood, agreed_forms, settled_poses
+from stereogenbench_data.index.evidence import Understood, settled_poses
 from stereogenbench_data.index.left_out import reasons_told
 from stereogenbench_data.index.rows import json_of, scene_of_json
 from stereogenbench_data.index.scene_folder import (
@@ -32,7 +32,6 @@ from stereogenbench_data.index.scene_folder import (
     missing_video,
     require_finished,
     unfinished,
-    with_common_pose_form,
 )
 from stereogenbench_data.index.tree import (
     Files,
@@ -682,8 +681,7 @@ def report_of(tree: Tree, of_keys: Mapping[str, Outcome]) -> TreeReport:
                              else {key: str(error)}).items()
     }  # fmt: skip
     found = [out.found for out in outcomes if isinstance(out.found, Scene)]
-    agreed = agreed_forms(scene.pose_form for scene in found if scene.pose_form)
-    found = _without_unfetched([with_common_pose_form(scene, agreed) for scene in found])
+    found = _without_unfetched(found)
     scenes = [replace(scene, id=tree.ids[scene.id.key]) for scene in found]
     eval_keys = (key for key in tree.keys if key.startswith("eval/"))
     unnamed = {key.split("/")[1] for key in eval_keys if parse_scene_key(key).subset is None}

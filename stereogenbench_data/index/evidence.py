@@ -10,7 +10,6 @@ fields on which they differ are refused. Pictures tell more: see `audit.contract
 `poses_of` read by one.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -232,30 +231,6 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
     unit = next(name for name, metres in UNITS_M.items() if metres == unit_m)
     form = None if is_own else "|".join(names)
     return Understood(taken.poses, names, replace(taken.at, unit=unit), form)
-
-
-def agreed_forms(forms: Iterable[str]) -> dict[str, tuple[str, ...]]:
-    """Return what the scenes of a dataset agree about, by the keys of their files.
-
-    One writer has one form. A reading that fits one scene by chance, of cameras that stand still or
-    never roll, does not fit the others.
-
-    Args:
-        forms: `Scene.pose_form` of each scene that has one.
-
-    Returns:
-        For each `shape_of`, the readings that fit the most scenes; () if not over half of them.
-    """
-    votes: dict[str, Counter[str]] = {}
-    counts: Counter[str] = Counter()
-    for form in forms:
-        votes.setdefault(shape_of(form), Counter()).update(form.split("|"))
-        counts[shape_of(form)] += 1
-    return {
-        shape: tuple(name for name, count in found.items()
-                     if count == max(found.values()) and 2 * count > counts[shape])
-        for shape, found in votes.items()
-    }  # fmt: skip
 
 
 def shape_of(form: str) -> str:

@@ -17,18 +17,23 @@ def are_few(left_out: int, *, of: int) -> bool:
     return left_out <= max(1, of * MOST_LEFT_OUT)
 
 
+def by_reason(reasons: Mapping[str, str]) -> list[list[str]]:
+    """Return the keys of scenes, sorted, those together whose reasons differ by figures alone."""
+    groups: dict[str, list[str]] = {}
+    for key, reason in sorted(reasons.items()):
+        kind = re.sub(r"[0-9.]+", "#", reason.replace(key, ""))
+        groups.setdefault(kind, []).append(key)
+    return list(groups.values())
+
+
 def reasons_told(reasons: Mapping[str, str]) -> str:
     """Return the reasons for which scenes are left out, each once, with the first scene of it.
 
     Args:
         reasons: The key of each scene to its reason.
     """
-    groups: dict[str, list[str]] = {}
-    for key, reason in sorted(reasons.items()):
-        kind = re.sub(r"[0-9.]+", "#", reason.replace(key, ""))
-        groups.setdefault(kind, []).append(key)
-    lines = []
-    for keys in list(groups.values())[:_SHOWN]:
+    groups, lines = by_reason(reasons), []
+    for keys in groups[:_SHOWN]:
         reason = reasons[keys[0]]
         told = reason if keys[0] in reason else f"{keys[0]}: {reason}"
         more = f" ({counted(len(keys) - 1, 'other scene')} likewise)" if len(keys) > 1 else ""

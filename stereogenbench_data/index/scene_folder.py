@@ -32,7 +32,6 @@ from stereogenbench_data.index.evidence import (
     Understood,
     declared_poses,
     settled_poses,
-    shape_of,
 )
 from stereogenbench_data.index.tree import FILES, Files, SceneFolder, folder_of
 from stereogenbench_data.media.container import (
@@ -576,31 +575,6 @@ def as_kept(remarks: list[Remark]) -> tuple[Remark, ...]:
 def missing_video(key: str, name: str) -> str:
     """Return what is remarked about a video that a scene lacks."""
     return f"{key}/{name}: is missing, and the scene is marked as complete"
-
-
-def with_common_pose_form(scene: Scene, agreed: Mapping[str, tuple[str, ...]]) -> Scene:
-    """Return a scene whose poses are read as the scenes of its dataset agree (`agreed_forms`)."""
-    if scene.pose_form is None:
-        return scene
-    names = scene.pose_form.split("|")
-    left = [name for name in agreed.get(shape_of(scene.pose_form), names) if name in names]
-    if left == names:
-        return scene
-    others = tuple(each for each in scene.remarks if each.about != "world")
-    if left:
-        more = scene.remarks if len(left) > 1 else others
-        return replace(scene, pose_form="|".join(left), remarks=more)
-    reason = (
-        f"{scene.id.key}/{TRAJECTORY_JSON}: fits the rig only as {names[0]}, and the files of "
-        f"other scenes with the same keys do not. Is it another scene's?"
-    )
-    return replace(
-        scene,
-        pose_form=None,
-        lateral_m=assumed_places_m(scene.rig),
-        rig_residual_px=0.0,
-        remarks=(*others, Remark("poses", reason)),
-    )
 
 
 def _places_m(poses: CameraPoses) -> tuple[float, ...]:

@@ -26,7 +26,6 @@ from stereogenbench_data.index.build import (
     require_some,
     tell_requests,
 )
-from stereogenbench_data.index.evidence import agreed_forms
 from stereogenbench_data.index.scene_folder import (
     DESCRIPTIONS,
     as_kept,
@@ -37,7 +36,6 @@ from stereogenbench_data.index.scene_folder import (
     merged_labels,
     missing_video,
     sized_as_videos,
-    with_common_pose_form,
 )
 from stereogenbench_data.index.tree import SceneFolder
 from stereogenbench_data.schema.declaration import BUILT_IN
@@ -263,7 +261,6 @@ class UnopenedScenes:
         found = (each.found for each in opened.values())
         self.outcomes = opened
         self.opened = tuple(scene for scene in found if isinstance(scene, Scene))
-        self._agreed = agreed_forms(each.pose_form for each in self.opened if each.pose_form)
         self._ahead = FetchAhead()
         self._planned: dict[str, int] = {}
         self._count = 0
@@ -358,7 +355,6 @@ class UnopenedScenes:
         opened = frozenset(VIDEO_FILES) if videos is None else videos
         try:
             scene = self.tree.describe(self.tree.folder(key), videos)
-            scene = with_common_pose_form(scene, self._agreed)
         except StereoGenBenchError as error:
             differences = [str(error)]
         else:
@@ -406,11 +402,6 @@ def _differences(
     yield from _unlike(usual, now)
     if found.members != row.members and "videos" not in stopped:
         yield "its files have changed since the tree was opened"
-    if baselines == "read":
-        for name in ("primary_pair", "baselines_cm", "focal_mm", "sensor_width_mm"):
-            before, there = getattr(row.rig, name), getattr(found.rig, name)
-            if before != there:
-                yield f"{name} of {BASELINE_JSON} is {there}, and was {before}"
     before_m, now_m = row.lateral_m, found.lateral_m
     if any((before_m[b] > before_m[a]) != (now_m[b] > now_m[a]) for a, b in CAMERA_PAIRS):
         yield f"places of cameras in m {now_m}, and not {before_m}"

@@ -18,7 +18,6 @@ from stereogenbench_data.geometry.pose_forms import poses_named
 from stereogenbench_data.index import evidence
 from stereogenbench_data.index.evidence import (
     SidesError,
-    agreed_forms,
     declared_poses,
     settled_poses,
 )
@@ -312,12 +311,3 @@ def test_a_left_camera_that_stands_on_the_right_is_a_contradiction():
 
     with pytest.raises(SidesError, match="camera 0 is to the right of camera 1"):
         understood(written("rotator", rotators, mirrored, coordinate_system="Unreal"))
-
-
-def test_scenes_of_one_shape_decide_together():
-    both, one, other = "a: x @ 1.0|a: y @ 1.0", "a: x @ 1.0", "b: z @ 1.0"
-
-    agreed = agreed_forms([both, one, both, other])
-
-    assert agreed == {"a": ("a: x @ 1.0",), "b": ("b: z @ 1.0",)}
-    assert agreed_forms(["a: x @ 1.0", "a: y @ 1.0"]) == {"a": ()}
