@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.index.evidence import every_fitting
+from stereogenbench_data.geometry.pose_evidence import every_fitting
 from stereogenbench_data.schema.conventions import parse_conventions
 from stereogenbench_data.schema.declaration import BUILT_IN, NumberAt, PairsAt, PrimaryPairAt
 from stereogenbench_data.schema.document import child_path, is_number

@@ -3,7 +3,7 @@
 A file of conventions may state any of them. Where none is stated, `readings` yields those that are
 settled: rotators in degrees, quaternions and matrices on Unreal's axes, or on those that the file
 itself names. Its keys and texts (``rotation_representation``) are a hint: what fits them comes
-first, and `index.evidence` keeps what the rig's geometry confirms. All become poses in Unreal's
+first, and `pose_evidence` keeps what the rig's geometry confirms. All become poses in Unreal's
 axes: left-handed, x forward, y right, z up; a right-handed world is mirrored as a whole, cameras
 with it, so that no picture is.
 """

@@ -21,7 +21,7 @@ import numpy as np
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, no_advance, require_workers
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
-from stereogenbench_data.index.evidence import Understood, settled_poses
+from stereogenbench_data.geometry.pose_evidence import Understood, settled_poses
 from stereogenbench_data.index.left_out import reasons_told
 from stereogenbench_data.index.rows import json_of, scene_of_json
 from stereogenbench_data.index.scene_folder import (

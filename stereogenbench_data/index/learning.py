@@ -15,8 +15,8 @@ from typing import Final
 import numpy as np
 
 from stereogenbench_data.errors import StereoGenBenchError
+from stereogenbench_data.geometry.pose_evidence import Understood
 from stereogenbench_data.index.build import find_tree
-from stereogenbench_data.index.evidence import Understood
 from stereogenbench_data.index.scene_folder import (
     Description,
     IncompleteScene,

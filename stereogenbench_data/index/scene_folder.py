@@ -25,14 +25,14 @@ from stereogenbench_data.errors import (
 )
 from stereogenbench_data.geometry.camera import recorded_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
-from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
-from stereogenbench_data.index.clocks import require_one_clock
-from stereogenbench_data.index.evidence import (
+from stereogenbench_data.geometry.pose_evidence import (
     SidesError,
     Understood,
     declared_poses,
     settled_poses,
 )
+from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
+from stereogenbench_data.index.clocks import require_one_clock
 from stereogenbench_data.index.tree import FILES, Files, SceneFolder, folder_of
 from stereogenbench_data.media.container import (
     SeekableFile,

@@ -708,7 +708,7 @@ class SampleDecoder:
         return stored if self._streams.kept_frames > 1 else replace(stored, derived=kept.derived)
 
     def _read_poses(self, scene: Scene) -> CameraPoses:
-        from stereogenbench_data.index.evidence import poses_of  # slow to import
+        from stereogenbench_data.geometry.pose_evidence import poses_of  # slow to import
 
         text = self._source.read(scene, TRAJECTORY_JSON)
         where = self._source.label(scene, TRAJECTORY_JSON)

@@ -2,8 +2,8 @@
 
 `BUILT_IN` is the release's, as the paper prints it; a file of conventions replaces tables of it
 (`schema.conventions`), and what the paper leaves to prose is settled on some scenes
-(`index.evidence`). Whatever reads a file goes by a declaration: what that does not name is never
-read, so it contradicts nothing.
+(`geometry.pose_evidence`). Whatever reads a file goes by a declaration: what that does not name is
+never read, so it contradicts nothing.
 """
 
 import json

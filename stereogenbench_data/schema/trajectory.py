@@ -1,7 +1,7 @@
 """``trajectory.json``: the numbers of six cameras in each frame, read where they stand.
 
 A `PosesAt` says where; `schema.pose_search` finds it where nobody has said it. What the numbers
-mean as poses is for `geometry.pose_forms` to say and for `index.evidence` to confirm.
+mean as poses is for `geometry.pose_forms` to say and for `geometry.pose_evidence` to confirm.
 """
 
 import math

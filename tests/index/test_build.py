@@ -9,8 +9,8 @@ from io import FileIO
 
 import pytest
 
+from stereogenbench_data.geometry import pose_evidence as evidence
 from stereogenbench_data.index import build as walk_module
-from stereogenbench_data.index import evidence
 from stereogenbench_data.index import tree as tree_module
 from stereogenbench_data.index.build import ManyReadsWarning, walk
 from stereogenbench_data.index.tree_cache import CACHE_VARIABLE

@@ -9,7 +9,7 @@ from functools import partial
 import pytest
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.index.evidence import settled_poses
+from stereogenbench_data.geometry.pose_evidence import settled_poses
 from stereogenbench_data.schema.parse import parse_caption, parse_complete, parse_rig
 
 VALUES = (

@@ -31,7 +31,7 @@ from stereogenbench_data.audit.contract.worlds import (
 from stereogenbench_data.audit.scene_access import source_of, spread
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.index.evidence import poses_of, shape_of
+from stereogenbench_data.geometry.pose_evidence import poses_of, shape_of
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import Streams
 from stereogenbench_data.schema.conventions import depth_of

@@ -1,8 +1,8 @@
 """Which of several readings of poses is right: depth of one frame must be found in another.
 
 The rig alone does not tell a camera that looks ahead from one that looks back, or a world from its
-mirror image (`index.evidence`). Depth does: a pixel of one frame, taken by the poses to another
-frame of the same camera, must lie where that frame's depth says. The truth may not be among the
+mirror image (`geometry.pose_evidence`). Depth does: a pixel of one frame, taken by the poses to
+another frame of the same camera, must lie where that frame's depth says. The truth may not be among the
 readings, so the best must explain most pixels, be well ahead of the next, and do both in scenes
 that were not used to choose it, or with a camera that was not, where there is one scene.
 """
@@ -18,7 +18,7 @@ from stereogenbench_data.audit.contract.row_matches import SceneFrames
 from stereogenbench_data.audit.geometry.reprojection import MeasuredDepth, reproject
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.geometry.pose import CameraPoses
-from stereogenbench_data.index.evidence import poses_of, same_poses, settled_poses
+from stereogenbench_data.geometry.pose_evidence import poses_of, same_poses, settled_poses
 from stereogenbench_data.schema.conventions import declaration_of
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT

@@ -39,7 +39,7 @@ from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
-from stereogenbench_data.index.evidence import poses_of
+from stereogenbench_data.geometry.pose_evidence import poses_of
 from stereogenbench_data.media.depth import NO_DEPTH_UNIT, depth_frame_index
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.samples.load import Streams

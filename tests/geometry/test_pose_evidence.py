@@ -9,18 +9,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import SchemaError
+from stereogenbench_data.geometry import pose_evidence as evidence
 from stereogenbench_data.geometry.pose import (
     OPENCV_FROM_UNREAL,
     CameraPoses,
     rotation_from_rotator_deg,
 )
-from stereogenbench_data.geometry.pose_forms import poses_named
-from stereogenbench_data.index import evidence
-from stereogenbench_data.index.evidence import (
+from stereogenbench_data.geometry.pose_evidence import (
     SidesError,
     declared_poses,
     settled_poses,
 )
+from stereogenbench_data.geometry.pose_forms import poses_named
 from stereogenbench_data.schema.declaration import PosesAt
 from stereogenbench_data.schema.records import Rig
 from tests.servers.scene_fixtures import frames_of
