@@ -77,6 +77,20 @@ def test_baselines_bins_and_focal_lengths_of_three_scenes(three):
     assert [family.focal_mm[name] for name in ("min", "median", "max")] == [20, 85, 90]
 
 
+def test_a_map_of_train_in_a_scene_of_unseen_map_is_a_finding(three):
+    scenes = [three.scene(row) for row in range(3)]
+    place = dataclasses.replace(scenes[2].id, key="eval/MapUnseenInTrain/Uniform/Car_Dealer/s_3",
+                                split="eval", subset="unseen_map")  # fmt: skip
+    index = SceneIndex.from_scenes([*scenes[:2], dataclasses.replace(scenes[2], id=place)], "x")
+
+    (finding,) = statistics(index).findings
+
+    assert finding.startswith("Car_Dealer is a map of train, and 1 scene of unseen_map has it")
+    assert finding in statistics_markdown(statistics(index)).replace("\\", "")
+    assert index.seen_maps_called_unseen() == {place.key: "Car_Dealer"}
+    assert statistics(three).findings == ()
+
+
 def test_filters_choose_what_is_counted(three):
     assert statistics(three, focal_mm=(15, 30)).scenes == 1
     with pytest.raises(SelectionError, match="split eval matches none of 3 scenes"):

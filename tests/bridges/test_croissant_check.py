@@ -8,6 +8,7 @@ import pytest
 
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.croissant.check import check_descriptor
+from stereogenbench_data.bridges.croissant.descriptor import SEEN_AFTER_ALL as SEEN
 from stereogenbench_data.bridges.croissant.descriptor import write_descriptor
 from stereogenbench_data.errors import DescriptorError, ExtraError
 from tests.cli.command import invoke
@@ -42,6 +43,10 @@ MUTATIONS = {
     "question without an answer": (
         lambda d: d["creator"][0].update(name="FILL IN: who made it"),
         "creator.name: must be filled in",
+    ),
+    "map that is seen and unseen": (
+        lambda d: d["recordSet"].append({"data": [{"maps/name": "Town", "maps/meaning": SEEN}]}),
+        "maps: 'Town' is in train, though scenes of unseen_map have it",
     ),
     "no record sets": (
         lambda d: d.update(recordSet=[]),

@@ -80,6 +80,32 @@ def test_incomplete_scenes_are_listed_and_broken_ones_end_with_1(make_scene, roo
     assert sorted(path.name for path in root.iterdir()) == ["index.parquet", "train"]
 
 
+def test_odd_scenes_are_listed_with_their_reasons_as_json_too(make_scene, root, run):
+    for number in range(3):
+        folder = make_scene(f"train/Uniform/Car_Dealer/scene_{number:06d}")
+    (folder / "cam_03_rgb.mp4").write_bytes(b"no video" * 200)
+
+    told, document = run(root).stderr, json.loads(run(root, "--json").stdout)
+
+    assert "1 odd, left out where that is needed:" in told
+    assert "scene_000002/cam_03_rgb.mp4" in told
+    assert list(document["odd"]) == ["train/Uniform/Car_Dealer/scene_000002"]
+    assert "cam_03_rgb.mp4" in document["odd"]["train/Uniform/Car_Dealer/scene_000002"]
+
+
+def test_what_is_missing_everywhere_is_told_once_with_the_cure(make_scene, root, run, rewrite):
+    for number in range(3):
+        folder = make_scene(f"train/Uniform/Car_Dealer/scene_{number:06d}")
+        rewrite(folder / "baseline.json", lambda d: d.update(lens=d.pop("camera_intrinsics")))
+
+    told = run(root).stderr
+
+    assert told.count("$.camera_intrinsics.focal_length_mm is missing") == 1
+    assert "likewise train/Uniform/Car_Dealer/scene_000002" in told
+    assert "stereogenbench conventions" in told
+    assert "\\n" not in told
+
+
 def test_a_tree_of_which_nothing_is_whole_makes_no_index(make_scene, root, run):
     for video in make_scene().glob("cam_*"):
         video.unlink()

@@ -2,8 +2,8 @@
 
 The rig alone does not tell a camera that looks ahead from one that looks back, or a world from its
 mirror image (`geometry.pose_evidence`). Depth does: a pixel of one frame, taken by the poses to
-another frame of the same camera, must lie where that frame's depth says. The truth may not be among the
-readings, so the best must explain most pixels, be well ahead of the next, and do both in scenes
+another frame of the same camera, must lie where that frame's depth says. The truth may not be among
+the readings, so the best must explain most pixels, be well ahead of the next, and do both in scenes
 that were not used to choose it, or with a camera that was not, where there is one scene.
 """
 
