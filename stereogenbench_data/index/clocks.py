@@ -30,6 +30,7 @@ class _Clock:
         name: The video.
         begins_s: When its first frame is shown.
         shown_s: When each frame is shown, after the first one.
+        half_steps_s: Half the steps around each frame, on average of those before and behind it.
         tick_s: What times are rounded to.
         rate_hz: The rate in its header; 0 where it has none.
     """
@@ -37,27 +38,21 @@ class _Clock:
     name: str
     begins_s: float
     shown_s: Float64[np.ndarray, " frames"]
+    half_steps_s: Float64[np.ndarray, " frames"]
     tick_s: float
     rate_hz: float
-
-    def half_steps_s(self) -> Float64[np.ndarray, " frames"]:
-        """Return half the steps around each frame, on average of the one before and behind it."""
-        steps_s = np.diff(self.shown_s)
-        around_s = np.concatenate([steps_s[:1], (steps_s[:-1] + steps_s[1:]) / 2, steps_s[-1:]])
-        halves_s: Float64[np.ndarray, " frames"] = around_s / 2
-        return halves_s
 
     def first_off(self, other: "_Clock") -> int | None:
         """Return the first frame that another video shows at another time; None if none is."""
         frames = min(len(self.shown_s), len(other.shown_s))
-        own, its = ((each.shown_s[:frames], each.half_steps_s()[:frames]) for each in (self, other))
+        own, its = ((each.shown_s[:frames], each.half_steps_s[:frames]) for each in (self, other))
         allowed_s = np.maximum(np.minimum(own[1], its[1]), self.tick_s + other.tick_s)
         is_off = np.abs(own[0] - its[0]) > allowed_s
         return int(is_off.argmax()) if is_off.any() else None
 
     def begins_with(self, other: "_Clock") -> bool:
         """Return whether another video begins at the same time."""
-        allowed_s = max(self.half_steps_s()[0], self.tick_s + other.tick_s)
+        allowed_s = max(self.half_steps_s[0], self.tick_s + other.tick_s)
         return bool(abs(other.begins_s - self.begins_s) <= allowed_s)
 
     def step_s(self) -> tuple[float, float] | None:
@@ -133,8 +128,10 @@ def _clocks(videos: Mapping[str, StreamFacts]) -> Iterator[_Clock]:
         if facts.times is not None:
             tick_s = float(facts.times.tick_s)
             times_s = np.array(facts.times.ticks, dtype=np.float64) * tick_s
-            begins_s = float(times_s[0])
-            yield _Clock(name, begins_s, times_s - begins_s, tick_s, facts.frame_rate_hz)
+            begins_s, steps_s = float(times_s[0]), np.diff(times_s)
+            around_s = [steps_s[:1], (steps_s[:-1] + steps_s[1:]) / 2, steps_s[-1:]]
+            halves_s = np.concatenate(around_s) / 2
+            yield _Clock(name, begins_s, times_s - begins_s, halves_s, tick_s, facts.frame_rate_hz)
 
 
 def _of_rates(key: str, usual: _Clock, clocks: Sequence[_Clock]) -> Iterator[Remark]:
