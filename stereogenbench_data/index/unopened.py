@@ -256,8 +256,8 @@ class UnopenedScenes:
         """Name the tree, with how its poses are read, and the scenes that settled that."""
         self.is_remote = tree.remote is not None
         self.baselines = baselines
-        # On a disk files are listed anew when a scene is needed, so they need not be kept.
-        self.tree = tree if self.is_remote else replace(tree, files={})
+        # On a disk files are listed anew when a scene is needed, so nothing of others is kept.
+        self.tree = tree if self.is_remote else replace(tree, keys=(), ids={}, files={})
         found = (each.found for each in opened.values())
         self.outcomes = opened
         self.opened = tuple(scene for scene in found if isinstance(scene, Scene))
