@@ -633,13 +633,12 @@ def _with_subsets(scenes: Iterable[SceneId]) -> dict[str, SceneId]:
     """
     scenes = [*scenes]
     maps = TRAIN_MAPS | {scene.map_name for scene in scenes if scene.split == "train"}
-
-    def subset(scene: SceneId) -> Subset | None:
+    found = {scene.key: scene for scene in scenes}
+    for scene in scenes:
         if scene.split == "eval" and scene.subset is None:
-            return "seen_map" if scene.map_name in maps else "unseen_map"
-        return scene.subset
-
-    return {scene.key: replace(scene, subset=subset(scene)) for scene in scenes}
+            subset: Subset = "seen_map" if scene.map_name in maps else "unseen_map"
+            found[scene.key] = replace(scene, subset=subset)
+    return found
 
 
 def require_some(tree: Tree, outcomes: Collection[Outcome]) -> None:

@@ -348,7 +348,8 @@ class SceneIndex:
         else:
             return self
         index = copy.copy(self)
-        index._digest = self.digest
+        # What was not opened has the digest of its listing or files, and other rows a new one.
+        index._digest = "" if self.unopened is None else self.digest
         index._columns = {}
         column = SCHEMA.get_field_index("caption"), SCHEMA.field("caption")
         index._table = self._table.set_column(*column, pa.array(captions, type=pa.string()))

@@ -280,8 +280,8 @@ class RemoteFolder(SceneFolder):
     def _why_hollow(self, name: str, size: int) -> str:
         if size == 0:
             return "is empty: upload it again"
-        is_video = name in _VIDEOS
-        return f"has {size} bytes, as a Git LFS pointer: upload the file itself" * is_video
+        is_pointer = name in _VIDEOS
+        return f"has {size} bytes, as a Git LFS pointer: upload the file" if is_pointer else ""
 
     def fetch(self, names: Iterable[str]) -> None:
         """Fetch small files, and both ends of videos, at a time.

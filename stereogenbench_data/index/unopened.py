@@ -37,7 +37,7 @@ from stereogenbench_data.index.scene_folder import (
     missing_video,
     sized_as_videos,
 )
-from stereogenbench_data.index.tree import SceneFolder
+from stereogenbench_data.index.tree import Files, SceneFolder
 from stereogenbench_data.schema.declaration import BUILT_IN
 from stereogenbench_data.schema.parse import parse_complete, parse_rig, require_unit
 from stereogenbench_data.schema.records import Remark, Rig, Scene, SceneLabels
@@ -97,7 +97,7 @@ def unopened_report(
             return known
         try:
             files = tree.finished(key)
-            scene = _row(tree, key, alike, baselines=baselines)
+            scene = _row(tree, tree.folder(key), files, alike, baselines=baselines)
         except StereoGenBenchError as error:
             return Outcome(key, error)
         if scene is None:  # its poses may tell where cameras stand that are on no line
@@ -128,7 +128,7 @@ def _majority(
         firsts = [next(key for key in texts if texts[key] == kind) for kind, _ in votes]
         listed = "".join(
             f"\n  {counted(number, 'scene')}, such as {key}"
-            + (f": {'; '.join(_unlike(usual, formats[key]))}" if number and key in odd else "")
+            + (f": {'; '.join(_unlike(usual, formats[key]))}" if key in odd else "")
             for key, (_, number) in list(zip(firsts, votes, strict=True))[:_LISTED_KINDS]
         )
         raise StorageError(
@@ -170,19 +170,25 @@ def _format_of(
     } | ({} if baselines == "read" else {"primary pair": scene.rig.primary_pair})
 
 
-def _row(tree: Tree, key: str, alike: Sequence[Scene], *, baselines: Baselines) -> Scene | None:
+def _row(
+    tree: Tree,
+    folder: SceneFolder,
+    files: Files,
+    alike: Sequence[Scene],
+    *,
+    baselines: Baselines,
+) -> Scene | None:
     """Return the row of a scene that was not opened; None where its cameras are on no line.
 
     Raises:
         StorageError: If its listing or its ``baseline.json`` shows that it cannot be used.
     """
-    like, folder, files = alike[0], tree.folder(key), tree.files[key]
-    hollow = folder.hollow(files)
+    key, like, hollow = folder.key, alike[0], folder.hollow(files)
     if BASELINE_JSON in hollow:
         raise StorageError(hollow[BASELINE_JSON])
     rig, labels, remarks = like.rig, SceneLabels(), list[Remark]()
     if baselines == "read":
-        rig, labels, remarks = _of_baseline(tree, folder, like)
+        rig, labels, remarks = _of_baseline(tree, folder, files, like)
     places_m = assumed_places_m(rig)
     if not places_m:
         return None
@@ -220,7 +226,7 @@ def _row(tree: Tree, key: str, alike: Sequence[Scene], *, baselines: Baselines) 
 
 
 def _of_baseline(
-    tree: Tree, folder: SceneFolder, like: Scene
+    tree: Tree, folder: SceneFolder, files: Files, like: Scene
 ) -> tuple[Rig, SceneLabels, list[Remark]]:
     """Return what a ``baseline.json`` says, for pictures of the size that others have."""
     key, size_px = folder.key, (like.rig.image_width_px, like.rig.image_height_px)
@@ -230,7 +236,7 @@ def _of_baseline(
     )
     remarks = [*odd, *require_unit(rig, family=tree.ids[key].family, where=where)]
     rig = sized_as_videos(key, rig, size_px, remarks=remarks, shape=tree.stated)
-    if COMPLETE_JSON in tree.files[key] and None in (labels.character, labels.animation):
+    if COMPLETE_JSON in files and None in (labels.character, labels.animation):
         marked = f"{key}/{COMPLETE_JSON}"
         labels = merged_labels(labels, parse_complete(folder.read(COMPLETE_JSON), where=marked)[0])
     return rig, labels, remarks
