@@ -6,7 +6,6 @@ What pictures say of depth is added by `audit.conventions`.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -25,15 +24,13 @@ from stereogenbench_data.index.scene_folder import (
 )
 from stereogenbench_data.index.tree import folder_of
 from stereogenbench_data.media.container import StreamFacts
-from stereogenbench_data.schema.conventions import Conventions, keys_unread
+from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.declaration import (
-    BUILT_IN,
     UNKNOWN,
     Declaration,
     DepthAs,
     PosesAt,
 )
-from stereogenbench_data.schema.document import parse_object
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import (
     DepthEncoding,
@@ -68,7 +65,6 @@ class Examined:
         keys: The keys of its files, as `Declaration.has` names them.
         shape: What conventions would state about it.
         notes: For each table of the conventions, what was found and how it is known.
-        unknown: Keys of ``baseline.json`` that nothing reads.
         depth: What the first depth video is; None where none can be opened.
         scene: Its row; None where it cannot be used.
         problem: Why not; "" where it can.
@@ -79,7 +75,6 @@ class Examined:
     keys: frozenset[str]
     shape: Declaration
     notes: Notes
-    unknown: list[str]
     depth: StreamFacts | None
     scene: Scene | None
     problem: str = ""
@@ -145,11 +140,7 @@ def examine(root: str | Path, key: str, *, conventions: Conventions | None = Non
         raise
     except StereoGenBenchError as error:
         problem = str(error)
-    shape, notes, unknown = Declaration(), Notes(), list[str]()
-    with suppress(StereoGenBenchError, KeyError):  # `Description` has told the problem
-        document = parse_object(folder.read(BASELINE_JSON), where=key)
-        declared = described.shape if described is not None else None
-        unknown = keys_unread(document, declared or BUILT_IN)
+    shape, notes = Declaration(), Notes()
     if scene is not None and described is not None:
         _note_camera(scene, notes)
         named, notes["poses"] = _learned_poses(scene, described.understood)
@@ -158,7 +149,7 @@ def examine(root: str | Path, key: str, *, conventions: Conventions | None = Non
     notes["depth"] = [] if depth is None else _depth_notes(depth, scene)
     names = [name for name in (BASELINE_JSON, TRAJECTORY_JSON) if name in files]
     return Examined(
-        key, keys_in(folder, names), shape, notes, unknown, depth, scene, problem,
+        key, keys_in(folder, names), shape, notes, depth, scene, problem,
         lacks_mark=COMPLETE_JSON not in files,
     )  # fmt: skip
 
@@ -318,10 +309,6 @@ def tables_of_notes(learned: Learned) -> Iterator[tuple[tuple[int, str], list[st
         maps = sorted({parse_scene_key(each.key).map_name for each in group})
         scenes = f"{counted(len(group), 'scene')} of {counted(len(maps), 'map')}"
         head = f"{scenes}, decided by {group[0].key}"
-        unread = sorted({key for each in group for key in each.unknown})
-        lines = [head]
-        if unread:
-            lines.append(f"seen in {BASELINE_JSON} and not read: {', '.join(unread[:40])}")
-        yield (number, ""), lines
+        yield (number, ""), [head]
         for table, notes in group[0].notes.items():
             yield (number, table), notes

@@ -34,7 +34,6 @@ from typing import Any, Final, get_args
 from stereogenbench_data.errors import SchemaError, explain_os_errors
 from stereogenbench_data.schema.declaration import (
     BUILT_IN,
-    LABELS,
     Declaration,
     DepthAs,
     NumberAt,
@@ -505,34 +504,3 @@ def keys_of(node: Any, *, place: str = "$") -> set[str]:
             found |= {inner} if not isinstance(value, dict) else set()
             found |= keys_of(value, place=inner)
     return found
-
-
-def keys_unread(document: dict[str, Any], declared: Declaration) -> list[str]:
-    """Return the keys of a ``baseline.json``, as `keys_of` names them, that a declaration ignores.
-
-    >>> keys_unread({"zoom": 3, "pairwise_pairs": [{"index": 7, "baseline_cm": 6.5}]}, BUILT_IN)
-    ['$.pairwise_pairs[].index', '$.zoom']
-    """
-    texts = [place for at in declared.numbers.values() for place in at.places]
-    texts += [place for places in LABELS.values() for place in places]
-    texts += [*declared.primary_pair.left, *declared.primary_pair.right]
-    for at in filter(None, (declared.pairs, declared.gaps)):
-        texts += [f"{at.rows}.{part}" for part in (at.a, at.b, at.length) if part]
-        texts += [] if at.a else [at.rows]
-    read = {_as_key(text) for text in texts}
-    above = {text for text in read if not text.endswith("]")}
-    return sorted(
-        key for key in keys_of(document)
-        if key not in read
-        and not any(key.startswith((f"{each}.", f"{each}[")) for each in above)
-        and not any(each.startswith(f"{key}[]") for each in read)
-    )  # fmt: skip
-
-
-def _as_key(text: str) -> str:
-    """Return a place as `keys_of` names it."""
-    steps = (
-        f".{re.sub('[0-9]+', '#', words(step))}" if isinstance(step, str) else "[]"
-        for step in place_at(text).steps
-    )
-    return "$" + "".join(steps)

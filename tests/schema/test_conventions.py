@@ -10,7 +10,6 @@ from stereogenbench_data.schema.conventions import (
     MAX_BYTES,
     Conventions,
     declaration_of_text,
-    keys_unread,
     parse_conventions,
     write_toml,
 )
@@ -203,12 +202,6 @@ def test_what_is_not_understood_is_refused_by_name(text, told):
 def test_a_file_that_is_not_there_is_named(tmp_path):
     with pytest.raises(StorageError, match=r"none\.toml"):
         Conventions.read(tmp_path / "none.toml")
-
-
-def test_keys_that_nobody_reads_are_seen(rig_document):
-    document = rig_document | {"exposure": {"shutter_7": 0.5}}
-
-    assert keys_unread(document, BUILT_IN) == ["$.camera_count", "$.exposure.shutter_#", "$.unit"]
 
 
 def moved(document):
