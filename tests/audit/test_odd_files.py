@@ -14,6 +14,7 @@ from stereogenbench_data.datasets.mapped import StereoPairs
 from stereogenbench_data.errors import StereoGenBenchError
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.index.table import SceneIndex
+from tests.cli.command import invoke
 from tests.servers.scene_fixtures import PLACES_CM
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "release.md"
@@ -124,3 +125,22 @@ def test_an_odd_file_is_told_and_proposed_and_trained_on(
 
 def test_the_page_has_six_odd_files():
     assert [number for number, _ in examples()] == [1, 2, 3, 4, 5, 6]
+
+
+def test_the_last_line_says_what_is_settled_and_the_next_command(
+    make_scene, root, rewrite, tmp_path
+):
+    rewrite(make_scene() / "baseline.json", lambda document: lens(document, None))
+    file, options = tmp_path / "conventions.toml", ("--pictures", "0", "--workers", "1")
+
+    odd = invoke("conventions", root, "-o", file, *options)
+    file.write_text(dict(examples())[1]["toml"])
+    cured = invoke("conventions", root, "--check", file, *options)
+
+    assert (odd.exit_code, cured.exit_code) == (1, 0)
+    last, last_cured = (each.stderr.splitlines()[-1] for each in (odd, cured))
+    assert last.startswith("settled: nothing; not settled: baseline.json, poses, depth. Next: ")
+    assert f"--check {file}" in last
+    assert last_cured == (
+        f"{file}: fits. Next: stereogenbench show {root} --conventions {file} -o first.png"
+    )
