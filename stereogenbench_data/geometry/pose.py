@@ -134,6 +134,12 @@ class CameraPoses:
         centre = OPENCV_FROM_UNREAL @ self.centres[frame, camera]
         return _rigid(self.world_from_cam_rotations[frame, camera], centre * self.unit_m)
 
+    def later_from_cam(self, frame: int, later: int, *, camera: int) -> Float64[np.ndarray, "4 4"]:
+        """Return the transform from a camera's axes in a frame to its axes in another, in metres."""
+        return np.linalg.inv(self.world_from_cam(later, camera)) @ self.world_from_cam(
+            frame, camera
+        )
+
     def baseline_m(self, frame: int, camera_a: int, camera_b: int) -> float:
         """Return the distance between two cameras' centres in one frame, in metres."""
         step = self.centres[frame, camera_b] - self.centres[frame, camera_a]

@@ -358,5 +358,5 @@ def _rig_at(poses: CameraPoses, frame: int) -> np.ndarray:
 
 def _moved(poses: CameraPoses, frame: int) -> np.ndarray:
     """Return where camera 0 stands as seen from its first place, and how it is turned there."""
-    moved = np.linalg.inv(poses.world_from_cam(0, 0)) @ poses.world_from_cam(frame, 0)
+    moved = poses.later_from_cam(frame, 0, camera=0)
     return np.hstack([moved[:3], poses.world_from_cam_rotations[0, 0]])

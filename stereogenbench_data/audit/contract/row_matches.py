@@ -294,6 +294,16 @@ class SceneFrames:
                 matches += self._both_ways(frame, left, right, row_matches)
         return matches
 
+    def frame_moves(self, parts: Sequence[int]) -> list[tuple[int, int]]:
+        """Return frames and later ones whose depth is there, from the beginning and up to the end.
+
+        They are such parts of the scene apart: a quarter for 4.
+        """
+        frames, lag = self.scene.frames, self.encoding.frame_lag
+        first, last = max(0, -lag), min(frames, frames - lag) - 1
+        steps = sorted({max(1, (last - first) // part) for part in parts} if last > first else ())
+        return [(start, start + step) for step in steps for start in {first, last - step}]
+
     def matched_later(self, frame: int, file: int, other: int, *, lag: int) -> FrameMatch | None:
         """Return the pixels of a file's frame that another file shows ``lag`` frames later.
 

@@ -8,10 +8,11 @@ frame lands where the depth of another frame says only without it.
 
 import math
 from dataclasses import replace
+from itertools import chain
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float, Float32, Float64
 
 from stereogenbench_data.audit.contract.row_matches import SceneFrames
 from stereogenbench_data.audit.geometry.reprojection import moved_points
@@ -65,30 +66,20 @@ def _best(errors: Float64[np.ndarray, " factors"]) -> float:
 
 def _errors(views: SceneFrames, poses: CameraPoses, camera: int) -> Float64[np.ndarray, " factors"]:
     """Return for each factor the median by which depth of one frame is off in another."""
-    lag = views.encoding.frame_lag
-    frames = [frame for frame in range(min(views.scene.frames, poses.frame_count))
-              if 0 <= frame + lag < views.scene.frames]  # fmt: skip
-    last = len(frames) - 1
-    moves = sorted({(first, first + step) for step in (last // part for part in _PARTS) if step
-                    for first in (0, last - step)})  # fmt: skip
-    lengths = {
-        at: _lengths_m(views, frames[at] + lag, camera)
-        for at in sorted({at for move in moves for at in move})
-    }
-    motions = [
-        np.linalg.inv(poses.world_from_cam(frames[later], camera))
-        @ poses.world_from_cam(frames[first], camera)
-        for first, later in moves
-    ]
+    moves = views.frame_moves(_PARTS)
+    lengths = {frame: _lengths_m(views, frame, camera) for frame in sorted({*chain(*moves)})}
+    motions = [poses.later_from_cam(*move, camera=camera) for move in moves]
     errors = []
     for factor in _FACTORS:
         fx_px, fy_px = (factor * each for each in (views.intrinsics.fx_px, views.intrinsics.fy_px))
         stretched = replace(views.intrinsics, fx_px=fx_px, fy_px=fy_px)
+        is_ray = views.encoding.kind == "ray"
+        ray = np.sqrt(1 + (views.ray_per_planar**2 - 1) / factor**2) if is_ray else 1.0
+        depths_m = {frame: factor * length_m / ray for frame, length_m in lengths.items()}
         off = [
-            _off(factor * lengths[first], factor * lengths[later], stretched, motion,
-                 is_ray=views.encoding.kind == "ray")
+            _off(depths_m[first], depths_m[later], stretched, motion)
             for (first, later), motion in zip(moves, motions, strict=True)
-        ]  # fmt: skip
+        ]
         both = np.concatenate([np.empty(0), *off])
         errors.append(float(np.median(both)) if len(both) >= _FEWEST else math.inf)
     return np.array(errors)
@@ -96,7 +87,7 @@ def _errors(views: SceneFrames, poses: CameraPoses, camera: int) -> Float64[np.n
 
 def _lengths_m(views: SceneFrames, frame: int, camera: int) -> Float32[np.ndarray, "h w"]:
     """Return a frame's depth, of rays their lengths; 0 where it was not measured."""
-    units, measured = views.depth(frame, camera)
+    units, measured = views.depth(frame + views.encoding.frame_lag, camera)
     as_stated = views.scene.depth_encoding(camera, views.encoding)
     encoding = replace(as_stated, kind="planar", unit_m=views.unit_m(camera))
     lengths_m = depth_m_from_units(
@@ -106,33 +97,20 @@ def _lengths_m(views: SceneFrames, frame: int, camera: int) -> Float32[np.ndarra
 
 
 def _off(
-    here_m: Float32[np.ndarray, "h w"],
-    there_m: Float32[np.ndarray, "h w"],
+    here_m: Float[np.ndarray, "h w"],
+    there_m: Float[np.ndarray, "h w"],
     camera: Intrinsics,
     motion: Float64[np.ndarray, "4 4"],
-    *,
-    is_ray: bool,
 ) -> Float64[np.ndarray, " n"]:
     """Return by how much the logarithm of depth is off where points of a frame land in another."""
     height, width = here_m.shape
     step = max(1, math.ceil(min(height, width) / _ACROSS))
     rows, columns = (each.ravel() for each in np.mgrid[step // 2 : height : step,
                                                        step // 2 : width : step])  # fmt: skip
-    known = here_m[rows, columns] > 0
-    rows, columns = rows[known], columns[known]
-    depth_m = here_m[rows, columns] / _ray(rows, columns, camera, is_ray=is_ray)
+    depth_m = here_m[rows, columns]
     u_px, v_px, expected_m = moved_points(columns + 0.5, rows + 0.5, depth_m, camera, motion)
     inside = (expected_m > 0) & (u_px >= 0) & (u_px < width) & (v_px >= 0) & (v_px < height)
-    rows, columns = v_px[inside].astype(np.intp), u_px[inside].astype(np.intp)
-    found_m = there_m[rows, columns] / _ray(rows, columns, camera, is_ray=is_ray)
+    inside &= depth_m > 0
+    found_m = there_m[v_px[inside].astype(np.intp), u_px[inside].astype(np.intp)]
     both = found_m > 0
     return np.asarray(np.abs(np.log(expected_m[inside][both] / found_m[both])))
-
-
-def _ray(
-    rows: np.ndarray, columns: np.ndarray, camera: Intrinsics, *, is_ray: bool
-) -> Float64[np.ndarray, " n"]:
-    """Return the length of a pixel's ray to depth 1; 1 where depth is along the axis."""
-    x = (columns + 0.5 - camera.cx_px) / camera.fx_px
-    y = (rows + 0.5 - camera.cy_px) / camera.fy_px
-    return np.sqrt(1 + x**2 + y**2) if is_ray else np.ones(len(rows))

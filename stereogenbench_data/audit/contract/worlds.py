@@ -10,6 +10,7 @@ that were not used to choose it, or with a camera that was not, where there is o
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Final
 
 import numpy as np
@@ -30,7 +31,7 @@ LEAST_MARGIN: Final = 0.2
 """How far the best reading must be ahead of the next."""
 
 _LEAST_PIXELS: Final = 200
-_STEPS: Final = (8, 4, 2)
+_PARTS: Final = (8, 4, 2)
 _CAMERAS: Final = (0, CAMERA_COUNT - 1)
 
 Shares = Mapping[str, tuple[float, float]]
@@ -107,12 +108,10 @@ def explained_shares(views: SceneFrames, text: bytes, names: Sequence[str]) -> S
         MediaError: If depth cannot be decoded.
     """
     where = views.scene.id.key
-    last = views.scene.frames - 1
-    steps = sorted({max(1, last // step) for step in _STEPS} if last else ())
-    moves = [(first, first + step) for step in steps for first in {0, last - step}]
+    moves = views.frame_moves(_PARTS)
     depths = {
         (frame, camera): _depth(views, frame, camera)
-        for frame in sorted({frame for move in moves for frame in move})
+        for frame in sorted({*chain(*moves)})
         for camera in _CAMERAS
     }
     found = {}
@@ -122,10 +121,7 @@ def explained_shares(views: SceneFrames, text: bytes, names: Sequence[str]) -> S
         for camera in _CAMERAS:
             counts = np.zeros(2, dtype=np.int64)
             for first, later in moves:
-                # From a camera's axes in one frame to its axes in another.
-                motion = np.linalg.inv(poses.world_from_cam(later, camera)) @ (
-                    poses.world_from_cam(first, camera)
-                )
+                motion = poses.later_from_cam(first, later, camera=camera)
                 both, pinhole = (depths[first, camera], depths[later, camera]), views.intrinsics
                 errors = reproject(*both, intrinsics=pinhole, right_from_left=motion)
                 counts += (errors.agreeing, errors.unhidden)
@@ -170,6 +166,6 @@ def _mean(scenes: Sequence[Shares], name: str) -> float:
 
 
 def _depth(views: SceneFrames, frame: int, camera: int) -> MeasuredDepth:
-    units, measured = views.depth(frame, camera)
+    units, measured = views.depth(frame + views.encoding.frame_lag, camera)
     encoding = replace(views.encoding, unit_m=views.unit_m(camera))
     return MeasuredDepth.of(units, measured, encoding=encoding, intrinsics=views.intrinsics)

@@ -213,8 +213,7 @@ class AlignmentCheck:
         for camera in self._last[1].keys() & depths.keys():
             sides = (before, self._last[1][camera]), (frame, depths[camera])
             for (here, shown), (there, other) in (sides, sides[::-1]):
-                world_from_there = poses.world_from_cam(there, camera)
-                motion = np.linalg.inv(world_from_there) @ poses.world_from_cam(here, camera)
+                motion = poses.later_from_cam(here, there, camera=camera)
                 landed = _landed(shown, other, intrinsics=self.intrinsics, motion=motion)
                 if landed is not None:
                     self._motion.add(landed)
