@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-import av
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
@@ -27,6 +26,7 @@ from stereogenbench_data.engine import Progress, advance_of
 from stereogenbench_data.errors import MediaError, SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.jobs import named_errors
 from stereogenbench_data.media.depth import DEPTH_CURES, NO_DEPTH_UNIT
 from stereogenbench_data.media.encoder import Encoding, VideoEncoder
 from stereogenbench_data.samples.fields import Request, Sample
@@ -242,7 +242,6 @@ def _difference(sample: Sample) -> tuple[Picture, float]:
 
 
 CLIP_FIELDS: Final = ("left", "right", "disparity", "valid", "baseline_m")
-CLIP_SUFFIXES: Final = (".mp4", ".gif")
 
 _SCALED_ON: Final = 5
 """How many frames determine the range of colours, which is the same throughout."""
@@ -307,13 +306,9 @@ def write_clip(
         progress: Called with (pages written, all) after each page.
 
     Raises:
-        SelectionError: If the path ends in neither.
-        OSError: If the file cannot be written.
+        StorageError: If the file cannot be written.
     """
-    writers = {".mp4": _write_mp4, ".gif": _write_gif}
-    write = writers.get(path.suffix.lower())
-    if write is None:
-        raise SelectionError(f"{path}: a clip is {' or '.join(CLIP_SUFFIXES)}, by its ending.")
+    write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
     advance = advance_of(progress, total=frames)
 
     def reported() -> Iterator[Picture]:
@@ -321,14 +316,8 @@ def write_clip(
             yield page
             advance(1)
 
-    try:
-        with open_output(path) as file:
-            write(file, reported(), rate_hz)
-    except av.FFmpegError as error:
-        # PyAV only says that writing to the file object failed; the reason is the error's context.
-        if isinstance(error.__context__, OSError):
-            raise error.__context__ from None
-        raise
+    with named_errors(path), open_output(path) as file:
+        write(file, reported(), rate_hz)
 
 
 def _write_mp4(file: Any, pages: Iterator[Picture], rate_hz: float) -> None:

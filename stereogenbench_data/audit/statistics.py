@@ -2,13 +2,12 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Final, TypeVar, Unpack
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from stereogenbench_data.audit.geometry.records import plain
 from stereogenbench_data.audit.paper_numbers import FOCAL_MM, paper_table
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import (
@@ -89,11 +88,6 @@ class Statistics:
     branches: tuple[FamilyStatistics, ...]
     derived: str = ""
     findings: tuple[str, ...] = ()
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the statistics as values for `json.dumps`."""
-        document: dict[str, Any] = plain(asdict(self))
-        return document
 
 
 @list_options()

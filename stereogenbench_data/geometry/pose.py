@@ -135,7 +135,7 @@ class CameraPoses:
         return _rigid(self.world_from_cam_rotations[frame, camera], centre * self.unit_m)
 
     def later_from_cam(self, frame: int, later: int, *, camera: int) -> Float64[np.ndarray, "4 4"]:
-        """Return the transform from a camera's axes in a frame to its axes in another, in metres."""
+        """Return the transform from a camera's axes in one frame to those in another, in metres."""
         return np.linalg.inv(self.world_from_cam(later, camera)) @ self.world_from_cam(
             frame, camera
         )

@@ -52,5 +52,5 @@ def test_statistics_say_so(derived_shards, small_shards):
     found = statistics(SceneIndex.open(derived_shards))
 
     assert "derived at 48x32" in statistics_markdown(found)
-    assert "derived at 48x32" in found.to_json()["derived"]
+    assert "derived at 48x32" in found.derived
     assert "derived" not in statistics_markdown(statistics(SceneIndex.open(small_shards)))

@@ -89,7 +89,6 @@ class Catalogue:
         """Take an index, and the argument of `StereoPairs` for its data."""
         self.index = index
         self._data = shown_data
-        self._row_of = {str(key): row for row, key in enumerate(index.column("key"))}
 
     def row(self, key: str) -> int:
         """Return the row of a key, or of a part of one that only one scene has.
@@ -97,7 +96,7 @@ class Catalogue:
         Raises:
             SelectionError: If there is no such scene, naming those that are close.
         """
-        return self._row_of[key] if key in self._row_of else find_scene(self.index, key)
+        return find_scene(self.index, key)
 
     def about(self) -> dict[str, Any]:
         """Return what the page shows of the data as a whole."""

@@ -28,9 +28,9 @@ from stereogenbench_data.audit.contract.scoring import (
     ScoredContract,
     fit_scale,
     gain_of,
+    most_explained,
     ray_power,
     score_hypothesis,
-    voted,
 )
 from stereogenbench_data.schema.release import CAMERA_COUNT, DEFAULT_DEPTH_UNIT_M
 
@@ -183,7 +183,7 @@ class ContractSearch:
         """Return the orders that explain most matches, at any scale."""
         orders = current.alternatives("order")
         few = [match for match in self._matches if match.frame == self._matches[0].frame]
-        shares = {order: voted(self._views, few, order)[1] for order in orders}
+        shares = {order: most_explained(self._views, few, order) for order in orders}
         return tuple(sorted(orders, key=lambda order: -shares[order])[:_PROMISING])
 
     def _most_better(

@@ -6,7 +6,6 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from stereogenbench_data.audit.contract.doctor import DoctorReport
-from stereogenbench_data.audit.contract.scoring import Gain
 from stereogenbench_data.audit.contract.verdict import QUOTIENT, Answer, Verdict, encoding_line
 from stereogenbench_data.audit.geometry.records import plain
 from stereogenbench_data.schema.text import counted
@@ -21,10 +20,6 @@ NOT_TESTED: Final = (
     "Not tested here, see `stereogenbench audit`: the sensor's height, the baselines recorded "
     "beside the poses, noise in depth, depth of one camera that is off by a pixel or lies where "
     "there is no texture, and all other frames."
-)
-_DB_NOTE: Final = (
-    "dB of the depth scale and of the ray count small differences under a tight cap: they are not "
-    "comparable with dB of flips, lags and orders."
 )
 _READINGS: Final = (
     "Several readings of the poses fit the rigs; pixels whose depth is found in other frames:"
@@ -59,16 +54,13 @@ def screen(report: DoctorReport) -> tuple[str, list[Part]]:
     unjudged = report.left_out | {each.key: each.problem for each in report.scenes if each.problem}
     if unjudged:
         parts.append(("", [("not judged", "why"), *unjudged.items()]))
-    for verdict in report.verdicts:
-        behind = [(answer.topic, _behind(answer)) for answer in verdict.answers if answer.behind]
-        parts += [("", [("question", "next best"), *behind])] if behind else []
     views = sum(scene.views for scene in report.scenes)
     matches = sum(scene.matches for scene in report.scenes)
     looked = (
         f"{report.data}: {counted(len(report.scenes), 'scene')}, {counted(views, 'view')}, "
         f"{matches:,} pixels found in both pictures"
     )
-    parts.append(("", [("notes",), [looked], [QUOTIENT_MEANS], [_DB_NOTE], [NOT_TESTED]]))
+    parts.append(("", [("notes",), [looked], [QUOTIENT_MEANS], [NOT_TESTED]]))
     return _headline(report), parts
 
 
@@ -118,7 +110,9 @@ def _conclusion(verdict: Verdict) -> Iterator[str]:
     """Yield what follows from a verdict's answers."""
     yield from (f"WRONG: {problem}." for problem in verdict.problems)
     if any(answer.status == "wrong" for answer in verdict.answers):
-        yield f"Another contract is {_gain_words(verdict.gain)} better than the declared one."
+        gain = verdict.gain
+        better = f"{gain.mean_db:.2f} dB (95 %: {gain.low_db:.2f} to {gain.high_db:.2f}) better"
+        yield f"Another contract is {better} than the declared one."
     if verdict.choices:
         yield "One of these explains the depth scale; the pictures cannot tell which:"
         yield from (f"  - {choice}" for choice in verdict.choices)
@@ -162,19 +156,6 @@ _HEAD: Final = ("question", "declared", "pictures say", "", "why")
 def _row(answer: Answer) -> tuple[str, str, str, str, str]:
     status = answer.status.upper() if answer.status == "wrong" else answer.status
     return answer.topic, answer.declared, answer.found or "?", status, answer.note
-
-
-def _behind(answer: Answer) -> str:
-    """Return by how much the next best answer is worse, or the declared one that is wrong."""
-    if answer.behind is None or not math.isfinite(answer.behind.mean_db):
-        return "not compared"
-    declared = "declared is " if answer.status == "wrong" else ""
-    by_shape = ", told by the shape of disparity" if answer.behind.by_shape else ""
-    return f"{declared}{_gain_words(answer.behind)} worse{by_shape}"
-
-
-def _gain_words(gain: Gain) -> str:
-    return f"{gain.mean_db:.2f} dB (95 %: {gain.low_db:.2f} to {gain.high_db:.2f})"
 
 
 def doctor_json(report: DoctorReport) -> dict[str, Any]:

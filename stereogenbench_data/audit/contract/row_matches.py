@@ -16,7 +16,7 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt16
+from jaxtyping import Bool, Float32, Float64, Int64, UInt16
 from numpy.lib.stride_tricks import sliding_window_view
 
 from stereogenbench_data.audit.contract.hypotheses import LAGS, Flip, Hypothesis
@@ -233,14 +233,11 @@ class SceneFrames:
         """Return the declared unit of a depth file; the release's default if there is none."""
         return self.scene.depth_encoding(file, self.encoding).unit_m or DEFAULT_DEPTH_UNIT_M
 
-    def rgb(self, frame: int, file: int) -> UInt8[np.ndarray, "3 h w"]:
-        """Return a picture."""
-        return self._streams.rgb(self.scene, rgb_name(file), frame, size=None)
-
     def band(self, frame: int, file: int) -> Luma:
         """Return a picture's grey levels, band-passed."""
         if (frame, file) not in self._bands:
-            self._bands[frame, file] = band_passed(luma_of(self.rgb(frame, file)))
+            picture = self._streams.rgb(self.scene, rgb_name(file), frame, size=None)
+            self._bands[frame, file] = band_passed(luma_of(picture))
         return self._bands[frame, file]
 
     def depth(

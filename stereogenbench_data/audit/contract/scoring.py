@@ -342,16 +342,15 @@ def _fit_terms(
     return terms
 
 
-def voted(
+def most_explained(
     views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis
-) -> tuple[float, float]:
-    """Return the scale of a hypothesis that most matches agree on, and how many it explains."""
+) -> float:
+    """Return how many matches a hypothesis explains, at the scale on which most of them agree."""
     terms = _fit_terms(views, matches, hypothesis)
     if not terms:
-        return 1.0, 0.0
+        return 0.0
     found, predicted = _joined(terms)
-    scale = _voted_scale(found, predicted)
-    return scale, _agreement(found, scale * predicted)
+    return _agreement(found, _voted_scale(found, predicted) * predicted)
 
 
 def _joined(terms: Iterable[_Term]) -> tuple[Points, Points]:

@@ -215,8 +215,6 @@ CHECKS: Final = {
     "intrinsics_px": Check(
         "intrinsics", "largest deviation of fx, fy, cx, cy from f / s W", 1e-3, unit="px",
         paper=AUDIT["intrinsics"]),
-    "adjacent_cm": Check(
-        "pose/baseline", "pose-derived less recorded, adjacent cameras", 1e-3, unit="cm"),
     "baseline_cm": Check(
         "pose/baseline", "pose-derived less recorded, all 15 pairs", 1e-3, unit="cm",
         paper=AUDIT["baseline"]),
@@ -271,7 +269,6 @@ CHECKS: Final = {
 _DOCTOR: Final = "`stereogenbench doctor` looks for the cause"
 _UNFIT: Final = "depth, a camera's place, or the lens"
 _CAUSES: Final = {
-    "adjacent_cm": "baseline.json or trajectory.json is wrong",
     "baseline_cm": "baseline.json or trajectory.json is wrong",
     "rotation_px": "the rig is not rectified, or the poses are wrong",
     "lateral_px": "the rig is not rectified, or the poses are wrong",

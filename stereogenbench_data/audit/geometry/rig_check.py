@@ -18,7 +18,7 @@ from stereogenbench_data.schema.declaration import BUILT_IN, Declaration
 from stereogenbench_data.schema.document import is_number
 from stereogenbench_data.schema.places import first_value
 from stereogenbench_data.schema.records import Rig
-from stereogenbench_data.schema.release import ADJACENT_PAIRS, CAMERA_PAIRS
+from stereogenbench_data.schema.release import CAMERA_PAIRS
 
 _QUANTITIES: Final = {
     "fx_px": "focal_length_px", "cx_px": "principal_x", "cy_px": "principal_y",
@@ -67,7 +67,6 @@ def rig_figures(
     posed_cm = np.linalg.norm(poses.centres[:, right] - poses.centres[:, left], axis=-1)
     away_cm = np.abs(posed_cm * (poses.unit_m * 100) - np.array(rig.baselines_cm))
     away_cm[away_cm <= _rounding_cm(rig.baselines_cm) + 1e-9] = 0.0
-    adjacent_cm = away_cm[:, [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]]
     rotations = poses.world_from_cam_rotations
     in_one_place = replace(poses, centres=np.zeros_like(poses.centres))
     looking_alike = replace(
@@ -75,7 +74,6 @@ def rig_figures(
     )
     return {
         "intrinsics_px": float(max(deviations)),
-        "adjacent_cm": float(adjacent_cm.max()),
         "baseline_cm": float(away_cm.max()),
         "rotation_px": rectification_residual_px(in_one_place, intrinsics),
         "lateral_px": rectification_residual_px(looking_alike, intrinsics),
