@@ -1,14 +1,14 @@
 """Conventions of a tree, with what its pictures say of depth: the doctor measures, nobody else.
 
 `index.learning` finds where quantities stand; here the depth contract of each shape of files is
-tested on some scenes, changed where nothing states it and the pictures are sure, and tested again
-on other scenes. Where several readings of the poses fit the rigs, depth decides between them.
+tested on some scenes, changed where nothing states it and the pictures of all of them are sure, and
+tested again. Where several readings of the poses fit the rigs, depth decides between them.
 """
 
 import functools
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -52,8 +52,8 @@ from stereogenbench_data.sources.location import is_remote, shown
 SCENES: Final = 20
 FRAMES: Final = 3
 """Of how many frames of a scene the pictures are compared."""
-PICTURED: Final = 3
-"""How many scenes of a shape are measured by their pictures, and how many others verify it."""
+PICTURED: Final = 6
+"""How many scenes of a shape are compared with their pictures."""
 _TOPICS: Final = {
     "unit_m": QUOTIENT, "kind": TOPICS["kind"], "form": TOPICS["form"],
     "frame_lag": TOPICS["frame_lag"],
@@ -127,8 +127,7 @@ def survey(  # noqa: PLR0913 - each names one thing that a user chooses
     Args:
         root: The folder that holds ``train`` and ``eval``, or its URL.
         scenes: How many scenes, at least 1, are read, spread over families, maps and keys of files.
-        pictured: How many scenes of each shape are measured by their pictures, and as many others
-            verify what was measured; 0 for none.
+        pictured: How many scenes of each shape are compared with their pictures; 0 for none.
         conventions: What is tested; None to learn.
         wanted: Which scenes, by their paths.
         workers: Number of processes, None for one a core.
@@ -164,13 +163,14 @@ def survey(  # noqa: PLR0913 - each names one thing that a user chooses
     tested.problems.extend(each.problem for each in found if each.problem)
     usable = [each.scene for each in found if each.scene is not None]
     tested.problems.extend(scene.remark("left") for scene in usable if scene.remark("left"))
-    if usable and pictured:
-        report = _tested(tested, _some(usable, 2 * pictured), None, how)
-        for verdict in () if report is None else report.worlds:
+    some = _some(usable, pictured) if pictured else []
+    report = _diagnosed(tested, some, None, how) if some else None
+    if report is not None:
+        _note(tested, report, cures=_changed(_measured(report, DepthEncoding(), some)))
+        for verdict in report.worlds:
             told = f"{_SHARES}: {'; '.join(verdict.lines)}"
             (tested.problems if verdict.is_wrong else tested.poses).append(f"poses: {told}")
-        untested = {} if report is None else dict.fromkeys(_untested(report))
-        tested = replace(tested, untested=tuple(untested))
+        tested = replace(tested, untested=tuple(dict.fromkeys(_untested(report))))
     return replace(tested, problems=_alike_once(tested))
 
 
@@ -205,20 +205,19 @@ def _learning(
     for number, (shape, group) in enumerate(
         zip(learned.conventions.shapes, learned.taught_by, strict=True)
     ):
-        teaching = [each.scene for each in group if each.scene is not None]
         keys_there = {each.keys for each in group}
-        others = [each.scene for each in learned.verified if each.keys in keys_there and each.scene]
-        if not teaching or teaching[0].remark("poses", "left"):
-            scene = teaching[0] if teaching and pictured else None
+        alike = [each.scene for each in (*group, *learned.verified)
+                 if each.keys in keys_there and each.scene]  # fmt: skip
+        if not alike or alike[0].remark("poses", "left"):
+            scene = alike[0] if alike and pictured else None
             _note_candidates(surveyed, number, group[0].key, scene)
         lines, before = surveyed.notes.setdefault((number, "depth"), []), len(surveyed.verdicts)
         report = None
-        if pictured and teaching:
-            teaching, others = _some(teaching, pictured), _some(others, pictured)
-            shape, report = _with_measured_depth(surveyed, shape, teaching, others, how)
-        if shape.poses is None and teaching and teaching[0].remark("world"):
+        if pictured and alike:
+            shape, report = _with_measured_depth(surveyed, shape, _some(alike, pictured), how)
+        if shape.poses is None and alike and alike[0].remark("world"):
             notes = surveyed.notes.setdefault((number, "poses"), [])
-            shape = _with_decided_poses(surveyed, shape, teaching[0], report, notes)
+            shape = _with_decided_poses(surveyed, shape, alike[0], report, notes)
         lines += surveyed.verdicts[before:] or ["not compared with pictures"]
         shapes.append(shape)
     learned = replace(learned, conventions=Conventions(tuple(shapes), "the conventions learned"))
@@ -312,11 +311,7 @@ def _diagnosed(
 
 
 def _with_measured_depth(
-    surveyed: Survey,
-    shape: Declaration,
-    teaching: Sequence[Scene],
-    others: Sequence[Scene],
-    how: dict[str, Any],
+    surveyed: Survey, shape: Declaration, scenes: Sequence[Scene], how: dict[str, Any]
 ) -> tuple[Declaration, DoctorReport | None]:
     """Return a shape with the depth contract that pictures confirm, as far as they do.
 
@@ -325,34 +320,33 @@ def _with_measured_depth(
     Args:
         surveyed: Takes what pictures say, and what is wrong.
         shape: What files state.
-        teaching: Scenes of it whose pictures are measured.
-        others: Other scenes of it, which must have the contract that was measured.
+        scenes: Scenes of it, which must all have the contract that is measured.
         how: Where processes run.
     """
     stated = DepthEncoding(source="conventions") if shape.depth is None else shape.depth.encoding
-    report = _diagnosed(surveyed, teaching, stated, how)
+    report = _diagnosed(surveyed, scenes, stated, how)
     if report is None:
         return shape, None
-    measured = _measured(report, stated, teaching)
-    if measured == stated:
-        known = None if others else report
-        return shape, _tested(surveyed, [*teaching, *others], stated, how, known)
-    trial = replace(surveyed, problems=[], verdicts=[])
-    tested = _tested(trial, others or teaching, measured, how)
-    if tested is None or tested.is_wrong:
+    measured = _measured(report, stated, scenes)
+    again = None if measured == stated else _diagnosed(surveyed, scenes, measured, how)
+    found = encoding_line(measured)
+    if again is not None and not again.is_wrong:
+        count = counted(len(scenes), "scene")
+        what = f"measured in {count}: {found}, where the files say {encoding_line(stated)}"
+        if measured.unit_m != stated.unit_m:
+            what += (
+                "; the unit, if focal length and baselines are right: pictures show the quotient"
+            )
+        surveyed.verdicts.append(what)
+        _note(surveyed, again)
+        return replace(shape, depth=DepthAs(encoding=measured)), again
+    if again is not None:
         surveyed.problems.append(
-            f"depth: {encoding_line(measured)} was measured in {teaching[0].id.key}, and other "
-            f"scenes do not have it. `stereogenbench doctor` says more."
+            f"depth: {found} was measured, and by it the pictures of {scenes[0].id.key} or others "
+            f"do not fit. `stereogenbench doctor` says more."
         )
-        return shape, _tested(surveyed, teaching, stated, how)
-    declared = encoding_line(stated)
-    what = f"measured: {encoding_line(measured)}, where the files say {declared}"
-    if measured.unit_m != stated.unit_m:
-        what += "; the unit, if focal length and baselines are right: pictures show the quotient"
-    surveyed.verdicts.extend([what, *trial.verdicts])
-    if not others:
-        surveyed.verdicts.append("there were no other scenes to verify it")
-    return replace(shape, depth=DepthAs(encoding=measured)), tested
+    _note(surveyed, report)
+    return shape, report
 
 
 _SHARES: Final = "share of pixels whose depth is found in another frame"
@@ -423,26 +417,15 @@ def _measured(
     return replace(stated, **found)
 
 
-def _tested(
-    surveyed: Survey,
-    scenes: Sequence[Scene],
-    depth: DepthEncoding | None,
-    how: dict[str, Any],
-    known: DoctorReport | None = None,
-) -> DoctorReport | None:
-    """Return what pictures say of a contract and note it; None where they cannot be compared.
-
-    ``known`` is what they are already known to say.
-    """
-    report = known or _diagnosed(surveyed, scenes, depth, how)
-    if report is None:
-        return None
-    written = _changed(_measured(report, DepthEncoding(), scenes)) if depth is None else {}
+def _note(
+    surveyed: Survey, report: DoctorReport, *, cures: Mapping[str, str] | None = None
+) -> None:
+    """Note what pictures say of a contract; ``cures`` is what may be written below ``[depth]``."""
     for verdict in report.verdicts:
         line = f"pictures of {counted(len(verdict.scenes), 'scene')}: {_in_words(verdict)}"
         surveyed.verdicts.append(line)
-        if verdict.is_wrong and "unit_m" in written:
-            cure = ", ".join(f"{name} = {value}" for name, value in written.items())
+        if verdict.is_wrong and cures and "unit_m" in cures:
+            cure = ", ".join(f"{name} = {value}" for name, value in cures.items())
             line = f"no unit that is understood is stated; by pictures, write {cure} below [depth]"
         if verdict.is_wrong:
             surveyed.problems.append(f"depth, {', '.join(verdict.scenes[:3])}: {line}")
@@ -450,7 +433,6 @@ def _tested(
         key, reason = next(iter(report.left_out.items()))
         count = counted(len(report.left_out), "scene")
         surveyed.verdicts.append(f"{count} not compared with pictures, such as {key}: {reason}")
-    return report
 
 
 def _in_words(verdict: Verdict) -> str:

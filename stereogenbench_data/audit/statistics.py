@@ -205,6 +205,12 @@ class Line:
     ours: str
     agrees: bool
 
+    @property
+    def in_a_word(self) -> str:
+        """How the two compare, for a table."""
+        same = "same" if self.paper == self.ours else "within"
+        return same if self.agrees else "**differs**"
+
 
 def _equal(split: str, table: str, item: str, paper: str, ours: str) -> Line:
     return Line(split, table, item, paper, ours, paper == ours)
@@ -334,18 +340,8 @@ def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
         agreeing = sum(line.agrees for line in lines)
         title = f"Against the paper: {agreeing} of {len(lines)} figures agree"
         rows = [
-            (
-                "**differs**"
-                if not line.agrees
-                else "same"
-                if line.paper == line.ours
-                else "within",
-                line.item,
-                line.paper,
-                line.ours,
-                line.table,
-            )
-            for line in sorted(lines, key=lambda each: each.agrees)
+            (each.in_a_word, each.item, each.paper, each.ours, each.table)
+            for each in sorted(lines, key=lambda each: each.agrees)
         ]
         text += _section(title, [("", "figure", "paper", "here", "source"), *rows])
     return "\n".join(text) + "\n"

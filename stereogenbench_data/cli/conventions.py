@@ -32,8 +32,8 @@ def conventions(  # noqa: PLR0913 - one parameter an option
     ] = None,
     scenes: Annotated[int, option("Scenes to read.", min=1)] = 20,
     pictures: Annotated[
-        int, option("Scenes of a shape to measure by pictures, and to verify.", min=0)
-    ] = 3,
+        int, option("Scenes of a shape to compare with their pictures.", min=0)
+    ] = 6,
     chosen: SceneOptions,
     work: WorkOptions,
 ) -> None:

@@ -32,6 +32,7 @@ from stereogenbench_data.audit.contract.scoring import (
     ray_power,
     score_hypothesis,
 )
+from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_COUNT, DEFAULT_DEPTH_UNIT_M
 
 
@@ -54,7 +55,8 @@ class SceneDiagnosis:
         matches: Pixels that were found in both pictures of a view.
         unit_m: The declared unit of the primary pair's left depth, in metres.
         unit_source: Where it comes from: "tag", "default", "conventions", "user" or "unreadable".
-        declared: The declared answers.
+        encoding: The contract under test; its unit is None if files state it.
+        declared: Its answers.
         best: The answers of the best contract.
         problem: Why the scene could not be judged; empty if it could.
         is_scaled: Whether the best contract has another scale too.
@@ -78,6 +80,7 @@ class SceneDiagnosis:
     matches: int
     unit_m: float
     unit_source: str
+    encoding: DepthEncoding
     declared: Hypothesis
     best: Hypothesis
     problem: str = ""
@@ -362,6 +365,7 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         unit_source=(
             views.encoding.source if views.encoding.unit_m else views.scene.depth_unit_source[file]
         ),
+        encoding=views.encoding,
         declared=declared,
         best=declared,
     )

@@ -145,7 +145,6 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
     ]
     found: list[SceneDiagnosis] = []
     shares: dict[str, Shares] = {}
-    contracts = {task.scene.id.key: task.encoding for task in tasks}
     results = engine.map(_diagnose, tasks, name=lambda task: task.scene.id.key, workers=workers)
     with closing(results):
         for diagnosis, explained in results:
@@ -154,13 +153,7 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
             if progress is not None:
                 progress(len(found), len(tasks))
     found.sort(key=lambda diagnosis: diagnosis.key)
-    groups = [
-        group
-        for contract in dict.fromkeys(contracts.values())
-        for group in group_by_contract([each for each in found if contracts[each.key] == contract])
-    ]
-    groups.sort(key=len, reverse=True)
-    verdicts = tuple(judge(group, declared=contracts[group[0].key]) for group in groups)
+    verdicts = tuple(map(judge, group_by_contract(found)))
     worlds: dict[tuple[str, str], list[Shares]] = {}
     for scene in (task.scene for task in tasks if task.scene.id.key in shares):
         taken = str(scene.pose_form)

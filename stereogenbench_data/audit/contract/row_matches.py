@@ -298,7 +298,7 @@ class SceneFrames:
         """
         frames, lag = self.scene.frames, self.encoding.frame_lag
         first, last = max(0, -lag), min(frames, frames - lag) - 1
-        steps = sorted({max(1, (last - first) // part) for part in parts} if last > first else ())
+        steps = sorted({(last - first) // part for part in parts if last - first >= part})
         return [(start, start + step) for step in steps for start in {first, last - step}]
 
     def matched_later(self, frame: int, file: int, other: int, *, lag: int) -> FrameMatch | None:

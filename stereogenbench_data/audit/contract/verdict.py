@@ -56,8 +56,6 @@ class Answer:
         declared: What the data declare.
         found: What the pictures show; empty if they show nothing.
         status: Whether that confirms what is declared.
-        behind: By how much the next best answer is worse, in the scene where it comes nearest;
-            None if not known.
         note: The reason, in words; may be empty.
         is_sure: Whether every tested rival is excluded by the margin.
     """
@@ -66,7 +64,6 @@ class Answer:
     declared: str
     found: str
     status: Status
-    behind: Gain | None = None
     note: str = ""
     is_sure: bool = False
 
@@ -83,7 +80,7 @@ def _no_answer(scenes: Sequence[SceneDiagnosis], topic: str, declared: str) -> A
 
 
 def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> Answer:
-    """Return the answer to one question, and how far the next best answer is behind."""
+    """Return the answer to one question."""
     first = scenes[0]
     declared, best = (getattr(part, question) for part in (first.declared, first.best))
     blank = _no_answer(scenes, TOPICS[question], describe(declared))
@@ -106,7 +103,9 @@ def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
     at_end = question == "frame_lag" and abs(best) == max(LAGS)
     want = "frames or of motion" if question == "frame_lag" else "depth where it would be"
     close = [answer for answer, state in states.items() if state == "close"]
+    by_shape = any(gain.by_shape for each in gains.values() for gain in each)
     notes = {
+        "told by the shape of disparity": by_shape,
         f"{describe(best)} fits best, but not surely better": is_changed and status != "wrong",
         f"not excluded by the margin: {_named(left)}": status == "not contradicted",
         f"fit alike: {_named([best, *close])}": close,
@@ -115,14 +114,11 @@ def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
         _OR_PICTURES: question == "flip" and is_changed,
     }
     found = " or ".join(map(describe, [best, *left] if is_changed else [best]))
-    lows = [gain for each in gains.values() for gain in each if not math.isnan(gain.mean_db)]
     return Answer(
         blank.topic,
         blank.declared,
         found="" if status == "cannot tell" else f"{found} or beyond" if at_end else found,
         status=status,
-        behind=of_declared if is_changed
-        else min(lows, key=lambda gain: gain.low_db, default=None),
         note="; ".join(note for note, is_said in notes.items() if is_said),
         is_sure=worst == "excluded" and not at_end,
     )  # fmt: skip
@@ -256,7 +252,6 @@ def _quotient(scenes: Sequence[SceneDiagnosis], unit: Unit) -> Answer:
         note = f"numbers of another form: {describe(first.best.form)} has a unit of its own"
         return replace(blank, found=found, note=note)
     if first.is_scaled:
-        blank = replace(blank, behind=pooled([scene.gain for scene in scenes]))
         if _kind_explains_scale(scenes):
             kind = describe(first.best.kind)
             note = f"{found} if depth is along {kind}, as declared if it is not"
@@ -280,7 +275,7 @@ def _beside_default(scenes: Sequence[SceneDiagnosis]) -> Iterator[Answer]:
         return
     gain = pooled([scene.beside for scene in scenes if scene.beside is not None])
     declared = f"{scenes[0].unit_m:g} m a unit"
-    blank = replace(_no_answer(scenes, DEFAULT, declared), behind=gain)
+    blank = _no_answer(scenes, DEFAULT, declared)
     against = replace(gain, mean_db=-gain.mean_db)
     default = f"{DEFAULT_DEPTH_UNIT_M:g} m a unit"
     is_judged = scenes[0].best == scenes[0].declared
@@ -289,7 +284,7 @@ def _beside_default(scenes: Sequence[SceneDiagnosis]) -> Iterator[Answer]:
     elif not blank.note and gain.is_clear():
         yield replace(blank, found=f"{declared}, not {default}", status="confirmed")
     elif not blank.note and against.low_db > 0 and all(scene.default_fits for scene in scenes):
-        yield replace(blank, found=default, status="wrong", behind=against)
+        yield replace(blank, found=default, status="wrong")
     else:
         yield blank
 
@@ -402,14 +397,14 @@ class Verdict:
         return tuple(c for c in range(CAMERA_COUNT) if c not in self.untested_cameras)
 
 
-def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdict:
+def judge(scenes: Sequence[SceneDiagnosis]) -> Verdict:
     """Return the verdict on scenes that have one best contract.
 
     Args:
         scenes: One or more scenes with the same changes, or only scenes with a ``problem``.
-        declared: The contract under test; its unit is None if files state it.
     """
     first = scenes[0]
+    declared = first.encoding
     unit = _common_unit(scenes)
     hypothesis = [_question_answer(scenes, question) for question in QUESTIONS]
     quotient = _quotient(scenes, unit)
@@ -509,7 +504,7 @@ def _is_changed(scene: SceneDiagnosis) -> bool:
 
 def _fits(scene: SceneDiagnosis, leader: SceneDiagnosis) -> bool:
     """Tell whether a scene may have the contract of another."""
-    if (scene.declared, scene.unit_m) != (leader.declared, leader.unit_m):
+    if (scene.encoding, scene.unit_m) != (leader.encoding, leader.unit_m):
         return False
     if has_camera_problems([scene, leader]):
         # Problems of single cameras are the scene's own.

@@ -108,7 +108,7 @@ def explained_shares(views: SceneFrames, text: bytes, names: Sequence[str]) -> S
         MediaError: If depth cannot be decoded.
     """
     where = views.scene.id.key
-    moves = views.frame_moves(_PARTS)
+    moves = views.frame_moves(_PARTS) or views.frame_moves((1,))
     depths = {
         (frame, camera): _depth(views, frame, camera)
         for frame in sorted({*chain(*moves)})

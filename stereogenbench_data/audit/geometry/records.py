@@ -190,6 +190,7 @@ class Check:
         worst: `max` where large figures are wrong, `min` where small ones are.
         unit: Such as "px"; "%" for a share.
         paper: The paper's figure.
+        causes: Every cause that would look so, where the figure does not show it.
     """
 
     name: str
@@ -198,6 +199,7 @@ class Check:
     worst: Callable[..., float] = max
     unit: str = ""
     paper: str = ""
+    causes: str = ""
 
     def text(self, value: float) -> str:
         """Return a figure with its unit, a dash for nan."""
@@ -211,49 +213,69 @@ def with_unit(value: float, unit: str = "") -> str:
     return f"{value * 100:.4g} %" if unit == "%" else f"{value:.3g} {unit}".rstrip()
 
 
+_DOCTOR: Final = "`stereogenbench doctor` looks for the cause"
+_UNFIT: Final = "depth, a camera's place, or the lens"
+_RIG: Final = "the rig is not rectified, or the poses are wrong"
+_FROZEN: Final = "frames are repeated, or the poses are those of another scene"
+
 CHECKS: Final = {
     "intrinsics_px": Check(
         "intrinsics", "largest deviation of fx, fy, cx, cy from f / s W", 1e-3, unit="px",
         paper=AUDIT["intrinsics"]),
     "baseline_cm": Check(
         "pose/baseline", "pose-derived less recorded, all 15 pairs", 1e-3, unit="cm",
-        paper=AUDIT["baseline"]),
+        paper=AUDIT["baseline"],
+        causes="baseline.json or trajectory.json is wrong"),
     "rotation_px": Check(
-        "rig rotation", "what the turn of a camera against camera 0 moves", 0.05, unit="px"),
+        "rig rotation", "what the turn of a camera against camera 0 moves", 0.05, unit="px",
+        causes=_RIG),
     "lateral_px": Check(
-        "lateral residual", "what a camera off the rig's line moves", 0.05, unit="px"),
+        "lateral residual", "what a camera off the rig's line moves", 0.05, unit="px",
+        causes=_RIG),
     "reprojection_px": Check(
-        "reprojection", "median error of the primary pair at the last tolerance", 0.5, unit="px"),
+        "reprojection", "median error of the primary pair at the last tolerance", 0.5, unit="px",
+        causes=f"{_DOCTOR}: {_UNFIT}"),
     "see_through": Check(
         "depth consistency",
-        "share of points on smooth surfaces that another camera sees through", 0.02, unit="%"),
+        "share of points on smooth surfaces that another camera sees through", 0.02, unit="%",
+        causes=f"{_DOCTOR}: {_UNFIT}"),
     "depth_residual": Check(
         "depth residual",
         "90th percentile of what inverse depth differs between cameras, beyond one step", 0.0005,
-        unit="%"),
+        unit="%",
+        causes=f"{_DOCTOR}: {_UNFIT}"),
     "depth_agreement": Check(
         "depth agreement",
         "share of points whose depths in two cameras agree to 2 %, but not to 0.5 %", 0.2,
-        unit="%"),
+        unit="%",
+        causes=f"noise, or wrong: {_UNFIT}"),
     "motion_residual": Check(
         "motion residual",
         "median of what inverse depth differs from frame to frame, beyond one step", 0.001,
-        unit="%"),
+        unit="%",
+        causes=f"{_DOCTOR}: depth, the poses, or the lens"),
     "picture_lag": Check(
-        "picture time", "gain of correlation by pictures of a frame beside", 0.02),
+        "picture time", "gain of correlation by pictures of a frame beside", 0.02,
+        causes=f"late or early, or wrong: the pictures, {_UNFIT}"),
     "picture_odd": Check(
         "picture content",
         "correlation with other cameras' pictures, taken there by depth, below that of others",
-        0.15),
+        0.15,
+        causes=(
+            "of another camera (`stereogenbench doctor` tests exchanges) or another moment, or "
+            f"wrong: the pictures, {_UNFIT}")),
     "copied": Check(
-        "copied view", "share of pictures that another camera shows bit for bit", 0.5, unit="%"),
+        "copied view", "share of pictures that another camera shows bit for bit", 0.5, unit="%",
+        causes="either may be the copy"),
     "brightness": Check("too dark", "mean luma, of 255", DARK_MEAN, min),
     "contrast": Check("flat", "standard deviation of luma, of 255", FLAT_SD, min),
     "change": Check(
-        "frozen", "change of luma to the next audited frame while the camera moves", 0.25, min),
+        "frozen", "change of luma to the next audited frame while the camera moves", 0.25, min,
+        causes=_FROZEN),
     "depth_change": Check(
         "frozen", "share of depth that changes to the next audited frame while the camera moves",
-        1e-6, min, "%"),
+        1e-6, min, "%",
+        causes=_FROZEN),
     "valid_depth": Check(
         "invalid depth", "share of pixels with depth", 1e-6, min, "%"),
     "mean_valid_depth": Check(
@@ -265,28 +287,6 @@ CHECKS: Final = {
         unit="%"),
 }  # fmt: skip
 """By quantity, in the order of the table."""
-
-_DOCTOR: Final = "`stereogenbench doctor` looks for the cause"
-_UNFIT: Final = "depth, a camera's place, or the lens"
-_CAUSES: Final = {
-    "baseline_cm": "baseline.json or trajectory.json is wrong",
-    "rotation_px": "the rig is not rectified, or the poses are wrong",
-    "lateral_px": "the rig is not rectified, or the poses are wrong",
-    "reprojection_px": f"{_DOCTOR}: {_UNFIT}",
-    "see_through": f"{_DOCTOR}: {_UNFIT}",
-    "depth_residual": f"{_DOCTOR}: {_UNFIT}",
-    "depth_agreement": f"noise, or wrong: {_UNFIT}",
-    "motion_residual": f"{_DOCTOR}: depth, the poses, or the lens",
-    "picture_lag": f"late or early, or wrong: the pictures, {_UNFIT}",
-    "picture_odd": (
-        f"of another camera (`stereogenbench doctor` tests exchanges) or another moment, or wrong: "
-        f"the pictures, {_UNFIT}"
-    ),
-    "copied": "either may be the copy",
-    "change": "frames are repeated, or the poses are those of another scene",
-    "depth_change": "frames are repeated, or the poses are those of another scene",
-}
-"""Every cause that would look like a figure beyond its limit, where the figure does not show it."""
 
 
 def findings_of(scene: SceneAudit) -> Iterator[Finding]:
@@ -317,7 +317,7 @@ def _beyond(scene: SceneAudit, figure: Figure) -> tuple[str, str] | None:
     if check.worst(figure.value, check.limit) != figure.value:  # nan is not beyond it either
         return None
     place = f", {figure.where}" if figure.where else ""
-    causes = f"; {_CAUSES[figure.quantity]}" if figure.quantity in _CAUSES else ""
+    causes = f"; {check.causes}" if check.causes else ""
     value, limit = check.text(figure.value), check.text(check.limit)
     return check.name, f"{check.what} is {value}{place} (limit {limit}){causes}"
 

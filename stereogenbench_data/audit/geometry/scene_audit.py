@@ -36,7 +36,7 @@ from stereogenbench_data.audit.geometry.reprojection import (
 from stereogenbench_data.audit.geometry.rig_check import motion_px, recorded_px, rig_figures
 from stereogenbench_data.audit.scene_access import spread
 from stereogenbench_data.engine import Advance
-from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
+from stereogenbench_data.errors import MediaError, SchemaError, StereoGenBenchError, StorageError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.pose_evidence import poses_of
@@ -82,22 +82,31 @@ class AuditedFiles:
             if scene.held_name(name) not in scene.members and name not in scene.remark("videos")
         }  # fmt: skip
 
-    def attempt(
-        self, name: str, read: Callable[..., Result], *args: Any, **kwargs: Any
-    ) -> Result | None:
+    def attempt(self, name: str, read: Callable[..., Result], *args: Any) -> Result | None:
         """Return what ``read`` returns for a file, None if it or an earlier attempt failed."""
         if name in self.problems or name in self.not_fetched:
             return None
         try:
-            return read(*args, **kwargs)
+            return read(*args)
         except (StereoGenBenchError, OSError) as error:
             self.problems[name] = str(error)
             return None
 
-    def text(self, name: str) -> bytes:
-        """Return a metadata file's bytes."""
-        self._require_member(name)
-        return self.source.read(self.scene, name)
+    def recorded_px(self) -> list[tuple[str, float]]:
+        """Return what ``baseline.json`` records in pixels, by the names of `Intrinsics`."""
+        self._require_member(BASELINE_JSON)
+        document = parse_object(self.source.read(self.scene, BASELINE_JSON), where=BASELINE_JSON)
+        return list(recorded_px(document, declaration_of(self.scene)))
+
+    def poses(self) -> CameraPoses:
+        """Return the poses of at least as many frames as the scene has."""
+        self._require_member(TRAJECTORY_JSON)
+        text = self.source.read(self.scene, TRAJECTORY_JSON)
+        poses = poses_of(self.scene, text, where=TRAJECTORY_JSON)
+        if poses.frame_count < self.scene.frames:
+            told = f"has poses of {poses.frame_count} frames, and the index says"
+            raise SchemaError(f"{told} {self.scene.frames}")
+        return poses
 
     def _require_member(self, name: str) -> None:
         if self.scene.held_name(name) not in self.scene.members:
@@ -210,28 +219,12 @@ class _SceneCheck:
         )
 
     def _metadata(self) -> tuple[list[Figure], CameraPoses | None]:
-        recorded: list[tuple[str, float]] = []
-        declared = declaration_of(self.scene)
-        poses: CameraPoses | None = None
-        for name in (BASELINE_JSON, TRAJECTORY_JSON):
-            text = self.files.attempt(name, self.files.text, name)
-            if text is None:
-                continue
-            if name == BASELINE_JSON:
-                document = self.files.attempt(name, parse_object, text, where=name)
-                recorded += [] if document is None else recorded_px(document, declared)
-            else:
-                poses = self.files.attempt(name, poses_of, self.scene, text, where=name)
+        recorded = self.files.attempt(BASELINE_JSON, self.files.recorded_px)
+        poses = self.files.attempt(TRAJECTORY_JSON, self.files.poses)
         if poses is None:
             return [], None
-        of_rig = rig_figures(self.scene.rig, poses, recorded)
-        figures = [Figure(quantity, "", value) for quantity, value in of_rig.items()]
-        if poses.frame_count >= self.scene.frames:
-            return figures, poses
-        self.files.problems[TRAJECTORY_JSON] = (
-            f"has poses of {poses.frame_count} frames, and the index says {self.scene.frames}"
-        )
-        return figures, None
+        of_rig = rig_figures(self.scene.rig, poses, recorded or [])
+        return [Figure(quantity, "", value) for quantity, value in of_rig.items()], poses
 
     def _frame(self, frame: int, poses: CameraPoses | None) -> None:
         """Decode one frame of all cameras, and add it to the checks."""
