@@ -136,9 +136,7 @@ class CameraPoses:
 
     def later_from_cam(self, frame: int, later: int, *, camera: int) -> Float64[np.ndarray, "4 4"]:
         """Return the transform from a camera's axes in one frame to those in another, in metres."""
-        return np.linalg.inv(self.world_from_cam(later, camera)) @ self.world_from_cam(
-            frame, camera
-        )
+        return invert_rigid(self.world_from_cam(later, camera)) @ self.world_from_cam(frame, camera)
 
     def baseline_m(self, frame: int, camera_a: int, camera_b: int) -> float:
         """Return the distance between two cameras' centres in one frame, in metres."""

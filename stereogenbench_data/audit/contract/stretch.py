@@ -17,7 +17,9 @@ from jaxtyping import Float, Float32, Float64
 from stereogenbench_data.audit.contract.row_matches import SceneFrames
 from stereogenbench_data.audit.geometry.reprojection import moved_points
 from stereogenbench_data.geometry.camera import Intrinsics
+from stereogenbench_data.geometry.disparity import planar_from_ray
 from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.geometry.projection import Projection, landing_pixels
 from stereogenbench_data.media.depth import depth_m_from_units
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
@@ -73,9 +75,9 @@ def _errors(views: SceneFrames, poses: CameraPoses, camera: int) -> Float64[np.n
     for factor in _FACTORS:
         fx_px, fy_px = (factor * each for each in (views.intrinsics.fx_px, views.intrinsics.fy_px))
         stretched = replace(views.intrinsics, fx_px=fx_px, fy_px=fy_px)
-        is_ray = views.encoding.kind == "ray"
-        ray = np.sqrt(1 + (views.ray_per_planar**2 - 1) / factor**2) if is_ray else 1.0
-        depths_m = {frame: factor * length_m / ray for frame, length_m in lengths.items()}
+        depths_m = {frame: factor * length_m for frame, length_m in lengths.items()}
+        if views.encoding.kind == "ray":
+            depths_m = {at: planar_from_ray(each, stretched) for at, each in depths_m.items()}
         off = [
             _off(depths_m[first], depths_m[later], stretched, motion)
             for (first, later), motion in zip(moves, motions, strict=True)
@@ -105,12 +107,11 @@ def _off(
     """Return by how much the logarithm of depth is off where points of a frame land in another."""
     height, width = here_m.shape
     step = max(1, math.ceil(min(height, width) / _ACROSS))
-    rows, columns = (each.ravel() for each in np.mgrid[step // 2 : height : step,
-                                                       step // 2 : width : step])  # fmt: skip
+    rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
     depth_m = here_m[rows, columns]
     u_px, v_px, expected_m = moved_points(columns + 0.5, rows + 0.5, depth_m, camera, motion)
-    inside = (expected_m > 0) & (u_px >= 0) & (u_px < width) & (v_px >= 0) & (v_px < height)
-    inside &= depth_m > 0
-    found_m = there_m[v_px[inside].astype(np.intp), u_px[inside].astype(np.intp)]
-    both = found_m > 0
-    return np.asarray(np.abs(np.log(expected_m[inside][both] / found_m[both])))
+    landed = Projection(u_px=u_px, v_px=v_px, depth_m=expected_m)
+    inside, pixel = landing_pixels(landed, height_px=height, width_px=width)
+    found_m = there_m.ravel()[pixel]
+    both = inside & (depth_m > 0) & (found_m > 0)
+    return np.asarray(np.abs(np.log(expected_m[both] / found_m[both])))
