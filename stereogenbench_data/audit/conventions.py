@@ -21,7 +21,6 @@ from stereogenbench_data.audit.contract.verdict import (
     STRETCH,
     TOPICS,
     Unit,
-    Verdict,
     encoding_line,
 )
 from stereogenbench_data.audit.contract.worlds import LEAST_SHARE, explained_shares, judge_worlds
@@ -422,7 +421,7 @@ def _note(
 ) -> None:
     """Note what pictures say of a contract; ``cures`` is what may be written below ``[depth]``."""
     for verdict in report.verdicts:
-        line = f"pictures of {counted(len(verdict.scenes), 'scene')}: {_in_words(verdict)}"
+        line = f"pictures of {counted(len(verdict.scenes), 'scene')}: {verdict.in_a_line}"
         surveyed.verdicts.append(line)
         if verdict.is_wrong and cures and "unit_m" in cures:
             cure = ", ".join(f"{name} = {value}" for name, value in cures.items())
@@ -433,17 +432,6 @@ def _note(
         key, reason = next(iter(report.left_out.items()))
         count = counted(len(report.left_out), "scene")
         surveyed.verdicts.append(f"{count} not compared with pictures, such as {key}: {reason}")
-
-
-def _in_words(verdict: Verdict) -> str:
-    """Return a verdict with its figures in a line."""
-    if verdict.is_wrong:
-        return f"{encoding_line(verdict.declared)} is WRONG: {'; '.join(verdict.contradicted)}"
-    told: dict[str, list[str]] = {"confirmed": [], "not contradicted": [], "cannot tell": []}
-    for answer in verdict.answers:
-        found = "" if answer.status == "cannot tell" else f" {answer.found}"
-        told[answer.status].append(answer.topic + found)
-    return "; ".join(f"{status}: {', '.join(each)}" for status, each in told.items() if each)
 
 
 def _head(surveyed: Survey) -> list[str]:

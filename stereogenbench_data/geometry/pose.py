@@ -136,7 +136,9 @@ class CameraPoses:
 
     def later_from_cam(self, frame: int, later: int, *, camera: int) -> Float64[np.ndarray, "4 4"]:
         """Return the transform from a camera's axes in one frame to those in another, in metres."""
-        return invert_rigid(self.world_from_cam(later, camera)) @ self.world_from_cam(frame, camera)
+        later_from_world = invert_rigid(self.world_from_cam(later, camera))
+        moved: Float64[np.ndarray, "4 4"] = later_from_world @ self.world_from_cam(frame, camera)
+        return moved
 
     def baseline_m(self, frame: int, camera_a: int, camera_b: int) -> float:
         """Return the distance between two cameras' centres in one frame, in metres."""

@@ -42,7 +42,7 @@ def doctor_lines(report: DoctorReport) -> list[str]:
 def screen(report: DoctorReport) -> tuple[str, list[Part]]:
     """Return the verdict, and tables of everything else, the most important first."""
     several = len(report.verdicts) > 1
-    rows = [(_scenes(each), _in_a_line(each)) for each in report.verdicts]
+    rows = [(_scenes(each), each.in_a_line) for each in report.verdicts]
     parts: list[Part] = [("", [("scenes", "pictures say"), *rows])] if several else []
     for verdict in report.verdicts:
         follows = [*_conclusion(verdict), *_tested(verdict)]
@@ -62,12 +62,6 @@ def screen(report: DoctorReport) -> tuple[str, list[Part]]:
     )
     parts.append(("", [("notes",), [looked], [QUOTIENT_MEANS], [NOT_TESTED]]))
     return _headline(report), parts
-
-
-def _in_a_line(verdict: Verdict) -> str:
-    if verdict.is_wrong:
-        return f"WRONG: {'; '.join(verdict.contradicted)}"
-    return "fits" if verdict.fits else f"undecided: {', '.join(_open(verdict))}"
 
 
 def _scenes(verdict: Verdict) -> str:

@@ -392,6 +392,19 @@ class Verdict:
         return bool(self.contradicted)
 
     @property
+    def in_a_line(self) -> str:
+        """The verdict with its figures."""
+        if self.is_wrong:
+            return f"{encoding_line(self.declared)} is WRONG: {'; '.join(self.contradicted)}"
+        told: dict[Status, list[str]] = {
+            "confirmed": [], "not contradicted": [], "cannot tell": []
+        }  # fmt: skip
+        for answer in self.answers:
+            found = "" if answer.status == "cannot tell" else f" {answer.found}"
+            told[answer.status].append(answer.topic + found)
+        return "; ".join(f"{status}: {', '.join(each)}" for status, each in told.items() if each)
+
+    @property
     def tested_cameras(self) -> tuple[int, ...]:
         """Cameras whose depth was tested in every scene."""
         return tuple(c for c in range(CAMERA_COUNT) if c not in self.untested_cameras)

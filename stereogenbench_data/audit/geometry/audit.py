@@ -18,7 +18,6 @@ from stereogenbench_data.audit.geometry.records import (
     SceneAudit,
     broken_finding,
     findings_of,
-    plain,
     untested_of,
 )
 from stereogenbench_data.audit.geometry.scene_audit import AuditTask, audit_scene
@@ -43,7 +42,7 @@ from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import MissingObject
 
 DEFAULT_FRAMES: Final = 5
-_FORMAT: Final = 8
+_FORMAT: Final = 9
 
 
 class AuditOptions(WorkOptions, SceneFilters, total=False):
@@ -149,7 +148,7 @@ def audit(
 
     def keep(each: SceneAudit) -> None:
         found[each.key] = each
-        cache.keep(kind, names[each.key], json.dumps(plain(asdict(each))).encode())
+        cache.keep(kind, names[each.key], json.dumps(asdict(each)).encode())
 
     do_items(
         audit_scene,

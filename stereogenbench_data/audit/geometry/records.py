@@ -89,19 +89,15 @@ class SceneAudit:
 
     @classmethod
     def revived(cls, record: Mapping[str, Any]) -> "SceneAudit":
-        """Return the audit that `plain` made a record of.
+        """Return the audit that `dataclasses.asdict` made a record of.
 
         Raises:
             TypeError: If a field is missing or unknown.
         """
-        figures = (
-            Figure(**{**each, "value": math.nan if each["value"] is None else each["value"]})
-            for each in record["figures"]
-        )
-        pairs = (PairAudit(**each) for each in record["pairs"])
+        figures = tuple(Figure(**each) for each in record["figures"])
+        pairs = tuple(PairAudit(**each) for each in record["pairs"])
         frames = tuple(record["audited_frames"])
-        parts = {"figures": tuple(figures), "pairs": tuple(pairs), "audited_frames": frames}
-        return cls(**{**record, **parts})
+        return cls(**{**record, "figures": figures, "pairs": pairs, "audited_frames": frames})
 
 
 @dataclass(frozen=True, slots=True)
