@@ -419,5 +419,4 @@ def relative_step(numbers: UInt16[np.ndarray, " n"]) -> float:
     gaps = np.diff(values.astype(np.float64))
     nearest = np.minimum(np.append(np.inf, gaps), np.append(gaps, np.inf))
     shares = np.where(np.isfinite(nearest), nearest, 1.0) / np.maximum(values, 1)
-    order = shares.argsort()
-    return float(shares[order][np.searchsorted(counts[order].cumsum(), 0.75 * len(numbers))])
+    return float(np.quantile(shares, 0.75, weights=counts, method="inverted_cdf"))

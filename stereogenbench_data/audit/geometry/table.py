@@ -19,7 +19,7 @@ from stereogenbench_data.audit.geometry.records import (
 from stereogenbench_data.audit.geometry.reprojection import TOLERANCES
 from stereogenbench_data.audit.geometry.scene_audit import LONG_PAIR
 from stereogenbench_data.audit.paper_numbers import AUDIT
-from stereogenbench_data.schema.release import FRAME_COUNT, VIDEO_FILES
+from stereogenbench_data.schema.release import CAMERA_COUNT, FRAME_COUNT
 from stereogenbench_data.schema.text import counted, markdown_table, markdown_text
 
 _LISTED: Final = 500
@@ -88,15 +88,13 @@ def _reprojection_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
 
 def _frame_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
     for name in ("RGB", "depth"):
-        found = {
-            (scene.key, each.member): int(each.value) for scene in scenes for each in scene.figures
+        found = [
+            (int(each.value), scene.frames) for scene in scenes for each in scene.figures
             if each.quantity == "frames" and name.lower() in each.member
-        }  # fmt: skip
-        missing = sum(
-            max(0, scene.frames - found.get((scene.key, member), 0))
-            for scene in scenes for member in VIDEO_FILES if name.lower() in member
-        )  # fmt: skip
-        counts = list(found.values()) or [0]
+        ]  # fmt: skip
+        expected = CAMERA_COUNT * sum(scene.frames for scene in scenes)
+        missing = expected - sum(min(count, frames) for count, frames in found)
+        counts = [count for count, _ in found] or [0]
         low, high = min(counts), max(counts)
         span = f"{low}" if low == high else f"{low} to {high}"
         yield AuditRow(
