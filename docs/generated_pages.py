@@ -139,7 +139,6 @@ REFERENCE: Mapping[str, tuple[str, Mapping[str, Sequence[str]]]] = {
             "bridges.huggingface": ("iterable", "sample_features", "features", "decode"),
             "bridges.webdataset": ("decode",),
             "bridges.croissant.descriptor": ("write_descriptor",),
-            "bridges.croissant.check": ("check_descriptor",),
             "bridges.card": ("card", "write_card"),
         },
     ),

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import ShardsArgument, flag, grouped, option
 from stereogenbench_data.schema.text import counted
 
@@ -35,16 +34,12 @@ RepositoryArgument = Annotated[
 def croissant(
     data: Annotated[
         str | None,
-        typer.Argument(
-            help="Folder of shards, their index file, or a URL; with --check a descriptor "
-            "[the public release]."
-        ),
+        typer.Argument(help="Folder of shards, their index file, or a URL [the public release]."),
     ] = None,
     *,
     out: Annotated[
         Path | None, option("--out", "-o", "Descriptor to write, with tables beside.")
     ] = None,
-    check: Annotated[bool, flag("--check", "Check a descriptor.")] = False,
     base_url: Annotated[
         str | None, option("URL of the data, pinned to a revision [paths from the descriptor].")
     ] = None,
@@ -53,22 +48,12 @@ def croissant(
         bool, flag("--template", "Write the questions that --about answers.")
     ] = False,
 ) -> None:
-    """Write a Croissant 1.1 descriptor, or check one.
+    """Write a Croissant 1.1 descriptor, with the properties on responsible use.
 
-    The check is mlcroissant's own (extra 'croissant'), and of the properties on responsible use.
+    `mlcroissant validate --jsonld FILE` checks one.
 
     Example: `stereogenbench publish croissant shards/ -o croissant/sample.json`
     """
-    if check:
-        from stereogenbench_data.bridges.croissant.check import check_descriptor
-
-        if data is None:
-            raise typer.BadParameter("no descriptor to check: name its file.", param_hint="DATA")
-        problems = check_descriptor(Path(data))
-        for problem in problems:
-            typer.echo(problem)
-        typer.echo(f"{data}: {counted(len(problems), 'problem')}")
-        raise typer.Exit(FINDINGS if problems else 0)
     if out is None:
         raise typer.BadParameter(
             "no file for the descriptor: name it with -o FILE.", param_hint="--out"

@@ -13,11 +13,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from stereogenbench_data import SceneIndex
-from stereogenbench_data.bridges.croissant.check import check_descriptor
 from stereogenbench_data.bridges.croissant.descriptor import write_descriptor
 from stereogenbench_data.errors import DescriptorError
 from stereogenbench_data.shards.download import download, wanted_files
 from stereogenbench_data.shards.pack import pack
+from tests.bridges.validation import problems_of
 from tests.cli.command import invoke
 from tests.servers.tools import require_tool
 
@@ -56,7 +56,7 @@ def test_the_shipped_descriptors_are_valid_without_a_warning():
     paths = [SHIPPED / "release.json", SHIPPED / "sample.json"]
 
     assert sorted(SHIPPED.glob("*.json")) == [*paths, SHIPPED / "template.json"]
-    assert [check_descriptor(path) for path in paths] == [[], []]
+    assert [problems_of(path) for path in paths] == [[], []]
 
 
 def test_the_shipped_descriptors_name_where_their_own_data_come_from_and_their_splits():
@@ -95,7 +95,7 @@ def found(packed_depth_shards, of_many, tmp_path_factory):
     root = tmp_path_factory.mktemp("c")
     write_descriptor(SceneIndex.open(packed_depth_shards), root / "packed.json")
     paths = [SHIPPED / "release.json", SHIPPED / "sample.json", root / "packed.json", of_many]
-    assert check_descriptor(root / "packed.json") == []
+    assert problems_of(root / "packed.json") == []
     return {path.stem: each for path, each in zip(paths, loaded(root, *paths), strict=True)}
 
 
@@ -201,14 +201,14 @@ def test_a_partial_download_is_described_by_its_videos(small_shards, tmp_path):
 
     kinds = [each["@id"] for each in written["recordSet"] if each["@id"].endswith("_videos")]
     assert kinds == ["depth_videos"]
-    assert check_descriptor(path) == []
+    assert problems_of(path) == []
 
 
 def test_records_of_many_shards_are_those_of_the_smallest_of_each_family(index, of_many, found):
     named = {each["@id"] for each in json.loads(of_many.read_text())["distribution"]}
     counts = found["many"]["counts"]
 
-    assert check_descriptor(of_many) == []
+    assert problems_of(of_many) == []
     assert set(index.shards) <= named
     assert counts["shards"] == len(index.shards)
     assert 0 < counts["media_files"] <= 12 * len(index)

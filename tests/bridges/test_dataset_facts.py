@@ -8,13 +8,13 @@ import pytest
 
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.card import card
-from stereogenbench_data.bridges.croissant.check import check_descriptor
 from stereogenbench_data.bridges.croissant.descriptor import write_descriptor
 from stereogenbench_data.bridges.dataset_facts import DRAWN, RELEASE, facts_of, template
 from stereogenbench_data.errors import DescriptorError
 from stereogenbench_data.schema.release import COMPLETE_JSON
 from stereogenbench_data.shards.pack import pack
 from tests.audit.release_counts import paper_scenes
+from tests.bridges.validation import problems_of
 from tests.cli.command import invoke, one_line
 
 
@@ -93,7 +93,7 @@ def test_scenes_of_an_unknown_maker_are_described_as_the_maker_states(
     assert "Known: who made it" in text or write == "card"
     assert "Known: where results on it do not hold" in text
     if write == "descriptor":
-        assert check_descriptor(path) == []
+        assert problems_of(path) == []
 
 
 def test_blanks_misspelt_names_and_what_is_not_json_are_named(small_shards, about, tmp_path):

@@ -6,8 +6,8 @@ import re
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.audit.statistics import statistics, statistics_markdown
 from stereogenbench_data.bridges.card import card
-from stereogenbench_data.bridges.croissant.check import check_descriptor
 from stereogenbench_data.bridges.croissant.descriptor import write_descriptor
+from tests.bridges.validation import problems_of
 
 
 def test_the_descriptor_says_from_what_how_and_with_what_error(
@@ -17,7 +17,7 @@ def test_the_descriptor_says_from_what_how_and_with_what_error(
     index = SceneIndex.open(derived_shards)
     written = write_descriptor(index, path)
 
-    assert check_descriptor(path) == []
+    assert problems_of(path) == []
     assert "derived from other scenes for training" in written["description"]
     (source,) = [
         each

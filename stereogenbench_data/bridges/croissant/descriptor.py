@@ -41,7 +41,7 @@ from stereogenbench_data.sources.location import is_remote, shown
 MOST_MEDIA_BYTES: Final = 1_000_000_000
 """Above this size of all shards, record sets of files use the smallest shard of each family."""
 
-SEEN_AFTER_ALL: Final = "in train, though scenes of unseen_map have it"
+_SEEN_AFTER_ALL: Final = "in train, though scenes of unseen_map have it"
 """The meaning of a map that contradicts the subset of its scenes."""
 
 _TEXT, _WHOLE, _NUMBER = pa.string(), pa.int64(), pa.float64()
@@ -318,7 +318,7 @@ def _enumerations(index: SceneIndex | None) -> list[Node]:
 
     def meaning(name: str) -> str:
         if name in contradicted:
-            return SEEN_AFTER_ALL
+            return _SEEN_AFTER_ALL
         return "in train" if name in train else "in eval alone"
 
     _, _, families, places = nodes
