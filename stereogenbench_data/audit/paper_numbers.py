@@ -20,9 +20,7 @@ from functools import cache
 from importlib.resources import files
 from typing import Final, Literal
 
-PaperTable = Literal[
-    "main", "unseen", "bins", "controls", "adjacent", "all_pairs", "train_maps", "eval_maps"
-]
+PaperTable = Literal["bins", "adjacent", "all_pairs", "train_maps", "eval_maps"]
 PaperRow = Mapping[str, str]
 
 AUDIT: Final = {
@@ -44,12 +42,11 @@ def paper_table(name: PaperTable) -> tuple[PaperRow, ...]:
     """Return the rows of one of the paper's tables, by column, as printed.
 
     Args:
-        name: Scores: "main" (seen maps), "unseen", "bins" (baseline bins of seen-map Uniform),
-            "controls". Statistics of the release: "adjacent" and "all_pairs" (baselines in cm;
-            medians are from the appendix), "train_maps" and "eval_maps" (scenes).
+        name: "bins" (baseline bins of seen-map Uniform), "adjacent" and "all_pairs" (baselines in
+            cm; medians are from the appendix), "train_maps" and "eval_maps" (scenes).
 
-    >>> paper_table("controls")[0]["psnr"]
-    'inf'
+    >>> paper_table("bins")[0]["n_scenes"]
+    '52'
     """
     text = files(__package__).joinpath("paper_tables", f"{name}.csv").read_text("utf-8")
     return tuple(csv.DictReader(text.splitlines()))

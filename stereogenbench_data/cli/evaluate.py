@@ -289,9 +289,8 @@ def controls(
     """Score a perfect, a copied, a wrong and a random right view.
 
     The controls are the rendered target, the left view, the view of the next camera (02 for 01),
-    and the right view of another scene. On the whole eval split the report shows the paper's own
-    controls beside them. It goes to --out [evaluation/controls]. To continue a stopped run, run
-    it again.
+    and the right view of another scene. The report goes to --out [evaluation/controls]. To continue
+    a stopped run, run it again.
 
     Example: `stereogenbench eval controls shards/ --frames every:20`
     """

@@ -24,7 +24,7 @@ class Column:
 
 
 _SD_FITS: Final = {"filtered": "filtered", "least_squares": "least squares"}
-"""The fits of SD and what tables call them; the first is the one beside the paper's numbers."""
+"""The fits of SD and what tables call them; the first is the one to compare with the paper's."""
 
 EXPLAIN_A_FIT: Final = {
     "slope": ("a", 4),
@@ -93,8 +93,8 @@ FRAME_METRICS: Final[dict[str, tuple[str, ...]]] = {
 }  # fmt: skip
 """The columns of each metric that is computed frame by frame.
 
-The first is the headline: the paper's numbers stand in it. Of SD that is the filtered fit, because
-the paper leaves outliers out, though it does not state by which rule.
+The first is the headline. Of SD that is the filtered fit, because the paper leaves outliers out,
+though it does not state by which rule.
 """
 
 HEAVY_TAILED: Final = frozenset(f"sd_{fit}" for fit in _SD_FITS)

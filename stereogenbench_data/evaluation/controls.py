@@ -39,7 +39,7 @@ COPIED_LEFT: Final = "copied left"
 WRONG_BASELINE: Final = "wrong baseline"
 RANDOM_RIGHT: Final = "random right"
 CONTROLS: Final = (TARGET, COPIED_LEFT, WRONG_BASELINE, RANDOM_RIGHT)
-"""Names as in the package's table of the paper's controls."""
+"""Names as in the paper's table of controls."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -301,7 +301,6 @@ def _parts(results: Sequence[Scores], parts: Mapping[str, str]) -> list[TableRow
             if there:
                 rows.append(
                     TableRow(
-                        source="scored",
                         method=one.name,
                         labels=(part,),
                         scenes=len({pair.scene for pair in there}),

@@ -25,14 +25,13 @@ from stereogenbench_data.evaluation.tables import (
     Table,
     Value,
     cell,
-    exceeded_ceiling,
     group_by,
 )
 from stereogenbench_data.schema.release import BASELINE_BINS, baseline_bin
 from stereogenbench_data.schema.text import counted, markdown_table, markdown_text
 from stereogenbench_data.sources.files import open_atomic, write_atomic
 
-FORMAT: Final = 6
+FORMAT: Final = 7
 _GAPS_SHOWN: Final = 20
 ABSENT: Final = "-"
 _ARROWS: Final = {"higher": "↑", "lower": "↓", "neither": ""}
@@ -253,11 +252,8 @@ def latex(table: Table) -> str:
 
 
 def transposed(table: Table) -> list[list[str]]:
-    """Return what was scored of a table as cells, a row a column of it: few methods have many.
-
-    The paper's rows are left out.
-    """
-    scored = [row for row in table.rows if row.source == "scored"]
+    """Return a table as cells, a row a column of it: few methods have many."""
+    scored = table.rows
     has_several = len({row.method for row in scored}) > 1
     heads = [
         " ".join([*([row.method] if has_several else []), *filter(None, row.labels)])
@@ -318,7 +314,7 @@ def _texts(table: Table) -> list[list[str]]:
     for row in table.rows:
         counts = [row.scenes, row.frames, *([row.missing] if has_gaps else [])]
         texts = [row.method, *(label or ABSENT for label in row.labels)]
-        texts += [ABSENT if count is None else str(count) for count in counts]
+        texts += map(str, counts)
         lines.append(texts + [_cell_text(table, row.values, name) for name in table.columns])
     return lines
 
@@ -344,10 +340,6 @@ def _cell_text(table: Table, values: Mapping[str, Value], column: str) -> str:
             remarks = _remarks(found, column, values)
             text = _number_text(found, column)
             return f"{text} ({', '.join(remarks)})" if remarks else text
-        case printed:
-            text = printed.replace("inf", "∞")
-            has_backend = column in COLUMNS and COLUMNS[column].backend
-            return f"{text} (by the paper's matcher)" if has_backend else text
 
 
 def _number_text(found: Cell, column: str) -> str:
@@ -372,8 +364,11 @@ def _remarks(found: Cell, column: str, values: Mapping[str, Value]) -> list[str]
     match values.get("sd_beyond"):
         case Cell(mean=float(share)) if column in HEAVY_TAILED and share > 0:
             told.append(f"{share:.1%} beyond range")
-    if column == "p_psnr" and (ceiling_db := exceeded_ceiling(values)) is not None:
-        told.append(f"above the target's {ceiling_db:.2f}, so not better")
+    match found.mean, values.get("p_psnr_ceiling"):
+        case float(own_db), Cell(mean=float(ceiling_db)) if (
+            column == "p_psnr" and own_db > ceiling_db
+        ):
+            told.append(f"above the target's {ceiling_db:.2f}, so not better")
     return told
 
 
@@ -387,13 +382,12 @@ def _plain_table(table: Table) -> dict[str, Any]:
         "rows": [
             {
                 "method": row.method,
-                "source": row.source,
                 "group": dict(zip(table.keys, row.labels, strict=True)),
                 "scenes": row.scenes,
                 "frames": row.frames,
                 "missing": row.missing,
                 "values": {
-                    name: value if isinstance(value, str) else asdict(value)
+                    name: asdict(value)
                     for name, value in row.values.items()
                     if name in table.columns
                 },

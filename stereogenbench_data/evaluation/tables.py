@@ -1,4 +1,4 @@
-"""The scores of a method, and tables of them: groups of pairs, the paper's rows below the methods'.
+"""The scores of a method, and tables of them: a row for each group of pairs and method.
 
 Frames are averaged first, then the pairs of a scene, then scenes: every scene counts once, whatever
 the number of its frames and pairs. Intervals are over scenes. A table holds methods of one tier
@@ -7,8 +7,7 @@ only: rows of different tiers answer different questions.
 
 import hashlib
 import math
-from collections import Counter
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -18,26 +17,13 @@ from typing import Any, Final, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
-from stereogenbench_data.audit.paper_numbers import PaperRow, PaperTable, paper_table
 from stereogenbench_data.errors import EvaluationError, missing_extra
-from stereogenbench_data.evaluation.columns import COLUMNS, FRAME_METRICS
+from stereogenbench_data.evaluation.columns import COLUMNS
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.metrics.scale import LEAST_R2
-from stereogenbench_data.evaluation.protocol import (
-    PAPER_SIZE,
-    DisparityProtocol,
-    EvaluationProtocol,
-)
+from stereogenbench_data.evaluation.protocol import DisparityProtocol, EvaluationProtocol
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.release import (
-    BASELINE_BINS,
-    FAMILIES,
-    FRAME_COUNT,
-    SCENE_COUNTS,
-    TRAIN_MAPS,
-    UNSEEN_MAPS,
-    baseline_bin,
-)
+from stereogenbench_data.schema.release import BASELINE_BINS, FAMILIES, baseline_bin
 
 CONFIDENCE: Final = 0.95
 _DISTINCT_VALUES: Final = 6
@@ -288,67 +274,6 @@ def require_comparable(results: Sequence[Scores]) -> None:
                 )
 
 
-SOURCES: Final[dict[PaperTable, str]] = {
-    "main": "tab:main-results, reference results on the seen-map evaluation split",
-    "unseen": "tab:app-unseen-results, unseen-map evaluation",
-    "bins": "tab:app-baseline-bins, baseline-stratified diagnostics of the seen-map Uniform branch",
-    "controls": "tab:metric-calibration, calibration controls on the full evaluation split",
-}
-"""Where each table of scores stands in the paper: its LaTeX label and what it is."""
-
-
-def paper_difference(
-    results: Sequence[Scores], protocol: EvaluationProtocol, *, scored: str = "some"
-) -> str:
-    """Return why the paper's rows cannot stand beside scores, empty if they can.
-
-    Args:
-        results: Each method's scores.
-        protocol: How they were scored.
-        scored: As for `release_difference`.
-    """
-    pairs = [pair for one in results for pair in one.pairs if not pair.problem]
-    differs = release_difference(results[0].index, {pair.row for pair in pairs}, scored=scored)
-    if differs:
-        return f"these scores are of {differs}"
-    frames, (height, width) = {pair.frames for pair in pairs}, protocol.size
-    if (height, width) == PAPER_SIZE and frames <= {FRAME_COUNT}:
-        return ""
-    return (
-        f"it scores {FRAME_COUNT} frames a scene at {PAPER_SIZE[1]}x{PAPER_SIZE[0]}, this "
-        f"{', '.join(map(str, sorted(frames)))} at {width}x{height}"
-    )
-
-
-def release_difference(index: SceneIndex, rows: Collection[int], *, scored: str = "some") -> str:
-    """Return how scored scenes differ from those that the paper scored, empty if they do not.
-
-    By their maps, subsets and numbers: what the index tells.
-
-    Args:
-        index: The scenes.
-        rows: Which of them were scored.
-        scored: "some" of the branches of subset and family, or "all" of them.
-    """
-    names, subsets, families = (
-        index.column(name)[sorted(set(rows))].tolist() for name in ("map_name", "subset", "family")
-    )
-    others = [name for name in names if name not in TRAIN_MAPS | UNSEEN_MAPS]
-    if others:
-        named = ", ".join(sorted(set(others))[:3])
-        return (
-            f"{len(others)} of {len(names)} scenes on maps that the release does not have ({named})"
-        )
-    branches = Counter(zip(subsets, families, strict=True))
-    papers = {branch[1:]: count for branch, count in SCENE_COUNTS.items() if branch[0] == "eval"}
-    for branch in {**branches, **(papers if scored == "all" else {})}:
-        found, expected = branches[branch], papers.get(branch, 0)
-        if found != expected:
-            name = " ".join(filter(None, branch))
-            return f"{found} scenes of {name}, of which the paper scored {expected or 'none'}"
-    return ""
-
-
 PairsShown = Literal["primary", "all"]
 _BRANCH: Final = ("subset", "family")
 _BINS: Final = (*_BRANCH, "baseline")
@@ -363,47 +288,43 @@ class TableForm(NamedTuple):
         title: What it shows, in words.
         keys: What groups are made by: "subset", "family", "baseline" or a column of the index.
         pairs: Which pairs are in them.
-        paper: The paper's tables whose rows stand in it.
     """
 
     title: str
     keys: tuple[str, ...]
     pairs: PairsShown = "primary"
-    paper: tuple[PaperTable, ...] = ()
 
 
 TABLES: Final[Mapping[str, TableForm]] = {
-    "branches": TableForm("Evaluation branches, primary pairs", _BRANCH, paper=("main", "unseen")),
-    "bins_primary": TableForm("Baseline in cm, primary pairs", _BINS, paper=("bins",)),
+    "branches": TableForm("Evaluation branches, primary pairs", _BRANCH),
+    "bins_primary": TableForm("Baseline in cm, primary pairs", _BINS),
     "bins_all": TableForm("Baseline in cm, all pairs", _BINS, pairs="all"),
     "explanations": TableForm("What explains the scores, primary pairs", _BRANCH),
-    "controls": TableForm("Calibration controls", (), pairs="all", paper=("controls",)),
+    "controls": TableForm("Calibration controls", (), pairs="all"),
 }
 """The tables by name; those by a column of the index come on top."""
 
-Value = Cell | FrechetDistance | str
-"""The numbers of a column of frames, a distance between sets, or what the paper printed."""
+Value = Cell | FrechetDistance
+"""The numbers of a column of frames, or a distance between sets."""
 
 
 @dataclass(frozen=True, slots=True)
 class TableRow:
-    """One row: a method's scores of one group, or a row of the paper as printed.
+    """One row: a method's scores of one group.
 
     Attributes:
-        source: Whether it was scored or is the paper's.
         method: The method's name.
         labels: The group's values of the table's keys.
-        scenes: N_s, the scenes of the group that are scored; None where the paper has no number.
+        scenes: N_s, the scenes of the group that are scored.
         frames: N_f, their frames.
         missing: How many pairs have no scores, because their right views are missing or unusable.
         values: What stands in each column.
     """
 
-    source: Literal["scored", "paper"]
     method: str
     labels: Labels
-    scenes: int | None
-    frames: int | None
+    scenes: int
+    frames: int
     missing: int
     values: Mapping[str, Value]
 
@@ -418,7 +339,7 @@ class Table:
         keys: What groups are made by.
         protocol: How everything in it was scored.
         columns: Columns of frames, and distances.
-        rows: Group by group, in each the methods before the paper's.
+        rows: Group by group, in each the methods.
         notes: What to know when reading it.
     """
 
@@ -471,9 +392,6 @@ def table_of(results: Sequence[Scores], name: str, *, form: TableForm | None = N
     protocol = first.protocol
     if isinstance(protocol, DisparityProtocol):
         raise EvaluationError("scores of disparity have tables of their own: `disparity_tables`.")
-    scored = "all" if name == "controls" else "some"
-    differs = paper_difference(results, protocol, scored=scored) if form.paper else ""
-    rows = rows_of(results, form._replace(paper=()) if differs else form)
     explains = name == "explanations"
     columns = [each for each in protocol.columns if (COLUMNS[each].better == "neither") == explains]
     if name == "branches":
@@ -487,22 +405,12 @@ def table_of(results: Sequence[Scores], name: str, *, form: TableForm | None = N
         keys=form.keys,
         protocol=protocol,
         columns=tuple(columns),
-        rows=tuple(rows),
-        notes=_notes(form, rows, differs=differs),
+        rows=tuple(rows_of(results, form)),
     )
 
 
-def _notes(form: TableForm, rows: Sequence[TableRow], *, differs: str) -> tuple[str, ...]:
-    """Return where the rows of the paper stand there, or why they are left out."""
-    if differs:
-        return (f"The paper's rows are left out: {differs}.",)
-    if not any(row.source == "paper" for row in rows):
-        return ()
-    return (f"Rows of the paper as printed: {'; '.join(SOURCES[each] for each in form.paper)}.",)
-
-
 def rows_of(results: Sequence[Scores], form: TableForm) -> list[TableRow]:
-    """Return the rows of groups in the order of tables: every method's, then the paper's."""
+    """Return the rows of groups in the order of tables, of every method."""
     label_of = [_labels_by(key, results) for key in form.keys]
     groups_of = [
         group_by(
@@ -511,25 +419,15 @@ def rows_of(results: Sequence[Scores], form: TableForm) -> list[TableRow]:
         )
         for one in results
     ]
-    rows = []
-    for labels in sorted(
-        {labels for groups in groups_of for labels in groups},
-        key=lambda labels: list(map(_rank, labels)),
-    ):
-        where = dict(zip(form.keys, labels, strict=True)) | {"tier": results[0].tier}
-        paper = [
-            _paper_row(row, labels)
-            for name in form.paper
-            for row in paper_table(name)
-            if all(where.get(key, value) == value for key, value in row.items())
-        ]
-        for one, groups in zip(results, groups_of, strict=True):
-            if labels in groups:
-                rows.append(_row(one, labels, groups[labels]))
-                if not form.keys:  # A control of the paper stands below the one of its name.
-                    rows += [row for row in paper if row.method.startswith(f"{one.name} (")]
-        rows += paper if form.keys else []
-    return rows
+    return [
+        _row(one, labels, groups[labels])
+        for labels in sorted(
+            {labels for groups in groups_of for labels in groups},
+            key=lambda labels: list(map(_rank, labels)),
+        )
+        for one, groups in zip(results, groups_of, strict=True)
+        if labels in groups
+    ]
 
 
 def _labels_by(key: str, results: Sequence[Scores]) -> Callable[[PairMeans], str]:
@@ -562,7 +460,6 @@ def _row(one: Scores, labels: Labels, pairs: Sequence[PairMeans]) -> TableRow:
     scored = [pair for pair in pairs if not pair.problem]
     cells = {name: cell(scored, name) for name in (scored[0].tallies if scored else {})}
     return TableRow(
-        source="scored",
         method=one.name,
         labels=labels,
         scenes=len({pair.scene for pair in scored}),
@@ -570,30 +467,3 @@ def _row(one: Scores, labels: Labels, pairs: Sequence[PairMeans]) -> TableRow:
         missing=len(pairs) - len(scored),
         values={**cells, **one.distances.get(labels, {})},
     )
-
-
-def _paper_row(row: PaperRow, labels: Labels) -> TableRow:
-    """Return a row of one of the paper's tables, its numbers as printed."""
-    printed = {}
-    for name in (*FRAME_METRICS, "fid", "fvd"):
-        if value := row.get(name, ""):
-            interval = row.get(f"{name}_ci95", "")
-            headline = FRAME_METRICS.get(name, (name,))[0]
-            printed[headline] = f"{value} ± {interval}" if interval else value
-    return TableRow(
-        source="paper",
-        method=f"{row.get('method') or row['control']} (paper)",
-        labels=labels,
-        scenes=int(row["n_scenes"]) if "n_scenes" in row else None,
-        frames=int(row["n_frames"]) if "n_frames" in row else None,
-        missing=0,
-        values=printed,
-    )
-
-
-def exceeded_ceiling(values: Mapping[str, Value]) -> float | None:
-    """Return the P-PSNR of the rendered target, in dB, where a row's own is above it."""
-    match values.get("p_psnr"), values.get("p_psnr_ceiling"):
-        case Cell(mean=float(own_db)), Cell(mean=float(ceiling_db)) if own_db > ceiling_db:
-            return ceiling_db
-    return None

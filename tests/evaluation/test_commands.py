@@ -23,7 +23,6 @@ def test_predictions_are_scored_and_reported(scenes, other_views, tmp_path):
 
     assert shown.exit_code == 0, shown.output
     assert "# next camera, tier G1: calibrated target camera" in shown.stdout
-    assert "The paper's rows are left out: " in shown.stdout
     assert "By map_name" in shown.stdout
     assert {path.name for path in out.iterdir()} == {
         "results.json", "report.md", "tables.tex", "pairs.csv", "plots", "partial",

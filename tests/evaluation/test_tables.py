@@ -1,24 +1,20 @@
-"""Scores: averages, intervals by hand, tables in order, the paper's rows beside, no nan."""
+"""Scores: averages, intervals by hand, tables in order, no nan."""
 
 import csv
 import io
 import json
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from stereogenbench_data import EvaluationError, EvaluationProtocol, tables_of, write_report
-from stereogenbench_data.evaluation import tables
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.report import document, latex, markdown
 from stereogenbench_data.evaluation.tables import (
     PairMeans,
     Scores,
     cell,
-    release_difference,
     strata,
     table_of,
     tallies,
@@ -61,70 +57,22 @@ def rows(table):
     return [(row.method, *row.labels) for row in table.rows]
 
 
-@pytest.fixture
-def as_the_paper(monkeypatch):
-    """Take whatever was scored for what the paper scored."""
-    monkeypatch.setattr(tables, "paper_difference", lambda *_, **__: "")
-
-
-@pytest.mark.usefixtures("as_the_paper")
-def test_branches_stand_beside_the_papers_rows_of_the_same_tier(scores):
-    table = table_of([scores(tier="G1")], "branches")
-
-    assert rows(table) == [
-        ("ours", "seen_map", "Uniform"),
-        ("StereoSpace (paper)", "seen_map", "Uniform"),
-        ("ours", "unseen_map", "IPD_Gaussian"),
-        ("StereoSpace (paper)", "unseen_map", "IPD_Gaussian"),
-    ]
-    assert table.rows[0].values["psnr"].mean == (31 + 22) / 2
-    assert table.rows[1].values["psnr"] == "19.71"
-    assert (table.rows[0].scenes, table.rows[0].frames) == (2, 4)
-    assert "Rows of the paper as printed: tab:main-results" in markdown(table)
-
-
-def test_the_papers_rows_are_left_out_where_it_scored_other_scenes(scores):
+def test_a_row_averages_the_scenes_of_its_branch(scores):
     table = table_of([scores(tier="G1")], "branches")
 
     assert rows(table) == [("ours", "seen_map", "Uniform"), ("ours", "unseen_map", "IPD_Gaussian")]
-    assert table.notes == (
-        "The paper's rows are left out: these scores are of 3 of 3 scenes on maps that the "
-        "release does not have (SynthStage, SynthYard).",
-    )
+    assert table.rows[0].values["psnr"].mean == (31 + 22) / 2
+    assert (table.rows[0].scenes, table.rows[0].frames) == (2, 4)
 
 
-def test_only_all_scenes_of_a_branch_are_those_of_the_paper():
-    def difference(count, *, subset="seen_map", map_name="Stylized_Egypt", **scored):
-        columns = {
-            "map_name": np.array([map_name] * count, dtype=object),
-            "subset": np.array([subset] * count, dtype=object),
-            "family": np.array(["Uniform"] * count, dtype=object),
-        }
-        return release_difference(SimpleNamespace(column=columns.get), range(count), **scored)
-
-    assert difference(281) == ""
-    assert difference(102, subset="unseen_map") == ""
-    assert difference(281, scored="all").startswith("0 scenes of seen_map IPD_Gaussian")
-    assert difference(280) == "280 scenes of seen_map Uniform, of which the paper scored 281"
-    assert difference(5, subset=None) == "5 scenes of Uniform, of which the paper scored none"
-    assert (
-        difference(281, map_name="Home")
-        == "281 of 281 scenes on maps that the release does not have (Home)"
-    )
-
-
-@pytest.mark.usefixtures("as_the_paper")
-def test_bins_are_in_order_with_the_papers_beside(scores):
+def test_bins_are_in_order(scores):
     table = table_of([scores(tier="G1")], "bins_primary")
 
     assert rows(table) == [
         ("ours", "seen_map", "Uniform", "[1,10)"),
-        ("StereoSpace (paper)", "seen_map", "Uniform", "[1,10)"),
         ("ours", "seen_map", "Uniform", "[10,30)"),
-        ("StereoSpace (paper)", "seen_map", "Uniform", "[10,30)"),
         ("ours", "unseen_map", "IPD_Gaussian", "[100,150]"),
     ]
-    assert table.rows[1].values["psnr"] == "21.69 ± 1.04"
 
 
 def test_a_column_of_the_index_makes_strata(scores, scored_index):
@@ -140,7 +88,7 @@ def test_a_column_of_the_index_makes_strata(scores, scored_index):
 def test_methods_of_one_tier_share_a_table_and_those_of_two_do_not(scores):
     both = table_of([scores("one"), scores("two")], "branches")
 
-    assert [row.method for row in both.rows if row.source == "scored"] == ["one", "two"] * 2
+    assert [row.method for row in both.rows] == ["one", "two"] * 2
     with pytest.raises(EvaluationError, match=r"their tier differs \(G0 and G2\)"):
         tables_of([scores("one"), scores("two", tier="G2")])
     for change in ({"size": (240, 416)}, {"metrics": ("psnr",)}):
@@ -149,36 +97,18 @@ def test_methods_of_one_tier_share_a_table_and_those_of_two_do_not(scores):
             tables_of([scores("one"), scores("two", protocol=other)])
 
 
-def test_a_size_of_its_own_leaves_the_papers_rows_out_and_names_its_matchers(scores, monkeypatch):
-    monkeypatch.setattr(tables, "release_difference", lambda *_, **__: "")
-    table = table_of([scores(protocol=EvaluationProtocol(size=(240, 416)))], "branches")
-    text = markdown(table)
+def test_columns_name_the_matchers_that_they_were_measured_with(scores):
+    text = markdown(table_of([scores(protocol=EvaluationProtocol(size=(240, 416)))], "branches"))
+    mine = EvaluationProtocol(
+        keypoint_matcher="mine.py:DeDoDe", stereo_matcher="mine.py:FoundationStereo"
+    )
 
     assert "0.5000 ± 0.0000 [0.5000]" in text
     assert "1.0000 ± 0.0000 [1.0000]" in text
     assert "E_match (sift)↓" in text
     assert "SD filtered (sgbm)↓" in text
     assert "SD least squares (sgbm)↓" in text
-    assert "(paper)" not in text
-    assert "left out: it scores 81 frames a scene at 832x480, this 2 at 416x240." in text
-
-
-@pytest.mark.usefixtures("as_the_paper")
-def test_a_plug_in_of_any_name_is_named_and_the_papers_number_beside_it_marked(scores):
-    protocol = EvaluationProtocol(
-        keypoint_matcher="mine.py:DeDoDe", stereo_matcher="mine.py:FoundationStereo"
-    )
-    table = table_of([scores(tier="G1", protocol=protocol)], "branches")
-    text = markdown(table)
-    head, line = (
-        [each.strip() for each in line.split("|")]
-        for line in (text.splitlines()[2], text.splitlines()[5])
-    )
-    cells = dict(zip(head, line, strict=True))
-
-    assert "| E_match (DeDoDe)↓ |" in text
-    assert cells["SD filtered (FoundationStereo)↓ [median]"] == "0.3951 (by the paper's matcher)"
-    assert cells["SD least squares (FoundationStereo)↓ [median]"] == "-"
+    assert "| E_match (DeDoDe)↓ |" in markdown(table_of([scores(protocol=mine)], "branches"))
 
 
 def test_identical_and_undefined_frames_are_counted_in_the_cell(scores):

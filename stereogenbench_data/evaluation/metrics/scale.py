@@ -31,7 +31,7 @@ SD_OF_THE_PAPER: Final = (
     "the paper fits after 'outlier and occlusion filtering' and does not state its rule for "
     "outliers. SD depends on that rule, by a factor of two and more where the matcher errs, so "
     "two fits are reported: 'SD filtered' leaves out outliers by this package's own rule, 'SD "
-    "least squares' leaves out none. The paper's numbers stand in 'SD filtered', because the "
+    "least squares' leaves out none. Compare the paper's with 'SD filtered', because the "
     "paper leaves outliers out; a difference as large as that of the two fits may be the rule's"
 )
 """What to know when SD is compared with the paper's."""
@@ -44,7 +44,7 @@ FITS: Final[dict[FitMethod, str]] = {
 }
 """The fits of SD: reports show both, because SD depends on the choice and the paper leaves it open.
 
-The first stands beside the paper's numbers.
+The first is the one to compare with the paper's numbers.
 """
 
 
