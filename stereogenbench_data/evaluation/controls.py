@@ -151,8 +151,7 @@ def score_controls(
     index, scenes = select_pairs(
         data,
         fields_of(protocol),
-        size=protocol.size,
-        depth=protocol.depth,
+        protocol,
         options=options,
         conventions=conventions,
     )

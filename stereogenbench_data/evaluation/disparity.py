@@ -5,9 +5,10 @@ results, averages and tables. What is measured is said in `metrics.disparity`.
 """
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, Final, Unpack
 
@@ -26,11 +27,10 @@ from stereogenbench_data.evaluation.evaluate import (
     EVALUATION_DEFAULTS,
     EvaluationOptions,
     Run,
-    called_name,
     pair_scores,
-    prediction_root,
     scored_scenes,
     select_pairs,
+    source_of,
 )
 from stereogenbench_data.evaluation.metrics.disparity import (
     COLUMNS_OF_FRAMES,
@@ -41,18 +41,15 @@ from stereogenbench_data.evaluation.metrics.disparity import (
     REGIONS,
     frame_scores,
 )
-from stereogenbench_data.evaluation.predictions import (
-    CalledMethod,
-    PairFrames,
-    PredictionSource,
-    open_frames,
-)
+from stereogenbench_data.evaluation.predictions import CalledMethod
 from stereogenbench_data.evaluation.protocol import DisparityProtocol
 from stereogenbench_data.evaluation.scene_scores import (
     RESIZE,
     PairScores,
     SceneScores,
     SceneWork,
+    one_thread,
+    open_scene,
     versions,
 )
 from stereogenbench_data.evaluation.tables import (
@@ -66,7 +63,7 @@ from stereogenbench_data.evaluation.tables import (
     require_comparable,
     rows_of,
 )
-from stereogenbench_data.samples.fields import PAIR_FIELDS, Sample
+from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.signatures import list_options
@@ -111,21 +108,11 @@ def evaluate_disparity(
     """
     require_options(evaluate_disparity, options)
     protocol = protocol or DisparityProtocol()
-    source: PredictionSource
-    if callable(predictions):
-        called = called_name(predictions, name, options)
-        source = CalledMethod(called, predictions, ("left", "right"), accept_disparity)
-    else:
-        root = prediction_root(predictions, "disparity maps")
-        source = DisparityFolder(name or root.name, root, protocol.max_disparity_px)
-    index, scenes = select_pairs(
-        data,
-        (*_TRUTH, *source.inputs),
-        size=protocol.size,
-        depth=protocol.depth,
-        options=options,
-        conventions=conventions,
-    )
+    called = partial(CalledMethod, inputs=("left", "right"), accept=accept_disparity)
+    written = partial(DisparityFolder, max_disparity_px=protocol.max_disparity_px)
+    source = source_of(predictions, name, options, called=called, written=written)
+    fields = (*_TRUTH, *source.inputs)
+    index, scenes = select_pairs(data, fields, protocol, options=options, conventions=conventions)
     settings = _settings_of(protocol)
     run = Run(index, scenes, protocol, (source,), DISPARITY)
     with scored_scenes(run, score_disparity, {"settings": settings}, options) as out:
@@ -186,9 +173,6 @@ def score_disparity(
         MediaError: If a video of the data does not decode.
     """
     protocol = work.protocol
-    row = list(work.index.column("key")).index(work.scene)
-    needed = {*_TRUTH, *(each for source in work.sources for each in source.inputs)}
-    fields = tuple(name for name in PAIR_FIELDS if name in needed)
     gathered = {
         (source.name, wanted.pair): _PairErrors(
             PairScores({name: [] for name in COLUMNS_OF_FRAMES}), hashlib.sha256()
@@ -196,49 +180,25 @@ def score_disparity(
         for source in work.sources
         for wanted in work.pairs
     }
-    with ExitStack() as stack:
-        stack.enter_context(_one_thread())
-        load = stack.enter_context(
-            open_frames(work.index, fields, size=protocol.size, depth=protocol.depth)
-        )
-        reads = [(each.name, stack.enter_context(each.open(work.index))) for each in work.sources]
-        for batch in _batches(work.pairs, protocol.batch_frames):
-            for wanted, frames in batch:
-                samples = [load(row, wanted.pair, frame) for frame in frames]
-                for name, read in reads:
-                    found = gathered[name, wanted.pair]
-                    if found.scores.problem:
-                        continue
-                    try:
-                        maps = read(wanted, samples)
-                        found.add(maps, samples, protocol.max_disparity_px)
-                    except PredictionError as problem:
-                        found.scores = PairScores(problem=str(problem))
-                    except EvaluationError as problem:
-                        found.scores = PairScores(problem=f"{wanted.label}: {name}: {problem}")
-                after_frames(len(frames))
+    size, frames = protocol.batch_frames, work.pairs[0].frames
+    with one_thread(), open_scene(work, _TRUTH) as (load, reads):
+        # Some frames of every pair, which share cameras, and then those after them.
+        for start, wanted in product(range(0, len(frames), size), work.pairs):
+            samples = [load(wanted.pair, frame) for frame in frames[start : start + size]]
+            for name, read in reads.items():
+                found = gathered[name, wanted.pair]
+                if found.scores.problem:
+                    continue
+                try:
+                    found.add(read(wanted, samples), samples, protocol.max_disparity_px)
+                except PredictionError as problem:
+                    found.scores = PairScores(problem=str(problem))
+                except EvaluationError as problem:
+                    found.scores = PairScores(problem=f"{wanted.label}: {name}: {problem}")
+            after_frames(len(samples))
     for found in gathered.values():
         found.scores.views_sha256 = "" if found.scores.problem else found.pixels.hexdigest()
     return work.scene, {place: found.scores for place, found in gathered.items()}
-
-
-def _batches(
-    pairs: Sequence[PairFrames], size: int
-) -> Iterator[list[tuple[PairFrames, tuple[int, ...]]]]:
-    """Yield some frames of every pair, which share cameras, and then those after them."""
-    for start in range(0, len(pairs[0].frames), size):
-        yield [(wanted, wanted.frames[start : start + size]) for wanted in pairs]
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let torch compute on the calling thread alone: sums are then the same to the last digit."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def disparity_tables(

@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, fields
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from pickle import UnpicklingError
@@ -42,7 +43,11 @@ from stereogenbench_data.evaluation.predictions import (
     PredictionSource,
     Size,
 )
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol, require_tier
+from stereogenbench_data.evaluation.protocol import (
+    DisparityProtocol,
+    EvaluationProtocol,
+    require_tier,
+)
 from stereogenbench_data.evaluation.scene_scores import (
     How,
     PairScores,
@@ -58,7 +63,6 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import WORK_DEFAULTS, JobKind, WorkOptions, do_items, job_folder
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
-from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import may_pass
 from stereogenbench_data.selection.options import require_options
@@ -138,52 +142,49 @@ def evaluate(
     require_options(evaluate, options)
     protocol = protocol or EvaluationProtocol()
     known = require_tier(tier)
-    source: PredictionSource
-    if callable(predictions):
-        called = called_name(predictions, name, options)
-        source = CalledMethod(called, predictions, known.inputs)
-    else:
-        root = prediction_root(predictions, "predicted right views")
-        source = PredictionFolder(name or root.name, root)
-    index, scenes = select_pairs(
-        data,
-        (*fields_of(protocol), *source.inputs),
-        size=protocol.size,
-        depth=protocol.depth,
-        options=options,
-        conventions=conventions,
-    )
+    called = partial(CalledMethod, inputs=known.inputs)
+    source = source_of(predictions, name, options, called=called, written=PredictionFolder)
+    fields = (*fields_of(protocol), *source.inputs)
+    index, scenes = select_pairs(data, fields, protocol, options=options, conventions=conventions)
     (scores,) = score_pairs(Run(index, scenes, protocol, (source,), known.name), options)
     return scores
 
 
-def called_name(method: Method, name: str | None, options: EvaluationOptions) -> str:
-    """Return what a callable is called, and let it be called in this process.
+def source_of(
+    predictions: str | Path | Method,
+    name: str | None,
+    options: EvaluationOptions,
+    *,
+    called: Callable[[str, Method], PredictionSource],
+    written: Callable[[str, Path], PredictionSource],
+) -> PredictionSource:
+    """Return the source of predictions by its name: a callable, which this process calls, or files.
+
+    Args:
+        predictions: The callable, or the folder.
+        name: What tables call it, if that is stated.
+        options: How it is run; of a callable the workers are this process.
+        called: Makes the source of a name and a callable.
+        written: Makes the source of a name and a folder.
 
     Raises:
-        EvaluationError: If its results are to be kept, and nothing tells them from another's.
+        EvaluationError: If there is no such folder; if the results of a callable are to be kept,
+            and nothing tells them from another's.
     """
-    called = name or str(getattr(method, "__name__", type(method).__name__))
+    if not callable(predictions):
+        root = Path(predictions).resolve()
+        if not root.is_dir():
+            raise EvaluationError(f"{root}: is not a folder. Pass the folder of the predictions.")
+        return written(name or root.name, root)
+    label = name or str(getattr(predictions, "__name__", type(predictions).__name__))
     if options.get("out") and not name:
         raise EvaluationError(
-            f"{options['out']}: is to keep the scores of {called}, and another method may be "
+            f"{options['out']}: is to keep the scores of {label}, and another method may be "
             f"called so, too. Pass name=..., another for each method, parameter and "
             f"checkpoint, so that its scores are found again and no other's."
         )
     options["workers"], options["engine"] = 1, LOCAL
-    return called
-
-
-def prediction_root(predictions: str | Path, held: str) -> Path:
-    """Return the folder of predictions.
-
-    Raises:
-        EvaluationError: If it is none.
-    """
-    root = Path(predictions).resolve()
-    if not root.is_dir():
-        raise EvaluationError(f"{root}: is not a folder. Pass the folder that holds the {held}.")
-    return root
+    return called(label, predictions)
 
 
 ScoredPairs = Mapping[int, Sequence[PairFrames]]
@@ -193,9 +194,8 @@ ScoredPairs = Mapping[int, Sequence[PairFrames]]
 def select_pairs(
     data: Data,
     fields: Sequence[str],
+    protocol: EvaluationProtocol | DisparityProtocol,
     *,
-    size: Size | None,
-    depth: DepthEncoding | None,
     options: Mapping[str, Any],
     conventions: str | Path | Conventions | None = None,
 ) -> tuple[SceneIndex, ScoredPairs]:
@@ -204,8 +204,7 @@ def select_pairs(
     Args:
         data: What `StereoPairs` takes.
         fields: The fields of a sample that are needed.
-        size: (height, width) at which they are; None for the stored size.
-        depth: A depth contract instead of the one that files and release state.
+        protocol: At which size they are, and by which depth contract.
         options: The selection; `RunOptions` among it are ignored.
         conventions: As for `StereoPairs`.
 
@@ -222,13 +221,13 @@ def select_pairs(
     dataset = StereoPairs(
         data,
         fields=tuple(dict.fromkeys((*fields, "baseline_m"))),
-        size=size,
-        depth=depth,
+        size=protocol.size,
+        depth=protocol.depth,
         **selection,
     )
     _require_whole(dataset.index, dataset.left_out, "the warning says why.")
     _require_single_frames(dataset, selection)
-    return dataset.index, _pairs_of_scenes(dataset, size)
+    return dataset.index, _pairs_of_scenes(dataset, protocol.size)
 
 
 def _whole_data(

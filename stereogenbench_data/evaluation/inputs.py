@@ -25,7 +25,12 @@ from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.evaluate import select_pairs
 from stereogenbench_data.evaluation.predictions import PairFrames, frame_name, open_frames
-from stereogenbench_data.evaluation.protocol import PAPER_SIZE, Tier, require_tier
+from stereogenbench_data.evaluation.protocol import (
+    PAPER_SIZE,
+    EvaluationProtocol,
+    Tier,
+    require_tier,
+)
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.jobs import (
     WORK_DEFAULTS,
@@ -36,7 +41,6 @@ from stereogenbench_data.jobs import (
     job_folder,
     named_errors,
 )
-from stereogenbench_data.samples.fields import require_size
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.options import require_options
@@ -92,14 +96,14 @@ def export_inputs(
     """
     require_options(export_inputs, options)
     known, root = require_tier(tier), Path(out)
-    size = require_size(size)
+    protocol = EvaluationProtocol(size=size, depth=depth)
     index, scenes = select_pairs(
-        data, known.inputs, size=size, depth=depth, options=options, conventions=conventions
+        data, known.inputs, protocol, options=options, conventions=conventions
     )
     wanted = [pair for pairs in scenes.values() for pair in pairs]
     settings = {
         "tier": known.name,
-        "size": f"{size[1]}x{size[0]}",
+        "size": f"{protocol.size[1]}x{protocol.size[0]}",
         "frames": sorted({each.frames for each in wanted}),
         "data": index.digest,
     }

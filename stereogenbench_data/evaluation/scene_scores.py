@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
 from importlib.metadata import PackageNotFoundError, version
+from types import ModuleType
 from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
@@ -291,6 +292,30 @@ class SceneWork(Generic[How]):
         """The key of the scene."""
         return self.pairs[0].scene
 
+    @property
+    def row(self) -> int:
+        """Where the scene is in the index."""
+        return list(self.index.column("key")).index(self.scene)
+
+
+@contextmanager
+def open_scene(
+    work: SceneWork[Any], fields: Sequence[str]
+) -> Iterator[tuple[Callable[[Pair, int], Sample], dict[str, Read]]]:
+    """Yield what loads the sample of a pair and a frame, and what reads each source, by its name.
+
+    Args:
+        work: What to score.
+        fields: What scoring needs of a sample, besides what sources need.
+    """
+    needed = {*fields, *(each for source in work.sources for each in source.inputs)}
+    known = tuple(name for name in PAIR_FIELDS if name in needed)
+    size, depth = work.protocol.size, work.protocol.depth
+    with ExitStack() as stack:
+        load = stack.enter_context(open_frames(work.index, known, size=size, depth=depth))
+        reads = {each.name: stack.enter_context(each.open(work.index)) for each in work.sources}
+        yield partial(load, work.row), reads
+
 
 def score_scene(
     work: SceneWork[EvaluationProtocol], after_frames: Advance
@@ -308,19 +333,14 @@ def score_scene(
         ExtraError: If a package or weights that a metric needs are not there.
     """
     protocol = work.protocol
-    row = list(work.index.column("key")).index(work.scene)
-    needed = {*fields_of(protocol), *(each for source in work.sources for each in source.inputs)}
-    fields = tuple(name for name in PAIR_FIELDS if name in needed)
     frames = work.pairs[0].frames
-    with ExitStack() as stack:
-        load = stack.enter_context(
-            open_frames(work.index, fields, size=protocol.size, depth=protocol.depth)
-        )
-        load_stored = stack.enter_context(open_frames(work.index, ("right",)))
+    with (
+        open_scene(work, fields_of(protocol)) as (load, reads),
+        open_frames(work.index, ("right",)) as load_stored,
+    ):
         scorers = {
-            (source.name, wanted.pair): PairScorer(protocol, read, wanted)
-            for source in work.sources
-            for read in [stack.enter_context(source.open(work.index))]
+            (name, wanted.pair): PairScorer(protocol, read, wanted)
+            for name, read in reads.items()
             for wanted in work.pairs
         }
         for start in range(0, len(frames), protocol.batch_frames):
@@ -331,36 +351,34 @@ def score_scene(
             for frame in frames[start : start + protocol.batch_frames]:
                 pictures: dict[int, Any] = {}  # of each camera one array for all its pairs
                 for pair in targets:
-                    sample = load(row, pair, frame)
+                    sample = load(pair, frame)
                     for camera, view in zip(pair, ("left", "right"), strict=True):
                         sample[view] = pictures.setdefault(camera, sample[view])
-                    stored = partial(load_stored, row, pair, frame)
+                    stored = partial(load_stored, work.row, pair, frame)
                     targets[pair].append(TargetFrame(sample, matcher, load_stored=stored))
             for (_, pair), scorer in scorers.items():
                 scorer.add(targets[pair])
             after_frames(sum(map(len, targets.values())))
-    with one_thread():
+    with one_thread(require_opencv()):
         return work.scene, {place: scorer.scores() for place, scorer in scorers.items()}
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Let OpenCV and torch compute on the calling thread alone while the block runs.
+def one_thread(*libraries: ModuleType) -> Iterator[None]:
+    """Let torch, and OpenCV if it is given, compute on the calling thread alone in the block.
 
     Scores are then the same to the last digit, whatever else the process does.
-
-    Raises:
-        ExtraError: If OpenCV is not installed.
     """
-    opencv = require_opencv()
-    before = opencv.getNumThreads(), torch.get_num_threads()
-    opencv.setNumThreads(1)
-    torch.set_num_threads(1)
+    counts = [(torch.get_num_threads, torch.set_num_threads)]
+    counts += [(each.getNumThreads, each.setNumThreads) for each in libraries]
+    before = [now() for now, _ in counts]
+    for _, change in counts:
+        change(1)
     try:
         yield
     finally:
-        opencv.setNumThreads(before[0])
-        torch.set_num_threads(before[1])
+        for (_, change), threads in zip(counts, before, strict=True):
+            change(threads)
 
 
 @dataclass(slots=True)
@@ -401,7 +419,7 @@ class PairScorer:
         for picture in given:
             self._read_pixels.update(f"{picture.shape}".encode())
             self._read_pixels.update(np.ascontiguousarray(picture).data)
-        with one_thread():
+        with one_thread(require_opencv()):
             self._score(given, frames)
 
     def _score(self, given: Sequence[Any], frames: Sequence[TargetFrame]) -> None:
