@@ -122,7 +122,7 @@ REFERENCE: Mapping[str, tuple[str, Mapping[str, Sequence[str]]]] = {
     "synthesis": (
         "Generating scenes",
         {
-            "synthesis.produce": ("synthesise", "plan_scenes", "hold_out"),
+            "synthesis.produce": ("synthesise", "plan_scenes"),
             "synthesis.request": ("SynthRequest", "ExportContract"),
             "synthesis.renderer": ("Renderer", "World", "ScenePlan", "RenderedView"),
         },

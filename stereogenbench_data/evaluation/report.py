@@ -253,19 +253,7 @@ def latex(table: Table) -> str:
 
 def transposed(table: Table) -> list[list[str]]:
     """Return a table as cells, a row a column of it: few methods have many."""
-    scored = table.rows
-    has_several = len({row.method for row in scored}) > 1
-    heads = [
-        " ".join([*([row.method] if has_several else []), *filter(None, row.labels)])
-        for row in scored
-    ]
-    lines = [["", *heads], ["scenes, frames", *(f"{row.scenes}, {row.frames}" for row in scored)]]
-    if any(row.missing for row in scored):
-        lines.append(["pairs missing", *(str(row.missing) for row in scored)])
-    for name in table.columns:
-        cells = (_cell_text(table, row.values, name) for row in scored)
-        lines.append([heading(table, name), *cells])
-    return lines
+    return [list(row) for row in zip(*_texts(table), strict=True)]
 
 
 def verdict(results: Sequence[Scores]) -> str:

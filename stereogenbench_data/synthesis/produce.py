@@ -6,10 +6,9 @@ and the next run of the same request goes on with what is missing.
 """
 
 import hashlib
-import itertools
 import json
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +21,6 @@ from jaxtyping import Float64
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import SynthesisError, explain_os_errors
 from stereogenbench_data.jobs import WORK_DEFAULTS, WorkOptions, differing, do_items
-from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.signatures import list_options
@@ -49,8 +47,6 @@ _CURE: Final = (
 
 FOLDER: Final = ".generation"
 """Where unfinished scenes are drawn, below the root."""
-HOLDOUT: Final = ".holdout"
-"""Where scenes are that a person refused, below the root."""
 
 
 @list_options(WORK_DEFAULTS, {"workers": 1})
@@ -75,7 +71,7 @@ def synthesise(
             are spawned, so a script must call this function below ``if __name__ == "__main__"``.
 
     Returns:
-        The scenes' keys, by number, without those that are held out (`hold_out`).
+        The scenes' keys, by number.
 
     Raises:
         SynthesisError: If there is no such part or map, another process draws this part now, a
@@ -102,7 +98,7 @@ def synthesise(
                     total=len(indices) * per_scene,
                 )
             there = tree.existing(indices)
-    return [key for _, key in sorted(there.items()) if key is not None]
+    return [there[index] for index in sorted(there)]
 
 
 @list_options(WORK_DEFAULTS, {"workers": 1})
@@ -142,36 +138,6 @@ def plan_scenes(
     return {each.plan.proposal.index: each for each in found}
 
 
-def hold_out(out: str | Path, keys: Iterable[str]) -> None:
-    """Move scenes that a person refused out of the tree, into its hidden folder ``.holdout``.
-
-    A later run of their request does not draw them again.
-
-    Args:
-        out: Root of the tree.
-        keys: Whole paths of scenes below the root. All must be in the tree or in the holdout.
-
-    Raises:
-        SchemaError: If a key is no path of a scene.
-        SynthesisError: If there is no such scene, or a folder cannot be moved.
-
-    Source: the paper's preview-based manual pass.
-    """
-    root = Path(out)
-    moves = {root / parse_scene_key(key).key: root / HOLDOUT / key for key in keys}
-    for folder, target in moves.items():
-        if not (folder.is_dir() or target.is_dir()):
-            raise SynthesisError(
-                f"{folder}: there is no such scene to hold out. Name whole paths, such as "
-                f"train/Uniform/SynthStage/scene_000000."
-            )
-    with _disk_errors(root):
-        for folder, target in moves.items():
-            if folder.is_dir():
-                target.parent.mkdir(parents=True, exist_ok=True)
-                folder.rename(target)
-
-
 @dataclass(frozen=True, slots=True)
 class _Tree:
     """The scenes of a request in a tree; it is pickled into worker processes."""
@@ -192,21 +158,21 @@ class _Tree:
         """What the completion marker says of the renderer."""
         return f"{self.renderer.name} {self.renderer.fingerprint}"
 
-    def existing(self, indices: list[int]) -> dict[int, str | None]:
-        """Return the keys of the scenes that the tree has; None for those in the holdout.
+    def existing(self, indices: list[int]) -> dict[int, str]:
+        """Return the keys of the scenes that the tree has.
 
         Raises:
             SynthesisError: If another request wrote one of them.
         """
-        found: dict[int, str | None] = {}
-        for root, name in itertools.product((self.out / HOLDOUT, self.out), self.request.maps):
-            folder = root / self.request.folder(name)
+        found: dict[int, str] = {}
+        for name in self.request.maps:
+            folder = self.out / self.request.folder(name)
             there = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
             for index in indices:
                 key = self.request.key(index, map_name=name)
                 if key.rpartition("/")[2] in there:
-                    self._require_own(root / key, index)
-                    found[index] = None if root.name == HOLDOUT else key
+                    self._require_own(self.out / key, index)
+                    found[index] = key
         return found
 
     def _require_own(self, folder: Path, index: int) -> None:

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.audit.geometry.audit import audit
-from stereogenbench_data.errors import StereoGenBenchError, SynthesisError
+from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.schema.release import FAMILIES
 from stereogenbench_data.synthesis.filters import LIMITS, check_poses
 from stereogenbench_data.synthesis.maps import MAPS, open_map
 from stereogenbench_data.synthesis.planning import acceptance_markdown, plan_scene
-from stereogenbench_data.synthesis.produce import FOLDER, hold_out, plan_scenes, synthesise
+from stereogenbench_data.synthesis.produce import FOLDER, plan_scenes, synthesise
 from stereogenbench_data.synthesis.render import RAY_CASTING, RayCasting
 from stereogenbench_data.synthesis.renderer import RenderedView
 from stereogenbench_data.synthesis.request import SynthRequest
@@ -181,28 +181,7 @@ def test_a_renderer_that_always_fails_its_checks_ends_with_the_reason(tmp_path, 
     assert not list(tmp_path.rglob("*.mp4"))
 
 
-# Reports and the holdout.
-
-
-def test_held_out_scenes_leave_the_tree_and_do_not_come_back(tmp_path):
-    request = SynthRequest(scenes=2, **SMALL)
-    first, second = synthesise(tmp_path, request)
-
-    for _ in range(2):
-        hold_out(tmp_path, [first])
-
-    assert not (tmp_path / first).exists()
-    assert synthesise(tmp_path, request) == [second]
-    assert not (tmp_path / first).exists()
-
-
-@pytest.mark.parametrize("key", ["train/Uniform/Elsewhere/scene_000000", "../outside"])
-def test_a_holdout_of_what_is_no_scene_moves_nothing(tmp_path, key):
-    (there,) = synthesise(tmp_path, SynthRequest(**SMALL))
-
-    with pytest.raises(StereoGenBenchError, match=r"no such scene|not a valid folder"):
-        hold_out(tmp_path, [there, key])
-    assert (tmp_path / there).is_dir()
+# Reports.
 
 
 def test_the_report_counts_acceptance_by_map_and_reason_and_wide_rigs_are_refused_more(tmp_path):
