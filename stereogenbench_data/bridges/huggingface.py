@@ -4,9 +4,8 @@ from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Self, Unpack
 
-from stereogenbench_data.bridges.in_memory import SampleOptions, columns, samples_of, to_arrays
+from stereogenbench_data.bridges.in_memory import Decoder, SampleOptions, columns, to_arrays
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
-from stereogenbench_data.datasets.shared import SharedEpoch
 from stereogenbench_data.errors import (
     FieldError,
     SelectionError,
@@ -181,22 +180,11 @@ def features(*, depth_suffix: str = "mkv") -> "Features":
     )
 
 
-class RowDecoder:
-    """Turns rows of raw shards into samples; see `decode`."""
+class RowDecoder(Decoder):
+    """Turns rows of raw shards into samples; see `decode`.
 
-    def __init__(self, fields: tuple[str, ...], options: SampleOptions) -> None:
-        """Keep the fields and the options of the samples."""
-        self._fields, self._options, self._epoch = fields, options, SharedEpoch()
-
-    def set_epoch(self, epoch: int) -> None:
-        """Draw new random frames and transforms in rows that are mapped after this call.
-
-        Running workers, and datasets that hold this function, see it, too.
-
-        Raises:
-            SelectionError: If it is not a whole number from 0.
-        """
-        self._epoch.set(epoch)
+    ``set_epoch`` is seen by datasets that hold this function.
+    """
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         """Return this one: ``datasets`` copies functions where it concatenates or interleaves."""
@@ -230,10 +218,7 @@ class RowDecoder:
                 f"{row['__key__']}: the shard has no {', '.join(absent)}. If it was packed with "
                 '--depth-codec blosc2, read it with features(depth_suffix="b2frame").'
             )
-        epoch = self._epoch.value
-        found = samples_of(
-            row["__key__"], row, fields=self._fields, epoch=epoch, options=self._options
-        )
+        found = self._samples_of(row["__key__"], row, epoch=self._epoch.value)
         return [to_arrays(sample) for sample in found]
 
 

@@ -8,10 +8,12 @@ import json
 import tempfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Final, TypedDict
 
 from stereogenbench_data.datasets.mapped import StereoPairs
+from stereogenbench_data.datasets.shared import SharedEpoch
 from stereogenbench_data.errors import SelectionError, StorageError, explain_os_errors
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.index.table import SceneIndex
@@ -51,51 +53,55 @@ class SampleOptions(TypedDict, total=False):
     seed: int
 
 
-def samples_of(
-    key: str,
-    files: Mapping[str, Any],
-    *,
-    fields: tuple[str, ...],
-    epoch: int,
-    options: SampleOptions,
-) -> Iterator[Sample]:
-    """Yield the samples of one scene; none if no pair has a baseline within ``baseline_cm``.
+class Decoder:
+    """Turns scenes whose files are in memory into samples."""
 
-    Args:
-        key: The scene's key: its path.
-        files: File name to content in bytes; parsed JSON and decoded text are accepted too.
-            Unknown names are ignored.
-        fields: Names of the fields to return.
-        epoch: Seeds random frames and transforms, with the seed.
-        options: As for `StereoPairs`.
+    def __init__(self, fields: tuple[str, ...], options: SampleOptions) -> None:
+        """Keep the fields and the options of the samples."""
+        self._fields, self._options, self._epoch = fields, options, SharedEpoch()
 
-    Raises:
-        StorageError: If a file is missing, or the content of a video is not bytes.
-        SchemaError: If the key or a metadata file does not follow the format.
-        MediaError: If a video does not decode to what its header says.
-        SelectionError: If a pair or frame does not exist.
-    """
-    parse_scene_key(key)
-    with tempfile.TemporaryDirectory(prefix="stereogenbench-") as root:
-        folder = Path(root, key)
-        folder.mkdir(parents=True)
-        _write_files(key, files, folder)
-        index = SceneIndex.from_scenes([describe_scene(root, key)], root)
-        # Scenes draw different random numbers.
-        seed = (options.get("seed", 0) << 32 | zlib.crc32(key.encode())) % 2**63
-        seeded: dict[str, Any] = dict(options) | {"seed": seed}
-        try:
-            pairs = StereoPairs(index, fields=fields, **seeded)
-        except SelectionError:
-            if options.get("baseline_cm") is None:
-                raise
-            return
-        pairs.set_epoch(epoch)
-        try:
-            for number in range(len(pairs)):
-                yield pairs[number]
-        finally:
-            pairs.close()
+    def set_epoch(self, epoch: int) -> None:
+        """Draw new random frames and transforms from now on; running workers see it, too.
+
+        Raises:
+            SelectionError: If it is not a whole number from 0.
+        """
+        self._epoch.set(epoch)
+
+    def _samples_of(self, key: str, files: Mapping[str, Any], *, epoch: int) -> Iterator[Sample]:
+        """Yield the samples of one scene; none if no pair's baseline is within ``baseline_cm``.
+
+        Args:
+            key: The scene's key: its path.
+            files: File name to content in bytes; parsed JSON and decoded text are accepted too.
+                Unknown names are ignored.
+            epoch: Seeds random frames and transforms, with the seed.
+
+        Raises:
+            StorageError: If a file is missing, or the content of a video is not bytes.
+            SchemaError: If the key or a metadata file does not follow the format.
+            MediaError: If a video does not decode to what its header says.
+            SelectionError: If a pair or frame does not exist.
+        """
+        parse_scene_key(key)
+        with tempfile.TemporaryDirectory(prefix="stereogenbench-") as root:
+            folder = Path(root, key)
+            folder.mkdir(parents=True)
+            _write_files(key, files, folder)
+            index = SceneIndex.from_scenes([describe_scene(root, key)], root)
+            # Scenes draw different random numbers.
+            seed = (self._options.get("seed", 0) << 32 | zlib.crc32(key.encode())) % 2**63
+            seeded: dict[str, Any] = dict(self._options) | {"seed": seed}
+            try:
+                pairs = StereoPairs(index, fields=self._fields, **seeded)
+            except SelectionError:
+                if self._options.get("baseline_cm") is None:
+                    raise
+                return
+            pairs.set_epoch(epoch)
+            with closing(pairs):
+                for number in range(len(pairs)):
+                    yield pairs[number]
 
 
 def _write_files(key: str, files: Mapping[str, Any], folder: Path) -> None:

@@ -9,8 +9,7 @@
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Unpack
 
-from stereogenbench_data.bridges.in_memory import SampleOptions, samples_of
-from stereogenbench_data.datasets.shared import SharedEpoch
+from stereogenbench_data.bridges.in_memory import Decoder, SampleOptions
 from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS, Sample
 from stereogenbench_data.selection.filters import SceneFilters
 from stereogenbench_data.selection.options import require_options
@@ -18,24 +17,11 @@ from stereogenbench_data.selection.plan import SELECTION_DEFAULTS
 from stereogenbench_data.selection.signatures import list_options
 
 
-class SceneDecoder:
-    """Turns the scenes that ``webdataset`` reads into samples; see `decode`."""
+class SceneDecoder(Decoder):
+    """Turns the scenes that ``webdataset`` reads into samples; see `decode`.
 
-    def __init__(self, fields: tuple[str, ...], options: SampleOptions) -> None:
-        """Keep the fields and the options of the samples."""
-        self._fields = fields
-        self._options = options
-        self._epoch = SharedEpoch()
-
-    def set_epoch(self, epoch: int) -> None:
-        """Draw new random frames and transforms in iterations that start after this call.
-
-        Running workers see it, too.
-
-        Raises:
-            SelectionError: If it is not a whole number from 0.
-        """
-        self._epoch.set(epoch)
+    ``set_epoch`` is for iterations that start after it.
+    """
 
     def __call__(self, scenes: Iterable[Mapping[str, Any]]) -> Iterator[Sample]:
         """Yield the samples of every scene.
@@ -47,13 +33,7 @@ class SceneDecoder:
         """
         epoch = self._epoch.value
         for scene in scenes:
-            for sample in samples_of(
-                scene["__key__"],
-                scene,
-                fields=self._fields,
-                epoch=epoch,
-                options=self._options,
-            ):
+            for sample in self._samples_of(scene["__key__"], scene, epoch=epoch):
                 if "__url__" in sample and "__url__" in scene:
                     sample["__url__"] = scene["__url__"]
                 yield sample

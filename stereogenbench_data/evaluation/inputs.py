@@ -135,7 +135,8 @@ def _write_item(work: _ItemWork, after_frames: Advance) -> None:
         open_frames(work.index, fields, size=wanted.size, depth=work.depth) as load,
     ):
         for frame in wanted.frames:
-            inputs = work.tier.inputs_of(load(0, wanted.pair, frame))
+            sample = load(0, wanted.pair, frame)
+            inputs = {name: sample[name] for name in work.tier.inputs}
             _write_frame(unfinished, inputs, name=frame_name(frame))
             after_frames(1)
 

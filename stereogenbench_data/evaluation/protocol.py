@@ -6,10 +6,9 @@ Source: the StereoGenBench paper, section "Benchmark Protocol" and its appendix 
 conditions.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.columns import (
@@ -41,10 +40,6 @@ class Tier:
     name: Literal["G0", "G1", "G2"]
     meaning: str
     inputs: tuple[str, ...]
-
-    def inputs_of(self, sample: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the fields of a sample that a method of this tier may see."""
-        return {name: sample[name] for name in self.inputs}
 
 
 TIERS: Final[dict[str, Tier]] = {

@@ -27,15 +27,6 @@ LEAST_R2: Final = 0.1
 _MEDIAN_PIXELS: Final = 20_000
 """About how many pixels, evenly spaced in reading order, the medians of a fit are taken of."""
 
-SD_OF_THE_PAPER: Final = (
-    "the paper fits after 'outlier and occlusion filtering' and does not state its rule for "
-    "outliers. SD depends on that rule, by a factor of two and more where the matcher errs, so "
-    "two fits are reported: 'SD filtered' leaves out outliers by this package's own rule, 'SD "
-    "least squares' leaves out none. Compare the paper's with 'SD filtered', because the "
-    "paper leaves outliers out; a difference as large as that of the two fits may be the rule's"
-)
-"""What to know when SD is compared with the paper's."""
-
 FITS: Final[dict[FitMethod, str]] = {
     "filtered": "least squares without outliers: those farther from a median line (Theil's "
     f"incomplete method, of about {_MEDIAN_PIXELS} pixels) than {_OUTLIER_SIGMAS:g} robust "
@@ -141,7 +132,6 @@ def scale_settings(matcher: StereoMatcher) -> Settings:
     return {
         "matcher": matcher.name,
         **{f"sd_{method}": what for method, what in FITS.items()},
-        "paper": SD_OF_THE_PAPER,
         "occlusion": "pixels that the right camera does not see are not scored, by true depth",
         "range": "pixels whose true disparity the matcher cannot find are not scored, nor is a "
         f"frame of which they are more than {1 - _FEWEST_IN_RANGE:.0%}",
