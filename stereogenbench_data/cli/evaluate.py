@@ -24,7 +24,7 @@ from stereogenbench_data.cli.options import (
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.screen import print_report
-from stereogenbench_data.evaluation.columns import METRICS, OFFLINE_METRICS, require_metrics
+from stereogenbench_data.evaluation.columns import METRICS, OFFLINE_METRICS
 from stereogenbench_data.schema.text import counted
 
 if TYPE_CHECKING:
@@ -88,14 +88,7 @@ class ProtocolOptions:
         """
         from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 
-        return EvaluationProtocol(
-            metrics=require_metrics(self.metrics),
-            size=self.size,
-            keypoint_matcher=self.keypoint_matcher,
-            stereo_matcher=self.stereo_matcher,
-            device=self.device,
-            weights=self.weights,
-        )
+        return EvaluationProtocol(**vars(self))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,16 +20,10 @@ from stereogenbench_data.cli.progress import progress_bar
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportedPairOptions(ExportedOptions):
-    """Which pairs of which scenes are exported."""
+class ClipOptions:
+    """What a clip is, and of which pairs."""
 
     pairs: PairsOption = "primary"
-
-
-@dataclass(frozen=True, kw_only=True)
-class ClipOptions:
-    """What a clip is."""
-
     length: Annotated[int | None, option("Frames of a clip [the most that fit].")] = None
     stride: Annotated[int, option("Take one of this many frames.")] = 1
     step: Annotated[int | None, option("Frames from clip to clip [no overlap].")] = None
@@ -37,16 +31,6 @@ class ClipOptions:
     baseline_in_caption: Annotated[
         bool, flag("--baseline-in-caption", "Tell the baseline in the captions.")
     ] = False
-
-    def form(self) -> dict[str, Any]:
-        """Return what a clip is."""
-        return {
-            "length": self.length,
-            "stride": self.stride,
-            "step": self.step,
-            "size": self.size,
-            "captions": "with baseline" if self.baseline_in_caption else "plain",
-        }
 
 
 @grouped
@@ -58,7 +42,7 @@ def clips(
         Literal["diffsynth", "finetrainers", "musubi", "stereocrafter"],
         option("Whose manifests to write: the trainer's."),
     ],
-    chosen: ExportedPairOptions,
+    chosen: ExportedOptions,
     clip: ClipOptions,
     work: WorkOptions,
 ) -> None:
@@ -72,11 +56,19 @@ def clips(
     from stereogenbench_data.bridges.clips import export_clips
     from stereogenbench_data.schema.text import counted
 
-    form, selection = clip.form(), chosen.filters() | {"pairs": chosen.pairs}
-    index = source.open()
+    form: dict[str, Any] = dict(vars(clip))
+    captions: Any = "with baseline" if form.pop("baseline_in_caption") else "plain"
+    filters, index = chosen.filters(), source.open()
     with progress_bar("writing", unit="frames") as progress:
         report = export_clips(
-            index, out, layout=layout, progress=progress, **form, **work.options(), **selection
+            index,
+            out,
+            layout=layout,
+            captions=captions,
+            progress=progress,
+            **form,
+            **work.options(),
+            **filters,
         )
     if report.without_caption:
         typer.echo(f"{counted(report.without_caption, 'clip')} without a caption", err=True)

@@ -29,17 +29,11 @@ def _points_of(text: str) -> int | str:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions(ExportedOptions):
-    """Which views of which scenes are exported."""
+    """Which views of which scenes are exported, and how many points are in a folder."""
 
     cameras: CamerasOption = None
     frames: FramesOption = "first"
     size: SizeOption = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class FolderOptions(ViewOptions):
-    """The same, with how many points are in a folder."""
-
     points: Annotated[
         Any,
         option("3D points of a picture [5000; clouds 100000].", parser=_points_of, metavar="N|all"),
@@ -48,7 +42,7 @@ class FolderOptions(ViewOptions):
 
 @grouped
 def colmap(
-    source: DataOptions, out: OutArgument, *, chosen: FolderOptions, work: WorkOptions
+    source: DataOptions, out: OutArgument, *, chosen: ViewOptions, work: WorkOptions
 ) -> None:
     """Write COLMAP's text model with points from depth.
 
@@ -63,7 +57,7 @@ def colmap(
 
 @grouped
 def transforms(
-    source: DataOptions, out: OutArgument, *, chosen: FolderOptions, work: WorkOptions
+    source: DataOptions, out: OutArgument, *, chosen: ViewOptions, work: WorkOptions
 ) -> None:
     """Write transforms.json for nerfstudio, with depth and points.
 
@@ -76,7 +70,7 @@ def transforms(
 
 
 @grouped
-def ply(source: DataOptions, out: OutArgument, *, chosen: FolderOptions, work: WorkOptions) -> None:
+def ply(source: DataOptions, out: OutArgument, *, chosen: ViewOptions, work: WorkOptions) -> None:
     """Write coloured point clouds from depth as PLY.
 
     Points are in metres, x right, y down, z forward. Each folder has points.ply, and
@@ -93,18 +87,19 @@ def _export(
 ) -> None:
     from stereogenbench_data.bridges.export_views import export_views
 
-    names = ("cameras", "frames", "size", "points")
-    given: dict[str, Any] = chosen.filters() | {
-        name: value for name, value in vars(chosen).items() if name in names and value is not None
-    }
-    index = source.open()
+    cameras: Any = "all" if chosen.cameras is None else chosen.cameras
+    filters, index = chosen.filters(), source.open()
     with progress_bar("writing", unit="pictures") as progress:
         folders = export_views(
             index,
             out,
             layout=layout,
+            cameras=cameras,
+            frames=chosen.frames,
+            size=chosen.size,
+            points=chosen.points,
             progress=progress,
-            **given,
             **work.options(),
+            **filters,
         )
     typer.echo(f"{out}: {counted(len(folders), 'folder')}")

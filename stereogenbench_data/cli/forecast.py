@@ -8,38 +8,14 @@ from typing import Annotated, Any
 import typer
 
 from stereogenbench_data.cli.options import (
-    SCENES,
     DataOptions,
     SampleOptions,
     SizeOption,
-    frames_of,
     grouped,
     option,
 )
 
 _of = partial(option, panel="What trains, and on which network")
-
-
-def _trained_frames(text: str) -> Any:
-    """Return frames as `StereoPairs` takes them: drawn at random and clips, too."""
-    kind, _, number = text.partition(":")
-    is_drawn = kind in ("random", "clips") and number.isdecimal()
-    return (kind, int(number)) if is_drawn else frames_of(text)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainedOptions(SampleOptions):
-    """Which samples of which scenes are trained on."""
-
-    frames: Annotated[
-        Any,
-        _of(
-            "all, first, every:K, random:N, clips:LENGTH, or such as 0,40,80.",
-            panel=SCENES,
-            parser=_trained_frames,
-            metavar="FRAMES",
-        ),
-    ] = "all"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,12 +42,13 @@ def forecast(
         str | None, option("Such as left,right [the defaults].", metavar="NAMES")
     ] = None,
     batch_size: Annotated[int, option("Samples of a batch.", min=1)] = 8,
-    chosen: TrainedOptions,
+    chosen: SampleOptions,
 ) -> None:
     """Forecast what will limit a training: processors, network, requests.
 
     Bytes and requests of a sample follow from the index. Decoding is measured on this machine, for
-    seconds. The documentation has the formula; `stereogenbench_data.forecast` returns the numbers.
+    seconds. Frames may be random:N or clips:LENGTH, too. The documentation has the formula;
+    `stereogenbench_data.forecast` returns the numbers.
 
     Example: `stereogenbench forecast shards/ --samples-s 100 --delay-ms 60`
     """

@@ -137,12 +137,14 @@ def frames_of(text: str) -> Any:
     """Return frames as `StereoPairs` takes them."""
     if text in ("all", "first"):
         return text
-    every, _, step = text.partition(":")
-    if every == "every" and step.isdecimal():
-        return ("every", int(step))
+    kind, _, number = text.partition(":")
+    if kind in ("every", "random", "clips") and number.isdecimal():
+        return kind, int(number)
     if all(map(str.isdecimal, text.split(","))):
         return [int(number) for number in text.split(",")]
-    raise typer.BadParameter(f"{text!r} is not all, first, every:K or numbers such as 0,40,80.")
+    raise typer.BadParameter(
+        f"{text!r} is not all, first, every:K, random:N, clips:LENGTH or numbers such as 0,40,80."
+    )
 
 
 def filter_of(text: str) -> tuple[str, Any]:
