@@ -24,7 +24,8 @@ class Column:
 
 
 _SD_FITS: Final = {"filtered": "filtered", "least_squares": "least squares"}
-"""The fits of SD and what tables call them; the first is the one to compare with the paper's."""
+"""The fits of SD and what tables call them; the first is the one to compare with the paper's, which
+leaves outliers out and does not state by which rule."""
 
 EXPLAIN_A_FIT: Final = {
     "slope": ("a", 4),
@@ -91,11 +92,7 @@ FRAME_METRICS: Final[dict[str, tuple[str, ...]]] = {
     "p_psnr": ("p_psnr", "p_psnr_pooled", "p_psnr_ceiling", "p_psnr_outside"),
     "sd": tuple(name for name in COLUMNS if name.startswith("sd_")),
 }  # fmt: skip
-"""The columns of each metric that is computed frame by frame.
-
-The first is the headline. Of SD that is the filtered fit, because the paper leaves outliers out,
-though it does not state by which rule.
-"""
+"""The columns of each metric that is computed frame by frame."""
 
 HEAVY_TAILED: Final = frozenset(f"sd_{fit}" for fit in _SD_FITS)
 """Columns whose mean a few scenes can dominate: their median is shown and judged."""

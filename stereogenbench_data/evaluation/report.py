@@ -80,12 +80,9 @@ def page(results: Sequence[Scores], tables: Sequence[Table]) -> str:
     for one in results:
         covered = _coverage(one)
         missing = covered["missing"]
+        what = "disparity maps" if first.tier == DISPARITY else "right views"
         lines.append(
-            f"- {markdown_text(one.name)}: {counted(covered['pairs'], 'pair')} of "
-            f"{counted(covered['scenes'], 'scene')}, {counted(covered['frames'], 'frame')}, "
-            f"{'disparity maps' if first.tier == DISPARITY else 'right views'} sha256 "
-            f"{one.views_sha256}"
-            + (f", {counted(len(missing), 'pair')} missing" if missing else "")
+            f"- {markdown_text(one.name)}: {_counts(covered)}, {what} sha256 {one.views_sha256}"
         )
         lines += [f"  - missing: {markdown_text(each)}" for each in missing[:_GAPS_SHOWN]]
     lines += ["", *map(markdown, tables)]
@@ -228,6 +225,16 @@ def _coverage(one: Scores) -> dict[str, Any]:
     }
 
 
+def _counts(covered: Mapping[str, Any]) -> str:
+    """Return in words how much was scored of a method."""
+    missing = covered["missing"]
+    return (
+        f"{counted(covered['pairs'], 'pair')} of {counted(covered['scenes'], 'scene')}, "
+        f"{counted(covered['frames'], 'frame')}"
+        + (f", {counted(len(missing), 'pair')} missing" if missing else "")
+    )
+
+
 def markdown(table: Table) -> str:
     """Return a table in Markdown, with its title and notes."""
     notes = ["", *(f"- {note}" for note in table.notes)] if table.notes else []
@@ -261,16 +268,7 @@ def verdict(results: Sequence[Scores]) -> str:
     first = results[0]
     if first.tier == CONTROL:
         return _verdict_of_controls(results)
-    told = []
-    for one in results:
-        covered = _coverage(one)
-        missing = f", {counted(len(covered['missing']), 'pair')} missing" * bool(covered["missing"])
-        told.append(
-            f"{one.name}: {counted(covered['pairs'], 'pair')} of "
-            f"{counted(covered['scenes'], 'scene')} scored, "
-            f"{counted(covered['frames'], 'frame')}{missing}."
-        )
-    return "\n".join(told)
+    return "\n".join(f"{one.name}: scored {_counts(_coverage(one))}." for one in results)
 
 
 def _verdict_of_controls(results: Sequence[Scores]) -> str:
