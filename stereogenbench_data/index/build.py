@@ -5,6 +5,7 @@ The user's cache keeps the described scenes, so a killed run continues where it 
 
 import hashlib
 import json
+import math
 import os
 import warnings
 from collections import Counter, defaultdict
@@ -46,7 +47,7 @@ from stereogenbench_data.index.tree import (
 )
 from stereogenbench_data.index.tree_cache import NOTHING_KEPT, TreeCache
 from stereogenbench_data.media.depth import require_depth_stream
-from stereogenbench_data.media.heads import END_BYTES, Asked
+from stereogenbench_data.media.heads import END_BYTES
 from stereogenbench_data.schema.conventions import Conventions, depth_of
 from stereogenbench_data.schema.declaration import BUILT_IN, Declaration
 from stereogenbench_data.schema.document import brief
@@ -88,6 +89,8 @@ _SETTLED_BY_REMOTE: Final = 12
 """How many do so behind a URL, where each takes nine requests."""
 _TRIED: Final = 2
 """How many of them are described to know that; imports are part of the first."""
+_HEADS_BYTES: Final = 80_000
+"""What the heads of a scene's videos have, more or less."""
 _REQUESTS: Final = 2 * len(VIDEO_FILES) + len(METADATA_FILES)
 """The requests that describe a scene behind a URL: both ends of each video, and the small files."""
 _READERS: Final = 8
@@ -129,17 +132,25 @@ class Outcome:
         key: The scene.
         found: Its row, or why it has none: `IncompleteScene` where it was never finished.
         has_mark: Whether it has its completion mark.
+        poses: Its poses, where these were just read.
     """
 
     key: str
     found: Scene | StereoGenBenchError
     has_mark: bool = True
+    poses: Understood | None = None
 
     @property
     def lacks_poses(self) -> bool:
         """Whether it is a scene whose poses cannot be used."""
         found = self.found
-        return isinstance(found, Scene) and bool(found.remark("poses") or found.remark("left"))
+        return isinstance(found, Scene) and bool(found.remark("poses", "left"))
+
+    @property
+    def has_one_form(self) -> bool:
+        """Whether it is a scene of whose poses one form is known to be right."""
+        found = self.found
+        return isinstance(found, Scene) and not found.remark("poses", "left", "world")
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +169,6 @@ class Tree:
         conventions: Where quantities stand in the files; what they do not state is the release's.
         valid_depth: Whether depth pictures are decoded, see `walk`.
         checksums: Whether rows hold checksums, see `walk`.
-        reads: Whether of videos on this machine only heads are read, or all.
         files: Key to files, of scenes whose files are listed.
         stamp: A digest of all this, which changes when a file is added, removed or changed.
         settled: Where poses stand in all scenes and in which form; None where that is settled for
@@ -176,14 +186,16 @@ class Tree:
     conventions: Conventions | None = None
     valid_depth: ValidDepth = "skip"
     checksums: Checksums = "none"
-    reads: Literal["heads", "whole files"] = "heads"
     files: Mapping[str, Files] = field(default_factory=dict)
     stamp: str = ""
     settled: Understood | None = None
 
-    def with_poses_of(self, key: str) -> "Tree":
+    def with_poses_of(self, scene: Outcome) -> "Tree":
         """Return the tree with how one scene has its poses; that of conventions of one shape."""
-        folder, declared = self.folder(key), self.stated or BUILT_IN
+        if scene.poses is not None:
+            return replace(self, settled=scene.poses)
+        key, declared = scene.key, self.stated or BUILT_IN
+        folder = self.folder(key)
         with suppress(StereoGenBenchError):
             rig, _, _ = parse_rig(folder.read(BASELINE_JSON), where=key, declared=declared)
             text = folder.read(TRAJECTORY_JSON)
@@ -217,7 +229,7 @@ class Tree:
     def folder(self, key: str) -> SceneFolder:
         """Return a scene's folder; on this machine its files are listed anew."""
         if self.remote is None:
-            return (SceneFolder if self.reads == "heads" else WholeFiles)(self.root, key)
+            return (SceneFolder if self.checksums == "none" else WholeFiles)(self.root, key)
         return RemoteFolder(self.remote.root, key, self.files.get(key), self.cache)
 
     def finished(self, key: str) -> Files:
@@ -302,8 +314,8 @@ class Tree:
         videos: Collection[str] | None,
         *,
         kept: Literal["used", "ignored"] = "used",
-    ) -> tuple[Outcome, Understood | None]:
-        """Return what becomes of a scene, and its poses if it was not kept."""
+    ) -> Outcome:
+        """Return what becomes of a scene, of which some videos are opened if they are there."""
         files: Files = {}
         try:
             files = folder.stamps()
@@ -311,14 +323,14 @@ class Tree:
                 videos = None
             scene = self.kept(self.name_of(folder, videos)) if kept == "used" else None
             found = (scene, None) if scene is not None else self.opened(folder, videos)
-            return Outcome(folder.key, found[0], COMPLETE_JSON in files), found[1]
+            return Outcome(folder.key, found[0], COMPLETE_JSON in files, poses=found[1])
         except StereoGenBenchError as error:
-            return Outcome(folder.key, error, not files or COMPLETE_JSON in files), None
+            return Outcome(folder.key, error, not files or COMPLETE_JSON in files)
 
     def outcome(self, folder: SceneFolder, advance: Advance = no_advance) -> Outcome:
         """Return what becomes of a scene whose files are all read, in a worker process too."""
         advance(0)
-        return self.settling(folder, None)[0]
+        return replace(self.settling(folder, None), poses=None)
 
 
 def walk(  # noqa: PLR0913 - each is an option of the command
@@ -362,9 +374,7 @@ def walk(  # noqa: PLR0913 - each is an option of the command
             f"them without checksums."
         )
     tree = find_tree(root, wanted=wanted, if_none=if_none, conventions=conventions, retry=retry)
-    tree = replace(tree, valid_depth=valid_depth)
-    if checksums == "all":
-        tree = replace(tree, checksums="all", reads="whole files")
+    tree = replace(tree, valid_depth=valid_depth, checksums=checksums)
     return walk_tree(tree, workers=workers, engine=engine, progress=progress)
 
 
@@ -397,7 +407,8 @@ def walk_tree(
             tree.root, len(pending), each=_REQUESTS, what="all files", size_bytes=size_bytes
         )
     elif len(pending) > _MOST_UNTOLD_SCENES or tree.checksums == "all":
-        bare, tried, pending = _tried(bare, pending, workers=workers)
+        tried = _tried(bare, pending, workers=workers)
+        pending = pending[len(tried) :]
     others = engine.map(bare.outcome, pending, name=lambda folder: folder.key, workers=workers)
     for outcome in chain(tried, others):
         outcomes[outcome.key] = outcome
@@ -446,62 +457,60 @@ def settle(
     chosen = [tree.folder(keys[place]) for place in places]
     names = [None if videos == "all" else (rgb_name(camera), depth_name(camera))
              for camera in (place % CAMERA_COUNT for place in range(len(chosen)))]  # fmt: skip
-    opened: dict[str, tuple[Outcome, Understood | None]] = {}
+    outcomes: dict[str, Outcome] = {}
     several_shapes = bool((tree.stated or BUILT_IN).has)
+    guided = tree
     if tree.remote is None:
-        guided = tree
         for folder in chosen:
-            outcome, poses = guided.settling(folder, None)
+            outcome = guided.settling(folder, None)
             if guided.settled is not None and outcome.lacks_poses:
-                outcome, poses = tree.settling(folder, None)
-            opened[folder.key] = outcome, poses
+                outcome = tree.settling(folder, None)
+            outcomes[folder.key] = outcome
             if progress is not None:
-                progress(len(opened), len(tree.ids))
-            if poses is not None and len(poses.names) == 1 and not several_shapes:
-                guided = replace(tree, settled=guided.settled or poses)
+                progress(len(outcomes), len(tree.ids))
+            if guided.settled is None and outcome.has_one_form and not several_shapes:
+                guided = tree.with_poses_of(outcome)
     else:
         found = in_parallel(lambda each: tree.settling(*each), zip(chosen, names, strict=True))
-        opened = {out.key: (out, poses) for out, poses in found}
-    outcomes = {key: outcome for key, (outcome, _) in opened.items()}
+        outcomes = {outcome.key: outcome for outcome in found}
     if several_shapes:
         return tree, outcomes
-    return _with_common_poses(tree, chosen, names, opened)
+    return _with_common_poses(guided, chosen, names, outcomes)
 
 
 def _with_common_poses(
     tree: Tree,
     chosen: Sequence[SceneFolder],
     names: Sequence[Collection[str] | None],
-    opened: Mapping[str, tuple[Outcome, Understood | None]],
+    outcomes: dict[str, Outcome],
 ) -> tuple[Tree, dict[str, Outcome]]:
     """Return a tree that reads poses as most of some scenes have them, and these read so."""
-    outcomes = {key: outcome for key, (outcome, _) in opened.items()}
-    posed = [out.found for out in outcomes.values()
-             if isinstance(out.found, Scene) and not out.lacks_poses]  # fmt: skip
-    forms = {scene.id.key: scene.pose_form for scene in posed}
-    plain = {scene.id.key: scene.pose_form for scene in posed if not scene.remark("world")}
-    if not plain:
+    forms = {key: each.found.pose_form for key, each in outcomes.items()
+             if isinstance(each.found, Scene) and each.has_one_form}  # fmt: skip
+    votes = Counter(forms.values()).most_common()
+    if not votes:
         return tree, outcomes
-    votes = Counter(plain.values()).most_common()
     form, count = votes[0]
-    if 2 * count <= len(plain):
-        firsts = [next(key for key in plain if plain[key] == each) for each, _ in votes]
+    of_form = {each: key for key, each in reversed(forms.items())}  # the first scene of each
+    if 2 * count <= len(forms):
         listed = "".join(
-            f"\n  {counted(number, 'scene')}, such as {key}: {shortened(each or _USUAL_FORM, 200)}"
-            for key, (each, number) in zip(firsts[:_NAMED], votes, strict=False)
+            f"\n  {counted(number, 'scene')}, such as {of_form[each]}: "
+            f"{shortened(each or _USUAL_FORM, 200)}"
+            for each, number in votes[:_NAMED]
         )
         raise StorageError(
             f"{shown(tree.root)}: no form of poses is that of most scenes. Of those that were "
             f"looked at{listed}\nWrite a [[shape]] for each kind into a file of conventions, with "
             f"the keys that it has, and give the file as conventions= or --conventions."
         )
-    guide = next(key for key in plain if plain[key] == form)
-    odd = [place for place, folder in enumerate(chosen) if forms.get(folder.key, form) != form]
-    if odd or len(tree.ids) > len(chosen):
-        settled = opened[guide][1]
-        tree = tree.with_poses_of(guide) if settled is None else replace(tree, settled=settled)
-    for place in odd:
-        outcomes[chosen[place].key] = tree.settling(chosen[place], names[place], kept="ignored")[0]
+    if tree.settled is None or tree.settled.form != form:
+        tree = tree.with_poses_of(outcomes[of_form[form]])
+    for folder, videos in zip(chosen, names, strict=True):
+        outcome = outcomes[folder.key]
+        if isinstance(outcome.found, Scene) and outcome.found.pose_form != form and (
+            not outcome.lacks_poses
+        ):  # fmt: skip
+            outcomes[folder.key] = tree.settling(folder, videos, kept="ignored")
     return tree, outcomes
 
 
@@ -533,50 +542,28 @@ def _asked_bytes(files: Files) -> int:
                for name, (size, _) in files.items())  # fmt: skip
 
 
-def _tried(
-    tree: Tree, pending: Sequence[SceneFolder], *, workers: int | None
-) -> tuple[Tree, list[Outcome], list[SceneFolder]]:
-    """Describe some scenes, and tell what the others will take.
-
-    Where a disk takes most of the time to read heads, one more is read through: if that is faster,
-    the others are, too.
-
-    Returns:
-        How the others are read, what became of the first, and the others.
-    """
+def _tried(tree: Tree, pending: Sequence[SceneFolder], *, workers: int | None) -> list[Outcome]:
+    """Return what becomes of some scenes, having told what the others will take."""
     outcomes: list[Outcome] = []
-
-    def tried(folder: SceneFolder) -> float:
+    each_s = math.inf
+    for folder in pending[:_TRIED]:
         begins_s = perf_counter()
         outcomes.append(tree.outcome(folder))
-        return perf_counter() - begins_s
-
-    folders = [tree.folder(each.key) for each in pending[:_TRIED]]
-    each_s = min(map(tried, folders), default=0.0)
-    asked = folders[-1].asked if folders else Asked()
-    if tree.reads == "heads" and asked.took_s > each_s / 2:
-        whole = WholeFiles(tree.root, pending[_TRIED].key)
-        whole_s = tried(whole)
-        if whole_s < each_s:
-            tree, each_s, asked = replace(tree, reads="whole files"), whole_s, whole.asked
-    others = [tree.folder(each.key) for each in pending[len(outcomes) :]]
-    if others:
-        _tell_reads(tree, len(others), asked, took_s=each_s, workers=workers)
-    return tree, outcomes, others
-
-
-def _tell_reads(
-    tree: Tree, scenes: int, each: Asked, *, took_s: float, workers: int | None
-) -> None:
-    """Warn of what so many scenes take, of which one took some seconds."""
-    workers = min(workers or os.cpu_count() or 1, scenes)
-    what = "the heads of all videos" if tree.reads == "heads" else "all files through"
-    told = (
-        f"{shown(tree.root)}: reads {what} of {scenes} scenes, some {_size(each.bytes * scenes)} "
-        f"in {each.reads * scenes:,} reads, which takes some {_lasting(took_s * scenes / workers)} "
-        f"by {counted(workers, 'worker')}. An interrupted run goes on where it stopped."
-    )
-    warnings.warn(told, ManyReadsWarning, stacklevel=2)
+        each_s = min(each_s, perf_counter() - begins_s)
+    if scenes := len(pending) - len(outcomes):
+        workers = min(workers or os.cpu_count() or 1, scenes)
+        what, each_bytes = "the heads of all videos", _HEADS_BYTES
+        if tree.checksums == "all":
+            found = [out.found for out in outcomes if isinstance(out.found, Scene)]
+            sizes = (sum(file.size for file in scene.members.values()) for scene in found)
+            what, each_bytes = "all files through", max(sizes, default=0)
+        told = (
+            f"{shown(tree.root)}: reads {what} of {scenes} scenes, some "
+            f"{_size(each_bytes * scenes)}, which takes some {_lasting(each_s * scenes / workers)} "
+            f"by {counted(workers, 'worker')}. An interrupted run goes on where it stopped."
+        )
+        warnings.warn(told, ManyReadsWarning, stacklevel=2)
+    return outcomes
 
 
 def _size(size_bytes: int) -> str:

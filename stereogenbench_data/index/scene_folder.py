@@ -52,7 +52,7 @@ from stereogenbench_data.media.depth import (
     resolve_encoding,
 )
 from stereogenbench_data.media.depth_frames import CODEC_NAME
-from stereogenbench_data.media.heads import Heads, heads_of
+from stereogenbench_data.media.heads import heads_of
 from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
 from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
 from stereogenbench_data.schema.conventions import Conventions, declaration_of_text, keys_of
@@ -122,15 +122,13 @@ class IncompleteScene(StorageError):
     """A scene that is not finished, or of which only metadata were fetched."""
 
 
-def describe_scene(  # noqa: PLR0913 - each says what is known of the scene already
+def describe_scene(
     root: str | Path,
     key: str,
     *,
-    valid_depth: ValidDepth = "skip",
     conventions: Conventions | None = None,
     folder: SceneFolder | None = None,
     videos: Collection[str] | None = None,
-    settled: Understood | None = None,
 ) -> Scene:
     """Return the index row of a finished scene.
 
@@ -140,12 +138,9 @@ def describe_scene(  # noqa: PLR0913 - each says what is known of the scene alre
     Args:
         root: The folder that holds ``train`` and ``eval``, or its URL.
         key: The scene's path below it.
-        valid_depth: "sample" decodes the first, middle and last depth picture of each camera, for
-            the share of pixels that have a depth.
         conventions: Where quantities stand and how they are read, in place of the release's.
         folder: Its folder, where that is listed already.
         videos: Names of the videos to open; None is all. The row then holds for these alone.
-        settled: How the poses of the tree's scenes are read; without it they are searched for.
 
     Raises:
         IncompleteScene: If the scene has no video at all.
@@ -153,8 +148,8 @@ def describe_scene(  # noqa: PLR0913 - each says what is known of the scene alre
             other or the conventions, or `SchemaError` or `MediaError` if one of them is not
             understood. All problems of all files are in one message.
     """
-    described = Description(folder or folder_of(root, key), key, settled)
-    return described.scene(conventions, videos=videos, valid_depth=valid_depth)
+    described = Description(folder or folder_of(root, key), key)
+    return described.scene(conventions, videos=videos)
 
 
 class Description:
@@ -300,8 +295,6 @@ class Description:
                 try:
                     with heads_of(video, name=self.where(held)) as known:
                         self.probe_video(name, held, known)
-                        if isinstance(known, Heads) and isinstance(video, Path):
-                            self.folder.asked += known.asked
                 except MediaError as error:
                     self.unread[held] = str(error)
                 finally:

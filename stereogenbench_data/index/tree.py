@@ -20,7 +20,6 @@ import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from time import perf_counter
 from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
@@ -31,7 +30,7 @@ from stereogenbench_data.errors import (
 )
 from stereogenbench_data.index.tree_cache import NOTHING_KEPT, TreeCache
 from stereogenbench_data.media.container import BinaryFile
-from stereogenbench_data.media.heads import END_BYTES, Asked
+from stereogenbench_data.media.heads import END_BYTES
 from stereogenbench_data.schema.document import MAX_TEXT_BYTES, require_text_size
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import (
@@ -47,7 +46,6 @@ from stereogenbench_data.sources.location import is_remote
 from stereogenbench_data.sources.members import read_text_file
 from stereogenbench_data.sources.ranged_file import RangedFile
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import RetryPolicy
 
 _T = TypeVar("_T")
 _Item = TypeVar("_Item")
@@ -77,10 +75,10 @@ def in_parallel(read: Callable[[_Item], _T], items: Iterable[_Item]) -> Iterator
         yield from pool.map(read, items)
 
 
-def folder_of(root: str | Path, key: str, *, retry: RetryPolicy | None = None) -> "SceneFolder":
+def folder_of(root: str | Path, key: str) -> "SceneFolder":
     """Return a scene's folder on this machine or behind a URL; nothing is read yet."""
     if is_remote(root):
-        return RemoteFolder(RemoteObject(str(root), retry=retry), key)
+        return RemoteFolder(RemoteObject(str(root)), key)
     return SceneFolder(root, key)
 
 
@@ -104,10 +102,7 @@ class SceneFolder:
 
     Attributes:
         key: The scene's key.
-        asked: What was asked for of its videos so far.
     """
-
-    asked = Asked()
 
     def __init__(self, root: str | Path, key: str) -> None:
         """Name the folder by the data's root and the scene's key; nothing is read yet."""
@@ -227,10 +222,9 @@ class WholeFiles(SceneFolder):
         Raises:
             StorageError: If it cannot be read.
         """
-        begins_s, path = perf_counter(), Path(self._root, self.key, name)
+        path = Path(self._root, self.key, name)
         with explain_os_errors(f"{path}: cannot be read", "Fetch it again."):
             content = path.read_bytes()
-        self.asked += Asked(len(content), 1, perf_counter() - begins_s)
         self._crc32s[name] = zlib.crc32(content)
         return io.BytesIO(content)
 

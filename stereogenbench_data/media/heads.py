@@ -10,10 +10,8 @@ Source: RFC 8794 (EBML), RFC 9559 (Matroska), ISO/IEC 14496-12 (MP4).
 from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
-from time import perf_counter
 from typing import Final
 
 from stereogenbench_data.errors import explain_os_errors
@@ -56,25 +54,11 @@ _BOX_BYTES: Final = 16
 """Bytes of a box's size and type, with a long size behind them."""
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """What was asked for of files: bytes, in reads, which took some seconds."""
-
-    bytes: int = 0
-    reads: int = 0
-    took_s: float = 0.0
-
-    def __add__(self, other: "Asked") -> "Asked":
-        """Return the sum."""
-        return Asked(self.bytes + other.bytes, self.reads + other.reads, self.took_s + other.took_s)
-
-
 class Heads(SeekableFile):
     """A video whose packets seem to be zeros.
 
     Attributes:
         video: The video: a path, or an open file.
-        asked: What was asked for of it.
     """
 
     has_packets = False
@@ -90,7 +74,6 @@ class Heads(SeekableFile):
         self._is_own = isinstance(video, str | Path)
         super().__init__(self._file.seek(0, 2))
         self.video = video
-        self.asked = Asked()
         self._starts: list[int] = []
         self._parts: list[bytearray] = []
         self._hidden = range(0)
@@ -114,11 +97,10 @@ class Heads(SeekableFile):
         first, known = self._starts[number], self._parts[number]
         if start >= first and stop <= first + len(known):
             return bytes(known[start - first : stop - first])
-        begins_s, found = perf_counter(), b""
+        found = b""
         self._file.seek(start)
         while len(found) < stop - start and (more := self._file.read(stop - start - len(found))):
             found += more
-        self.asked += Asked(len(found), 1, perf_counter() - begins_s)
         return found
 
     def hide(self, start: int, stop: int) -> None:

@@ -40,14 +40,16 @@ def painted(frames: int = FRAMES) -> np.ndarray:
 
 
 class CountingFile(io.BytesIO):
-    """A file in memory that counts the bytes read from it."""
+    """A file in memory that counts the bytes read from it, and in how many reads."""
 
     bytes_read = 0
+    reads = 0
 
     def read(self, size: int | None = -1) -> bytes:
         """Read, and count."""
         content = super().read(size)
         self.bytes_read += len(content)
+        self.reads += 1
         return content
 
 
