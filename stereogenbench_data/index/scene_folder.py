@@ -49,7 +49,7 @@ from stereogenbench_data.media.depth import (
     open_video,
     read_depth_units,
     require_depth_stream,
-    resolve_encoding,
+    stated_unit,
 )
 from stereogenbench_data.media.depth_frames import CODEC_NAME
 from stereogenbench_data.media.heads import heads_of
@@ -71,7 +71,6 @@ from stereogenbench_data.schema.parse import (
     require_unit,
 )
 from stereogenbench_data.schema.records import (
-    DepthEncoding,
     DepthUnitSource,
     Member,
     Remark,
@@ -108,6 +107,8 @@ _NO_DEPTH: Final = StreamFacts(CODEC_NAME, "gray16le", 0, 0, 0, 0.0, {})
 """What the index says of depth of a scene of training shards that has none."""
 _DEVIATION_CM: Final = 0.1
 _DEVIATION_SHARE: Final = 0.001
+_UNREADABLE: Final[tuple[float, DepthUnitSource]] = (math.nan, "unreadable")
+"""The unit of depth of a camera whose files do not tell it."""
 _SAME_UNIT: Final = 1.005
 """Units of depth of one rig that differ by a larger factor are several, and not rounded."""
 _SQUARE: Final = 0.01
@@ -471,21 +472,21 @@ class Description:
                     stated += stated_in_json(
                         document, name=self.where(name), about="" if name in read else stem
                     )
-        found: list[DepthEncoding | None] = []
+        found: list[tuple[float, DepthUnitSource]] = []
         problems: list[str] = []
         for name, facts in depths:
             try:
-                found.append(resolve_encoding(facts, name=self.where(name), stated=stated))
+                found.append(stated_unit(facts, name=self.where(name), stated=stated))
             except MediaError as error:
-                found.append(None)
+                found.append(_UNREADABLE)
                 problems.append(str(error))
-        known = [each for each in found if each is not None]
-        units_m = [each.known_unit_m for each in known]
+        known = [each for each in found if each is not _UNREADABLE]
+        units_m = [unit_m for unit_m, _ in known]
         if units_m and max(units_m) > _SAME_UNIT * min(units_m):
-            found = [None] * len(found)
+            found = [_UNREADABLE] * len(found)
             listed = ", ".join(
-                f"{each.known_unit_m:g}{' by default' if each.source == 'default' else ''}"
-                for each in known
+                f"{unit_m:g}{' by default' if source == 'default' else ''}"
+                for unit_m, source in known
             )
             problems.append(
                 f"{self.key}: its cameras' units of depth differ by a scale: {listed} m. "
@@ -493,19 +494,15 @@ class Description:
             )
         depth = None if self.shape is None else self.shape.depth
         if depth is not None and depth.encoding.unit_m is not None:
-            for (name, _), each in zip(depths, found, strict=True):
-                if each is not None and each.source in ("tag", "metadata"):
-                    depth.require(each.known_unit_m, each.offset_m, where=self.where(name))
+            for (name, _), (unit_m, source) in zip(depths, found, strict=True):
+                if source in ("tag", "metadata"):
+                    depth.require(unit_m, 0.0, where=self.where(name))
             return [(depth.encoding.unit_m, depth.encoding.offset_m, "conventions")] * len(found)
         if problems:
             others = len(problems) - 1
             more = f" ({counted(others, 'other video')} likewise.)" if others else ""
             self.remark("depth", problems[0] + more)
-        return [
-            (math.nan, 0.0, "unreadable") if each is None or each.source == "user"
-            else (each.known_unit_m, each.offset_m, each.source)
-            for each in found
-        ]  # fmt: skip
+        return [(unit_m, 0.0, source) for unit_m, source in found]
 
     def valid_depth_ratio(self, frames: int) -> float:
         """Return the share of pixels of some depth pictures that have a depth."""

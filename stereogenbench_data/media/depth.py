@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
-from typing import Final, cast, get_args
+from typing import Final, Literal, cast, get_args
 
 import av
 import numpy as np
@@ -265,14 +265,10 @@ def _not_numbers(name: str, why: str) -> MediaError:
     )
 
 
-def resolve_encoding(
-    facts: StreamFacts,
-    *,
-    name: str,
-    override: DepthEncoding | None = None,
-    stated: Sequence[Statement] = (),
-) -> DepthEncoding:
-    """Return how a depth stream's numbers become metres: as the user says, else as files state.
+def stated_unit(
+    facts: StreamFacts, *, name: str, stated: Sequence[Statement] = ()
+) -> tuple[float, Literal["tag", "metadata", "default"]]:
+    """Return the metres in a stored unit of a depth stream, and what states it.
 
     Tags of the container and the stream and the scene's JSON are read as `depth_contract` reads
     them; all must agree. Where nothing is stated the release's default holds, 0.1 m.
@@ -280,7 +276,6 @@ def resolve_encoding(
     Args:
         facts: What `probe` found.
         name: What messages call the file.
-        override: The user's contract, which counts instead of the files if it has a unit.
         stated: What the scene's JSON says.
 
     Raises:
@@ -288,16 +283,11 @@ def resolve_encoding(
 
     Source: the paper's appendix on the file schema.
     """
-    if override is not None and override.unit_m is not None:
-        return replace(override, source="user")
-    contract = override or DepthEncoding()
     try:
         found = agreed([*stated_in_tags(facts.tags, name=name), *stated])
     except SchemaError as error:
         raise MediaError(f"{error}. {DEPTH_CURES}") from error
-    if found.unit_m is None:
-        return contract.with_file_unit(DEFAULT_DEPTH_UNIT_M, source="default")
-    return contract.with_file_unit(found.unit_m, source=found.origin)
+    return found or (DEFAULT_DEPTH_UNIT_M, "default")
 
 
 def measured(

@@ -101,19 +101,6 @@ class Statement:
         return f"{self.place} {self.text}"
 
 
-@dataclass(frozen=True, slots=True)
-class StatedDepth:
-    """What all statements together say.
-
-    Attributes:
-        unit_m: Metres in a stored unit; None where nothing is stated.
-        origin: Where the unit stands.
-    """
-
-    unit_m: float | None = None
-    origin: Origin = "tag"
-
-
 def stated_in_tags(tags: Mapping[str, str], *, name: str) -> list[Statement]:
     """Return what the tags of a depth video say of its unit."""
     found: list[Statement] = []
@@ -273,8 +260,10 @@ def _ratio(key: str) -> tuple[bool, float] | None:
     return None
 
 
-def agreed(statements: Sequence[Statement]) -> StatedDepth:
-    """Return the unit that all statements give.
+def agreed(statements: Sequence[Statement]) -> tuple[float, Origin] | None:
+    """Return the metres in a stored unit that all statements give, and where it stands.
+
+    None where nothing is stated.
 
     Raises:
         SchemaError: If they contradict each other, or do not tell the unit although they are about
@@ -290,16 +279,16 @@ def agreed(statements: Sequence[Statement]) -> StatedDepth:
     everything = [*numbers, *told]
     if not everything:
         _refuse("does not tell how many metres a stored unit has", statements)
-        return StatedDepth()
+        return None
     if all(each.is_bare and each.values == (1.0,) for each in everything):
         _refuse("may mean a metre, or that stored numbers are not scaled", everything)
     for unit_m in min(everything, key=lambda each: len(each.values)).values:
         if all(any(abs(value - unit_m) <= _SAME * unit_m for value in each.values)
                for each in everything):  # fmt: skip
             is_tagged = any(each.origin == "tag" for each in everything)
-            return StatedDepth(unit_m, origin="tag" if is_tagged else "metadata")
+            return unit_m, "tag" if is_tagged else "metadata"
     _refuse("contradict each other", everything)
-    return StatedDepth()
+    return None
 
 
 def _refuse(why: str, statements: Sequence[Statement]) -> None:

@@ -202,22 +202,10 @@ class DepthEncoding:
         """
         if self.unit_m is None:
             raise SchemaError(
-                "unit_m is None, so the unit depends on the file: resolve it with "
-                "`resolve_encoding`, or set unit_m."
+                "unit_m is None, so the unit depends on the file: take what "
+                "`Scene.depth_encoding` returns, or set unit_m."
             )
         return self.unit_m
-
-    def with_file_unit(
-        self,
-        unit_m: float,
-        *,
-        source: Literal["tag", "metadata", "default", "conventions"],
-        offset_m: float = 0.0,
-    ) -> "DepthEncoding":
-        """Return the encoding with the file's unit and offset, unless it has its own unit."""
-        if self.unit_m is not None:
-            return self
-        return replace(self, unit_m=unit_m, source=source, offset_m=offset_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,11 +315,10 @@ class Scene:
         """
         contract = contract or DepthEncoding()
         source = self.depth_unit_source[camera]
-        if source == "unreadable":
+        if source == "unreadable" or contract.unit_m is not None:
             return contract
-        return contract.with_file_unit(
-            self.depth_unit_m[camera], source=source, offset_m=self.depth_offset_m[camera]
-        )
+        unit_m, offset_m = self.depth_unit_m[camera], self.depth_offset_m[camera]
+        return replace(contract, unit_m=unit_m, offset_m=offset_m, source=source)
 
     def held_name(self, name: str) -> str:
         """Return the name in ``members`` of one of the release's files: depth may be packed."""

@@ -10,7 +10,7 @@ import pytest
 
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media import depth_frames
-from stereogenbench_data.media.depth import packed_depth, resolve_encoding, write_depth_video
+from stereogenbench_data.media.depth import packed_depth, stated_unit, write_depth_video
 from stereogenbench_data.media.depth_frames import (
     LAYER,
     DepthFrames,
@@ -87,7 +87,7 @@ def test_its_facts_are_those_of_the_video(packed, video):
 
     assert found == replace(told, codec="blosc2")
     assert probe(io.BytesIO(packed), name="cam_00_depth.b2frame") == found
-    assert resolve_encoding(found, name="it").unit_m == 0.001
+    assert stated_unit(found, name="it") == (0.001, "tag")
 
 
 @pytest.mark.parametrize("index", [0, 2, 5])

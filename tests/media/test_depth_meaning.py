@@ -11,28 +11,25 @@ from stereogenbench_data.media.depth import (
     depth_frame_index,
     depth_m_from_units,
     measured,
-    resolve_encoding,
+    stated_unit,
 )
 from stereogenbench_data.schema.records import DepthEncoding
 
 CAMERA = Intrinsics(1.5, 2.0, 0.5, 0.5, 3, 1)
-USERS = DepthEncoding(unit_m=0.02, kind="ray", source="tag")
 
 
 @pytest.mark.parametrize(
-    ("tags", "override", "expected"),
+    ("tags", "expected"),
     [
-        pytest.param({"encoder": "Lavf"}, None, (0.1, 0, "default", "planar"), id="no unit"),
-        pytest.param({"depth_scale": "0.001"}, None, (0.001, 0, "tag", "planar"), id="millimetres"),
-        pytest.param({"depth_scale": "mm"}, USERS, (0.02, 0, "user", "ray"), id="the user's"),
+        pytest.param({"encoder": "Lavf"}, (0.1, "default"), id="no unit"),
+        pytest.param({"depth_scale": "0.001"}, (0.001, "tag"), id="a number"),
+        pytest.param({"depth_scale": "mm"}, (0.001, "tag"), id="millimetres"),
     ],
-)  # fmt: skip
-def test_the_unit_is_the_users_or_the_tags_or_the_releases(tags, override, expected):
+)
+def test_the_unit_is_the_tags_or_the_releases(tags, expected):
     facts = StreamFacts("ffv1", "gray12le", 8, 8, 1, 15.0, tags)
 
-    found = resolve_encoding(facts, name="clip", override=override)
-
-    assert (found.unit_m, found.offset_m, found.source, found.kind) == expected
+    assert stated_unit(facts, name="clip") == expected
 
 
 @pytest.mark.parametrize(
