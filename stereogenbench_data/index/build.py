@@ -342,9 +342,7 @@ def walk(  # noqa: PLR0913 - each is an option of the command
     valid_depth: ValidDepth = "skip",
     checksums: Checksums = "none",
     wanted: Callable[[SceneId], bool] | None = None,
-    if_none: Literal["refuse", "all"] = "refuse",
     conventions: Conventions | None = None,
-    retry: RetryPolicy | None = None,
 ) -> TreeReport:
     """Return every scene of a tree in the released layout, and what is wrong with the others.
 
@@ -359,9 +357,7 @@ def walk(  # noqa: PLR0913 - each is an option of the command
             that have a depth.
         checksums: "all" reads all files of a folder on this machine through, for the crc32 of each.
         wanted: Returns whether to describe the scene of a path; None is all.
-        if_none: What to do where no scene is wanted: refuse, or describe all of them.
         conventions: Where quantities stand in the files and how they are read.
-        retry: How slow a server may be.
 
     Raises:
         StorageError: If there is no such scene below the root, or a worker process died; or if none
@@ -373,7 +369,7 @@ def walk(  # noqa: PLR0913 - each is an option of the command
             f"{shown(root)}: checksums are made of files on a disk. Download the scenes, or index "
             f"them without checksums."
         )
-    tree = find_tree(root, wanted=wanted, if_none=if_none, conventions=conventions, retry=retry)
+    tree = find_tree(root, wanted=wanted, conventions=conventions)
     tree = replace(tree, valid_depth=valid_depth, checksums=checksums)
     return walk_tree(tree, workers=workers, engine=engine, progress=progress)
 

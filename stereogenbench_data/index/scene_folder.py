@@ -496,7 +496,7 @@ class Description:
         if depth is not None and depth.encoding.unit_m is not None:
             for (name, _), (unit_m, source) in zip(depths, found, strict=True):
                 if source in ("tag", "metadata"):
-                    depth.require(unit_m, 0.0, where=self.where(name))
+                    depth.require(unit_m, where=self.where(name))
             return [(depth.encoding.unit_m, depth.encoding.offset_m, "conventions")] * len(found)
         if problems:
             others = len(problems) - 1

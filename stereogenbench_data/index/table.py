@@ -695,7 +695,7 @@ def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:
     return str(folder)
 
 
-_OF_DEPTH: Final = ("key", "depth_unit_m", "depth_offset_m", "depth_unit_source")
+_OF_DEPTH: Final = ("key", "depth_unit_m", "depth_unit_source")
 
 
 def _restated(
@@ -735,11 +735,10 @@ def _restated(
     encoding = None if shape.depth is None else shape.depth.encoding
     if shape.depth is not None and encoding is not None and encoding.unit_m is not None:
         columns = (table.column(name).to_pylist() for name in _OF_DEPTH)
-        for key, units_m, offsets_m, sources in zip(*columns, strict=True):
-            stated = zip(units_m, offsets_m or [0.0] * CAMERA_COUNT, sources, strict=True)
-            for unit_m, stored_m, source in stated:
+        for key, units_m, sources in zip(*columns, strict=True):
+            for unit_m, source in zip(units_m, sources, strict=True):
                 if source not in ("default", "unreadable"):
-                    shape.depth.require(unit_m, stored_m, where=f"{where}: {key}")
+                    shape.depth.require(unit_m, where=f"{where}: {key}")
         offset_m = encoding.offset_m
         replaced["depth_unit_m"] = [encoding.unit_m] * CAMERA_COUNT
         replaced["depth_unit_source"] = ["conventions"] * CAMERA_COUNT

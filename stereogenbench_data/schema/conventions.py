@@ -260,7 +260,7 @@ def _declaration(table: Mapping[str, Any], where: str, *, format_: int) -> Decla
         for name, values in tables.items()
     }  # fmt: skip
     return Declaration(
-        **(_by_earlier if format_ == 1 else _by_tables)(tables),
+        **_by_tables(_as_now(tables) if format_ == 1 else tables),
         has=_checked("has", table.get("has", []), where=where, format_=format_),
         poses=None if poses is None else PosesAt(**poses),
         depth=None if depth is None else _depth(depth, where=f"{where}: [depth]"),
@@ -276,17 +276,19 @@ def _units_of(name: str, values: Mapping[str, Any]) -> Collection[str]:
     return PIXELS if as_ in (*_OF_PIXELS, "focal_length_px") else UNITS_M
 
 
-def _by_tables(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the parts of a declaration that tables replace."""
+def _by_tables(tables: Mapping[str, Mapping[str, Any] | None]) -> dict[str, Any]:
+    """Return the parts of a declaration that tables replace; None is that there are none."""
     numbers, parts = dict(BUILT_IN.numbers), dict[str, Any]()
     for name, values in tables.items():
+        if values is None:
+            parts[name] = None
+            continue
         is_needed = not values.get("optional", False)
         if name in ("pairs", "gaps"):
             own = {key: value for key, value in values.items() if key != "optional"}
             parts[name] = PairsAt(is_needed=is_needed, **own)
         elif name == "primary_pair":
-            ends = (_listed(values[end]) for end in ("left", "right"))
-            left, right = ends
+            left, right = (_listed(values[end]) for end in ("left", "right"))
             parts[name] = PrimaryPairAt(left=left, right=right, is_needed=is_needed)
         elif {"place", "value"} & values.keys():
             quantity = _AS.get(values.get("as", ""), name)
@@ -298,29 +300,27 @@ def _by_tables(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     return {"numbers": numbers} | parts
 
 
-def _by_earlier(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the parts of a declaration that tables of the first format replace.
+def _as_now(tables: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return tables of the first format as those of the second.
 
     What is not in such a file was found; now it stands where the paper prints it. A unit that is
     not stated is that at the end of the key.
     """
-    numbers, parts = dict(BUILT_IN.numbers), dict[str, Any]()
+    now: dict[str, Any] = {}
     for name, values in tables.items():
         place = values.get("place", "")
         unit = values.get("unit") or without_unit(words(place.rpartition(".")[2]))[1]
         if name == "baselines":
-            parts["pairs"] = PairsAt(rows=place, unit=unit if unit in UNITS_M else "")
+            now["pairs"] = {"rows": place, "unit": unit if unit in UNITS_M else ""}
             if place != BUILT_IN.pairs.rows.removesuffix("[]"):
-                parts["gaps"] = None
+                now["gaps"] = None
         elif name == "primary_pair":
-            parts[name] = PrimaryPairAt(left=(values["left"],), right=(values["right"],))
+            now[name] = values
         elif {"place", "value"} & values.keys():
-            units = _units_of(name, values)
-            own = {**values, "unit": unit} if unit in units else {**values, "unit": None}
-            numbers[name] = _number(name, own, is_needed=True)
+            now[name] = {**values, "unit": unit if unit in _units_of(name, values) else None}
     if {"field_of_view", "focal_length_px"} & tables.keys() and "focal_length" not in tables:
-        numbers["focal_length"] = NumberAt(places=numbers["focal_length"].places, unit="mm")
-    return {"numbers": numbers} | parts
+        now["focal_length"] = {"optional": True}
+    return now
 
 
 def _number(name: str, values: Mapping[str, Any], *, is_needed: bool) -> NumberAt:

@@ -20,8 +20,6 @@ from stereogenbench_data.schema.units import UNITS_M
 UNKNOWN: Final = "unknown"
 """The form of poses that nobody understands: rigs are assumed rectified, and poses are not read."""
 
-_LEAST_OFFSET_M: Final = 1e-4
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NumberAt:
@@ -157,24 +155,18 @@ class DepthAs:
     encoding: DepthEncoding
     instead_of_tag_m: float | None = None
 
-    def require(self, unit_m: float, offset_m: float, *, where: str) -> None:
-        """Refuse what files state, if it is neither the contract's nor what that replaces.
+    def require(self, unit_m: float, *, where: str) -> None:
+        """Refuse the unit that files state, if it is neither the contract's nor what that replaces.
 
         Raises:
             SchemaError: With both figures.
         """
-        known_m, expected_m = self.instead_of_tag_m or self.encoding.unit_m, self.encoding.offset_m
-        told, is_replaced = "", self.instead_of_tag_m is not None
+        known_m = self.instead_of_tag_m or self.encoding.unit_m
         if known_m is not None and abs(unit_m - known_m) > 1e-9 * known_m:
-            told = (
-                f"{unit_m:g} m in a stored unit of depth, and the conventions expect {known_m:g} m"
-            )
-        elif not is_replaced and offset_m and abs(offset_m - expected_m) > _LEAST_OFFSET_M:
-            told = f"a range from {offset_m:g} m, and the conventions expect {expected_m:g} m"
-        if told:
             raise SchemaError(
-                f"{where}: states {told}. Correct unit_m and offset_m in [depth]; or, if the files "
-                f"are known to be wrong, add instead_of_tag_m = {unit_m:g}."
+                f"{where}: states {unit_m:g} m in a stored unit of depth, and the conventions "
+                f"expect {known_m:g} m. Correct unit_m in [depth]; or, if the files are known to "
+                f"be wrong, add instead_of_tag_m = {unit_m:g}."
             )
 
 
