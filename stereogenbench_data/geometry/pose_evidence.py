@@ -21,7 +21,7 @@ import numpy as np
 from stereogenbench_data.errors import GeometryError, SchemaError
 from stereogenbench_data.geometry.camera import recorded_intrinsics
 from stereogenbench_data.geometry.pose import OPENCV_FROM_UNREAL, CameraPoses
-from stereogenbench_data.geometry.pose_forms import AXES, Reading, poses_at, readings
+from stereogenbench_data.geometry.pose_forms import AXES, Reading, poses_at, poses_named, readings
 from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
 from stereogenbench_data.schema.conventions import declaration_of
 from stereogenbench_data.schema.declaration import PosesAt
@@ -255,14 +255,7 @@ def poses_of(scene: Scene, text: bytes, *, where: str, form: str | None = None) 
     if at is not None and at.is_settled and (form or own) == own:
         _, poses = poses_at(parse_trajectory(text, where=where), at, where=where)
     elif name:
-        named = PosesAt.of_reading(f"{name} @ {unit_m}")
-        try:
-            poses = settled_poses(text, scene.rig, where=where, named=named).poses
-        except SchemaError as error:
-            raise SchemaError(
-                f"{where}: has no poses of the form {shortened(name, 200)}. Run `stereogenbench "
-                f"index` again."
-            ) from error
+        poses = poses_named(parse_trajectory(text, where=where), name, where=where)
     else:
         return settled_poses(text, scene.rig, where=where).poses
     return replace(poses, unit_m=float(unit_m)) if unit_m else poses

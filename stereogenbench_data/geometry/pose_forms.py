@@ -25,9 +25,10 @@ from stereogenbench_data.geometry.pose import (
     rotation_from_rotator_deg,
 )
 from stereogenbench_data.schema.declaration import PosesAt
-from stereogenbench_data.schema.pose_search import RecordedPoses
+from stereogenbench_data.schema.places import place_at
+from stereogenbench_data.schema.pose_search import RecordedPoses, places_in
 from stereogenbench_data.schema.text import shortened
-from stereogenbench_data.schema.trajectory import Block, read_block
+from stereogenbench_data.schema.trajectory import Block, named, read_block, shown_key
 from stereogenbench_data.schema.units import UNITS_M
 
 TOLERANCE: Final = 1e-3
@@ -163,6 +164,33 @@ def poses_at(document: dict[str, Any], at: PosesAt, *, where: str) -> tuple[str,
             f"Correct [poses]."
         )
     return _name(turn, place, kind, at.axes), poses
+
+
+def poses_named(document: dict[str, Any], name: str, *, where: str) -> CameraPoses:
+    """Return the poses of a ``trajectory.json`` by the name of a reading, as an index has it.
+
+    Raises:
+        SchemaError: If the file has no poses of this name.
+    """
+    at = PosesAt.of_reading(name)
+    found = [
+        read_block(document, each, str(each.rotation), where=where)
+        for each in places_in(document)
+        if shown_key(named(place_at(str(each.rotation)))[0]) in (at.location, at.rotation)
+    ]
+    turns = [block for block in found if block.key == at.rotation and at.form in _kinds(block)]
+    places = [block for block in found if block.key == at.location and _is_place(block)]
+    for turn, place in itertools.product(turns, places if at.location else [None]):
+        unit_m = np.nan if at.unit is None else UNITS_M[at.unit]
+        poses = None if place is turn or at.axes not in AXES else _read(
+            turn, place, str(at.form).split(), at.axes, unit_m
+        )  # fmt: skip
+        if poses is not None:
+            return poses
+    raise SchemaError(
+        f"{where}: has no poses of the form {shortened(name, 200)}. Run `stereogenbench index` "
+        f"again."
+    )
 
 
 def _short(kind: str) -> str:

@@ -73,8 +73,13 @@ class Block:
 
     @property
     def key(self) -> str:
-        """The keys as messages and the names of readings have them."""
-        return ".".join("[]" if key == "*" else key for key in self.name).replace(".[]", "[]")
+        """The keys as messages show them."""
+        return shown_key(self.name)
+
+
+def shown_key(name: Sequence[str]) -> str:
+    """Return keys on the way to numbers as messages and the names of readings have them."""
+    return ".".join("[]" if key == "*" else key for key in name).replace(".[]", "[]")
 
 
 def parse_trajectory(text: bytes, *, where: str) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Poses in every form that the reader knows: read as the same poses, or refused."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from stereogenbench_data.geometry.pose_evidence import (
     declared_poses,
     settled_poses,
 )
+from stereogenbench_data.geometry.pose_forms import poses_named
 from stereogenbench_data.schema.declaration import PosesAt
 from stereogenbench_data.schema.records import Rig
 from tests.servers.scene_fixtures import frames_of
@@ -217,9 +219,10 @@ def test_poses_are_read_again_by_the_name_that_an_index_has(form):
     axes = "unreal" if form in ROTATORS_ONLY else "opencv"
     text = written(form, *TURNED, axes=axes, unit="m", coordinate_system=axes)
 
-    named = PosesAt.of_reading(understood(text).names[0])
-    poses = settled_poses(text, RIG, where="trajectory.json", named=named).poses
+    name, _, unit_m = understood(text).names[0].rpartition(" @ ")
+    poses = poses_named(json.loads(text), name, where="trajectory.json")
 
+    poses = replace(poses, unit_m=float(unit_m))
     np.testing.assert_allclose(motions(poses), truth(*TURNED), atol=1e-9)
 
 
