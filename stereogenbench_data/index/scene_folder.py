@@ -762,16 +762,12 @@ def described_again(
         The scene, or the row itself if its files cannot be used; and for each difference the
         file's name, empty for the scene's own path, and what it tells.
     """
-    shape, conventions = Declaration(), None
+    shape = None
     if scene.conventions is not None:
         shape = replace(declaration_of_text(scene.conventions), has=())
-        conventions = Conventions((shape,))
     folder = MemberFolder(source, scene)
     try:
-        if shape.poses is None and scene.pose_form:  # also a form that is not settled any more
-            shape = replace(shape, poses=PosesAt.of_reading(scene.pose_form.split("|")[0]))
-            conventions = Conventions((shape,))
-        now = describe_scene("", folder.key, conventions=conventions, folder=folder, videos=videos)
+        now, is_by_row = _described_by_row(scene, folder, shape, videos)
     except (SchemaError, MediaError, StorageError) as error:
         return scene, [_placed(folder.key, str(error))]
     by_videos = videos is None and {*scene.depth_unit_source} <= {"tag", "default"}
@@ -790,7 +786,7 @@ def described_again(
     parts = {
         "key_frames": scene.training is None,
         "frames": "frames" in new or (scene.remark("frames") and now.frames > scene.frames),
-        "pose_form": lacks_poses or shape.poses is not None or {*forms} <= {*forms_now},
+        "pose_form": lacks_poses or is_by_row or {*forms} <= {*forms_now},
         **dict.fromkeys(_OF_POSES, lacks_poses),
         **dict.fromkeys(_UNITS, "depth" in new or not by_videos),
     }
@@ -808,6 +804,26 @@ def described_again(
             if name in scene.members:
                 found += [(name, told) for told in _changed(part, before, after)]
     return now, found
+
+
+def _described_by_row(
+    scene: Scene, folder: "MemberFolder", shape: Declaration | None, videos: Collection[str] | None
+) -> tuple[Scene, bool]:
+    """Return what a row's files say, and whether their poses are of a form that is stated.
+
+    The row's own form counts as stated, also where nothing settles on it any more. Files that have
+    no such poses are read without it, so that their form is told beside the row's.
+    """
+    if scene.pose_form and (shape is None or shape.poses is None):
+        at = PosesAt.of_reading(scene.pose_form.split("|")[0])
+        with suppress(SchemaError):
+            stated = Conventions((replace(shape or Declaration(), poses=at),))
+            now = describe_scene("", folder.key, conventions=stated, folder=folder, videos=videos)
+            if not now.remark("poses"):
+                return now, True
+    own = None if shape is None else Conventions((shape,))
+    now = describe_scene("", folder.key, conventions=own, folder=folder, videos=videos)
+    return now, shape is not None and shape.poses is not None
 
 
 _OF_POSES: Final = ("lateral_m", "rig_residual_px")

@@ -73,7 +73,7 @@ def test_an_index_as_json_is_one_document_and_a_broken_scene_gives_exit_status_1
 
     assert json.loads(whole.stdout) == {
         "index": str(data / "index.parquet"), "scenes": 4, "incomplete": {}, "broken": {},
-        "notes": [],
+        "odd": {}, "notes": [],
     }  # fmt: skip
     assert broken.exit_code == 1
     assert list(json.loads(broken.stdout)["broken"]) == [SCENE]

@@ -9,7 +9,7 @@ import pytest
 
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.index.table import StaleIndexWarning
+from stereogenbench_data.index.table import IncompleteSceneWarning, StaleIndexWarning
 from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.shards.download import download, wanted_files
 from tests.cli.command import COMMAND, invoke
@@ -128,8 +128,10 @@ def test_a_share_passes_over_scenes_without_the_wanted_videos(small_release, tmp
     lacking.unlink()
 
     words = ["download", root, "-o", "unused", "--streams", "rgb", "--dry-run", "--cameras", "5"]
-    all_that_have_it = invoke(*words, "--scenes", 3)
-    more = invoke(*words, "--scenes", 4)
+    with pytest.warns(IncompleteSceneWarning, match=lacking.name):
+        all_that_have_it = invoke(*words, "--scenes", 3)
+    with pytest.warns(IncompleteSceneWarning, match=lacking.name):
+        more = invoke(*words, "--scenes", 4)
 
     assert "3 scenes, " in all_that_have_it.stderr
     assert (more.exit_code, "3" in more.stderr) == (2, True)

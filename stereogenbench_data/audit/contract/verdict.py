@@ -301,9 +301,11 @@ def _along_axis(scenes: Sequence[SceneDiagnosis], quotient: Answer, unit: Unit) 
     if logs.max() - logs.min() > STRETCH_MARGIN:
         return replace(blank, note=f"scenes differ: {min(found):.3g} to {max(found):.3g} x")
     focal, far = math.exp(float(np.median(logs))), abs(float(np.median(logs))) > STRETCH_MARGIN
-    if quotient.status == "confirmed" and not far:
-        told = f"{focal:.3g} x recorded"
-        return replace(blank, found=told, status="confirmed", note=f"to {STRETCH_MARGIN:.0%}")
+    if not far:
+        # Where the quotient is wrong, that is said once: there.
+        status: Status = "confirmed" if quotient.status == "confirmed" else "not contradicted"
+        told, note = f"{focal:.3g} x recorded", f"to {STRETCH_MARGIN:.0%}"
+        return replace(blank, found=told, status=status, note=note)
     told = f"unit {focal * unit.metres / scenes[0].unit_m:.3g} x and focal length {focal:.3g} x"
     note = "by depth from frame to frame; a focal length is as wrong as a sensor's width, inversely"
     return replace(blank, found=told, status="wrong", note=note)
