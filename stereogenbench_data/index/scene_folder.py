@@ -463,15 +463,16 @@ class Description:
             SchemaError: If conventions state another unit than a tag.
         """
         stated: list[Statement] = []
-        read = BASELINE_JSON, TRAJECTORY_JSON, COMPLETE_JSON
+        read = BASELINE_JSON, TRAJECTORY_JSON, COMPLETE_JSON, DESCRIPTION_JSON
         for name in (name for name in self.files if name in read or name not in FILES):
             with suppress(SchemaError):
                 text, stem = self.folder.read(name), name.rpartition(".")[0]
                 if b"depth" in (stem.encode() + text).lower():
                     document = parse_object(text, where=name)
                     stated += stated_in_json(
-                        document, name=self.where(name), about="" if name in read else stem
-                    )
+                        document, name=self.where(name), about="" if name in read else stem,
+                        is_prose=name == DESCRIPTION_JSON,
+                    )  # fmt: skip
         found: list[tuple[float, DepthUnitSource]] = []
         problems: list[str] = []
         for name, facts in depths:

@@ -135,13 +135,16 @@ _JOINED: Final = re.compile(
 _ONLY_JOINED: Final = re.compile(rf"(?:{_JOINED.pattern})+")
 
 
-def stated_in_json(document: dict[str, Any], *, name: str, about: str = "") -> list[Statement]:
+def stated_in_json(
+    document: dict[str, Any], *, name: str, about: str = "", is_prose: bool = False
+) -> list[Statement]:
     """Return what a metadata file says of the unit of depth under keys that name depth.
 
     Args:
         document: The file as parsed JSON.
         name: Its path, for messages.
         about: The name of a file that is itself about depth: its keys need not name it.
+        is_prose: Whether it describes a scene: then texts count only below keys of a scale.
     """
     found: list[Statement] = []
     for path, key, value in _nodes_of(document):
@@ -150,6 +153,8 @@ def stated_in_json(document: dict[str, Any], *, name: str, about: str = "") -> l
         if "depth" not in place.split("_") or _OTHER_DEPTHS.search(place):
             continue
         if not ({*place.split("_")}.isdisjoint(_STATISTICS) and _RANGES.isdisjoint(parts)):
+            continue
+        if is_prose and _SCALES.isdisjoint(parts):
             continue
         text = value.strip() if isinstance(value, str) else json.dumps(value)
         statement = _stated(words(key), text, f"{name}: {path} is", "metadata")
