@@ -75,8 +75,8 @@ Checksums = Literal["none", "all"]
 
 FORMAT_CURE: Final = (
     "Files are read by the keys that the paper prints. For others, write where a quantity stands "
-    "into a file of conventions: `stereogenbench conventions {root} -o c.toml` lists the keys that "
-    'nobody reads; add a table, such as [focal_length] with place = "$.lens.f" and unit = "mm", '
+    "into a file of conventions: `stereogenbench conventions {root} -o c.toml` writes candidates "
+    'as comments; keep a table, such as [focal_length] with place = "$.lens.f" and unit = "mm", '
     "and give the file as conventions= or --conventions. docs/release.md has examples."
 )
 _MOST_UNTOLD: Final = 2500
