@@ -287,7 +287,7 @@ def test_evaluation_scenes_need_an_explicit_word(indexed_release, tmp_path):
     assert [record["split"] for record in records(tmp_path / "named")] == ["eval"]
     assert [record["split"] for record in records(tmp_path / "both")].count("eval") == 1
     for selection in ({"subset": "seen_map"}, {"scenes": records(tmp_path / "named")[0]["scene"]}):
-        with pytest.raises(SelectionError, match="left by split train"):
+        with pytest.raises(SelectionError, match="split train left"):
             exported(indexed_release, tmp_path / "none", split=None, **selection)
     assert not (tmp_path / "none").exists()
 
