@@ -19,7 +19,7 @@ from stereogenbench_data.cli.writing import write_report
 from stereogenbench_data.schema.text import counted, plain_line
 
 if TYPE_CHECKING:
-    from stereogenbench_data.audit.conventions import Survey
+    from stereogenbench_data.audit.survey import Survey
 
 
 @grouped
@@ -47,7 +47,7 @@ def conventions(  # noqa: PLR0913 - one parameter an option
 
     Example: `stereogenbench conventions scenes/ -o conventions.toml`
     """
-    from stereogenbench_data.audit.conventions import survey
+    from stereogenbench_data.audit.survey import survey
     from stereogenbench_data.schema.conventions import Conventions
 
     if check is not None and out is not None:

@@ -1,4 +1,4 @@
-"""``stereogenbench doctor``: find the depth contract from the pictures."""
+"""``stereogenbench doctor``: find the depth encoding from the pictures."""
 
 import json
 from typing import Annotated, Any

@@ -201,7 +201,7 @@ class PartedBatches:
             before: The pass that the same workers served before. Its slots are free once torch has
                 waited for them, which is when it asks for the first task.
         """
-        self._batches, self._of_all_ranks, self._share = batches, of_all_ranks, share
+        self._batches, self._global_batches, self._share = batches, of_all_ranks, share
         self._memory, self._making, self._before = memory, making, before
         self._pass, self._due = next(_passes), 0
         self._told: Layout | None = None
@@ -226,7 +226,7 @@ class PartedBatches:
         share, layout = self._share, self._making.layout
         worker_of = np.full(len(batch), number % share.workers)
         if batch.number is not None:
-            worker_of = self._of_all_ranks.workers_of(batch, share)
+            worker_of = self._global_batches.workers_of(batch, share)
         if layout is not None and (not layout.fields or layout.samples < len(batch)):
             layout = None
         slot = None if layout is None else self._memory.take()
@@ -304,7 +304,7 @@ class PartedBatches:
                 own = {name: tensor[place] for name, tensor in tensors.items()} | rows[place]
                 rows[place] = {name: own[name] for name in layout.fields}
         if layout is None:
-            size = self._of_all_ranks.rule.batch_size
+            size = self._global_batches.rule.batch_size
             self._making.layout = Layout.of_samples(rows, count=size)
         batch = self._making.collate_fn(rows)
         return pin_memory(batch) if pinned else batch

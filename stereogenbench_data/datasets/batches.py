@@ -209,22 +209,22 @@ class Passes:
     @property
     def next_position(self) -> Position:
         """Where the next pass begins."""
-        return (self._dataset_epoch.value, 0) if self._is_behind else self._next
+        return (self._dataset_epoch.value, 0) if self._dataset_epoch_changed else self._next
 
     @property
     def position(self) -> Position:
         """The position that a state holds."""
-        is_of_pass = self.latest is not None and not self._is_behind
+        is_of_pass = self.latest is not None and not self._dataset_epoch_changed
         return self.latest.position if self.latest and is_of_pass else self.next_position
 
     @property
-    def _is_behind(self) -> bool:
+    def _dataset_epoch_changed(self) -> bool:
         """Whether the dataset was set an epoch that these passes have not followed."""
         return self._follows and self._times_set != self._dataset_epoch.times_set
 
     def begin(self, begun: Pass) -> None:
         """Record that a pass begins."""
-        if self._is_behind:
+        if self._dataset_epoch_changed:
             self.go_to(begun.epoch, 0)
         if self._watched and self._is_of_dataset(begun):
             self._dataset_epoch.mark_begun(self._watched, loader=self._number)

@@ -216,7 +216,7 @@ class _MappedScenes(Dataset[Sample]):
         self.shared_epoch = SharedEpoch()
         self.is_random = _is_random(plan, request)
         self._is_watched = self.is_random
-        self._of_all_ranks: GlobalBatches | None = None
+        self._global_batches: GlobalBatches | None = None
         self._share, self._stop = WorkerShare(0, 1, 0, 1, "batches"), 0
         self._next_batch: tuple[int, int] | None = None
         self._pass_read: int | None = None
@@ -391,14 +391,14 @@ class _MappedScenes(Dataset[Sample]):
         if this != self._next_batch or not self._loader.has_order:
             self._loader.expect(self.steps(batch, reading, share))
         self._next_batch = None
-        if batch.number is not None and self._of_all_ranks is not None:
+        if batch.number is not None and self._global_batches is not None:
             self._next_batch = (batch.epoch, batch.number + share.batches_apart)
 
     def steps(
         self, batch: EpochBatch, reading: Sequence[int], share: WorkerShare
     ) -> Iterator[Step]:
         """Yield the samples of a batch, and of those that this process gets after it."""
-        known, number, epoch = self._of_all_ranks, batch.number, batch.epoch
+        known, number, epoch = self._global_batches, batch.number, batch.epoch
         while True:
             for each in reading:
                 if -len(self.plan) <= each < len(self.plan):
@@ -492,13 +492,13 @@ class _MappedScenes(Dataset[Sample]):
         if epoch is not None:
             twin.shared_epoch = SharedEpoch(epoch)
             twin._is_watched = False
-        twin._of_all_ranks = twin._next_batch = None
+        twin._global_batches = twin._next_batch = None
         twin._open_runs = {}
         return twin
 
     def read_by(self, batches: EpochBatches, share: WorkerShare) -> None:
         """Expect these batches, divided in this way: what comes next is fetched ahead."""
-        self._of_all_ranks, self._share, self._stop = batches.of_all_ranks, share, batches.end()
+        self._global_batches, self._share, self._stop = batches.of_all_ranks, share, batches.end()
         self._next_batch = None
         order = batches.of_all_ranks.order(0)
         warn_of_division(order, share, videos_per_scene=self._videos_per_scene)

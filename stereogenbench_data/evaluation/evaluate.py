@@ -204,7 +204,7 @@ def select_pairs(
     Args:
         data: What `StereoPairs` takes.
         fields: The fields of a sample that are needed.
-        protocol: At which size they are, and by which depth contract.
+        protocol: At which size they are, and by which depth encoding.
         options: The selection; `RunOptions` among it are ignored.
         conventions: As for `StereoPairs`.
 

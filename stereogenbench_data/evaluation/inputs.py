@@ -85,7 +85,7 @@ def export_inputs(
         out: The folder to write into.
         tier: "G0", "G1" or "G2".
         size: (height, width) in pixels.
-        depth: A depth contract instead of the one that files and release state.
+        depth: A depth encoding instead of the one that files and release state.
         conventions: How the files of a folder are read, as for `StereoPairs`.
         **options: Which scenes, pairs and frames, and how they are written (`ExportOptions`).
 

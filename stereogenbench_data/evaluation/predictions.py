@@ -119,7 +119,7 @@ def open_frames(
         index: The scenes.
         fields: What a sample has (`PAIR_FIELDS`).
         size: (height, width); None for the stored size.
-        depth: A depth contract instead of the one that files and release state.
+        depth: A depth encoding instead of the one that files and release state.
     """
     request = Request(kind="pairs", fields=fields, layout="single", size=size, depth=depth)
     with closing(SampleDecoder(index, request)) as loader:

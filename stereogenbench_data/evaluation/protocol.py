@@ -77,7 +77,7 @@ class DisparityProtocol:
         size: (height, width) in pixels at which it is; None: at the stored size of the scenes.
         max_disparity_px: Pixels whose true disparity is this or more are left out, and counted in
             the column "beyond"; None scores all.
-        depth: A depth contract instead of the one that files and release state.
+        depth: A depth encoding instead of the one that files and release state.
         batch_frames: How many frames a callable is given at a time.
     """
 
@@ -117,7 +117,7 @@ class EvaluationProtocol:
         keypoint_matcher: What finds the matches of E_match: "sift", or a model of your own
             (`models.loading`).
         stereo_matcher: What finds the disparity of SD: "sgbm", or a model of your own.
-        depth: A depth contract instead of the one that files and release state.
+        depth: A depth encoding instead of the one that files and release state.
         device: Where learned models run, as torch names it.
         weights: The folder of their weights; None for that of torch.hub's checkpoints.
         batch_frames: How many frames are held, and given to learned parts, at a time.

@@ -62,7 +62,7 @@ class SidesError(SchemaError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Understood:
+class MatchedPoses:
     """The poses of a scene, and how they were read.
 
     Attributes:
@@ -85,7 +85,9 @@ class Understood:
         return self.at.first or 0
 
 
-def settled_poses(text: bytes, rig: Rig, *, where: str, named: PosesAt | None = None) -> Understood:
+def settled_poses(
+    text: bytes, rig: Rig, *, where: str, named: PosesAt | None = None
+) -> MatchedPoses:
     """Return the poses of a ``trajectory.json`` that fit a rig, and where they stand in which form.
 
     Args:
@@ -132,7 +134,7 @@ def _readings_as(recorded: RecordedPoses, named: PosesAt) -> Iterator[Reading]:
             yield replace(reading, tier=0, poses=replace(reading.poses, unit_m=unit_m))
 
 
-def declared_poses(text: bytes, rig: Rig, *, where: str, settled: Understood) -> Understood:
+def declared_poses(text: bytes, rig: Rig, *, where: str, settled: MatchedPoses) -> MatchedPoses:
     """Return the poses of a ``trajectory.json`` as another scene's settled them.
 
     Raises:
@@ -179,7 +181,7 @@ def every_fitting(text: bytes, rig: Rig, *, where: str) -> list[tuple[PosesAt, s
              f"{each.name} @ {each.poses.unit_m!r}") for each in fitting]  # fmt: skip
 
 
-def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
+def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> MatchedPoses:
     """Return the poses of the first tier of readings that fit a rig, as `settled_poses` says."""
     failures: dict[str, str] = {}
     sides: list[SidesError] = []
@@ -230,7 +232,7 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> Understood:
     )  # fmt: skip
     unit = next(name for name, metres in UNITS_M.items() if metres == unit_m)
     form = None if is_own else "|".join(names)
-    return Understood(taken.poses, names, replace(taken.at, unit=unit), form)
+    return MatchedPoses(taken.poses, names, replace(taken.at, unit=unit), form)
 
 
 def shape_of(form: str) -> str:

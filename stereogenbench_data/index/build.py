@@ -22,7 +22,7 @@ import numpy as np
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, no_advance, require_workers
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
-from stereogenbench_data.geometry.pose_evidence import Understood, settled_poses
+from stereogenbench_data.geometry.pose_evidence import MatchedPoses, settled_poses
 from stereogenbench_data.index.left_out import reasons_told
 from stereogenbench_data.index.rows import json_of, scene_of_json
 from stereogenbench_data.index.scene_folder import (
@@ -79,7 +79,7 @@ FORMAT_CURE: Final = (
     'as comments; keep a table, such as [focal_length] with place = "$.lens.f" and unit = "mm", '
     "and give the file as conventions= or --conventions. docs/release.md has examples."
 )
-_MOST_UNTOLD: Final = 2500
+_WARN_ABOVE_REQUESTS: Final = 2500
 """More requests are told: the Hub answers 3,000 in five minutes."""
 _MOST_UNTOLD_SCENES: Final = 100
 """Of more scenes of a folder it is told what reading them takes."""
@@ -138,7 +138,7 @@ class Outcome:
     key: str
     found: Scene | StereoGenBenchError
     has_mark: bool = True
-    poses: Understood | None = None
+    poses: MatchedPoses | None = None
 
     @property
     def lacks_poses(self) -> bool:
@@ -188,7 +188,7 @@ class Tree:
     checksums: Checksums = "none"
     files: Mapping[str, Files] = field(default_factory=dict)
     stamp: str = ""
-    settled: Understood | None = None
+    settled: MatchedPoses | None = None
 
     def with_poses_of(self, scene: Outcome) -> "Tree":
         """Return the tree with how one scene has its poses; that of conventions of one shape."""
@@ -290,7 +290,7 @@ class Tree:
 
     def opened(
         self, folder: SceneFolder, videos: Collection[str] | None = None
-    ) -> tuple[Scene, Understood | None]:
+    ) -> tuple[Scene, MatchedPoses | None]:
         """Return a scene as its files say, and its poses; the user's cache then holds it.
 
         Raises:
@@ -522,7 +522,7 @@ def tell_requests(
 ) -> None:
     """Warn of the requests that scenes behind a URL take, if a server may let them wait."""
     requests, where = scenes * each, shown(root)
-    if requests > _MOST_UNTOLD:
+    if requests > _WARN_ABOVE_REQUESTS:
         size = "" if size_bytes is None else f" some {_size(size_bytes)}"
         message = (
             f"{where}: reads {what} of {scenes} scenes,{size} in {requests:,} requests: on the Hub "

@@ -2,7 +2,7 @@
 
 Scenes with the same keys have one decision, made by the first of them; decisions that are equal are
 one shape. Others then verify: described by the conventions, they must be what they are without.
-What pictures say of depth is added by `audit.conventions`.
+What pictures say of depth is added by `audit.survey`.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from stereogenbench_data.errors import StereoGenBenchError
-from stereogenbench_data.geometry.pose_evidence import Understood
+from stereogenbench_data.geometry.pose_evidence import MatchedPoses
 from stereogenbench_data.index.build import find_tree
 from stereogenbench_data.index.scene_folder import (
     Description,
@@ -176,7 +176,7 @@ def _note_camera(scene: Scene, notes: Notes) -> None:
             notes.setdefault(table, []).append(scene.remark(about).removeprefix(f"{scene.id.key}/"))
 
 
-def _learned_poses(scene: Scene, found: Understood | None) -> tuple[PosesAt | None, list[str]]:
+def _learned_poses(scene: Scene, found: MatchedPoses | None) -> tuple[PosesAt | None, list[str]]:
     """Return how poses are read, and the evidence; None where it is not decided."""
     if found is None:
         reason = scene.remark("poses").replace(f"{scene.id.key}/", "")

@@ -26,8 +26,8 @@ from stereogenbench_data.errors import (
 from stereogenbench_data.geometry.camera import recorded_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.pose_evidence import (
+    MatchedPoses,
     SidesError,
-    Understood,
     declared_poses,
     settled_poses,
 )
@@ -163,7 +163,7 @@ class Description:
         understood: The poses; None where there are none.
     """
 
-    def __init__(self, folder: SceneFolder, key: str, settled: Understood | None = None) -> None:
+    def __init__(self, folder: SceneFolder, key: str, settled: MatchedPoses | None = None) -> None:
         """List the files; a scene of training shards says what it was derived from."""
         self.folder, self.key, self.files = folder, key, folder.stamps()
         self.settled = settled
@@ -171,7 +171,7 @@ class Description:
         self.shape: Declaration | None = None
         self.facts: dict[str, StreamFacts] = {}
         self.depths: list[StreamFacts] = []
-        self.understood: Understood | None = None
+        self.understood: MatchedPoses | None = None
         self.tables: dict[str, SeekTable] = {}
         self.unread: dict[str, str] = {}
         self.document: TrainingDocument | None = None
@@ -389,7 +389,7 @@ class Description:
                     f"stands under this name: fetch it again."
                 )
 
-    def poses(self, rig: Rig, frames: int) -> Understood | None:
+    def poses(self, rig: Rig, frames: int) -> MatchedPoses | None:
         """Return the poses that fit the rig.
 
         Raises:
@@ -425,7 +425,7 @@ class Description:
             )
         return found
 
-    def understand(self, rig: Rig, where: str) -> tuple[Understood | None, str]:
+    def understand(self, rig: Rig, where: str) -> tuple[MatchedPoses | None, str]:
         """Return poses that fit the rig, or why there are none."""
         named = None if self.shape is None else self.shape.poses
         if named is not None and named.form == UNKNOWN:

@@ -9,7 +9,8 @@ data's root and never lead out of it. `SceneIndex.open` makes one of any data:
     a folder or URL without one ── its scenes: all opened where they are few, some where many
 
 An index file may come from a stranger: it opens data beside itself, and any other root is the
-user's own word. Conventions that are given for an index are compared with its rows (`_restated`).
+user's own word. Conventions that are given for an index are compared with its rows
+(`_with_conventions`).
 An index is old if its folder holds other scenes or shards (`_stale_message`): the names of folders
 tell, as copies and unpacked archives change dates; 7 ms for 8,493 scenes. What was read of a tree
 is kept in the user's cache, and what was taken for granted of it is told in one line.
@@ -221,7 +222,7 @@ class SceneIndex:
             index = _open_tree(place, wanted=wanted, conventions=stated, rows=rows, retry=retry)
         index.retry = retry
         if stated is not None:
-            table = _restated(index._table, index._head, stated, retry=retry)
+            table = _with_conventions(index._table, index._head, stated, retry=retry)
             if table is not index._table:
                 index._table, index._digest = table, table_digest(table)
         lacking = {} if index.is_from_file else _lacking(index)
@@ -698,7 +699,7 @@ def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:
 _OF_DEPTH: Final = ("key", "depth_unit_m", "depth_unit_source")
 
 
-def _restated(
+def _with_conventions(
     table: pa.Table, head: IndexHead, conventions: Conventions, *, retry: RetryPolicy | None
 ) -> pa.Table:
     """Return the rows of an index with conventions, which must be those of its scenes.

@@ -486,7 +486,7 @@ class RemoteTree:
         Raises:
             StorageError: If the tree cannot be listed, or no scene is where it belongs.
         """
-        keys, refused = self._once("scenes", lambda: find_scene_folders(self.root))
+        keys, refused = self._cached_or_built("scenes", lambda: find_scene_folders(self.root))
         return keys, refused
 
     def files(self, keys: Sequence[str]) -> tuple[dict[str, Files], dict[str, str]]:
@@ -524,9 +524,12 @@ class RemoteTree:
                 if size is not None
             }
 
-        return {path: (size, number) for path, (size, number) in self._once(folder, listed).items()}
+        return {
+            path: (size, number)
+            for path, (size, number) in self._cached_or_built(folder, listed).items()
+        }
 
-    def _once(self, name: str, ask: Callable[[], Any]) -> Any:
+    def _cached_or_built(self, name: str, ask: Callable[[], Any]) -> Any:
         """Return an answer as JSON holds it; that of a commit is kept."""
         return json.loads(self._kept.once("listing", name, lambda: json.dumps(ask()).encode()))
 

@@ -112,7 +112,7 @@ def declaration_of(scene: Scene) -> Declaration:
 
 
 def depth_of(scene: Scene) -> DepthEncoding:
-    """Return the depth contract of a scene by its conventions; what these leave out is usual."""
+    """Return the depth encoding of a scene by its conventions; what these leave out is usual."""
     if scene.conventions is None:
         return DepthEncoding()
     shape = declaration_of(scene)

@@ -145,7 +145,7 @@ class PosesAt:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DepthAs:
-    """The depth contract.
+    """The depth encoding.
 
     Attributes:
         encoding: The contract; its unit is None where files state theirs.
@@ -228,7 +228,7 @@ class Declaration:
             none are.
         primary_pair: The left and the right camera.
         poses: How poses are read; None where that is settled by some scenes.
-        depth: The depth contract.
+        depth: The depth encoding.
         stated: The tables on ``baseline.json`` as a file of conventions states them, from which
             `text` writes them.
     """

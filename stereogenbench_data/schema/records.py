@@ -128,7 +128,7 @@ def _is_length(value: object, *, least: float) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class DepthEncoding:
-    """The depth contract: how a number stored in a depth video becomes metres.
+    """The depth encoding: how a number stored in a depth video becomes metres.
 
     Attributes:
         unit_m: Metres in one stored unit. None means what the scene's files state, or the release's

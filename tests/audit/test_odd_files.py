@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from stereogenbench_data.audit.conventions import survey
+from stereogenbench_data.audit.survey import survey
 from stereogenbench_data.datasets.mapped import StereoPairs
 from stereogenbench_data.errors import StereoGenBenchError
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg

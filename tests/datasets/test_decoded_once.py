@@ -34,7 +34,7 @@ def tasks(monkeypatch):
 
     class Recording(processes.PartedBatches):
         def _parts(self, batch, number):
-            firsts = self._of_all_ranks.runs.first_sample
+            firsts = self._global_batches.runs.first_sample
             for worker, part in enumerate(parts := super()._parts(batch, number)):
                 for run in np.searchsorted(firsts, part.batch, side="right").tolist():
                     given.setdefault((batch.group, run), set()).add(worker)

@@ -154,7 +154,7 @@ def test_the_command_indexes_a_part_of_a_repository(tmp_path, small_release):
 
 @pytest.mark.usefixtures("hub_tree")
 def test_the_command_tells_requests_and_time_before_it_reads_many_scenes(tmp_path, monkeypatch):
-    monkeypatch.setattr(build, "_MOST_UNTOLD", 40)
+    monkeypatch.setattr(build, "_WARN_ABOVE_REQUESTS", 40)
     monkeypatch.setattr(build, "_SETTLED_BY_REMOTE", 1)
 
     done = invoke("index", HUB, "-o", tmp_path / "all.parquet")

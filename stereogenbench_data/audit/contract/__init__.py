@@ -1,4 +1,4 @@
-"""The doctor: which depth contract the pictures of a scene confirm, found without trusting depth.
+"""The doctor: which depth encoding the pictures of a scene confirm, found without trusting depth.
 
 The modules in the order in which a scene passes through them: `hypotheses` (what may be wrong),
 `matching` (pixels found in two pictures), `scoring` (how well a hypothesis explains them, and its

@@ -47,7 +47,7 @@ class Rival:
 
 @dataclass(frozen=True, slots=True)
 class SceneDiagnosis:
-    """What one scene's pictures show about its depth contract.
+    """What one scene's pictures show about its depth encoding.
 
     Attributes:
         key: The scene.

@@ -1,4 +1,4 @@
-"""The doctor: find out which depth contract explains the pictures of a data set.
+"""The doctor: find out which depth encoding explains the pictures of a data set.
 
 Matching along the rows of two pictures gives disparity without any depth. Each hypothesis on the
 contract predicts another disparity for the same pixels, at which the pictures are compared. The
@@ -100,7 +100,7 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
     progress: Progress | None = None,
     filters: SceneFilters | None = None,
 ) -> DoctorReport:
-    """Return which depth contract the pictures of some scenes confirm.
+    """Return which depth encoding the pictures of some scenes confirm.
 
     Args:
         data: What `SceneIndex.open` takes, or an index.

@@ -1,4 +1,4 @@
-"""The questions that the doctor asks about a depth contract, and hypotheses that answer them."""
+"""The questions that the doctor asks about a depth encoding, and hypotheses that answer them."""
 
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, get_args
@@ -74,7 +74,7 @@ class Hypothesis:
 
     @classmethod
     def declared(cls, encoding: DepthEncoding) -> "Hypothesis":
-        """Return the hypothesis of a depth contract, with pictures and cameras as recorded."""
+        """Return the hypothesis of a depth encoding, with pictures and cameras as recorded."""
         return cls(kind=encoding.kind, form=encoding.form, frame_lag=encoding.frame_lag)
 
     def changed(self, question: Question, answer: Any) -> "Hypothesis":

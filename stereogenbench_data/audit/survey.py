@@ -1,6 +1,6 @@
 """Conventions of a tree, with what its pictures say of depth: the doctor measures, nobody else.
 
-`index.learning` finds where quantities stand; here the depth contract of each shape of files is
+`index.learning` finds where quantities stand; here the depth encoding of each shape of files is
 tested on some scenes, changed where nothing states it and the pictures of all of them are sure, and
 tested again. Where several readings of the poses fit the rigs, depth decides between them.
 """
@@ -312,7 +312,7 @@ def _diagnosed(
 def _with_measured_depth(
     surveyed: Survey, shape: Declaration, scenes: Sequence[Scene], how: dict[str, Any]
 ) -> tuple[Declaration, DoctorReport | None]:
-    """Return a shape with the depth contract that pictures confirm, as far as they do.
+    """Return a shape with the depth encoding that pictures confirm, as far as they do.
 
     The doctor's report by that contract comes with it.
 
