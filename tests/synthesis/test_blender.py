@@ -447,5 +447,5 @@ def test_the_doctor_confirms_the_contract_and_the_audit_finds_nothing(rendered):
     assert len(verdict["scenes"]) == 2
     assert verdict["quotient"] == pytest.approx(1, rel=0.01)
     found = {answer["topic"]: answer["status"] for answer in verdict["answers"]}
-    assert found["unit / (focal length x baseline)"] == "confirmed"
+    assert found["depth scale"] == "confirmed"
     assert found["depth along"] == "confirmed"
