@@ -200,7 +200,7 @@ def _stage(proposal: Proposal) -> tuple[SceneModel, Bounds, Bounds]:
     return (
         scene,
         _bounds((-reach_m, -reach_m, -reach_m), (reach_m, reach_m, reach_m)),
-        _bounds((-aside_m, -aside_m, -reach_m), (aside_m, aside_m, reach_m)),
+        _bounds((-aside_m, -aside_m, -aside_m), (aside_m, aside_m, reach_m)),
     )
 
 

@@ -6,11 +6,12 @@ direction. So a view that is warped into another view by its depth agrees with t
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int32, UInt8
+from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 from torch.nn.functional import grid_sample
 
 from stereogenbench_data.synthesis.maps import ANIMATIONS, CHARACTERS, MAPS, RayWorld, open_map
@@ -185,34 +186,29 @@ def _shaded(
     faces: Int32[np.ndarray, " n"],
 ) -> UInt8[np.ndarray, "n 3"]:
     """Return the colours of what rays meet."""
-    # Neighbours on one surface are shaded together.
+    # Neighbours on one surface are lit together, and then all are painted at once.
     order = np.argsort(faces.astype(np.int16), kind="stable")
     sorted_faces = faces[order]
-    ends = np.append(np.flatnonzero(np.diff(sorted_faces)) + 1, len(order))
+    starts = np.append(0, np.flatnonzero(np.diff(sorted_faces)) + 1)[: len(order)]
+    counts = np.diff(starts, append=len(order))
     right, below, depth_m = right[order], below[order], depth_m[order]
-    length = np.sqrt(1 + right * right + below * below)
+    depth_m[sorted_faces == SKY] = 1
+    all_rays = _Rays(right, below, depth_m, np.sqrt(1 + right * right + below * below))
+    lit = _Lit(*np.empty((4, len(order)), np.float32))
+    materials = []
+    for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
+        part = slice(start, start + count)
+        rays = _Rays(*(each[part] for each in all_rays))
+        material, found = _met(rays, state=state, view=view, face=int(sorted_faces[start]))
+        materials.append(material)
+        for whole, values in zip(lit, found, strict=True):
+            whole[part] = values
+    painted = _painted(materials, counts, lit, depth_m, focal_px=max(view.focal_px))
+    painted *= 255
+    painted += np.float32(0.5)
     # One number of 32 bits a pixel goes back to its place faster than three of 8.
     colours = np.empty(len(order), np.uint32)
-    channels = colours.view(np.uint8).reshape(-1, 4)
-    start = 0
-    for end in ends.tolist():
-        part = slice(start, end)
-        rays = _Rays(right[part], below[part], depth_m[part], length[part])
-        face = int(sorted_faces[start])
-        if face == SKY:
-            material, lit = _SKY_MATERIAL, _on_sky(rays, view=view)
-            rays = rays._replace(depth_m=np.ones_like(rays.depth_m))
-        elif face == GROUND:
-            material, lit = state.scene.ground, _on_ground(rays, view=view, state=state)
-        else:
-            shape = state.shapes[int(shape_of(np.int64(face)))]
-            on = _on_face if shape.kind == "box" else _on_ball
-            material, lit = shape.material, on(rays, view, shape, face, state.scene.sun)
-        painted = _painted(material, lit, rays, focal_px=max(view.focal_px))
-        painted *= 255
-        painted += np.float32(0.5)
-        channels[part, :3] = painted.T
-        start = end
+    colours.view(np.uint8).reshape(-1, 4)[:, :3] = painted.T
     result = np.empty_like(colours)
     result[order] = colours
     return result.view(np.uint8).reshape(-1, 4)[:, :3]
@@ -233,34 +229,55 @@ class _Rays(NamedTuple):
 
 
 def _painted(
-    material: Material, lit: _Lit, rays: _Rays, *, focal_px: float
+    materials: Sequence[Material],
+    counts: Int64[np.ndarray, " m"],
+    lit: _Lit,
+    depth_m: Float32[np.ndarray, " n"],
+    *,
+    focal_px: float,
 ) -> Float32[np.ndarray, "3 n"]:
-    """Return a texture times its tint, the light and, except for the sky, a fine grain."""
+    """Return textures times their tints, the light and, except for the sky, a fine grain.
+
+    The first ``counts[0]`` rays meet the first material, and so on.
+    """
     # The mip level is the binary logarithm of the texels that one pixel covers.
-    log_depth = torch.from_numpy(rays.depth_m * np.float32(_BLUR_PX / focal_px)).log2_()
+    log_depth = torch.from_numpy(depth_m * np.float32(_BLUR_PX / focal_px)).log2_()
     slant = torch.from_numpy(np.maximum(lit.slant, np.float32(_LEAST_SLANT)))
     log_footprint: Array = (log_depth - slant.log2_() * _SLANT_POWER).numpy()
-    per_m = np.float32(1 / material.tile_m)
+    per_m = np.array([1 / material.tile_m for material in materials], np.float32)
+    rows = np.array([texture_row(material.texture) for material in materials], np.float32)
+    tints = np.array([material.tint for material in materials], np.float32).reshape(-1, 3)
+    tiles = np.repeat(per_m, counts)
     colour = sample_atlas(
-        lit.u_m * per_m,
-        lit.v_m * per_m,
-        row=texture_row(material.texture),
-        log_footprint=log_footprint + np.float32(np.log2(per_m)),
+        lit.u_m * tiles,
+        lit.v_m * tiles,
+        row=np.repeat(rows, counts),
+        log_footprint=log_footprint + np.repeat(np.log2(per_m), counts),
     )
-    light = lit.light
-    if material is not _SKY_MATERIAL:
-        per_m = np.float32(1 / _GRAIN_TILE_M)
-        grain = sample_tile(
-            lit.u_m * per_m,
-            lit.v_m * per_m,
-            row=texture_row("grain"),
-            log_footprint=log_footprint + np.float32(np.log2(per_m)),
-        )
-        contrast = np.float32(_GRAIN_CONTRAST)
-        light = light * (np.float32(1 - 0.5 * _GRAIN_CONTRAST) + contrast * grain)
-    colour *= light
-    colour *= np.array(material.tint, np.float32)[:, None]
+    per_grain = np.float32(1 / _GRAIN_TILE_M)
+    grain = sample_tile(
+        lit.u_m * per_grain,
+        lit.v_m * per_grain,
+        row=texture_row("grain"),
+        log_footprint=log_footprint + np.float32(np.log2(per_grain)),
+    )
+    grain *= np.float32(_GRAIN_CONTRAST)
+    grain += np.float32(1 - 0.5 * _GRAIN_CONTRAST)
+    grain[np.repeat([material is _SKY_MATERIAL for material in materials], counts)] = 1
+    colour *= lit.light * grain
+    colour *= np.repeat(tints.T, counts, axis=1)
     return np.clip(colour, 0, 1, out=colour)
+
+
+def _met(rays: _Rays, *, state: SceneState, view: View, face: int) -> tuple[Material, _Lit]:
+    """Return the material of a face, and how rays meet it."""
+    if face == SKY:
+        return _SKY_MATERIAL, _on_sky(rays, view=view)
+    if face == GROUND:
+        return state.scene.ground, _on_ground(rays, view=view, state=state)
+    shape = state.shapes[int(shape_of(np.int64(face)))]
+    on = _on_face if shape.kind == "box" else _on_ball
+    return shape.material, on(rays, view, shape, face, state.scene.sun)
 
 
 def _light(*, sunward: Array, upward: Array, sunlight: Array) -> Array:
@@ -369,6 +386,13 @@ def _metres_at(texel: Array, *, scene: SceneModel) -> Array:
     return ((texel + 0.5) * (2 / _LIGHT_TEXELS) - 1) * scene.shadow_range_m
 
 
+@lru_cache(maxsize=1)
+def _lit_map(proposal: Proposal) -> tuple[RayWorld, Float64[np.ndarray, "side side"]]:
+    """Return the map of a proposal with its `static_light`, once for all cameras."""
+    world = open_map(proposal)
+    return world, static_light(world.scene)
+
+
 @dataclass(frozen=True)
 class RayCasting(Renderer):
     """The built-in renderer; see `Renderer`."""
@@ -387,8 +411,7 @@ class RayCasting(Renderer):
 
     def views(self, plan: ScenePlan, *, cameras: tuple[int, ...]) -> Iterator[RenderedView]:
         """See `Renderer.views`."""
-        world = open_map(plan.proposal)
-        light = static_light(world.scene)
+        world, light = _lit_map(plan.proposal)
         for frame in range(plan.proposal.request.frames):
             state = SceneState(
                 world.scene,

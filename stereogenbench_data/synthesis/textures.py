@@ -32,7 +32,7 @@ def sample_atlas(
     u: Float32[np.ndarray, " n"],
     v: Float32[np.ndarray, " n"],
     *,
-    row: int,
+    row: Float32[np.ndarray, " n"],
     log_footprint: Float32[np.ndarray, " n"],
 ) -> Float32[np.ndarray, "3 n"]:
     """Return a texture's colours, interpolated in the tile and between mip levels.
@@ -40,7 +40,7 @@ def sample_atlas(
     Args:
         u: Places along the tile's width, in tiles; the texture repeats.
         v: The same along its height.
-        row: The texture, by its index in `TEXTURES`.
+        row: The textures, by their indices in `TEXTURES`.
         log_footprint: Binary logarithm of the part of a tile that one pixel covers; finer detail is
             averaged.
 
@@ -77,7 +77,7 @@ def _sample_level(
     u: Float32[np.ndarray, " n"],
     v: Float32[np.ndarray, " n"],
     *,
-    row: int,
+    row: float | Float32[np.ndarray, " n"],
     level: Int32[np.ndarray, " n"],
 ) -> Float32[np.ndarray, "c n"]:
     """Interpolate bilinearly at whole mip levels."""
