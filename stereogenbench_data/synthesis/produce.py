@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Final, Unpack
 
@@ -90,9 +91,9 @@ def synthesise(
         if missing:
             with tree.held(part) as unfinished:
                 do_items(
-                    _draw,
-                    [(tree, index, unfinished) for index in missing],
-                    name=lambda task: f"scene {task[1]} of {request.stream}",
+                    partial(tree.draw, unfinished),
+                    missing,
+                    name=lambda index: f"scene {index} of {request.stream}",
                     options={"workers": 1, **options},
                     done=len(there) * per_scene,
                     total=len(indices) * per_scene,
@@ -221,8 +222,11 @@ class _Tree:
             finally:
                 shutil.rmtree(unfinished, ignore_errors=True)
 
-    def draw(self, index: int, unfinished: Path, after_frames: Advance) -> None:
-        """Render proposals of a scene until one passes its checks, and move it to its place."""
+    def draw(self, unfinished: Path, index: int, after_frames: Advance) -> None:
+        """Render proposals of a scene until one passes its checks, and move it to its place.
+
+        A worker process calls this, with the folder of unfinished scenes.
+        """
         refused: list[tuple[Proposal, Refusal]] = []
         for _ in range(_MOST_RENDERED):
             plan, before = plan_scene(
@@ -250,14 +254,20 @@ class _Tree:
         """Write the videos of all cameras, and return what they show (`write_cameras`)."""
         measured: dict[int, Float64[np.ndarray, "frames 4"]] = {}
         together = self.renderer.cameras_per_task
-        for first in range(0, CAMERA_COUNT, together):
-            measured |= write_cameras(
-                plan,
-                renderer=self.renderer,
-                cameras=tuple(range(first, first + together)),
-                folder=folder,
-                after_frame=lambda: after_frames(1),
-            )
+        # Torch renders with one thread, because its rounding depends on the number of threads.
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            for first in range(0, CAMERA_COUNT, together):
+                measured |= write_cameras(
+                    plan,
+                    renderer=self.renderer,
+                    cameras=tuple(range(first, first + together)),
+                    folder=folder,
+                    after_frame=lambda: after_frames(1),
+                )
+        finally:
+            torch.set_num_threads(threads)
         return measured
 
     def _finish(self, plan: ScenePlan, folder: Path) -> None:
@@ -283,18 +293,6 @@ def _plan(task: tuple[_Tree, int], after_scene: Advance) -> Planned:
     planned = plan_scene(tree.request, index=index, renderer=tree.renderer)
     after_scene(1)
     return planned
-
-
-def _draw(task: tuple[_Tree, int, Path], after_frames: Advance) -> None:
-    """Draw a scene; a worker process calls this."""
-    tree, index, unfinished = task
-    # Torch renders with one thread, because its rounding depends on the number of threads.
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        tree.draw(index, unfinished, after_frames)
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _of_part(request: SynthRequest, part: tuple[int, int]) -> list[int]:

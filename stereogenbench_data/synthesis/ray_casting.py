@@ -29,7 +29,6 @@ _FACES: Final = 6
 _NEAREST_M: Final = 0.05
 _TILE_PX: Final = 256
 """Side of the squares that are drawn at a time: they stay in the processor's cache."""
-_EVERYWHERE: Final = (-np.inf, np.inf, -np.inf, np.inf)
 
 
 def in_unit_solid(view: View, shape: Shape) -> tuple[Array, Array]:
@@ -141,26 +140,28 @@ def first_hits(
     right = view.right_of_axis(np.arange(width) + 0.5)
     below = view.below_axis(np.arange(height) + 0.5)
 
-    def draw(part: Plane | Ball, bounds: tuple[float, float, float, float]) -> None:
-        first, last = np.searchsorted(right, bounds[:2]).tolist()
-        top, bottom = np.searchsorted(below, bounds[2:]).tolist()
-        for row, column in product(range(top, bottom, _TILE_PX), range(first, last, _TILE_PX)):
-            rows = slice(row, min(row + _TILE_PX, bottom))
-            columns = slice(column, min(column + _TILE_PX, last))
-            across, down = right[columns], below[rows]
+    def draw(part: Plane | Ball, rows: range, columns: range) -> None:
+        for top, first in product(rows, columns):
+            tile = np.s_[
+                top : min(top + _TILE_PX, rows.stop), first : min(first + _TILE_PX, columns.stop)
+            ]
+            across, down = right[tile[1]], below[tile[0]]
             if isinstance(part, Plane) and _misses(part, right=across, below=down):
                 continue
             inverse = inverse_depth(part, right=across, below=down[:, None])
-            nearer = inverse > nearest[rows, columns]
-            np.copyto(nearest[rows, columns], inverse, where=nearer)
-            np.copyto(faces[rows, columns], part.face, where=nearer)
+            nearer = inverse > nearest[tile]
+            np.copyto(nearest[tile], inverse, where=nearer)
+            np.copyto(faces[tile], part.face, where=nearer)
 
-    draw(ground_plane(view, slope=slope), _EVERYWHERE)
+    draw(ground_plane(view, slope=slope), range(0, height, _TILE_PX), range(0, width, _TILE_PX))
     for number, shape in enumerate(shapes):
         bounds = _bounds(shape, view=view)
-        if bounds is not None:
+        first, last = np.searchsorted(right, bounds[:2]).tolist()
+        top, bottom = np.searchsorted(below, bounds[2:]).tolist()
+        rows, columns = range(top, bottom, _TILE_PX), range(first, last, _TILE_PX)
+        if rows and columns:
             for part in visible_parts(view, number=number, shape=shape):
-                draw(part, bounds)
+                draw(part, rows, columns)
     return nearest, faces
 
 
@@ -174,13 +175,13 @@ def _misses(plane: Plane, *, right: Array, below: Array) -> bool:
     return False
 
 
-def _bounds(shape: Shape, *, view: View) -> tuple[float, float, float, float] | None:
-    """Return left, right, top and bottom bounds of a shape at depth 1; None if it is behind."""
+def _bounds(shape: Shape, *, view: View) -> tuple[float, float, float, float]:
+    """Return left, right, top and bottom bounds of a shape at depth 1; all 0 if it is behind."""
     forward, right, up = ((shape.corners() - view.eye) @ view.axes).T
     if forward.max() <= 0:
-        return None
+        return 0.0, 0.0, 0.0, 0.0
     if forward.min() < _NEAREST_M:
-        return _EVERYWHERE
+        return -np.inf, np.inf, -np.inf, np.inf
     across, down = right / forward, -up / forward
     return float(across.min()), float(across.max()), float(down.min()), float(down.max())
 

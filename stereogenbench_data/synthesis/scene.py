@@ -139,12 +139,7 @@ class SceneModel:
     def _may_meet(self, origins_m: Array, directions: Array) -> Array:
         """Return for each shape which rays pass its bounding sphere."""
         centres = np.array([shape.centre for shape in self.static_shapes]).reshape(-1, 3)
-        radii_m = np.array(
-            [
-                np.sqrt(shape.half_m @ shape.half_m) if shape.kind == "box" else shape.half_m.max()
-                for shape in self.static_shapes
-            ]
-        )
+        radii_m = np.array([np.linalg.norm(shape.half_m) for shape in self.static_shapes])
         ahead = centres @ directions - (origins_m * directions).sum(axis=0)
         squared = (centres * centres).sum(axis=1)[:, None] - 2 * (centres @ origins_m)
         squared += (origins_m * origins_m).sum(axis=0)
@@ -181,18 +176,18 @@ class Figure:
         side = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
         skin, upper, lower = self.clothes
         materials = (upper, lower, skin, *(lower, lower, skin, upper, skin) * 2)
-        shapes = []
-        for start, end, radius_m, material in zip(starts, ends, radii_m, materials, strict=True):
-            # An ellipsoid along the line between two joints, a little longer than the line.
-            along = end - start
-            length = float(np.linalg.norm(along))
-            first = along / length
-            second = np.cross(first, side)
-            second /= np.linalg.norm(second)
-            axes = np.stack([first, second, np.cross(first, second)])
-            half_m = np.array([length / 2 + 0.5 * radius_m, radius_m, radius_m])
-            shapes.append(Shape("ellipsoid", (start + end) / 2, axes, half_m, material))
-        return shapes
+        # An ellipsoid along each line between two joints, a little longer than the line.
+        along = ends - starts
+        lengths_m = np.array([np.linalg.norm(each) for each in along])
+        first = along / lengths_m[:, None]
+        second = np.cross(first, side)
+        second /= np.array([[np.linalg.norm(each)] for each in second])
+        axes = np.stack([first, second, np.cross(first, second)], axis=1)
+        halves_m = np.stack([lengths_m / 2 + 0.5 * radii_m, radii_m, radii_m], axis=1)
+        return [
+            Shape("ellipsoid", *limb)
+            for limb in zip((starts + ends) / 2, axes, halves_m, materials, strict=True)
+        ]
 
     def points_m(
         self, spawn: Spawn, *, slope: Float64[np.ndarray, "2"], frame: int

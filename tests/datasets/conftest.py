@@ -14,6 +14,7 @@ from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.media import depth
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
+from tests.servers.tools import made_once
 
 
 @pytest.fixture(scope="session")
@@ -119,6 +120,5 @@ def same(one, other):
 @pytest.fixture(scope="session")
 def drawn(tmp_path_factory):
     """A tree of one scene of 17 frames, of which tests alter copies."""
-    root = tmp_path_factory.mktemp("drawn") / "scenes"
-    synthesise(root, SynthRequest(size_px=72, frames=17, seed=3), workers=1)
-    return root
+    request = SynthRequest(size_px=72, frames=17, seed=3)
+    return made_once(tmp_path_factory, "drawn", lambda root: synthesise(root, request))

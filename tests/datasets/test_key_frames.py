@@ -11,6 +11,7 @@ from stereogenbench_data.selection import plan
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.datasets.conftest import write_again
+from tests.servers.tools import made_once
 
 FRAMES = 20
 KEY_FRAMES = (0, 8, 16)
@@ -30,19 +31,20 @@ def runs_of_eight_frames(monkeypatch):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    root = tmp_path_factory.mktemp("whole")
-    request = SynthRequest(family="Uniform", scenes=2, size_px=48, frames=FRAMES, seed=5)
-    synthesise(root, request, workers=1)
-    return root
+    request = SynthRequest(map_name="SynthRoom", scenes=2, size_px=48, frames=FRAMES, seed=5)
+    return made_once(tmp_path_factory, "without_keys", lambda root: synthesise(root, request))
 
 
 @pytest.fixture(scope="module")
 def keyed_release(whole, tmp_path_factory):
     """The same scenes with a key frame every 8 frames."""
-    root = shutil.copytree(whole, tmp_path_factory.mktemp("keyed"), dirs_exist_ok=True)
-    for path in sorted(root.rglob("*_rgb.mp4")):
-        encode_again(path, key_every=8)
-    return root
+
+    def make(root):
+        shutil.copytree(whole, root)
+        for path in sorted(root.rglob("*_rgb.mp4")):
+            encode_again(path, key_every=8)
+
+    return made_once(tmp_path_factory, "with_keys", make)
 
 
 def epoch_of(loader):

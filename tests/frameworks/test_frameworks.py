@@ -6,6 +6,7 @@ Each sample comes once an epoch, epochs differ, and a run that goes on equals th
 import json
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -13,13 +14,18 @@ from accelerate import skip_first_batches
 
 from stereogenbench_data import SelectionError, StereoPairs
 from tests.datasets.conftest import flat, keys_of
-from tests.frameworks import runs
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::UserWarning:lightning"),
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),
     pytest.mark.filterwarnings("ignore::FutureWarning"),
 ]
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """The runs of trainers. Importing Lightning takes seconds, which other tests need not wait."""
+    return import_module("tests.frameworks.runs")
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +55,9 @@ def of_epochs(steps, *, epochs):
         ("lightning", 56, 56),
     ],
 )
-def test_two_ranks_get_each_sample_once_and_other_frames_each_epoch(ranks, name, given, different):
+def test_two_ranks_get_each_sample_once_and_other_frames_each_epoch(
+    runs, ranks, name, given, different
+):
     shares = [of_epochs(rank[name][0], epochs=runs.EPOCHS) for rank in ranks]
     together = [flat(of_ranks) for of_ranks in zip(*shares, strict=True)]
 
@@ -79,17 +87,23 @@ def test_shares_are_not_shared_again(ranks):
         assert "Prepare pairs.loader(...) instead" in stream
 
 
-def run(name, data, folder, **options):
-    pairs = runs.random_frames(data)
-    loader = pairs.loader(4, num_workers=1)
-    if name == "lightning":
-        return runs.lightning(loader, folder, **options)
-    own = loader if name == "loader" else None
-    return runs.hugging_face(pairs, folder / "run", loader=own, **options)
+@pytest.fixture(scope="module")
+def run(runs):
+    """Return the steps of a run, by the trainer and what it is given."""
+
+    def run(name, data, folder, **options):
+        pairs = runs.random_frames(data)
+        loader = pairs.loader(4, num_workers=1)
+        if name == "lightning":
+            return runs.lightning(loader, folder, **options)
+        own = loader if name == "loader" else None
+        return runs.hugging_face(pairs, folder / "run", loader=own, **options)
+
+    return run
 
 
 @pytest.fixture(scope="module")
-def whole_runs(indexed_release, tmp_path_factory):
+def whole_runs(run, indexed_release, tmp_path_factory):
     """The steps of a run that is not stopped, by the trainer and what it was given."""
     folder = tmp_path_factory.mktemp("whole")
     return {name: run(name, indexed_release, folder) for name in ("lightning", "loader", "dataset")}
@@ -99,7 +113,9 @@ def whole_runs(indexed_release, tmp_path_factory):
     ("name", "stop"),
     [("lightning", 15), ("lightning", 22), ("loader", 15), ("dataset", 22)],
 )
-def test_a_run_goes_on_as_if_it_had_not_stopped(whole_runs, indexed_release, tmp_path, name, stop):
+def test_a_run_goes_on_as_if_it_had_not_stopped(
+    runs, run, whole_runs, indexed_release, tmp_path, name, stop
+):
     """After the last batch of an epoch, and in the second one."""
     before = run(name, indexed_release, tmp_path, stop_at=stop)
     after = run(name, indexed_release, tmp_path, resume=True)
@@ -112,14 +128,14 @@ def test_a_run_goes_on_as_if_it_had_not_stopped(whole_runs, indexed_release, tmp
 
 
 @pytest.mark.parametrize("limit", ["overfit_batches", "limit_train_batches"])
-def test_lightning_overfits_the_first_batches_in_order(indexed_release, tmp_path, limit):
+def test_lightning_overfits_the_first_batches_in_order(runs, indexed_release, tmp_path, limit):
     pairs = StereoPairs(indexed_release, fields=("left", "__key__"), frames="all")
     steps = runs.lightning(pairs.loader(4, shuffle=False), tmp_path, **{limit: 2})
 
     assert steps == keys_of(pairs.loader(4, shuffle=False))[:2] * runs.EPOCHS
 
 
-def test_lightning_sees_other_samples_in_each_of_some_short_epochs(indexed_release, tmp_path):
+def test_lightning_sees_other_samples_in_each_of_some_short_epochs(runs, indexed_release, tmp_path):
     pairs = StereoPairs(indexed_release, fields=("left", "__key__"), frames="all")
     steps = runs.lightning(pairs.loader(4), tmp_path, limit_train_batches=2)
     expected = [
@@ -129,7 +145,9 @@ def test_lightning_sees_other_samples_in_each_of_some_short_epochs(indexed_relea
     assert steps == flat(expected)
 
 
-def test_a_shuffled_loader_that_lightning_would_overfit_says_what_to_use(indexed_release, tmp_path):
+def test_a_shuffled_loader_that_lightning_would_overfit_says_what_to_use(
+    runs, indexed_release, tmp_path
+):
     pairs = runs.random_frames(indexed_release)
 
     with pytest.raises(
@@ -138,14 +156,14 @@ def test_a_shuffled_loader_that_lightning_would_overfit_says_what_to_use(indexed
         runs.lightning(pairs.loader(4), tmp_path, overfit_batches=2)
 
 
-def test_lightning_predicts_each_sample_once(indexed_release):
+def test_lightning_predicts_each_sample_once(runs, indexed_release):
     pairs = runs.random_frames(indexed_release)
     keys = runs.predicted(pairs.loader(8, num_workers=1, drop_last=False))
 
     assert len(keys) == len(set(keys)) == 60
 
 
-def test_accelerates_skipped_batches_are_followed_by_the_next_epoch(indexed_release):
+def test_accelerates_skipped_batches_are_followed_by_the_next_epoch(runs, indexed_release):
     pairs = runs.random_frames(indexed_release)
     loader = pairs.loader(4, num_workers=1)
     expected = [pairs.set_epoch(epoch) or keys_of(pairs.loader(4)) for epoch in (0, 1)]

@@ -1,4 +1,5 @@
 import json
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -6,8 +7,12 @@ import av
 import numpy as np
 import pytest
 
+from stereogenbench_data.synthesis.planning import plan_scene
 from stereogenbench_data.synthesis.produce import synthesise
+from stereogenbench_data.synthesis.render import RAY_CASTING
 from stereogenbench_data.synthesis.request import SynthRequest
+from stereogenbench_data.synthesis.scene_files import metadata_texts, write_cameras
+from tests.servers.tools import made_once
 
 UNIT_M = 0.001
 SENSOR_MM = 23.76
@@ -53,15 +58,29 @@ def decoded(path, pixel_format):
 @pytest.fixture(scope="session")
 def draw(tmp_path_factory):
     """Draw one scene, once for all tests: by default 96 px wide, 3 frames."""
-    drawn = {}
 
     def draw_scene(**request):
         asked = SynthRequest(**{"size_px": 96, "frames": 3, "seed": 2} | request)
-        if asked not in drawn:
-            out = tmp_path_factory.mktemp("synth")
-            (key,) = synthesise(out, asked)
-            drawn[asked] = Drawn(out / key)
-        return drawn[asked]
+        name = f"synth_{zlib.crc32(repr(asked).encode())}"
+        out = made_once(tmp_path_factory, name, lambda root: synthesise(root, asked))
+        return Drawn(out / asked.key(0))
+
+    return draw_scene
+
+
+@pytest.fixture
+def draw_cameras(tmp_path_factory):
+    """Write a scene with the videos of some cameras only."""
+
+    def draw_scene(*cameras, **request):
+        folder = tmp_path_factory.mktemp("cameras")
+        plan, _ = plan_scene(SynthRequest(**request), index=0)
+        description = RAY_CASTING.description(plan)
+        for name, text in metadata_texts(plan, renderer="", description=description).items():
+            (folder / name).write_text(text)
+        how = {"renderer": RAY_CASTING, "folder": folder, "after_frame": int}
+        write_cameras(plan, cameras=cameras, **how)
+        return Drawn(folder)
 
     return draw_scene
 

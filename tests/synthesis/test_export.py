@@ -57,8 +57,8 @@ def test_files_have_the_keys_of_a_scene_that_was_rendered_elsewhere(draw, shared
     }
 
 
-def test_videos_are_encoded_as_the_release_is(draw):
-    scene = draw(**small(frames=12))
+def test_videos_are_encoded_as_the_release_is(draw_cameras):
+    scene = draw_cameras(3, **small(frames=12))
 
     kinds = {}
     for name, form in (("rgb.mp4", ("h264", "yuv420p")), ("depth.mkv", ("ffv1", "gray16le"))):
@@ -75,7 +75,7 @@ def test_videos_are_encoded_as_the_release_is(draw):
 @pytest.mark.parametrize("family", ["IPD_Gaussian", "Uniform", "Pairwise_Uniform"])
 def test_recorded_baselines_are_the_distances_of_the_recorded_poses(draw, family):
     """At world offsets of up to 1e6 cm, where a coordinate is rounded to 1.2e-10 cm."""
-    scene = draw(family=family, **small(frames=5))
+    scene = draw(family=family, **small())
     rig, locations = rig_of(scene), poses_of(scene).centres
 
     assert np.abs(locations).max() > 1e4
@@ -84,10 +84,10 @@ def test_recorded_baselines_are_the_distances_of_the_recorded_poses(draw, family
         np.testing.assert_allclose(distances_cm, recorded_cm, rtol=0, atol=1e-9)
 
 
-def test_every_rotation_form_records_the_same_poses(draw):
+def test_every_rotation_form_records_the_same_poses(draw_cameras):
     found = []
     for form in ("rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"):
-        scene = draw(contract=ExportContract(rotation=form), **small())
+        scene = draw_cameras(contract=ExportContract(rotation=form), **small())
         found.append(poses_of(scene).world_from_cam(1, 2))
         raw = scene.json("trajectory.json")["frames"][1]["cameras"][2]["rotation"]
         if form == "quaternion_wxyz":
@@ -118,9 +118,9 @@ def share_found(units_m, *, focal_px, later_from_first):
     return ((nearest - 0.01 * z < z) & (z < farthest + 0.01 * z)).mean()
 
 
-def test_the_recorded_poses_carry_depth_from_frame_to_frame(draw):
+def test_the_recorded_poses_carry_depth_from_frame_to_frame(draw_cameras):
     """All but the walker and what it and the poles come to hide; a roll with a wrong sign shows."""
-    scene = draw(size_px=128, frames=13, seed=8, family="IPD_Gaussian", focal_mm=30.0)
+    scene = draw_cameras(1, size_px=128, frames=13, seed=8, family="IPD_Gaussian", focal_mm=30.0)
     recorded, found = poses_of(scene), []
     mirrored_deg = [
         [[turn["pitch"], turn["yaw"], -turn["roll"]] for turn in (p["rotation"] for p in poses)]
@@ -156,9 +156,11 @@ def test_the_release_reader_takes_a_scene_as_rectified(draw):
     assert described.labels.character.startswith("SK_Synth")
 
 
-def test_the_depth_tag_states_the_unit_or_is_absent(draw):
-    tagged = draw(contract=ExportContract(depth_unit_m=0.01, depth_tag="scale"), **small())
-    bare = draw(contract=ExportContract(depth_unit_m=0.1, depth_tag=None), **small())
+def test_the_depth_tag_states_the_unit_or_is_absent(draw_cameras):
+    tagged = draw_cameras(
+        0, contract=ExportContract(depth_unit_m=0.01, depth_tag="scale"), **small()
+    )
+    bare = draw_cameras(0, contract=ExportContract(depth_unit_m=0.1, depth_tag=None), **small())
 
     assert float(tags(tagged.folder / "cam_00_depth.mkv")["SCALE"]) == 0.01
     assert not [key for key in tags(bare.folder / "cam_00_depth.mkv") if "SCALE" in key]
@@ -167,9 +169,9 @@ def test_the_depth_tag_states_the_unit_or_is_absent(draw):
     np.testing.assert_allclose(coarse[measured] / 10, fine[measured] / 100, atol=0.056)
 
 
-def test_depth_beyond_16_bits_saturates_at_the_largest_number(draw):
+def test_depth_beyond_16_bits_saturates_at_the_largest_number(draw, draw_cameras):
     coarse = draw(**small())
-    fine = draw(contract=ExportContract(depth_unit_m=0.0001), **small())
+    fine = draw_cameras(0, contract=ExportContract(depth_unit_m=0.0001), **small())
 
     expected = np.minimum(coarse.units(0) * 10.0, 65535)
     assert (expected == 65535).any()
