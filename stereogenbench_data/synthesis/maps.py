@@ -9,7 +9,6 @@ in a folder of that name.
 import colorsys
 import zlib
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -17,8 +16,8 @@ from jaxtyping import Float64
 
 from stereogenbench_data.schema.release import TRAIN_MAPS, UNSEEN_MAPS
 from stereogenbench_data.synthesis.proposal import Proposal
-from stereogenbench_data.synthesis.renderer import Bounds, Spawn, unknown_map
-from stereogenbench_data.synthesis.scene import Figure, Kind, Material, SceneModel, Shape
+from stereogenbench_data.synthesis.renderer import Bounds, unknown_map
+from stereogenbench_data.synthesis.scene import Figure, Kind, Material, RayWorld, Shape
 
 STAGE: Final = "SynthStage"
 CHARACTERS: Final = tuple(f"SK_Synth{number:02d}" for number in range(1, 20))
@@ -44,33 +43,6 @@ _FAR: Final = 24
 Array = Any
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RayWorld:
-    """A built-in map with the figure of a proposal; see `World`.
-
-    Attributes:
-        scene: The map's contents.
-        bounds_m: Where cameras may be.
-        spawn_bounds_m: Where the figure may start.
-        figure: The subject.
-    """
-
-    scene: SceneModel
-    bounds_m: Bounds
-    spawn_bounds_m: Bounds
-    figure: Figure
-
-    def cast(
-        self, origins_m: Float64[np.ndarray, "n 3"], directions: Float64[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, " n"]:
-        """See `World.cast`."""
-        return self.scene.distances(origins_m, directions)
-
-    def subject_points_m(self, spawn: Spawn, *, frame: int) -> Float64[np.ndarray, "p 3"]:
-        """Return both ends of every limb; see `World.subject_points_m`."""
-        return self.figure.points_m(spawn, slope=self.scene.slope, frame=frame)
-
-
 def open_map(proposal: Proposal) -> RayWorld:
     """Return the map of a proposal with its figure.
 
@@ -79,15 +51,13 @@ def open_map(proposal: Proposal) -> RayWorld:
     """
     name = proposal.map_name
     if name in PLACES:
-        scene, bounds, spawn_bounds = _fixed_place(name)
-    elif name == STAGE or name in _OF_RELEASE:
-        scene, bounds, spawn_bounds = _stage(proposal)
-    else:
-        raise unknown_map(
-            "ray-casting", name, (*MAPS, *sorted(_OF_RELEASE)),
-            choose=f"{', '.join(MAPS)}, all, or a map of the release for a stage of that name",
-        )  # fmt: skip
-    return RayWorld(scene, bounds, spawn_bounds, _figure(proposal))
+        return _fixed_place(proposal)
+    if name == STAGE or name in _OF_RELEASE:
+        return _stage(proposal)
+    raise unknown_map(
+        "ray-casting", name, (*MAPS, *sorted(_OF_RELEASE)),
+        choose=f"{', '.join(MAPS)}, all, or a map of the release for a stage of that name",
+    )  # fmt: skip
 
 
 def _figure(proposal: Proposal) -> Figure:
@@ -167,7 +137,7 @@ def _around(rng: np.random.Generator, radius_m: float) -> tuple[float, float]:
     return abs(radius_m) * np.cos(turn), abs(radius_m) * np.sin(turn)
 
 
-def _stage(proposal: Proposal) -> tuple[SceneModel, Bounds, Bounds]:
+def _stage(proposal: Proposal) -> RayWorld:
     rng = proposal.rng("map")
     width_m, height_m = proposal.rig.picture_at_1m
     framing = _Framing(
@@ -184,7 +154,8 @@ def _stage(proposal: Proposal) -> tuple[SceneModel, Bounds, Bounds]:
         *_objects(rng, framing=framing),
         *_poles(rng, framing=framing),
     ]
-    scene = SceneModel(
+    reach_m, aside_m = 4 * framing.distance_m, 0.12 * framing.distance_m
+    return RayWorld(
         slope=slope,
         ground=_material(rng, textures=_GROUNDS, tile_m=(2.0, 4.0)),
         # The shapes stand on a level ground; here they are raised to the slanted one.
@@ -195,12 +166,9 @@ def _stage(proposal: Proposal) -> tuple[SceneModel, Bounds, Bounds]:
         shell=0,
         sun=sun,
         shadow_range_m=3 * framing.distance_m + 4,
-    )
-    reach_m, aside_m = 4 * framing.distance_m, 0.12 * framing.distance_m
-    return (
-        scene,
-        _bounds((-reach_m, -reach_m, -reach_m), (reach_m, reach_m, reach_m)),
-        _bounds((-aside_m, -aside_m, -aside_m), (aside_m, aside_m, reach_m)),
+        bounds_m=_bounds((-reach_m, -reach_m, -reach_m), (reach_m, reach_m, reach_m)),
+        spawn_bounds_m=_bounds((-aside_m, -aside_m, -aside_m), (aside_m, aside_m, reach_m)),
+        figure=_figure(proposal),
     )
 
 
@@ -298,24 +266,24 @@ PLACES: Final[dict[str, _Place]] = {
 MAPS: Final = (STAGE, *PLACES)
 
 
-@lru_cache(maxsize=len(PLACES))
-def _fixed_place(name: str) -> tuple[SceneModel, Bounds, Bounds]:
-    place = PLACES[name]
-    rng = np.random.default_rng(zlib.crc32(name.encode()))
+def _fixed_place(proposal: Proposal) -> RayWorld:
+    place = PLACES[proposal.map_name]
+    rng = np.random.default_rng(zlib.crc32(proposal.map_name.encode()))
     half = np.array(place.size_m) / 2
     shell = _shell(rng, place=place)
     things = [*_crates(rng, place=place), *_posts(rng, place=place)]
-    scene = SceneModel(
+    inner = half - 0.3
+    return RayWorld(
         slope=np.zeros(2),
         ground=_material(rng, textures=_GROUNDS, tile_m=(2.0, 4.0)),
         static_shapes=(*shell, *things),
         shell=len(shell),
         sun=_sun(rng),
         shadow_range_m=float(half.max()) + 1,
+        bounds_m=_bounds((-half[0], -half[1], 0.0), (half[0], half[1], place.height_m)),
+        spawn_bounds_m=_bounds((-inner[0], -inner[1], 0.0), (inner[0], inner[1], 2.5)),
+        figure=_figure(proposal),
     )
-    bounds = _bounds((-half[0], -half[1], 0.0), (half[0], half[1], place.height_m))
-    inner = half - 0.3
-    return scene, bounds, _bounds((-inner[0], -inner[1], 0.0), (inner[0], inner[1], 2.5))
 
 
 def _shell(rng: np.random.Generator, *, place: _Place) -> list[Shape]:

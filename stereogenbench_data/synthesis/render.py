@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 from torch.nn.functional import grid_sample
 
-from stereogenbench_data.synthesis.maps import ANIMATIONS, CHARACTERS, MAPS, RayWorld, open_map
+from stereogenbench_data.synthesis.maps import ANIMATIONS, CHARACTERS, MAPS, open_map
 from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.ray_casting import (
     GROUND,
@@ -27,7 +27,7 @@ from stereogenbench_data.synthesis.ray_casting import (
 )
 from stereogenbench_data.synthesis.renderer import RenderedView, Renderer, ScenePlan, View
 from stereogenbench_data.synthesis.request import SENSOR_MM
-from stereogenbench_data.synthesis.scene import Material, SceneModel, Shape, entry_depth
+from stereogenbench_data.synthesis.scene import Material, RayWorld, Shape, entry_depth
 from stereogenbench_data.synthesis.textures import sample_atlas, sample_tile, texture_row
 
 Array = Any
@@ -52,7 +52,7 @@ class SceneState:
 
     def __init__(
         self,
-        scene: SceneModel,
+        scene: RayWorld,
         *,
         walker: Sequence[Shape],
         static_light: Float64[np.ndarray, "side side"],
@@ -65,7 +65,7 @@ class SceneState:
         self.light_map = torch.from_numpy(self.light.astype(np.float32))[None, None]
 
 
-def static_light(scene: SceneModel) -> Float64[np.ndarray, "side side"]:
+def static_light(scene: RayWorld) -> Float64[np.ndarray, "side side"]:
     """Return the map of sunlight on the ground, with the shadows of things; rows y, columns x."""
     light = np.ones((_LIGHT_TEXELS, _LIGHT_TEXELS))
     for shape in scene.static_shapes[scene.shell :]:
@@ -347,7 +347,7 @@ def _on_ball(rays: _Rays, view: View, shape: Shape, face: int, sun: Array) -> _L
 
 
 def _sunlight_at(
-    light: torch.Tensor, *, x_m: Array, y_m: Array, scene: SceneModel
+    light: torch.Tensor, *, x_m: Array, y_m: Array, scene: RayWorld
 ) -> Float32[np.ndarray, " n"]:
     """Return the interpolated light at places on the ground; beyond the map, that of its border."""
     grid = torch.from_numpy(np.stack([x_m, y_m], axis=-1) / np.float32(scene.shadow_range_m))
@@ -355,9 +355,7 @@ def _sunlight_at(
     return found[0, 0, 0].numpy()
 
 
-def cast_shadow(
-    light: Float64[np.ndarray, "side side"], *, shape: Shape, scene: SceneModel
-) -> None:
+def cast_shadow(light: Float64[np.ndarray, "side side"], *, shape: Shape, scene: RayWorld) -> None:
     """Darken the map of sunlight, in place, where a shape is between the ground and the sun."""
     corners = shape.corners()
     drop = (corners[:, 2] - corners[:, :2] @ scene.slope) / (
@@ -382,7 +380,7 @@ def cast_shadow(
     light[low[1] : high[1], low[0] : high[0]][blocked] = _SHADE
 
 
-def _metres_at(texel: Array, *, scene: SceneModel) -> Array:
+def _metres_at(texel: Array, *, scene: RayWorld) -> Array:
     return ((texel + 0.5) * (2 / _LIGHT_TEXELS) - 1) * scene.shadow_range_m
 
 
@@ -390,7 +388,7 @@ def _metres_at(texel: Array, *, scene: SceneModel) -> Array:
 def _lit_map(proposal: Proposal) -> tuple[RayWorld, Float64[np.ndarray, "side side"]]:
     """Return the map of a proposal with its `static_light`, once for all cameras."""
     world = open_map(proposal)
-    return world, static_light(world.scene)
+    return world, static_light(world)
 
 
 @dataclass(frozen=True)
@@ -414,8 +412,8 @@ class RayCasting(Renderer):
         world, light = _lit_map(plan.proposal)
         for frame in range(plan.proposal.request.frames):
             state = SceneState(
-                world.scene,
-                walker=world.figure.limbs(plan.spawn, slope=world.scene.slope, frame=frame),
+                world,
+                walker=world.figure.limbs(plan.spawn, slope=world.slope, frame=frame),
                 static_light=light,
             )
             for camera in cameras:
@@ -423,7 +421,7 @@ class RayCasting(Renderer):
 
     def description(self, plan: ScenePlan) -> dict[str, object]:
         """See `Renderer.description`."""
-        scene = open_map(plan.proposal).scene
+        scene = open_map(plan.proposal)
         ground, walls = scene.ground.texture, scene.static_shapes[0].material.texture
         things = len(scene.static_shapes)
         shell = scene.static_shapes[: scene.shell]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from stereogenbench_data.schema.release import FRAME_RATE_HZ
-from stereogenbench_data.synthesis.renderer import Spawn
+from stereogenbench_data.synthesis.renderer import Bounds, Spawn
 
 Array = Any
 Kind = Literal["box", "ellipsoid"]
@@ -78,73 +78,6 @@ def entry_depth(shape: Shape, *, origin: Sequence[Array], direction: Sequence[Ar
         root = np.sqrt(half_linear * half_linear - squared * constant)
         t = (-half_linear - root) / squared
         return np.where(t > 0, t, np.inf)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SceneModel:
-    """A map without its subject.
-
-    Attributes:
-        slope: (2,) rise of the ground per metre along x and y; the ground passes the origin.
-        ground: The ground's material.
-        static_shapes: The shapes, none of which moves.
-        shell: How many of the first shapes, walls and ceilings, cast no shadow on the ground.
-        sun: (3,) unit direction to the sun.
-        shadow_range_m: Distance from the origin, along x and y, up to which there are shadows.
-    """
-
-    slope: Float64[np.ndarray, "2"]
-    ground: Material
-    static_shapes: tuple[Shape, ...]
-    shell: int
-    sun: Float64[np.ndarray, "3"]
-    shadow_range_m: float
-
-    def distances(
-        self, origins_m: Float64[np.ndarray, "n 3"], directions: Float64[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, " n"]:
-        """Return how far rays of unit direction go until they meet the map, as `World.cast`."""
-        result = np.empty(len(origins_m))
-        for start in range(0, len(origins_m), _BATCH_RAYS):
-            batch = slice(start, start + _BATCH_RAYS)
-            result[batch] = self._distances(origins_m[batch].T, directions[batch].T)
-        return result
-
-    def _distances(self, origins_m: Array, directions: Array) -> Array:
-        rise_x, rise_y = self.slope
-        above = origins_m[2] - rise_x * origins_m[0] - rise_y * origins_m[1]
-        descent = rise_x * directions[0] + rise_y * directions[1] - directions[2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            nearest = np.where(descent > 0, above / descent, np.inf)
-        nearest = np.where(above <= 0, 0.0, nearest)
-        for shape, near in zip(
-            self.static_shapes, self._may_meet(origins_m, directions), strict=True
-        ):
-            index = np.flatnonzero(near)
-            if not len(index):
-                continue
-            apart = [o[index] - c for o, c in zip(origins_m, shape.centre, strict=True)]
-            from_world = shape.axes / shape.half_m[:, None]
-            origin = [a * apart[0] + b * apart[1] + c * apart[2] for a, b, c in from_world]
-            if shape.kind == "box":
-                inside = np.maximum(np.maximum(abs(origin[0]), abs(origin[1])), abs(origin[2])) < 1
-            else:
-                inside = sum(o * o for o in origin) < 1
-            x, y, z = (d[index] for d in directions)
-            ray = [a * x + b * y + c * z for a, b, c in from_world]
-            met = np.where(inside, 0.0, entry_depth(shape, origin=origin, direction=ray))
-            nearest[index] = np.minimum(nearest[index], met)
-        return nearest
-
-    def _may_meet(self, origins_m: Array, directions: Array) -> Array:
-        """Return for each shape which rays pass its bounding sphere."""
-        centres = np.array([shape.centre for shape in self.static_shapes]).reshape(-1, 3)
-        radii_m = np.array([np.linalg.norm(shape.half_m) for shape in self.static_shapes])
-        ahead = centres @ directions - (origins_m * directions).sum(axis=0)
-        squared = (centres * centres).sum(axis=1)[:, None] - 2 * (centres @ origins_m)
-        squared += (origins_m * origins_m).sum(axis=0)
-        radii_m = radii_m[:, None] * 1.001 + 0.001
-        return (ahead > -radii_m) & (squared - ahead * ahead < radii_m * radii_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,3 +170,80 @@ class Figure:
 def _limb_direction(angle: float, ahead: Array) -> Array:
     """Return the direction of a hanging limb that swings forward by an angle."""
     return np.sin(angle) * ahead - np.cos(angle) * _UP
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RayWorld:
+    """A built-in map with the figure of a proposal; see `World`.
+
+    Attributes:
+        slope: (2,) rise of the ground per metre along x and y; the ground passes the origin.
+        ground: The ground's material.
+        static_shapes: The shapes, none of which moves.
+        shell: How many of the first shapes, walls and ceilings, cast no shadow on the ground.
+        sun: (3,) unit direction to the sun.
+        shadow_range_m: Distance from the origin, along x and y, up to which there are shadows.
+        bounds_m: Where cameras may be.
+        spawn_bounds_m: Where the figure may start.
+        figure: The subject.
+    """
+
+    slope: Float64[np.ndarray, "2"]
+    ground: Material
+    static_shapes: tuple[Shape, ...]
+    shell: int
+    sun: Float64[np.ndarray, "3"]
+    shadow_range_m: float
+    bounds_m: Bounds
+    spawn_bounds_m: Bounds
+    figure: Figure
+
+    def cast(
+        self, origins_m: Float64[np.ndarray, "n 3"], directions: Float64[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, " n"]:
+        """See `World.cast`."""
+        result = np.empty(len(origins_m))
+        for start in range(0, len(origins_m), _BATCH_RAYS):
+            batch = slice(start, start + _BATCH_RAYS)
+            result[batch] = self._distances(origins_m[batch].T, directions[batch].T)
+        return result
+
+    def subject_points_m(self, spawn: Spawn, *, frame: int) -> Float64[np.ndarray, "p 3"]:
+        """Return both ends of every limb; see `World.subject_points_m`."""
+        return self.figure.points_m(spawn, slope=self.slope, frame=frame)
+
+    def _distances(self, origins_m: Array, directions: Array) -> Array:
+        rise_x, rise_y = self.slope
+        above = origins_m[2] - rise_x * origins_m[0] - rise_y * origins_m[1]
+        descent = rise_x * directions[0] + rise_y * directions[1] - directions[2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            nearest = np.where(descent > 0, above / descent, np.inf)
+        nearest = np.where(above <= 0, 0.0, nearest)
+        for shape, near in zip(
+            self.static_shapes, self._may_meet(origins_m, directions), strict=True
+        ):
+            index = np.flatnonzero(near)
+            if not len(index):
+                continue
+            apart = [o[index] - c for o, c in zip(origins_m, shape.centre, strict=True)]
+            from_world = shape.axes / shape.half_m[:, None]
+            origin = [a * apart[0] + b * apart[1] + c * apart[2] for a, b, c in from_world]
+            if shape.kind == "box":
+                inside = np.maximum(np.maximum(abs(origin[0]), abs(origin[1])), abs(origin[2])) < 1
+            else:
+                inside = sum(o * o for o in origin) < 1
+            x, y, z = (d[index] for d in directions)
+            ray = [a * x + b * y + c * z for a, b, c in from_world]
+            met = np.where(inside, 0.0, entry_depth(shape, origin=origin, direction=ray))
+            nearest[index] = np.minimum(nearest[index], met)
+        return nearest
+
+    def _may_meet(self, origins_m: Array, directions: Array) -> Array:
+        """Return for each shape which rays pass its bounding sphere."""
+        centres = np.array([shape.centre for shape in self.static_shapes]).reshape(-1, 3)
+        radii_m = np.array([np.linalg.norm(shape.half_m) for shape in self.static_shapes])
+        ahead = centres @ directions - (origins_m * directions).sum(axis=0)
+        squared = (centres * centres).sum(axis=1)[:, None] - 2 * (centres @ origins_m)
+        squared += (origins_m * origins_m).sum(axis=0)
+        radii_m = radii_m[:, None] * 1.001 + 0.001
+        return (ahead > -radii_m) & (squared - ahead * ahead < radii_m * radii_m)

@@ -33,8 +33,8 @@ def view_from(eye, *, size_px=(5, 5), focal_px=5.0):
 
 def state_of(plan, *, frame):
     world = open_map(plan.proposal)
-    walker = world.figure.limbs(plan.spawn, slope=world.scene.slope, frame=frame)
-    return SceneState(world.scene, walker=walker, static_light=static_light(world.scene))
+    walker = world.figure.limbs(plan.spawn, slope=world.slope, frame=frame)
+    return SceneState(world, walker=walker, static_light=static_light(world))
 
 
 def depth_of(shapes, view, *, slope=LEVEL):

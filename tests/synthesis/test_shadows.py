@@ -1,13 +1,20 @@
+from dataclasses import replace
+
 import numpy as np
 
+from stereogenbench_data.synthesis.maps import open_map
+from stereogenbench_data.synthesis.planning import propose
 from stereogenbench_data.synthesis.render import cast_shadow, static_light
-from stereogenbench_data.synthesis.scene import Material, SceneModel, Shape
+from stereogenbench_data.synthesis.request import SynthRequest
+from stereogenbench_data.synthesis.scene import Material, Shape
 
 
 def test_a_box_shades_the_ground_on_the_side_away_from_the_sun():
     stone = Material("plaster", 1.0, (1.0, 1.0, 1.0))
     sun = np.array([-0.6, 0.48, 0.64])
-    scene = SceneModel(np.array([0.05, -0.02]), stone, (), 0, sun, shadow_range_m=16.0)
+    empty = open_map(propose(SynthRequest(), index=0, number=0))
+    slope = np.array([0.05, -0.02])
+    scene = replace(empty, slope=slope, static_shapes=(), sun=sun, shadow_range_m=16.0)
     box = Shape("box", np.array([0.0, 0.0, 1.0]), np.eye(3), np.full(3, 1.0), stone)
     light = static_light(scene)
 
