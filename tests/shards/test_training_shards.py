@@ -44,7 +44,7 @@ from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.cli.command import invoke
 from tests.datasets.conftest import same
-from tests.servers.tools import require_module
+from tests.servers.tools import made_once, require_module
 from tests.shards.shard_files import alter_scene, bytes_of, flip_byte, scenes_of
 
 SIZE = (24, 32)
@@ -61,21 +61,25 @@ def blosc2():
 
 @pytest.fixture(scope="module")
 def release(tmp_path_factory):
-    """Three scenes of 18 frames, more than two runs between key frames."""
-    root = tmp_path_factory.mktemp("training") / "release"
-    for family, scenes in (("IPD_Gaussian", 1), ("Uniform", 2)):
-        request = SynthRequest(family=family, scenes=scenes, size_px=48, frames=18)
-        synthesise(root, request, workers=1)
-    SceneIndex.open(root).write(root / "index.parquet")
-    return root
+    """Three scenes of 18 frames, more than two runs between key frames; not to be changed."""
+
+    def make(root):
+        for family, scenes in (("IPD_Gaussian", 1), ("Uniform", 2)):
+            request = SynthRequest(family=family, scenes=scenes, size_px=48, frames=18)
+            synthesise(root, request, workers=1)
+        SceneIndex.open(root).write(root / "index.parquet")
+
+    return made_once(tmp_path_factory, "training_release", make)
 
 
 @pytest.fixture(scope="module")
 def packed(release, tmp_path_factory):
     """Its training shards by the default settings; not to be changed."""
-    out = tmp_path_factory.mktemp("training_shards") / "shards"
-    pack(release, out, training=SETTINGS, workers=1)
-    return out
+    return made_once(
+        tmp_path_factory,
+        "training_shards",
+        lambda out: pack(release, out, training=SETTINGS, workers=1),
+    )
 
 
 @pytest.fixture
