@@ -5,17 +5,14 @@ The user's cache keeps the described scenes, so a killed run continues where it 
 
 import hashlib
 import json
-import math
-import os
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import chain
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, thread_time
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -36,7 +33,6 @@ from stereogenbench_data.index.scene_folder import (
 )
 from stereogenbench_data.index.tree import (
     Files,
-    MisplacedScenes,
     RemoteFolder,
     RemoteTree,
     SceneFolder,
@@ -81,22 +77,19 @@ FORMAT_CURE: Final = (
 )
 _WARN_ABOVE_REQUESTS: Final = 2500
 """More requests are told: the Hub answers 3,000 in five minutes."""
-_MOST_UNTOLD_SCENES: Final = 100
-"""Of more scenes of a folder it is told what reading them takes."""
 _SETTLED_BY: Final = 20
 """How many scenes of a tree settle how its scenes are read."""
 _SETTLED_BY_REMOTE: Final = 12
 """How many do so behind a URL, where each takes nine requests."""
-_TRIED: Final = 2
-"""How many of them are described to know that; imports are part of the first."""
-_HEADS_BYTES: Final = 80_000
-"""What the heads of a scene's videos have, more or less."""
 _REQUESTS: Final = 2 * len(VIDEO_FILES) + len(METADATA_FILES)
 """The requests that describe a scene behind a URL: both ends of each video, and the small files."""
+_WAITS: Final = 3.0
+"""How many times as long as its work reading must take for several to wait for the disk at a time:
+where files are near, threads only keep each other from working."""
 _READERS: Final = 8
-"""Threads that list the files of scenes on this machine: its disk may be slow."""
+"""Threads that read the files of scenes on this machine, if its disk waits."""
 _AT_A_TIME: Final = 128
-"""How many scenes each of them lists at a time."""
+"""How many scenes each of them reads at a time; the first so many tell how the disk is."""
 POOL_FROM: Final = 64
 """How many scenes there must be for worker processes to be worth their start."""
 
@@ -169,8 +162,9 @@ class Tree:
         conventions: Where quantities stand in the files; what they do not state is the release's.
         valid_depth: Whether depth pictures are decoded, see `walk`.
         checksums: Whether rows hold checksums, see `walk`.
-        files: Key to files, of scenes whose files are listed.
-        stamp: A digest of all this, which changes when a file is added, removed or changed.
+        files: Key to files, of scenes behind a URL whose files are listed.
+        stamp: A digest of all this, which changes when a file is added, removed or changed
+            (`listed`).
         settled: Where poses stand in all scenes and in which form; None where that is settled for
             each scene.
     """
@@ -203,28 +197,34 @@ class Tree:
             return replace(self, settled=found)
         return self
 
-    def listed(self) -> "Tree":
-        """Return the tree with the files of its scenes; where they cannot be listed, without."""
+    def listed(self, *, by: Literal["files", "folders"] = "files") -> "Tree":
+        """Return the tree with a stamp of its scenes; behind a URL with their files, too.
 
-        def stamps(key: str) -> Files | None:
-            with suppress(StorageError):
-                return self.folder(key).stamps()
-            return None
-
-        refused: Mapping[str, str] = {}
+        Args:
+            by: What the stamp changes with: every file, or on a disk the names in each folder and
+                each ``baseline.json``, which is an eighth of the work.
+        """
+        files, refused, stamps = dict[str, Files](), dict[str, str](), list[object]()
         if self.remote is None:
-            found = zip(self.keys, self.of_each(stamps, self.keys), strict=True)
-            files = {key: each for key, each in found if each is not None}
+            stamp = self.file_stamp if by == "files" else lambda key: self.folder(key).times()
+            stamps += self.of_each(stamp, self.keys)
         else:
             files, refused = self.remote.files(self.keys)
+            stamps += files.items()
         refused = self.refused | dict(sorted(refused.items()))
         is_marked = self.is_marked or any(COMPLETE_JSON in each for each in files.values())
         chosen = (self.is_part, sorted(self.train_maps()), is_marked, refused, self.keys)
         digest = hashlib.sha256(repr(chosen).encode())
-        for item in files.items():
-            digest.update(repr(item).encode())
-        stamp = digest.hexdigest()[:32]
-        return replace(self, files=files, refused=refused, is_marked=is_marked, stamp=stamp)
+        for each in stamps:
+            digest.update(repr(each).encode())
+        stamp_of_all = digest.hexdigest()[:32]
+        return replace(self, files=files, refused=refused, is_marked=is_marked, stamp=stamp_of_all)
+
+    def file_stamp(self, key: str) -> str:
+        """Return a digest of a scene's files; "" where they cannot be listed."""
+        with suppress(StorageError):
+            return stamp_of(self.folder(key).stamps())
+        return ""
 
     def folder(self, key: str) -> SceneFolder:
         """Return a scene's folder; on this machine its files are listed anew."""
@@ -254,11 +254,17 @@ class Tree:
         return None if self.conventions is None else self.conventions.shapes[0]
 
     def of_each(self, read: Callable[[str], Any], keys: Sequence[str]) -> Iterator[Any]:
-        """Yield what is read of each scene, in order; several wait at a time."""
+        """Yield what is read of each scene, in order; of a disk that waits several at a time."""
         if self.remote is not None:
             yield from in_parallel(read, keys)
             return
-        parts = [keys[start : start + _AT_A_TIME] for start in range(0, len(keys), _AT_A_TIME)]
+        begins_s, worked_s = perf_counter(), thread_time()
+        yield from map(read, keys[:_AT_A_TIME])
+        if perf_counter() - begins_s < _WAITS * (thread_time() - worked_s):
+            yield from map(read, keys[_AT_A_TIME:])
+            return
+        starts = range(_AT_A_TIME, len(keys), _AT_A_TIME)
+        parts = [keys[start : start + _AT_A_TIME] for start in starts]
         with ThreadPoolExecutor(_READERS) as pool:
             for part in pool.map(lambda part: [*map(read, part)], parts):
                 yield from part
@@ -396,17 +402,13 @@ def walk_tree(
     if engine is LOCAL and len(pending) < POOL_FROM:
         workers = 1
     bare = replace(tree, keys=(), ids={}, refused={}, files={})
-    tried: list[Outcome] = []
     if tree.remote is not None:
         size_bytes = sum(_asked_bytes(tree.files[each.key]) for each in pending)
         tell_requests(
             tree.root, len(pending), each=_REQUESTS, what="all files", size_bytes=size_bytes
         )
-    elif len(pending) > _MOST_UNTOLD_SCENES or tree.checksums == "all":
-        tried = _tried(bare, pending, workers=workers)
-        pending = pending[len(tried) :]
     others = engine.map(bare.outcome, pending, name=lambda folder: folder.key, workers=workers)
-    for outcome in chain(tried, others):
+    for outcome in others:
         outcomes[outcome.key] = outcome
         if progress is not None:
             progress(len(outcomes), total)
@@ -538,40 +540,9 @@ def _asked_bytes(files: Files) -> int:
                for name, (size, _) in files.items())  # fmt: skip
 
 
-def _tried(tree: Tree, pending: Sequence[SceneFolder], *, workers: int | None) -> list[Outcome]:
-    """Return what becomes of some scenes, having told what the others will take."""
-    outcomes: list[Outcome] = []
-    each_s = math.inf
-    for folder in pending[:_TRIED]:
-        begins_s = perf_counter()
-        outcomes.append(tree.outcome(folder))
-        each_s = min(each_s, perf_counter() - begins_s)
-    if scenes := len(pending) - len(outcomes):
-        workers = min(workers or os.cpu_count() or 1, scenes)
-        what, each_bytes = "the heads of all videos", _HEADS_BYTES
-        if tree.checksums == "all":
-            found = [out.found for out in outcomes if isinstance(out.found, Scene)]
-            sizes = (sum(file.size for file in scene.members.values()) for scene in found)
-            what, each_bytes = "all files through", max(sizes, default=0)
-        told = (
-            f"{shown(tree.root)}: reads {what} of {scenes} scenes, some "
-            f"{_size(each_bytes * scenes)}, which takes some {_lasting(each_s * scenes / workers)} "
-            f"by {counted(workers, 'worker')}. An interrupted run goes on where it stopped."
-        )
-        warnings.warn(told, ManyReadsWarning, stacklevel=2)
-    return outcomes
-
-
 def _size(size_bytes: int) -> str:
     """Return a number of bytes for messages."""
     return f"{size_bytes / 1e9:,.1f} GB" if size_bytes >= 1e9 else f"{size_bytes / 1e6:,.1f} MB"
-
-
-def _lasting(time_s: float) -> str:
-    """Return a time for messages."""
-    if time_s < 90:
-        return f"{time_s:.0f} s"
-    return f"{time_s / 60:.0f} minutes" if time_s < 5400 else f"{time_s / 3600:.1f} hours"
 
 
 def find_tree(
@@ -656,12 +627,7 @@ def report_of(tree: Tree, of_keys: Mapping[str, Outcome]) -> TreeReport:
     left_out = {out.key: out.found for out in outcomes if not isinstance(out.found, Scene)}
     incomplete = {key: str(error) for key, error in left_out.items()
                   if isinstance(error, IncompleteScene)}  # fmt: skip
-    broken = {
-        path: reason
-        for key, error in left_out.items() if key not in incomplete
-        for path, reason in (error.refused if isinstance(error, MisplacedScenes)
-                             else {key: str(error)}).items()
-    }  # fmt: skip
+    broken = {key: str(error) for key, error in left_out.items() if key not in incomplete}
     found = [out.found for out in outcomes if isinstance(out.found, Scene)]
     found = _without_unfetched(found)
     scenes = [replace(scene, id=tree.ids[scene.id.key]) for scene in found]

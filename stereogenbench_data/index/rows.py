@@ -7,7 +7,7 @@ import base64
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
 import pyarrow as pa
@@ -151,21 +151,20 @@ def row_of(scene: Scene) -> dict[str, Any]:
         value: Any = scene
         for part in parts:
             if value is not None:
-                value = getattr(value, part) if isinstance(part, str) else value[part]
-        row[name] = list(value) if isinstance(value, tuple) else value
+                value = getattr(value, part) if type(part) is str else value[part]
+        row[name] = list(value) if type(value) is tuple else value
     if scene.key_frames == (0,):
         row["key_frames"] = None
     if not any(scene.depth_offset_m):
         row["depth_offset_m"] = None
     row["remarks"] = [asdict(remark) for remark in scene.remarks] or None
     row["members"] = [
-        {"name": name} | {field: getattr(member, field) for field in _OF_MEMBER}
-        for name, member in sorted(scene.members.items())
+        {"name": name, "path": at.path, "offset": at.offset, "size": at.size, "crc32": at.crc32}
+        for name, at in sorted(scene.members.items())
     ]
     return row
 
 
-_OF_MEMBER: Final = tuple(field.name for field in fields(Member))
 _PARTS: Final = {
     name: [int(part) if part.isdigit() else part for part in column.place.split(".")]
     for name, column in COLUMNS.items()

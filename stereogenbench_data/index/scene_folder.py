@@ -561,6 +561,21 @@ def as_kept(remarks: list[Remark]) -> tuple[Remark, ...]:
     )
 
 
+def median_depth_m(root: str | Path, scene: Scene) -> float:
+    """Return the median depth in metres of a scene's first depth picture by its row's unit.
+
+    nan where there is no such picture, or none that can be read.
+    """
+    name = next((name for name in scene.held_videos if name[6:12] == "_depth"), "")
+    with suppress(StereoGenBenchError, KeyError):
+        video = Path(root, scene.members[name].path)
+        with open_video(video, name=name, frames=scene.frames) as reader:
+            units = read_depth_units(reader, 0, encoding=ANY_DEPTH)
+            known = measured(units, encoding=ANY_DEPTH, pixel_format=reader.facts.pixel_format)
+        return float(np.median(units[known])) * scene.depth_unit_m[0] if known.any() else math.nan
+    return math.nan
+
+
 def missing_video(key: str, name: str) -> str:
     """Return what is remarked about a video that a scene lacks."""
     return f"{key}/{name}: is missing, and the scene is marked as complete"
@@ -576,7 +591,7 @@ def assumed_places_m(rig: Rig) -> tuple[float, ...]:
     The cameras are assumed to stand on a line; () where the baselines are not those of a line.
     """
     of_pair = dict(zip(CAMERA_PAIRS, rig.baselines_cm, strict=True))
-    first, last = max(of_pair, key=lambda pair: of_pair[pair])
+    _, (first, last) = max(zip(rig.baselines_cm, CAMERA_PAIRS, strict=True))
     along_cm = [
         of_pair.get((first, camera), of_pair.get((camera, first), 0.0))
         for camera in range(CAMERA_COUNT)

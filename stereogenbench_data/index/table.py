@@ -55,6 +55,7 @@ from stereogenbench_data.schema.records import Scene, SceneId, ShardFacts, remar
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
     COMPLETE_JSON,
+    DEFAULT_DEPTH_UNIT_M,
     TRAJECTORY_JSON,
     VIDEO_FILES,
 )
@@ -835,20 +836,25 @@ def _open_tree(
     with _no_collection():
         tree = find_tree(root, wanted=wanted, if_none="all", conventions=conventions, retry=retry)
         is_large = len(tree.ids) >= (POOL_FROM if tree.remote is None else FEW_REMOTE)
-        tree = tree.listed() if is_large else tree
+        is_near = tree.remote is None
+        is_settled = is_large and rows == "settled" and not (tree.stated and tree.stated.has)
+        if is_settled or not is_near:
+            tree = tree.listed(by="folders")
 
     def read() -> SceneIndex:
-        if tree.remote is not None:
+        if not is_near:
             _require_few(tree)
         # In this process: a script without `if __name__ == "__main__"` could start no others.
         return _of_report(walk_tree(tree, workers=1))
 
     index = None
-    if is_large and rows == "settled" and not (tree.stated and tree.stated.has):
-        is_near = tree.remote is None
+    if is_settled:
         settled, opened = settle(tree, videos="all" if is_near else "of one camera")
         index = _open_settled(settled, opened, "read" if is_near else "not read")
-    index = index or (_cached_or_built(tree, "read", read) if is_large else None) or read()
+    if index is None and is_large:
+        tree = tree.listed() if is_near else tree
+        index = _cached_or_built(tree, "read", read)
+    index = index or read()
     wanted_keys = set(tree.keys)
     index.others = tuple(each for key, each in tree.ids.items() if key not in wanted_keys)
     return index
@@ -882,12 +888,22 @@ def _cached_or_built(
         table, head, tables = kept
         # Without a digest: the user has made no index file.
         head = replace(head, root=str(tree.root), digest="")
-        return SceneIndex(table, head, seek_tables=tables)
+        index = SceneIndex(table, head, seek_tables=tables)
+        if tree.cache.read("odd", name) == _stamp_of_odd(tree, index):
+            return index
     found = find()
     if found is not None and not isinstance(found._seek_tables, Path):
         head = replace(found._head, digest=table_digest(found._table))
         tree.cache.keep_table(name, found._table, head, found._seek_tables)
+        tree.cache.keep("odd", name, _stamp_of_odd(tree, found))
     return found
+
+
+def _stamp_of_odd(tree: "Tree", index: SceneIndex) -> bytes:
+    """Return what changes with any file of the scenes that cannot be used, or lack a file."""
+    lacking = np.union1d(index.remarked("videos"), index.remarked("poses"))
+    odd = {*index.incomplete, *index.broken, *index.column("key")[lacking]}
+    return "".join(map(tree.file_stamp, sorted(odd & tree.ids.keys()))).encode()
 
 
 def _require_few(tree: "Tree") -> None:
@@ -952,15 +968,38 @@ def _lacking(index: SceneIndex) -> dict[str, str]:
 def _assumed_of(index: SceneIndex) -> str:
     """Return what was taken for granted about the scenes of a tree; "" if nothing."""
     table, unopened = index._table, index.unopened
+    told = [_depth_too_far(index)]
     if unopened is not None:
-        odd = assumptions(unopened.opened[:_LOOKED_AT], where=index.where)
-        return (
-            f"{index.where}: {index.not_opened}. `stereogenbench index {index.where}` opens all."
-            + f" {odd}" * bool(odd)
-        )
+        all_opened = f"`stereogenbench index {index.where}` opens all."
+        told = [f"{index.where}: {index.not_opened}. {all_opened}", *told]
+        told += [assumptions(unopened.opened[:_LOOKED_AT], where=index.where)]
+        return " ".join(filter(None, told))
     is_odd = pc.or_(pc.is_valid(table.column("pose_form")), pc.is_valid(table.column("remarks")))
     scenes = table.filter(is_odd).slice(0, _LOOKED_AT).to_pylist()
-    return assumptions(map(scene_of, scenes), where=index.where)
+    told += [assumptions(map(scene_of, scenes), where=index.where)]
+    return " ".join(filter(None, told))
+
+
+def _depth_too_far(index: SceneIndex) -> str:
+    """Return that depth by the release's default unit is farther than stereo shows; "" if not."""
+    from stereogenbench_data.index.scene_folder import median_depth_m
+
+    scene = index.indexed_scene(0)
+    if is_remote(index.root) or scene.depth_unit_source[0] != "default":
+        return ""
+    far_m = median_depth_m(index.root, scene)
+    if not far_m > _FAR_M:
+        return ""
+    return (
+        f"{index.where}: nothing states the unit of depth, and by the release's default of "
+        f"{DEFAULT_DEPTH_UNIT_M:g} m half of the pixels of {scene.id.key} are farther than "
+        f"{far_m:,.0f} m. `stereogenbench doctor {index.where}` measures the unit; "
+        f"DepthEncoding(unit_m=...), or unit_m below [depth] in a file of conventions, states it."
+    )
+
+
+_FAR_M: Final = 200.0
+"""Scenes of stereo are nearer: 6 cm apart, cameras show half a pixel of that at 1,756 px."""
 
 
 _ASSUMED: Final = (

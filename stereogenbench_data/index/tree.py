@@ -19,8 +19,8 @@ import sys
 import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Final, TypeVar
 
 from stereogenbench_data.errors import (
@@ -42,6 +42,7 @@ from stereogenbench_data.schema.release import (
     TRAJECTORY_JSON,
     VIDEO_FILES,
 )
+from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.location import is_remote
 from stereogenbench_data.sources.members import read_text_file
 from stereogenbench_data.sources.ranged_file import RangedFile
@@ -87,16 +88,6 @@ def stamp_of(files: Files) -> str:
     return hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest()[:32]
 
 
-class MisplacedScenes(StorageError):
-    """Where a scene belongs there is none, and others are below it.
-
-    Attributes:
-        refused: Path of each to what is wrong with it, and the cure.
-    """
-
-    refused: Mapping[str, str] = MappingProxyType({})
-
-
 class SceneFolder:
     """A scene's folder on this machine.
 
@@ -113,22 +104,28 @@ class SceneFolder:
         """Return the size in bytes of each file, and a number that changes with it.
 
         Raises:
-            StorageError: If the folder cannot be read; `MisplacedScenes` if scenes are below it.
+            StorageError: If the folder cannot be read, or scenes are below it.
         """
         folder = f"{self._root}/{self.key}"
         with (
             explain_os_errors(f"{folder}: cannot be read", "Fetch the scene again."),
             os.scandir(folder) as entries,
         ):
-            found = {entry.name: _stamp(entry) for entry in entries if is_read(entry.name)}
+            found = {entry.name: _stamp_of(entry) for entry in entries if is_read(entry.name)}
         files = () if found else Path(folder).rglob("*")
-        if deeper := {each.parent for each in files if each.name in _SCENE_FILES}:
-            paths = (each.relative_to(self._root).as_posix() for each in deeper)
-            refused = {path: refusal(str(self._root), path) for path in sorted(paths)}
-            error = MisplacedScenes("\n".join(refused.values()))
-            error.refused = refused
-            raise error
+        if deeper := sorted({each.parent for each in files if each.name in _SCENE_FILES}):
+            first = deeper[0].relative_to(self._root).as_posix()
+            others = f" ({counted(len(deeper) - 1, 'other')} likewise.)" if deeper[1:] else ""
+            raise StorageError(f"{refusal(str(self._root), first)}{others}")
         return dict(sorted(found.items()))
+
+    def times(self) -> tuple[object, ...]:
+        """Return numbers that change with the names of the files, and with ``baseline.json``."""
+        folder = f"{self._root}/{self.key}"
+        paths = folder, f"{folder}/{BASELINE_JSON}"
+        with suppress(OSError):
+            return tuple(_stamp(os.stat(path)) for path in paths)  # noqa: PTH116 - Paths cost more
+        return ()
 
     def hollow(self, files: Files) -> dict[str, str]:
         """Return the files that cannot hold what they should, as their listing shows, and why.
@@ -190,14 +187,17 @@ _VIDEOS: Final = frozenset({*VIDEO_FILES, *PACKED_DEPTH_NAMES.values()})
 _LARGE: Final = _VIDEOS | {BASELINE_JSON, TRAJECTORY_JSON}
 
 
-def _stamp(entry: "os.DirEntry[str]") -> tuple[int, int]:
+def _stamp_of(entry: "os.DirEntry[str]") -> tuple[int, int]:
     """Return the size of a file and a number that changes with it; a dangling link has no bytes."""
     try:
-        status = entry.stat()
+        return _stamp(entry.stat())
     except OSError:
         if not entry.is_symlink():
             raise
         return 0, 0
+
+
+def _stamp(status: os.stat_result) -> tuple[int, int]:
     # Times of modification can be set, as `tar` does; those of change cannot, but on Windows.
     return status.st_size, status.st_mtime_ns + status.st_ctime_ns
 

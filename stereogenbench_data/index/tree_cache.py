@@ -3,12 +3,15 @@
     <cache>/stereogenbench/trees/<digest of the root>/
         settled-<digest of the listing>.parquet    the rows, as an index file
         scenes/ab/<digest of the scene's files>    the row of a scene that was opened
+        odd/ab/<digest of a table's name>          the files of its scenes that cannot be used
         listing/ab/<digest of the folder>          what a commit of the Hub holds
         files/ab/<digest of path and ETag>         a small file of a scene behind a URL
 
-The listing is the path, size and times of every file, so what is kept is used only for unchanged
-files, and by the same code. Any number of processes, of several machines too, may read and write:
-files are renamed into place, whole or not at all, and a damaged one counts as missing.
+The listing is the times of every folder and its ``baseline.json``; where all scenes are opened,
+behind a URL, and of scenes that cannot be used, those of every file. What it does not tell is
+compared when a scene is first used. What is kept is used by the same code alone. Any number of
+processes, of several machines too, may read and write: files are renamed into place, whole or not
+at all, and a damaged one counts as missing.
 """
 
 import functools
@@ -84,6 +87,12 @@ class TreeCache:
             tables = sorted(self._folder.glob("*.parquet"), key=lambda path: path.stat().st_mtime)
             for old in tables[:-_MOST_TABLES]:
                 old.unlink(missing_ok=True)
+
+    def forget_tables(self) -> None:
+        """Remove all rows, as files have changed that no listing tells."""
+        with suppress(OSError):
+            for table in self._folder.glob("*.parquet"):
+                table.unlink(missing_ok=True)
 
     def read(self, kind: str, name: str) -> bytes | None:
         """Return what was kept under a kind and a name; None if there is none, or it is damaged."""

@@ -372,6 +372,7 @@ class UnopenedScenes:
                 scene = replace(scene, key_frames=row.key_frames)
             differences = [*_differences(row, scene, opened, self.baselines)]
         if differences:
+            self.tree.cache.forget_tables()
             told = shortened("; ".join(differences), _LONGEST_TOLD)
             raise StorageError(
                 f"{shown(self.tree.root)}: {key} is not as the scenes that were opened first: "
@@ -406,8 +407,6 @@ def _differences(
     for name in ("form of poses", "what poses lack"):
         del now[name], usual[name]
     yield from _unlike(usual, now)
-    if found.members != row.members and "videos" not in stopped:
-        yield "its files have changed since the tree was opened"
     before_m, now_m = row.lateral_m, found.lateral_m
     if any((before_m[b] > before_m[a]) != (now_m[b] > now_m[a]) for a, b in CAMERA_PAIRS):
         yield f"places of cameras in m {now_m}, and not {before_m}"

@@ -6,6 +6,7 @@ and be understood: `SchemaError` lists everything else that is wrong. What no sa
 captions) is left out with a `Remark`.
 """
 
+import functools
 import itertools
 import math
 import re
@@ -59,6 +60,7 @@ _SHOWN: Final = 20
 Pair = tuple[int, int]
 
 
+@functools.lru_cache(maxsize=2**14)  # opening a tree asks twice for each scene
 def parse_scene_key(key: str) -> SceneId:
     """Return the split, subset, family and map that a scene's path names.
 
@@ -216,11 +218,11 @@ def require_unit(rig: Rig, *, family: str, where: str) -> tuple[Remark, ...]:
     Raises:
         SchemaError: If they are far off, and would be the family's in another unit of length.
     """
+    if is_of_family(rig, family):
+        return ()
     low_cm, high_cm = ADJACENT_CM.get(family, (0.0, math.inf))
     adjacent_cm = [rig.baseline_cm(a, b) for a, b in ADJACENT_PAIRS]
     least_cm, most_cm = min(adjacent_cm), max(adjacent_cm)
-    if is_of_family(rig, family):
-        return ()
     told = (
         f"{where}: neighbouring cameras are {least_cm:.6g} to {most_cm:.6g} cm apart, and in the "
         f"paper's family {family} {low_cm:g} to {high_cm:g} cm"
@@ -562,9 +564,9 @@ def _row(at: PairsAt, row: Any, keys: str, way: tuple[str | int, ...]) -> tuple[
         _OddRow: If it does not have them.
     """
     try:
-        if at is BUILT_IN.pairs:  # the paper's example compares numbers
+        if at is BUILT_IN.pairs or at is BUILT_IN.gaps:  # the paper's example compares numbers
             a, b, stated = row[at.a], row[at.b], row[at.length]
-            a, b = (each if type(each) is int else None for each in (a, b))
+            a, b = a if type(a) is int else None, b if type(b) is int else None
         else:
             a, b = _camera_of_row(row, keys, at.a, 0), _camera_of_row(row, keys, at.b, 1)
             stated = value_at(row, at.length) if at.length else row

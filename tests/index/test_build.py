@@ -10,7 +10,7 @@ import pytest
 
 from stereogenbench_data.geometry import pose_evidence as evidence
 from stereogenbench_data.index import build as walk_module
-from stereogenbench_data.index.build import ManyReadsWarning, walk
+from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.tree_cache import CACHE_VARIABLE
 
 KEY = "train/Uniform/Car_Dealer/scene_{:06d}"
@@ -112,18 +112,6 @@ def test_a_stopped_walk_goes_on_and_a_damaged_row_is_read_again(alike_scenes, ro
     assert len(report.scenes) == 4
 
 
-def test_what_many_scenes_take_is_told_before_they_are_read(alike_scenes, root, monkeypatch):
-    alike_scenes(6)
-    monkeypatch.setattr(walk_module, "_MOST_UNTOLD_SCENES", 4)
-    monkeypatch.setattr(walk_module, "_SETTLED_BY", 1)
-
-    told = rf"{root}: reads the heads of all videos of 3 scenes, some 0.2 MB, .* [0-9]+ s .* worker"
-    with pytest.warns(ManyReadsWarning, match=told):
-        report = walk(root)
-
-    assert len(report.scenes) == 6
-
-
 @pytest.mark.usefixtures("cache")
 def test_checksums_of_a_folder_go_on_where_they_were_stopped(alike_scenes, root, monkeypatch):
     keys = alike_scenes(4)
@@ -134,12 +122,7 @@ def test_checksums_of_a_folder_go_on_where_they_were_stopped(alike_scenes, root,
         if done == 3:
             raise KeyboardInterrupt
 
-    size = sum(path.stat().st_size for path in (root / keys[0]).iterdir()) / 1e6
-    told = f"all files through of 1 scenes, some {size:.1f} MB, which takes some [0-9]+ s by 1"
-    with (
-        pytest.warns(ManyReadsWarning, match=told),
-        pytest.raises(KeyboardInterrupt, match=r"^$"),
-    ):
+    with pytest.raises(KeyboardInterrupt, match=r"^$"):
         walk(root, checksums="all", progress=stop)
     known, report = again(root, checksums="all")
 

@@ -44,19 +44,14 @@ def test_commands_take_the_root_of_an_index_elsewhere(small_release, tmp_path):
     assert json.loads(taken.stdout)["root"] == str(small_release)
 
 
-def test_checksums_are_filled_by_the_command_and_only_for_a_folder(
-    make_scene, root, run, monkeypatch
-):
-    monkeypatch.setattr(walk_module, "_SETTLED_BY", 1)
+def test_checksums_are_filled_by_the_command_and_only_for_a_folder(make_scene, root, run):
     make_scene()
-    for number in (2, 3, 4):
-        make_scene(f"train/Uniform/Car_Dealer/scene_{number:06d}")
+    make_scene("train/Uniform/Car_Dealer/scene_000002")
 
     done = run(root, "--checksums")
     refused = run("hf://datasets/an/other", "--checksums", "-o", root / "other.parquet")
 
     assert done.exit_code == 0
-    assert "reads all files through of 1 scenes, some" in one_line(done.stderr)
     members = SceneIndex.open(root).scene(1).members.values()
     assert all(each.crc32 is not None for each in members)
     assert refused.exit_code == 2

@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 
+import av
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from stereogenbench_data import IncompleteSceneWarning, StereoPairs
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import build
 from stereogenbench_data.index.table import AssumptionWarning, SceneIndex
+from stereogenbench_data.index.tree import SceneFolder
 from stereogenbench_data.index.tree_cache import CACHE_VARIABLE
 from tests.servers.scene_fixtures import documents
 
@@ -265,6 +267,60 @@ def test_a_second_opening_has_the_same_rows_without_a_cache_too(whole_tree, cach
     assert list(cache.rglob("settled-*.parquet"))
     assert first.digest == second.digest == without.digest
     assert second.root == first.root
+
+
+def test_a_second_opening_lists_the_files_of_those_scenes_alone_that_settle(
+    tree, cache, monkeypatch
+):
+    SceneIndex.open(tree)
+    listed, stamps = [], SceneFolder.stamps
+    monkeypatch.setattr(SceneFolder, "stamps", lambda it: listed.append(it.key) or stamps(it))
+
+    index = SceneIndex.open(tree)
+
+    assert len(index) == len(KEYS)
+    assert len(set(listed)) == 20
+
+
+def test_a_file_that_is_mended_in_place_is_seen_at_the_next_opening(tree, cache):
+    video = tree / ODD / "cam_01_rgb.mp4"
+    content = video.read_bytes()
+    put(video, POINTER)
+    with pytest.warns(IncompleteSceneWarning, match=ODD):
+        SceneIndex.open(tree)
+    with video.open("r+b") as file:
+        file.write(content)
+
+    assert not SceneIndex.open(tree).lacking
+
+
+def test_a_scene_that_changed_in_place_is_read_anew_after_it_was_told(tree, cache):
+    before = SceneIndex.open(tree)
+    row, path = row_of(before, ODD), tree / ODD / "trajectory.json"
+    whole = path.read_bytes()
+    put(path, whole)
+    SceneIndex.open(tree)
+    path.write_bytes(whole[:-200])
+    index = SceneIndex.open(tree)
+
+    with pytest.raises(StorageError, match=rf"{ODD}/trajectory.json: is cut short"):
+        index.scene(row)
+    with pytest.warns(IncompleteSceneWarning, match=rf"{ODD}/trajectory.json: is cut short"):
+        SceneIndex.open(tree)
+
+
+def test_depth_farther_than_stereo_shows_by_the_default_unit_is_told(tree, video):
+    untagged = video("depth.mkv", tags={})
+    for key in KEYS[1:]:
+        shutil.rmtree(tree / key)
+    for camera in range(6):
+        put(tree / KEYS[0] / f"cam_{camera:02d}_depth.mkv", untagged)
+    with av.open(untagged) as opened:
+        units = next(opened.decode(video=0)).to_ndarray()
+    half_m = float(np.median(units[(units > 0) & (units < 65535)])) * 0.1
+
+    with pytest.warns(AssumptionWarning, match=f"farther than {half_m:,.0f} m.*doctor"):
+        SceneIndex.open(tree)
 
 
 def test_a_damaged_cache_is_ignored_and_written_anew(whole_tree, cache):
