@@ -14,6 +14,7 @@ A batch on its way is in one place, `PartedBatches`. Whoever takes it out there,
 thread that pins memory, decides what becomes of its slot.
 """
 
+import copy
 import itertools
 import traceback
 import weakref
@@ -22,10 +23,10 @@ from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from torch.utils.data import get_worker_info
 from torch.utils.data._utils.pin_memory import pin_memory
 
 from stereogenbench_data.datasets.batch_buffers import (
-    BatchArrays,
     BatchMemory,
     Buffers,
     Layout,
@@ -60,11 +61,6 @@ class BatchPart(NamedTuple):
     key: tuple[int, int]
     slot: int | None = None
     layout: Layout | None = None
-
-    @property
-    def is_filler(self) -> bool:
-        """Whether it is of no batch."""
-        return self.key[1] == _FILLER
 
 
 @dataclass(slots=True)
@@ -101,10 +97,15 @@ class MadePart:
         return self
 
 
+def memory_of(task: BatchPart) -> BatchMemory:
+    """Return the slots for a task that this process has dealt to itself."""
+    return _parted[task.key[0]].memory
+
+
 def make_part(
     task: BatchPart,
-    memory: BatchMemory | None,
-    load: Callable[[Callable[[int], Allocate] | None], Iterator[Sample]],
+    memory: BatchMemory,
+    load: Callable[[Callable[[int], Allocate]], Iterator[Sample]],
 ) -> MadePart:
     """Make the samples of a task, in its slot if it has one.
 
@@ -112,28 +113,39 @@ def make_part(
         task: The task.
         memory: The slots.
         load: Yields the samples as arrays and texts. It is given what allocates their arrays, by
-            their places in the task; None where they may lie anywhere.
+            their places in the task.
     """
     made = MadePart(task.key, task.places)
-    arrays: BatchArrays | None = None
-    if memory is not None and task.slot is not None and memory.layout is not None:
-        arrays = memory.arrays(task.slot, memory.layout)
-    of_place = None if arrays is None else (lambda n: arrays.of_sample(task.places[n]))
+    arrays = {} if task.slot is None else memory.arrays(task.slot)
+
+    def of_place(number: int) -> Allocate:
+        def allocate(name: str, shape: tuple[int, ...], dtype: Any) -> Any:
+            whole = arrays.get(name)
+            if whole is None or whole.shape[1:] != shape or whole.dtype != dtype:
+                made.is_in_slot = False
+                return np.empty(shape, dtype=dtype)
+            return whole[task.places[number], ...]
+
+        return allocate
+
     try:
         for sample in load(of_place):
             made.samples.append(sample)
     except StereoGenBenchError as error:
         # Of a batch the first row's error is raised, whichever worker has met it.
-        error.add_note(traceback.format_exc())
+        if get_worker_info() is not None:
+            error.add_note(traceback.format_exc())
         made.failed = task.places[len(made.samples)], error
         made.samples.clear()
         return made
-    made.is_in_slot = not made.samples or (arrays is not None and arrays.holds_all)
     if made.is_in_slot:
         made.samples = [
             {name: value for name, value in each.items() if isinstance(value, str)}
             for each in made.samples
         ]
+    elif arrays:
+        # The slot may soon be another batch's.
+        made.samples = [copy.deepcopy(each) for each in made.samples]
     return made
 
 
@@ -163,18 +175,15 @@ class Making:
 class _Coming:
     """A batch on its way: how many samples it has, its slot, and what has come of it.
 
-    ``whole`` is the batch where it was put together already.
+    ``whole`` is the batch where it was put together already. ``failures`` are the places of samples
+    that could not be loaded, and why.
     """
 
     count: int
     slot: int | None
     parts: list[MadePart] = field(default_factory=list)
     whole: Any = None
-
-    @property
-    def failures(self) -> list[tuple[int, StereoGenBenchError]]:
-        """The samples that could not be loaded, by their places, and why."""
-        return [part.failed for part in self.parts if part.failed is not None]
+    failures: list[tuple[int, StereoGenBenchError]] = field(default_factory=list)
 
 
 class PartedBatches:
@@ -202,7 +211,7 @@ class PartedBatches:
                 waited for them, which is when it asks for the first task.
         """
         self._batches, self._global_batches, self._share = batches, of_all_ranks, share
-        self._memory, self._making, self._before = memory, making, before
+        self.memory, self._making, self._before = memory, making, before
         self._pass, self._due = next(_passes), 0
         self._told: Layout | None = None
         self._coming: dict[int, _Coming] = {}
@@ -227,12 +236,11 @@ class PartedBatches:
         worker_of = np.full(len(batch), number % share.workers)
         if batch.number is not None:
             worker_of = self._global_batches.workers_of(batch, share)
+            batch.open_runs = share.open_runs(self._global_batches.order(batch.epoch))
         if layout is not None and (not layout.fields or layout.samples < len(batch)):
             layout = None
-        slot = None if layout is None else self._memory.take()
+        slot = None if layout is None else self.memory.take()
         self._coming[number] = _Coming(len(batch), slot)
-        if batch.number is not None:
-            batch.open_runs = -(-batch.open_runs // share.workers)
         places: list[list[int]] = [[] for _ in range(share.workers)]
         for place, worker in enumerate(worker_of.tolist()):
             places[worker].append(place)
@@ -271,6 +279,8 @@ class PartedBatches:
         """Take a part that came from a worker."""
         coming = self._coming[made.key[1]]
         coming.parts.append(made)
+        if made.failed is not None:
+            coming.failures.append(made.failed)
         if made.work is not None:
             self._making.work.add(made.work)
         is_whole = pinned and len(coming.parts) == self._share.workers
@@ -282,7 +292,7 @@ class PartedBatches:
         slot, layout = coming.slot, self._making.layout
         if coming.failures:
             if slot is not None:
-                self._memory.give_back(slot)
+                self.memory.give_back(slot)
             raise min(coming.failures, key=lambda failure: failure[0])[1]
         rows: list[Sample] = [{}] * coming.count
         for part in coming.parts:
@@ -290,7 +300,7 @@ class PartedBatches:
                 rows[place] = sample if part.is_in_slot else to_tensors(sample)
         in_slot = {each for part in coming.parts if part.is_in_slot for each in part.places}
         if slot is not None and layout is not None:
-            tensors = self._memory.batch(slot, layout, count=coming.count)
+            tensors = self.memory.batch(slot, layout, count=coming.count)
             if self._making.buffers == "fresh":
                 tensors = {name: tensor.clone() for name, tensor in tensors.items()}
             if self._making.collate_fn is collate and len(in_slot) == len(rows):
@@ -314,7 +324,7 @@ class PartedBatches:
         while self._coming:
             _, coming = self._coming.popitem()
             if coming.slot is not None and coming.whole is None:
-                self._memory.give_back(coming.slot)
+                self.memory.give_back(coming.slot)
 
 
 _passes: Final = itertools.count()

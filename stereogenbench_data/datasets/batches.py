@@ -16,14 +16,14 @@ from torch.utils.data import Sampler
 
 from stereogenbench_data.datasets.division import (
     WorkerShare,
-    groups_of_rank,
     require_group,
     torchs_group,
 )
 from stereogenbench_data.datasets.epoch_rule import EPOCH_DEFAULTS, EpochOptions, fitting_rule
-from stereogenbench_data.datasets.shared import SharedEpoch, require_epoch
+from stereogenbench_data.datasets.shared import SharedEpoch
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.selection.filters import require_whole, whole_number
 from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.order import (
     ORDER_VERSION,
@@ -67,28 +67,21 @@ class EpochBatch(list[int]):
         ends_of_runs: The samples after which their videos are wanted no more for now.
         number: Its number among the batches of all ranks; None for a batch outside of an epoch.
         group: The shuffle group that it is of.
-        open_runs: How many runs of its group who reads it has open at a time.
+        open_runs: How many runs who reads it has open at a time, at the most.
         open_frames: How many frames of each are kept.
     """
 
-    def __init__(
-        self,
-        numbers: Iterable[int],
-        *,
-        epoch: int,
-        ends_of_runs: Collection[int] = (),
-        number: int | None = None,
-        group: int = 0,
-    ) -> None:
-        """Hold the numbers."""
+    is_padding: list[bool] | None = None
+    ends_of_runs: Collection[int] = ()
+    number: int | None = None
+    group = 0
+    open_runs = 0
+    open_frames = 1
+
+    def __init__(self, numbers: Iterable[int], *, epoch: int) -> None:
+        """Hold the numbers of a batch outside of an epoch's order."""
         super().__init__(numbers)
         self.epoch = epoch
-        self.is_padding: list[bool] | None = None
-        self.ends_of_runs = ends_of_runs
-        self.number = number
-        self.group = group
-        self.open_runs = 0
-        self.open_frames = 1
 
     def at(self, places: Sequence[int]) -> "EpochBatch":
         """Return the samples at some of its places as a batch."""
@@ -190,7 +183,7 @@ class Passes:
         Raises:
             SelectionError: If the epoch is not a whole number from 0.
         """
-        epoch = require_epoch(epoch)
+        epoch = require_whole("epoch", epoch, least=0)
         if self._then == "same epoch":
             self._dataset_epoch.set(epoch)
         else:
@@ -274,19 +267,13 @@ class GlobalBatches:
     def batch(self, number: int, *, epoch: int) -> EpochBatch:
         """Return the samples of a batch."""
         order, size = self.order(epoch), self.rule.batch_size
-        samples, ends_of_runs = np.empty(0, dtype=np.int64), list[int]()
+        samples = order.full_batch(number) if self.is_padded else order.batch(number)
+        batch = EpochBatch(samples.tolist(), epoch=epoch)
+        batch.number, batch.group = number, number % order.groups
+        batch.open_runs, batch.open_frames = order.open_runs(), self.rule.open_frames
         if number < order.batches:
-            samples, ends_run, _ = order.described(number)
-            ends_of_runs = samples[ends_run].tolist()
-        batch = EpochBatch(
-            (order.full_batch(number) if self.is_padded else samples).tolist(),
-            epoch=epoch,
-            ends_of_runs=ends_of_runs,
-            number=number,
-            group=number % order.groups,
-        )
-        batch.open_runs = order.streams(batch.group)
-        batch.open_frames = self.rule.open_frames
+            found = order.described(number)
+            batch.ends_of_runs = found.samples[found.ends_run].tolist()
         if self.is_padded:
             places = range(number * size, (number + 1) * size)
             batch.is_padding = [place >= order.samples for place in places]
@@ -294,14 +281,14 @@ class GlobalBatches:
 
     def workers_of(self, batch: EpochBatch, share: WorkerShare) -> Numbers:
         """Return which of a rank's workers decodes each sample of one of its batches."""
-        if batch.number is None or share.of == "batches":
-            turn = (batch.number or 0) // share.world_size
-            return np.full(len(batch), turn % share.workers)
+        number = batch.number or 0
+        if share.of == "batches":
+            return np.full(len(batch), number // share.world_size % share.workers)
         workers: Numbers = np.arange(len(batch)) % share.workers  # of what fills up the epoch
         order = self.order(batch.epoch)
-        if batch.number < order.batches:
-            groups = groups_of_rank(order.groups, share.rank, share.world_size)
-            own = order.workers_of(batch.number, groups=groups, workers=share.workers)
+        if number < order.batches:
+            groups = share.groups(order)
+            own = order.workers_of(number, groups=groups, workers=share.workers)
             workers[: len(own)] = own
         return workers
 
@@ -592,16 +579,18 @@ class EpochBatches(Sampler[list[int]]):
                 f"{_STATES}"
             )
         differing = [
-            f"{name} is {value!r} here and {state[name]!r} there"
+            name
             for name, value in own.items()
-            if name not in _DIGESTS
-            and (type(state[name]) is not type(value) or state[name] != value)
+            if type(state[name]) is not type(value) or state[name] != value
         ]
-        if not differing:
-            differing = [why for name, why in _DIGESTS.items() if state[name] != own[name]]
         if differing:
+            told = [
+                f"{name} is {own[name]!r} here and {state[name]!r} there"
+                for name in differing
+                if name not in _DIGESTS
+            ] or [_DIGESTS[name] for name in differing]
             raise StateError(
-                f"the state was saved for other batches: {'; '.join(differing)}. Open the same "
+                f"the state was saved for other batches: {'; '.join(told)}. Open the same "
                 "data with the same selection and options, or begin the epoch anew without it."
             )
         position = (
@@ -662,7 +651,7 @@ def require_count(state: Mapping[str, Any], name: str, *, most: int | None = Non
         StateError: If it is not a whole number, or more than there can be.
     """
     value = state.get(name)
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+    if not isinstance(value, int) or whole_number(value) is None or value < 0:
         raise StateError(f"the state's {name} is {value!r}, no whole number from 0. {_STATES}")
     if most is not None and value > most:
         raise StateError(f"the state's {name} is {value}, and there are {most}. {_STATES}")

@@ -35,16 +35,28 @@ class WorkerShare(NamedTuple):
     workers: int
     of: Literal["streams", "batches"]
 
+    @classmethod
+    def of_this_process(cls, rank: int, world_size: int) -> "WorkerShare":
+        """Return what this process decodes of the batches that it, or a worker, takes in turn."""
+        info = get_worker_info()
+        worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
+        return cls(rank, world_size, worker, workers, "batches")
+
     @property
     def batches_apart(self) -> int:
         """How far the numbers of two batches lie apart that it decodes one after the other."""
         return self.world_size * (self.workers if self.of == "batches" else 1)
 
+    def groups(self, order: EpochOrder) -> range:
+        """Return the shuffle groups of the batches that it reads, wholly or in parts."""
+        first = self.rank + (self.world_size * self.worker if self.of == "batches" else 0)
+        apart = math.gcd(order.groups, self.batches_apart)
+        return range(first % apart, order.groups, apart)
 
-def groups_of_rank(groups: int, rank: int, world_size: int) -> range:
-    """Return the shuffle groups that a rank's batches are of."""
-    apart = math.gcd(groups, world_size)
-    return range(rank % apart, groups, apart)
+    def open_runs(self, order: EpochOrder) -> int:
+        """Return how many runs of frames, of videos or of their parts, it has open at the most."""
+        of_rank = order.open_runs(self.groups(order))
+        return of_rank if self.of == "batches" else -(-of_rank // self.workers)
 
 
 def torchs_group() -> tuple[int, int] | None:
@@ -102,9 +114,7 @@ def warn_of_division(order: EpochOrder, share: WorkerShare, *, videos_per_scene:
     """
     if not (order.rule.shuffle and videos_per_scene):
         return
-    readers = share.world_size * (share.workers if share.of == "batches" else 1)
-    groups = groups_of_rank(order.groups, share.rank, readers)
-    open_scenes = sum(map(order.streams, groups))
+    readers, groups = share.batches_apart, share.groups(order)
     together, scenes = readers // math.gcd(order.groups, readers), len(order.runs.pairs)
     cure = "Use fewer ranks or a smaller batch_size: ranks times batch at most the scenes."
     is_avoidable = True
@@ -119,18 +129,17 @@ def warn_of_division(order: EpochOrder, share: WorkerShare, *, videos_per_scene:
             RepeatedDecodingWarning,
             stacklevel=users_level(),
         )
-    if share.of == "streams":
-        if share.workers > open_scenes:
-            warnings.warn(
-                f"{share.workers - open_scenes} of {share.workers} workers have nothing to do: a "
-                f"rank has {open_scenes} scenes open at a time, and one worker decodes a scene. "
-                f"Use num_workers={open_scenes}, or open_scenes="
-                f"{-(-share.workers // len(groups))} where there are as many scenes.",
-                IdleWorkersWarning,
-                stacklevel=users_level(),
-            )
-        open_scenes = -(-open_scenes // share.workers)
-    wanted, allowed = open_scenes * videos_per_scene, videos_allowed()
+    open_scenes = order.open_runs(groups)
+    if share.of == "streams" and share.workers > open_scenes:
+        warnings.warn(
+            f"{share.workers - open_scenes} of {share.workers} workers have nothing to do: a "
+            f"rank has {open_scenes} scenes open at a time, and one worker decodes a scene. "
+            f"Use num_workers={open_scenes}, or open_scenes="
+            f"{-(-share.workers // len(groups))} where there are as many scenes.",
+            IdleWorkersWarning,
+            stacklevel=users_level(),
+        )
+    wanted, allowed = share.open_runs(order) * videos_per_scene, videos_allowed()
     if wanted > allowed:
         warnings.warn(
             f"up to {wanted} videos would be open at a time, and this process may open {allowed}: "

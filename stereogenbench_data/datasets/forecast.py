@@ -207,7 +207,7 @@ def planned_bytes(pairs: StereoPairs, batch_size: int, *, workers: int) -> tuple
         index.root = "https://forecast.invalid"  # stands for their place, and is never asked
     batches, own = pairs.loader(batch_size, drop_last=False).batches, pairs.with_own_videos()
     own.read_by(batches, WorkerShare(0, 1, 0, workers, "streams"))
-    scenes = batches.rule.open_scenes * batches.of_all_ranks.order(0).groups
+    scenes = batches.of_all_ranks.order(0).open_runs()
     videos, frames = scenes * len(VIDEO_FILES), batches.rule.open_frames
     requests = count = samples = 0
     for worker in range(workers):
@@ -217,7 +217,8 @@ def planned_bytes(pairs: StereoPairs, batch_size: int, *, workers: int) -> tuple
         )
         decoder.keep_open(videos, frames=frames, scenes=scenes)
         share = WorkerShare(0, 1, worker, workers, "streams")
-        before_first = EpochBatch((), epoch=0, number=-share.batches_apart)
+        before_first = EpochBatch((), epoch=0)
+        before_first.number = -share.batches_apart
         decoder.expect(own.steps(before_first, (), share))
         most = -(-_MOST_PLANNED // workers)
         for step in islice(own.steps(before_first, (), share), most):

@@ -192,7 +192,7 @@ class PairsLoader(DataLoader[Any]):
         self._begun_passes = 0
         self._pass_began_s = self._passed_s = self._waited_s = 0.0
         self._persistent: Workers | None = None
-        self.making = Making(self.collate_fn, dataset.buffers.kind)
+        self.making = Making(self.collate_fn, dataset.buffers)
         self._set_sampler()
         dataset.read_by(batches, self.share)
 
@@ -331,16 +331,6 @@ class PairsLoader(DataLoader[Any]):
         )
 
     @property
-    def total_batch_size(self) -> int:
-        """How many samples the batches of all ranks hold together."""
-        return self.batches.batch_size * self.batches.world_size
-
-    @property
-    def total_dataset_length(self) -> int:
-        """How many samples an epoch has."""
-        return self.batches.samples_of_epoch
-
-    @property
     def _is_accelerate_prepared(self) -> bool:
         """Whether Accelerate need not divide the batches; ``accelerator.prepare`` reads it.
 
@@ -413,9 +403,10 @@ class PairsLoader(DataLoader[Any]):
         self._pass_began_s, self._waited_s = perf_counter(), 0.0
         self._begun_passes += 1
         if self._begun_passes == 1 and self._gradient_state is not None:
-            self.remainder = 0
-            if not self.batches.drop_last:
-                self.remainder = self.total_dataset_length % self.total_batch_size
+            batches, self.remainder = self.batches, 0
+            if not batches.drop_last:
+                of_all_ranks = batches.batch_size * batches.world_size
+                self.remainder = batches.samples_of_epoch % of_all_ranks
             self._gradient_state._add_dataloader(self)
 
     def _end(self, ended: Pass) -> None:
@@ -524,7 +515,7 @@ class LoaderPass(Iterator[Any]):
         loader._begin(begun)
         self._pass, self._workers = begun, workers
         with self._ended_by_errors():
-            workers.begin(begun, numbers, batches.of_all_ranks, loader.share, loader.making)
+            workers.begin(begun, numbers, loader)
 
     @contextmanager
     def _ended_by_errors(self) -> Iterator[None]:

@@ -5,7 +5,7 @@ import multiprocessing
 import operator
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypedDict, Unpack, get_args
@@ -13,14 +13,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypedDict, Unpack, 
 import numpy as np
 from torch.utils.data import Dataset, get_worker_info
 
-from stereogenbench_data.datasets.batch_buffers import (
-    BatchArrays,
-    BatchBuffers,
-    BatchMemory,
-    Buffers,
-    to_tensors,
-)
-from stereogenbench_data.datasets.batch_parts import BatchPart, MadePart, make_part
+from stereogenbench_data.datasets.batch_buffers import BatchMemory, Buffers, to_tensors
+from stereogenbench_data.datasets.batch_parts import BatchPart, MadePart, make_part, memory_of
 from stereogenbench_data.datasets.batches import (
     EpochBatch,
     EpochBatches,
@@ -169,6 +163,7 @@ class _MappedScenes(Dataset[Sample]):
     Attributes:
         left_out: How many scenes were selected and cannot give what is requested.
         is_random: Whether the samples of an epoch may differ from those of another.
+        is_watched: Whether who reads an epoch a second time is warned.
         chosen: Split, pairs or cameras, and frames, as chosen or by default; for people.
     """
 
@@ -212,15 +207,13 @@ class _MappedScenes(Dataset[Sample]):
             frames="shared" if (np.diff(plan.first_pair) > 1).any() else "used once",
             ahead=ahead if is_remote(index.root) else None,
         )
-        self.buffers = BatchBuffers(options["buffers"])
+        self.buffers = _require_one_of("buffers", options["buffers"], Buffers)
         self.shared_epoch = SharedEpoch()
         self.is_random = _is_random(plan, request)
-        self._is_watched = self.is_random
+        self.is_watched = self.is_random
         self._global_batches: GlobalBatches | None = None
         self._share, self._stop = WorkerShare(0, 1, 0, 1, "batches"), 0
-        self._next_batch: tuple[int, int] | None = None
         self._pass_read: int | None = None
-        self._open_runs: dict[int, int] = {}
         self._memory: BatchMemory | None = None
         self._idle_since_s = 0.0
 
@@ -271,9 +264,8 @@ class _MappedScenes(Dataset[Sample]):
         What `EpochBatches` gives is read as it comes: a stream that ends with what lies before its
         start goes back once.
 
-        Samples of one shape lie side by side in memory, so that `collate` need not copy them. What
-        `EpochBatches` gives is drawn for its own epoch, and has the field ``is_padding`` with
-        ``drop_last="pad"``. Workers of our loader are given a `BatchPart` and return a `MadePart`.
+        What `EpochBatches` gives is drawn for its own epoch, and has the field ``is_padding`` with
+        ``drop_last="pad"``. Of our loader a `BatchPart` is given, and a `MadePart` returned.
         """
         if isinstance(numbers, BatchPart):
             return self._made(numbers)
@@ -283,58 +275,36 @@ class _MappedScenes(Dataset[Sample]):
         places = list(range(len(batch)))
         if batch is not numbers:
             places.sort(key=batch.__getitem__)
-        share = self._share_of_batches()
-        samples = self._read(batch, places, self.buffers.allocate(len(batch)), share)
-        loaded = dict(zip(places, samples, strict=True))
+        loaded = dict(zip(places, self.samples_of(batch, places), strict=True))
         return [loaded[place] for place in range(len(batch))]
 
     def _mark_drawn(self, batch: EpochBatch) -> None:
-        """Warn once where torch's own `DataLoader` draws random samples of an epoch again."""
-        if self._is_watched:
+        """Warn once where torch's own `DataLoader` reads samples of an epoch again."""
+        if self.is_watched:
             fills_up = batch.is_padding or [False] * len(batch)
             own = [number for number, is_again in zip(batch, fills_up, strict=True) if not is_again]
             self.shared_epoch.mark_drawn(own, epoch=batch.epoch, dataset=self)
 
-    def samples_of(self, batch: EpochBatch, *, start: int = 0) -> Iterator[Sample]:
-        """Return the samples of a batch one after another, from one of its places on.
-
-        They lie side by side in memory where `BatchBuffers.collate` makes batches of them.
-        """
-        arrays = self.buffers.allocate(len(batch)) if self.buffers.makes_batches else None
-        return self._read(batch, range(start, len(batch)), arrays, self._share_of_batches())
-
-    def _share_of_batches(self) -> WorkerShare:
-        """Return what this process decodes where it is given whole batches."""
-        info, share = get_worker_info(), self._share
-        worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
-        return share._replace(worker=worker, workers=workers, of="batches")
-
-    def _read(
-        self,
-        batch: EpochBatch,
-        places: Sequence[int],
-        arrays: BatchArrays | None,
-        share: WorkerShare,
-    ) -> Iterator[Sample]:
-        """Yield samples of a batch, as slices of the batch's arrays if they are given."""
-        of_place = None if arrays is None else arrays.of_sample
-        samples = self._load(batch, places, of_place, share)
-        for place, sample in zip(places, samples, strict=True):
-            yield to_tensors(sample) if arrays is None else arrays.as_tensors(place, sample)
+    def samples_of(self, batch: EpochBatch, places: Sequence[int]) -> Iterator[Sample]:
+        """Return samples of a batch one after another, by their places in it."""
+        share = WorkerShare.of_this_process(self._share.rank, self._share.world_size)
+        return map(to_tensors, self._load(batch, places, share))
 
     def _load(
         self,
         batch: EpochBatch,
         places: Sequence[int],
-        of_place: Callable[[int], Allocate] | None,
         share: WorkerShare,
+        of_place: Callable[[int], Allocate] = lambda place: new_array,
     ) -> Iterator[Sample]:
         """Yield samples of a batch as arrays and texts, written into what is allocated for them."""
         self._mark_drawn(batch)
         self._keep_open(batch)
-        self._expect(batch, [batch[place] for place in places], share)
+        reading = [batch[place] for place in places]
+        if reading and not self._loader.is_next(self._address(reading[0], batch)):
+            self._loader.expect(self.steps(batch, reading, share))
         for place in places:
-            allocate = new_array if of_place is None else of_place(place)
+            allocate = of_place(place)
             sample = self._sample(batch[place], batch, allocate)
             if batch.is_padding is not None:
                 sample["is_padding"] = allocate("is_padding", (), np.bool_)
@@ -342,29 +312,24 @@ class _MappedScenes(Dataset[Sample]):
             yield sample
 
     def _made(self, task: BatchPart) -> MadePart:
-        """Return what this worker makes of its part of a batch."""
-        began_s, batch, memory = perf_counter(), task.batch, self._memory
-        if task.layout is not None and memory is not None:
-            memory.layout = task.layout
+        """Return what this process makes of its part of a batch."""
+        began_s, batch = perf_counter(), task.batch
+        memory = self._memory or memory_of(task)
+        memory.layout = task.layout or memory.layout
         if not batch:
-            # What is fetched ahead goes on after a batch of which nothing is this worker's.
-            is_of_others = self._share.of == "streams" and not task.is_filler
-            if self._next_batch is not None and is_of_others:
-                epoch, number = self._next_batch
-                self._next_batch = epoch, number + self._share.batches_apart
             return MadePart(task.key, [])
-        if self._pass_read != task.key[0]:
+        is_worker = self._memory is not None
+        if is_worker and self._pass_read != task.key[0]:
             # What an earlier pass has open is not wanted any more.
             self._loader.close()
-            self._pass_read, self._open_runs = task.key[0], {}
-        places = range(len(batch))
-        made = make_part(
-            task, memory, lambda of_place: self._load(batch, places, of_place, self._share)
-        )
+            self._pass_read = task.key[0]
+        load = partial(self._load, batch, range(len(batch)), self._share)
+        made = make_part(task, memory, load)
         made.work = self._loader.take_work()
         if self._idle_since_s:
             made.work.waiting_s = began_s - self._idle_since_s
-        self._idle_since_s = perf_counter()
+        if is_worker:
+            self._idle_since_s = perf_counter()
         return made
 
     def begin_worker(self, worker: int, memory: BatchMemory) -> None:
@@ -376,23 +341,11 @@ class _MappedScenes(Dataset[Sample]):
         return self._loader.take_work()
 
     def _keep_open(self, batch: EpochBatch) -> None:
-        """Keep as many videos open as the groups have runs open that this process reads."""
-        known = self._open_runs
-        if batch.number is not None and known.get(batch.group) != batch.open_runs:
-            known[batch.group] = batch.open_runs
-            scenes = sum(known.values())
-            videos = scenes * self._videos_per_scene
-            videos = min(max(OPEN_STREAMS, videos), videos_allowed())
-            self._loader.keep_open(videos, frames=batch.open_frames, scenes=scenes)
-
-    def _expect(self, batch: EpochBatch, reading: Sequence[int], share: WorkerShare) -> None:
-        """Let the bytes of a batch, in the order of reading, and of those after it be fetched."""
-        this = (batch.epoch, batch.number)
-        if this != self._next_batch or not self._loader.has_order:
-            self._loader.expect(self.steps(batch, reading, share))
-        self._next_batch = None
-        if batch.number is not None and self._global_batches is not None:
-            self._next_batch = (batch.epoch, batch.number + share.batches_apart)
+        """Keep as many videos open as this process has runs open."""
+        if batch.number is not None:
+            videos = max(OPEN_STREAMS, batch.open_runs * self._videos_per_scene)
+            videos = min(videos, videos_allowed())
+            self._loader.keep_open(videos, frames=batch.open_frames, scenes=batch.open_runs)
 
     def steps(
         self, batch: EpochBatch, reading: Sequence[int], share: WorkerShare
@@ -475,31 +428,29 @@ class _MappedScenes(Dataset[Sample]):
         require_options(self.loader, options)
         ordering, others = split_options(options, EpochOptions)
         own = self.with_own_videos()
-        own._is_watched = False  # a loader's passes are each of the next epoch
+        own.is_watched = False  # a loader's passes are each of the next epoch
         batches = EpochBatches(own, batch_size, **ordering)
         repeats = batches.rule if batches.rule.shuffle or self.is_random else None
         batches.passes = Passes(self.shared_epoch, then="next epoch", watched=repeats)
         return PairsLoader(own, batches, num_workers=num_workers, **others)
 
     def with_own_videos(self, *, epoch: int | None = None) -> Self:
-        """Return the same samples with open videos and buffers of their own.
+        """Return the same samples with open videos of their own.
 
         Args:
             epoch: An epoch of their own; None goes with this dataset.
         """
         twin = copy.copy(self)
-        twin._loader, twin.buffers = copy.copy(self._loader), BatchBuffers(self.buffers.kind)
+        twin._loader = copy.copy(self._loader)
         if epoch is not None:
             twin.shared_epoch = SharedEpoch(epoch)
-            twin._is_watched = False
-        twin._global_batches = twin._next_batch = None
-        twin._open_runs = {}
+            twin.is_watched = False
+        twin._global_batches = None
         return twin
 
     def read_by(self, batches: EpochBatches, share: WorkerShare) -> None:
         """Expect these batches, divided in this way: what comes next is fetched ahead."""
         self._global_batches, self._share, self._stop = batches.of_all_ranks, share, batches.end()
-        self._next_batch = None
         order = batches.of_all_ranks.order(0)
         warn_of_division(order, share, videos_per_scene=self._videos_per_scene)
 
@@ -698,15 +649,25 @@ def _is_random(plan: Plan, request: Request) -> bool:
     return isinstance(plan.windows, Random) or not all(isinstance(step, fixed) for step in steps)
 
 
+def _require_one_of(name: str, value: Any, kinds: Any) -> Any:
+    """Return what is one of the words of an option.
+
+    Raises:
+        SelectionError: If it is none of them.
+    """
+    if value not in get_args(kinds):
+        known = ", ".join(map(repr, get_args(kinds)))
+        raise SelectionError(f"{name} must be one of {known}, got {value!r}.")
+    return value
+
+
 def _check_of(check: Check, plan: Plan) -> Literal["opened", "metadata"]:
     """Return when videos are compared with their checksums.
 
     Raises:
         SelectionError: If there is no such check.
     """
-    if check not in get_args(Check):
-        known = ", ".join(map(repr, get_args(Check)))
-        raise SelectionError(f"check must be one of {known}, got {check!r}.")
+    _require_one_of("check", check, Check)
     frames = int(plan.frame_counts[0])
     clip = len(plan.windows.window(0, frames=frames, draw=(0,)))
     is_mostly_read = 2 * clip * plan.windows.count(frames) >= frames

@@ -3,7 +3,7 @@
 import multiprocessing
 import os
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from multiprocessing.context import get_spawning_popen
 from multiprocessing.reduction import ForkingPickler
 from multiprocessing.sharedctypes import RawArray
@@ -14,9 +14,9 @@ import pyarrow as pa
 import torch
 from torch.utils.data import get_worker_info
 
-from stereogenbench_data.errors import SelectionError, users_level
+from stereogenbench_data.errors import users_level
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.selection.filters import whole_number
+from stereogenbench_data.selection.filters import require_whole
 from stereogenbench_data.selection.order import OrderRule
 
 _rows: Final[WeakKeyDictionary[SceneIndex, torch.Tensor]] = WeakKeyDictionary()
@@ -44,7 +44,8 @@ class SharedNumbers:
         self._owner, self._shared = os.getpid(), RawArray("q", list(numbers))
 
     @property
-    def _numbers(self) -> Any:
+    def here(self) -> Any:
+        """The numbers as this process shares them: an array whose changes all its workers see."""
         if self._owner != os.getpid():
             parent = multiprocessing.parent_process()
             started_by = None if get_worker_info() is None or parent is None else parent.pid
@@ -52,26 +53,9 @@ class SharedNumbers:
                 self._owner, self._shared = os.getpid(), RawArray("q", self._shared[:])
         return self._shared
 
-    def __getitem__(self, place: int) -> int:
-        """Return a number."""
-        number: int = self._numbers[place]
-        return number
-
-    def __setitem__(self, place: int, number: int) -> None:
-        """Change a number for all processes."""
-        self._numbers[place] = number
-
-    def __iter__(self) -> Iterator[int]:
-        """Yield all numbers."""
-        yield from self._numbers
-
-    def clear(self) -> None:
-        """Set all of them to 0."""
-        self._numbers[:] = [0] * len(self._numbers)
-
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what a copy is made from: these numbers, in a process that is being started."""
-        shared = self._numbers
+        shared = self.here
         if get_spawning_popen() is None:
             return SharedNumbers, (shared[:],)
         return object.__new__, (SharedNumbers,), {"_owner": self._owner, "_shared": shared}
@@ -95,12 +79,14 @@ class SharedEpoch:
     @property
     def value(self) -> int:
         """The epoch, from 0."""
-        return self._numbers[0]
+        epoch: int = self._numbers.here[0]
+        return epoch
 
     @property
     def times_set(self) -> int:
         """How often it was set."""
-        return self._numbers[1]
+        times: int = self._numbers.here[1]
+        return times
 
     def set(self, epoch: int) -> None:
         """Go to an epoch.
@@ -108,28 +94,29 @@ class SharedEpoch:
         Raises:
             SelectionError: If it is not a whole number from 0.
         """
-        self._numbers[0] = require_epoch(epoch)
-        self._numbers[1] += 1
+        self._numbers.here[0] = require_whole("epoch", epoch, least=0)
+        self._numbers.here[1] += 1
 
     def mark_drawn(self, numbers: Sequence[int], *, epoch: int, dataset: object) -> None:
-        """Take random samples as drawn, and warn if the watched one is drawn again.
+        """Take samples as drawn, and warn if the watched one is drawn again.
 
         Args:
             numbers: The samples.
             epoch: Their epoch.
             dataset: What draws them, for the warning.
         """
-        watched, marked = self._watched, hash((epoch, self.times_set))
+        watched, marked = self._watched.here, hash((epoch, self.times_set))
         if watched[0] != marked and numbers:
             watched[1], watched[0] = numbers[0], marked
         elif watched[1] in numbers and not watched[2]:
             watched[2] = 1
             warnings.warn(
                 f"{dataset!r} is read by torch's own DataLoader, and samples of epoch {epoch} "
-                "come a second time, with the same random frames and transforms. If this is "
-                "another pass, call set_epoch(epoch) before each, or use StereoPairs(...)"
-                ".loader(...), whose every pass is of the next epoch. A sampler that draws with "
-                "replacement repeats samples within a pass, and that changes nothing.",
+                "come a second time, in the same order or with the same random frames and "
+                "transforms. If this is another pass, call set_epoch(epoch) before each, or use "
+                "StereoPairs(...).loader(...), whose every pass is of the next epoch. A sampler "
+                "that draws with replacement repeats samples within a pass, and that changes "
+                "nothing.",
                 RepeatedEpochWarning,
                 stacklevel=users_level(),
             )
@@ -151,18 +138,6 @@ class SharedEpoch:
                 RepeatedEpochWarning,
                 stacklevel=users_level(),
             )
-
-
-def require_epoch(epoch: int) -> int:
-    """Return the number of an epoch.
-
-    Raises:
-        SelectionError: If it is not a whole number from 0.
-    """
-    whole = whole_number(epoch)
-    if whole is None or not 0 <= whole < 2**63:
-        raise SelectionError(f"an epoch is a whole number from 0, got {epoch!r}.")
-    return whole
 
 
 def _parted(index: SceneIndex) -> tuple[Any, ...]:

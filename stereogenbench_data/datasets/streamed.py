@@ -1,12 +1,12 @@
 """An iterable dataset with the order of the map-style ones, for trainers that want one."""
 
 import os
-import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final, Unpack
 
 from torch.utils.data import IterableDataset, get_worker_info
 
+from stereogenbench_data.datasets.batch_buffers import collate
 from stereogenbench_data.datasets.batches import (
     EpochBatches,
     Pass,
@@ -17,8 +17,8 @@ from stereogenbench_data.datasets.batches import (
 from stereogenbench_data.datasets.division import WorkerShare
 from stereogenbench_data.datasets.epoch_rule import EPOCH_DEFAULTS, EpochOptions
 from stereogenbench_data.datasets.mapped import PAIRS_DEFAULTS, Data, PairsOptions, StereoPairs
-from stereogenbench_data.datasets.shared import RepeatedEpochWarning, SharedNumbers
-from stereogenbench_data.errors import StateError, users_level
+from stereogenbench_data.datasets.shared import SharedNumbers
+from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.selection.options import require_options, split_options
 from stereogenbench_data.selection.signatures import list_options
@@ -39,9 +39,8 @@ class StereoPairStream(IterableDataset[Sample]):
     ``DataLoader(stream, batch_size=B, num_workers=W, collate_fn=stream.collate)``, with the batch
     size of the stream, gives the batches that ``StereoPairs(...).loader(B, num_workers=W)`` gives:
     each rank and worker yields its own, without duplicates or holes, also where there are more
-    workers than scenes. torch's own ``collate_fn`` gives the same, and copies more. With
-    ``drop_last="pad"`` a sample has the field ``is_padding``, a bool. A stream holds one position:
-    make one for each `DataLoader` that is used side by side with others.
+    workers than scenes. With ``drop_last="pad"`` a sample has the field ``is_padding``, a bool. A
+    stream holds one position: make one for each `DataLoader` that is used side by side with others.
 
     >>> from stereogenbench_data import StereoPairStream
     >>> stream = StereoPairStream(getfixture("small_release"), 2, drop_last=False)
@@ -71,6 +70,7 @@ class StereoPairStream(IterableDataset[Sample]):
             others["seed"] = ordering["seed"]
         self.pairs = StereoPairs(data, **others)
         self.batches = EpochBatches(self.pairs, batch_size, **ordering)
+        self.pairs.is_watched |= self.batches.rule.shuffle
         # Worker processes begin passes, so all processes see the position that was set (an epoch,
         # a global batch), and how many passes each worker has begun since.
         self._set_to = SharedNumbers([self.epoch, 0])
@@ -80,16 +80,12 @@ class StereoPairStream(IterableDataset[Sample]):
         self._resumed: tuple[Pass, int] | None = None
 
     def collate(self, samples: Sequence[Sample]) -> Any:
-        """Make a batch of samples: `DataLoader`'s ``collate_fn``, where speed matters.
-
-        Worker processes then write samples where their batch will be, in shared memory. Do not keep
-        samples in a worker. Any other ``collate_fn`` works too, and costs the copies that torch
-        makes.
+        """Make a batch of samples, as `collate` does: a ``collate_fn`` of `DataLoader`.
 
         Raises:
             FieldError: If a field has another shape in one sample than in the first.
         """
-        return self.pairs.buffers.collate(samples)
+        return collate(samples)
 
     @property
     def epoch(self) -> int:
@@ -108,19 +104,21 @@ class StereoPairStream(IterableDataset[Sample]):
     def _go_to(self, epoch: int, start: int) -> None:
         """Let the next pass of each worker begin at a global batch of an epoch."""
         self.pairs.set_epoch(epoch)
-        self._set_to[0], self._set_to[1] = epoch, start
-        self._begun.clear()
+        self._set_to.here[:] = [epoch, start]
+        self._begun.here[:] = [0] * _MOST_WORKERS
         self._latest = None
 
     @property
     def _has_begun(self) -> bool:
         """Whether this process, or this worker, has begun a pass since the position was set."""
-        return self._begun[self._place["worker"] % _MOST_WORKERS] > 0
+        begun: int = self._begun.here[self._share.worker % _MOST_WORKERS]
+        return begun > 0
 
     @property
     def _first_position(self) -> Position:
         """Where the first pass begins, or has begun, since the position was set."""
-        return self.epoch, self._set_to[1] if self._set_to[0] == self.epoch else 0
+        epoch, start = self._set_to.here
+        return self.epoch, start if epoch == self.epoch else 0
 
     def __len__(self) -> int:
         """Return how many samples this rank has in a whole epoch."""
@@ -140,33 +138,21 @@ class StereoPairStream(IterableDataset[Sample]):
             SelectionError: If Accelerate would share these samples among ranks a second time.
         """
         self.batches.require_shared_once(self)
-        place = self._place
-        share = WorkerShare(
-            place["rank"], place["world_size"], place["worker"], place["workers"], "batches"
-        )
+        share = self._share
         self.pairs.read_by(self.batches, share)
         begun, pid = self._resumed or (None, 0)
         self._resumed = None
         if begun is None or pid != os.getpid() or begun.epoch != self.epoch:
             epoch, start = self._first_position
             begun = self._pass_of_worker(epoch, 0 if self._has_begun else start)
-        has_begun_once = self._begun[place["worker"] % _MOST_WORKERS] == 1
-        is_told_elsewhere = self.pairs.is_random or place["worker"] > 0
-        if has_begun_once and not self.pairs.shared_epoch.times_set and not is_told_elsewhere:
-            warnings.warn(
-                f"{self!r} begins epoch {self.epoch} a second time, in the same order. Call "
-                "set_epoch(epoch) of the stream before each pass.",
-                RepeatedEpochWarning,
-                stacklevel=users_level(),
-            )
-        self._begun[place["worker"] % _MOST_WORKERS] += 1
+        self._begun.here[share.worker % _MOST_WORKERS] += 1
         self._latest = begun
         return self._samples(begun)
 
     def _samples(self, begun: Pass) -> Iterator[Sample]:
         for number in begun.share[begun.taken :]:
             batch = self.batches.of_all_ranks.batch(number, epoch=begun.epoch)
-            for sample in self.pairs.samples_of(batch, start=begun.part):
+            for sample in self.pairs.samples_of(batch, range(begun.part, len(batch))):
                 begun.part += 1
                 if begun.part == len(batch):
                     begun.taken, begun.part = begun.taken + 1, 0
@@ -176,16 +162,19 @@ class StereoPairStream(IterableDataset[Sample]):
     def _pass_of_worker(self, epoch: int, start: int) -> Pass:
         """Return a pass over this worker's part of the rank's batches."""
         begun = self.batches.pass_from(epoch, start)
-        begun.share = begun.share[self._place["worker"] :: self._place["workers"]]
+        begun.share = begun.share[self._share.worker :: self._share.workers]
         return begun
 
     @property
-    def _place(self) -> dict[str, int]:
+    def _share(self) -> WorkerShare:
         """Which part of the batches this process iterates."""
-        info = get_worker_info()
-        worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
-        rank, world_size = self.batches.rank, self.batches.world_size
-        return {"rank": rank, "world_size": world_size, "worker": worker, "workers": workers}
+        return WorkerShare.of_this_process(self.batches.rank, self.batches.world_size)
+
+    @property
+    def _place(self) -> dict[str, int]:
+        """The same in a state."""
+        place: dict[str, Any] = self._share._asdict()
+        return {name: place[name] for name in ("rank", "world_size", "worker", "workers")}
 
     def state_dict(self, *, batches: int | None = None) -> State:
         """Return a position that any number of ranks and workers can load.
@@ -207,7 +196,7 @@ class StereoPairStream(IterableDataset[Sample]):
             given = latest.taken * self.batches.batch_size + latest.part
             own = {"start": latest.start, "samples_given": given, **self._place}
             return self.batches.state_at(*latest.position) | own
-        if latest is None and get_worker_info() is None and any(self._begun):
+        if latest is None and get_worker_info() is None and any(self._begun.here):
             raise StateError(
                 "worker processes iterate this stream and read ahead: pass the number of "
                 "batches the loop has taken, state_dict(batches=...), or use the loader of "

@@ -28,10 +28,9 @@ from weakref import WeakSet, ref
 
 from torch.utils.data import DataLoader, Sampler, get_worker_info
 
-from stereogenbench_data.datasets.batch_buffers import BatchMemory
-from stereogenbench_data.datasets.batch_parts import Making, PartedBatches, part_as_made
-from stereogenbench_data.datasets.batches import GlobalBatches, Pass
-from stereogenbench_data.datasets.division import WorkerShare
+from stereogenbench_data.datasets.batch_buffers import BatchMemory, memory_file
+from stereogenbench_data.datasets.batch_parts import PartedBatches, part_as_made
+from stereogenbench_data.datasets.batches import Pass
 from stereogenbench_data.errors import PassError, WorkerError
 
 if sys.platform != "win32":
@@ -52,7 +51,7 @@ class Workers:
 
     Attributes:
         serves: The pass whose batches they load; None before the first.
-        parted: Its batches on their way; None where this process loads.
+        parted: Its batches on their way.
     """
 
     def __init__(self, loader: DataLoader[Any]) -> None:
@@ -60,23 +59,22 @@ class Workers:
 
         Without worker processes this one loads.
         """
+        self._pid = os.getpid()
         self._torch: DataLoader[Any] | None = None
         self._results: Iterator[Any] = iter(())
         self.serves: Pass | None = None
         self.parted: PartedBatches | None = None
         self._due = _DueTasks()
         self._context: _WatchedContext | None = None
-        self._memory: BatchMemory | None = None
-        own: dict[str, Any] = {"collate_fn": loader.collate_fn}
-        workers, ahead = loader.num_workers, loader.prefetch_factor
-        if workers > 0 and ahead is not None:
+        workers, ahead = loader.num_workers, loader.prefetch_factor or 0
+        # Of what is on its way, and what the loop holds.
+        self._memory = BatchMemory(kept=workers * ahead + 2, fd=memory_file() if workers else None)
+        own: dict[str, Any] = {"collate_fn": part_as_made}
+        if workers > 0:
             given: Any = loader.multiprocessing_context
             base = given.get_context() if isinstance(given, BaseContext) else get_context(given)
             self._context = _WatchedContext(base)
-            # Of what is on its way, and what the loop holds.
-            self._memory = BatchMemory(kept=workers * ahead + 2)
-            own = {
-                "collate_fn": part_as_made,
+            own |= {
                 "worker_init_fn": _Beginning(self._memory, loader.worker_init_fn),
                 "prefetch_factor": ahead * workers,
                 "in_order": True,
@@ -95,7 +93,6 @@ class Workers:
         self._loader = ref(loader)
         self._stop_reader, self._stop_writer = connection.Pipe(duplex=False)
         self._thread: threading.Thread | None = None
-        self._pid = os.getpid()
         _running.add(self)
 
     @property
@@ -103,37 +100,26 @@ class Workers:
         """Whether this process started them, and not one that it was forked from."""
         return self._context is None or os.getpid() == self._pid
 
-    def begin(
-        self,
-        begun: Pass,
-        numbers: Iterator[Any],
-        of_all_ranks: GlobalBatches,
-        share: WorkerShare,
-        making: Making,
-    ) -> None:
+    def begin(self, begun: Pass, numbers: Iterator[Any], loader: Any) -> None:
         """Begin a pass over batches; the pass that these workers served before has ended.
 
         Args:
             begun: The pass.
             numbers: Its batches.
-            of_all_ranks: Says which worker decodes which sample.
-            share: Whose batches they are.
-            making: How batches are made of samples.
+            loader: The `PairsLoader`, whose module imports this one; not kept.
         """
         if self._torch is None:
             raise PassError("these workers have ended: call iter(loader) again.")
         are_new, self.serves = self.serves is None, begun
-        self._due.tasks = numbers
-        if self._memory is not None:
-            self.parted = PartedBatches(
-                numbers,
-                of_all_ranks,
-                share,
-                memory=self._memory,
-                making=making,
-                before=self.parted,
-            )
-            self._due.tasks = self.parted.tasks()
+        self.parted = PartedBatches(
+            numbers,
+            loader.batches.of_all_ranks,
+            loader.share,
+            memory=self._memory,
+            making=loader.making,
+            before=self.parted,
+        )
+        self._due.tasks = self.parted.tasks()
         # So workers do not end by it before they have begun.
         with _sigterm_blocked(self._context):
             self._results = iter(self._torch)
@@ -147,9 +133,7 @@ class Workers:
 
     def next(self) -> Any:
         """Return the next batch."""
-        if self.parted is None:
-            return next(self._results)
-        return self.parted.next(self._results)
+        return None if self.parted is None else self.parted.next(self._results)
 
     def __del__(self) -> None:
         """End the workers when no reference is left."""
@@ -157,14 +141,13 @@ class Workers:
 
     def end(self) -> None:
         """End the workers; batches that came from them keep their memory."""
+        if not self.is_of_this_process:
+            return
         self.serves = None  # a pass that goes on is told
         results, self._results = self._results, iter(())
         loader, self._torch = self._torch, None
         self._due.tasks = iter(())
         if loader is None or self._context is None or sys.is_finalizing():
-            return
-        if not self.is_of_this_process:
-            _inherited.append((loader, results))
             return
         if self._thread is not None:
             # From now on workers may end.
@@ -177,8 +160,7 @@ class Workers:
         shutdown = getattr(results, "_shutdown_workers", None)
         if shutdown is not None:
             shutdown()
-        if self._memory is not None:
-            self._memory.close()
+        self._memory.close()
 
     def error(self, noticed: BaseException) -> WorkerError | None:
         """Return an error that names the worker that died; None if none did.

@@ -69,11 +69,7 @@ class _Planned(NamedTuple):
 
 
 class ComingSamples:
-    """Plans the bytes of coming samples, and of the one that is read now.
-
-    Attributes:
-        has_order: Whether samples were read as they were expected.
-    """
+    """Plans the bytes of coming samples, and of the one that is read now."""
 
     def __init__(self, source: MemberSource, ahead: FetchAhead, streams: OpenVideos) -> None:
         """Plan nothing yet.
@@ -103,13 +99,23 @@ class ComingSamples:
         self._positions.clear()
         self._read_texts.clear()
         self._is_filling = True
-        self.has_order = False
 
     def expect(self, steps: Iterable[Step]) -> None:
         """Take the samples that will be read next; they replace those expected before."""
         if self._due:
             self._begin_anew()
-        self._steps, self.has_order = iter(steps), True
+        self._steps = iter(steps)
+
+    def is_next(self, address: Address, files: Callable[[Address], NeededFiles]) -> bool:
+        """Return whether a sample is the one that is expected next.
+
+        Args:
+            address: The sample.
+            files: As for `begin`.
+        """
+        if not self._due:
+            self._plan_next(files)
+        return bool(self._due) and self._due[0].address == address
 
     def begin(self, address: Address, files: Callable[[Address], NeededFiles]) -> None:
         """Plan a sample that is read now, unless it is planned, and some of those after it.
@@ -118,11 +124,9 @@ class ComingSamples:
             address: The sample.
             files: Returns what a sample is read from; not kept, as it refers to who keeps this.
         """
-        if not self._due:
-            self._plan_next(files)
-        if self._due and self._due[0].address != address:
-            self._begin_anew()
-        if not self._due:
+        if not self.is_next(address, files):
+            if self._due:
+                self._begin_anew()
             self._plan(Step(address, ends_run=False), files(address))
         first = self._due[0].number
         self._begun = max(self._begun, first)

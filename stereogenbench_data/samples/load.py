@@ -149,33 +149,11 @@ class _Stream:
         reader: A `VideoReader` or, of depth that blosc2 packed, `DepthFrames`.
         file: What it reads.
         kept: Pictures and stored depth, by their frames.
-        memories: The memory of its last pictures, and weak references to them, the oldest first.
     """
 
     reader: Any
     file: Path | SeekableFile
     kept: OrderedDict[Any, Any] = field(default_factory=OrderedDict)
-    memories: list[tuple[memoryview, Callable[[], object]]] = field(default_factory=list)
-
-    def picture(self, *, height: int, width: int, most: int) -> UInt8[np.ndarray, "3 h w"]:
-        """Return an array to write a picture into, of any content.
-
-        It lies in the memory of an earlier picture that nobody holds. New memory costs more than
-        what is written into it: the system clears it first. A weak reference shows whether anybody
-        holds a picture, or a view or tensor of it. Where an interpreter frees objects late, the
-        next picture gets memory of its own.
-        """
-        size = 3 * height * width
-        memory = np.empty(0, dtype=np.uint8).data
-        if len(self.memories) >= most:
-            memory, held = self.memories.pop(0)
-            memory = memory if held() is None else memory[:0]
-        if memory.nbytes != size:
-            memory = np.empty(size, dtype=np.uint8).data
-        # All views of the picture are based on this array, and none on what is below it.
-        base = np.frombuffer(memory, dtype=np.uint8)
-        self.memories.append((memory, weakref.ref(base)))
-        return base.reshape(3, height, width)
 
     def close(self) -> None:
         self.reader.close()
@@ -232,21 +210,18 @@ class Streams:
             StorageError: If the video cannot be read.
             MediaError: If it does not decode to the scene's number of colour pictures.
         """
-        most = self.kept_frames
-        height, width = size or (scene.rig.image_height_px, scene.rig.image_width_px)
         with self._stream(scene, name, run, index) as stream:
             if out is not None:
-                shape = (out.shape[-2], out.shape[-1])
-                read_rgb(stream.reader, index, size=shape, out=out, content="colour")
+                size = (out.shape[-2], out.shape[-1])
+                read_rgb(stream.reader, index, size=size, out=out, content="colour")
                 return out
 
             def read() -> np.ndarray:  # its shape in words would be parsed at each call
-                place = stream.picture(height=height, width=width, most=most)
-                read_rgb(stream.reader, index, size=size, out=place, content="colour")
-                place.flags.writeable = False
-                return place
+                picture = read_rgb(stream.reader, index, size=size, content="colour")
+                picture.flags.writeable = False
+                return picture
 
-            return _kept(stream.kept, (index, size), read, most=most)
+            return _kept(stream.kept, (index, size), read, most=self.kept_frames)
 
     def read_stored_depth(
         self,
@@ -452,10 +427,10 @@ class SampleDecoder:
         self._limits = self._streams.limit, self._streams.kept_frames = videos, frames
         self._kept_scenes = max(KEPT_SCENES, 2 * scenes)
 
-    @property
-    def has_order(self) -> bool:
-        """Whether samples were decoded as they were expected; True where none is fetched."""
-        return self._coming is None or self._coming.has_order
+    def is_next(self, address: Address) -> bool:
+        """Return whether a sample is the one expected next; True where none is fetched."""
+        with self._lock:
+            return self._coming is None or self._coming.is_next(address, self._needed_files)
 
     def expect(self, steps: Iterable[Step]) -> None:
         """Take the samples that will be decoded next, so that their bytes are fetched ahead."""

@@ -262,7 +262,6 @@ class EpochOrder:
         self.batches = -(-self.samples // rule.batch_size)
         self.groups = rule.groups_of(runs.lengths)
         self._groups: dict[int, _Group] = {}
-        self._streams: dict[int, int] = {}
 
     def batch(self, number: int) -> Numbers:
         """Return the samples of a batch, in its order.
@@ -298,13 +297,17 @@ class EpochOrder:
         found = self._group(group)
         return found.samples(turn * size, min(found.length, (turn + 1) * size))
 
-    def streams(self, group: int) -> int:
-        """Return how many runs a group has open at a time: one in each of its streams."""
+    def open_runs(self, groups: Sequence[int] | None = None) -> int:
+        """Return how many runs some groups, or all, have open at a time: one in each stream."""
+        return sum(self._streams if groups is None else [self._streams[each] for each in groups])
+
+    @cached_property
+    def _streams(self) -> list[int]:
+        """Into how many streams the runs of each group are dealt."""
         if not self.rule.shuffle:
-            return 1
-        if group not in self._streams:
-            self._streams[group] = min(self.rule.open_scenes, len(self._pieces(group).run))
-        return self._streams[group]
+            return [1]
+        runs = [len(self._pieces(group).run) for group in range(self.groups)]
+        return [min(self.rule.open_scenes, count) for count in runs]
 
     def workers_of(
         self, number: int, *, groups: Sequence[int], workers: int
@@ -324,7 +327,7 @@ class EpochOrder:
         if not self.rule.shuffle:
             return streams % workers
         group = number % self.groups
-        before = sum(map(self.streams, groups[: groups.index(group)]))
+        before = self.open_runs(groups[: groups.index(group)])
         places: Numbers = before + self._group(group).places_of_streams[streams]
         return places % workers
 
@@ -393,7 +396,7 @@ class _Group:
         self._runs = order.runs
         self._rule = order.rule
         self.length = int((pieces.stop - pieces.begin).sum())
-        count = order.streams(group)
+        count = order.open_runs([group])
         # Numbers from 0 up to 1, made of the upper 53 bits.
         raw = order.raw(3 * count, part=group + 1).reshape(3, count)
         draws = (raw >> np.uint64(11)) * 2.0**-53

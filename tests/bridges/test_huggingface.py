@@ -197,7 +197,7 @@ def test_mapped_rows_draw_for_the_epoch_of_their_decoder(urls, made):
     first, second, again = drawn(0), drawn(1), drawn(0)
 
     assert first == again != second
-    with pytest.raises(SelectionError, match="an epoch is a whole number from 0, got -1"):
+    with pytest.raises(SelectionError, match="epoch must be a whole number from 0, got -1"):
         decoder.set_epoch(-1)
 
 

@@ -74,6 +74,7 @@ def test_running_workers_of_a_copied_dataset_follow_its_epoch(small_index, how, 
     assert pairs.epoch == (5 if how == "shallow" else 2)
 
 
+@pytest.mark.filterwarnings("ignore::stereogenbench_data.RepeatedEpochWarning")
 @pytest.mark.parametrize(
     ("how", "persistent"), [("deep", False), ("pickled", True), ("shallow", True)]
 )

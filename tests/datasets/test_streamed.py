@@ -13,6 +13,7 @@ from stereogenbench_data import StateError, StereoPairs, StereoPairStream
 from tests.datasets.conftest import flat, keys_of, same
 
 pytestmark = [
+    pytest.mark.filterwarnings("ignore::stereogenbench_data.RepeatedEpochWarning"),
     pytest.mark.filterwarnings("ignore:This DataLoader will create"),
     pytest.mark.filterwarnings("ignore:'set_vital' is deprecated"),
 ]

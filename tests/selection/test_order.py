@@ -126,7 +126,7 @@ def test_moments_of_a_run_ascend_but_for_where_a_stream_starts(lengths, rule):
             assert (np.diff(moments) < 0).sum() <= 1
             parts += 1
 
-    assert goes_back <= sum(map(order.streams, range(order.groups)))
+    assert goes_back <= order.open_runs()
     assert parts - len(lengths) <= order.groups - 1
 
 
@@ -159,7 +159,7 @@ def test_the_number_of_open_runs_is_reached_and_never_exceeded(runs, open_scenes
     opened = np.searchsorted(first, np.arange(len(numbers)), side="right")
     closed = np.searchsorted(last, np.arange(len(numbers)))
 
-    assert (opened - closed).max() == order.streams(0) == min(runs, open_scenes)
+    assert (opened - closed).max() == order.open_runs([0]) == min(runs, open_scenes)
 
 
 @pytest.mark.parametrize("batches", [1, 15, 40])
@@ -444,7 +444,7 @@ def test_each_stream_is_one_workers_and_workers_have_about_as_many(workers):
                 assert found.setdefault((number % order.groups, stream), worker) == worker
         counts = np.bincount(list(found.values()), minlength=workers)
 
-        assert len(found) == sum(map(order.streams, groups))
+        assert len(found) == order.open_runs(groups)
         assert counts.max() - counts.min() <= 1
 
 

@@ -48,7 +48,7 @@ def test_the_defaults_that_help_lists_are_those_that_hold(small_shards, kind):
     assert plain.plan.digest == stated.plan.digest
     assert plain.request == stated.request
     assert repr(plain) == repr(stated)
-    assert plain.buffers.kind == stated.buffers.kind
+    assert plain.buffers == stated.buffers
 
 
 def test_the_defaults_of_a_loader_that_help_lists_are_those_that_hold(small_shards):
