@@ -8,15 +8,15 @@
 
 The right view is what is to be generated. ``warped`` is the left view splatted into the right one,
 black in holes; ``mask`` is white in holes, and lossless. ``grid``, StereoCrafter's input, has left
-and depth above mask and warped; depth is grey by inverse depth, white at the clip's nearest point.
+and black above mask and warped.
 """
 
 import csv
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from io import StringIO
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, Unpack, cast
@@ -177,11 +177,12 @@ LAYOUTS: Final[Mapping[LayoutName, ClipLayout]] = {
     "diffsynth": ClipLayout(_diffsynth),
     "finetrainers": ClipLayout(_finetrainers),
     "musubi": ClipLayout(_musubi),
-    # It takes the grids one by one. Source: TencentARC/StereoCrafter, inpainting_inference.py.
+    # It takes the grids one by one, and ignores the quarter at the top right.
+    # Source: TencentARC/StereoCrafter, inpainting_inference.py.
     "stereocrafter": ClipLayout(lambda root, clips: {}, kinds=("grid", "right"), frames_step=1),
 }
 
-_FORMAT: Final = 4
+_FORMAT: Final = 5
 _CLIPS_JSONL: Final = "clips.jsonl"
 _CLIPS: Final = "clips"
 
@@ -190,7 +191,7 @@ _FIELDS: Final[Mapping[Kind, tuple[str, ...]]] = {
     "left": ("left",),
     "warped": ("warped_right",),
     "mask": ("hole",),
-    "grid": ("left", "warped_right", "hole", "depth", "valid"),
+    "grid": ("left", "warped_right", "hole"),
 }
 _FACTS: Final = ("scene", "split", "pair", "caption", "baseline_m", "frame_rate_hz")
 
@@ -441,8 +442,6 @@ def _is_finished(work: _ClipWork) -> bool:
 
 def _write_clip(work: _ClipWork, advance: Advance) -> None:
     """Write the videos of a clip, then its record."""
-    draws_depth = "grid" in work.kinds
-    nearness = _nearness(work) if draws_depth else (0.0, 0.0)
     with named_errors(work.root), ExitStack() as stack:
         encoders = {}
         for kind, path in work.videos.items():
@@ -456,54 +455,31 @@ def _write_clip(work: _ClipWork, advance: Advance) -> None:
                     quality="lossless" if kind == "mask" else "as set",
                 )
             )
-        for sample in _frames(work, work.request):
+        loader = stack.enter_context(
+            closing(SampleDecoder(work.index, work.request, check="opened"))
+        )
+        for frame in work.address.frames:
+            sample = loader.load(work.address._replace(frames=(frame,)), clip="frame")
             for kind, encoder in encoders.items():
-                encoder.write_picture(_picture(kind, sample, nearness))
+                encoder.write_picture(_picture(kind, sample))
             advance(1)
-        height, width = sample["right"].shape[-2:]
-    record: dict[str, Any] = work.facts | {"height": height, "width": width}
-    if draws_depth:
-        record["depth_m"] = [1 / each if each else None for each in nearness[::-1]]
-    record["videos"] = work.videos
-    record["bytes"] = {
-        kind: (work.root / path).stat().st_size for kind, path in work.videos.items()
+    height, width = sample["right"].shape[-2:]
+    record = work.facts | {
+        "height": height,
+        "width": width,
+        "videos": work.videos,
+        "bytes": {kind: (work.root / path).stat().st_size for kind, path in work.videos.items()},
     }
     with named_errors(work.record):
         work.record.parent.mkdir(exist_ok=True)
         write_atomic(work.record, json_bytes(record))
 
 
-def _frames(work: _ClipWork, request: Request) -> Iterator[Sample]:
-    with closing(SampleDecoder(work.index, request, check="opened")) as loader:
-        for frame in work.address.frames:
-            yield loader.load(work.address._replace(frames=(frame,)), clip="frame")
-
-
-def _nearness(work: _ClipWork) -> tuple[float, float]:
-    """Return the least and the largest inverse depth of a clip in 1/m: what is black and white."""
-    found = [
-        1 / sample["depth"][sample["valid"]]
-        for sample in _frames(work, replace(work.request, fields=("depth", "valid")))
-        if sample["valid"].any()
-    ]
-    return (
-        min((float(each.min()) for each in found), default=0.0),
-        max((float(each.max()) for each in found), default=0.0),
-    )
-
-
-def _picture(kind: Kind, sample: Sample, nearness: tuple[float, float]) -> Any:
+def _picture(kind: Kind, sample: Sample) -> Any:
     """Return one frame of a kind of video as (h, w, 3) uint8."""
     if kind == "grid":
-        mask, warped, left = (
-            _picture(each, sample, nearness) for each in ("mask", "warped", "left")
-        )
-        low, high = nearness
-        valid = sample["valid"][0]
-        inverse = 1 / np.where(valid, sample["depth"][0], 1)
-        share = (inverse - low) / (high - low) if high > low else np.ones_like(inverse)
-        grey = np.rint(np.where(valid, share, 0).clip(0, 1) * 255).astype(np.uint8)
-        return np.block([[[left], [np.repeat(grey[..., None], 3, axis=-1)]], [[mask], [warped]]])
+        mask, warped, left = (_picture(each, sample) for each in ("mask", "warped", "left"))
+        return np.block([[[left], [np.zeros_like(left)]], [[mask], [warped]]])
     if kind == "mask":
         return np.repeat((sample["hole"][0] * np.uint8(255))[..., None], 3, axis=-1)
     name = "warped_right" if kind == "warped" else kind
