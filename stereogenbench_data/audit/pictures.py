@@ -8,7 +8,6 @@ from typing import Any, Final
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
 
 from stereogenbench_data.bridges.picture import (
     FRAME,
@@ -296,10 +295,10 @@ def write_clip(
     rate_hz: float,
     progress: Progress | None = None,
 ) -> None:
-    """Write pages as an H.264 video or as an animated GIF, by the path's ending.
+    """Write pages as an H.264 video.
 
     Args:
-        path: Ends in .mp4 or .gif; an existing file is replaced.
+        path: An MP4 file; an existing one is replaced.
         pages: (h, w, 3) uint8, with even sides.
         frames: Number of pages, for the progress.
         rate_hz: Pages a second.
@@ -308,30 +307,12 @@ def write_clip(
     Raises:
         StorageError: If the file cannot be written.
     """
-    write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
     advance = advance_of(progress, total=frames)
-
-    def reported() -> Iterator[Picture]:
-        for page in pages:
-            yield page
-            advance(1)
-
-    with named_errors(path), open_output(path) as file:
-        write(file, reported(), rate_hz)
-
-
-def _write_mp4(file: Any, pages: Iterator[Picture], rate_hz: float) -> None:
-    with VideoEncoder(file, rate_hz=rate_hz, encoding=Encoding(crf=18)) as video:
+    with (
+        named_errors(path),
+        open_output(path) as file,
+        VideoEncoder(file, rate_hz=rate_hz, encoding=Encoding(crf=18)) as video,
+    ):
         for page in pages:
             video.write_picture(page)
-
-
-def _write_gif(file: Any, pages: Iterator[Picture], rate_hz: float) -> None:
-    """Write a GIF with the colours of its first page, timed in hundredths of a second."""
-    first = Image.fromarray(next(pages)).quantize(256, dither=Image.Dither.NONE)
-    others = (
-        Image.fromarray(page).quantize(palette=first, dither=Image.Dither.NONE) for page in pages
-    )
-    hundredths = max(2, round(100 / rate_hz))
-    first.save(file, format="GIF", save_all=True, append_images=others, loop=0,
-               duration=10 * hundredths)  # fmt: skip
+            advance(1)

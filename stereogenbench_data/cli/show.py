@@ -23,7 +23,7 @@ def show(
         option(
             "--out",
             "-o",
-            "File to write: .png a sheet, .mp4 or .gif a clip, .rrd for Rerun [KEY.png].",
+            "File to write: .png a sheet, .mp4 a clip, .rrd for Rerun [KEY.png].",
         ),
     ] = None,
     pair: Annotated[
@@ -44,9 +44,9 @@ def show(
     from stereogenbench_data.selection.filters import find_scene
 
     ending = ".png" if out is None else out.suffix.lower()
-    if ending not in (".png", ".mp4", ".gif", ".rrd"):
+    if ending not in (".png", ".mp4", ".rrd"):
         raise typer.BadParameter(
-            f"{out}: a sheet is .png, a clip .mp4 or .gif, a recording .rrd.", param_hint="--out"
+            f"{out}: a sheet is .png, a clip .mp4, a recording .rrd.", param_hint="--out"
         )
     index = source.open()
     row = 0 if scene is None else find_scene(index, scene)

@@ -37,12 +37,11 @@ def test_a_part_of_a_key_a_pair_and_a_frame_are_taken(indexed_release, tmp_path)
     assert not any(np.array_equal(first, other) for other in others)
 
 
-@pytest.mark.parametrize("name", ["clip.mp4", "clip.gif"])
-def test_a_clip_is_written_by_the_ending_of_its_name(small_shards, tmp_path, name):
-    shown = invoke("show", small_shards, SCENE, "-o", tmp_path / name)
+def test_a_clip_is_written_by_the_ending_of_its_name(small_shards, tmp_path):
+    shown = invoke("show", small_shards, SCENE, "-o", tmp_path / "clip.mp4")
 
     assert shown.exit_code == 0, shown.output
-    with av.open(tmp_path / name) as clip:
+    with av.open(tmp_path / "clip.mp4") as clip:
         assert sum(1 for _ in clip.decode(video=0)) == 7
 
 
@@ -51,7 +50,7 @@ def test_a_clip_is_written_by_the_ending_of_its_name(small_shards, tmp_path, nam
     [
         ([SCENE, "--frame", "7"], "has no frame 7: its 7 are 0 to 6"),
         ([SCENE, "-o", "sheet.jpg"], "a sheet is .png"),
-        ([SCENE, "-o", "clip.avi"], "a clip .mp4 or .gif"),
+        ([SCENE, "-o", "clip.avi"], "a clip .mp4"),
     ],
 )
 def test_what_cannot_be_shown_is_refused(small_shards, tmp_path, monkeypatch, options, reason):

@@ -31,7 +31,6 @@ def files_of_at_most(size):
     [
         ("show", "-o", "sheet.png"),
         ("show", "-o", "clip.mp4"),
-        ("show", "-o", "clip.gif"),
         ("stats", "-o", "plots"),
         ("audit", "--per-scene", "1", "--workers", "1", "-o", "audit.md"),
     ],
@@ -57,7 +56,7 @@ def test_a_file_that_cannot_be_written_is_named_and_not_left_half(
     "words",
     [
         ("show", "-o", "new/deep/sheet.png"),
-        ("show", "-o", "new/deep/clip.gif"),
+        ("show", "-o", "new/deep/clip.mp4"),
         ("stats", "-o", "new/deep/stats.md"),
         ("conventions", "--scenes", "1", "--pictures", "0", "-o", "new/deep/conventions.toml"),
     ],
