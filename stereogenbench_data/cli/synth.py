@@ -9,7 +9,6 @@ from stereogenbench_data.cli.options import (
     OutArgument,
     PartOption,
     WorkOptions,
-    flag,
     grouped,
     option,
     size_of,
@@ -52,7 +51,6 @@ def synth(  # noqa: PLR0913 - one parameter an option
         option("assets.toml of your own maps and characters, for Blender [the built-in maps]."),
     ] = None,
     part: PartOption = "1/1",
-    plan_only: Annotated[bool, flag("--plan-only", "Report on proposals, render nothing.")] = False,
     work: WorkOptions,
 ) -> None:
     """Generate scenes with exact depth, poses and intrinsics, in the released layout.
@@ -63,8 +61,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
 
     Example: `stereogenbench synth scenes/ --family Uniform --scenes 4 --size 256`
     """
-    from stereogenbench_data.synthesis.planning import acceptance_markdown
-    from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
+    from stereogenbench_data.synthesis.produce import synthesise
     from stereogenbench_data.synthesis.render import RAY_CASTING
     from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
@@ -91,14 +88,9 @@ def synth(  # noqa: PLR0913 - one parameter an option
         focal_mm=focal_mm,
         contract=ExportContract(depth_unit_m=depth_unit_m),
     )
-    how: Any = {"renderer": chosen, "part": part, **work.options()}
-    if plan_only:
-        with progress_bar("proposing", unit="scenes") as progress:
-            planned = plan_scenes(out, request, progress=progress, **how)
-        typer.echo(acceptance_markdown(planned.values()).rstrip())
-        return
+    how = work.options()
     with progress_bar("drawing", unit="frames") as progress:
-        keys = synthesise(out, request, progress=progress, **how)
+        keys = synthesise(out, request, renderer=chosen, part=part, progress=progress, **how)
     folders = sorted({key.rpartition("/")[0] for key in keys})
     none = f" (part {part[0]}/{part[1]} of {scenes} has none)"
     where = f" in {', '.join(folders)}" if folders else none

@@ -1,11 +1,10 @@
-"""The search for scenes: proposals are drawn and examined until one passes; and a report on it."""
+"""The search for scenes: proposals are drawn and examined until one passes."""
 
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from stereogenbench_data.errors import SynthesisError
-from stereogenbench_data.schema.text import markdown_table
 from stereogenbench_data.synthesis.filters import Refusal
 from stereogenbench_data.synthesis.proposal import (
     Proposal,
@@ -22,7 +21,6 @@ MOST_PROPOSALS: Final = 4000
 """How many proposals of one scene are examined before the request counts as impossible."""
 
 _OFFSET_RANGE_CM: Final = 1e6
-_ALL_MAPS: Final = "all maps"
 _FOCAL_RANGE_MM: Final = (18.0, 85.0)
 
 
@@ -91,30 +89,9 @@ def plan_scene(
         if isinstance(result, ScenePlan):
             return Planned(result, refused)
         refused.append((proposal, result))
-    reasons = Counter(refusal.reason for _, refusal in refused)
+    reasons = Counter(refusal.reason for _, refusal in refused).most_common()
+    counts = ", ".join(f"{reason} {count:,}" for reason, count in reasons)
     raise SynthesisError(
         f"scene {index} of {request.stream}: all of {MOST_PROPOSALS} proposals are refused "
-        f"({_counts(reasons)}). Choose wider maps, another family or a shorter focal length."
+        f"({counts}). Choose wider maps, another family or a shorter focal length."
     )
-
-
-def acceptance_markdown(planned: Iterable[Planned]) -> str:
-    """Return what became of proposals as a table in Markdown, by map and over all maps."""
-    accepted: Counter[str] = Counter()
-    refused: dict[str, Counter[str]] = defaultdict(Counter)
-    for scene in planned:
-        accepted.update((scene.plan.proposal.map_name, _ALL_MAPS))
-        for proposal, refusal in scene.refused:
-            for name in (proposal.map_name, _ALL_MAPS):
-                refused[name][refusal.reason] += 1
-    rows = [("map", "proposals", "accepted", "refused for")]
-    for name in sorted({*accepted, *refused}, key=lambda each: (each == _ALL_MAPS, each)):
-        reasons = refused[name]
-        count = accepted[name] + reasons.total()
-        found = f"{accepted[name]:,} ({accepted[name] / count:.1%})"
-        rows.append((name, f"{count:,}", found, _counts(reasons)))
-    return "".join(f"{line}\n" for line in markdown_table(*rows))
-
-
-def _counts(reasons: Counter[str]) -> str:
-    return ", ".join(f"{reason} {count:,}" for reason, count in reasons.most_common())

@@ -74,7 +74,7 @@ def test_a_filter_of_one_value_that_is_given_two_is_refused_with_both(words, val
 
 
 def test_every_command_takes_one_number_for_width_and_height(tmp_path):
-    words = ("synth", tmp_path, "--frames", 1, "--plan-only", "--workers", 1, "--size")
+    words = ("synth", tmp_path, "--frames", 1, "--workers", 1, "--size")
     sizes = {
         path: option
         for path, call in CALLS.items()
@@ -82,7 +82,7 @@ def test_every_command_takes_one_number_for_width_and_height(tmp_path):
         if "--size" in option.opts
     }
 
-    assert [invoke(*words, size).exit_code for size in ("64", "64x48")] == [0, 0]
+    assert invoke(*words, "64").exit_code == 0
     assert "WIDTHxHEIGHT" in refused(*words, "64x")
     assert ("pack",) in sizes
     for path, size in sizes.items():

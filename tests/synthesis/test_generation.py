@@ -11,7 +11,7 @@ from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.schema.release import FAMILIES
 from stereogenbench_data.synthesis.filters import LIMITS, check_poses
 from stereogenbench_data.synthesis.maps import MAPS, open_map
-from stereogenbench_data.synthesis.planning import acceptance_markdown, plan_scene
+from stereogenbench_data.synthesis.planning import plan_scene
 from stereogenbench_data.synthesis.produce import FOLDER, plan_scenes, synthesise
 from stereogenbench_data.synthesis.render import RAY_CASTING, RayCasting
 from stereogenbench_data.synthesis.renderer import RenderedView
@@ -159,10 +159,7 @@ def test_a_renderer_that_always_fails_its_checks_ends_with_the_reason(tmp_path, 
     assert not list(tmp_path.rglob("*.mp4"))
 
 
-# Reports.
-
-
-def test_the_report_counts_acceptance_by_map_and_reason_and_wide_rigs_are_refused_more(tmp_path):
+def test_wide_rigs_are_refused_more(tmp_path):
     request = SynthRequest(
         scenes=24, family="Uniform", map_name=("SynthYard", "SynthHall"), **SMALL
     )
@@ -174,12 +171,6 @@ def test_the_report_counts_acceptance_by_map_and_reason_and_wide_rigs_are_refuse
         for proposals in ([proposal for proposal, _ in refused] + accepted, accepted)
     )
 
-    *_, hall, yard, everything = acceptance_markdown(planned).splitlines()
-
-    assert (hall[:11], yard[:11]) == ("| SynthHall", "| SynthYard")
-    assert f"| all maps | {24 + len(refused)} | 24 (" in everything
-    collisions = sum(refusal.reason == "collision" for _, refusal in refused)
-    assert f"collision {collisions}" in everything
-    assert collisions > 0
+    assert any(refusal.reason == "collision" for _, refusal in refused)
     assert proposed_cm == pytest.approx(75.5, abs=12)
     assert realised_cm < proposed_cm - 5
