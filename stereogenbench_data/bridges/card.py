@@ -49,9 +49,6 @@ _LICENCES: Final = {
 }
 """The Hub's name of a licence, by its URL."""
 _SIZES: Final = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
-_RESPONSIBLE_USE: Final = (
-    "rai:dataUseCases", "rai:dataLimitations", "rai:dataBiases", "rai:personalSensitiveInformation",
-)  # fmt: skip
 
 
 def card(index: SceneIndex, *, repository: str, about: dataset_facts.About | None = None) -> str:
@@ -72,8 +69,6 @@ def card(index: SceneIndex, *, repository: str, about: dataset_facts.About | Non
         from huggingface_hub import DatasetCard, DatasetCardData
     facts, configs = dataset_facts.facts_of(index, about=about), _configs(index)
     family = next(name for name in configs if name != "all")
-    provenance = (facts["prov:wasGeneratedBy"], facts["prov:wasDerivedFrom"])
-    uses = (dataset_facts.listed(facts[name]) for name in _RESPONSIBLE_USE)
     made = DatasetCard.from_template(
         DatasetCardData(**_head(index, facts, configs)),
         template_path=str(Path(__file__).with_name("card.md")),
@@ -83,10 +78,7 @@ def card(index: SceneIndex, *, repository: str, about: dataset_facts.About | Non
         repository=repository,
         config=family,
         split=next(iter(configs[family])),
-        derived=dataset_facts.derivation_facts(index) if index.is_derived else None,
-        derived_text=dataset_facts.STEPS["derived_text"],
-        provenance=[step for steps in provenance for step in dataset_facts.listed(steps)],
-        responsible_use=[use for each in uses for use in each],
+        derived=dataset_facts.STEPS["derived_text"] if index.is_derived else "",
         **_numbers(index),
     )
     return f"{made.content.rstrip()}\n"

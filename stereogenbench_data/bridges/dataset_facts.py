@@ -139,9 +139,8 @@ def packing_facts(index: SceneIndex, facts: Facts) -> Facts:
         how = ", depth packed by blosc2 without loss" if packed else ""
         step["description"] = step["description"].format(how=how)
         return made
-    derived = derivation_facts(index)
-    words = derived | {"settings": json.dumps(derived["settings"], sort_keys=True)}
-    step["description"] = step["description"].format(**words)
+    derived = _derivation(index)
+    step["description"] = step["description"].format(**derived)
     source = {
         "@type": "prov:Entity",
         "prov:label": facts["name"],
@@ -153,29 +152,27 @@ def packing_facts(index: SceneIndex, facts: Facts) -> Facts:
     }
 
 
-def derivation_facts(index: SceneIndex) -> Facts:
-    """Return from what, how and with what error training shards were derived, as JSON.
+def _derivation(index: SceneIndex) -> dict[str, Any]:
+    """Return from what, how and with what error training shards were derived.
 
-    Several values of a fact, as of scenes that were derived with several settings, are a list.
+    Several values of a fact, as of scenes that were derived with several settings, are all named.
     """
     scenes = [index.scene(row) for row in range(len(index))]
-    known = [(scene.rig, scene.training) for scene in scenes if scene.training is not None]
-    records = [training for _, training in known]
+    records = [scene.training for scene in scenes if scene.training is not None]
     values = {
-        "size": {f"{rig.image_width_px}x{rig.image_height_px}" for rig, _ in known},
+        "size": {f"{scene.rig.image_width_px}x{scene.rig.image_height_px}" for scene in scenes},
         **{
             name: {getattr(training, name) for training in records}
             for name in ("quality", "codec", "settings", "source_digest")
         },
     }
-    facts: Facts = {}
-    for name, found in values.items():
-        each = [json.loads(text) for text in sorted(found)] if name == "settings" else sorted(found)
-        facts[name] = each[0] if len(each) == 1 else each
     mean_db = [each for training in records for each in training.psnr_db if each == each]
     worst_db = [each for training in records for each in training.worst_psnr_db if each == each]
-    facts["mean_db"] = round(sum(mean_db) / max(len(mean_db), 1), 3)
-    return facts | {"worst_db": min(worst_db, default=0.0)}
+    return {
+        **{name: ", ".join(sorted(found)) for name, found in values.items()},
+        "mean_db": sum(mean_db) / max(len(mean_db), 1),
+        "worst_db": min(worst_db, default=0.0),
+    }
 
 
 def _known(index: SceneIndex, about: About | None) -> Facts:
