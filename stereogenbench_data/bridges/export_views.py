@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final, Literal, Unpack
 
@@ -131,40 +132,38 @@ def write_colmap(folder: Path, images: Sequence[PosedImage], points: int | None)
     Source: colmap/colmap, doc/format.rst, doc/faq.rst.
     """
     images, _ = _placed(folder, images, axes=np.eye(4))
-    point_lines: list[str] = []
-    observed: list[list[str]] = []
-    for number, image in enumerate(images):
-        rows, columns = sampled_pixels(image, points)
-        seen: list[str] = []
-        for position, colour, row, column in zip(
-            image.points_world(rows, columns).tolist(),
-            image.rgb[rows, columns].tolist(),
-            rows.tolist(),
-            columns.tolist(),
-            strict=True,
-        ):
-            point_id = len(point_lines) + 1
-            line = " ".join([str(point_id), *map(repr, position), *map(str, colour), "0"])
-            point_lines.append(f"{line} {number + 1} {len(seen)}\n")
-            seen.append(f"{column + CENTRE_PX!r} {row + CENTRE_PX!r} {point_id}")
-        observed.append(seen)
     (folder / "images").mkdir()
-    image_lines = []
-    for number, image in enumerate(images):
+    point_lines: list[str] = []
+    image_lines: list[str] = []
+    for number, image in enumerate(images, 1):
         _write_png(folder / "images" / f"{image.name}.png", image)
+        rows, columns = sampled_pixels(image, points)
+        first_point = len(point_lines) + 1
+        positions, colours = image.points_world(rows, columns), image.rgb[rows, columns]
+        point_lines += [
+            _line(first_point + place, *position, *colour, 0, number, place)
+            for place, (position, colour) in enumerate(
+                zip(positions.tolist(), colours.tolist(), strict=True)
+            )
+        ]
+        x_px, y_px = ((each + CENTRE_PX).tolist() for each in (columns, rows))
+        observed = zip(x_px, y_px, range(first_point, len(point_lines) + 1), strict=True)
         pose = image.cam_from_world
-        numbers = [*quaternion_wxyz(pose[:3, :3]).tolist(), *pose[:3, 3].tolist()]
-        image_lines.append(
-            f"{number + 1} {' '.join(map(repr, numbers))} 1 {image.name}.png\n"
-            f"{' '.join(observed[number])}\n"
-        )
+        numbers = (*quaternion_wxyz(pose[:3, :3]).tolist(), *pose[:3, 3].tolist())
+        image_lines += [
+            _line(number, *numbers, 1, f"{image.name}.png"),
+            _line(*chain.from_iterable(observed)),
+        ]
     (fx, _, cx), (_, fy, cy), _ = images[0].intrinsics.tolist()
     height, width = images[0].size
-    camera = f"1 PINHOLE {width} {height} {fx!r} {fy!r} {cx!r} {cy!r}\n"
     model = folder / "sparse" / "0"
     model.mkdir(parents=True)
     for name, head, lines in (
-        ("cameras", "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n", [camera]),
+        (
+            "cameras",
+            "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n",
+            [_line(1, "PINHOLE", width, height, fx, fy, cx, cy)],
+        ),
         (
             "images",
             "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
@@ -177,8 +176,12 @@ def write_colmap(folder: Path, images: Sequence[PosedImage], points: int | None)
             point_lines,
         ),
     ):
-        with (model / f"{name}.txt").open("w", encoding="utf-8") as file:
-            file.writelines([head, *lines])
+        (model / f"{name}.txt").write_text(head + "".join(lines), encoding="utf-8")
+
+
+def _line(*values: str | float) -> str:
+    """Return values as a line; floats in full."""
+    return " ".join(map(str, values)) + "\n"
 
 
 def write_transforms(folder: Path, images: Sequence[PosedImage], points: int | None) -> None:
