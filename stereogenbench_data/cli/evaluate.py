@@ -4,7 +4,8 @@ They share their options: scenes, pairs and frames, metrics and models, the repo
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,6 +17,7 @@ from stereogenbench_data.cli.options import (
     JsonOption,
     OutArgument,
     SampleOptions,
+    SizeOption,
     SplitOption,
     WorkOptions,
     grouped,
@@ -55,6 +57,21 @@ class ScoredOptions(SampleOptions):
     """Which samples are scored: those of the eval split by default."""
 
     split: SplitOption = "eval"
+
+    @contextmanager
+    def scored(
+        self, folder: Path, work: WorkOptions, *, device: str = "cpu"
+    ) -> Iterator[dict[str, Any]]:
+        """Show a bar, and yield options of what scores: samples, processes, partial results.
+
+        Args:
+            folder: Where the report will be.
+            work: How many processes.
+            device: Where learned models run.
+        """
+        options = {**work.options(device=device), **self.selection(), "out": folder / "partial"}
+        with progress_bar("scoring", unit="frames") as progress:
+            yield options | {"progress": progress}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,24 +213,13 @@ def score(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.evaluation.evaluate import evaluate
     from stereogenbench_data.evaluation.tables import tables_of
 
-    protocol, selection = scoring.protocol(), chosen.selection()
-    called = name or predictions.resolve().name
+    protocol, called = scoring.protocol(), name or predictions.resolve().name
     folder = report.out or Path("evaluation") / f"{called}-{tier}"
     index = source.open()
     columns = groups.columns(index)
-    with progress_bar("scoring", unit="frames") as progress:
-        scores = evaluate(
-            index,
-            predictions,
-            tier=tier,
-            name=called,
-            protocol=protocol,
-            out=folder / "partial",
-            **work.options(device=scoring.device),
-            allow_missing=groups.allow_missing,
-            progress=progress,
-            **selection,
-        )
+    with chosen.scored(folder, work, device=scoring.device) as how:
+        how["allow_missing"] = groups.allow_missing
+        scores = evaluate(index, predictions, tier=tier, name=called, protocol=protocol, **how)
     report.write(folder, [scores], tables_of([scores], by=columns))
 
 
@@ -226,12 +232,7 @@ def disparity(  # noqa: PLR0913 - one parameter an option
     ],
     *,
     chosen: ScoredOptions,
-    size: Annotated[
-        Any,
-        option(
-            "--size", "Width x height of what is scored [as stored].", parser=size_of, metavar="WxH"
-        ),
-    ] = None,
+    size: SizeOption = None,
     max_disparity: Annotated[
         float | None,
         option("Leave out pixels whose true disparity is this or more.", metavar="PX"),
@@ -252,21 +253,13 @@ def disparity(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.evaluation.disparity import disparity_tables, evaluate_disparity
     from stereogenbench_data.evaluation.protocol import DisparityProtocol
 
-    selection, called = chosen.selection(), predictions.resolve().name
-    folder = report.out or Path("evaluation") / f"{called}-disparity"
+    protocol = DisparityProtocol(size=size, max_disparity_px=max_disparity)
+    folder = report.out or Path("evaluation") / f"{predictions.resolve().name}-disparity"
     index = source.open()
     columns = groups.columns(index, "map_name")
-    with progress_bar("scoring", unit="frames") as progress:
-        scores = evaluate_disparity(
-            index,
-            predictions,
-            protocol=DisparityProtocol(size=size, max_disparity_px=max_disparity),
-            out=folder / "partial",
-            **work.options(),
-            allow_missing=groups.allow_missing,
-            progress=progress,
-            **selection,
-        )
+    with chosen.scored(folder, work) as how:
+        how["allow_missing"] = groups.allow_missing
+        scores = evaluate_disparity(index, predictions, protocol=protocol, **how)
     report.write(folder, [scores], disparity_tables([scores], by=columns))
 
 
@@ -290,17 +283,9 @@ def controls(
     from stereogenbench_data.evaluation.controls import score_controls
     from stereogenbench_data.evaluation.tables import table_of
 
-    protocol, selection = scoring.protocol(), chosen.selection()
-    folder = report.out or Path("evaluation") / "controls"
+    protocol, folder = scoring.protocol(), report.out or Path("evaluation") / "controls"
     index = source.open()
-    with progress_bar("scoring", unit="frames") as progress:
-        results = score_controls(
-            index,
-            protocol=protocol,
-            out=folder / "partial",
-            **work.options(device=scoring.device),
-            progress=progress,
-            **selection,
-        )
+    with chosen.scored(folder, work, device=scoring.device) as how:
+        results = score_controls(index, protocol=protocol, **how)
     tables = [table_of(results, name) for name in ("controls", "branches", "explanations")]
     report.write(folder, results, tables)

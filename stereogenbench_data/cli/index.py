@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Annotated, Literal
+from typing import Annotated, Any
 
 import typer
 
@@ -28,6 +28,8 @@ from stereogenbench_data.errors import explain_os_errors
 from stereogenbench_data.schema.text import counted, plain_line
 
 _INDEX_NAME = "index.parquet"
+_LEFT_OUT = ("incomplete", "broken", "odd", "notes")
+"""What a walk reports besides its scenes."""
 
 
 @grouped
@@ -64,7 +66,6 @@ def index(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.sources.location import is_remote, local_path, shown
 
     target = out or Path("." if is_remote(root) else root, _INDEX_NAME)
-    mode: Literal["skip", "sample"] = "sample" if valid_depth else "skip"
     wanted = chosen.by_path()
     if wanted is not None and out is None:
         raise typer.BadParameter(
@@ -89,7 +90,7 @@ def index(  # noqa: PLR0913 - one parameter an option
             root,
             **work.options(),
             progress=progress,
-            valid_depth=mode,
+            valid_depth="sample" if valid_depth else "skip",
             checksums="all" if checksums else "none",
             wanted=wanted,
             conventions=stated,
@@ -98,14 +99,9 @@ def index(  # noqa: PLR0913 - one parameter an option
             SceneIndex.from_report(report).write(target)
     status = FINDINGS if report.broken or not report.scenes else 0
     if as_json:
-        document = {
-            "index": str(target) if report.scenes else None,
-            "scenes": len(report.scenes),
-            "incomplete": report.incomplete,
-            "broken": report.broken,
-            "odd": report.odd,
-            "notes": report.notes,
-        }
+        document: dict[str, Any] = {"index": str(target) if report.scenes else None}
+        document["scenes"] = len(report.scenes)
+        document |= {name: getattr(report, name) for name in _LEFT_OUT}
         typer.echo(json.dumps(document, indent=2))
         raise typer.Exit(status)
     made = (
