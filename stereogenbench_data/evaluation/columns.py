@@ -14,13 +14,13 @@ class Column:
         label: What tables call it.
         better: Which way is better; "neither" for what only explains another column.
         digits: Decimals in tables.
-        backend: Which of a protocol's backends it was measured with, "" for none.
+        metric: The metric that fills it.
     """
 
     label: str
     better: Literal["higher", "lower", "neither"]
     digits: int
-    backend: Literal["", "keypoint_matcher", "stereo_matcher"] = ""
+    metric: str
 
 
 _SD_FITS: Final = {"filtered": "filtered", "least_squares": "least squares"}
@@ -43,56 +43,42 @@ QUANTILES: Final = {"a50": 0.50, "a90": 0.90, "a95": 0.95, "a99": 0.99}
 BAD_PX: Final = {"bad_0.5": 0.5, "bad_1": 1.0, "bad_2": 2.0, "bad_3": 3.0, "bad_4": 4.0}
 """Errors of disparity that are counted as bad, by their columns."""
 
-DISPARITY_COLUMNS: Final[dict[str, Column]] = {
-    "epe": Column("EPE px, answered", "lower", 3),
-    "rms": Column("RMS px, answered", "lower", 3),
-    **{name: Column(f"{name.upper()} px, answered", "lower", 3) for name in QUANTILES},
-    **{name: Column(f"bad {limit:g}, scored", "lower", 4) for name, limit in BAD_PX.items()},
-    "d1": Column("D1, scored", "lower", 4),
-    "invalid": Column("invalid, scored", "lower", 4),
-    "beyond": Column("left out, valid", "neither", 4),
-}
-"""Where disparity is scored: the measure, and of which pixels; `metrics.disparity` defines them."""
-
 COLUMNS: Final[dict[str, Column]] = {
-    "psnr": Column("PSNR", "higher", 2),
-    "ssim": Column("SSIM", "higher", 4),
-    "lpips": Column("LPIPS", "lower", 4),
-    "e_match": Column("E_match", "lower", 2, "keypoint_matcher"),
-    "p_psnr": Column("P-PSNR", "higher", 2),
+    "psnr": Column("PSNR", "higher", 2, "psnr"),
+    "ssim": Column("SSIM", "higher", 4, "ssim"),
+    "lpips": Column("LPIPS", "lower", 4, "lpips"),
+    "e_match": Column("E_match", "lower", 2, "e_match"),
+    "p_psnr": Column("P-PSNR", "higher", 2, "p_psnr"),
+    **{f"sd_{fit}": Column(f"SD {words}", "lower", 4, "sd") for fit, words in _SD_FITS.items()},
+    "p_psnr_ceiling": Column("P-PSNR of target", "neither", 2, "p_psnr"),
+    "p_psnr_outside": Column("outside window", "neither", 3, "p_psnr"),
+    "keypoints": Column("keypoints", "neither", 0, "e_match"),
+    "target_matches": Column("M_gt", "neither", 0, "e_match"),
+    "predicted_matches": Column("M_pred", "neither", 0, "e_match"),
+    "common_matches": Column("M_both", "neither", 0, "e_match"),
+    "sd_beyond": Column("beyond range", "neither", 3, "sd"),
+    "sd_answered": Column("answered", "neither", 3, "sd"),
     **{
-        f"sd_{fit}": Column(f"SD {words}", "lower", 4, "stereo_matcher")
-        for fit, words in _SD_FITS.items()
-    },
-    "p_psnr_pooled": Column("P-PSNR pooled", "neither", 2),
-    "p_psnr_ceiling": Column("P-PSNR of target", "neither", 2),
-    "p_psnr_outside": Column("outside window", "neither", 3),
-    "keypoints": Column("keypoints", "neither", 0, "keypoint_matcher"),
-    "target_matches": Column("M_gt", "neither", 0, "keypoint_matcher"),
-    "predicted_matches": Column("M_pred", "neither", 0, "keypoint_matcher"),
-    "common_matches": Column("M_both", "neither", 0, "keypoint_matcher"),
-    "sd_beyond": Column("beyond range", "neither", 3, "stereo_matcher"),
-    "sd_answered": Column("answered", "neither", 3, "stereo_matcher"),
-    **{
-        f"sd_{fit}_{name}": Column(f"{label} {words}", "neither", digits, "stereo_matcher")
+        f"sd_{fit}_{name}": Column(f"{label} {words}", "neither", digits, "sd")
         for fit, words in _SD_FITS.items()
         for name, (label, digits) in EXPLAIN_A_FIT.items()
     },
-    **DISPARITY_COLUMNS,
+    # Of disparity: the measure, and of which pixels; `metrics.disparity` defines them.
+    "epe": Column("EPE px, answered", "lower", 3, "disparity"),
+    "rms": Column("RMS px, answered", "lower", 3, "disparity"),
+    **{name: Column(f"{name.upper()} px, answered", "lower", 3, "disparity") for name in QUANTILES},
+    **{
+        name: Column(f"bad {limit:g}, scored", "lower", 4, "disparity")
+        for name, limit in BAD_PX.items()
+    },
+    "d1": Column("D1, scored", "lower", 4, "disparity"),
+    "invalid": Column("invalid, scored", "lower", 4, "disparity"),
+    "beyond": Column("left out, valid", "neither", 4, "disparity"),
 }
-"""Columns of frames, headline columns first; `frame_metrics` says how each is computed."""
+"""Columns of frames, headline columns first; `FRAME_METRIC_ROWS` says how each is computed."""
 
-FRAME_METRICS: Final[dict[str, tuple[str, ...]]] = {
-    "psnr": ("psnr",),
-    "ssim": ("ssim",),
-    "lpips": ("lpips",),
-    "e_match": (
-        "e_match", "keypoints", "target_matches", "predicted_matches", "common_matches",
-    ),
-    "p_psnr": ("p_psnr", "p_psnr_pooled", "p_psnr_ceiling", "p_psnr_outside"),
-    "sd": tuple(name for name in COLUMNS if name.startswith("sd_")),
-}  # fmt: skip
-"""The columns of each metric that is computed frame by frame."""
+MATCHERS: Final = {"e_match": "keypoint_matcher", "sd": "stereo_matcher"}
+"""The metrics that depend on a matcher, with a protocol's attribute that names it."""
 
 HEAVY_TAILED: Final = frozenset(f"sd_{fit}" for fit in _SD_FITS)
 """Columns whose mean a few scenes can dominate: their median is shown and judged."""
@@ -103,7 +89,7 @@ LEARNED: Final = ("lpips", "fid", "fvd")
 FID and FVD are distances between sets: of the features of frames, or of clips, one clip a pair.
 """
 
-METRICS: Final = (*FRAME_METRICS, "fid", "fvd")
+METRICS: Final = ("psnr", "ssim", "lpips", "e_match", "p_psnr", "sd", "fid", "fvd")
 OFFLINE_METRICS: Final = ("psnr", "ssim", "e_match", "p_psnr", "sd")
 """What is computed by default: nothing that needs weights."""
 

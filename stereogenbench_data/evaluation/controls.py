@@ -19,13 +19,12 @@ from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.evaluate import (
     EVALUATION_DEFAULTS,
     EvaluationOptions,
-    Run,
     score_pairs,
     select_pairs,
 )
 from stereogenbench_data.evaluation.predictions import PairFrames, Read, open_frames
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
-from stereogenbench_data.evaluation.scene_scores import fields_of
+from stereogenbench_data.evaluation.scene_scores import Run, fields_of
 from stereogenbench_data.evaluation.tables import CONTROL, Scores
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Sample
@@ -155,14 +154,15 @@ def score_controls(
         options=options,
         conventions=conventions,
     )
-    donors = derangement(sorted({pairs[0].scene for pairs in scenes.values()}), seed=seed)
+    rows = {pairs[0].scene: row for row, pairs in scenes.items()}
+    donors = derangement(sorted(rows), seed=seed)
     run = Run(
         index,
         scenes,
         protocol,
         sources=tuple(Control(name, protocol.size, donors) for name in CONTROLS),
         tier=CONTROL,
-        donors=donors,
+        donors={rows[scene]: rows[donor] for scene, donor in donors.items()},
         settings={"seed": seed},
     )
     return score_pairs(run, options)

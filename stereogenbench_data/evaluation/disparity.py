@@ -6,7 +6,7 @@ results, averages and tables. What is measured is said in `metrics.disparity`.
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -18,15 +18,10 @@ import torch
 from stereogenbench_data.datasets.mapped import Data
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import EvaluationError, PredictionError
-from stereogenbench_data.evaluation.disparity_maps import (
-    DisparityFolder,
-    Matcher,
-    accept_disparity,
-)
+from stereogenbench_data.evaluation.disparity_maps import Matcher, accept_disparity, open_maps
 from stereogenbench_data.evaluation.evaluate import (
     EVALUATION_DEFAULTS,
     EvaluationOptions,
-    Run,
     pair_scores,
     scored_scenes,
     select_pairs,
@@ -41,20 +36,19 @@ from stereogenbench_data.evaluation.metrics.disparity import (
     REGIONS,
     frame_scores,
 )
-from stereogenbench_data.evaluation.predictions import CalledMethod
+from stereogenbench_data.evaluation.predictions import CalledMethod, PredictionFolder
 from stereogenbench_data.evaluation.protocol import DisparityProtocol
 from stereogenbench_data.evaluation.scene_scores import (
     RESIZE,
     PairScores,
+    Run,
     SceneScores,
-    SceneWork,
     one_thread,
     open_scene,
     versions,
 )
 from stereogenbench_data.evaluation.tables import (
     DISPARITY,
-    PairMeans,
     Scores,
     Table,
     TableRow,
@@ -62,6 +56,7 @@ from stereogenbench_data.evaluation.tables import (
     forms_of,
     require_comparable,
     rows_of,
+    with_score,
 )
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.schema.conventions import Conventions
@@ -69,7 +64,8 @@ from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.signatures import list_options
 
 _TRUTH: Final = ("disparity", "valid", "visible", "frame_index")
-_SHOWN: Final = ("epe", "rms", "bad_1", "bad_2", "bad_3", "d1", "invalid")
+_REGION_ENDINGS: Final = {"all": "", **{region: f"_{region}" for region in REGIONS}}
+_SHOWN: Final[tuple[str, ...]] = ("epe", "rms", "bad_1", "bad_2", "bad_3", "d1", "invalid")
 """The columns of tables whose rows are groups of pairs."""
 _DENOMINATORS: Final = (
     "EPE, RMS and quantiles (A50 to A99) are over answered pixels; bad, D1 and invalid over scored "
@@ -109,13 +105,15 @@ def evaluate_disparity(
     require_options(evaluate_disparity, options)
     protocol = protocol or DisparityProtocol()
     called = partial(CalledMethod, inputs=("left", "right"), accept=accept_disparity)
-    written = partial(DisparityFolder, max_disparity_px=protocol.max_disparity_px)
+    open_pair = partial(open_maps, max_disparity_px=protocol.max_disparity_px)
+    written = partial(PredictionFolder, open_pair=open_pair, suffixes=())
     source = source_of(predictions, name, options, called=called, written=written)
     fields = (*_TRUTH, *source.inputs)
     index, scenes = select_pairs(data, fields, protocol, options=options, conventions=conventions)
     settings = _settings_of(protocol)
-    run = Run(index, scenes, protocol, (source,), DISPARITY)
-    with scored_scenes(run, score_disparity, {"settings": settings}, options) as out:
+    known = {"settings": settings}
+    run = Run(index, scenes, protocol, (source,), DISPARITY, settings=known)
+    with scored_scenes(run, score_disparity, options) as out:
         pairs = tuple(means for means, _ in pair_scores(run, out, source.name))
     return Scores(source.name, run.tier, protocol, settings, index, pairs)
 
@@ -145,26 +143,19 @@ class _PairErrors:
 
     def add(self, maps: Sequence[Any], samples: Sequence[Sample], most_px: float | None) -> None:
         for found, sample in zip(maps, samples, strict=True):
-            self.pixels.update(np.ascontiguousarray(found, dtype="<f8").data)
-            truth = {name: torch.from_numpy(sample[name][0]) for name in _TRUTH[:3]}
-            numbers = frame_scores(
-                torch.from_numpy(np.ascontiguousarray(found)),
-                truth["disparity"],
-                valid=truth["valid"],
-                visible=truth["visible"],
-                max_disparity_px=most_px,
-            )
+            found = np.ascontiguousarray(found, dtype="<f8")
+            self.pixels.update(found.data)
+            given = (found, *(sample[name][0] for name in _TRUTH[:3]))
+            numbers = frame_scores(*map(torch.from_numpy, given), max_disparity_px=most_px)
             for name, number in numbers.items():
                 self.scores.columns[name].append(number)
 
 
-def score_disparity(
-    work: SceneWork[DisparityProtocol], after_frames: Advance
-) -> tuple[str, SceneScores]:
+def score_disparity(work: Run[DisparityProtocol], after_frames: Advance) -> tuple[str, SceneScores]:
     """Return a scene's key, and the scores of each method and pair of it.
 
     Args:
-        work: What to score.
+        work: What to score of one scene.
         after_frames: Called with how many frames of pairs were scored since; it may raise to
             stop the work.
 
@@ -198,7 +189,7 @@ def score_disparity(
             after_frames(len(samples))
     for found in gathered.values():
         found.scores.views_sha256 = "" if found.scores.problem else found.pixels.hexdigest()
-    return work.scene, {place: found.scores for place, found in gathered.items()}
+    return work.pairs[0].scene, {place: found.scores for place, found in gathered.items()}
 
 
 def disparity_tables(
@@ -215,58 +206,37 @@ def disparity_tables(
             index has no such column with one value a scene.
     """
     require_comparable(results)
-    tables = [
-        _table(results, name, form.title, form.keys, _SHOWN, rows_of(results, form))
-        for name, form in forms_of(results, by).items()
-    ]
-    regions = {"all": "", **{region: f"_{region}" for region in REGIONS}}
-    ranges = {part: f"_{part}" for part in RANGES_PX}
-    title = "What the right camera sees, all pairs"
-    tables.append(
-        _table(results, "regions", title, ("region",), MEASURES, _parts(results, regions))
-    )
-    title = "True disparity in px, all pairs"
-    rows = _parts(results, ranges)
-    tables.append(_table(results, "ranges", title, ("disparity",), MEASURES, rows))
-    return tables
-
-
-def _table(
-    results: Sequence[Scores],
-    name: str,
-    title: str,
-    keys: tuple[str, ...],
-    columns: Sequence[str],
-    rows: Sequence[TableRow],
-) -> Table:
     protocol: Any = results[0].protocol
-    notes, shown = [], tuple(columns)
-    if name == "branches":  # the first: what holds for all
-        notes.append(_DENOMINATORS)
-        if protocol.max_disparity_px is not None:
-            shown = (*columns, "beyond")
-            notes.append(f"Left out are valid pixels from {protocol.max_disparity_px:g} px on.")
-    return Table(name, f"{title} (disparity)", keys, protocol, shown, tuple(rows), tuple(notes))
+    tables = []
+    for name, form in forms_of(results, by).items():
+        title, rows = f"{form.title} (disparity)", rows_of(results, form)
+        tables.append(Table(name, title, form.keys, protocol, _SHOWN, rows))
+    for name, title, key, endings in (
+        ("regions", "What the right camera sees", "region", _REGION_ENDINGS),
+        ("ranges", "True disparity in px", "disparity", {part: f"_{part}" for part in RANGES_PX}),
+    ):
+        title, rows = f"{title}, all pairs (disparity)", _parts(results, endings)
+        tables.append(Table(name, title, (key,), protocol, MEASURES, rows))
+    # What holds for all stands at the first.
+    columns, notes = _SHOWN, [_DENOMINATORS]
+    if protocol.max_disparity_px is not None:
+        columns = (*columns, "beyond")
+        notes.append(f"Left out are valid pixels from {protocol.max_disparity_px:g} px on.")
+    return [replace(tables[0], columns=columns, notes=tuple(notes)), *tables[1:]]
 
 
-def _parts(results: Sequence[Scores], parts: Mapping[str, str]) -> list[TableRow]:
+def _parts(results: Sequence[Scores], endings: Mapping[str, str]) -> tuple[TableRow, ...]:
     """Return a row for each part of the pixels of all pairs, of every method; none of no pixel."""
-    rows = []
-    for part, ending in parts.items():
-        for one in results:
-            scored = [pair for pair in one.pairs if not pair.problem]
-            there: list[PairMeans] = [
-                pair for pair in scored if pair.tallies[f"invalid{ending}"].finite
-            ]
-            if there:
-                rows.append(
-                    TableRow(
-                        method=one.name,
-                        labels=(part,),
-                        scenes=len({pair.scene for pair in there}),
-                        frames=sum(pair.tallies[f"invalid{ending}"].finite for pair in there),
-                        missing=len(one.pairs) - len(scored),
-                        values={name: cell(there, f"{name}{ending}") for name in MEASURES},
-                    )
-                )
-    return rows
+    return tuple(
+        TableRow(
+            method=one.name,
+            labels=(part,),
+            scenes=len({pair.scene for pair in there}),
+            frames=sum(pair.tallies[f"invalid{ending}"].finite for pair in there),
+            missing=sum(bool(pair.problem) for pair in one.pairs),
+            values={name: cell(there, f"{name}{ending}") for name in MEASURES},
+        )
+        for part, ending in endings.items()
+        for one in results
+        if (there := with_score(one.pairs, f"invalid{ending}"))
+    )

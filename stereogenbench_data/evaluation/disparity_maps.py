@@ -17,10 +17,8 @@ A map is (h, w), or (1, h, w), in pixels of the size that is scored.
 
 import re
 import zipfile
-import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,15 +26,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from stereogenbench_data.errors import PredictionError, StorageError, cure_of, describe_os_error
-from stereogenbench_data.evaluation.predictions import (
-    PairFrames,
-    Read,
-    find_prediction,
-    frame_name,
-    stamp_prediction,
-)
-from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.errors import PredictionError
+from stereogenbench_data.evaluation.predictions import PairFrames, frame_name, readable
 from stereogenbench_data.samples.fields import Sample
 
 PNG_PER_PX: Final = 256
@@ -45,64 +36,44 @@ PNG_ENDS_PX: Final = 65535 / PNG_PER_PX
 
 _PFM_HEAD: Final = re.compile(rb"(P[Ff])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,32})\s")
 _HEAD_BYTES: Final = 128
-_UNREADABLE: Final = (
-    OSError, SyntaxError, ValueError, EOFError, zlib.error, zipfile.BadZipFile,
-    Image.DecompressionBombError,
-)  # fmt: skip
 
 Matcher = Callable[[dict[str, Any]], Any]
 """Takes ``left`` and ``right``, uint8 (n, 3, h, w), frames of one pair in order, and returns their
 disparity in px, floats (n, h, w) or (n, 1, h, w)."""
 
 
-@dataclass(frozen=True, slots=True)
-class DisparityFolder:
-    """Disparity maps that a method wrote.
+@contextmanager
+def open_maps(
+    folder: Path, wanted: PairFrames, *, max_disparity_px: float | None = None
+) -> Iterator[Callable[[Sample], Any]]:
+    """Yield a function that reads the disparity map of a sample, float64 (h, w).
 
-    Attributes:
-        name: What tables call the method.
-        root: The folder.
+    Args:
+        folder: The folder of the pair's maps.
+        wanted: The pair.
         max_disparity_px: Pixels whose true disparity is this or more are not scored.
-        inputs: Nothing of a sample.
     """
 
-    name: str
-    root: Path
-    max_disparity_px: float | None = None
-    inputs: tuple[str, ...] = ()
+    def read(sample: Sample) -> Any:
+        path = _file_of(folder, int(sample["frame_index"]), wanted)
+        if path.suffix == ".png":
+            truth_px = sample["disparity"][sample["valid"]]
+            if max_disparity_px is not None:
+                truth_px = truth_px[truth_px < max_disparity_px]
+            _require_in_range(truth_px, path, wanted)
+        return read_disparity(path, size=wanted.size, where=wanted.label)
 
-    def stamp(self, wanted: PairFrames) -> str:
-        """Return the stamp of the files."""
-        return stamp_prediction(find_prediction(self.root, wanted, suffixes=()))
+    yield read
 
-    @contextmanager
-    def open(self, index: SceneIndex) -> Iterator[Read]:
-        """Yield a function that reads the files of a scene."""
 
-        def read(wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
-            folder = find_prediction(self.root, wanted, suffixes=())
-            maps = []
-            for sample in samples:
-                path = _file_of(folder, int(sample["frame_index"]), wanted)
-                found = read_disparity(path, size=wanted.size, where=wanted.label)
-                if path.suffix == ".png":
-                    self._require_in_range(path, sample, wanted)
-                maps.append(found)
-            return maps
-
-        yield read
-
-    def _require_in_range(self, path: Path, sample: Sample, wanted: PairFrames) -> None:
-        """Raise where the truth that is scored goes beyond what a PNG of KITTI's holds."""
-        truth_px = sample["disparity"][sample["valid"]]
-        if self.max_disparity_px is not None:
-            truth_px = truth_px[truth_px < self.max_disparity_px]
-        if truth_px.size and truth_px.max() > PNG_ENDS_PX:
-            raise PredictionError(
-                f"{wanted.label}: {path} is a PNG of KITTI's, which ends at {PNG_ENDS_PX:.3f} px, "
-                f"and the true disparity goes up to {truth_px.max():.1f} px. Write PFM or npy, or "
-                f"pass max_disparity_px."
-            )
+def _require_in_range(truth_px: np.ndarray, path: Path, wanted: PairFrames) -> None:
+    """Raise where the truth that is scored goes beyond what a PNG of KITTI's holds."""
+    if truth_px.size and truth_px.max() > PNG_ENDS_PX:
+        raise PredictionError(
+            f"{wanted.label}: {path} is a PNG of KITTI's, which ends at {PNG_ENDS_PX:.3f} px, "
+            f"and the true disparity goes up to {truth_px.max():.1f} px. Write PFM or npy, or "
+            f"pass max_disparity_px."
+        )
 
 
 def accept_disparity(returned: torch.Tensor, given: tuple[int, int, int]) -> torch.Tensor:
@@ -132,7 +103,7 @@ def _file_of(folder: Path, frame: int, wanted: PairFrames) -> Path:
     return found[0]
 
 
-def read_disparity(path: Path, *, size: tuple[int, int], where: str = "") -> np.ndarray:
+def read_disparity(path: Path, *, size: tuple[int, int], where: str) -> np.ndarray:
     """Return a disparity map of a file, float (h, w), px; nan or inf where there is no answer.
 
     Args:
@@ -144,17 +115,12 @@ def read_disparity(path: Path, *, size: tuple[int, int], where: str = "") -> np.
         PredictionError: If it is not such a map.
         StorageError: If it cannot be read.
     """
-    begin = f"{where}: {path}" if where else str(path)
-    try:
+    with readable(path, where=where, what="a disparity map"):
         found = _READERS[path.suffix](path, size)
         found = found[0] if found.ndim == 3 and len(found) == 1 else found
         _require_shape(found.shape, size)
         if found.dtype.kind not in "fiu":
             raise ValueError(f"it holds {found.dtype}, no numbers")
-    except _UNREADABLE as error:
-        if isinstance(error, OSError) and cure_of(error):
-            raise StorageError(describe_os_error(f"{path}: cannot be read", error)) from error
-        raise PredictionError(f"{begin} is no disparity map: {error}.") from error
     return found.astype(np.float64)
 
 
@@ -169,7 +135,6 @@ def _read_png(path: Path, size: tuple[int, int]) -> np.ndarray:
     with path.open("rb") as file, Image.open(file, formats=["PNG"]) as image:
         if image.mode not in ("I;16", "I"):
             raise ValueError(f"pixels of mode {image.mode}, where KITTI's have one of 16 bits")
-        _require_shape(image.size[::-1], size)
         stored = np.asarray(image)
     return np.where(stored == 0, np.nan, stored / PNG_PER_PX)
 

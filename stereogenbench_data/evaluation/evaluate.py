@@ -11,12 +11,13 @@ import hashlib
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, replace
 from functools import partial
 from io import BytesIO
+from itertools import product
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any, Final, Generic, Unpack
+from typing import Any, Final, Unpack
 
 import torch
 
@@ -28,6 +29,7 @@ from stereogenbench_data.errors import (
     StorageError,
     explain_os_errors,
 )
+from stereogenbench_data.evaluation.columns import MATCHERS
 from stereogenbench_data.evaluation.metrics.frechet import (
     FeatureStatistics,
     FrechetDistance,
@@ -49,10 +51,10 @@ from stereogenbench_data.evaluation.protocol import (
     require_tier,
 )
 from stereogenbench_data.evaluation.scene_scores import (
-    How,
     PairScores,
+    Run,
     SceneScores,
-    SceneWork,
+    ScoredPairs,
     fields_of,
     model_of,
     score_scene,
@@ -71,7 +73,7 @@ from stereogenbench_data.selection.signatures import list_options
 from stereogenbench_data.sources.files import write_atomic
 
 EVALUATION: Final = JobKind("scores", "evaluation.json", ".evaluation.lock", EvaluationError)
-FORMAT: Final = 5
+FORMAT: Final = 6
 """Of the files of scenes; other formats are refused."""
 _PROBLEMS_SHOWN: Final = 2
 
@@ -187,10 +189,6 @@ def source_of(
     return called(label, predictions)
 
 
-ScoredPairs = Mapping[int, Sequence[PairFrames]]
-"""What is scored of the pairs of each scene, by its row in an index, ascending."""
-
-
 def select_pairs(
     data: Data,
     fields: Sequence[str],
@@ -298,29 +296,6 @@ def _require_whole(index: SceneIndex, lost: int, why: str = "") -> None:
         )
 
 
-@dataclass(frozen=True)
-class Run(Generic[How]):
-    """What is scored and how, and what identifies its results.
-
-    Attributes:
-        index: The index of the scenes.
-        scenes: Which of their pairs and frames.
-        protocol: The choices that scores depend on.
-        sources: Whose right views are scored.
-        tier: What the sources were given.
-        donors: For each scene, by key, another one that sources read views of, if any.
-        settings: What else the scores depend on, as plain values.
-    """
-
-    index: SceneIndex
-    scenes: ScoredPairs
-    protocol: How
-    sources: tuple[PredictionSource, ...]
-    tier: str
-    donors: Mapping[str, str] = field(default_factory=dict)
-    settings: Mapping[str, Any] = field(default_factory=dict)
-
-
 def score_pairs(
     run: Run[EvaluationProtocol], options: RunOptions | EvaluationOptions
 ) -> list[Scores]:
@@ -336,51 +311,39 @@ def score_pairs(
     protocol = run.protocol
     try:
         settings = settings_of(protocol)
-        state = {
-            "settings": settings,
-            "matchers": [
-                place_of(matcher)
-                for matcher in (protocol.keypoint_matcher, protocol.stereo_matcher)
-            ],
-        }
+        matchers = [place_of(getattr(protocol, matcher)) for matcher in MATCHERS.values()]
+        known = {"settings": settings, "matchers": matchers, **run.settings}
         if protocol.device != "cpu" and isinstance(options.get("engine", LOCAL), ProcessPool):
             options = {**options, "workers": options.get("workers") or 1}
-        with scored_scenes(run, score_scene, state, options) as out:
+        with scored_scenes(replace(run, settings=known), score_scene, options) as out:
             return [_scores(run, out, source.name, settings) for source in run.sources]
     finally:
         model_of.cache_clear()
 
 
-ScoreScene = Callable[[SceneWork[Any], Advance], tuple[str, SceneScores]]
+ScoreScene = Callable[[Run[Any], Advance], tuple[str, SceneScores]]
 """Returns a scene's key and its scores, and tells how many frames of pairs it has scored since."""
 
 
 @contextmanager
 def scored_scenes(
-    run: Run[Any],
-    score: ScoreScene,
-    state: Mapping[str, Any],
-    options: RunOptions | EvaluationOptions,
+    run: Run[Any], score: ScoreScene, options: RunOptions | EvaluationOptions
 ) -> Iterator[Path]:
     """Score what is not scored yet, and yield the folder that holds all scenes' scores.
 
     Args:
         run: What is scored.
         score: How a scene is.
-        state: What scores depend on, besides what the run says.
         options: How it is run.
     """
-    pairs = [pair for pairs in run.scenes.values() for pair in pairs]
-    folders = [str(each.root) for each in run.sources if hasattr(each, "root")]
     whole = {
         "format": FORMAT,
         "tier": run.tier,
         "methods": [source.name for source in run.sources],
         "data": run.index.digest,
-        "frames": sorted({pair.frames for pair in pairs}),
-        "pairs": sorted({pair.pair for pair in pairs}),
-        **state,
-        **({"predictions": folders} if folders else {}),
+        "frames": sorted({pair.frames for pair in run.pairs}),
+        "pairs": sorted({pair.pair for pair in run.pairs}),
+        "predictions": [str(getattr(source, "root", "")) for source in run.sources],
         **run.settings,
     }
     with ExitStack() as stack:
@@ -399,29 +362,26 @@ def _score_missing_scenes(
     """Score what is not scored yet, and keep each scene's scores as soon as it is done."""
     allowed = options.get("allow_missing", 0)
     stamps: dict[str, dict[tuple[str, Pair], str]] = {}
-    works: list[SceneWork[Any]] = []
+    works: list[Run[Any]] = []
     missing: list[str] = []
     problems: list[str] = []
     done_frames = 0
-    rows = {str(key): row for row, key in enumerate(run.index.column("key"))}
     for row, pairs in run.scenes.items():
         scene = pairs[0].scene
         stamps[scene] = {}
-        for source in run.sources:
-            for pair in pairs:
-                try:
-                    stamp = source.stamp(pair)
-                except PredictionError as problem:
-                    stamp = ""
-                    missing.append(str(problem))
-                stamps[scene][source.name, pair.pair] = stamp
+        for source, pair in product(run.sources, pairs):
+            try:
+                stamp = source.stamp(pair)
+            except PredictionError as problem:
+                stamp = ""
+                missing.append(str(problem))
+            stamps[scene][source.name, pair.pair] = stamp
         known = _read_scene(out, scene)
         if {place: found.stamp for place, found in known.items()} == stamps[scene]:
             done_frames += sum(len(pair.frames) for pair in pairs)
             problems.extend(found.problem for found in known.values() if found.problem)
-            continue
-        index = run.index.only({row, rows[run.donors.get(scene, scene)]})
-        works.append(SceneWork(index, tuple(pairs), run.protocol, run.sources))
+        else:
+            works.append(run.of_scene(row))
     _require_few(missing, allowed=allowed)
     _require_few(problems, allowed=allowed)
 
@@ -436,11 +396,11 @@ def _score_missing_scenes(
     do_items(
         score,
         works,
-        name=lambda work: work.scene,
+        name=lambda work: work.pairs[0].scene,
         keep=keep,
         options=options,
         done=done_frames,
-        total=sum(len(pair.frames) for pairs in run.scenes.values() for pair in pairs),
+        total=sum(len(pair.frames) for pair in run.pairs),
     )
 
 
@@ -460,7 +420,7 @@ def _scene_path(out: Path, scene: str) -> Path:
 def _write_scene(out: Path, scene: str, scores: SceneScores) -> None:
     """Keep the scores of a scene, whole or not at all."""
     content = {
-        place: {each.name: getattr(found, each.name) for each in fields(found)}
+        place: asdict(found)
         | {"predicted": _tensors(found.predicted), "target": _tensors(found.target)}
         for place, found in scores.items()
     }

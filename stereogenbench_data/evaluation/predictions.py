@@ -11,6 +11,7 @@ are evaluated, in order.
 """
 
 import hashlib
+import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
@@ -45,6 +46,11 @@ VIDEO_SUFFIXES: Final = (".mp4", ".mkv")
 _ITEM_DIGITS: Final = 16
 _PNG_BITS_AT: Final = 24
 """Where a PNG's header has the bits of a channel, which Pillow reduces from 16 to 8 unasked."""
+_UNREADABLE: Final = (
+    OSError, SyntaxError, ValueError, EOFError, zlib.error, zipfile.BadZipFile,
+    Image.DecompressionBombError,
+)  # fmt: skip
+"""What Pillow, numpy and zipfile raise of a file that is damaged or of another kind."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,18 +181,39 @@ def stamp_prediction(path: Path) -> str:
 
 
 @contextmanager
-def open_prediction(path: Path, wanted: PairFrames) -> Iterator[Callable[[int], Any]]:
-    """Yield a function that reads frames of a prediction that `find_prediction` found.
+def readable(path: Path, *, where: str, what: str) -> Iterator[None]:
+    """Turn errors of reading a file of a prediction into one that names it.
 
-    It returns uint8 (3, h, w), of the evaluated size or the scene's own, and raises PredictionError
-    at a frame that is not.
+    Args:
+        path: The file.
+        where: The scene and the pair.
+        what: What the file should be.
+
+    Raises:
+        PredictionError: If the file is damaged or of another kind.
+        StorageError: If the machine cannot read it now.
+    """
+    try:
+        yield
+    except _UNREADABLE as error:
+        if isinstance(error, OSError) and cure_of(error):
+            raise StorageError(describe_os_error(f"{path}: cannot be read", error)) from error
+        raise PredictionError(f"{where}: {path} cannot be read as {what} ({error}).") from error
+
+
+@contextmanager
+def open_views(path: Path, wanted: PairFrames) -> Iterator[Callable[[Sample], Any]]:
+    """Yield a function that reads the right views of a prediction that `find_prediction` found.
+
+    Of a sample it returns uint8 (3, h, w), of the evaluated size or the scene's own, and raises
+    PredictionError if the frame is not.
 
     Raises:
         PredictionError: If the prediction has another number of frames, or is not a video.
     """
     if path.is_dir():
         _require_pngs(path, wanted)
-        yield lambda frame: _read_png(path / frame_name(frame), wanted)
+        yield lambda sample: _read_png(path / frame_name(int(sample["frame_index"])), wanted)
         return
     with _problems_named(wanted):
         facts = probe(path, name=str(path))
@@ -200,9 +227,9 @@ def open_prediction(path: Path, wanted: PairFrames) -> Iterator[Callable[[int], 
     whole = facts.frames == wanted.scene_frames
     places = {frame: frame if whole else n for n, frame in enumerate(wanted.frames)}
 
-    def read(frame: int) -> Any:
+    def read(sample: Sample) -> Any:
         with _problems_named(wanted):
-            return read_rgb(reader, places[frame])
+            return read_rgb(reader, places[int(sample["frame_index"])])
 
     with closing(reader):
         yield read
@@ -236,17 +263,10 @@ def _require_pngs(folder: Path, wanted: PairFrames) -> None:
 
 
 def _read_png(path: Path, wanted: PairFrames) -> Any:
-    try:
-        with path.open("rb") as file:
-            bits = file.read(_PNG_BITS_AT + 1)[_PNG_BITS_AT:]
-            with Image.open(file, formats=["PNG"]) as image:
-                mode, pixels = image.mode, np.asarray(image)
-    except (OSError, SyntaxError, ValueError, zlib.error, Image.DecompressionBombError) as error:
-        if isinstance(error, OSError) and cure_of(error):
-            raise StorageError(describe_os_error(f"{path}: cannot be read", error)) from error
-        raise PredictionError(
-            f"{wanted.label}: {path} cannot be read as a picture ({error})."
-        ) from error
+    with readable(path, where=wanted.label, what="a picture"), path.open("rb") as file:
+        bits = file.read(_PNG_BITS_AT + 1)[_PNG_BITS_AT:]
+        with Image.open(file, formats=["PNG"]) as image:
+            mode, pixels = image.mode, np.asarray(image)
     if mode != "RGB" or bits != b"\x08":
         raise PredictionError(
             f"{wanted.label}: {path} has pixels of mode {mode} of {bits[0]} bits: write 8-bit RGB."
@@ -290,8 +310,12 @@ Method = Callable[[dict[str, Any]], Any]
 uint8, or floats of 0 to 1, (n, 3, h, w)."""
 
 Read = Callable[[PairFrames, Sequence[Sample]], Sequence[Any]]
-"""Takes the samples of some frames of one pair, in order, and returns their right views: uint8
-(3, h, w), of the evaluated size or of that of the scene's own pictures."""
+"""Takes the samples of some frames of one pair, in order, and returns what is scored of them: right
+views, uint8 (3, h, w), of the evaluated size or of that of the scene's own pictures; or disparity,
+float64 (h, w)."""
+
+OpenPair = Callable[[Path, PairFrames], AbstractContextManager[Callable[[Sample], Any]]]
+"""Opens what was written for a pair, and yields a function that reads the frame of a sample."""
 
 
 class PredictionSource(Protocol):
@@ -318,33 +342,37 @@ class PredictionSource(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PredictionFolder:
-    """Right views that a method wrote, in the layout of `predictions`.
+    """What a method wrote: right views, in the layout of `predictions`, unless told otherwise.
 
     Attributes:
         name: What tables call the method.
         root: The folder.
+        open_pair: Opens what it holds for a pair.
+        suffixes: Those of videos; none where a folder of frames alone can hold a pair.
         inputs: Nothing of a sample.
     """
 
     name: str
     root: Path
+    open_pair: OpenPair = open_views
+    suffixes: tuple[str, ...] = VIDEO_SUFFIXES
     inputs: tuple[str, ...] = ()
 
     def stamp(self, wanted: PairFrames) -> str:
         """Return the stamp of the files."""
-        return stamp_prediction(find_prediction(self.root, wanted))
+        return stamp_prediction(find_prediction(self.root, wanted, suffixes=self.suffixes))
 
     @contextmanager
     def open(self, index: SceneIndex) -> Iterator[Read]:
         """Yield a function that reads the files of a scene; each is opened when it is needed."""
-        opened: dict[Pair, Callable[[int], Any]] = {}
+        opened: dict[Pair, Callable[[Sample], Any]] = {}
         with ExitStack() as stack:
 
             def read(wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
                 if wanted.pair not in opened:
-                    path = find_prediction(self.root, wanted)
-                    opened[wanted.pair] = stack.enter_context(open_prediction(path, wanted))
-                return [opened[wanted.pair](int(sample["frame_index"])) for sample in samples]
+                    path = find_prediction(self.root, wanted, suffixes=self.suffixes)
+                    opened[wanted.pair] = stack.enter_context(self.open_pair(path, wanted))
+                return [opened[wanted.pair](sample) for sample in samples]
 
             yield read
 

@@ -13,7 +13,7 @@ from typing import Final, Literal
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.columns import (
     COLUMNS,
-    FRAME_METRICS,
+    MATCHERS,
     OFFLINE_METRICS,
     require_metrics,
 )
@@ -142,8 +142,7 @@ class EvaluationProtocol:
     @property
     def columns(self) -> tuple[str, ...]:
         """The columns of every frame, in the order of `COLUMNS`."""
-        filled = {name for metric in self.metrics for name in FRAME_METRICS.get(metric, ())}
-        return tuple(name for name in COLUMNS if name in filled)
+        return tuple(name for name, each in COLUMNS.items() if each.metric in self.metrics)
 
     @property
     def plotted(self) -> tuple[str, ...]:
@@ -153,7 +152,7 @@ class EvaluationProtocol:
     def label(self, column: str) -> str:
         """Return what tables call a column: with the backend, of a model of one's own its class."""
         known = COLUMNS[column]
-        if not known.backend:
+        if known.metric not in MATCHERS:
             return known.label
-        name: str = getattr(self, known.backend)
+        name: str = getattr(self, MATCHERS[known.metric])
         return f"{known.label} ({name.rpartition(':')[2]})"

@@ -4,7 +4,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from itertools import cycle
 from pathlib import Path
@@ -20,12 +20,12 @@ from stereogenbench_data.evaluation.tables import (
     CONTROL,
     DISPARITY,
     Cell,
-    PairMeans,
     Scores,
     Table,
     Value,
     cell,
     group_by,
+    with_score,
 )
 from stereogenbench_data.schema.release import BASELINE_BINS, baseline_bin
 from stereogenbench_data.schema.text import counted, markdown_table, markdown_text
@@ -115,10 +115,9 @@ def write_report(folder: Path, results: Sequence[Scores], tables: Sequence[Table
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in written.items():
             write_atomic(folder / name, text.encode())
-    files = [folder / name for name in written]
-    if results[0].tier == CONTROL:  # Controls do not depend on the baseline.
-        return files
-    return files + write_plots(folder / "plots", results)
+        # Controls do not depend on the baseline.
+        plots = [] if results[0].tier == CONTROL else _write_plots(folder / "plots", results)
+    return [*(folder / name for name in written), *plots]
 
 
 _SIZE_IN: Final = (9.0, 4.2)
@@ -126,14 +125,10 @@ _DPI: Final = 120
 _COLOURS: Final = ("#1b5e9e", "#c4511d", "#2e7d45", "#7a3b8f", "#8a6d00", "#444444")
 
 
-def write_plots(folder: Path, results: Sequence[Scores]) -> list[Path]:
+def _write_plots(folder: Path, results: Sequence[Scores]) -> list[Path]:
     """Write each headline metric against the baseline as a PNG, and return the files.
 
     There is a point for each pair, and a line through bins with intervals.
-
-    Raises:
-        ExtraError: If matplotlib is not installed.
-        StorageError: If a file cannot be written.
     """
     try:
         from matplotlib.figure import Figure
@@ -141,28 +136,20 @@ def write_plots(folder: Path, results: Sequence[Scores]) -> list[Path]:
         raise missing_extra("plots", "plots", error) from None
     written = []
     for column in results[0].protocol.plotted:
-        if not any(_scored(one.pairs, column) for one in results):
-            continue
-        figure = Figure(figsize=_SIZE_IN, layout="constrained")
-        _draw(figure.add_subplot(), results, column)
-        path = folder / f"{column}_by_baseline.png"
-        cannot = f"{path}: the plot cannot be written"
-        with explain_os_errors(cannot, "Choose another folder with --out."):
-            folder.mkdir(parents=True, exist_ok=True)
-            with open_atomic(path) as file:
+        if any(with_score(one.pairs, column) for one in results):
+            figure = Figure(figsize=_SIZE_IN, layout="constrained")
+            _draw(figure.add_subplot(), results, column)
+            written.append(folder / f"{column}_by_baseline.png")
+            folder.mkdir(exist_ok=True)
+            with open_atomic(written[-1]) as file:
                 figure.savefig(file, format="png", dpi=_DPI)
-        written.append(path)
     return written
-
-
-def _scored(pairs: Iterable[PairMeans], column: str) -> list[PairMeans]:
-    return [pair for pair in pairs if column in pair.tallies and pair.tallies[column].finite]
 
 
 def _draw(axes: Any, results: Sequence[Scores], column: str) -> None:
     protocol, facts, tier = results[0].protocol, COLUMNS[column], results[0].tier
     for one, colour in zip(results, cycle(_COLOURS), strict=False):
-        pairs = _scored(one.pairs, column)
+        pairs = with_score(one.pairs, column)
         axes.scatter(
             [pair.baseline_cm for pair in pairs],
             [pair.tallies[column].mean for pair in pairs],

@@ -8,7 +8,7 @@ features need all frames of the scene.
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from importlib.metadata import PackageNotFoundError, version
 from types import ModuleType
@@ -149,7 +149,7 @@ class TargetFrame:
         return TargetFrame(sample, self.matcher, load_stored=self._load_stored)
 
     @cached_property
-    def ceiling(self) -> pixels.PatchScore:
+    def ceiling(self) -> float:
         """P-PSNR of the rendered view."""
         return pixels.patch_psnr(self.left, self.right)
 
@@ -165,11 +165,9 @@ class TargetFrame:
 
 
 def _p_psnr(picture: Any, target: TargetFrame, protocol: EvaluationProtocol) -> dict[str, float]:
-    score = pixels.patch_psnr(target.left, picture)
     return {
-        "p_psnr": score.mean_db,
-        "p_psnr_pooled": score.pooled_db,
-        "p_psnr_ceiling": target.ceiling.mean_db,
+        "p_psnr": pixels.patch_psnr(target.left, picture),
+        "p_psnr_ceiling": target.ceiling,
         "p_psnr_outside": target.outside,
     }
 
@@ -271,59 +269,69 @@ How = TypeVar("How")
 """The protocol: of right views, or of disparity."""
 
 
+ScoredPairs = Mapping[int, Sequence[PairFrames]]
+"""What is scored of the pairs of each scene, by its row in an index, ascending."""
+
+
 @dataclass(frozen=True)
-class SceneWork(Generic[How]):
-    """One scene to score.
+class Run(Generic[How]):
+    """What is scored and how, and what identifies its results.
 
     Attributes:
-        index: An index that holds the scene, and scenes that sources read views of.
-        pairs: What is scored of each pair, the same frames for all.
-        protocol: How.
-        sources: Whose right views are scored.
+        index: The index of the scenes.
+        scenes: Which of their pairs and frames; of all pairs of a scene the same frames.
+        protocol: The choices that scores depend on.
+        sources: Whose predictions are scored.
+        tier: What the sources were given.
+        donors: For each scene, by row, another one that sources read views of, if any.
+        settings: What else the scores depend on, as plain values.
     """
 
     index: SceneIndex
-    pairs: tuple[PairFrames, ...]
+    scenes: ScoredPairs
     protocol: How
     sources: tuple[PredictionSource, ...]
+    tier: str
+    donors: Mapping[int, int] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def of_scene(self, row: int) -> "Run[How]":
+        """Return the run of one scene, to be pickled: its index has what the sources read alone."""
+        rows = sorted({row, self.donors.get(row, row)})
+        scenes = {rows.index(row): self.scenes[row]}
+        return replace(self, index=self.index.only(rows), scenes=scenes, donors={})
 
     @property
-    def scene(self) -> str:
-        """The key of the scene."""
-        return self.pairs[0].scene
-
-    @property
-    def row(self) -> int:
-        """Where the scene is in the index."""
-        return list(self.index.column("key")).index(self.scene)
+    def pairs(self) -> tuple[PairFrames, ...]:
+        """The pairs of all scenes."""
+        return tuple(pair for pairs in self.scenes.values() for pair in pairs)
 
 
 @contextmanager
 def open_scene(
-    work: SceneWork[Any], fields: Sequence[str]
+    work: Run[Any], fields: Sequence[str]
 ) -> Iterator[tuple[Callable[[Pair, int], Sample], dict[str, Read]]]:
     """Yield what loads the sample of a pair and a frame, and what reads each source, by its name.
 
     Args:
-        work: What to score.
+        work: What to score of one scene.
         fields: What scoring needs of a sample, besides what sources need.
     """
+    (row,) = work.scenes
     needed = {*fields, *(each for source in work.sources for each in source.inputs)}
     known = tuple(name for name in PAIR_FIELDS if name in needed)
     size, depth = work.protocol.size, work.protocol.depth
     with ExitStack() as stack:
         load = stack.enter_context(open_frames(work.index, known, size=size, depth=depth))
         reads = {each.name: stack.enter_context(each.open(work.index)) for each in work.sources}
-        yield partial(load, work.row), reads
+        yield partial(load, row), reads
 
 
-def score_scene(
-    work: SceneWork[EvaluationProtocol], after_frames: Advance
-) -> tuple[str, SceneScores]:
+def score_scene(work: Run[EvaluationProtocol], after_frames: Advance) -> tuple[str, SceneScores]:
     """Return a scene's key, and the scores of each source and pair of it.
 
     Args:
-        work: What to score.
+        work: What to score of one scene.
         after_frames: Called with how many frames of pairs were scored since; it may raise to
             stop the work.
 
@@ -332,8 +340,8 @@ def score_scene(
         MediaError: If a video of the data does not decode.
         ExtraError: If a package or weights that a metric needs are not there.
     """
-    protocol = work.protocol
-    frames = work.pairs[0].frames
+    protocol, (row,), pairs = work.protocol, work.scenes, work.pairs
+    frames = pairs[0].frames
     with (
         open_scene(work, fields_of(protocol)) as (load, reads),
         open_frames(work.index, ("right",)) as load_stored,
@@ -341,26 +349,26 @@ def score_scene(
         scorers = {
             (name, wanted.pair): PairScorer(protocol, read, wanted)
             for name, read in reads.items()
-            for wanted in work.pairs
+            for wanted in pairs
         }
         for start in range(0, len(frames), protocol.batch_frames):
             matcher = None
             if "e_match" in protocol.metrics:
                 matcher = CachedKeypoints(model_of(protocol, "keypoint_matcher"))
-            targets: dict[Pair, list[TargetFrame]] = {wanted.pair: [] for wanted in work.pairs}
+            targets: dict[Pair, list[TargetFrame]] = {wanted.pair: [] for wanted in pairs}
             for frame in frames[start : start + protocol.batch_frames]:
                 pictures: dict[int, Any] = {}  # of each camera one array for all its pairs
                 for pair in targets:
                     sample = load(pair, frame)
                     for camera, view in zip(pair, ("left", "right"), strict=True):
                         sample[view] = pictures.setdefault(camera, sample[view])
-                    stored = partial(load_stored, work.row, pair, frame)
+                    stored = partial(load_stored, row, pair, frame)
                     targets[pair].append(TargetFrame(sample, matcher, load_stored=stored))
             for (_, pair), scorer in scorers.items():
                 scorer.add(targets[pair])
             after_frames(sum(map(len, targets.values())))
     with one_thread(require_opencv()):
-        return work.scene, {place: scorer.scores() for place, scorer in scorers.items()}
+        return pairs[0].scene, {place: scorer.scores() for place, scorer in scorers.items()}
 
 
 @contextmanager

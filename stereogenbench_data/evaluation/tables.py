@@ -132,6 +132,11 @@ def tally(numbers: Iterable[float], *, r2: Sequence[float] = ()) -> Tally:
     return Tally(mean, len(finite), infinite, undefined, sum(not fit >= LEAST_R2 for fit in loose))
 
 
+def with_score(pairs: Iterable[PairMeans], column: str) -> list[PairMeans]:
+    """Return the pairs some of whose frames have a finite score in a column."""
+    return [pair for pair in pairs if column in pair.tallies and pair.tallies[column].finite]
+
+
 def cell(pairs: Sequence[PairMeans], column: str) -> Cell:
     """Return a column's mean over the scenes of some pairs, with its interval.
 
@@ -139,7 +144,7 @@ def cell(pairs: Sequence[PairMeans], column: str) -> Cell:
         ExtraError: If scipy, which knows Student's t, is not installed.
     """
     found_in = [each.tallies[column] for each in pairs]
-    scenes = group_by((each for each in pairs if each.tallies[column].finite), lambda p: p.scene)
+    scenes = group_by(with_score(pairs, column), lambda pair: pair.scene)
     means = [
         math.fsum(each.tallies[column].mean for each in found) / len(found)
         for found in scenes.values()
@@ -375,9 +380,9 @@ def forms_of(results: Sequence[Scores], by: Sequence[str]) -> dict[str, TableFor
     """Return the forms of tables by branch, by baseline and by columns of the index, by name."""
     has_others = any(not pair.is_primary for one in results for pair in one.pairs)
     names = ["branches", "bins_primary", *(["bins_all"] if has_others else [])]
-    by_column = {f"by_{each}": TableForm(f"By {each}, primary pairs", (*_BRANCH, each))
-                 for each in by}  # fmt: skip
-    return {name: TABLES[name] for name in names} | by_column
+    return {name: TABLES[name] for name in names} | {
+        f"by_{each}": TableForm(f"By {each}, primary pairs", (*_BRANCH, each)) for each in by
+    }
 
 
 def table_of(results: Sequence[Scores], name: str, *, form: TableForm | None = None) -> Table:
@@ -405,11 +410,11 @@ def table_of(results: Sequence[Scores], name: str, *, form: TableForm | None = N
         keys=form.keys,
         protocol=protocol,
         columns=tuple(columns),
-        rows=tuple(rows_of(results, form)),
+        rows=rows_of(results, form),
     )
 
 
-def rows_of(results: Sequence[Scores], form: TableForm) -> list[TableRow]:
+def rows_of(results: Sequence[Scores], form: TableForm) -> tuple[TableRow, ...]:
     """Return the rows of groups in the order of tables, of every method."""
     label_of = [_labels_by(key, results) for key in form.keys]
     groups_of = [
@@ -419,15 +424,13 @@ def rows_of(results: Sequence[Scores], form: TableForm) -> list[TableRow]:
         )
         for one in results
     ]
-    return [
+    all_labels = {labels for groups in groups_of for labels in groups}
+    return tuple(
         _row(one, labels, groups[labels])
-        for labels in sorted(
-            {labels for groups in groups_of for labels in groups},
-            key=lambda labels: list(map(_rank, labels)),
-        )
+        for labels in sorted(all_labels, key=lambda labels: list(map(_rank, labels)))
         for one, groups in zip(results, groups_of, strict=True)
         if labels in groups
-    ]
+    )
 
 
 def _labels_by(key: str, results: Sequence[Scores]) -> Callable[[PairMeans], str]:

@@ -334,8 +334,8 @@ def test_partial_results_that_are_cut_are_made_again_and_of_another_format_refus
     assert numbers(scored(scored_index, right_views, protocol, out=tmp_path)) == numbers(whole)
     assert len(damaged.read_bytes()) == len(content)
     state = tmp_path / "evaluation.json"
-    state.write_text(json.dumps(json.loads(state.read_text()) | {"format": 4}))
-    with pytest.raises(EvaluationError, match="holds scores of other format: 4, where 5"):
+    state.write_text(json.dumps(json.loads(state.read_text()) | {"format": 5}))
+    with pytest.raises(EvaluationError, match="holds scores of other format: 5, where 6"):
         scored(scored_index, right_views, protocol, out=tmp_path)
 
 

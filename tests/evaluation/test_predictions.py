@@ -13,7 +13,7 @@ from stereogenbench_data.evaluation.predictions import (
     find_prediction,
     frame_name,
     item_name,
-    open_prediction,
+    open_views,
     scaled_rgb,
 )
 
@@ -43,8 +43,8 @@ def write_video(path, levels, *, size=(8, 16)):
 
 
 def read(path, frame=0):
-    with open_prediction(path, WANTED) as read_frame:
-        return read_frame(frame)
+    with open_views(path, WANTED) as read_sample:
+        return read_sample({"frame_index": frame})
 
 
 def levels(path):

@@ -20,6 +20,7 @@ nothing is filled, pooled, clipped or rounded.
 import math
 from typing import Final
 
+import numpy as np
 import torch
 
 from stereogenbench_data.errors import EvaluationError
@@ -128,8 +129,7 @@ class DisparityError:
 
     def reset(self) -> None:
         """Forget all frames."""
-        self._sums: dict[str, float] = dict.fromkeys(COLUMNS_OF_FRAMES, 0.0)
-        self._counts: dict[str, int] = dict.fromkeys(COLUMNS_OF_FRAMES, 0)
+        self._sums, self._counts = np.zeros((2, len(COLUMNS_OF_FRAMES)))
         self._frames = 0
 
     @torch.no_grad()
@@ -159,18 +159,12 @@ class DisparityError:
         if len(set(shapes.values())) > 1:
             told = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
             raise EvaluationError(f"the maps have different shapes as (frames, h, w): {told}.")
-        for number in range(len(frames["truth"])):
-            maps = {name: each[number] for name, each in frames.items()}
-            scores = frame_scores(
-                maps["predicted"], maps["truth"], valid=maps["valid"].bool(),
-                visible=None if visible is None else maps["visible"].bool(),
-                max_disparity_px=self.max_disparity_px,
-            )  # fmt: skip
+        for maps in zip(*frames.values(), strict=True):
+            scores = frame_scores(*maps, max_disparity_px=self.max_disparity_px)
+            numbers = np.array([scores.get(name, math.nan) for name in COLUMNS_OF_FRAMES])
+            self._sums += np.where(np.isfinite(numbers), numbers, 0)
+            self._counts += np.isfinite(numbers)
             self._frames += 1
-            for name, number_of_frame in scores.items():
-                if math.isfinite(number_of_frame):
-                    self._sums[name] += number_of_frame
-                    self._counts[name] += 1
 
     def compute(self) -> dict[str, float]:
         """Return the mean of every measure over all frames of all ranks; nan where none has one.
@@ -179,23 +173,16 @@ class DisparityError:
         ``epe_occluded``); by ranges of the true disparity (``epe_[16,32)``); ``beyond``, the share
         of valid pixels that ``max_disparity_px`` leaves out; and ``frames``, how many there were.
         """
-        packed = torch.tensor(
-            [*self._sums.values(), *self._counts.values(), self._frames], dtype=torch.float64
-        )
+        packed = torch.from_numpy(np.concatenate([self._sums, self._counts, [self._frames]]))
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             is_nccl = torch.distributed.get_backend() == "nccl"
             where = torch.device("cuda", torch.cuda.current_device()) if is_nccl else "cpu"
             packed = packed.to(where)
             torch.distributed.all_reduce(packed)
-        numbers = packed.tolist()
-        size = len(COLUMNS_OF_FRAMES)
-        found = {
-            name: total / count if count else math.nan
-            for name, total, count in zip(
-                COLUMNS_OF_FRAMES, numbers[:size], numbers[size : 2 * size], strict=True
-            )
-        }
-        return found | {"frames": numbers[-1]}
+        *numbers, frames = packed.tolist()
+        sums, counts = np.reshape(numbers, (2, -1))
+        means = np.divide(sums, counts, out=np.full_like(sums, math.nan), where=counts > 0)
+        return dict(zip(COLUMNS_OF_FRAMES, means.tolist(), strict=True)) | {"frames": frames}
 
 
 def _frames(name: str, maps: torch.Tensor) -> torch.Tensor:
@@ -224,9 +211,9 @@ share of valid pixels that are not scored."""
 def frame_scores(
     predicted: torch.Tensor,
     truth: torch.Tensor,
-    *,
     valid: torch.Tensor,
-    visible: torch.Tensor | None,
+    visible: torch.Tensor | None = None,
+    *,
     max_disparity_px: float | None,
 ) -> dict[str, float]:
     """Return the columns of one frame (`COLUMNS_OF_FRAMES`).
@@ -241,6 +228,7 @@ def frame_scores(
     Raises:
         EvaluationError: If most answers are negative.
     """
+    valid = valid.bool()
     scored = valid if max_disparity_px is None else valid & (truth < max_disparity_px)
     require_positive(predicted, scored)
     true = truth[scored].double()
@@ -250,7 +238,7 @@ def frame_scores(
     scores = measures_of(errors, true)
     parts = {name: (true >= low) & (true < high) for name, (low, high) in RANGES_PX.items()}
     if visible is not None:
-        is_seen = visible[scored][order]
+        is_seen = visible.bool()[scored][order]
         parts |= {"visible": is_seen, "occluded": ~is_seen}
     for part, inside in parts.items():
         found = measures_of(errors[inside], true[inside])

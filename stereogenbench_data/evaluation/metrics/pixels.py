@@ -4,11 +4,11 @@ P-PSNR asks how well each patch of the left picture is found again along its row
 """
 
 import math
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
-from numpy.lib.stride_tricks import as_strided
+from numpy.lib.stride_tricks import sliding_window_view
 
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.models.loading import Picture, Settings
@@ -112,33 +112,18 @@ PATCH_SETTINGS: Final[Settings] = {
 }
 
 
-class PatchScore(NamedTuple):
-    """P-PSNR of one pair; nan without patches.
-
-    Attributes:
-        mean_db: Mean over the patches of the PSNR of their best match.
-        pooled_db: PSNR of the mean squared error of all patches' best matches.
-    """
-
-    mean_db: float
-    pooled_db: float
-
-
-def patch_psnr(left: Picture, right: Picture) -> PatchScore:
-    """Return the P-PSNR of a predicted right picture; of the rendered target, its ceiling.
+def patch_psnr(left: Picture, right: Picture) -> float:
+    """Return the P-PSNR of a predicted right picture in dB; of the rendered target, its ceiling.
 
     Both are uint8 (3, h, w). Patches of 16 x 16 pixels stand side by side from the top left. What
     is left over at the right and at the bottom is not scored, nor is a patch all of whose
-    candidates leave the picture.
+    candidates leave the picture. It is nan without patches.
     """
     squared = _least_squared_error(left, right).reshape(-1)
     if squared.size == 0:
-        return PatchScore(math.nan, math.nan)
+        return math.nan
     mse = np.maximum(squared / (3 * _PATCH_PX**2), _MSE_FLOOR)
-    return PatchScore(
-        mean_db=float(np.mean(10 * np.log10(_PEAK**2 / mse))),
-        pooled_db=float(10 * np.log10(_PEAK**2 / np.mean(mse))),
-    )
+    return float(np.mean(10 * np.log10(_PEAK**2 / mse)))
 
 
 def outside_window(disparity_px: Float[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]) -> float:
@@ -172,7 +157,14 @@ def _least_squared_error(left: Picture, right: Picture) -> Int64[np.ndarray, "ro
     patches = _strips(left, rows=rows, columns=columns, pad_px=0)
     candidates = _strips(right, rows=rows, columns=columns, pad_px=_LARGEST_PX)
     shifts = _LARGEST_PX - _LEAST_PX + 1
-    products = _products(patches, candidates, columns=columns, shifts=shifts)
+    # The product of each column of a patch with each column that may lie below it; a shift, the
+    # furthest first, pairs them along a diagonal.
+    reached = sliding_window_view(candidates, _PATCH_PX + shifts - 1, axis=2)[:, :, ::_PATCH_PX]
+    by_column = np.matmul(
+        patches.reshape(rows, -1, columns, _PATCH_PX).transpose(0, 2, 3, 1),
+        reached[:, :, :columns].transpose(0, 2, 1, 3),
+    )
+    products = sum(by_column[:, :, x, x : x + shifts] for x in range(_PATCH_PX))
     own = np.sum(patches**2, axis=1).reshape(rows, columns, _PATCH_PX).sum(axis=2)
     summed = np.zeros((rows, candidates.shape[2] + 1))
     np.cumsum(np.sum(candidates**2, axis=1), axis=1, dtype=np.float64, out=summed[:, 1:])
@@ -192,31 +184,3 @@ def _strips(
     split = whole.reshape(3, rows, _PATCH_PX, -1).swapaxes(0, 1)
     np.subtract(split, np.float32(128), out=strips[..., pad_px:])
     return strips.reshape(rows, 3 * _PATCH_PX, -1)
-
-
-def _products(
-    patches: Float[np.ndarray, "rows values width"],
-    candidates: Float[np.ndarray, "rows values padded"],
-    *,
-    columns: int,
-    shifts: int,
-) -> Float[np.ndarray, "rows columns shifts"]:
-    """Return the scalar product of each patch with the candidates, the furthest shift first."""
-    rows, values, _ = patches.shape
-    reach = _PATCH_PX + shifts - 1
-    size = patches.itemsize
-    theirs = as_strided(
-        candidates,
-        (rows, columns, values, reach),
-        (candidates.strides[0], _PATCH_PX * size, candidates.strides[1], size),
-        writeable=False,
-    )
-    ours = patches.reshape(rows, values, columns, _PATCH_PX).transpose(0, 2, 3, 1)
-    by_column = np.matmul(ours, theirs)
-    diagonals = as_strided(
-        by_column,
-        (rows, columns, shifts, _PATCH_PX),
-        (*by_column.strides[:2], size, by_column.strides[2] + size),
-        writeable=False,
-    )
-    return np.asarray(diagonals.sum(axis=3))

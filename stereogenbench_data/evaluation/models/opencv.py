@@ -4,7 +4,7 @@ from types import ModuleType
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Int64, UInt8
 
 from stereogenbench_data.errors import EvaluationError, missing_extra
 from stereogenbench_data.evaluation.metrics.keypoint_matches import KEYPOINTS, RATIO, mutual_matches
@@ -52,9 +52,7 @@ class Sift:
 
     def detect(self, picture: Picture) -> Keypoints:
         """Return the strongest keypoints of a picture."""
-        grey = self._cv2.cvtColor(
-            np.ascontiguousarray(picture.transpose(1, 2, 0)), self._cv2.COLOR_RGB2GRAY
-        )
+        grey = self._cv2.cvtColor(_channels_last(picture), self._cv2.COLOR_RGB2GRAY)
         points = _strongest(self._sift.detect(grey, None))
         if not points:
             return Keypoints(
@@ -68,6 +66,10 @@ class Sift:
     def match(self, left: Keypoints, right: Keypoints) -> Int64[np.ndarray, "m 2"]:
         """Return mutual nearest neighbours."""
         return mutual_matches(left, right)
+
+
+def _channels_last(picture: Picture) -> UInt8[np.ndarray, "h w 3"]:
+    return np.ascontiguousarray(picture.transpose(1, 2, 0))
 
 
 def _strongest(points: Any) -> list[Any]:
@@ -133,13 +135,8 @@ class Sgbm:
                 f"SGBM searches {_DISPARITIES} disparities, and the pictures are "
                 f"{left.shape[-1]} px wide: score wider pictures, or leave out SD."
             )
-        views = (
-            self._cv2.cvtColor(
-                np.ascontiguousarray(view.transpose(1, 2, 0)), self._cv2.COLOR_RGB2BGR
-            )
-            for view in (left, right)
-        )
-        raw = self._matcher.compute(*views)
+        views = (_channels_last(view)[..., ::-1] for view in (left, right))
+        raw = self._matcher.compute(*map(np.ascontiguousarray, views))
         disparity_px: Float32[np.ndarray, "h w"] = raw.astype(np.float32) / _SUBPIXELS
         disparity_px[raw < _LEAST_PX * _SUBPIXELS] = np.nan
         return disparity_px
