@@ -327,13 +327,7 @@ def _enumerations(index: SceneIndex | None) -> list[Node]:
         {"families/name": name, "families/meaning": known.get(name, "A family of its own.")}
         for name in sorted(set(index.column("family")))
     ]
-    places["data"] = [
-        {
-            "maps/name": name,
-            "maps/meaning": meaning(name),
-        }
-        for name in maps
-    ]
+    places["data"] = [{"maps/name": name, "maps/meaning": meaning(name)} for name in maps]
     return nodes
 
 
