@@ -11,7 +11,7 @@ import hashlib
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from itertools import product
@@ -419,40 +419,21 @@ def _scene_path(out: Path, scene: str) -> Path:
 
 def _write_scene(out: Path, scene: str, scores: SceneScores) -> None:
     """Keep the scores of a scene, whole or not at all."""
-    content = {
-        place: asdict(found)
-        | {"predicted": _tensors(found.predicted), "target": _tensors(found.target)}
-        for place, found in scores.items()
-    }
     packed, path = BytesIO(), _scene_path(out, scene)
-    torch.save(content, packed)
+    torch.save(scores, packed)
     what = f"{path}: the scores of {scene} cannot be written"
     with explain_os_errors(what, "Choose another folder with --out."):
         path.parent.mkdir(exist_ok=True)
         write_atomic(path, packed.getvalue())
 
 
-def _tensors(sides: Mapping[str, FeatureStatistics]) -> dict[str, tuple[Any, ...]]:
-    return {
-        metric: (each.count, torch.from_numpy(each.mean), torch.from_numpy(each.root))
-        for metric, each in sides.items()
-    }
-
-
 def _read_scene(out: Path, scene: str) -> SceneScores:
     """Return the scores of a scene; none if it was not scored or its file was cut short."""
     try:
-        content = torch.load(_scene_path(out, scene), weights_only=True)
+        with torch.serialization.safe_globals([PairScores, FeatureStatistics]):
+            scores: SceneScores = torch.load(_scene_path(out, scene), weights_only=True)
     except (FileNotFoundError, UnpicklingError, RuntimeError, EOFError, ValueError):
         return {}
-    scores = {}
-    for place, entry in content.items():
-        for side in ("predicted", "target"):
-            entry[side] = {
-                metric: FeatureStatistics(count, mean.numpy(), root.numpy())
-                for metric, (count, mean, root) in entry[side].items()
-            }
-        scores[place] = PairScores(**entry)
     return scores
 
 

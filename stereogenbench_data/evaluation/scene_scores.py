@@ -24,8 +24,6 @@ from stereogenbench_data.evaluation.columns import EXPLAIN_A_FIT, LEARNED
 from stereogenbench_data.evaluation.metrics import keypoint_matches, pixels, scale
 from stereogenbench_data.evaluation.metrics.frechet import FeatureStatistics
 from stereogenbench_data.evaluation.models.loading import (
-    KeypointMatcher,
-    Keypoints,
     Picture,
     Settings,
     load_model,
@@ -103,23 +101,6 @@ def versions() -> dict[str, str]:
     return found
 
 
-class CachedKeypoints:
-    """A keypoint matcher that detects the keypoints of one and the same array once."""
-
-    def __init__(self, matcher: KeypointMatcher) -> None:
-        """Take the matcher."""
-        self.name, self.settings, self.match = matcher.name, matcher.settings, matcher.match
-        self._detect = matcher.detect
-        self._found: dict[int, tuple[Any, Keypoints]] = {}
-
-    def detect(self, picture: Picture) -> Keypoints:
-        """Return the keypoints of a picture."""
-        if id(picture) not in self._found:
-            # The picture is kept too, so that no other takes its identity.
-            self._found[id(picture)] = picture, self._detect(picture)
-        return self._found[id(picture)][1]
-
-
 class TargetFrame:
     """One frame of one pair, with the parts of its scores that do not depend on the prediction.
 
@@ -158,11 +139,6 @@ class TargetFrame:
         """The share of measured pixels whose disparity P-PSNR does not search."""
         return pixels.outside_window(self.sample["disparity"][0], self.sample["valid"][0])
 
-    @cached_property
-    def matches(self) -> keypoint_matches.TargetMatches:
-        """The matches of left and rendered right view."""
-        return keypoint_matches.target_matches(self.left, self.right, matcher=self.matcher)
-
 
 def _p_psnr(picture: Any, target: TargetFrame, protocol: EvaluationProtocol) -> dict[str, float]:
     return {
@@ -173,7 +149,9 @@ def _p_psnr(picture: Any, target: TargetFrame, protocol: EvaluationProtocol) -> 
 
 
 def _e_match(picture: Any, target: TargetFrame, protocol: EvaluationProtocol) -> dict[str, float]:
-    return keypoint_matches.match_error(picture, against=target.matches, matcher=target.matcher)
+    return keypoint_matches.match_error(
+        picture, left=target.left, target=target.right, matcher=target.matcher
+    )
 
 
 def _sd(picture: Any, target: TargetFrame, protocol: EvaluationProtocol) -> dict[str, float]:
@@ -354,7 +332,7 @@ def score_scene(work: Run[EvaluationProtocol], after_frames: Advance) -> tuple[s
         for start in range(0, len(frames), protocol.batch_frames):
             matcher = None
             if "e_match" in protocol.metrics:
-                matcher = CachedKeypoints(model_of(protocol, "keypoint_matcher"))
+                matcher = keypoint_matches.MatchedOnce(model_of(protocol, "keypoint_matcher"))
             targets: dict[Pair, list[TargetFrame]] = {wanted.pair: [] for wanted in pairs}
             for frame in frames[start : start + protocol.batch_frames]:
                 pictures: dict[int, Any] = {}  # of each camera one array for all its pairs

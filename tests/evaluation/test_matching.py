@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.evaluation.metrics.keypoint_matches import (
+    MatchedOnce,
     match_error,
     mutual_matches,
-    target_matches,
 )
 from stereogenbench_data.evaluation.models.loading import Keypoints
 from stereogenbench_data.evaluation.models.opencv import Sift
@@ -50,8 +50,8 @@ LISTED = Listed(
 
 
 def error_of(predicted, *, target=TARGET):
-    against = target_matches(view(LEFT), view(target), matcher=LISTED)
-    return match_error(view(predicted), against=against, matcher=LISTED)
+    matcher = MatchedOnce(LISTED)
+    return match_error(view(predicted), left=view(LEFT), target=view(target), matcher=matcher)
 
 
 def test_matches_are_counted_as_worked_by_hand():
@@ -104,11 +104,11 @@ def sift():
 
 def test_sift_on_photographs_orders_target_noise_copy_and_another_scene(cones, sift):
     left, right = cones
-    against = target_matches(left, right, matcher=sift)
+    matcher = MatchedOnce(sift)
     noise = np.random.default_rng(0).normal(0, 8, right.shape)
 
     def score(picture):
-        return match_error(picture, against=against, matcher=sift)
+        return match_error(picture, left=left, target=right, matcher=matcher)
 
     target, copied, other = score(right), score(left), score(left[:, ::-1, ::-1])
     noisy = score(np.clip(right + noise, 0, 255).astype(np.uint8))

@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float, Float64
 
 from stereogenbench_data.errors import EvaluationError
@@ -18,7 +19,7 @@ from stereogenbench_data.errors import EvaluationError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureStatistics:
-    """Count, mean and scatter of a set of features, in float64.
+    """Count, mean and scatter of a set of features, in float64: tensors, as files can hold them.
 
     Merging in another grouping changes the result by rounding alone; in the same order, not at all.
 
@@ -29,8 +30,8 @@ class FeatureStatistics:
     """
 
     count: int
-    mean: Float64[np.ndarray, " dim"]
-    root: Float64[np.ndarray, "rows dim"]
+    mean: Float64[torch.Tensor, " dim"]
+    root: Float64[torch.Tensor, "rows dim"]
 
     @classmethod
     def of(cls, features: Float[np.ndarray, "n dim"]) -> "FeatureStatistics":
@@ -47,8 +48,8 @@ class FeatureStatistics:
                 f"sample {bad[0]} first: the extractor overflowed or its weights are damaged."
             )
         mean = samples.mean(axis=0)
-        root = _compressed(samples - mean, at_most=2 * samples.shape[1])
-        return cls(count=len(samples), mean=mean, root=root)
+        root = _compressed(torch.from_numpy(samples - mean), at_most=2 * samples.shape[1])
+        return cls(count=len(samples), mean=torch.from_numpy(mean), root=root)
 
     @property
     def dim(self) -> int:
@@ -63,7 +64,7 @@ class FeatureStatistics:
         return FeatureStatistics(
             count=count,
             mean=self.mean + between * (other.count / count),
-            root=_compressed(np.vstack([self.root, other.root, apart]), at_most=2 * self.dim),
+            root=_compressed(torch.vstack([self.root, other.root, apart]), at_most=2 * self.dim),
         )
 
 
@@ -97,10 +98,10 @@ def frechet_distance(predicted: FeatureStatistics, target: FeatureStatistics) ->
     value = None
     if min(samples) > 1:
         one, two = (
-            _compressed(side.root, at_most=side.dim) / math.sqrt(side.count - 1)
+            _compressed(side.root, at_most=side.dim).numpy() / math.sqrt(side.count - 1)
             for side in (predicted, target)
         )
-        between = predicted.mean - target.mean
+        between = (predicted.mean - target.mean).numpy()
         shared = np.linalg.svd(one @ two.T, compute_uv=False).sum()
         distance = between @ between + np.sum(one**2) + np.sum(two**2) - 2 * shared
         value = max(float(distance), 0.0)
@@ -113,9 +114,9 @@ def frechet_distance(predicted: FeatureStatistics, target: FeatureStatistics) ->
 
 
 def _compressed(
-    root: Float64[np.ndarray, "rows dim"], *, at_most: int
-) -> Float64[np.ndarray, "fewer dim"]:
+    root: Float64[torch.Tensor, "rows dim"], *, at_most: int
+) -> Float64[torch.Tensor, "fewer dim"]:
     """Return a root of the same scatter, with as many rows as features if it has too many."""
     if len(root) <= at_most:
         return root
-    return np.asarray(np.linalg.qr(root, mode="r"))
+    return torch.from_numpy(np.linalg.qr(root.numpy(), mode="r"))

@@ -1,7 +1,6 @@
 """E_match: how much the set of left keypoints matched in the right picture changes."""
 
 import math
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -21,33 +20,40 @@ RATIO: Final = 0.9
 KEYPOINTS: Final = 2048
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TargetMatches:
-    """The left keypoints, and which the target shows: the same for all predictions.
+class MatchedOnce:
+    """A matcher that detects the keypoints of one and the same array once, and matches two once."""
 
-    Attributes:
-        left: Keypoints of the left picture.
-        matched: Which of them are found again in the target.
-    """
+    def __init__(self, matcher: KeypointMatcher) -> None:
+        """Take the matcher."""
+        self._matcher = matcher
+        self._keypoints: dict[int, tuple[Picture, Keypoints]] = {}
+        self._matched: dict[tuple[int, int], Bool[np.ndarray, " n"]] = {}
 
-    left: Keypoints
-    matched: Bool[np.ndarray, " n"]
+    def matched(self, left: Picture, right: Picture) -> Bool[np.ndarray, " n"]:
+        """Return which keypoints of a left picture are in nearly the same row of a right one."""
+        place = id(left), id(right)
+        if place not in self._matched:
+            ours, theirs = self._detected(left), self._detected(right)
+            pairs = self._matcher.match(ours, theirs)
+            rows_apart = np.abs(ours.xy_px[pairs[:, 0], 1] - theirs.xy_px[pairs[:, 1], 1])
+            self._matched[place] = np.zeros(len(ours.xy_px), dtype=bool)
+            self._matched[place][pairs[rows_apart <= EPIPOLAR_PX, 0]] = True
+        return self._matched[place]
 
-
-def target_matches(left: Picture, target: Picture, *, matcher: KeypointMatcher) -> TargetMatches:
-    """Return the left keypoints and which of them the rendered target shows.
-
-    The left keypoints are detected once, so the two sets that E_match compares are of the same
-    keypoints.
-    """
-    keypoints = matcher.detect(left)
-    return TargetMatches(keypoints, _matched(keypoints, target, matcher=matcher))
+    def _detected(self, picture: Picture) -> Keypoints:
+        if id(picture) not in self._keypoints:
+            # The picture is kept too, so that no other takes its identity.
+            self._keypoints[id(picture)] = picture, self._matcher.detect(picture)
+        return self._keypoints[id(picture)][1]
 
 
 def match_error(
-    predicted: Picture, *, against: TargetMatches, matcher: KeypointMatcher
+    predicted: Picture, *, left: Picture, target: Picture, matcher: MatchedOnce
 ) -> dict[str, float]:
-    """Return E_match of a predicted right picture, by the matcher that matched the target.
+    """Return E_match of a predicted right picture: how other its matches are than the target's.
+
+    The left keypoints are detected once, so the two sets that are compared are of the same
+    keypoints.
 
     Returns:
         e_match: 100 (1 - common / union), in percent; nan if neither right picture has a match.
@@ -56,14 +62,14 @@ def match_error(
         predicted_matches: How many of them are found again in the prediction.
         common_matches: How many in both.
     """
-    matched = _matched(against.left, predicted, matcher=matcher)
-    common = int(np.count_nonzero(matched & against.matched))
-    union = int(np.count_nonzero(matched | against.matched))
+    in_target, in_prediction = (matcher.matched(left, right) for right in (target, predicted))
+    common = int(np.count_nonzero(in_prediction & in_target))
+    union = int(np.count_nonzero(in_prediction | in_target))
     return {
         "e_match": 100 * (1 - common / union) if union else math.nan,
-        "keypoints": len(matched),
-        "target_matches": int(np.count_nonzero(against.matched)),
-        "predicted_matches": int(np.count_nonzero(matched)),
+        "keypoints": len(in_target),
+        "target_matches": int(np.count_nonzero(in_target)),
+        "predicted_matches": int(np.count_nonzero(in_prediction)),
         "common_matches": common,
     }
 
@@ -109,15 +115,3 @@ def _nearest(squared: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     nearest, index = squared.clamp(min=0).topk(2, dim=1, largest=False)
     clear = (nearest[:, 0] <= RATIO**2 * nearest[:, 1]) & (nearest[:, 1] > 0)
     return index[:, 0], clear
-
-
-def _matched(
-    left: Keypoints, right: Picture, *, matcher: KeypointMatcher
-) -> Bool[np.ndarray, " n"]:
-    """Return which left keypoints are found again in nearly the same row of a right picture."""
-    found = matcher.detect(right)
-    pairs = matcher.match(left, found)
-    rows_apart = np.abs(left.xy_px[pairs[:, 0], 1] - found.xy_px[pairs[:, 1], 1])
-    matched = np.zeros(len(left.xy_px), dtype=bool)
-    matched[pairs[rows_apart <= EPIPOLAR_PX, 0]] = True
-    return matched
