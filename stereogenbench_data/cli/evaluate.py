@@ -60,18 +60,20 @@ class ScoredOptions(SampleOptions):
 
     @contextmanager
     def scored(
-        self, folder: Path, work: WorkOptions, *, device: str = "cpu"
-    ) -> Iterator[dict[str, Any]]:
-        """Show a bar, and yield options of what scores: samples, processes, partial results.
+        self, source: DataOptions, folder: Path, work: WorkOptions, *, device: str = "cpu"
+    ) -> "Iterator[tuple[SceneIndex, dict[str, Any]]]":
+        """Yield the index, and options of what scores, with a bar that shows its progress.
 
         Args:
-            folder: Where the report will be.
+            source: The data.
+            folder: Where the report will be, and partial results.
             work: How many processes.
             device: Where learned models run.
         """
         options = {**work.options(device=device), **self.selection(), "out": folder / "partial"}
+        index = source.open()
         with progress_bar("scoring", unit="frames") as progress:
-            yield options | {"progress": progress}
+            yield index, options | {"progress": progress}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,10 +217,8 @@ def score(  # noqa: PLR0913 - one parameter an option
 
     protocol, called = scoring.protocol(), name or predictions.resolve().name
     folder = report.out or Path("evaluation") / f"{called}-{tier}"
-    index = source.open()
-    columns = groups.columns(index)
-    with chosen.scored(folder, work, device=scoring.device) as how:
-        how["allow_missing"] = groups.allow_missing
+    with chosen.scored(source, folder, work, device=scoring.device) as (index, how):
+        columns, how["allow_missing"] = groups.columns(index), groups.allow_missing
         scores = evaluate(index, predictions, tier=tier, name=called, protocol=protocol, **how)
     report.write(folder, [scores], tables_of([scores], by=columns))
 
@@ -255,10 +255,8 @@ def disparity(  # noqa: PLR0913 - one parameter an option
 
     protocol = DisparityProtocol(size=size, max_disparity_px=max_disparity)
     folder = report.out or Path("evaluation") / f"{predictions.resolve().name}-disparity"
-    index = source.open()
-    columns = groups.columns(index, "map_name")
-    with chosen.scored(folder, work) as how:
-        how["allow_missing"] = groups.allow_missing
+    with chosen.scored(source, folder, work) as (index, how):
+        columns, how["allow_missing"] = groups.columns(index, "map_name"), groups.allow_missing
         scores = evaluate_disparity(index, predictions, protocol=protocol, **how)
     report.write(folder, [scores], disparity_tables([scores], by=columns))
 
@@ -284,8 +282,7 @@ def controls(
     from stereogenbench_data.evaluation.tables import table_of
 
     protocol, folder = scoring.protocol(), report.out or Path("evaluation") / "controls"
-    index = source.open()
-    with chosen.scored(folder, work, device=scoring.device) as how:
+    with chosen.scored(source, folder, work, device=scoring.device) as (index, how):
         results = score_controls(index, protocol=protocol, **how)
     tables = [table_of(results, name) for name in ("controls", "branches", "explanations")]
     report.write(folder, results, tables)
