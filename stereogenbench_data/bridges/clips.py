@@ -306,8 +306,7 @@ def export_clips(
         if address.row not in scenes:
             scenes = {address.row: index.only([address.row])}
         facts = _facts(clips_facts[number], address.frames, options)
-        name, scene = _clip_name(number, facts), scenes[address.row]
-        place = Address(0, address.source, address.targets, address.frames)
+        name, scene, place = _clip_name(number, facts), scenes[address.row], address._replace(row=0)
         works.append(
             _ClipWork(root, rules.kinds, pairs.request, encoding, scene, place, facts, name)
         )
@@ -328,9 +327,9 @@ def export_clips(
         with named_errors(root):
             for name, text in texts.items():
                 write_atomic(root / name, text.encode())
-    written = {work.name for work in due}
+    written = tuple(work.name for work in due)
     return ClipReport(
-        written=tuple(work.name for work in due),
+        written=written,
         kept=tuple(work.name for work in works if work.name not in written),
         manifests=tuple(root / name for name in texts if "/" not in name),
         without_caption=sum(not clip["caption"] for clip in clips),
@@ -354,8 +353,8 @@ def _windows(
             f"length={length}: {layout} takes clips of {unit}N+1 frames and cuts others: give "
             f"{below} or {below + unit}."
         )
-    spec = ("clips", length, stride) if step is None else ("clips", length, stride, step)
-    parse_frames(cast("FramesSpec", spec))
+    spec: Any = ("clips", length, stride, *(() if step is None else (step,)))
+    parse_frames(spec)
     return cast("FramesSpec", spec)
 
 

@@ -56,24 +56,19 @@ def open_maps(
 
     def read(sample: Sample) -> Any:
         path = _file_of(folder, int(sample["frame_index"]), wanted)
-        if path.suffix == ".png":
+        if path.suffix == ".png":  # It cannot hold all truth that may be scored.
             truth_px = sample["disparity"][sample["valid"]]
             if max_disparity_px is not None:
                 truth_px = truth_px[truth_px < max_disparity_px]
-            _require_in_range(truth_px, path, wanted)
+            if truth_px.size and truth_px.max() > PNG_ENDS_PX:
+                raise PredictionError(
+                    f"{wanted.label}: {path} is a PNG of KITTI's, which ends at {PNG_ENDS_PX:.3f} "
+                    f"px, and the true disparity goes up to {truth_px.max():.1f} px. Write PFM or "
+                    f"npy, or pass max_disparity_px."
+                )
         return read_disparity(path, size=wanted.size, where=wanted.label)
 
     yield read
-
-
-def _require_in_range(truth_px: np.ndarray, path: Path, wanted: PairFrames) -> None:
-    """Raise where the truth that is scored goes beyond what a PNG of KITTI's holds."""
-    if truth_px.size and truth_px.max() > PNG_ENDS_PX:
-        raise PredictionError(
-            f"{wanted.label}: {path} is a PNG of KITTI's, which ends at {PNG_ENDS_PX:.3f} px, "
-            f"and the true disparity goes up to {truth_px.max():.1f} px. Write PFM or npy, or "
-            f"pass max_disparity_px."
-        )
 
 
 def accept_disparity(returned: torch.Tensor, given: tuple[int, int, int]) -> torch.Tensor:
