@@ -33,9 +33,6 @@ AUDIT: Final = {
 pose-derived baselines; mean valid-depth ratio; median and 95th percentile of the reprojection error
 of non-occluded pixels, of the primary pair and of cameras 0 and 5."""
 
-FOCAL_MM: Final = (18.0, 85.0)
-"""Between which focal lengths are drawn. Source: appendix on generation parameters."""
-
 
 @cache
 def paper_table(name: PaperTable) -> tuple[PaperRow, ...]:

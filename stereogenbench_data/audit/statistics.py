@@ -8,7 +8,7 @@ from typing import Any, Final, TypeVar, Unpack
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from stereogenbench_data.audit.paper_numbers import FOCAL_MM, paper_table
+from stereogenbench_data.audit.paper_numbers import paper_table
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
@@ -195,7 +195,6 @@ class Line:
         item: What it is.
         paper: The paper's.
         ours: That of the data.
-        agrees: Whether the two are equal, or of a range whether ours lies within the paper's.
     """
 
     split: str
@@ -203,17 +202,11 @@ class Line:
     item: str
     paper: str
     ours: str
-    agrees: bool
 
     @property
-    def in_a_word(self) -> str:
-        """How the two compare, for a table."""
-        same = "same" if self.paper == self.ours else "within"
-        return same if self.agrees else "**differs**"
-
-
-def _equal(split: str, table: str, item: str, paper: str, ours: str) -> Line:
-    return Line(split, table, item, paper, ours, paper == ours)
+    def agrees(self) -> bool:
+        """Whether the two are equal."""
+        return self.paper == self.ours
 
 
 def compared(found: Statistics) -> tuple[Line, ...]:
@@ -227,7 +220,7 @@ def compared(found: Statistics) -> tuple[Line, ...]:
         if abs(_scenes_of(found, split) - count) <= _RELEASE_SIZED * count
     ]
     lines = (*_count_lines(found), *_baseline_lines(found), *_bin_lines(found),
-             *_focal_lines(found), *_map_lines(found))  # fmt: skip
+             *_map_lines(found))  # fmt: skip
     return tuple(line for line in lines if line.split in whole)
 
 
@@ -241,7 +234,7 @@ def _beside(
     """Yield the numbers of scenes that the paper or the data have, 0 where one has none."""
     for place in dict.fromkeys([*paper, *ours]):
         item = f"{what}, {' '.join(filter(None, place))}"
-        yield _equal(place[0], table, item, str(paper.get(place, 0)), str(ours.get(place, 0)))
+        yield Line(place[0], table, item, str(paper.get(place, 0)), str(ours.get(place, 0)))
 
 
 def _count_lines(found: Statistics) -> Iterator[Line]:
@@ -268,7 +261,7 @@ def _baseline_lines(found: Statistics) -> Iterator[Line]:
                     ours = f"{getattr(branch, f'{name}_cm')[figure]:.{decimals}f}"
                 unit = "" if figure == "count" else " (cm)"
                 item = f"{name.replace('_', ' ')}, {split} {family}: {figure}{unit}"
-                yield _equal(split, table, item, row[figure], ours)
+                yield Line(split, table, item, row[figure], ours)
 
 
 def _bin_lines(found: Statistics) -> Iterator[Line]:
@@ -287,19 +280,6 @@ def _bin_lines(found: Statistics) -> Iterator[Line]:
     return _beside(table, "scenes by primary baseline", paper, ours)
 
 
-def _focal_lines(found: Statistics) -> Iterator[Line]:
-    low, high = FOCAL_MM
-    paper = f"{low:g} to {high:g}"
-    for split in _SPLITS:
-        spreads = [each.focal_mm for each in found.branches if each.split == split]
-        if not spreads:
-            continue
-        least, most = min(each["min"] for each in spreads), max(each["max"] for each in spreads)
-        ours, agrees = f"{least:g} to {most:g}", low <= least and most <= high
-        item = f"focal lengths within (mm), {split}"
-        yield Line(split, "appendix on generation parameters", item, paper, ours, agrees)
-
-
 def _map_lines(found: Statistics) -> Iterator[Line]:
     tables = {
         "train": "table of train scene counts per family and map",
@@ -315,12 +295,6 @@ def _map_lines(found: Statistics) -> Iterator[Line]:
             for each in found.branches if each.split == split for name, count in each.maps.items()
         }  # fmt: skip
         yield from _beside(tables[split], "scenes", paper, ours)
-    subsets = {
-        name: each.subset for each in found.families if each.split == "eval" for name in each.maps
-    }
-    for row in paper_table("eval_maps"):
-        item, ours_is = f"subset of {row['map']}", subsets.get(row["map"], "-")
-        yield _equal("eval", tables["eval"], item, row["subset"], ours_is)
 
 
 def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
@@ -340,7 +314,7 @@ def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
         agreeing = sum(line.agrees for line in lines)
         title = f"Against the paper: {agreeing} of {len(lines)} figures agree"
         rows = [
-            (each.in_a_word, each.item, each.paper, each.ours, each.table)
+            ("same" if each.agrees else "**differs**", each.item, each.paper, each.ours, each.table)
             for each in sorted(lines, key=lambda each: each.agrees)
         ]
         text += _section(title, [("", "figure", "paper", "here", "source"), *rows])

@@ -38,7 +38,7 @@ def stats(
     filters: Any = chosen.filters()
     found = statistics(source.open(), **filters)
     lines = compared(found)
-    document = asdict(found) | {"paper": [asdict(line) for line in lines]}
+    document = asdict(found) | {"paper": [asdict(line) | {"agrees": line.agrees} for line in lines]}
     print_and_write(
         screen(found, lines),
         text=statistics_markdown(found, lines),

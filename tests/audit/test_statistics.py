@@ -101,28 +101,8 @@ def test_an_index_with_the_papers_figures_agrees_with_all_of_its_tables(release)
     lines = compared(statistics(release))
 
     assert [line.item for line in lines if not line.agrees] == []
-    assert len(lines) == 151
-    assert len({line.table for line in lines}) == 7
-
-
-def test_focal_lengths_of_the_data_stand_beside_the_papers_range(release):
-    found = statistics(release, focal_mm=(20, 83))
-    first, *others = found.branches
-    longer = dataclasses.replace(first, focal_mm=first.focal_mm | {"max": 90.0})
-    beyond = dataclasses.replace(found, branches=(longer, *others))
-
-    def line(of):
-        return next(each for each in compared(of) if each.item.endswith("within (mm), train"))
-
-    within, differs = line(found), line(beyond)
-    low, _, high = within.ours.partition(" to ")
-    assert 20 <= float(low) < 21
-    assert 82 < float(high) <= 83
-    assert (within.paper, within.agrees) == ("18 to 85", True)
-    assert (differs.ours, differs.agrees) == (f"{low} to 90", False)
-    for told, shown in ((within, "within"), (differs, "**differs**")):
-        text = statistics_markdown(found, [told])
-        assert f"| {shown} | focal lengths within (mm), train | 18 to 85 | {told.ours} |" in text
+    assert len(lines) == 130
+    assert len({line.table for line in lines}) == 6
 
 
 def test_one_scene_less_is_seen_in_every_figure_that_it_moves(release):
@@ -138,7 +118,7 @@ def test_one_scene_less_is_seen_in_every_figure_that_it_moves(release):
     assert items["scenes, train IPD_Gaussian"].ours == "3288"
     assert items["adjacent, train IPD_Gaussian: count"].ours == "16440"
     assert not any("eval" in item for item in items)
-    assert f"## Against the paper: {151 - len(items)} of 151 figures agree" in markdown
+    assert f"## Against the paper: {130 - len(items)} of 130 figures agree" in markdown
     assert markdown.rindex("| **differs** | ") < markdown.index("| same | ")
 
 
@@ -149,10 +129,10 @@ def test_the_command_compares_a_release_by_itself(written_release):
     row = "| train | Uniform | 3,870 | 1.0113 | 149.8906 | 52.7908 | 38.9500 | 43.2916 |"
     assert result.exit_code == 0
     assert row in result.stdout
-    assert "## Against the paper: 151 of 151 figures agree" in result.stdout
+    assert "## Against the paper: 130 of 130 figures agree" in result.stdout
     assert "| same | scenes, train Uniform | 774 | 774 |" in result.stdout
     compared = json.loads(evaluated.stdout)["paper"]
-    assert len(compared) > 60
+    assert len(compared) > 40
     assert all(line["agrees"] and "train" not in line["item"] for line in compared)
 
 

@@ -42,22 +42,13 @@ class PairAudit:
 
     Attributes:
         comparable: Pixels that land inside the right picture where depth was measured.
-        unhidden: Those of them that nothing in the left view hides.
-        agreeing: Those of the unhidden ones whose two depths agree.
         kept: For each of `reprojection.TOLERANCES`, the pixels kept.
         errors_px: For each of them the `QUANTILES` of the errors; empty if no pixel was kept.
     """
 
     comparable: int
-    unhidden: int
-    agreeing: int
     kept: Sequence[int]
     errors_px: Sequence[Sequence[float]]
-
-    @property
-    def agreement(self) -> float:
-        """Share of the unhidden pixels whose depths agree, nan if there are no such pixels."""
-        return self.agreeing / self.unhidden if self.unhidden else math.nan
 
     def median_px(self, tolerance: int) -> float:
         """Return the median error at a tolerance, by its place; nan if no pixel was kept."""
@@ -86,18 +77,6 @@ class SceneAudit:
     pairs: tuple[PairAudit, ...]
     problems: Mapping[str, str]
     contradiction: str = ""
-
-    @classmethod
-    def revived(cls, record: Mapping[str, Any]) -> "SceneAudit":
-        """Return the audit that `dataclasses.asdict` made a record of.
-
-        Raises:
-            TypeError: If a field is missing or unknown.
-        """
-        figures = tuple(Figure(**each) for each in record["figures"])
-        pairs = tuple(PairAudit(**each) for each in record["pairs"])
-        frames = tuple(record["audited_frames"])
-        return cls(**{**record, "figures": figures, "pairs": pairs, "audited_frames": frames})
 
 
 @dataclass(frozen=True, slots=True)

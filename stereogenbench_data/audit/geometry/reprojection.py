@@ -8,8 +8,8 @@ its distance from u in pixels is the error. It is 0 if both cameras see the same
 B fx |1/z' - 1/z"| for a rectified pair.
 
 A tolerance bounds the error that it keeps, so the median is reported with the share of pixels that
-were kept. ``agreement`` is stricter: the share of pixels for which the right depth agrees, of those
-that nothing in the left view hides from the right camera.
+were kept. `contract.worlds` asks more strictly: for which share of the pixels that nothing in the
+left view hides from the right camera the right depth agrees.
 
 Source: the StereoGenBench paper, table of the geometry consistency audit and appendix on geometry
 derivation. The paper does not state its tolerance; ours are `TOLERANCES`.
@@ -197,8 +197,6 @@ def pair_audit(found: list[PairErrors]) -> PairAudit:
     quantiles = [np.quantile(each, QUANTILES).tolist() if len(each) else [] for each in errors_px]
     return PairAudit(
         comparable=sum(each.comparable for each in found),
-        unhidden=sum(each.unhidden for each in found),
-        agreeing=sum(each.agreeing for each in found),
         kept=[len(each) for each in errors_px],
         errors_px=[[float(f"{px:.{_SIGNIFICANT}g}") for px in each] for each in quantiles],
     )
