@@ -7,7 +7,6 @@ tested again. Where several readings of the poses fit the rigs, depth decides be
 
 import functools
 import json
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
@@ -29,11 +28,14 @@ from stereogenbench_data.audit.scene_access import source_of, spread
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import StereoGenBenchError, StorageError
 from stereogenbench_data.index.learning import (
+    SCENE_FILES,
     Examined,
     Learned,
+    Problem,
     chosen_scenes,
     examine,
     learn,
+    problem_of_scene,
     tables_of_notes,
 )
 from stereogenbench_data.index.scene_folder import IncompleteScene
@@ -79,7 +81,7 @@ class Survey:
     root: str
     examined: tuple[Examined, ...]
     learned: Learned | None
-    problems: list[str] = field(default_factory=list)
+    problems: list[Problem] = field(default_factory=list)
     verdicts: list[str] = field(default_factory=list)
     poses: list[str] = field(default_factory=list)
     notes: dict[tuple[int, str], list[str]] = field(default_factory=dict)
@@ -94,13 +96,25 @@ class Survey:
         is_read = len(known) == len(scenes)
         shapes = () if self.learned is None else self.learned.conventions.shapes
         stated = all(shape.depth and shape.depth.encoding.unit_m for shape in shapes) and shapes
-        is_odd = any(problem.startswith("depth") for problem in self.problems)
+        is_odd = any(problem.about == "depth" for problem in self.problems)
         has_unit = not any("unreadable" in scene.depth_unit_source for scene in known)
         return {
             BASELINE_JSON: is_read,
             "poses": is_read and not any(s.remark("poses", "world", "left") for s in known),
             "depth": is_read and not is_odd and bool(has_unit or stated),
         }
+
+    @property
+    def unsettled(self) -> list[str]:
+        """The problems, one of those about the same file, with how many more there are."""
+        alike: dict[str, list[str]] = {}
+        for problem in self.problems:
+            kind = problem.about if problem.about in SCENE_FILES else problem.text
+            alike.setdefault(kind, []).append(" ".join(problem.text.split()))
+        return [
+            f"{texts[0]} ({len(texts) - 1} more of {kind})" if len(texts) > 1 else texts[0]
+            for kind, texts in alike.items()
+        ]
 
     @property
     def toml(self) -> str:
@@ -159,18 +173,23 @@ def survey(  # noqa: PLR0913 - each names one thing that a user chooses
     if conventions is None:
         return _learning(root, found, pictured, how)
     tested = Survey(str(root), tuple(found), None)
-    tested.problems.extend(each.problem for each in found if each.problem)
+    tested.problems.extend(problem_of_scene(each.problem) for each in found if each.problem)
     usable = [each.scene for each in found if each.scene is not None]
-    tested.problems.extend(scene.remark("left") for scene in usable if scene.remark("left"))
+    tested.problems.extend(
+        Problem(scene.remark("left"), BASELINE_JSON) for scene in usable if scene.remark("left")
+    )
     some = _some(usable, pictured) if pictured else []
     report = _diagnosed(tested, some, None, how) if some else None
     if report is not None:
         _note(tested, report, cures=_changed(_measured(report, DepthEncoding(), some)))
         for verdict in report.worlds:
-            told = f"{_SHARES}: {'; '.join(verdict.lines)}"
-            (tested.problems if verdict.is_wrong else tested.poses).append(f"poses: {told}")
+            told = f"poses: {_SHARES}: {'; '.join(verdict.lines)}"
+            if verdict.is_wrong:
+                tested.problems.append(Problem(told, "poses"))
+            else:
+                tested.poses.append(told)
         tested = replace(tested, untested=tuple(dict.fromkeys(_untested(report))))
-    return replace(tested, problems=_alike_once(tested))
+    return tested
 
 
 def _untested(report: DoctorReport) -> Iterator[str]:
@@ -221,7 +240,6 @@ def _learning(
         shapes.append(shape)
     learned = replace(learned, conventions=Conventions(tuple(shapes), "the conventions learned"))
     surveyed = replace(surveyed, learned=learned)
-    surveyed = replace(surveyed, problems=_alike_once(surveyed))
     surveyed.notes[-1, ""] = _head(surveyed)
     return surveyed
 
@@ -263,19 +281,6 @@ def _by_depth(root: str, scene: Scene, text: bytes, group: Sequence[Candidate]) 
     ]  # fmt: skip
 
 
-def _alike_once(surveyed: Survey) -> list[str]:
-    """Return problems, one of those that are alike."""
-    keys = sorted((each.key for each in surveyed.examined), key=len, reverse=True)
-    alike: dict[str, list[str]] = {}
-    for problem in surveyed.problems:
-        plain = functools.reduce(lambda text, key: text.replace(key, ""), keys, problem)
-        alike.setdefault(re.sub(r"[0-9.]+", "#", plain), []).append(" ".join(problem.split()))
-    return [
-        f"{group[0]}{f' ({len(group) - 1} alike)' if len(group) > 1 else ''}"
-        for group in alike.values()
-    ]
-
-
 def _examined(
     root: str, conventions: Conventions | None, key: str, advance: Advance
 ) -> Examined | None:
@@ -304,7 +309,7 @@ def _diagnosed(
     try:
         return diagnose(index, scenes=len(scenes), frames=FRAMES, depth=depth, **how)
     except StereoGenBenchError as error:
-        surveyed.problems.append(str(error))
+        surveyed.problems.append(Problem(str(error)))
         surveyed.verdicts.append(f"the pictures tell nothing: {error}")
         return None
 
@@ -340,10 +345,11 @@ def _with_measured_depth(
         _note(surveyed, again)
         return replace(shape, depth=DepthAs(encoding=measured)), again
     if again is not None:
-        surveyed.problems.append(
-            f"depth: {found} was measured, and by it the pictures of {scenes[0].id.key} or others "
-            f"do not fit. `stereogenbench doctor` says more."
+        told = (
+            f"depth: {found} was measured, and by it the pictures of {scenes[0].id.key} or others"
         )
+        told += " do not fit. `stereogenbench doctor` says more."
+        surveyed.problems.append(Problem(told, "depth"))
     _note(surveyed, report)
     return shape, report
 
@@ -385,9 +391,8 @@ def _with_decided_poses(
         f"refused until [poses] names one of them: {refused}",
     ]
     told = "; ".join(figures) or why.removesuffix(", and ")
-    surveyed.problems.append(
-        f"{scene.id.key}: poses are not decided: {told}. Fields that are refused: {refused}."
-    )
+    told = f"{scene.id.key}: poses are not decided: {told}. Fields that are refused: {refused}."
+    surveyed.problems.append(Problem(told, "poses"))
     return shape
 
 
@@ -427,7 +432,8 @@ def _note(
             cure = ", ".join(f"{name} = {value}" for name, value in cures.items())
             line = f"no unit that is understood is stated; by pictures, write {cure} below [depth]"
         if verdict.is_wrong:
-            surveyed.problems.append(f"depth, {', '.join(verdict.scenes[:3])}: {line}")
+            told = f"depth, {', '.join(verdict.scenes[:3])}: {line}"
+            surveyed.problems.append(Problem(told, "depth"))
     if report.left_out:
         key, reason = next(iter(report.left_out.items()))
         count = counted(len(report.left_out), "scene")
@@ -444,5 +450,5 @@ def _head(surveyed: Survey) -> list[str]:
         "Use it: StereoPairs(..., conventions='conventions.toml'), or --conventions of a command.",
         "Edit it: what the data contradict is refused with the figures. Tables that it leaves out "
         "are the release's. Test it: `stereogenbench conventions ROOT --check FILE`.",
-        *(f"NOT SETTLED: {problem}" for problem in surveyed.problems),
+        *(f"NOT SETTLED: {problem}" for problem in surveyed.unsettled),
     ]

@@ -70,7 +70,7 @@ def conventions(  # noqa: PLR0913 - one parameter an option
     verified = "" if found.learned is None else f", {len(found.learned.verified)} verified the rest"
     typer.echo(f"{counted(usable, 'scene')} of {len(found.examined)} read{verified}", err=True)
     told = [f"depth: {line}" for line in found.verdicts] + found.poses
-    told += [f"NOT SETTLED: {line}" for line in found.problems]
+    told += [f"NOT SETTLED: {line}" for line in found.unsettled]
     if out is not None:
         write_report(out, found.toml)
         told.append(f"{out}: written")

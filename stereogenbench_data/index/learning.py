@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -44,6 +44,7 @@ from stereogenbench_data.schema.release import (
     CAMERA_PAIRS,
     COMPLETE_JSON,
     TRAJECTORY_JSON,
+    VIDEO_FILES,
 )
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.location import is_remote
@@ -51,9 +52,27 @@ from stereogenbench_data.sources.location import is_remote
 _KEYS_READ: Final = 500
 """Of how many scenes the keys are read, for shapes that the chosen scenes do not have."""
 _MORE_SHAPES: Final = 5
+SCENE_FILES: Final = (BASELINE_JSON, TRAJECTORY_JSON, *VIDEO_FILES)
 _LEFT, _RIGHT = (list(cameras) for cameras in zip(*CAMERA_PAIRS, strict=True))
 
 Notes = dict[str, list[str]]
+
+
+class Problem(NamedTuple):
+    """What is not understood of a dataset, or contradicts itself.
+
+    Attributes:
+        text: Where, and what.
+        about: The file of a scene, "poses" or "depth"; "" for anything else.
+    """
+
+    text: str
+    about: str = ""
+
+
+def problem_of_scene(text: str) -> Problem:
+    """Return what is wrong with a scene, about the first of its files that the text names."""
+    return Problem(text, next((name for name in SCENE_FILES if name in text), ""))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,7 +114,7 @@ class Learned:
     conventions: Conventions
     taught_by: list[list[Examined]]
     verified: list[Examined] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
+    problems: list[Problem] = field(default_factory=list)
 
 
 def chosen_scenes(
@@ -225,7 +244,7 @@ def learn(root: str | Path, examined: Sequence[Examined]) -> Learned:
         examined: The scenes.
     """
     usable = [each for each in examined if each.scene is not None]
-    problems = [each.problem for each in examined if each.scene is None]
+    problems = [problem_of_scene(each.problem) for each in examined if each.scene is None]
     decided_by: dict[frozenset[str], Examined] = {}
     teaching, others = list[Examined](), list[Examined]()
     for each in usable or examined:
@@ -244,17 +263,15 @@ def learn(root: str | Path, examined: Sequence[Examined]) -> Learned:
         own = frozenset.intersection(*(each.keys for each in group)) - elsewhere
         has = tuple(sorted(own, key=len)[:1]) if len(by_size) > 1 else ()
         if len(by_size) > 1 and not has and any(not shape.has for shape, _ in shapes):
-            problems.append(
-                f"{group[0].key} has the keys of other scenes and is read otherwise: the "
-                f"conventions do not state it."
-            )
+            told = "has the keys of other scenes and is read otherwise"
+            problems.append(Problem(f"{group[0].key} {told}: the conventions do not state it."))
             continue
         depth = _stated_depth(group)
         stated = {"format": 2}
         shapes.append((replace(group[0].shape, has=has, depth=depth, stated=stated), group))
     shapes.sort(key=lambda pair: not pair[0].has)
     problems += [
-        f"{group[0].key}: poses: {group[0].notes['poses'][-1]}"
+        Problem(f"{group[0].key}: poses: {group[0].notes['poses'][-1]}", "poses")
         for shape, group in shapes
         if group[0].scene is not None and shape.poses is None and not group[0].scene.remark("world")
     ]
@@ -289,10 +306,11 @@ def verify(root: str | Path, learned: Learned, scenes: Iterable[Examined]) -> No
         try:
             again = describe_scene(root, each.key, conventions=learned.conventions)
         except StereoGenBenchError as error:
-            learned.problems.append(str(error))
+            learned.problems.append(problem_of_scene(str(error)))
             continue
         if _essence(again) != _essence(each.scene):
-            learned.problems.append(f"{each.key}: is read otherwise by the conventions learned.")
+            told = f"{each.key}: is read otherwise by the conventions learned."
+            learned.problems.append(Problem(told))
         elif not any(each in group for group in learned.taught_by):
             learned.verified.append(each)
 

@@ -67,7 +67,7 @@ def test_scenes_that_conventions_leave_alike_unread_are_told_once_with_the_cure(
     (unit_m,) = re.findall(r"write unit_m = ([0-9.]+) below \[depth\]", silent.stderr)
     assert float(unit_m) == pytest.approx(0.001, rel=0.005)
     assert wrong.stderr.count("$.gaps is missing") == 1
-    assert "(1 alike)" in wrong.stderr
+    assert "(1 more of baseline.json)" in wrong.stderr
 
 
 def test_what_no_picture_can_test_is_told_beside_the_verdict(tmp_path):

@@ -243,8 +243,8 @@ def test_what_a_scene_cannot_be_used_for_is_told_with_its_keys(make_scene, root,
 
     learned, text = learned_of(root)
 
-    assert "focal_length_mm is missing" in learned.problems[0]
-    assert "camera_intrinsics.zoom" in learned.problems[0]
+    assert "focal_length_mm is missing" in learned.problems[0].text
+    assert "camera_intrinsics.zoom" in learned.problems[0].text
     cured = text + '[focal_length]\nplace = "$.camera_intrinsics.zoom"\nunit = "mm"\n'
     cured += '[sensor_width]\nvalue = 24\nunit = "mm"\n'
     assert SceneIndex.open(root, conventions=stated(cured)).scene(0).rig.focal_mm == 30.0

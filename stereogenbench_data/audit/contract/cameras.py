@@ -38,60 +38,22 @@ _MAJORITY: Final = CAMERA_COUNT // 2 + 1
 
 
 @dataclass(frozen=True, slots=True)
-class CameraFigures:
-    """One camera compared with the others.
-
-    Attributes:
-        camera: The number in its files' names.
-        matches: Pixels found both in its pictures and in those of its two nearest neighbours.
-        agreement: Share of them that its own depth explains to a pixel; nan if untested.
-    """
-
-    camera: int
-    matches: int
-    agreement: float
-
-    @property
-    def is_tested(self) -> bool:
-        """Whether there were enough matches to judge it."""
-        return self.matches >= limits.FEWEST_OF_CAMERA and math.isfinite(self.agreement)
-
-
-@dataclass(frozen=True, slots=True)
 class CameraCheck:
     """How well each camera fits a contract.
 
     Attributes:
-        cameras: Figures of all six cameras; empty if no pair has enough matches.
+        agreement: Share of the matches of neighbouring cameras that depth explains to a pixel; nan
+            if no camera has enough of them.
+        untested: Cameras with too few matches in the pictures of their two nearest neighbours.
+        unexplained: Cameras whose depth explains less than half of their matches.
         problems: What is wrong with single cameras, in words; each names its camera, unless no
             majority of cameras agrees.
     """
 
-    cameras: tuple[CameraFigures, ...] = ()
+    agreement: float = math.nan
+    untested: tuple[int, ...] = tuple(range(CAMERA_COUNT))
+    unexplained: tuple[int, ...] = ()
     problems: tuple[str, ...] = ()
-
-    @property
-    def agreement(self) -> float:
-        """Share of the matches of neighbouring cameras that is explained; nan if untested."""
-        tested = [figures for figures in self.cameras if figures.is_tested]
-        count = sum(figures.matches for figures in tested)
-        explained = sum(figures.matches * figures.agreement for figures in tested)
-        return explained / count if count else math.nan
-
-    @property
-    def untested(self) -> tuple[int, ...]:
-        """Cameras with too few matches in other pictures."""
-        tested = {figures.camera for figures in self.cameras if figures.is_tested}
-        return tuple(camera for camera in range(CAMERA_COUNT) if camera not in tested)
-
-    @property
-    def unexplained(self) -> tuple[int, ...]:
-        """Cameras whose depth explains less than half of their matches."""
-        return tuple(
-            figures.camera
-            for figures in self.cameras
-            if figures.is_tested and figures.agreement < limits.LEAST_SHARE
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,7 +85,7 @@ def check_cameras(
     *,
     depth_step: float,
 ) -> CameraCheck:
-    """Return every camera's figures and problems.
+    """Return how well each camera fits, and what is wrong with it.
 
     Args:
         views: The scene.
@@ -138,12 +100,32 @@ def check_cameras(
     pairs = [beside for beside in found if beside is not None]
     if not pairs:
         return CameraCheck()
-    figures = []
-    for camera in range(CAMERA_COUNT):
-        nearest = _of(pairs, camera)[:_NARROWEST]
-        count = sum(beside.count for beside in nearest)
-        explained = sum(beside.count * beside.near[camera] for beside in nearest)
-        figures.append(CameraFigures(camera, count, explained / count if count else math.nan))
+    nearest = {camera: _of(pairs, camera)[:_NARROWEST] for camera in range(CAMERA_COUNT)}
+    counts = {camera: sum(each.count for each in own) for camera, own in nearest.items()}
+    explained = {
+        camera: sum(each.count * each.near[camera] for each in own)
+        for camera, own in nearest.items()
+    }
+    tested = [camera for camera, count in counts.items() if count >= limits.FEWEST_OF_CAMERA]
+    return CameraCheck(
+        agreement=sum(explained[each] for each in tested) / sum(counts[each] for each in tested),
+        untested=tuple(camera for camera in counts if camera not in tested),
+        unexplained=tuple(
+            each for each in tested if explained[each] < limits.LEAST_SHARE * counts[each]
+        ),
+        problems=tuple(_problems(views, matches, contract, pairs, depth_step=depth_step)),
+    )
+
+
+def _problems(
+    views: SceneFrames,
+    matches: Sequence[FrameMatch],
+    contract: ScoredContract,
+    pairs: Sequence[CameraPairStats],
+    *,
+    depth_step: float,
+) -> list[str]:
+    """Return what is wrong with single cameras."""
     # In other pairs matches are false, and what is compared has nothing in common.
     clear = [beside for beside in pairs if beside.share >= limits.LEAST_SHARE]
     problems = {
@@ -189,8 +171,7 @@ def check_cameras(
             if late
             else _picture_problem(camera, down_px[camera], right_px[camera])
         )
-    named = (problems[camera] for camera in sorted(problems))
-    return CameraCheck(tuple(figures), (*named, *doubts, *unsure, *more))
+    return [*(problems[camera] for camera in sorted(problems)), *doubts, *unsure, *more]
 
 
 def _beside(

@@ -5,7 +5,7 @@ further change clearly improves. `diagnose_scene` reports how well that contract
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from typing import Any, Final
@@ -63,7 +63,6 @@ class SceneDiagnosis:
         scale: Found over declared disparity, fitted with the best contract's answers.
         scale_error: Standard error of log(scale).
         other_kind_scale: Scale with the other kind of depth, all else as in the best contract.
-        gain: By how much the best contract is better than the declared one.
         rivals: The other answers.
         disparity_px: Root mean square of the disparities found.
         depth_step: The `relative_step` of stored depths.
@@ -88,7 +87,6 @@ class SceneDiagnosis:
     scale: float = 1.0
     scale_error: float = math.inf
     other_kind_scale: float = math.nan
-    gain: Gain = NOTHING
     rivals: tuple[Rival, ...] = ()
     disparity_px: float = math.inf
     depth_step: float = 0.0
@@ -145,17 +143,10 @@ class ContractSearch:
         """Return the contract with the fewest changes that no further change clearly improves."""
         current = self.declared
         for _ in range(_MOST_CHANGES):
-            is_scaled = current.is_scaled
-            changed = list(self._other_answers(current, is_scaled=is_scaled))
-            changed += [] if is_scaled else [self.candidate(current.hypothesis)]
-            twice = [] if is_scaled else self._other_answers(current, is_scaled=True)
-            one, two = (self._most_better(current, each) for each in (changed, twice))
-            if one is not None and (two is None or not self._is_better(two, one)):
-                current = one
-            elif two is not None:
-                current = two
-            else:
+            better = [each for each in self._changed(current) if self._is_better(each, current)]
+            if not better:
                 break
+            current = max(better, key=lambda other: self.gain(other, current).mean_db)
         return self._settled(self._pruned(current))
 
     def _settled(self, current: ScoredContract) -> ScoredContract:
@@ -171,16 +162,16 @@ class ContractSearch:
             return current
         return self._pruned(theirs) if self.gain(theirs, mine).by_shape else current
 
-    def _other_answers(
-        self, current: ScoredContract, *, is_scaled: bool
-    ) -> Iterator[ScoredContract]:
-        """Yield contracts that change one answer, with the declared scale or a fitted one."""
+    def _changed(self, current: ScoredContract) -> Iterator[ScoredContract]:
+        """Yield contracts that change one answer, the scale, or both."""
+        yield self.candidate(current.hypothesis)
         for question in QUESTIONS:
             others = current.hypothesis.alternatives(question)
-            if question == "order" and is_scaled:
+            if not current.is_scaled and question != "form":
+                yield from (self.candidate(each, is_scaled=False) for each in others)
+            if question == "order":
                 others = self._promising(current.hypothesis)
-            fitted = is_scaled or question == "form"
-            yield from (self.candidate(hypothesis, is_scaled=fitted) for hypothesis in others)
+            yield from map(self.candidate, others)
 
     def _find_promising(self, current: Hypothesis) -> tuple[Hypothesis, ...]:
         """Return the orders that explain most matches, at any scale."""
@@ -188,13 +179,6 @@ class ContractSearch:
         few = [match for match in self._matches if match.frame == self._matches[0].frame]
         shares = {order: most_explained(self._views, few, order) for order in orders}
         return tuple(sorted(orders, key=lambda order: -shares[order])[:_PROMISING])
-
-    def _most_better(
-        self, current: ScoredContract, others: Iterable[ScoredContract]
-    ) -> ScoredContract | None:
-        """Return the contract that improves most on the current one, None if none clearly does."""
-        better = (other for other in others if self._is_better(other, current))
-        return max(better, key=lambda other: self.gain(other, current).mean_db, default=None)
 
     def _pruned(self, current: ScoredContract) -> ScoredContract:
         """Undo changes that another change has made unnecessary."""
@@ -412,7 +396,6 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         scale=with_scale.scale,
         scale_error=with_scale.scale_error,
         other_kind_scale=of_other_kind.scale,
-        gain=search.gain(best, search.declared),
         check=check,
         rivals=search.rivals(best),
     )

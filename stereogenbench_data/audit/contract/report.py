@@ -103,10 +103,6 @@ def _open(verdict: Verdict) -> Iterator[str]:
 def _conclusion(verdict: Verdict) -> Iterator[str]:
     """Yield what follows from a verdict's answers."""
     yield from (f"WRONG: {problem}." for problem in verdict.problems)
-    if any(answer.status == "wrong" for answer in verdict.answers):
-        gain = verdict.gain
-        better = f"{gain.mean_db:.2f} dB (95 %: {gain.low_db:.2f} to {gain.high_db:.2f}) better"
-        yield f"Another contract is {better} than the declared one."
     if verdict.choices:
         yield "One of these explains the depth scale; the pictures cannot tell which:"
         yield from (f"  - {choice}" for choice in verdict.choices)

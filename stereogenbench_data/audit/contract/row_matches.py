@@ -21,9 +21,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from stereogenbench_data.audit.contract.hypotheses import LAGS, Flip, Hypothesis
 from stereogenbench_data.audit.geometry.picture_check import Luma, band_passed, luma_of
+from stereogenbench_data.audit.geometry.reprojection import MeasuredDepth
 from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.samples.load import Streams
-from stereogenbench_data.schema.records import DepthEncoding, Scene
+from stereogenbench_data.schema.records import DepthEncoding, DepthKind, Scene
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
     DEFAULT_DEPTH_UNIT_M,
@@ -248,6 +249,21 @@ class SceneFrames:
             self.scene, depth_name(file), frame, encoding=self.encoding
         )
         return stored.units, stored.measured & (stored.units > 0)
+
+    def measured_depth(
+        self, frame: int, file: int, *, kind: DepthKind | None = None
+    ) -> MeasuredDepth:
+        """Return the depth that belongs to a frame of pictures, read as a kind of depth.
+
+        Args:
+            frame: The frame of pictures.
+            file: The camera.
+            kind: None for the contract's; "planar" leaves the lengths of rays as they are.
+        """
+        units, measured = self.depth(frame + self.encoding.frame_lag, file)
+        stated = self.scene.depth_encoding(file, self.encoding)
+        encoding = replace(stated, unit_m=self.unit_m(file), kind=kind or stated.kind)
+        return MeasuredDepth.of(units, measured, encoding=encoding, intrinsics=self.intrinsics)
 
     def _numbers(self, match: FrameMatch, *, frame: int, file: int) -> dict[Flip, _Numbers]:
         """Return what a depth frame stores at a match's pixels, as it is and flipped.

@@ -12,7 +12,7 @@ from itertools import chain
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float, Float64
 
 from stereogenbench_data.audit.contract.row_matches import SceneFrames
 from stereogenbench_data.audit.geometry.reprojection import moved_points
@@ -20,7 +20,6 @@ from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import planar_from_ray
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.projection import Projection, landing_pixels
-from stereogenbench_data.media.depth import depth_m_from_units
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
 _STEP: Final = 0.025
@@ -69,7 +68,10 @@ def _best(errors: Float64[np.ndarray, " factors"]) -> float:
 def _errors(views: SceneFrames, poses: CameraPoses, camera: int) -> Float64[np.ndarray, " factors"]:
     """Return for each factor the median by which depth of one frame is off in another."""
     moves = views.frame_moves(_PARTS)
-    lengths = {frame: _lengths_m(views, frame, camera) for frame in sorted({*chain(*moves)})}
+    lengths = {  # of rays, where depth is along them
+        frame: views.measured_depth(frame, camera, kind="planar").depth_m
+        for frame in sorted({*chain(*moves)})
+    }
     motions = [poses.later_from_cam(*move, camera=camera) for move in moves]
     errors = []
     for factor in _FACTORS:
@@ -85,17 +87,6 @@ def _errors(views: SceneFrames, poses: CameraPoses, camera: int) -> Float64[np.n
         both = np.concatenate([np.empty(0), *off])
         errors.append(float(np.median(both)) if len(both) >= _FEWEST else math.inf)
     return np.array(errors)
-
-
-def _lengths_m(views: SceneFrames, frame: int, camera: int) -> Float32[np.ndarray, "h w"]:
-    """Return a frame's depth, of rays their lengths; 0 where it was not measured."""
-    units, measured = views.depth(frame + views.encoding.frame_lag, camera)
-    as_stated = views.scene.depth_encoding(camera, views.encoding)
-    encoding = replace(as_stated, kind="planar", unit_m=views.unit_m(camera))
-    lengths_m = depth_m_from_units(
-        units, measured=measured, encoding=encoding, intrinsics=views.intrinsics
-    )
-    return np.where(np.isfinite(lengths_m), lengths_m, np.float32(0))
 
 
 def _off(

@@ -346,7 +346,6 @@ class Verdict:
         scenes: Their keys.
         declared: The contract under test.
         answers: One for each question.
-        gain: By how much the best contract is better than the declared one.
         agreement: Share of the matches of neighbouring cameras that the best contract explains.
         encoding: The contract to use instead of the declared one; None if none is certain. None is
             given if it explains less than half of the matches, for another unit (only the quotient
@@ -364,7 +363,6 @@ class Verdict:
     scenes: tuple[str, ...]
     declared: DepthEncoding
     answers: tuple[Answer, ...]
-    gain: Gain
     agreement: float
     encoding: DepthEncoding | None
     quotient: float
@@ -458,7 +456,6 @@ def judge(scenes: Sequence[SceneDiagnosis]) -> Verdict:
         scenes=tuple(scene.key for scene in scenes),
         declared=declared,
         answers=answers,
-        gain=pooled([scene.gain for scene in scenes]),
         agreement=float(np.mean([scene.check.agreement for scene in scenes])),
         encoding=pasted if is_sure else None,
         quotient=unit.metres / first.unit_m if is_measured else math.nan,
@@ -503,8 +500,7 @@ def group_by_contract(scenes: Sequence[SceneDiagnosis]) -> list[list[SceneDiagno
     if not judged:
         return [list(scenes)] if scenes else []
     groups: list[list[SceneDiagnosis]] = []
-    by_gain = sorted(judged, key=lambda scene: (not _is_changed(scene), -scene.gain.mean_db))
-    for scene in by_gain:
+    for scene in sorted(judged, key=lambda each: (not _is_changed(each), each.scale_error)):
         home = next((group for group in groups if _fits(scene, group[0])), None)
         if home is None:
             groups.append([scene])

@@ -9,14 +9,14 @@ that were not used to choose it, or with a camera that was not, where there is o
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
 from typing import Final
 
 import numpy as np
 
 from stereogenbench_data.audit.contract.row_matches import SceneFrames
-from stereogenbench_data.audit.geometry.reprojection import MeasuredDepth, reproject
+from stereogenbench_data.audit.geometry.reprojection import reproject
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.pose_evidence import poses_of, same_poses, settled_poses
@@ -110,7 +110,7 @@ def explained_shares(views: SceneFrames, text: bytes, names: Sequence[str]) -> S
     where = views.scene.id.key
     moves = views.frame_moves(_PARTS) or views.frame_moves((1,))
     depths = {
-        (frame, camera): _depth(views, frame, camera)
+        (frame, camera): views.measured_depth(frame, camera)
         for frame in sorted({*chain(*moves)})
         for camera in _CAMERAS
     }
@@ -163,9 +163,3 @@ def judge_worlds(scenes: Sequence[Shares], *, stated: str = "") -> WorldVerdict:
 
 def _mean(scenes: Sequence[Shares], name: str) -> float:
     return float(np.mean([scene[name] for scene in scenes]))
-
-
-def _depth(views: SceneFrames, frame: int, camera: int) -> MeasuredDepth:
-    units, measured = views.depth(frame + views.encoding.frame_lag, camera)
-    encoding = replace(views.encoding, unit_m=views.unit_m(camera))
-    return MeasuredDepth.of(units, measured, encoding=encoding, intrinsics=views.intrinsics)
