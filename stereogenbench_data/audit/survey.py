@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
+from stereogenbench_data.audit.contract import limits
 from stereogenbench_data.audit.contract.doctor import DiagnosisTask, DoctorReport, diagnose
 from stereogenbench_data.audit.contract.verdict import (
-    MARGIN,
     QUOTIENT,
     STRETCH,
     TOPICS,
@@ -414,7 +414,7 @@ def _measured(
     told = " ".join(scene.remark("depth") for scene in scenes)
     # Of numbers that are no plain lengths pictures would show a unit, too, and a wrong one.
     is_plain = not any(why in told for why in (MAY_BE_RANGE, NO_LENGTH))
-    is_known = is_plain and verdict.quotient_error <= MARGIN
+    is_known = is_plain and verdict.quotient_error <= limits.MARGIN
     if sources <= {"default", "unreadable"} and stated.unit_m is None and is_known:
         unit = Unit(verdict.quotient * report.scenes[0].unit_m, verdict.quotient_error)
         found["unit_m"] = unit.rounded_m

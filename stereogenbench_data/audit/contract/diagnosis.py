@@ -111,7 +111,11 @@ _PROMISING: Final = 4
 
 
 class ContractSearch:
-    """The search for the best contract of a scene; fits each contract once."""
+    """The search for the best contract of a scene; fits each hypothesis once.
+
+    Hypotheses are compared at the scale that suits each best. Whether the declared scale fits is
+    asked last, of the best one.
+    """
 
     def __init__(
         self,
@@ -128,50 +132,28 @@ class ContractSearch:
         # The pairs next but one serve the comparison of cameras.
         self._matches = [match for match in matches if match.pair in near] or list(matches)
         self._bias = limits.BIAS_PX / max(disparity_px(matches), 1e-6)
-        self._fitted = cache(partial(fit_scale, views, self._matches))
-        self._unscaled = cache(partial(score_hypothesis, views, self._matches))
+        self.fitted = cache(partial(fit_scale, views, self._matches))
         self._promising = cache(self._find_promising)
         self._power = cache(self._find_power)
         self._moved_px = cache(self._find_moved_px)
-        self.declared = self.candidate(Hypothesis.declared(views.encoding), is_scaled=False)
-
-    def candidate(self, hypothesis: Hypothesis, *, is_scaled: bool = True) -> ScoredContract:
-        """Return a contract, its scale fitted or as declared."""
-        return self._fitted(hypothesis) if is_scaled else self._unscaled(hypothesis)
+        self.declared = Hypothesis.declared(views.encoding)
 
     def best(self) -> ScoredContract:
         """Return the contract with the fewest changes that no further change clearly improves."""
-        current = self.declared
+        current = self.fitted(self.declared)
         for _ in range(_MOST_CHANGES):
-            better = [each for each in self._changed(current) if self._is_better(each, current)]
+            others = map(self.fitted, self._others(current.hypothesis))
+            better = [each for each in others if self.gain(each, current).is_clear()]
             if not better:
                 break
             current = max(better, key=lambda other: self.gain(other, current).mean_db)
-        return self._settled(self._pruned(current))
+        return self.with_scale(self._pruned(current).hypothesis)
 
-    def _settled(self, current: ScoredContract) -> ScoredContract:
-        """Change the kind of depth if the shape of disparity asks for it.
-
-        A scale explains most of the difference, so the search may have chosen a scale instead.
-        """
-        (other,) = current.hypothesis.alternatives("kind")
-        mine, theirs = (self.candidate(each) for each in (current.hypothesis, other))
-        # A ray is longer than its depth by a limited factor; more than that is another scale.
-        most = math.log(float(self._views.ray_per_planar.max())) + self._least_log_scale
-        if abs(math.log(mine.scale / current.scale)) > most:
-            return current
-        return self._pruned(theirs) if self.gain(theirs, mine).by_shape else current
-
-    def _changed(self, current: ScoredContract) -> Iterator[ScoredContract]:
-        """Yield contracts that change one answer, the scale, or both."""
-        yield self.candidate(current.hypothesis)
+    def _others(self, current: Hypothesis) -> Iterator[Hypothesis]:
+        """Yield hypotheses that change one answer; of orders those that explain most."""
         for question in QUESTIONS:
-            others = current.hypothesis.alternatives(question)
-            if not current.is_scaled and question != "form":
-                yield from (self.candidate(each, is_scaled=False) for each in others)
-            if question == "order":
-                others = self._promising(current.hypothesis)
-            yield from map(self.candidate, others)
+            is_order = question == "order"
+            yield from self._promising(current) if is_order else current.alternatives(question)
 
     def _find_promising(self, current: Hypothesis) -> tuple[Hypothesis, ...]:
         """Return the orders that explain most matches, at any scale."""
@@ -182,35 +164,45 @@ class ContractSearch:
 
     def _pruned(self, current: ScoredContract) -> ScoredContract:
         """Undo changes that another change has made unnecessary."""
-        declared = self.declared.hypothesis
-        simpler = [
-            self.candidate(
-                current.hypothesis.changed(question, getattr(declared, question)),
-                is_scaled=current.is_scaled,
-            )
-            for question in current.hypothesis.changes_from(declared)
-        ]
-        if current.is_scaled and current.hypothesis.form == declared.form:
-            simpler.append(self.candidate(current.hypothesis, is_scaled=False))
-        for each in simpler:
-            if not self._is_better(current, each):
-                return self._pruned(each)
+        hypothesis = current.hypothesis
+        for question in hypothesis.changes_from(self.declared):
+            simpler = self.fitted(hypothesis.changed(question, getattr(self.declared, question)))
+            if not self.gain(current, simpler).is_clear():
+                return self._pruned(simpler)
         return current
 
-    def simplest(self) -> ScoredContract:
-        """Return the declared contract, with another scale if that is clearly better."""
-        scaled = self.candidate(self.declared.hypothesis)
-        return scaled if self._is_better(scaled, self.declared) else self.declared
+    def with_scale(self, hypothesis: Hypothesis) -> ScoredContract:
+        """Return a contract with its declared scale, or a fitted one if that is clearly better."""
+        fitted = self.fitted(hypothesis)
+        if hypothesis.form != self.declared.form:
+            return fitted
+        declared = score_hypothesis(self._views, self._matches, hypothesis)
+        least = max(self._least_log_scale, self._bias) + limits.LEAST_ERRORS * min(
+            fitted.scale_error, 1e3
+        )
+        is_clear = partial(
+            Gain.is_clear, least_db=limits.LEAST_SCALE_DB, errors=limits.SCALE_ERRORS
+        )
+        if abs(math.log(fitted.scale)) <= least or not is_clear(
+            gain_of(self._matches, fitted, declared)
+        ):
+            return declared
+        # A camera elsewhere than recorded gives its own pairs another scale, and no others.
+        opposite = (
+            gain_of(self._matches, declared, fitted, left_out=camera)
+            for camera in range(CAMERA_COUNT)
+        )
+        return declared if any(map(is_clear, opposite)) else fitted
 
     def cameras(self, contract: ScoredContract, *, depth_step: float) -> CameraCheck:
         """Return how well each camera fits a contract, its scale fitted."""
         hypothesis = contract.hypothesis
         matches = self._every
-        if hypothesis.order != self.declared.hypothesis.order:
+        if hypothesis.order != self.declared.order:
             # Other files are neighbours.
             frames = len({match.frame for match in matches})
             matches = self._views.frame_matches(frames=frames, hypothesis=hypothesis)
-        fitted = self.candidate(hypothesis)
+        fitted = self.fitted(hypothesis)
         return check_cameras(self._views, matches, fitted, depth_step=depth_step)
 
     def rivals(self, best: ScoredContract) -> tuple[Rival, ...]:
@@ -224,9 +216,8 @@ class ContractSearch:
                     other = score_hypothesis(
                         self._views, self._matches, hypothesis, scale=best.scale
                     )
-                    other = replace(other, is_scaled=best.is_scaled)
                 else:
-                    other = self.candidate(hypothesis)
+                    other = self.fitted(hypothesis)
                 answer = getattr(hypothesis, question)
                 found.append(Rival(question, answer, self.gain(best, other)))
         return tuple(found)
@@ -245,11 +236,12 @@ class ContractSearch:
         default = views.read_as(
             replace(views.encoding, unit_m=DEFAULT_DEPTH_UNIT_M, offset_m=0.0, form="depth")
         )
-        hypothesis = replace(self.declared.hypothesis, form="depth")
+        hypothesis = replace(self.declared, form="depth")
         other = score_hypothesis(default, self._matches, hypothesis)
         scaled = fit_scale(default, self._matches, hypothesis)
         least = self._least_log_scale + limits.LEAST_ERRORS * min(scaled.scale_error, 1.0)
-        return gain_of(self._matches, self.declared, other), abs(math.log(scaled.scale)) <= least
+        declared = score_hypothesis(views, self._matches, self.declared)
+        return gain_of(self._matches, declared, other), abs(math.log(scaled.scale)) <= least
 
     def without_parallax(self, best: ScoredContract) -> Gain:
         """Return by how much a contract is better than infinite depth everywhere."""
@@ -270,7 +262,7 @@ class ContractSearch:
         only_kind = better.hypothesis.changes_from(worse.hypothesis) == ("kind",)
         # Coarse depth has a shape of its own.
         is_fine = self._least_log_scale <= limits.LEAST_LOG_SCALE
-        if is_fine and only_kind and worse.is_scaled >= better.is_scaled:
+        if is_fine and only_kind:
             shape_kind = self._power(better.hypothesis.changed("kind", "planar")).kind
             if shape_kind is not None and (shape_kind != kind or found.mean_db > 0):
                 return replace(found, by_shape=shape_kind == kind)
@@ -287,28 +279,7 @@ class ContractSearch:
 
     def _find_power(self, planar: Hypothesis) -> RayPower:
         """Return the power of the ray's length for a hypothesis of any kind and scale."""
-        return ray_power(self._views, self._matches, self.candidate(planar))
-
-    def _is_better(self, other: ScoredContract, current: ScoredContract) -> bool:
-        """Tell whether a contract is clearly better, and a scale that only it has significant."""
-        gain = self.gain(other, current)
-        if other.hypothesis != current.hypothesis or other.is_scaled <= current.is_scaled:
-            return gain.is_clear()
-        least = max(self._least_log_scale, self._bias) + limits.LEAST_ERRORS * min(
-            other.scale_error, 1e3
-        )
-        if abs(math.log(other.scale)) <= least or not _is_clear_scale(gain):
-            return False
-        # A camera elsewhere than recorded gives its own pairs another scale, and no others.
-        without = (
-            gain_of(self._matches, current, other, left_out=camera)
-            for camera in range(CAMERA_COUNT)
-        )
-        return not any(map(_is_clear_scale, without))
-
-
-def _is_clear_scale(gain: Gain) -> bool:
-    return gain.is_clear(least_db=limits.LEAST_SCALE_DB, errors=limits.SCALE_ERRORS)
+        return ray_power(self._views, self._matches, self.fitted(planar))
 
 
 def _checked(
@@ -320,8 +291,8 @@ def _checked(
     another scale if that is clearly better, is checked instead.
     """
     check = search.cameras(best, depth_step=depth_step)
-    plain = search.simplest()
-    if not (check.problems or check.unexplained) or best is plain:
+    plain = search.with_scale(search.declared)
+    if not (check.problems or check.unexplained) or best.hypothesis == search.declared:
         return best, check
     other = search.cameras(plain, depth_step=depth_step)
     if (
@@ -340,6 +311,7 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
     """
     matches = views.frame_matches(frames=frames)
     file = views.primary[0]
+    units, known = views.depth(matches[0].frame, file)
     declared = Hypothesis.declared(views.encoding)
     scene = SceneDiagnosis(
         key=views.scene.id.key,
@@ -352,24 +324,11 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         encoding=views.encoding,
         declared=declared,
         best=declared,
-    )
-    if scene.matches < limits.FEWEST_MATCHES:
-        problem = (
-            f"only {scene.matches:,} pixels were found in both pictures: they have no texture, or "
-            f"show different things"
-        )
-        return replace(scene, problem=problem)
-    units, known = views.depth(matches[0].frame, file)
-    scene = replace(
-        scene,
-        depth_step=relative_step(units[known]),
         disparity_px=disparity_px(matches),
+        depth_step=relative_step(units[known]),
     )
-    if scene.depth_step > limits.COARSEST_STEP:
-        problem = f"stored depth is too coarse: its steps are {scene.depth_step:.0%} of it"
-        return replace(scene, problem=problem)
-    if scene.disparity_px < limits.LEAST_PARALLAX_PX:
-        problem = f"too little parallax: disparities are of {scene.disparity_px:.2f} px"
+    problem = _too_little(scene)
+    if problem:
         return replace(scene, problem=problem)
     search = ContractSearch(views, matches, least_log_scale=allowed_log_scale(scene.depth_step))
     best, check = _checked(search, search.best(), depth_step=scene.depth_step)
@@ -384,7 +343,7 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         return replace(scene, problem=problem)
     (other_kind,) = best.hypothesis.alternatives("kind")
     with_scale, of_other_kind = (
-        search.candidate(hypothesis) for hypothesis in (best.hypothesis, other_kind)
+        search.fitted(hypothesis) for hypothesis in (best.hypothesis, other_kind)
     )
     beside, default_fits = search.beside_default()
     return replace(
@@ -399,3 +358,17 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         check=check,
         rivals=search.rivals(best),
     )
+
+
+def _too_little(scene: SceneDiagnosis) -> str:
+    """Return why a scene shows too little to be judged; empty if it shows enough."""
+    if scene.matches < limits.FEWEST_MATCHES:
+        return (
+            f"only {scene.matches:,} pixels were found in both pictures: they have no texture, or "
+            f"show different things"
+        )
+    if scene.depth_step > limits.COARSEST_STEP:
+        return f"stored depth is too coarse: its steps are {scene.depth_step:.0%} of it"
+    if scene.disparity_px < limits.LEAST_PARALLAX_PX:
+        return f"too little parallax: disparities are of {scene.disparity_px:.2f} px"
+    return ""

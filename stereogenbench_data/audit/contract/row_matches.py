@@ -9,6 +9,7 @@ pixels by a hypothesis.
 """
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -413,8 +414,9 @@ class SceneFrames:
 
 
 def disparity_px(matches: Sequence[FrameMatch]) -> float:
-    """Return the root mean square of found disparities."""
-    return float(np.sqrt((np.concatenate([match.matched_px for match in matches]) ** 2).mean()))
+    """Return the root mean square of found disparities, inf for none."""
+    found = np.concatenate([match.matched_px for match in matches])
+    return float(np.sqrt((found**2).mean())) if len(found) else math.inf
 
 
 def chosen_frames(available: int, *, count: int) -> list[int]:

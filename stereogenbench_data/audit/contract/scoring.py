@@ -68,11 +68,6 @@ class Gain:
         return self.mean_db - NORMAL_975 * self.interval_error_db
 
     @property
-    def high_db(self) -> float:
-        """The upper end of the 95 % interval."""
-        return self.mean_db + NORMAL_975 * self.interval_error_db
-
-    @property
     def is_excluded(self) -> bool:
         """Whether the other contract is excluded: the whole interval is beyond the margin."""
         return bool(self.by_shape) or self.low_db >= self.least_db

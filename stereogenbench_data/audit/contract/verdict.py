@@ -189,8 +189,6 @@ def describe(answer: Any) -> str:
     return _WORDS.get(answer, f"{answer}")
 
 
-MARGIN: Final = limits.MARGIN
-
 QUOTIENT: Final = "depth scale"
 """Unit / (focal length x baseline), which is all that disparity shows of the three."""
 DEFAULT: Final = "beside the release's default"
@@ -265,7 +263,7 @@ def _quotient(scenes: Sequence[SceneDiagnosis], unit: Unit) -> Answer:
         return replace(blank, note=doubt)
     if first.unit_source == "unreadable":
         return replace(blank, declared="files not understood", found=found)
-    note = f"the 95 % interval lies within {MARGIN:.0%} of what is declared"
+    note = f"the 95 % interval lies within {limits.MARGIN:.0%} of what is declared"
     return replace(blank, found=found, status="confirmed", note=note)
 
 
@@ -316,8 +314,8 @@ def _doubt(first: SceneDiagnosis, unit: Unit, *, found: str) -> str:
     off = abs(math.log(unit.metres / first.unit_m))
     is_coarse = allowed_log_scale(first.depth_step) > limits.LEAST_LOG_SCALE
     why = "depth is stored in too large steps" if is_coarse else "too little parallax"
-    if off + unit.uncertainty > MARGIN:
-        return f"{found}: the 95 % interval reaches beyond {MARGIN:.0%}: {why}"
+    if off + unit.uncertainty > limits.MARGIN:
+        return f"{found}: the 95 % interval reaches beyond {limits.MARGIN:.0%}: {why}"
     if off > max(unit.uncertainty, limits.LEAST_TOLERANCE):
         return f"{found} fits best, but is not clearly better"
     return ""

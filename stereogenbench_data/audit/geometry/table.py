@@ -18,7 +18,6 @@ from stereogenbench_data.audit.geometry.records import (
 )
 from stereogenbench_data.audit.geometry.reprojection import TOLERANCES
 from stereogenbench_data.audit.paper_numbers import AUDIT
-from stereogenbench_data.schema.release import CAMERA_COUNT, FRAME_COUNT
 from stereogenbench_data.schema.text import counted, markdown_table, markdown_text
 
 _LISTED: Final = 500
@@ -34,7 +33,6 @@ def table_rows(scenes: Sequence[SceneAudit], findings: Sequence[Finding]) -> tup
     return (
         *_check_rows(scenes),
         *_reprojection_rows(scenes),
-        *_frame_rows(scenes),
         *_depth_rows(scenes),
         AuditRow("findings", "scenes with", ", ".join(counts) or "none", "none", "none"),
     )
@@ -71,26 +69,6 @@ def _reprojection_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
             f"both pairs, {tolerance.name}: median / 95th percentile (pixels kept)",
             f"{median_px} px / {p95_px} px ({kept})",
             AUDIT["reprojection"],
-        )
-
-
-def _frame_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
-    for name in ("RGB", "depth"):
-        found = [
-            (int(each.value), scene.frames) for scene in scenes for each in scene.figures
-            if each.quantity == "frames" and name.lower() in each.member
-        ]  # fmt: skip
-        expected = CAMERA_COUNT * sum(scene.frames for scene in scenes)
-        missing = expected - sum(min(count, frames) for count, frames in found)
-        counts = [count for count, _ in found] or [0]
-        low, high = min(counts), max(counts)
-        span = f"{low}" if low == high else f"{low} to {high}"
-        yield AuditRow(
-            "frames",
-            f"{name} frames in all (of a video), missing",
-            f"{sum(counts):,} ({span}), {missing:,} missing",
-            f"{FRAME_COUNT} of a video, 0 missing",
-            "as poses",
         )
 
 
