@@ -14,11 +14,10 @@ from hypothesis import strategies as st
 
 from stereogenbench_data.audit.contract.cameras import CameraCheck
 from stereogenbench_data.audit.contract.diagnosis import Rival, SceneDiagnosis
-from stereogenbench_data.audit.contract.doctor import DoctorReport, diagnose
+from stereogenbench_data.audit.contract.doctor import diagnose
 from stereogenbench_data.audit.contract.hypotheses import LAGS, Hypothesis
-from stereogenbench_data.audit.contract.report import doctor_lines
 from stereogenbench_data.audit.contract.row_matches import match_pairs
-from stereogenbench_data.audit.contract.scoring import Gain, is_ruled_out, pooled
+from stereogenbench_data.audit.contract.scoring import SURE, Gain, is_ruled_out, pooled
 from stereogenbench_data.audit.contract.verdict import (
     DEFAULT,
     QUOTIENT,
@@ -157,7 +156,7 @@ def test_a_unit_that_the_other_kind_explains_as_well_is_left_open():
     )  # fmt: skip
 
     verdict = judge([scene])
-    told = judge([replace(scene, rivals=(Rival("kind", "ray", Gain(0.01, 0.02, by_shape=True)),))])
+    told = judge([replace(scene, rivals=(Rival("kind", "ray", SURE),))])
 
     assert not verdict.fits
     assert verdict.encoding is None
@@ -166,17 +165,6 @@ def test_a_unit_that_the_other_kind_explains_as_well_is_left_open():
         answer(verdict, QUOTIENT).note
     )
     assert wrong_topics(told) == {QUOTIENT}
-
-
-def test_a_kind_that_less_than_the_margin_confirms_says_what_tells_it():
-    scene = diagnosed(rivals=(Rival("kind", "ray", Gain(0.06, 0.01, by_shape=True)),))
-    verdict = judge([scene])
-
-    (told,) = [each for each in doctor_lines(DoctorReport("data", (scene,), (verdict,), {}))
-               if each.startswith("depth along")]  # fmt: skip
-
-    assert "confirmed" in told
-    assert told.endswith("told by the shape of disparity")
 
 
 def test_a_wrong_quotient_does_not_accuse_the_unit():
@@ -785,7 +773,7 @@ def test_what_is_pooled_is_at_least_as_sure_as_each_part(scenes):
         ([Gain(9.0, 0.5), Gain(0.1, 0.5)], True),
         ([Gain(0.4, 0.2), Gain(0.1, 0.5)], False),
         ([Gain(9.0, 0.5), Gain(-8.0, 0.5)], False),
-        ([Gain(0.01, 0.02, by_shape=True), Gain(0.0, 0.02)], True),
+        ([SURE, Gain(0.0, 0.02)], True),
         ([], False),
     ],
 )

@@ -23,6 +23,7 @@ from stereogenbench_data.audit.contract.row_matches import (
 )
 from stereogenbench_data.audit.contract.scoring import (
     NOTHING,
+    SURE,
     Gain,
     RayPower,
     ScoredContract,
@@ -265,7 +266,8 @@ class ContractSearch:
         if is_fine and only_kind:
             shape_kind = self._power(better.hypothesis.changed("kind", "planar")).kind
             if shape_kind is not None and (shape_kind != kind or found.mean_db > 0):
-                return replace(found, by_shape=shape_kind == kind)
+                sure_db = max(SURE.mean_db, found.mean_db)
+                return replace(SURE, mean_db=sure_db if shape_kind == kind else -sure_db)
         return found
 
     def _find_moved_px(self, hypothesis: Hypothesis, lag: int) -> float:

@@ -45,15 +45,12 @@ class Gain:
     Attributes:
         mean_db: The mean difference; nan for nothing to compare.
         error_db: Its standard error, the smaller of two estimates; the search uses it.
-        by_shape: Whether the shape of disparity over the picture decides for this contract,
-            however few dB it makes; None if it does not decide.
         least_db: Smaller differences are not believed.
         wide_db: The larger estimate of the error, for intervals; None if there is one estimate.
     """
 
     mean_db: float
     error_db: float
-    by_shape: bool | None = None
     least_db: float = limits.LEAST_DB
     wide_db: float | None = None
 
@@ -70,17 +67,18 @@ class Gain:
     @property
     def is_excluded(self) -> bool:
         """Whether the other contract is excluded: the whole interval is beyond the margin."""
-        return bool(self.by_shape) or self.low_db >= self.least_db
+        return self.low_db >= self.least_db
 
     def is_clear(
         self, *, least_db: float | None = None, errors: float = limits.LEAST_ERRORS
     ) -> bool:
         """Tell whether the difference is large and certain enough to be believed."""
-        if self.by_shape is not None:
-            return self.by_shape
         least = self.least_db if least_db is None else least_db
         return self.mean_db >= max(least, errors * self.error_db)
 
+
+SURE: Final = Gain(1.0, 0.0)
+"""The shape of disparity over the picture decides, however few dB it makes."""
 
 NOTHING: Final = Gain(math.nan, math.inf)
 """Nothing was compared."""
@@ -115,8 +113,7 @@ def pooled(scenes: Sequence[Gain]) -> Gain:
         least=limits.LEAST_ERROR_DB,
     )
     least_db = max(scene.least_db for scene in tested)
-    by_shape = any(scene.by_shape for scene in tested) or None
-    return Gain(mean_db, error_db, by_shape, least_db)
+    return Gain(mean_db, error_db, least_db)
 
 
 def is_ruled_out(scenes: Sequence[Gain]) -> bool:
@@ -129,7 +126,7 @@ def is_ruled_out(scenes: Sequence[Gain]) -> bool:
     is_clear = any(each.is_clear() for each in scenes) or (
         len(scenes) > 1 and together.mean_db >= together.least_db and together.low_db > 0
     )
-    opposite = (replace(each, mean_db=-each.mean_db) for each in scenes if each.by_shape is None)
+    opposite = (replace(each, mean_db=-each.mean_db) for each in scenes)
     return is_clear and not any(each.is_clear() for each in opposite)
 
 

@@ -97,15 +97,13 @@ def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
     worst: State = max(states.values(), key=_STATES.index, default="untested")
     is_changed, of_declared = best != declared, pooled(gains.get(declared, ()))
     decides = worst if not is_changed else states.get(declared, "untested")
-    if is_changed and not (of_declared.by_shape or of_declared.low_db > 0):
+    if is_changed and not of_declared.low_db > 0:
         decides = "close"
     status = _STATUS[is_changed, decides]
     at_end = question == "frame_lag" and abs(best) == max(LAGS)
     want = "frames or of motion" if question == "frame_lag" else "depth where it would be"
     close = [answer for answer, state in states.items() if state == "close"]
-    by_shape = any(gain.by_shape for each in gains.values() for gain in each)
     notes = {
-        "told by the shape of disparity": by_shape,
         f"{describe(best)} fits best, but not surely better": is_changed and status != "wrong",
         f"not excluded by the margin: {_named(left)}": status == "not contradicted",
         f"fit alike: {_named([best, *close])}": close,

@@ -13,10 +13,11 @@ Pictures are only correlated, at the points that depth puts in the same place, a
 frames beside with them: whether each camera shows its own view and moment.
 """
 
+import math
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from statistics import median
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -57,7 +58,8 @@ LEAST_CONTRAST: Final = 2.0
 """Least standard deviation, in grey levels, of a band-passed picture with texture."""
 
 Points = Float64[np.ndarray, " n"]
-Key = TypeVar("Key")
+Cameras = tuple[int, ...]
+"""One camera, or a pair."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -260,7 +262,7 @@ class AlignmentCheck:
         known = {pair: each for pair, each in self._depth.items() if each.smooth >= _FEWEST_POINTS}
         near = {pair: each for pair, each in self._depth.items() if each.near >= _FEWEST_POINTS}
         residuals = {pair: each.percentile(_MOST_OF_PAIR) for pair, each in known.items()}
-        of_pairs = {
+        of_pairs: dict[str, dict[Cameras, float]] = {
             "see_through": {pair: each.through / each.smooth for pair, each in known.items()},
             "depth_agreement": {pair: each.rough / each.near for pair, each in near.items()},
             "depth_residual": {p: each for p, each in residuals.items() if not np.isnan(each)},
@@ -272,7 +274,7 @@ class AlignmentCheck:
         if motion.value > CHECKS["motion_residual"].limit:
             suspects = set()
         for each in of_pairs.items():
-            yield _of_pairs(*each, suspects)
+            yield _worst(*each, suspects)
         seen = {camera for pair in known for camera in pair}
         yield from _untested("see_through", seen, "too few points of smooth surfaces")
         yield motion
@@ -291,74 +293,60 @@ class AlignmentCheck:
 
     def _content_figures(self, suspects: Set[int]) -> Iterator[Figure]:
         correlations = {pair: float(np.mean(each)) for pair, each in self._correlations.items()}
-        odd, best = {}, {}
+        odd, best = dict[Cameras, float](), dict[Cameras, float]()
         for camera in range(CAMERA_COUNT):
             own = [each for pair, each in correlations.items() if camera in pair]
             others = [each for pair, each in correlations.items() if camera not in pair]
             if own and others:
-                odd[camera] = median(others) - max(own)
-                best[camera] = f"its best is {max(own):.2f}"
-        yield from _of_cameras("picture_odd", odd, best, suspects)
+                best[camera,] = max(own)
+                odd[camera,] = median(others) - max(own)
+        least = min(best.values(), default=math.nan)
+        yield _worst("picture_odd", odd, suspects, f"its best is {least:.2f}")
         seen = {camera for pair in correlations for camera in pair}
         yield from _untested("picture_odd", seen, "no texture, or no depth")
 
     def _time_figures(self, suspects: Set[int]) -> Iterator[Figure]:
-        gains: dict[int, dict[int, float]] = {}
-        for (camera, lag), each in sorted(self._lags.items()):
-            gains.setdefault(camera, {})[lag] = float(np.mean(each))
-        timed, most, beside = set(), {}, {}
-        for camera, of in gains.items():
-            lag = max(of, key=lambda lag: of[lag])
-            most[camera] = of[lag]
-            beside[camera] = f"by those of the frame {'before' if lag < 0 else 'after'}"
-            timed |= {camera} if min(of.values()) <= -_TELLS_TIME else set()
+        gains = {place: float(np.mean(each)) for place, each in self._lags.items()}
+        timed = {camera for (camera, _), gain in gains.items() if gain <= -_TELLS_TIME}
+        most: dict[Cameras, float] = {}
+        for (camera, _), gain in gains.items():
+            most[camera,] = max(gain, most.get((camera,), -math.inf))
         if sum(gain > 0 for gain in most.values()) > 1:
             suspects = set()
-        yield from _of_cameras("picture_lag", most, beside, suspects)
+        (_, lag) = max(gains, key=lambda place: gains[place], default=(0, 0))
+        told = f"by those of the frame {'before' if lag < 0 else 'after'}"
+        yield _worst("picture_lag", most, suspects, told)
         why = "pictures of the neighbouring frames fit as well, or there are none"
         yield from _untested("picture_lag", timed, why)
 
 
-def _off(quantity: str, values: Mapping[Key, float]) -> list[Key]:
+def _off(quantity: str, values: Mapping[Cameras, float]) -> list[Cameras]:
     """Return what is beyond the limit or, in a finding, comes near the largest value."""
     limit, most = CHECKS[quantity].limit, max(values.values(), default=0.0)
     return [key for key, value in values.items() if most > limit and value > min(limit, most / 2)]
 
 
-def _of_pairs(quantity: str, values: Mapping[tuple[int, int], float], suspects: Set[int]) -> Figure:
-    """Return the largest value of any pair, with the pairs that come near.
+def _worst(
+    quantity: str, values: Mapping[Cameras, float], suspects: Set[int], told: str = ""
+) -> Figure:
+    """Return the largest value, with the cameras or the pairs that come near.
 
-    If the pairs that are off are all those of one suspect, its file comes with it.
-    """
-    most = max(values.values(), default=float("nan"))
-    if not most > 0:
-        return Figure(quantity, "", most)
-    among = [pair for pair, value in values.items() if value > most / 2]
-    off = _off(quantity, values)
-    odd = (
-        depth_name(camera) for camera in suspects
-        if len(off) > 1 and off == [pair for pair in values if camera in pair]
-    )  # fmt: skip
-    where = f"most in {', '.join(f'{a}-{b}' for a, b in among)}"
-    return Figure(quantity, next(odd, ""), most, where)
-
-
-def _of_cameras(
-    quantity: str, values: Mapping[int, float], where: Mapping[int, str], suspects: Set[int]
-) -> Iterator[Figure]:
-    """Yield each camera's value with its pictures' file; one for all, if not only a suspect is off.
-
-    Pictures are compared where depth and poses put them, so wrong lenses, places or depth put
+    If those that are off are all those of one suspect (and two pairs or more), its file comes with
+    it. Pictures are compared where depth and poses put them, so wrong lenses, places or depth put
     several cameras off.
     """
+    most = max(values.values(), default=math.nan)
+    if not most > 0:
+        return Figure(quantity, "", most)
     off = _off(quantity, values)
-    if len(off) <= 1 and suspects >= set(off):
-        for camera, value in values.items():
-            yield Figure(quantity, rgb_name(camera), value, where[camera])
-        return
-    worst = max(off, key=lambda camera: values[camera])
-    those = f"in camera{'s' * (len(off) > 1)} {', '.join(map(str, off))}"
-    yield Figure(quantity, "", values[worst], f"{where[worst]}, {those}")
+    file_name = rgb_name if quantity.startswith("picture") else depth_name
+    odd = (
+        file_name(camera) for camera in suspects
+        if off and len(off) >= len(off[0]) and off == [each for each in values if camera in each]
+    )  # fmt: skip
+    near = ("-".join(map(str, key)) for key, value in values.items() if value > most / 2)
+    where = f"{told}, in camera " if told else "most in "
+    return Figure(quantity, next(odd, ""), most, where + ", ".join(near))
 
 
 def _untested(quantity: str, tested: set[int], why: str) -> Iterator[Figure]:
