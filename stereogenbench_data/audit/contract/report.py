@@ -110,10 +110,8 @@ def _conclusion(verdict: Verdict) -> Iterator[str]:
         yield f"Paste: {encoding_line(verdict.encoding)}"
     elif verdict.is_wrong:
         yield "Nothing to paste: no DepthEncoding is certain to correct this."
-    elif verdict.fits:
-        yield f"The declared contract fits: {encoding_line(verdict.declared)}"
     else:
-        yield f"Nothing contradicts the declared contract. Undecided: {', '.join(_open(verdict))}."
+        yield f"Nothing contradicts the declared contract: {encoding_line(verdict.declared)}"
 
 
 def _tested(verdict: Verdict) -> Iterator[str]:

@@ -274,12 +274,13 @@ def _beside_default(scenes: Sequence[SceneDiagnosis]) -> Iterator[Answer]:
     blank = _no_answer(scenes, DEFAULT, declared)
     against = replace(gain, mean_db=-gain.mean_db)
     default = f"{DEFAULT_DEPTH_UNIT_M:g} m a unit"
-    is_judged = scenes[0].best == scenes[0].declared
-    if not (blank.note or is_judged):
+    if blank.note:
+        yield blank
+    elif scenes[0].best != scenes[0].declared:
         yield replace(blank, note="not answered while another answer is wrong")
-    elif not blank.note and gain.is_clear():
+    elif gain.is_clear():
         yield replace(blank, found=f"{declared}, not {default}", status="confirmed")
-    elif not blank.note and against.low_db > 0 and all(scene.default_fits for scene in scenes):
+    elif against.low_db > 0 and all(scene.default_fits for scene in scenes):
         yield replace(blank, found=default, status="wrong")
     else:
         yield blank

@@ -76,11 +76,11 @@ def _depth_rows(scenes: Sequence[SceneAudit]) -> Iterator[AuditRow]:
     valid = with_unit(_over(np.mean, _values(scenes, "mean_valid_depth")), "%")
     quantity = "mean valid-depth ratio over audited frames and cameras"
     yield AuditRow("depth validity", quantity, valid, AUDIT["valid_depth"])
-    units = sorted({float(f"{each:.6g}") for each in _values(scenes, "depth_unit_m")})
-    known = [unit_m for unit_m in units if not math.isnan(unit_m)]
-    span = ", ".join(f"{unit_m:g}" for unit_m in known)
-    span = f"{known[0]:g} to {known[-1]:g}" if len(known) > 4 else span
-    ours = f"{span} m" if known else "-"
+    units_m = sorted(
+        {f"{each:.6g}" for each in _values(scenes, "depth_unit_m")} - {"nan"}, key=float
+    )
+    span = ", ".join(units_m) if len(units_m) < 5 else f"{units_m[0]} to {units_m[-1]}"
+    ours = f"{span} m" if units_m else "-"
     yield AuditRow("depth unit", "metres in a stored unit", ours, "0.1 m without a tag")
 
 
