@@ -151,9 +151,8 @@ def judged(**changes):
 
 def test_a_unit_that_the_other_kind_explains_as_well_is_left_open():
     scene = diagnosed(
-        is_scaled=True, scale=1.02, other_kind_scale=1.001,
-        rivals=(Rival("kind", "ray", Gain(0.01, 0.02)),),
-    )  # fmt: skip
+        is_scaled=True, scale=1.02, rivals=(Rival("kind", "ray", Gain(0.01, 0.02), 1.001),)
+    )
 
     verdict = judge([scene])
     told = judge([replace(scene, rivals=(Rival("kind", "ray", SURE),))])
@@ -168,7 +167,12 @@ def test_a_unit_that_the_other_kind_explains_as_well_is_left_open():
 
 
 def test_a_wrong_quotient_does_not_accuse_the_unit():
-    verdict = judged(is_scaled=True, scale=1.05, scale_error=1e-3, other_kind_scale=1.05)
+    verdict = judged(
+        is_scaled=True,
+        scale=1.05,
+        scale_error=1e-3,
+        rivals=(Rival("kind", "ray", Gain(0.01, 0.02), 1.05),),
+    )
 
     assert verdict.contradicted == ["depth scale 0.95238 x declared ± 0.28%"]
 

@@ -44,6 +44,7 @@ class Rival:
     question: Question
     answer: Any
     lead_of_best: Gain
+    scale: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,6 @@ class SceneDiagnosis:
         is_scaled: Whether the best contract has another scale too.
         scale: Found over declared disparity, fitted with the best contract's answers.
         scale_error: Standard error of log(scale).
-        other_kind_scale: Scale with the other kind of depth, all else as in the best contract.
         rivals: The other answers.
         disparity_px: Root mean square of the disparities found.
         depth_step: The `relative_step` of stored depths.
@@ -87,7 +87,6 @@ class SceneDiagnosis:
     is_scaled: bool = False
     scale: float = 1.0
     scale_error: float = math.inf
-    other_kind_scale: float = math.nan
     rivals: tuple[Rival, ...] = ()
     disparity_px: float = math.inf
     depth_step: float = 0.0
@@ -219,8 +218,8 @@ class ContractSearch:
                     )
                 else:
                     other = self.fitted(hypothesis)
-                answer = getattr(hypothesis, question)
-                found.append(Rival(question, answer, self.gain(best, other)))
+                answer, lead = getattr(hypothesis, question), self.gain(best, other)
+                found.append(Rival(question, answer, lead, other.scale))
         return tuple(found)
 
     def beside_default(self) -> tuple[Gain | None, bool]:
@@ -343,10 +342,7 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
             f"explains {check.agreement:.0%} to a pixel, and pictures no better than none does"
         )
         return replace(scene, problem=problem)
-    (other_kind,) = best.hypothesis.alternatives("kind")
-    with_scale, of_other_kind = (
-        search.fitted(hypothesis) for hypothesis in (best.hypothesis, other_kind)
-    )
+    fitted = search.fitted(best.hypothesis)
     beside, default_fits = search.beside_default()
     return replace(
         scene,
@@ -354,9 +350,8 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         default_fits=default_fits,
         best=best.hypothesis,
         is_scaled=best.is_scaled,
-        scale=with_scale.scale,
-        scale_error=with_scale.scale_error,
-        other_kind_scale=of_other_kind.scale,
+        scale=fitted.scale,
+        scale_error=fitted.scale_error,
         check=check,
         rivals=search.rivals(best),
     )

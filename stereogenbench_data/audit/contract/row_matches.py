@@ -200,11 +200,8 @@ class FrameMatch:
 
     def at(self, pixels: Bool[np.ndarray, " n"]) -> "FrameMatch":
         """Return the match with some of its pixels."""
-        return replace(
-            self, rows=self.rows[pixels], columns=self.columns[pixels],
-            matched_px=self.matched_px[pixels], brightness=self.brightness[pixels],
-            slope=self.slope[pixels], cells=self.cells[pixels],
-        )  # fmt: skip
+        each = ("rows", "columns", "matched_px", "brightness", "slope", "cells")
+        return replace(self, **{name: getattr(self, name)[pixels] for name in each})
 
 
 class SceneFrames:

@@ -322,16 +322,16 @@ def _doubt(first: SceneDiagnosis, unit: Unit, *, found: str) -> str:
 
 def _kind_explains_scale(scenes: Sequence[SceneDiagnosis]) -> bool:
     """Tell whether the other kind of depth explains as much as a scale, and is not ruled out."""
-    first = scenes[0]
-    if first.best != first.declared or not first.is_scaled:
+    if scenes[0].best != scenes[0].declared:
         return False
     if any(map(is_ruled_out, gains_of(scenes, "kind").values())):
         return False
     return all(
-        abs(math.log(scene.other_kind_scale))
+        abs(math.log(rival.scale))
         <= allowed_log_scale(scene.depth_step) + limits.LEAST_ERRORS * min(scene.scale_error, 1.0)
         for scene in scenes
-        if scene.other_kind_scale > 0
+        for rival in scene.rivals
+        if rival.question == "kind"
     )
 
 
