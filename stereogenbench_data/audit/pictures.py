@@ -42,17 +42,16 @@ OPEN_VIDEOS: Final = 6
 
 
 class SceneReader:
-    """Reads pictures and maps of one pair and one frame at a time.
+    """Reads pictures and maps of one pair and one frame at a time; may be used by any thread.
 
-    Reads of the same fields take turns and share open videos; reads of other fields run in
-    parallel. Only the last frame of each open video is kept.
+    Reads of the same fields share open videos, of which the last frame is kept.
     """
 
     def __init__(self, index: SceneIndex) -> None:
         """Prepare to read the data of an index; nothing is opened yet."""
         self.index = index
-        self._lock = threading.Lock()
-        self._loaders: dict[Request, tuple[SampleDecoder, threading.Lock]] = {}
+        self._turn = threading.Lock()
+        self._decoders: dict[Request, SampleDecoder] = {}
 
     def pair(
         self, row: int, *, pair: tuple[int, int], frame: int, fields: tuple[str, ...]
@@ -79,11 +78,9 @@ class SceneReader:
 
     def close(self) -> None:
         """Close open videos; the reader can be used again."""
-        with self._lock:
-            loaders = list(self._loaders.values())
-        for loader, turn in loaders:
-            with turn:
-                loader.close()
+        with self._turn:
+            for decoder in self._decoders.values():
+                decoder.close()
 
     def _read(self, request: Request, address: Address) -> Sample:
         scene, frame = self.index.scene(address.row), address.frames[0]
@@ -92,12 +89,6 @@ class SceneReader:
                 f"{scene.id.key} has no frame {frame}: its {scene.frames} are 0 to "
                 f"{scene.frames - 1}. Choose one of them."
             )
-        with self._lock:
-            if request not in self._loaders:
-                loader = SampleDecoder(self.index, request)
-                loader.keep_open(OPEN_VIDEOS)
-                self._loaders[request] = loader, threading.Lock()
-            loader, turn = self._loaders[request]
         needs_depth = not request.streams.isdisjoint({"source_depth", "target_depth"})
         if needs_depth and any(
             scene.depth_encoding(camera, depth_of(scene)).unit_m is None
@@ -106,8 +97,11 @@ class SceneReader:
             raise MediaError(
                 scene.remark("depth") or f"{scene.id.key}: {NO_DEPTH_UNIT}. {DEPTH_CURES}"
             )
-        with turn:
-            return loader.load(address, clip="frame")
+        with self._turn:
+            if request not in self._decoders:
+                self._decoders[request] = SampleDecoder(self.index, request)
+                self._decoders[request].keep_open(OPEN_VIDEOS)
+            return self._decoders[request].load(address, clip="frame")
 
 
 SHEET_FIELDS: Final = (

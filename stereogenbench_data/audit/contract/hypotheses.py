@@ -109,12 +109,9 @@ class Hypothesis:
 
     def reads_alike(self, other: "Hypothesis", *, left: int, right: int) -> bool:
         """Tell whether both use the same depth and positions for the pictures of two files."""
-        return self.changed("order", other.order) == other and all(
-            mine == theirs
-            for mine, theirs in (
-                (self.is_mirrored, other.is_mirrored),
-                (self.depth_file(left), other.depth_file(left)),
-                (self.camera_of(left, content="rgb"), other.camera_of(left, content="rgb")),
-                (self.camera_of(right, content="rgb"), other.camera_of(right, content="rgb")),
-            )
+        mine, theirs = (
+            [each.is_mirrored, each.depth_file(left)]
+            + [each.camera_of(file, content="rgb") for file in (left, right)]
+            for each in (self, other)
         )
+        return mine == theirs and self.changed("order", other.order) == other

@@ -221,7 +221,6 @@ class Unit:
 
 def _common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
     """Return the unit that scenes agree on, weighted by how sure each is."""
-    fitted = [scene for scene in scenes if math.isfinite(scene.scale_error)]
     coarse = max(allowed_log_scale(scene.depth_step) for scene in scenes)
     seen_px = max(scene.disparity_px for scene in scenes)
     bias = (
@@ -229,10 +228,8 @@ def _common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
         if coarse > limits.LEAST_LOG_SCALE
         else max(limits.SCALE_BIAS, limits.BIAS_PX / seen_px)
     )
-    if not fitted:
-        return Unit(scenes[0].unit_m / scenes[0].scale, math.inf)
-    logs = [math.log(scene.unit_m / scene.scale) for scene in fitted]
-    log, error = weighted_mean(logs, [scene.scale_error for scene in fitted], least=1e-4)
+    logs = [math.log(scene.unit_m / scene.scale) for scene in scenes]
+    log, error = weighted_mean(logs, [scene.scale_error for scene in scenes], least=1e-4)
     return Unit(math.exp(log), math.hypot(NORMAL_975 * error, bias))
 
 

@@ -159,13 +159,12 @@ def audit(
 def _wanted(unusable: Mapping[str, str], filters: SceneFilters) -> dict[str, str]:
     """Return the scenes, among those that could not be indexed, whose paths pass the filters."""
     passes = may_pass(filters)
-
-    def is_wanted(key: str) -> bool:
+    wanted = {}
+    for key, reason in unusable.items():
         with suppress(SchemaError):
-            return passes is None or passes(parse_scene_key(key))
-        return False
-
-    return {key: reason for key, reason in unusable.items() if is_wanted(key)}
+            if passes is None or passes(parse_scene_key(key)):
+                wanted[key] = reason
+    return wanted
 
 
 def _chosen(
