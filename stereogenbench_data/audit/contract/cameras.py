@@ -78,149 +78,204 @@ class CameraPairStats:
     share: float
 
 
-def check_cameras(
-    views: SceneFrames,
-    matches: Sequence[FrameMatch],
-    contract: ScoredContract,
-    *,
-    depth_step: float,
-) -> CameraCheck:
-    """Return how well each camera fits, and what is wrong with it.
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraComparison:
+    """Compares each camera of a scene with the others.
 
-    Args:
+    Attributes:
         views: The scene.
         matches: Frame matches, by turns from either side.
         contract: A contract with its scale fitted.
         depth_step: The `relative_step` of stored depth.
     """
-    by_pair: dict[Pair, list[tuple[FrameMatch, FrameMatch]]] = {}
-    for here, there in zip(matches[::2], matches[1::2], strict=True):
-        by_pair.setdefault(here.pair, []).append((here, there))
-    found = (_beside(views, both, contract, depth_step) for both in by_pair.values())
-    pairs = [beside for beside in found if beside is not None]
-    if not pairs:
-        return CameraCheck()
-    nearest = {camera: _of(pairs, camera)[:_NARROWEST] for camera in range(CAMERA_COUNT)}
-    counts = {camera: sum(each.count for each in own) for camera, own in nearest.items()}
-    explained = {
-        camera: sum(each.count * each.near[camera] for each in own)
-        for camera, own in nearest.items()
-    }
-    tested = [camera for camera, count in counts.items() if count >= limits.FEWEST_OF_CAMERA]
-    return CameraCheck(
-        agreement=sum(explained[each] for each in tested) / sum(counts[each] for each in tested),
-        untested=tuple(camera for camera in counts if camera not in tested),
-        unexplained=tuple(
-            each for each in tested if explained[each] < limits.LEAST_SHARE * counts[each]
-        ),
-        problems=tuple(_problems(views, matches, contract, pairs, depth_step=depth_step)),
-    )
 
+    views: SceneFrames
+    matches: Sequence[FrameMatch]
+    contract: ScoredContract
+    depth_step: float
 
-def _problems(
-    views: SceneFrames,
-    matches: Sequence[FrameMatch],
-    contract: ScoredContract,
-    pairs: Sequence[CameraPairStats],
-    *,
-    depth_step: float,
-) -> list[str]:
-    """Return what is wrong with single cameras."""
-    # In other pairs matches are false, and what is compared has nothing in common.
-    clear = [beside for beside in pairs if beside.share >= limits.LEAST_SHARE]
-    problems = {
-        camera: f"depth of camera {camera} agrees with that of the others in {alike:.0%} of the "
-        f"matches, where theirs agree in {usual:.0%}"
-        for camera, alike, usual in _behind(
-            clear, lambda beside: beside.alike, least=limits.LEAST_UNLIKE
+    def check(self) -> CameraCheck:
+        """Return how well each camera fits, and what is wrong with it."""
+        by_pair: dict[Pair, list[tuple[FrameMatch, FrameMatch]]] = {}
+        for here, there in zip(self.matches[::2], self.matches[1::2], strict=True):
+            by_pair.setdefault(here.pair, []).append((here, there))
+        found = (self._beside(both) for both in by_pair.values())
+        pairs = [beside for beside in found if beside is not None]
+        if not pairs:
+            return CameraCheck()
+        nearest = {camera: _of(pairs, camera)[:_NARROWEST] for camera in range(CAMERA_COUNT)}
+        counts = {camera: sum(each.count for each in own) for camera, own in nearest.items()}
+        explained = {
+            camera: sum(each.count * each.near[camera] for each in own)
+            for camera, own in nearest.items()
+        }
+        tested = [camera for camera, count in counts.items() if count >= limits.FEWEST_OF_CAMERA]
+        return CameraCheck(
+            agreement=sum(explained[each] for each in tested)
+            / sum(counts[each] for each in tested),
+            untested=tuple(camera for camera in counts if camera not in tested),
+            unexplained=tuple(
+                each for each in tested if explained[each] < limits.LEAST_SHARE * counts[each]
+            ),
+            problems=tuple(self._problems(pairs)),
         )
-    }
-    most = max(limits.MOST_LOG_SCALE, depth_step / 4)
-    bounds = {beside.pair: max(most, 4 * beside.ratio_error) for beside in clear}
-    least = min(max(bounds.values(), default=most), 0.02)
-    # Disparity is inverse to depth: hence the sign.
-    ratios = {beside.pair: -beside.log_ratio for beside in clear}
-    logs, doubts = _levels(ratios, bounds, "scale of depth", least=least)
-    problems |= {
-        camera: f"depth of camera {camera} is {math.exp(log):.4g} x that of the others"
-        for camera, log in enumerate(logs)
-        if abs(log) > least
-    }
-    # The more matches are false, the more they move the middle.
-    bounds = {beside.pair: limits.MOST_SHIFT_PX / beside.share**2 for beside in clear}
-    rows = {beside.pair: beside.row_px for beside in clear}
-    across = {beside.pair: beside.across_px for beside in clear}
-    down_px, unsure = _levels(rows, bounds, "rows of pictures")
-    right_px, more = _levels(across, bounds, "places or columns of pictures")
-    behind = _behind(pairs, lambda beside: beside.share, least=limits.LEAST_DEFICIT)
-    shifted = np.abs([down_px, right_px]).max(axis=0) > limits.MOST_SHIFT_PX
-    odd_pictures = {*np.flatnonzero(shifted).tolist(), *(camera for camera, *_ in behind)}
-    if unsure or more:
-        odd_pictures = set()
-    in_both = [match for match in matches if match.pair in bounds]
-    for camera in set(range(CAMERA_COUNT)) - odd_pictures:
-        better = _better_depth(
-            views, in_both, contract, camera, scale=math.exp(logs[camera]), depth_step=depth_step
+
+    def _problems(self, pairs: Sequence[CameraPairStats]) -> list[str]:
+        """Return what is wrong with single cameras."""
+        # In other pairs matches are false, and what is compared has nothing in common.
+        clear = [beside for beside in pairs if beside.share >= limits.LEAST_SHARE]
+        problems = {
+            camera: f"depth of camera {camera} agrees with that of the others in {alike:.0%} of "
+            f"the matches, where theirs agree in {usual:.0%}"
+            for camera, alike, usual in _behind(
+                clear, lambda beside: beside.alike, least=limits.LEAST_UNLIKE
+            )
+        }
+        most = max(limits.MOST_LOG_SCALE, self.depth_step / 4)
+        bounds = {beside.pair: max(most, 4 * beside.ratio_error) for beside in clear}
+        least = min(max(bounds.values(), default=most), 0.02)
+        # Disparity is inverse to depth: hence the sign.
+        ratios = {beside.pair: -beside.log_ratio for beside in clear}
+        logs, doubts = _levels(ratios, bounds, "scale of depth", least=least)
+        problems |= {
+            camera: f"depth of camera {camera} is {math.exp(log):.4g} x that of the others"
+            for camera, log in enumerate(logs)
+            if abs(log) > least
+        }
+        # The more matches are false, the more they move the middle.
+        bounds = {beside.pair: limits.MOST_SHIFT_PX / beside.share**2 for beside in clear}
+        rows = {beside.pair: beside.row_px for beside in clear}
+        across = {beside.pair: beside.across_px for beside in clear}
+        down_px, unsure = _levels(rows, bounds, "rows of pictures")
+        right_px, more = _levels(across, bounds, "places or columns of pictures")
+        behind = _behind(pairs, lambda beside: beside.share, least=limits.LEAST_DEFICIT)
+        shifted = np.abs([down_px, right_px]).max(axis=0) > limits.MOST_SHIFT_PX
+        odd_pictures = {*np.flatnonzero(shifted).tolist(), *(camera for camera, *_ in behind)}
+        if unsure or more:
+            odd_pictures = set()
+        in_both = [match for match in self.matches if match.pair in bounds]
+        for camera in set(range(CAMERA_COUNT)) - odd_pictures:
+            better = self._better_depth(camera, in_both, scale=math.exp(logs[camera]))
+            problems |= {camera: better} if better else {}
+        for camera in odd_pictures:
+            late = self._late_by(camera, pairs)
+            when = f"{counted(abs(late), 'frame')} {'late' if late > 0 else 'early'}"
+            problems[camera] = (
+                f"pictures of camera {camera} are {when}, or its recorded place is wrong"
+                if late
+                else _picture_problem(camera, down_px[camera], right_px[camera])
+            )
+        return [*(problems[camera] for camera in sorted(problems)), *doubts, *unsure, *more]
+
+    def _beside(self, both: Sequence[tuple[FrameMatch, FrameMatch]]) -> CameraPairStats | None:
+        """Return what a pair's matches of all frames show, from either side; None if too few."""
+        parts = []
+        hypothesis, scale = self.contract.hypothesis, self.contract.scale
+        for here, there in both:
+            mine, theirs = (self.views.predicted(match, hypothesis) for match in (here, there))
+            if mine is None or theirs is None:
+                continue
+            known = mine[1] & theirs[1]
+            predicted = scale * mine[0], -scale * theirs[0]
+            parts.append([
+                part[known] for part in (*predicted, here.matched_px, *_row_terms(self.views, here))
+            ])  # fmt: skip
+        if not parts or sum(len(part[0]) for part in parts) < limits.FEWEST_OF_CAMERA:
+            return None
+        left_px, right_px, found, upward, steep = map(np.concatenate, zip(*parts, strict=True))
+        first = both[0][0]
+        near = np.abs(left_px - found) < first.grain_px, np.abs(right_px - found) < first.grain_px
+        usable = left_px * right_px > 0
+        log_ratio, ratio_error = _median(np.log(left_px[usable] / right_px[usable]))
+        moved = [_moved(found, predicted, first.grain_px) for predicted in (left_px, right_px)]
+        either = moved[0][1] | moved[1][1]
+        allowed_px = self._allowed_px(first, right_px)
+        return CameraPairStats(
+            pair=first.pair,
+            width_m=abs(self.views.baseline_m(first, hypothesis)),
+            count=len(found),
+            near={pair: float(side.mean()) for pair, side in zip(first.pair, near, strict=True)},
+            alike=float(
+                (np.abs(left_px - right_px) < allowed_px)[either].sum() / max(either.sum(), 1)
+            ),
+            log_ratio=log_ratio,
+            ratio_error=ratio_error,
+            row_px=float(upward[either].sum() / max(steep[either].sum(), 1e-6)),
+            across_px=min((away_px for away_px, _ in moved), key=abs),
+            share=max(float(explained.mean()) for _, explained in moved),
         )
-        problems |= {camera: better} if better else {}
-    for camera in odd_pictures:
-        late = _late_by(views, matches, contract, pairs, camera)
-        when = f"{counted(abs(late), 'frame')} {'late' if late > 0 else 'early'}"
-        problems[camera] = (
-            f"pictures of camera {camera} are {when}, or its recorded place is wrong"
-            if late
-            else _picture_problem(camera, down_px[camera], right_px[camera])
-        )
-    return [*(problems[camera] for camera in sorted(problems)), *doubts, *unsure, *more]
 
+    def _allowed_px(self, match: FrameMatch, disparity_px: Points) -> Points:
+        """Return how far apart the disparities of two depths of a point may be."""
+        least_px = limits.MOST_APART_PX * match.grain_px
+        allowed_px: Points = least_px + 2 * self.depth_step * np.abs(disparity_px)
+        return allowed_px
 
-def _beside(
-    views: SceneFrames,
-    both: Sequence[tuple[FrameMatch, FrameMatch]],
-    contract: ScoredContract,
-    depth_step: float,
-) -> CameraPairStats | None:
-    """Return what a pair's matches of all frames show, seen from either side; None if too few."""
-    parts = []
-    hypothesis, scale = contract.hypothesis, contract.scale
-    for here, there in both:
-        mine, theirs = (views.predicted(match, hypothesis) for match in (here, there))
-        if mine is None or theirs is None:
-            continue
-        known = mine[1] & theirs[1]
-        predicted = scale * mine[0], -scale * theirs[0]
-        parts.append([
-            part[known] for part in (*predicted, here.matched_px, *_row_terms(views, here))
-        ])  # fmt: skip
-    if not parts or sum(len(part[0]) for part in parts) < limits.FEWEST_OF_CAMERA:
-        return None
-    left_px, right_px, found, upward, steep = map(np.concatenate, zip(*parts, strict=True))
-    first = both[0][0]
-    near = np.abs(left_px - found) < first.grain_px, np.abs(right_px - found) < first.grain_px
-    usable = left_px * right_px > 0
-    log_ratio, ratio_error = _median(np.log(left_px[usable] / right_px[usable]))
-    moved = [_moved(found, predicted, first.grain_px) for predicted in (left_px, right_px)]
-    either = moved[0][1] | moved[1][1]
-    allowed_px = _allowed_px(first, right_px, depth_step)
-    return CameraPairStats(
-        pair=first.pair,
-        width_m=abs(views.baseline_m(first, hypothesis)),
-        count=len(found),
-        near={pair: float(side.mean()) for pair, side in zip(first.pair, near, strict=True)},
-        alike=float((np.abs(left_px - right_px) < allowed_px)[either].sum() / max(either.sum(), 1)),
-        log_ratio=log_ratio,
-        ratio_error=ratio_error,
-        row_px=float(upward[either].sum() / max(steep[either].sum(), 1e-6)),
-        across_px=min((away_px for away_px, _ in moved), key=abs),
-        share=max(float(explained.mean()) for _, explained in moved),
-    )
+    def _late_by(self, camera: int, pairs: Sequence[CameraPairStats]) -> int:
+        """Return by how many frames a camera's pictures are late, 0 if no lag explains them."""
+        (other,) = set(_of(pairs, camera)[0].pair) - {camera}
+        counts = {lag: np.zeros(2) for lag in LAGS}
+        for frame, lag in itertools.product(
+            dict.fromkeys(match.frame for match in self.matches), LAGS
+        ):
+            match = self.views.matched_later(frame, other, camera, lag=lag)
+            predicted = (
+                None if match is None else self.views.predicted(match, self.contract.hypothesis)
+            )
+            if match is not None and predicted is not None:
+                away_px = self.contract.scale * predicted[0] - match.matched_px
+                near = np.abs(away_px[predicted[1]]) < match.grain_px
+                counts[lag] += near.sum(), near.size
+        first, second = sorted(LAGS, key=lambda lag: -counts[lag][0])[:2]
+        explained, found = counts[first]
+        usual = max((each.share for each in pairs if camera not in each.pair), default=1.0)
+        is_ahead = explained > limits.LEAST_LEAD * counts[second][0]
+        return first if is_ahead and explained > (usual - limits.LEAST_DEFICIT) * found else 0
 
+    def _better_depth(self, camera: int, matches: Sequence[FrameMatch], *, scale: float) -> str:
+        """Return in words a lag, flip or other file that explains a camera's depth clearly better.
 
-def _allowed_px(match: FrameMatch, disparity_px: Points, depth_step: float) -> Points:
-    """Return how far apart the disparities of two depths of a point may be."""
-    least_px = limits.MOST_APART_PX * match.grain_px
-    allowed_px: Points = least_px + 2 * depth_step * np.abs(disparity_px)
-    return allowed_px
+        The depth as it is counts with the scale that was found for it. A reading explains the
+        points at which it agrees with the other camera's depth: depth agrees more sharply with
+        depth than with matches, some of which are wrong.
+        """
+        hypothesis = self.contract.hypothesis
+        both = zip(matches[::2], matches[1::2], strict=True)
+        sides = [pair if pair[0].left == camera else pair[::-1] for pair in both
+                 if camera in pair[0].pair]  # fmt: skip
+
+        def shares(
+            read: Hypothesis, *, file: int | None = None, factor: float = 1.0
+        ) -> Float64[np.ndarray, " matches"]:
+            found = np.full(len(sides), np.nan)
+            for place, (here, there) in enumerate(sides):
+                mine = self.views.predicted(here, read, depth_file=file)
+                theirs = self.views.predicted(there, hypothesis)
+                if mine is not None and theirs is not None and (known := mine[1] & theirs[1]).any():
+                    expected_px = -self.contract.scale * theirs[0][known]
+                    away_px = self.contract.scale * factor * mine[0][known] - expected_px
+                    allowed_px = self._allowed_px(here, expected_px)
+                    found[place] = float((np.abs(away_px) < allowed_px).mean())
+            return found
+
+        now, best, most = shares(hypothesis, factor=scale), "", 0.0
+        readings = [
+            (f"fits better {fits.format(getattr(other, question))}", shares(other))
+            for question, fits in _READINGS.items()
+            for other in hypothesis.alternatives(question)
+        ] + [
+            (
+                f"fits worse than that of file {file} does in its place",
+                shares(hypothesis, file=file),
+            )
+            for file in range(CAMERA_COUNT)
+            if file != hypothesis.depth_file(camera)
+        ]
+        for words, explained in readings:  # the simplest first
+            gain, is_clear = _gain(explained, now)
+            if is_clear and gain > most + limits.LEAST_GAIN * bool(best):
+                best, most = f"depth of camera {camera} {words}", gain
+        return best
 
 
 def _moved(found: Points, predicted: Points, grain_px: int) -> tuple[float, Bool[np.ndarray, " n"]]:
@@ -287,81 +342,6 @@ def _picture_problem(camera: int, down_px: float, right_px: float) -> str:
         f"pictures of camera {camera} do not fit those of the others, by the depth of "
         f"either: {shift}, another moment or another place, or its recorded place is wrong"
     )
-
-
-def _late_by(
-    views: SceneFrames,
-    matches: Sequence[FrameMatch],
-    contract: ScoredContract,
-    pairs: Sequence[CameraPairStats],
-    camera: int,
-) -> int:
-    """Return by how many frames a camera's pictures are late, 0 if no lag explains them."""
-    (other,) = set(_of(pairs, camera)[0].pair) - {camera}
-    counts = {lag: np.zeros(2) for lag in LAGS}
-    for frame, lag in itertools.product(dict.fromkeys(match.frame for match in matches), LAGS):
-        match = views.matched_later(frame, other, camera, lag=lag)
-        predicted = None if match is None else views.predicted(match, contract.hypothesis)
-        if match is not None and predicted is not None:
-            away_px = contract.scale * predicted[0] - match.matched_px
-            near = np.abs(away_px[predicted[1]]) < match.grain_px
-            counts[lag] += near.sum(), near.size
-    first, second = sorted(LAGS, key=lambda lag: -counts[lag][0])[:2]
-    explained, found = counts[first]
-    usual = max((each.share for each in pairs if camera not in each.pair), default=1.0)
-    is_ahead = explained > limits.LEAST_LEAD * counts[second][0]
-    return first if is_ahead and explained > (usual - limits.LEAST_DEFICIT) * found else 0
-
-
-def _better_depth(
-    views: SceneFrames,
-    matches: Sequence[FrameMatch],
-    contract: ScoredContract,
-    camera: int,
-    *,
-    scale: float,
-    depth_step: float,
-) -> str:
-    """Return, in words, a lag, flip or other file that explains a camera's depth clearly better.
-
-    The depth as it is counts with the scale that was found for it. A reading explains the points
-    at which it agrees with the other camera's depth: depth agrees more sharply with depth than
-    with matches, some of which are wrong.
-    """
-    hypothesis = contract.hypothesis
-    both = zip(matches[::2], matches[1::2], strict=True)
-    sides = [pair if pair[0].left == camera else pair[::-1] for pair in both
-             if camera in pair[0].pair]  # fmt: skip
-
-    def shares(
-        read: Hypothesis, *, file: int | None = None, factor: float = 1.0
-    ) -> Float64[np.ndarray, " matches"]:
-        found = np.full(len(sides), np.nan)
-        for place, (here, there) in enumerate(sides):
-            mine = views.predicted(here, read, depth_file=file)
-            theirs = views.predicted(there, hypothesis)
-            if mine is not None and theirs is not None and (known := mine[1] & theirs[1]).any():
-                expected_px = -contract.scale * theirs[0][known]
-                away_px = contract.scale * factor * mine[0][known] - expected_px
-                allowed_px = _allowed_px(here, expected_px, depth_step)
-                found[place] = float((np.abs(away_px) < allowed_px).mean())
-        return found
-
-    now, best, most = shares(hypothesis, factor=scale), "", 0.0
-    readings = [
-        (f"fits better {fits.format(getattr(other, question))}", shares(other))
-        for question, fits in _READINGS.items()
-        for other in hypothesis.alternatives(question)
-    ] + [
-        (f"fits worse than that of file {file} does in its place", shares(hypothesis, file=file))
-        for file in range(CAMERA_COUNT)
-        if file != hypothesis.depth_file(camera)
-    ]
-    for words, explained in readings:  # the simplest first
-        gain, is_clear = _gain(explained, now)
-        if is_clear and gain > most + limits.LEAST_GAIN * bool(best):
-            best, most = f"depth of camera {camera} {words}", gain
-    return best
 
 
 _READINGS: Final[dict[Question, str]] = {

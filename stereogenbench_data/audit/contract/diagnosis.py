@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from stereogenbench_data.audit.contract import limits
-from stereogenbench_data.audit.contract.cameras import CameraCheck, check_cameras
+from stereogenbench_data.audit.contract.cameras import CameraCheck, CameraComparison
 from stereogenbench_data.audit.contract.hypotheses import QUESTIONS, Hypothesis, Question
 from stereogenbench_data.audit.contract.row_matches import (
     FrameMatch,
@@ -203,7 +203,7 @@ class ContractSearch:
             frames = len({match.frame for match in matches})
             matches = self._views.frame_matches(frames=frames, hypothesis=hypothesis)
         fitted = self.fitted(hypothesis)
-        return check_cameras(self._views, matches, fitted, depth_step=depth_step)
+        return CameraComparison(self._views, matches, fitted, depth_step).check()
 
     def rivals(self, best: ScoredContract) -> tuple[Rival, ...]:
         """Return the other answers to every question, each with its own scale."""
