@@ -27,11 +27,7 @@ from stereogenbench_data.audit.contract.scoring import (
     Gain,
     RayPower,
     ScoredContract,
-    fit_scale,
-    gain_of,
-    most_explained,
-    ray_power,
-    score_hypothesis,
+    Scorer,
 )
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_COUNT, DEFAULT_DEPTH_UNIT_M
@@ -132,7 +128,8 @@ class ContractSearch:
         # The pairs next but one serve the comparison of cameras.
         self._matches = [match for match in matches if match.pair in near] or list(matches)
         self._bias = limits.BIAS_PX / max(disparity_px(matches), 1e-6)
-        self.fitted = cache(partial(fit_scale, views, self._matches))
+        self._scorer = Scorer(views, self._matches)
+        self.fitted = cache(self._scorer.fitted)
         self._promising = cache(self._find_promising)
         self._power = cache(self._find_power)
         self._moved_px = cache(self._find_moved_px)
@@ -159,7 +156,8 @@ class ContractSearch:
         """Return the orders that explain most matches, at any scale."""
         orders = current.alternatives("order")
         few = [match for match in self._matches if match.frame == self._matches[0].frame]
-        shares = {order: most_explained(self._views, few, order) for order in orders}
+        scorer = Scorer(self._views, few)
+        shares = {order: scorer.most_explained(order) for order in orders}
         return tuple(sorted(orders, key=lambda order: -shares[order])[:_PROMISING])
 
     def _pruned(self, current: ScoredContract) -> ScoredContract:
@@ -176,7 +174,7 @@ class ContractSearch:
         fitted = self.fitted(hypothesis)
         if hypothesis.form != self.declared.form:
             return fitted
-        declared = score_hypothesis(self._views, self._matches, hypothesis)
+        declared = self._scorer.score(hypothesis)
         least = max(self._least_log_scale, self._bias) + limits.LEAST_ERRORS * min(
             fitted.scale_error, 1e3
         )
@@ -184,13 +182,12 @@ class ContractSearch:
             Gain.is_clear, least_db=limits.LEAST_SCALE_DB, errors=limits.SCALE_ERRORS
         )
         if abs(math.log(fitted.scale)) <= least or not is_clear(
-            gain_of(self._matches, fitted, declared)
+            self._scorer.gain(fitted, declared)
         ):
             return declared
         # A camera elsewhere than recorded gives its own pairs another scale, and no others.
         opposite = (
-            gain_of(self._matches, declared, fitted, left_out=camera)
-            for camera in range(CAMERA_COUNT)
+            self._scorer.gain(declared, fitted, left_out=camera) for camera in range(CAMERA_COUNT)
         )
         return declared if any(map(is_clear, opposite)) else fitted
 
@@ -213,9 +210,7 @@ class ContractSearch:
             for hypothesis in best.hypothesis.alternatives(question):
                 if question == "order" and hypothesis not in likely:
                     # An exchange of two cameras leaves the others, and so the scale, as they are.
-                    other = score_hypothesis(
-                        self._views, self._matches, hypothesis, scale=best.scale
-                    )
+                    other = self._scorer.score(hypothesis, scale=best.scale)
                 else:
                     other = self.fitted(hypothesis)
                 answer, lead = getattr(hypothesis, question), self.gain(best, other)
@@ -237,16 +232,15 @@ class ContractSearch:
             replace(views.encoding, unit_m=DEFAULT_DEPTH_UNIT_M, offset_m=0.0, form="depth")
         )
         hypothesis = replace(self.declared, form="depth")
-        other = score_hypothesis(default, self._matches, hypothesis)
-        scaled = fit_scale(default, self._matches, hypothesis)
+        scorer = Scorer(default, self._matches)
+        other, scaled = scorer.score(hypothesis), scorer.fitted(hypothesis)
         least = self._least_log_scale + limits.LEAST_ERRORS * min(scaled.scale_error, 1.0)
-        declared = score_hypothesis(views, self._matches, self.declared)
-        return gain_of(self._matches, declared, other), abs(math.log(scaled.scale)) <= least
+        declared = self._scorer.score(self.declared)
+        return self._scorer.gain(declared, other), abs(math.log(scaled.scale)) <= least
 
     def without_parallax(self, best: ScoredContract) -> Gain:
         """Return by how much a contract is better than infinite depth everywhere."""
-        flat = score_hypothesis(self._views, self._matches, best.hypothesis, scale=1e-12)
-        return gain_of(self._matches, best, flat)
+        return self._scorer.gain(best, self._scorer.score(best.hypothesis, scale=1e-12))
 
     def gain(self, better: ScoredContract, worse: ScoredContract) -> Gain:
         """Return by how much one contract is better than another.
@@ -257,7 +251,7 @@ class ContractSearch:
             moved_px = self._moved_px(better.hypothesis, worse.hypothesis.frame_lag)
             if better.scale * moved_px < limits.BIAS_PX:
                 return NOTHING
-        found = gain_of(self._matches, better, worse)
+        found = self._scorer.gain(better, worse)
         kind = better.hypothesis.kind
         only_kind = better.hypothesis.changes_from(worse.hypothesis) == ("kind",)
         # Coarse depth has a shape of its own.
@@ -280,7 +274,7 @@ class ContractSearch:
 
     def _find_power(self, planar: Hypothesis) -> RayPower:
         """Return the power of the ray's length for a hypothesis of any kind and scale."""
-        return ray_power(self._views, self._matches, self.fitted(planar))
+        return self._scorer.ray_power(self.fitted(planar))
 
 
 def _checked(

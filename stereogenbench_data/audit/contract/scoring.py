@@ -1,7 +1,7 @@
 """How well a contract explains pictures, in dB, how certain a difference is, and the best scale.
 
-A contract's score are the squared differences of the pictures after the warp. `gain_of` compares
-scores in one scene; `pooled` takes several scenes together.
+A contract's score are the squared differences of the pictures after the warp. `Scorer.gain`
+compares scores in one scene; `pooled` takes several scenes together.
 
 The ratios of found to predicted disparities vote for a scale, which needs no starting value. Robust
 Gauss-Newton steps on the difference of the pictures then refine it (Lucas and Kanade, 1981, with
@@ -9,8 +9,8 @@ disparity as a multiple of the predicted one).
 
 Planar and ray depth differ by a few per cent towards the corners, and by less with a long lens.
 Their scores in dB hardly differ then, and a slightly different unit explains most of the rest. So
-`ray_power` fits, beside the scale, the power of the ray's length with which disparity grows: 0 is
-depth along the optical axis, 1 along the ray.
+`Scorer.ray_power` fits, beside the scale, the power of the ray's length with which disparity grows:
+0 is depth along the optical axis, 1 along the ray.
 """
 
 import math
@@ -178,100 +178,6 @@ def sample_along_rows(
     return value, linear + t * (2 * square + 3 * t * cube), inside
 
 
-def score_hypothesis(
-    views: SceneFrames,
-    matches: Sequence[FrameMatch],
-    hypothesis: Hypothesis,
-    *,
-    scale: float = 1.0,
-) -> ScoredContract:
-    """Return a contract's score on the frame matches of a scene.
-
-    A pixel counts with its capped squared difference, or with the cap if it leaves the picture.
-    """
-    errors = []
-    for match in matches:
-        predicted = views.predicted(match, hypothesis)
-        squares = np.full(len(match.rows), np.nan, dtype=np.float32)
-        if predicted is not None:
-            disparity_px, known = predicted
-            there, _, inside = sample_along_rows(
-                views.band(match.frame, match.right),
-                match.rows,
-                match.columns - scale * disparity_px,
-            )
-            square = (there - match.brightness) ** 2
-            capped = np.where(inside, np.minimum(square, match.cap), match.cap)
-            squares[known] = capped[known]
-        errors.append(squares)
-    return ScoredContract(hypothesis, scale, math.inf, errors)
-
-
-def gain_of(
-    matches: Sequence[FrameMatch],
-    better: ScoredContract,
-    worse: ScoredContract,
-    *,
-    left_out: int | None = None,
-) -> Gain:
-    """Return by how many dB one contract explains a scene better than another.
-
-    Only pixels for which both predict something are compared, in the views that they do not read
-    alike (an exchange of two cameras leaves the others as they are). Contracts that read the same
-    depth (another unit, ray) differ a little at many pixels: there a pixel counts at most
-    a small part of the cap, so that wrong matches do not outweigh it. Others (lag, order, flips)
-    differ much at some pixels, which count in full.
-
-    The pairs of a camera that is ``left_out`` do not count.
-
-    There are two estimates of the error: one from the differences between views (a pair in a
-    frame), which is large if some cameras are wrong; and a jackknife over parts of the picture,
-    each left out of all views at once, which is large if only some parts matter (such as moving
-    ones).
-    """
-    same_places = better.hypothesis.changed("kind", worse.hypothesis.kind) == worse.hypothesis
-    share = limits.FINE_CAP if same_places else 1.0
-    sums = np.zeros((2, 0, SIDE_CELLS**2))
-    orders_differ = better.hypothesis.order != worse.hypothesis.order
-    for match, low, high in zip(matches, better.errors, worse.errors, strict=True):
-        if left_out in match.pair:
-            continue
-        if orders_differ and better.hypothesis.reads_alike(
-            worse.hypothesis, left=match.left, right=match.right
-        ):
-            continue
-        both = np.isfinite(low) & np.isfinite(high)
-        if both.sum() >= limits.FEWEST_POINTS:
-            cells = [
-                np.bincount(
-                    match.cells[both],
-                    weights=np.minimum(part[both], share * match.cap),
-                    minlength=SIDE_CELLS**2,
-                )
-                for part in (low, high)
-            ]
-            sums = np.concatenate([sums, np.array(cells)[:, None]], axis=1)
-    if sums.shape[1] == 0:
-        return NOTHING
-    ours, theirs = sums.sum(axis=-1, keepdims=True)
-    used = sums.sum(axis=(0, 1)) > 0
-    parts, views = int(used.sum()), sums.shape[1]
-    errors_db = []
-    if parts >= _FEWEST_PARTS:
-        without = _mean_db(ours - sums[0][:, used], theirs - sums[1][:, used])
-        errors_db.append(math.sqrt((parts - 1) * float(without.var())))
-    if views >= _FEWEST_PARTS:
-        each = _mean_db(ours[None, :, 0], theirs[None, :, 0])
-        few = 1 + _FEW_VIEWS / (views - 2)
-        errors_db.append(few * float(each.std(ddof=1)) / math.sqrt(views))
-    return Gain(
-        float(_mean_db(ours, theirs)[0]),
-        min(errors_db, default=math.inf),
-        least_db=limits.LEAST_DB if same_places else limits.LEAST_DB_ELSEWHERE,
-        wide_db=max(errors_db, default=math.inf),
-    )
-
-
 def _mean_db(ours: np.ndarray, theirs: np.ndarray) -> Float64[np.ndarray, " k"]:
     """Return the mean over frame matches (the first axis) of the ratio of two sums, in dB."""
     ratios = np.maximum(theirs, _SMALLEST) / np.maximum(ours, _SMALLEST)
@@ -306,45 +212,6 @@ class _Term:
     large_px: float
 
 
-def fit_scale(
-    views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis
-) -> ScoredContract:
-    """Return a hypothesis with the scale that explains the pictures best."""
-    terms, log_scale, error = _fit_terms(views, matches, hypothesis), 0.0, math.inf
-    if terms:
-        (log_scale,), (error,) = _refined(views, terms, [math.log(_voted_scale(*_joined(terms)))])
-    scored = score_hypothesis(views, matches, hypothesis, scale=math.exp(log_scale))
-    return replace(scored, scale_error=error, is_scaled=True)
-
-
-def _fit_terms(
-    views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis
-) -> list[_Term]:
-    """Return the frame matches for which a hypothesis predicts anything, with its predictions."""
-    terms = []
-    for match in matches:
-        predicted = views.predicted(match, hypothesis)
-        if predicted is not None and predicted[1].any():
-            known = match.at(predicted[1])
-            predicted_px = predicted[0][predicted[1]]
-            log_ray = np.log(views.ray_per_planar[known.rows, known.columns])
-            basis = np.stack([np.ones_like(log_ray), log_ray])
-            large_px = float(np.percentile(np.abs(predicted_px), 90))
-            terms.append(_Term(known, predicted_px, basis, large_px))
-    return terms
-
-
-def most_explained(
-    views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis
-) -> float:
-    """Return how many matches a hypothesis explains, at the scale on which most of them agree."""
-    terms = _fit_terms(views, matches, hypothesis)
-    if not terms:
-        return 0.0
-    found, predicted = _joined(terms)
-    return _agreement(found, _voted_scale(found, predicted) * predicted)
-
-
 def _joined(terms: Iterable[_Term]) -> tuple[Points, Points]:
     """Return the disparities found and predicted."""
     found, predicted = zip(
@@ -372,59 +239,6 @@ def _voted_scale(found: Points, predicted: Points) -> float:
     best = smooth.argsort()[-12:]
     scales = [1.0, *np.exp((edges[best] + edges[best + 1]) / 2), math.exp(np.median(ratios))]
     return float(max(scales, key=lambda scale: _agreement(found, scale * predicted)))
-
-
-def _refined(
-    views: SceneFrames, terms: Sequence[_Term], start: Sequence[float]
-) -> tuple[list[float], list[float]]:
-    """Return log(scale), and the ray's power if it has a start too, after Gauss-Newton steps.
-
-    Their standard errors come with them.
-    """
-    values = np.array(start)
-    count = len(values)
-    for _ in range(_STEPS):
-        normals, rights = np.zeros((len(terms), count, count)), np.zeros((len(terms), count))
-        for number, term in enumerate(terms):
-            grown_px = term.predicted_px * np.exp(values @ term.basis[:count])
-            difference, slope, weight = _compared(views, term, grown_px)
-            if weight is not None:
-                columns = slope * grown_px * term.basis[:count]
-                normals[number] = (columns * weight) @ columns.T
-                rights[number] = (columns * weight) @ difference
-        step, errors = _solved(normals, rights)
-        large_px = np.exp(values[0]) * np.array([term.large_px for term in terms])
-        longest = np.array([term.basis[:count].max(axis=1) for term in terms])
-        moved_px = float(np.abs(large_px * (longest @ step)).max())
-        part = 1.0 if count > 1 else min(1.0, _LARGEST_STEP_PX / max(moved_px, 1e-12))
-        values += np.clip(part * step, -_LARGEST_STEPS[count], _LARGEST_STEPS[count])
-        if moved_px < 5e-3:
-            break
-    return values.tolist(), errors.tolist()
-
-
-def _compared(
-    views: SceneFrames, term: _Term, disparity_px: Points
-) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], Float64[np.ndarray, " n"] | None]:
-    """Return right less left at a disparity, the mean slope of both, and each pixel's weight.
-
-    The weight is robust, and 0 for pixels that leave the picture or whose match is elsewhere. It
-    is None if too few pixels are left.
-    """
-    match = term.match
-    there, slope, inside = sample_along_rows(
-        views.band(match.frame, match.right), match.rows, match.columns - disparity_px
-    )
-    difference = there - match.brightness
-    slope = (slope + match.slope) / 2
-    usable = inside & (np.abs(disparity_px - match.matched_px) < _NEAR_PX)
-    if usable.sum() < _FEWEST_USABLE:
-        return difference, slope, None
-    spread = 1.4826 * float(np.median(np.abs(difference[usable]))) + 1e-3
-    weight: Float64[np.ndarray, " n"] = (
-        usable / (1 + (difference.astype(np.float64) / (2 * spread)) ** 2) ** 2 / spread**2
-    )
-    return difference, slope, weight
 
 
 def _solved(
@@ -462,12 +276,179 @@ class RayPower:
         return kind if abs(away) <= 2 * limits.RAY_BIAS + limits.LEAST_ERRORS * self.error else None
 
 
-def ray_power(
-    views: SceneFrames, matches: Sequence[FrameMatch], contract: ScoredContract
-) -> RayPower:
-    """Return the power that fits the pictures best, together with the scale."""
-    terms = _fit_terms(views, matches, contract.hypothesis)
-    if not terms:
-        return RayPower(0.0, math.inf)
-    (_, bend), (_, error) = _refined(views, terms, [math.log(contract.scale), 0.0])
-    return RayPower(bend + (contract.hypothesis.kind == "ray"), error)
+@dataclass(frozen=True, slots=True, eq=False)
+class Scorer:
+    """Scores hypotheses on the frame matches of a scene."""
+
+    views: SceneFrames
+    matches: Sequence[FrameMatch]
+
+    def score(self, hypothesis: Hypothesis, *, scale: float = 1.0) -> ScoredContract:
+        """Return a contract's score on the frame matches of a scene.
+
+        A pixel counts with its capped squared difference, or with the cap if it leaves the picture.
+        """
+        errors = []
+        for match in self.matches:
+            predicted = self.views.predicted(match, hypothesis)
+            squares = np.full(len(match.rows), np.nan, dtype=np.float32)
+            if predicted is not None:
+                disparity_px, known = predicted
+                there, _, inside = sample_along_rows(
+                    self.views.band(match.frame, match.right),
+                    match.rows,
+                    match.columns - scale * disparity_px,
+                )
+                square = (there - match.brightness) ** 2
+                capped = np.where(inside, np.minimum(square, match.cap), match.cap)
+                squares[known] = capped[known]
+            errors.append(squares)
+        return ScoredContract(hypothesis, scale, math.inf, errors)
+
+    def gain(
+        self, better: ScoredContract, worse: ScoredContract, *, left_out: int | None = None
+    ) -> Gain:
+        """Return by how many dB one contract explains a scene better than another.
+
+        Only pixels for which both predict something are compared, in the views that they do not
+        read alike (an exchange of two cameras leaves the others as they are). Contracts that read
+        the same depth (another unit, ray) differ a little at many pixels: there a pixel counts at
+        most a small part of the cap, so that wrong matches do not outweigh it. Others (lag, order,
+        flips) differ much at some pixels, which count in full.
+
+        The pairs of a camera that is ``left_out`` do not count.
+
+        There are two estimates of the error: one from the differences between views (a pair in a
+        frame), which is large if some cameras are wrong; and a jackknife over parts of the picture,
+        each left out of all views at once, which is large if only some parts matter (such as moving
+        ones).
+        """
+        same_places = better.hypothesis.changed("kind", worse.hypothesis.kind) == worse.hypothesis
+        share = limits.FINE_CAP if same_places else 1.0
+        sums = np.zeros((2, 0, SIDE_CELLS**2))
+        orders_differ = better.hypothesis.order != worse.hypothesis.order
+        for match, low, high in zip(self.matches, better.errors, worse.errors, strict=True):
+            if left_out in match.pair:
+                continue
+            if orders_differ and better.hypothesis.reads_alike(
+                worse.hypothesis, left=match.left, right=match.right
+            ):
+                continue
+            both = np.isfinite(low) & np.isfinite(high)
+            if both.sum() >= limits.FEWEST_POINTS:
+                cells = [
+                    np.bincount(
+                        match.cells[both],
+                        weights=np.minimum(part[both], share * match.cap),
+                        minlength=SIDE_CELLS**2,
+                    )
+                    for part in (low, high)
+                ]
+                sums = np.concatenate([sums, np.array(cells)[:, None]], axis=1)
+        if sums.shape[1] == 0:
+            return NOTHING
+        ours, theirs = sums.sum(axis=-1, keepdims=True)
+        used = sums.sum(axis=(0, 1)) > 0
+        parts, views = int(used.sum()), sums.shape[1]
+        errors_db = []
+        if parts >= _FEWEST_PARTS:
+            without = _mean_db(ours - sums[0][:, used], theirs - sums[1][:, used])
+            errors_db.append(math.sqrt((parts - 1) * float(without.var())))
+        if views >= _FEWEST_PARTS:
+            each = _mean_db(ours[None, :, 0], theirs[None, :, 0])
+            few = 1 + _FEW_VIEWS / (views - 2)
+            errors_db.append(few * float(each.std(ddof=1)) / math.sqrt(views))
+        return Gain(
+            float(_mean_db(ours, theirs)[0]),
+            min(errors_db, default=math.inf),
+            least_db=limits.LEAST_DB if same_places else limits.LEAST_DB_ELSEWHERE,
+            wide_db=max(errors_db, default=math.inf),
+        )
+
+    def fitted(self, hypothesis: Hypothesis) -> ScoredContract:
+        """Return a hypothesis with the scale that explains the pictures best."""
+        terms, log_scale, error = self._terms(hypothesis), 0.0, math.inf
+        if terms:
+            (log_scale,), (error,) = self._refined(terms, [math.log(_voted_scale(*_joined(terms)))])
+        scored = self.score(hypothesis, scale=math.exp(log_scale))
+        return replace(scored, scale_error=error, is_scaled=True)
+
+    def most_explained(self, hypothesis: Hypothesis) -> float:
+        """Return how many matches a hypothesis explains, at the scale on which most agree."""
+        terms = self._terms(hypothesis)
+        if not terms:
+            return 0.0
+        found, predicted = _joined(terms)
+        return _agreement(found, _voted_scale(found, predicted) * predicted)
+
+    def ray_power(self, contract: ScoredContract) -> RayPower:
+        """Return the power that fits the pictures best, together with the scale."""
+        terms = self._terms(contract.hypothesis)
+        if not terms:
+            return RayPower(0.0, math.inf)
+        (_, bend), (_, error) = self._refined(terms, [math.log(contract.scale), 0.0])
+        return RayPower(bend + (contract.hypothesis.kind == "ray"), error)
+
+    def _terms(self, hypothesis: Hypothesis) -> list[_Term]:
+        """Return the frame matches for which a hypothesis predicts anything, with what it is."""
+        terms = []
+        for match in self.matches:
+            predicted = self.views.predicted(match, hypothesis)
+            if predicted is not None and predicted[1].any():
+                known = match.at(predicted[1])
+                predicted_px = predicted[0][predicted[1]]
+                log_ray = np.log(self.views.ray_per_planar[known.rows, known.columns])
+                basis = np.stack([np.ones_like(log_ray), log_ray])
+                large_px = float(np.percentile(np.abs(predicted_px), 90))
+                terms.append(_Term(known, predicted_px, basis, large_px))
+        return terms
+
+    def _refined(
+        self, terms: Sequence[_Term], start: Sequence[float]
+    ) -> tuple[list[float], list[float]]:
+        """Return log(scale), and the ray's power if it has a start too, after Gauss-Newton steps.
+
+        Their standard errors come with them.
+        """
+        values = np.array(start)
+        count = len(values)
+        for _ in range(_STEPS):
+            normals, rights = np.zeros((len(terms), count, count)), np.zeros((len(terms), count))
+            for number, term in enumerate(terms):
+                grown_px = term.predicted_px * np.exp(values @ term.basis[:count])
+                difference, slope, weight = self._compared(term, grown_px)
+                columns = slope * grown_px * term.basis[:count]
+                normals[number] = (columns * weight) @ columns.T
+                rights[number] = (columns * weight) @ difference
+            step, errors = _solved(normals, rights)
+            large_px = np.exp(values[0]) * np.array([term.large_px for term in terms])
+            longest = np.array([term.basis[:count].max(axis=1) for term in terms])
+            moved_px = float(np.abs(large_px * (longest @ step)).max())
+            part = 1.0 if count > 1 else min(1.0, _LARGEST_STEP_PX / max(moved_px, 1e-12))
+            values += np.clip(part * step, -_LARGEST_STEPS[count], _LARGEST_STEPS[count])
+            if moved_px < 5e-3:
+                break
+        return values.tolist(), errors.tolist()
+
+    def _compared(
+        self, term: _Term, disparity_px: Points
+    ) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+        """Return right less left at a disparity, the mean slope of both, and each pixel's weight.
+
+        The weight is robust, and 0 for pixels that leave the picture or whose match is elsewhere,
+        and for all if too few are left.
+        """
+        match = term.match
+        there, slope, inside = sample_along_rows(
+            self.views.band(match.frame, match.right), match.rows, match.columns - disparity_px
+        )
+        difference = there - match.brightness
+        slope = (slope + match.slope) / 2
+        usable = inside & (np.abs(disparity_px - match.matched_px) < _NEAR_PX)
+        if usable.sum() < _FEWEST_USABLE:
+            return difference, slope, np.zeros(len(difference))
+        spread = 1.4826 * float(np.median(np.abs(difference[usable]))) + 1e-3
+        weight: Float64[np.ndarray, " n"] = (
+            usable / (1 + (difference.astype(np.float64) / (2 * spread)) ** 2) ** 2 / spread**2
+        )
+        return difference, slope, weight
