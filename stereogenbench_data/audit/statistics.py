@@ -281,11 +281,10 @@ def _bin_lines(found: Statistics) -> Iterator[Line]:
 
 
 def _map_lines(found: Statistics) -> Iterator[Line]:
-    tables = {
-        "train": "table of train scene counts per family and map",
-        "eval": "table of evaluation scene counts per family and map",
-    }
-    for split, rows in (("train", paper_table("train_maps")), ("eval", paper_table("eval_maps"))):
+    for split, table, rows in (
+        ("train", "table of train scene counts per family and map", paper_table("train_maps")),
+        ("eval", "table of evaluation scene counts per family and map", paper_table("eval_maps")),
+    ):
         paper = {
             (split, family, row["map"]): int(row[family])
             for row in rows for family in FAMILIES if int(row.get(family, 0))
@@ -294,7 +293,7 @@ def _map_lines(found: Statistics) -> Iterator[Line]:
             (split, each.family, name): count
             for each in found.branches if each.split == split for name, count in each.maps.items()
         }  # fmt: skip
-        yield from _beside(tables[split], "scenes", paper, ours)
+        yield from _beside(table, "scenes", paper, ours)
 
 
 def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
