@@ -110,7 +110,7 @@ def test_a_loader_says_where_its_workers_time_goes(of_real_size):
             break
 
     said = loader.stats().time
-    assert [word in said for word in ("reading", "decoding", "making samples", "waiting")]
+    assert all(word in said for word in ("reading", "decoding", "making samples", "waiting"))
     assert said.endswith("is the limit")
     assert loader.work().samples >= 400
 
