@@ -39,8 +39,8 @@ def audit(  # noqa: PLR0913 - one parameter an option
     The audit compares intrinsics, baselines, poses and depth with each other, as the paper's audit
     does, and shows the paper's figures beside. It counts frames and looks for dark, flat and
     frozen pictures, invalid depth and occluders at the border. It prints Markdown; --out also
-    writes it to a file (as JSON if the name ends with .json). The
-    exit status is 1 if anything exceeds its limit.
+    writes it to a file (as JSON if the name ends with .json). To continue a stopped audit, run it
+    again. The exit status is 1 if anything exceeds its limit.
 
     Example: `stereogenbench audit shards/ --scenes 20 -o audit.md`
     """

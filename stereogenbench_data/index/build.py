@@ -630,7 +630,9 @@ def report_of(tree: Tree, of_keys: Mapping[str, Outcome]) -> TreeReport:
     broken = {key: str(error) for key, error in left_out.items() if key not in incomplete}
     found = [out.found for out in outcomes if isinstance(out.found, Scene)]
     found = _without_unfetched(found)
-    scenes = [replace(scene, id=tree.ids[scene.id.key]) for scene in found]
+    ids = tree.ids
+    scenes = [scene if scene.id == ids[scene.id.key] else replace(scene, id=ids[scene.id.key])
+              for scene in found]  # fmt: skip
     eval_keys = (key for key in tree.keys if key.startswith("eval/"))
     unnamed = {key.split("/")[1] for key in eval_keys if parse_scene_key(key).subset is None}
     labels = [f"{scene.id.key}: {brief(scene.labels.map_name)}" for scene in scenes

@@ -115,6 +115,11 @@ class TreeCache:
             self.keep(kind, name, found)
         return found
 
+    def forget(self, kind: str, name: str) -> None:
+        """Remove what was kept under a kind and a name."""
+        with suppress(OSError):
+            self._place(kind, name).unlink()
+
     def _place(self, kind: str, name: str) -> Path:
         digest = _digest(name)
         return self._folder / kind / digest[:2] / digest

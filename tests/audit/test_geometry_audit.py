@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import warnings
+import zlib
 
 import fsspec
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from stereogenbench_data.audit.geometry.audit import audit, open_for_audit
 from stereogenbench_data.audit.geometry.table import audit_markdown, pooled_px
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.index.tree_cache import CACHE_VARIABLE
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.audit.corruption import (
@@ -379,6 +381,54 @@ def test_a_sample_is_spread_over_the_scenes_that_pass_the_filters(indexed_releas
     assert keys(1, split="train")[0].startswith("train/")
     with pytest.raises(SelectionError, match="matches none of 4 scenes"):
         keys(2, map="Nowhere")
+
+
+@pytest.fixture
+def stopped(tmp_path, monkeypatch):
+    """Audit, and be stopped at the end: the results stay in a cache."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+
+    def run(index, frames, **options):
+        told = []
+
+        def progress(done, total):
+            told.append(done)
+            if told[-2:] == [total, total]:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt, match=r"^$"):
+            audit(index, frames=frames, workers=1, progress=progress, **options)
+        return told[0]
+
+    return run
+
+
+def test_results_of_other_frames_or_changed_files_are_not_used(indexed_release, tmp_path, stopped):
+    folder = copied(indexed_release / SCENE, tmp_path / "data")
+    index = open_for_audit(tmp_path / "data")
+
+    known = [stopped(index, 2), stopped(index, 2), stopped(index, 3)]
+    again = audit(index, frames=2, workers=1)
+    flat(folder)
+    changed = open_for_audit(tmp_path / "data")
+    known.append(stopped(changed, 3))
+
+    assert known == [0, 2, 0, 0]
+    assert again.findings == ()
+    assert [each.check for each in audit(changed, frames=2, workers=1).findings] == ["flat"]
+
+
+def test_a_damaged_result_is_passed_over(exact, indexed_release, tmp_path, stopped):
+    index = open_for_audit(indexed_release)
+    stopped(index, 3, scenes=SCENE)
+    (kept,) = (tmp_path / "cache").rglob("audit-*/*/*")
+    text = zlib.decompress(kept.read_bytes())
+    kept.write_bytes(zlib.compress(text.replace(b'"figures": [{', b'"figures": [{"odd": 1, ')))
+
+    report = audit(index, frames=3, workers=1, scenes=SCENE)
+
+    (expected,) = [scene for scene in exact.to_json()["scenes"] if scene["key"] == SCENE]
+    assert report.to_json()["scenes"] == [expected]
 
 
 def test_quantiles_of_scenes_are_pooled_by_their_pixels():

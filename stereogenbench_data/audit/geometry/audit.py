@@ -1,10 +1,13 @@
 """The audit of a data set: the paper's geometry table and quality checks, scene by scene."""
 
+import hashlib
+import json
 import warnings
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
-from typing import Final, Unpack
+from typing import Any, Final, Unpack
 
 import numpy as np
 from jaxtyping import Int64
@@ -20,13 +23,17 @@ from stereogenbench_data.audit.geometry.records import (
 from stereogenbench_data.audit.geometry.scene_audit import AuditTask, audit_scene
 from stereogenbench_data.audit.geometry.table import table_rows
 from stereogenbench_data.audit.scene_access import source_of, spread
-from stereogenbench_data.errors import SchemaError, SelectionError
+from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
 from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.parquet import INDEX_NAME
+from stereogenbench_data.index.rows import row_of
 from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
+from stereogenbench_data.index.tree import SceneFolder
+from stereogenbench_data.index.tree_cache import TreeCache
 from stereogenbench_data.jobs import WORK_DEFAULTS, WorkOptions, do_items
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.parse import parse_scene_key
+from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes, may_pass
 from stereogenbench_data.selection.options import require_options, split_options
 from stereogenbench_data.selection.signatures import list_options
@@ -35,6 +42,7 @@ from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import MissingObject
 
 DEFAULT_FRAMES: Final = 5
+_FORMAT: Final = 10
 
 
 class AuditOptions(WorkOptions, SceneFilters, total=False):
@@ -100,7 +108,8 @@ def audit(
     """Measure whether data are right: the paper's geometry audit and its quality checks.
 
     `reprojection` defines the reprojection error. A broken scene does not stop the audit; it is
-    a finding.
+    a finding. The user's cache keeps the result of each scene until the audit ends, so that a
+    stopped one goes on with the same number of frames; filters may differ.
 
     Args:
         data: A released tree, shards, an index file, the URL of either, or an index.
@@ -124,16 +133,35 @@ def audit(
     broken, incomplete = (_wanted(each, filters) for each in (index.broken, index.incomplete))
     rows = _chosen(index, sample, filters, left_out=broken | incomplete)
     scenes = [index.scene(int(row)) for row in rows]
-    audited: list[SceneAudit] = []
+    cache, kind = TreeCache(index.root), f"audit-{_FORMAT}-{frames}"
+    names = {scene.id.key: _stamp(index, scene) for scene in scenes}
+    found: dict[str, SceneAudit] = {}
+    for key, name in names.items():
+        with suppress(KeyError, TypeError, ValueError):  # it is damaged
+            known = cache.read(kind, name)
+            found |= {} if known is None else {key: SceneAudit.revived(json.loads(known))}
+    tasks = [
+        AuditTask(scene, source_of(index, scene), frames)
+        for scene in scenes
+        if scene.id.key not in found
+    ]
+
+    def keep(each: SceneAudit) -> None:
+        found[each.key] = each
+        cache.keep(kind, names[each.key], json.dumps(asdict(each)).encode())
+
     do_items(
         audit_scene,
-        [AuditTask(scene, source_of(index, scene), frames) for scene in scenes],
+        tasks,
         name=lambda task: task.scene.id.key,
-        keep=audited.append,
+        keep=keep,
         options=work,
+        done=sum(len(known.audited_frames) for known in found.values()),
         total=sum(len(spread(scene.frames, frames)) for scene in scenes),
     )
-    audited.sort(key=lambda scene: scene.key)
+    for name in names.values():
+        cache.forget(kind, name)
+    audited = [found[scene.id.key] for scene in scenes]
     findings = [broken_finding(key, text) for key, text in sorted(broken.items())]
     chosen = {scene.key for scene in audited}
     findings += [
@@ -183,3 +211,14 @@ def _chosen(
             raise
         return np.empty(0, dtype=np.int64)
     return rows[list(spread(len(rows), sample or 0))]
+
+
+def _stamp(index: SceneIndex, scene: Scene) -> str:
+    """Return a hash that changes when a scene's row or one of its local files does."""
+    parts: list[Any] = [row_of(scene)]
+    if not index.shards and not is_remote(index.root):
+        try:
+            parts.append(SceneFolder(index.root, scene.id.key).stamps())
+        except StorageError as error:
+            parts.append(str(error))
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]

@@ -78,6 +78,18 @@ class SceneAudit:
     problems: Mapping[str, str]
     contradiction: str = ""
 
+    @classmethod
+    def revived(cls, record: Mapping[str, Any]) -> "SceneAudit":
+        """Return the audit that `dataclasses.asdict` made a record of.
+
+        Raises:
+            TypeError: If a field is missing or unknown.
+        """
+        figures = tuple(Figure(**each) for each in record["figures"])
+        pairs = tuple(PairAudit(**each) for each in record["pairs"])
+        frames = tuple(record["audited_frames"])
+        return cls(**{**record, "figures": figures, "pairs": pairs, "audited_frames": frames})
+
 
 @dataclass(frozen=True, slots=True)
 class Finding:
