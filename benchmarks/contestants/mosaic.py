@@ -27,16 +27,17 @@ def streaming_module() -> Any:
     """Return the module ``streaming``.
 
     It imports torchvision for picture datasets that nothing here uses. Where torchvision is missing
-    or made for another build of torch, empty modules stand in for it.
+    or made for another build of torch, empty modules stand in for it during that import.
 
     Raises:
         ImportError: If it is not installed.
     """
+    stands_in = False
     try:
         import torchvision  # noqa: F401
     except (ImportError, RuntimeError):
-        for name in [name for name in sys.modules if name.partition(".")[0] == "torchvision"]:
-            del sys.modules[name]
+        stands_in = True
+        _forget_torchvision()
         for name, held in (
             ("torchvision", {}), ("torchvision.datasets", {"VisionDataset": object}),
             ("torchvision.transforms", {}), ("torchvision.transforms.functional", {"to_tensor": 0}),
@@ -46,9 +47,17 @@ def streaming_module() -> Any:
             module.__path__ = []
             module.__dict__.update(held)
             sys.modules[name] = module
-    import streaming
-
+    try:
+        import streaming
+    finally:
+        if stands_in:
+            _forget_torchvision()
     return streaming
+
+
+def _forget_torchvision() -> None:
+    for name in [name for name in sys.modules if name.partition(".")[0] == "torchvision"]:
+        del sys.modules[name]
 
 
 def write_shards(index: SceneIndex, out: Path) -> None:
