@@ -112,8 +112,8 @@ class Survey:
             kind = problem.about if problem.about in SCENE_FILES else problem.text
             alike.setdefault(kind, []).append(" ".join(problem.text.split()))
         return [
-            f"{texts[0]} ({len(texts) - 1} more of {kind})" if len(texts) > 1 else texts[0]
-            for kind, texts in alike.items()
+            f"{first} ({len(others)} more of {kind})" if others and kind in SCENE_FILES else first
+            for kind, (first, *others) in alike.items()
         ]
 
     @property

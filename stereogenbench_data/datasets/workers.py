@@ -132,8 +132,9 @@ class Workers:
             self._thread.start()
 
     def next(self) -> Any:
-        """Return the next batch."""
-        return None if self.parted is None else self.parted.next(self._results)
+        """Return the next batch of the pass that was begun."""
+        assert self.parted is not None  # `begin` made it
+        return self.parted.next(self._results)
 
     def __del__(self) -> None:
         """End the workers when no reference is left."""
