@@ -5,6 +5,8 @@ import os
 import shutil
 import zlib
 from dataclasses import replace
+from threading import get_ident
+from time import sleep
 
 import pytest
 
@@ -43,6 +45,21 @@ def test_every_scene_is_whole_incomplete_or_broken(alike_scenes, root):
     assert list(report.incomplete) == [keys[1]]
     assert list(report.broken) == [keys[2], "train/Uniform/scene.7"]
     assert "has no baseline.json" in report.broken[keys[2]]
+
+
+def test_of_a_disk_that_waits_several_scenes_are_read_at_a_time_in_their_order(make_scene, root):
+    make_scene()
+    threads = set()
+
+    def read(key):
+        sleep(0.001)
+        threads.add(get_ident())
+        return key
+
+    keys = [KEY.format(number) for number in range(300)]
+
+    assert [*walk_module.find_tree(root, wanted=None).of_each(read, keys)] == keys
+    assert len(threads) > 2
 
 
 def test_poses_are_searched_for_once_and_then_read_where_they_stand(

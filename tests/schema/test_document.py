@@ -26,8 +26,15 @@ def test_a_text_that_is_not_a_json_object_is_refused(text, match):
         parse_object(text, where="a.json")
 
 
-def test_a_key_that_is_written_twice_is_named_with_its_place():
-    text = b'{"frames": [{"x": 1}, {"pose": {"yaw": 1, "yaw": 2}}]}'
+def test_a_colon_in_a_text_is_no_key():
+    assert parse_object(rb'{"a": "b\": c", "d": ["e\":", {"f": 1}]}', where="a.json") == {
+        "a": 'b": c', "d": ['e":', {"f": 1}]
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("beside", ["", r'"said": "a\": b", '])
+def test_a_key_that_is_written_twice_is_named_with_its_place(beside):
+    text = f'{{{beside}"frames": [{{"x": 1}}, {{"pose": {{"yaw": 1, "yaw": 2}}}}]}}'.encode()
 
     with pytest.raises(SchemaError, match="'yaw' is written twice"):
         parse_object(text, where="a.json")
