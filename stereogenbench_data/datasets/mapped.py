@@ -704,7 +704,9 @@ def _without_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> Plan
     )
     if len(reasons) == len(selected) or not are_few(len(reasons), of=len(selected)):
         raise StorageError(
-            f"{told} Leave out that field, choose other pairs or scenes, or mend the files."
+            f"{told} Leave out that field, choose other pairs or scenes, mend the files, or state "
+            f"how they are read in a file of conventions (`stereogenbench conventions` proposes "
+            f"one)."
         )
     keys = index.column("key")
     if multiprocessing.parent_process() is None and not index.lacking.issuperset(keys[[*reasons]]):

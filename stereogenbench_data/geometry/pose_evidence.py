@@ -212,8 +212,8 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> MatchedPoses:
         tried = "; ".join(f"{reason} ({name})" for reason, name in list(failures.items())[:_SHOWN])
         raise SchemaError(
             f"{where}: no reading of its poses fits the rig of baseline.json: "
-            f"{tried or 'it has no location with a rotation'}. Is it another scene's, or its "
-            f"unit wrong?"
+            f"{tried or 'it has no location with a rotation'}. It may be "
+            f"another scene's, or in another unit."
         )
     taken = passed[0]
     others = [each for each in passed[1:] if not _same(each.poses, taken.poses, _rig_at)]

@@ -148,12 +148,13 @@ def poses_at(document: dict[str, Any], at: PosesAt, *, where: str) -> tuple[str,
     turn = read_block(document, at, str(at.rotation), where=where)
     place = None if at.location is None else read_block(document, at, at.location, where=where)
     form = str(at.form)
-    kind = next((each for each in _kinds(turn) if form in (each, _short(each))), "")
+    kinds = _kinds(turn, is_rotation=True)
+    kind = next((each for each in kinds if form in (each, _short(each))), "")
     if not kind or at.axes not in AXES:
         raise SchemaError(
             f"{where}: {at.rotation} is not of the form {shortened(form)!r} with "
             f"{shortened(str(at.axes))!r} axes that the conventions state below [poses]: for these "
-            f"numbers there are {', '.join(_kinds(turn)) or 'no forms'}, with the axes "
+            f"numbers there are {', '.join(kinds) or 'no forms'}, with the axes "
             f"{', '.join(AXES)}."
         )
     unit_m = np.nan if at.unit is None else UNITS_M[at.unit]
@@ -295,13 +296,16 @@ _KINDS: Final = (
 and "rows" are matrices for row vectors."""
 
 
-def _kinds(block: Block) -> list[str]:
-    """Return the forms that numbers of this shape and these names can have."""
+def _kinds(block: Block, *, is_rotation: bool = False) -> list[str]:
+    """Return the forms that numbers of this shape and these names can have.
+
+    Three numbers are angles where their key speaks of a rotation, or a file says that they are one.
+    """
     shape, names = block.values.shape[2:], block.components
     units = ("deg", "rad")
     if names == _ROTATOR:
         kinds = [f"{_KINDS[0]} {unit}" for unit in units]
-    elif shape == (3,) and (block.words & _ROTATION or names == ("rx", "ry", "rz")):
+    elif shape == (3,) and (is_rotation or block.words & _ROTATION or names == ("rx", "ry", "rz")):
         kinds = [f"{kind} {unit}" for kind, unit in itertools.product(_KINDS[:4], units)]
         kinds += [f"{_KINDS[3]} {unit} w2c" for unit in units]
     elif shape == (4,):

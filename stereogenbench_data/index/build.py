@@ -498,8 +498,9 @@ def _with_common_poses(
         )
         raise StorageError(
             f"{shown(tree.root)}: no form of poses is that of most scenes. Of those that were "
-            f"looked at{listed}\nWrite a [[shape]] for each kind into a file of conventions, with "
-            f"the keys that it has, and give the file as conventions= or --conventions."
+            f"looked at{listed}\n`stereogenbench conventions {shown(tree.root)}` writes a file "
+            f"with a [[shape]] for each kind that has keys of its own: give it as conventions= or "
+            f"--conventions."
         )
     if tree.settled is None or tree.settled.form != form:
         tree = tree.with_poses_of(outcomes[of_form[form]])

@@ -120,7 +120,7 @@ def _majority(
     odd = {
         key: StorageError(
             f"{key}: is unlike {count} of the {len(scenes)} scenes that were looked at: "
-            f"{'; '.join(_unlike(usual, found))}. An index of `stereogenbench index` may hold both."
+            f"{'; '.join(_unlike(usual, found))}. {_cure_of(tree, usual, found)}"
         )
         for key, found in formats.items() if texts[key] != common
     }  # fmt: skip
@@ -138,6 +138,13 @@ def _majority(
             f"that; or state what differs in a file of conventions."
         )
     return alike, {key: error for key, error in odd.items() if key in tree.keys}
+
+
+def _cure_of(tree: Tree, usual: Mapping[str, object], found: Mapping[str, object]) -> str:
+    """Return what to do about scenes of two formats."""
+    if usual["poses"] == found["poses"]:
+        return "An index of `stereogenbench index` may hold both."
+    return f"`stereogenbench conventions {shown(tree.root)}` writes a file that states both."
 
 
 def _unlike(usual: Mapping[str, object], found: Mapping[str, object]) -> Iterator[str]:
@@ -166,7 +173,8 @@ def _format_of(
         "metres of depth at the stored number 0": of_cameras("depth_offset_m"),
         "where the unit of depth stands": of_cameras("depth_unit_source"),
         "form of poses": scene.pose_form,
-        "what poses lack": tuple(about for about in _OF_ALL if scene.remark(about)),
+        "poses": " and ".join(f"refused for {about!r}" for about in _OF_ALL if scene.remark(about))
+        or "as in the others",
     } | ({} if baselines == "read" else {"primary pair": scene.rig.primary_pair})
 
 
@@ -203,7 +211,7 @@ def _row(
         remarks.append(Remark("marker", f"{key}: has no {COMPLETE_JSON}"))
     for about in _OF_ALL:
         if like.remark(about):
-            text = f"{key} is taken to be as other scenes: {like.remark(about)}"
+            text = f"{key}, which is taken to be as other scenes: {like.remark(about)}"
             remarks.append(Remark(about, text))
     if TRAJECTORY_JSON in hollow or TRAJECTORY_JSON not in files:
         why = hollow.get(TRAJECTORY_JSON, f"{key}/{TRAJECTORY_JSON}: is missing")
@@ -404,7 +412,7 @@ def _differences(
     stopped = [about for about in _STOPPING if found.remark(about) and not row.remark(about)]
     yield from (found.remark(about) for about in stopped)
     now, usual = (_format_of(each, baselines, cameras) for each in (found, row))
-    for name in ("form of poses", "what poses lack"):
+    for name in ("form of poses", "poses"):
         del now[name], usual[name]
     yield from _unlike(usual, now)
     before_m, now_m = row.lateral_m, found.lateral_m

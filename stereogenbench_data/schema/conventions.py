@@ -387,7 +387,8 @@ _PLACE: Final = "a JSON path, such as $.camera_intrinsics.focal_length_mm"
 _RULES: Final[tuple[tuple[str, Callable[[Any], bool], str], ...]] = (
     ("kind form axes unit has accept channels", _is_text, "a text"),
     ("as", lambda value: value in _AS, '"field of view" or "pixels"'),
-    ("outer", lambda value: value in ("frames", "cameras"), '"frames" or "cameras"'),
+    ("outer", lambda value: value in ("frames", "cameras", "rows"),
+     '"frames", "cameras" or "rows"'),
     ("optional", lambda value: isinstance(value, bool), "true or false"),
     ("first step", lambda value: type(value) is int and 0 <= value < 10**6, "a whole number"),
     ("value instead_of_tag_m", lambda value: is_number(value) and value > 0,
@@ -461,9 +462,12 @@ def write_toml(conventions: Conventions, notes: Mapping[tuple[int, str], Iterabl
             lines += [f"has = {_toml(table.pop('has', []))}"]
         noted = [name for at, name in notes if at == number and name and name not in table]
         for name in sorted({*table, *noted}, key=_ORDER.index):
-            lines += ["", *_comments(notes.get((number, name), ()))]
+            header = f"[{name}]" if is_one else f"[shape.{name}]"
+            about = (header if each == f"[{name}]" else each  # of a candidate
+                     for each in notes.get((number, name), ()))  # fmt: skip
+            lines += ["", *_comments(about)]
             if name in table:
-                lines += [f"[{name}]" if is_one else f"[shape.{name}]"]
+                lines += [header]
                 lines += [f"{key} = {_toml(value)}" for key, value in table[name].items()]
     return "\n".join(lines).strip() + "\n"
 

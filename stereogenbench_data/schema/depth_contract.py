@@ -17,6 +17,7 @@ from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.schema.document import child_path
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.text import shortened
+from stereogenbench_data.schema.trajectory import number_of
 from stereogenbench_data.schema.units import UNITS_M, words
 
 Origin = Literal["tag", "metadata"]
@@ -164,20 +165,19 @@ def stated_in_json(
 
 
 def _nodes_of(document: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
-    """Yield path, key and value of each text and number; six alike, of the cameras, are one."""
+    """Yield path, key and value of each text and number, also of lists of the six cameras."""
     waiting: list[tuple[str, str, Any, int]] = [("$", "", document, 0)]
     for path, key, node, depth in waiting:  # which grows
-        if isinstance(node, list) and node[:1] * CAMERA_COUNT == node:
-            node = node[0]
-        if isinstance(node, dict) and len(node) == CAMERA_COUNT:
-            alike = [*node.values()]
-            if not isinstance(alike[0], dict | list) and alike[:1] * CAMERA_COUNT == alike:
-                node = alike[0]
-        if isinstance(node, dict) and depth < _DEEPEST and len(waiting) < _MOST_NODES:
+        is_open = depth < _DEEPEST and len(waiting) < _MOST_NODES
+        if isinstance(node, list) and len(node) == CAMERA_COUNT and is_open:
+            waiting += [(f"{path}[{at}]", key, node[at], depth + 1) for at in range(CAMERA_COUNT)]
+        elif isinstance(node, dict) and is_open:
+            is_of_cameras = {*map(number_of, node)} == {*range(CAMERA_COUNT)}
             waiting += [
-                (child_path(path, each), key if each == "value" else each, node[each], depth + 1)
+                (child_path(path, each), key if is_of_cameras or each == "value" else each,
+                 node[each], depth + 1)
                 for each in node
-            ]
+            ]  # fmt: skip
         elif isinstance(node, str | int | float):
             yield path, key, node
 
@@ -292,7 +292,8 @@ def agreed(statements: Sequence[Statement]) -> tuple[float, Origin] | None:
                for each in everything):  # fmt: skip
             is_tagged = any(each.origin == "tag" for each in everything)
             return unit_m, "tag" if is_tagged else "metadata"
-    _refuse("contradict each other", everything)
+    one_of_each = {each.values: each for each in reversed(everything)}
+    _refuse("contradict each other", [*one_of_each.values()][::-1])
     return None
 
 

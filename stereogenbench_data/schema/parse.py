@@ -566,7 +566,9 @@ def _row(at: PairsAt, row: Any, keys: str, way: tuple[str | int, ...]) -> tuple[
     try:
         if at is BUILT_IN.pairs or at is BUILT_IN.gaps:  # the paper's example compares numbers
             a, b, stated = row[at.a], row[at.b], row[at.length]
-            a, b = a if type(a) is int else None, b if type(b) is int else None
+            if not type(a) is type(b) is int:  # 0.0 is camera 0 there
+                a, b = (int(each) if is_number(each) and each == int(each) else None
+                        for each in (a, b))  # fmt: skip
         else:
             a, b = _camera_of_row(row, keys, at.a, 0), _camera_of_row(row, keys, at.b, 1)
             stated = value_at(row, at.length) if at.length else row

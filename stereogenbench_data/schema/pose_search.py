@@ -185,7 +185,8 @@ def _places_in_list(
     inner = f"{path}[]"
     axis = _Axis(inner, owner, node)
     own = (axis, axis) if not axes and _are_rows(node) else (*axes, axis)
-    yield from _places(node[0], inner, owner, own, depth + 1)
+    own_name = "" if isinstance(node[0], list) else owner  # that of the outer list
+    yield from _places(node[0], inner, own_name, own, depth + 1)
 
 
 def _shape_of(node: list[Any]) -> tuple[int, ...]:
@@ -285,7 +286,11 @@ def _key_of(elements: Sequence[Any], keys: Sequence[str]) -> str | None:
         return None
     named = {words(key): key for key in first}
     there = (named[key] for key in keys if key in named)
-    return next((key for key in there if number_of(first[key]) is not None), None)
+    found = next((key for key in there if number_of(first[key]) is not None), None)
+    is_time = found is not None and words(found) == "t" and any(
+        type(each.get(found)) is float and not each[found].is_integer() for each in elements
+    )  # fmt: skip
+    return None if is_time else found
 
 
 def _step(frames: _Axis, place: str | None) -> int | None:

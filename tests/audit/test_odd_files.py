@@ -123,6 +123,58 @@ def test_an_odd_file_is_told_and_proposed_and_trained_on(
     )
 
 
+def as_rows(document):
+    """A row for each frame and camera, in place of frames that have cameras."""
+    document["poses"] = [
+        {"frame": frame["frame_index"], "camera": pose["camera_index"],
+         **{key: pose[key] for key in ("location", "rotation")}}
+        for frame in document.pop("frames") for pose in frame["cameras"]
+    ]  # fmt: skip
+
+
+def as_six_numbers(document):
+    """Place and angles of each pose in one list."""
+    for frame in document["frames"]:
+        for pose in frame["cameras"]:
+            pose["pose"] = [*pose.pop("location").values(), *pose.pop("rotation").values()]
+
+
+def relative_poses(root, **how):
+    pairs = StereoPairs(root, fields=("right_from_left",), frames="all", pairs="all", **how)
+    return torch.stack([sample["right_from_left"] for sample in map(pairs.__getitem__,
+                                                                   range(len(pairs)))])  # fmt: skip
+
+
+def test_what_is_written_for_rows_of_frame_and_camera_is_read_back(
+    make_scene, root, rewrite, tmp_path
+):
+    folder, file = make_scene(), tmp_path / "conventions.toml"
+    usual = relative_poses(root)
+    rewrite(folder / "trajectory.json", as_rows)
+
+    written = invoke("conventions", root, "-o", file, "--pictures", "0", "--workers", "1")
+
+    assert written.exit_code == 0, written.output
+    assert 'outer = "rows"' in file.read_text()
+    assert torch.equal(relative_poses(root, conventions=file), usual)
+
+
+def test_angles_in_a_part_of_a_list_are_read_where_a_file_says_so(
+    make_scene, root, rewrite, tmp_path
+):
+    folder, file = make_scene(), tmp_path / "conventions.toml"
+    usual = relative_poses(root)
+    rewrite(folder / "trajectory.json", as_six_numbers)
+    file.write_text(
+        'format = 2\n[poses]\nlocation = "$.frames[].cameras[].pose[0:3]"\n'
+        'rotation = "$.frames[].cameras[].pose[3:6]"\nframe = "$.frames[].frame_index"\n'
+        'camera = "$.frames[].cameras[].camera_index"\nouter = "frames"\n'
+        'form = "rotator pitch yaw roll deg"\naxes = "unreal"\nunit = "cm"\n'
+    )
+
+    assert torch.equal(relative_poses(root, conventions=file), usual)
+
+
 def test_the_page_has_six_odd_files():
     assert [number for number, _ in examples()] == [1, 2, 3, 4, 5, 6]
 

@@ -135,6 +135,17 @@ def test_all_that_can_be_stated_is_read_and_written_again(text):
     assert [*map(declaration_of_text, texts)] == [*conventions.shapes]
 
 
+def test_a_candidate_has_the_header_of_its_shape():
+    candidate = {(1, "image_width"): ["candidate 1 of 1", "[image_width]", "value = 320"]}
+
+    written = write_toml(read(EARLIER), candidate)
+
+    head, found, uncommented = written.partition("# [shape.image_width]\n# value = 320\n")
+    assert found
+    _, second = read((head + found.replace("# ", "") + uncommented).encode()).shapes
+    assert second.numbers["image_width"].value == 320
+
+
 def test_files_of_the_earlier_format_are_declarations():
     first, second = read(EARLIER).shapes
     assert (first.has, first.numbers["sensor_width"].value) == (

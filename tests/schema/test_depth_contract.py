@@ -42,9 +42,23 @@ def test_a_tag_of_millimetres_is_understood(tag):
 @pytest.mark.parametrize(
     "document",
     [
+        {"cameras": [{"id": at, "depth_scale": 0.01 if at == 3 else 0.001} for at in range(6)]},
+        {"depth_scales_m": {f"cam_{at:02d}": 0.01 if at == 3 else 0.001 for at in range(6)}},
+    ],
+    ids=json.dumps,
+)
+def test_cameras_whose_units_differ_are_refused_with_both_places(document):
+    with pytest.raises(SchemaError, match=r"03|\[3\].* is '0.01', .* is '0.001': contradict"):
+        of_json(document)
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
         {"depth_scale": 1000},
         {"depth_scales_m": [0.001] * 6},
         {"depth_scales_m": {f"cam_{camera:02d}": 0.001 for camera in range(6)}},
+        {"cameras": [{"camera_index": number, "depth_scale": 0.001} for number in range(6)]},
         {"depth_unit": "mm"},
         {"depthUnitMeters": 0.001},
         {"depth": {"scale": 0.001, "unit": "m", "bits": 16, "frames": 81}},

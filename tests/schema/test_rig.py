@@ -135,6 +135,14 @@ def test_keys_beside_the_printed_ones_never_matter(rig_document):
     assert read(BESIDE | rig_document | {"unit": "m"}) == expected
 
 
+def test_cameras_are_numbers_as_the_papers_example_compares_them(rig_document):
+    expected = read(rig_document)
+    for pair in rig_document["pairwise_pairs"]:
+        pair["camera_index_a"] = float(pair["camera_index_a"])
+
+    assert read(rig_document) == expected
+
+
 PAIR = "the primary pair must be a left and a right one of the cameras 0 to 5.*found "
 TWICE = {"camera_index_a": 2, "camera_index_b": 0, "baseline_cm": 13.5}
 LENGTH = r"pairwise_pairs\[3\]\.baseline_cm: must be a number above zero, found "

@@ -114,6 +114,16 @@ def named(place):
                                   for f in range(3)]},
             id="an order of its own",
         ),
+        pytest.param(
+            lambda d: {"frames": [[{"loc": p} for k, _, p in poses_of(d) if k == f]
+                                  for f in range(3)]},
+            id="lists in lists",
+        ),
+        pytest.param(
+            lambda d: {"frames": [{"t": f / 15, "cameras": [{"loc": p} for k, _, p in poses_of(d)
+                                                            if k == f]} for f in range(3)]},
+            id="frames with times in seconds",
+        ),
     ],
 )  # fmt: skip
 def test_locations_are_found_at_any_depth_and_in_any_order(trajectory_document, write):
