@@ -107,12 +107,13 @@ WORKLOADS: Final = (
         target=Target(0.85, 1.2),
     ),
     Workload(
-        "all-frames", "primary pair, all frames shuffled, 1280", 8, "all", range(12),
+        "all-frames", "primary pair, 12 frames of each of 8 scenes, 1280", 8, "all", range(12),
         workers=(2, 0, 1, 4), target=Target(0.85, 15), more=("ours-shards",),
     ),
     Workload(
-        "all-pairs", "all 15 pairs, all frames, both disparities, 1280", 4, "all", range(4),
-        pairs="all", both_ways=True, target=Target(0.75, 60),
+        "all-pairs", f"all 15 pairs, all frames, both disparities, 1280, {WHOLE:,} scenes", WHOLE,
+        "all", range(4), pairs="all", both_ways=True, batch=8, target=Target(0.75, 60),
+        part=4, begun=16,
     ),
     Workload(
         "all-pairs-832", "all 15 pairs, all frames, both disparities, 832x480", 4, "all", range(4),
