@@ -286,11 +286,15 @@ def _key_of(elements: Sequence[Any], keys: Sequence[str]) -> str | None:
         return None
     named = {words(key): key for key in first}
     there = (named[key] for key in keys if key in named)
-    found = next((key for key in there if number_of(first[key]) is not None), None)
-    is_time = found is not None and words(found) == "t" and any(
-        type(each.get(found)) is float and not each[found].is_integer() for each in elements
-    )  # fmt: skip
-    return None if is_time else found
+    numbered = (key for key in there if number_of(first[key]) is not None)
+    return next(
+        (key for key in numbered if words(key) != "t" or not _are_times(elements, key)), None
+    )
+
+
+def _are_times(elements: Sequence[dict[str, Any]], key: str) -> bool:
+    """Return whether numbers are seconds, and count nothing."""
+    return any(type(each.get(key)) is float and not each[key].is_integer() for each in elements)
 
 
 def _step(frames: _Axis, place: str | None) -> int | None:

@@ -36,7 +36,8 @@ def rows(baseline, _):
     ]  # fmt: skip
 
 
-def radians(_, trajectory):
+def tilted(trajectory):
+    """Turn all cameras, in degrees, and let them stand along the axis to their right."""
     rotator = np.array([-10.0, 30.0, 2.0])
     right = rotation_from_rotator_deg(rotator)[:, 1]
     for frame in trajectory["frames"]:
@@ -44,8 +45,14 @@ def radians(_, trajectory):
             place = np.array([500.0 + frame["frame_index"], 0.0, 160.0])
             place += PLACES_CM[pose["camera_index"]] * right
             pose["location"] = dict(zip("xyz", place.tolist(), strict=True))
-            angles = np.deg2rad(rotator).tolist()
-            pose["rotation"] = dict(zip(("pitch", "yaw", "roll"), angles, strict=True))
+            pose["rotation"] = dict(zip(("pitch", "yaw", "roll"), rotator.tolist(), strict=True))
+
+
+def radians(_, trajectory):
+    tilted(trajectory)
+    for frame in trajectory["frames"]:
+        for pose in frame["cameras"]:
+            pose["rotation"] = {key: np.deg2rad(at).item() for key, at in pose["rotation"].items()}
 
 
 def columns(_, trajectory):
@@ -139,31 +146,34 @@ def as_six_numbers(document):
             pose["pose"] = [*pose.pop("location").values(), *pose.pop("rotation").values()]
 
 
-def relative_poses(root, **how):
-    pairs = StereoPairs(root, fields=("right_from_left",), frames="all", pairs="all", **how)
-    return torch.stack([sample["right_from_left"] for sample in map(pairs.__getitem__,
-                                                                   range(len(pairs)))])  # fmt: skip
+def all_poses(root, **how):
+    fields = ("right_from_left", "world_from_left")
+    pairs = StereoPairs(root, fields=fields, frames="all", pairs="all", **how)
+    samples = (pairs[number] for number in range(len(pairs)))
+    return torch.stack([sample[field] for sample in samples for field in fields])
 
 
 def test_what_is_written_for_rows_of_frame_and_camera_is_read_back(
     make_scene, root, rewrite, tmp_path
 ):
     folder, file = make_scene(), tmp_path / "conventions.toml"
-    usual = relative_poses(root)
+    rewrite(folder / "trajectory.json", tilted)
+    usual = all_poses(root)
     rewrite(folder / "trajectory.json", as_rows)
 
     written = invoke("conventions", root, "-o", file, "--pictures", "0", "--workers", "1")
 
     assert written.exit_code == 0, written.output
     assert 'outer = "rows"' in file.read_text()
-    assert torch.equal(relative_poses(root, conventions=file), usual)
+    assert torch.equal(all_poses(root, conventions=file), usual)
 
 
 def test_angles_in_a_part_of_a_list_are_read_where_a_file_says_so(
     make_scene, root, rewrite, tmp_path
 ):
     folder, file = make_scene(), tmp_path / "conventions.toml"
-    usual = relative_poses(root)
+    rewrite(folder / "trajectory.json", tilted)
+    usual = all_poses(root)
     rewrite(folder / "trajectory.json", as_six_numbers)
     file.write_text(
         'format = 2\n[poses]\nlocation = "$.frames[].cameras[].pose[0:3]"\n'
@@ -172,7 +182,7 @@ def test_angles_in_a_part_of_a_list_are_read_where_a_file_says_so(
         'form = "rotator pitch yaw roll deg"\naxes = "unreal"\nunit = "cm"\n'
     )
 
-    assert torch.equal(relative_poses(root, conventions=file), usual)
+    assert torch.equal(all_poses(root, conventions=file), usual)
 
 
 def test_the_page_has_six_odd_files():

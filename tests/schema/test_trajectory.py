@@ -124,6 +124,11 @@ def named(place):
                                                             if k == f]} for f in range(3)]},
             id="frames with times in seconds",
         ),
+        pytest.param(
+            lambda d: {"frames": [{"t": (2 - f) / 15, "idx": 2 - f, "cameras": [
+                {"loc": p} for k, _, p in poses_of(d) if k == 2 - f]} for f in range(3)]},
+            id="times in seconds beside numbers, backwards",
+        ),
     ],
 )  # fmt: skip
 def test_locations_are_found_at_any_depth_and_in_any_order(trajectory_document, write):
