@@ -17,7 +17,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import connection, get_context, resource_tracker
 from multiprocessing.context import BaseContext
 from multiprocessing.process import BaseProcess
@@ -160,7 +160,9 @@ class Workers:
         # workers in this way, too; where none could be started there is nothing to end.
         shutdown = getattr(results, "_shutdown_workers", None)
         if shutdown is not None:
-            shutdown()
+            # torch may raise here that a worker was killed, which ends with the others anyway.
+            with suppress(RuntimeError):
+                shutdown()
         self._memory.close()
 
     def error(self, noticed: BaseException) -> WorkerError | None:

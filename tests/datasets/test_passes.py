@@ -14,10 +14,11 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import connection
 from pathlib import Path
 
 import pytest
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, dataloader
 
 from stereogenbench_data import PassError, StereoPairs, StereoPairStream, WorkerError
 from stereogenbench_data.datasets import workers as processes
@@ -288,6 +289,28 @@ def test_a_worker_that_dies_ends_the_pass_whatever_it_held(small_index, how, opt
     dying.how = None
 
     assert len(list(loader)) == 14
+
+
+def test_a_worker_that_is_killed_as_the_loader_is_closed_raises_nothing(small_index, monkeypatch):
+    loader = StereoPairs(small_index, fields=FIELDS, frames="all").loader(
+        2, num_workers=2, persistent_workers=True, multiprocessing_context="fork"
+    )
+    next(iter(loader))
+    ending = dataloader._MultiProcessingDataLoaderIter._shutdown_workers
+
+    def killed_meanwhile(batches):
+        for process in batches._workers:
+            process.kill()
+            connection.wait([process.sentinel])  # torch's handler of its signal raises here
+        ending(batches)
+
+    monkeypatch.setattr(
+        dataloader._MultiProcessingDataLoaderIter, "_shutdown_workers", killed_meanwhile
+    )
+    loader.close()
+    monkeypatch.undo()
+
+    assert len(list(loader)) == len(loader)
 
 
 def test_an_error_ends_its_pass_and_says_so_to_who_asks_on(small_index):
