@@ -1,18 +1,18 @@
 """One scene's folder: whether it is finished, whole and consistent, and its row of the index.
 
 Everything that an index says of a scene comes from its JSON files and the heads of its videos. No
-picture is decoded unless the share of measured depth is asked for. `described_again` compares files
-with an existing row.
+picture is decoded unless the share of measured depth is asked for. `row_check` compares files with
+an existing row.
 """
 
 import functools
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from typing import Final, Literal, TypeVar
 
 import numpy as np
 
@@ -35,7 +35,6 @@ from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_re
 from stereogenbench_data.index.clocks import require_one_clock
 from stereogenbench_data.index.tree import FILES, Files, SceneFolder, folder_of
 from stereogenbench_data.media.container import (
-    SeekableFile,
     StreamFacts,
     VideoFile,
     depth_coding,
@@ -55,9 +54,9 @@ from stereogenbench_data.media.depth_frames import CODEC_NAME
 from stereogenbench_data.media.heads import heads_of
 from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
 from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
-from stereogenbench_data.schema.conventions import Conventions, declaration_of_text, keys_of
-from stereogenbench_data.schema.declaration import BUILT_IN, UNKNOWN, Declaration, PosesAt
-from stereogenbench_data.schema.depth_contract import UNREAD, Statement, stated_in_json
+from stereogenbench_data.schema.conventions import Conventions, keys_of
+from stereogenbench_data.schema.declaration import BUILT_IN, UNKNOWN, Declaration
+from stereogenbench_data.schema.depth_contract import Statement, stated_in_json
 from stereogenbench_data.schema.document import (
     brief,
     parse_object,
@@ -94,7 +93,6 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.schema.training import TrainingDocument, parse_training
-from stereogenbench_data.sources.members import MemberSource
 
 _T = TypeVar("_T")
 
@@ -113,10 +111,6 @@ _SAME_UNIT: Final = 1.005
 """Units of depth of one rig that differ by a larger factor are several, and not rounded."""
 _SQUARE: Final = 0.01
 """How far the sides of a pixel may differ, as a share: lengths of a sensor are rounded."""
-Difference = tuple[str, str]
-"""The file's name, empty for the scene's own path, and how it contradicts the index."""
-
-_ROUNDING: Final = {"lateral_m": 1e-6, "rig_residual_px": 1e-3}
 
 
 class IncompleteScene(StorageError):
@@ -734,149 +728,3 @@ def derived_scene(scene: Scene, document: TrainingDocument) -> Scene:
         key_frames=document.key_frames,
         training=document.facts,
     )
-
-
-class MemberFolder(SceneFolder):
-    """The files of a scene that an index lists: members of shards, or of a folder."""
-
-    def __init__(self, source: MemberSource, scene: Scene) -> None:
-        """Name the scene, and what opens its files; nothing is read yet."""
-        self.key = scene.id.key
-        self._source, self._scene = source, scene
-
-    def stamps(self) -> dict[str, tuple[int, int]]:
-        """Return the size in bytes of each file."""
-        return {name: (each.size, 0) for name, each in sorted(self._scene.members.items())}
-
-    def hollow(self, files: Files) -> dict[str, str]:
-        """Return no file: members are compared with their checksums."""
-        return {}
-
-    def read(self, name: str) -> bytes:
-        """Return a metadata file, whole and compared with its checksum."""
-        return self._source.read(self._scene, name)
-
-    def video(self, name: str) -> Path | SeekableFile:
-        """Return a video: its path, or an open file that the caller closes."""
-        return self._source.open(self._scene, name)
-
-
-def described_again(
-    scene: Scene, source: MemberSource, *, videos: Collection[str] | None = None
-) -> tuple[Scene, list[Difference]]:
-    """Return what the files in a scene's row of an index say, and how the row differs from that.
-
-    Files are read by the row's conventions. Not compared are remarks, what the row does not know,
-    and what may depend on files that are no members, such as a unit of depth stated elsewhere.
-
-    Args:
-        scene: The row.
-        source: Opens its files.
-        videos: Names of the videos to open; None is all.
-
-    Returns:
-        The scene, or the row itself if its files cannot be used; and for each difference the
-        file's name, empty for the scene's own path, and what it tells.
-    """
-    shape = None
-    if scene.conventions is not None:
-        shape = replace(declaration_of_text(scene.conventions), has=())
-    folder = MemberFolder(source, scene)
-    try:
-        now, is_by_row = _described_by_row(scene, folder, shape, videos)
-    except (SchemaError, MediaError, StorageError) as error:
-        return scene, [_placed(folder.key, str(error))]
-    by_videos = videos is None and {*scene.depth_unit_source} <= {"tag", "default"}
-    # What an earlier version understood and this one does not read is taken from the row.
-    by_videos = by_videos and not any(why in now.remark("depth") for why in UNREAD)
-    new = [
-        about
-        for about in ("frames", "poses", *(["depth"] if by_videos else []))
-        if now.remark(about) and not scene.remark(about)
-    ]
-    new += ["videos"] if scene.members.keys() != now.members.keys() else []
-    found = [_placed(folder.key, now.remark(about)) for about in new]
-    # What is not compared is taken from the row.
-    forms, forms_now = ((each.pose_form or "").split("|") for each in (scene, now))
-    lacks_poses = "poses" in new or scene.remark("poses")
-    parts = {
-        "key_frames": scene.training is None,
-        "frames": "frames" in new or (scene.remark("frames") and now.frames > scene.frames),
-        "pose_form": lacks_poses or is_by_row or {*forms} <= {*forms_now},
-        **dict.fromkeys(_OF_POSES, lacks_poses),
-        **dict.fromkeys(_UNITS, "depth" in new or not by_videos),
-    }
-    row = replace(now, **{part: getattr(scene, part) for part, is_kept in parts.items() if is_kept})
-    if row.id.split == "eval" and not row.id.subset:
-        row = replace(row, id=replace(row.id, subset=scene.id.subset))
-    for part, name in _COMPARED.items():
-        told = _changed(part, getattr(scene, part), getattr(row, part))
-        name = name if name in scene.members else ""
-        found += [(name, f"its path {each}" if part == "id" else each) for each in told]
-    for part in (*_STORED, *_UNITS) if videos is None else ():
-        cameras = zip(getattr(scene, part), getattr(row, part), strict=True)
-        for camera, (before, after) in enumerate(cameras):
-            name = scene.held_name(depth_name(camera))
-            if name in scene.members:
-                found += [(name, told) for told in _changed(part, before, after)]
-    return now, found
-
-
-def _described_by_row(
-    scene: Scene, folder: "MemberFolder", shape: Declaration | None, videos: Collection[str] | None
-) -> tuple[Scene, bool]:
-    """Return what a row's files say, and whether their poses are of a form that is stated.
-
-    The row's own form counts as stated, also where nothing settles on it any more. Files that have
-    no such poses are read without it, so that their form is told beside the row's.
-    """
-    if scene.pose_form and (shape is None or shape.poses is None):
-        at = PosesAt.of_reading(scene.pose_form.split("|")[0])
-        with suppress(SchemaError):
-            stated = Conventions((replace(shape or Declaration(), poses=at),))
-            now = describe_scene("", folder.key, conventions=stated, folder=folder, videos=videos)
-            if not now.remark("poses"):
-                return now, True
-    own = None if shape is None else Conventions((shape,))
-    now = describe_scene("", folder.key, conventions=own, folder=folder, videos=videos)
-    return now, shape is not None and shape.poses is not None
-
-
-_OF_POSES: Final = ("lateral_m", "rig_residual_px")
-_STORED: Final = ("depth_codec", "depth_pixel_format")
-_UNITS: Final = ("depth_unit_m", "depth_offset_m")
-_COMPARED: Final = {
-    "id": "", "rig": BASELINE_JSON, "labels": BASELINE_JSON, "caption": DESCRIPTION_JSON,
-    "training": TRAINING_JSON, "key_frames": TRAINING_JSON,
-    **dict.fromkeys(("frames", "pose_form", *_OF_POSES), TRAJECTORY_JSON),
-}  # fmt: skip
-"""The parts of a row that are compared, and the files that tell them."""
-
-
-def _placed(key: str, told: str) -> Difference:
-    """Return a message about a scene as the name of its file and the rest."""
-    name, _, rest = told.removeprefix(key).partition(": ")
-    return (name[1:], rest.rstrip(".")) if told.startswith(key) else ("", told.rstrip("."))
-
-
-def _changed(name: str, indexed: Any, now: Any) -> Iterator[str]:
-    """Yield how a value or the fields of a record differ from those of the index."""
-    if is_dataclass(now):
-        for each in fields(now):
-            yield from _changed(
-                each.name, getattr(indexed, each.name, None), getattr(now, each.name)
-            )
-    elif not _same(now, indexed, within=_ROUNDING.get(name, 0.0)):
-        yield f"tells {name} {brief(now)}, and by the index it is {brief(indexed)}"
-
-
-def _same(found: Any, indexed: Any, *, within: float = 0.0) -> bool:
-    """Return whether two values are equal; numbers may differ by rounding, and nan equals nan."""
-    if isinstance(found, tuple) and isinstance(indexed, tuple):
-        return len(found) == len(indexed) and all(
-            _same(one, other, within=within) for one, other in zip(found, indexed, strict=True)
-        )
-    if isinstance(found, float) and isinstance(indexed, float):
-        is_close = math.isclose(found, indexed, rel_tol=max(within, 1e-9), abs_tol=within)
-        return is_close or (math.isnan(found) and math.isnan(indexed))
-    return bool(found == indexed)

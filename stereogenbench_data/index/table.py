@@ -708,7 +708,7 @@ def _with_conventions(
     Raises:
         StorageError: If the rows were described by other conventions, or files contradict these.
     """
-    from stereogenbench_data.index.scene_folder import described_again
+    from stereogenbench_data.index.row_check import compared_with_files
     from stereogenbench_data.sources.members import MemberSource
 
     texts = [shape.text() for shape in conventions.shapes]
@@ -726,7 +726,7 @@ def _with_conventions(
     for row in rows.tolist():
         scene = replace(scene_of(table.slice(row, 1).to_pylist()[0]), conventions=texts[0])
         videos = [name for name in VIDEO_FILES if scene.held_name(name) in scene.members][:1]
-        _, found = described_again(scene, source, videos=videos)
+        _, found = compared_with_files(scene, source, videos=videos)
         for name, difference in found[:1]:
             by = f"; so it is by {conventions.where}. Correct the conventions" if name else ""
             raise StorageError(

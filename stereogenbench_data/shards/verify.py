@@ -15,7 +15,7 @@ from typing import Final, Literal
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
 from stereogenbench_data.errors import MediaError, ShardError, cure_of
-from stereogenbench_data.index.scene_folder import described_again
+from stereogenbench_data.index.row_check import compared_with_files
 from stereogenbench_data.index.table import SceneIndex, StaleIndexWarning
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
@@ -265,7 +265,7 @@ def _misindexed(expected: _ExpectedShard, sound: set[str]) -> Iterator[Problem]:
     source = MemberSource(expected.path.parent, shards={}, check="opened")
     for scene in expected.scenes:
         if sound.issuperset(f"{scene.id.key}.{name}" for name in scene.members):
-            _, differences = described_again(scene, source)
+            _, differences = compared_with_files(scene, source)
             for name, difference in differences:
                 yield expected.problem(
                     f"{scene.id.key}.{name}", "contradicts the index", difference, _FETCH_BOTH

@@ -21,7 +21,8 @@ from typing import Final
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, ShardError, StorageError, explain_os_errors
 from stereogenbench_data.index.parquet import INDEX_NAME, read_index_file
-from stereogenbench_data.index.scene_folder import derived_scene, described_again
+from stereogenbench_data.index.row_check import compared_with_files
+from stereogenbench_data.index.scene_folder import derived_scene
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import packed_depth
 from stereogenbench_data.media.depth_frames import CODEC_NAME
@@ -261,7 +262,7 @@ def _row_of(task: ShardTask, scene: Scene) -> Scene:
         scene = derived_scene(scene, parse_training(text, where=where))
     elif not RELEASED_NAMES.keys().isdisjoint(scene.members):
         scene = replace(scene, depth_codec=(CODEC_NAME,) * CAMERA_COUNT)
-    now, differences = described_again(scene, source)
+    now, differences = compared_with_files(scene, source)
     for name, difference in differences[:1]:
         raise ShardError(
             f"{Path(task.root, scene.id.key, name)}: {difference}. The index is older than the "

@@ -11,7 +11,8 @@ from stereogenbench_data.datasets.mapped import SceneViews, StereoPairs
 from stereogenbench_data.errors import FieldError, StereoGenBenchError, StorageError
 from stereogenbench_data.index.learning import chosen_scenes, examine, learn, tables_of_notes
 from stereogenbench_data.index.parquet import INDEX_NAME
-from stereogenbench_data.index.scene_folder import describe_scene, described_again
+from stereogenbench_data.index.row_check import compared_with_files
+from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.index.table import AssumptionWarning, SceneIndex
 from stereogenbench_data.schema.conventions import parse_conventions, write_toml
 from stereogenbench_data.schema.records import DepthEncoding
@@ -154,7 +155,7 @@ def test_a_row_is_compared_by_the_form_that_it_names_also_if_nothing_settles_on_
     index = SceneIndex.open(root, conventions=stated('[poses]\naxes = "opencv"'))
     row = replace(index.scene(0), conventions=None)
 
-    now, differences = described_again(row, source_of(index, row))
+    now, differences = compared_with_files(row, source_of(index, row))
 
     assert (now.pose_form, differences) == (row.pose_form, [])
     assert "no reading" in SceneIndex.open(root).scene(0).remark("poses")

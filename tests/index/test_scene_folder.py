@@ -8,10 +8,10 @@ import av
 import pytest
 
 from stereogenbench_data.errors import SchemaError, StorageError
+from stereogenbench_data.index.row_check import compared_with_files
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
     describe_scene,
-    described_again,
 )
 from stereogenbench_data.index.table import assumptions
 from stereogenbench_data.schema.conventions import parse_conventions
@@ -228,7 +228,7 @@ def test_without_a_size_a_focal_length_in_pixels_is_of_the_videos(make_scene, ro
     scene = describe_scene(root, KEY, conventions=parse_conventions(text, where="c.toml"))
 
     assert scene.rig.focal_mm == pytest.approx(40 / 32 * 24)
-    assert described_again(scene, MemberSource(root, shards={})) == (scene, [])
+    assert compared_with_files(scene, MemberSource(root, shards={})) == (scene, [])
 
 
 def test_a_sensor_of_another_shape_than_the_pictures_is_told(make_scene, root, rewrite):

@@ -227,7 +227,7 @@ def test_remote_shards_must_be_downloaded_first(tmp_path):
         ("baseline.json", lambda scene: {"rig": replace(scene.rig, image_width_px=63)},
          "tells image_width_px 64, and by the index it is 63"),
         ("trajectory.json", lambda scene: {"pose_form": "R: matrix, opencv axes @ 1.0"},
-         "tells pose_form null, and by the index it is 'R: matrix"),
+         "no reading of its poses fits the rig of baseline.json"),
         ("cam_00_depth.mkv", lambda scene: {"depth_unit_m": (1.0, *scene.depth_unit_m[1:])},
          "tells depth_unit_m 0.001, and by the index it is 1.0"),
         ("cam_05_depth.mkv", lambda scene: {"depth_codec": (*scene.depth_codec[:5], "hevc")},
