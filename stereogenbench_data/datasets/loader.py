@@ -483,15 +483,7 @@ class LoaderPass(Iterator[Any]):
             )
         loader, asked_s = self._loader, perf_counter()
         with self._ended_by_errors():
-            try:
-                batch = workers.next()
-            except (RuntimeError, OSError, EOFError) as error:
-                # Where a dead worker caused it, the error names that.
-                death = None if isinstance(error, StereoGenBenchError) else workers.error(error)
-                if death is None:
-                    raise
-                loader._forget(workers)
-                raise death from error
+            batch = workers.next()
         loader._waited_s += perf_counter() - asked_s
         loader._passed_s = perf_counter() - loader._pass_began_s
         begun.taken += 1
@@ -519,11 +511,20 @@ class LoaderPass(Iterator[Any]):
 
     @contextmanager
     def _ended_by_errors(self) -> Iterator[None]:
-        """Close the pass where an error is raised, and keep what is said to who asks on."""
+        """Close the pass where an error is raised, and keep what is said to who asks on.
+
+        Where a dead worker caused it, the error names that.
+        """
+        workers, death = self._workers, None
         try:
             yield
         except BaseException as error:
             begun = self._pass or self._loader.batches.next_pass()
+            is_torchs = isinstance(error, RuntimeError | OSError | EOFError)
+            if workers is not None and is_torchs and not isinstance(error, StereoGenBenchError):
+                death = workers.error(error)
+            if workers is not None and death is not None:
+                self._loader._forget(workers)
             if isinstance(error, StopIteration):
                 begun.is_exhausted = True
             else:
@@ -532,6 +533,8 @@ class LoaderPass(Iterator[Any]):
                     "batches with an error: begin another one, or load a state."
                 )
             self.close()
+            if death is not None:
+                raise death from error
             raise
 
     def close(self) -> None:

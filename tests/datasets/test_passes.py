@@ -291,6 +291,20 @@ def test_a_worker_that_dies_ends_the_pass_whatever_it_held(small_index, how, opt
     assert len(list(loader)) == 14
 
 
+def test_a_worker_that_is_killed_between_two_passes_is_named_by_the_second(small_index):
+    loader = StereoPairs(small_index, fields=FIELDS, frames="all").loader(
+        2, num_workers=2, persistent_workers=True, multiprocessing_context="fork"
+    )
+    assert len(list(loader)) == len(loader)
+    with contextlib.suppress(RuntimeError):  # torch's handler of the signal, wherever the loop is
+        os.kill(next(iter(processes.pids_for(loader))), signal.SIGKILL)
+        time.sleep(1)
+
+    with pytest.raises(WorkerError, match=r"worker \(pid \d+\) was killed by SIGKILL in"):
+        next(iter(loader))
+    assert len(list(loader)) == len(loader)
+
+
 def test_a_worker_that_is_killed_as_the_loader_is_closed_raises_nothing(small_index, monkeypatch):
     loader = StereoPairs(small_index, fields=FIELDS, frames="all").loader(
         2, num_workers=2, persistent_workers=True, multiprocessing_context="fork"
