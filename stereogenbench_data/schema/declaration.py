@@ -8,7 +8,7 @@ never read, so it contradicts nothing.
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final
 
@@ -175,13 +175,13 @@ _MATRICES: Final = tuple(f"$.{above}{name}" for above in ("camera_intrinsics.", 
                          for name in ("K", "camera_matrix"))  # fmt: skip
 
 
-def _in_pixels(name: str, of_point: tuple[str, ...], at: str) -> NumberAt:
+def _in_pixels(names: Sequence[str], of_point: Sequence[str], row: int, column: int) -> NumberAt:
     """Return where a number in pixels may stand: by itself, in a point, or in a camera matrix."""
-    places = [
-        f"$.{above}{name}{end}" for above in ("camera_intrinsics.", "") for end in ("", "_px")
-    ]
+    places = [f"$.{above}{name}" for above in ("camera_intrinsics.", "") for name in names]
     places += [f"{_CAMERA}principal_point{end}{part}" for end in ("", "_px") for part in of_point]
-    return NumberAt(places=(*places, *(f"{matrix}{at}" for matrix in _MATRICES)), unit="px")
+    places += [f"{matrix}{at}" for matrix in _MATRICES
+               for at in (f"[{row}][{column}]", f"[{3 * row + column}]")]  # fmt: skip
+    return NumberAt(places=tuple(places), unit="px")
 
 
 _NUMBERS: Final[Mapping[str, NumberAt]] = {
@@ -190,9 +190,10 @@ _NUMBERS: Final[Mapping[str, NumberAt]] = {
     "sensor_height": NumberAt(places=(f"{_CAMERA}sensor_height_mm",), unit="mm"),
     "image_width": NumberAt(places=("$.image_width",), unit="px"),
     "image_height": NumberAt(places=("$.image_height",), unit="px"),
-    "focal_length_px": _in_pixels("fx", (), "[0][0]"),
-    "principal_x": _in_pixels("cx", ("[0]", ".x"), "[0][2]"),
-    "principal_y": _in_pixels("cy", ("[1]", ".y"), "[1][2]"),
+    "focal_length_px": _in_pixels(("fx", "fx_px", "focal_length_px"), (), 0, 0),
+    "focal_length_y_px": _in_pixels(("fy", "fy_px"), (), 1, 1),
+    "principal_x": _in_pixels(("cx", "cx_px"), ("[0]", ".x"), 0, 2),
+    "principal_y": _in_pixels(("cy", "cy_px"), ("[1]", ".y"), 1, 2),
 }
 _PAIRS: Final = PairsAt(
     rows="$.pairwise_pairs[]", a="camera_index_a", b="camera_index_b", length="baseline_cm"

@@ -302,14 +302,16 @@ class _RigFile:
         width, height = (self._side(name) for name in ("image_width", "image_height"))
         like_px = size_px or (IMAGE_SIZE_PX, IMAGE_SIZE_PX)
         width_px, height_px = width or like_px[0], height or width or like_px[1]
-        known_px = width if size_px is None else width_px
-        focal_mm, sensor_width_mm = self._lens(known_px)
         _, sensor_height = self._number("sensor_height")
+        focal_mm, sensor_width_mm = self._lens(width if size_px is None else width_px)
+        sensor_height_mm = sensor_height or sensor_width_mm * height_px / width_px
+        if size_px is not None or width is not None:
+            self._compare_focal_y(focal_mm / sensor_height_mm * height_px)
         baselines_cm = self._baselines_cm()
         return Rig(
             focal_mm=focal_mm,
             sensor_width_mm=sensor_width_mm,
-            sensor_height_mm=sensor_height or sensor_width_mm * height_px / width_px,
+            sensor_height_mm=sensor_height_mm,
             image_width_px=width_px,
             image_height_px=height_px,
             principal_point_px=self._principal_point(width_px, height_px),
@@ -407,6 +409,15 @@ class _RigFile:
         path, focal_px = self._number("focal_length_px")
         if path and focal_px and width_px:
             yield path, focal_px / width_px
+
+    def _compare_focal_y(self, by_mm_px: float) -> None:
+        """Refuse a vertical focal length in pixels that is not that of the lens in mm."""
+        path, focal_y_px = self._number("focal_length_y_px")
+        if path and abs(by_mm_px - focal_y_px) > _RATIO * focal_y_px and not self.problems:
+            self.problems.append(
+                f"{path}: is {focal_y_px:.6g} px, and by focal length and sensor in mm it is "
+                f"{by_mm_px:.6g} px. Correct the wrong one"
+            )
 
     def _principal_point(self, *size_px: int) -> tuple[float, float] | None:
         """Return the principal point in pixels; None where it is the centre or not recorded."""

@@ -92,7 +92,7 @@ def test_intrinsics_in_pixels_are_compared_where_they_are_declared():
 
     found = sorted(recorded_px(document))
 
-    assert found == [("cx_px", 49.5), ("cy_px", 40.0), ("fx_px", 201.0)]
+    assert found == [("cx_px", 49.5), ("cy_px", 40.0), ("fx_px", 201.0), ("fy_px", 200.0)]
     assert rig_figures(RIG, poses(), found)["intrinsics_px"] == 1.0
 
 

@@ -172,6 +172,8 @@ LENGTH = r"pairwise_pairs\[3\]\.baseline_cm: must be a number above zero, found 
         (keys(pairwise_pairs={"0-1": 6.5}), r"pairwise_pairs\[\] is missing.*\[pairs\] rows = "),
         (lens(focal_length_mm=0.0325), r"0\.0325 mm.*0\.00137 widths"),
         (lens(sensor_width_mm=0.02376), r"0\.02376 mm.*e\+03 widths"),
+        (lens(fx=875.42, fy=920.0), r"intrinsics\.fy: is 920 px, .* it is 875\.421 px"),
+        (lens(K=[875.42, 0, 320, 0, 920, 240, 0, 0, 1]), r"intrinsics\.K\[4\]: is 920 px"),
         (lens(fx=920.0), r"intrinsics\.fx: means 1\.4375 focal.*focal_length_mm.* mean 1\.36785"),
         (keys(K=[[920.0, 0, 320], [0, 920.0, 240], [0, 0, 1]]), r"\$\.K\[0\]\[0\]: means 1\.4375"),
         (lens(cx=960.0, cy=720.0), r"by its principal point \(960, 720\) it is of .* 640x480"),

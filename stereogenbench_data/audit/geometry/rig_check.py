@@ -21,7 +21,8 @@ from stereogenbench_data.schema.records import Rig
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 
 _QUANTITIES: Final = {
-    "fx_px": "focal_length_px", "cx_px": "principal_x", "cy_px": "principal_y",
+    "fx_px": "focal_length_px", "fy_px": "focal_length_y_px",
+    "cx_px": "principal_x", "cy_px": "principal_y",
 }  # fmt: skip
 """The parts of `Intrinsics` and the tables of a declaration that say where they stand in pixels."""
 
