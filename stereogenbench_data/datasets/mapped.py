@@ -805,7 +805,7 @@ def _require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> Non
 def _warn_of_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> None:
     needs = {request.known[name].needs_poses for name in request.fields}
     rows = plan.scene_rows
-    if "unless rectified" in needs:
+    if needs != {"never"}:
         residuals_px = index.column("rig_residual_px")[rows]
         _warn(
             index, rows[residuals_px > RECTIFIED_PX],

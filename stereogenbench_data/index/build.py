@@ -73,7 +73,8 @@ FORMAT_CURE: Final = (
     "Files are read by the keys that the paper prints. For others, write where a quantity stands "
     "into a file of conventions: `stereogenbench conventions {root} -o c.toml` writes candidates "
     'as comments; keep a table, such as [focal_length] with place = "$.lens.f" and unit = "mm", '
-    "and give the file as conventions= or --conventions. docs/release.md has examples."
+    "below a [[shape]] if only some scenes have it there, and give the file as conventions= or "
+    "--conventions. docs/release.md has examples."
 )
 _WARN_ABOVE_REQUESTS: Final = 2500
 """More requests are told: the Hub answers 3,000 in five minutes."""
