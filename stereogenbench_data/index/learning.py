@@ -24,7 +24,7 @@ from stereogenbench_data.index.scene_folder import (
 )
 from stereogenbench_data.index.tree import folder_of
 from stereogenbench_data.media.container import StreamFacts
-from stereogenbench_data.schema.conventions import Conventions
+from stereogenbench_data.schema.conventions import Conventions, parse_conventions, write_toml
 from stereogenbench_data.schema.declaration import (
     UNKNOWN,
     Declaration,
@@ -299,12 +299,14 @@ def _stated_depth(group: Sequence[Examined]) -> DepthAs | None:
 
 
 def verify(root: str | Path, learned: Learned, scenes: Iterable[Examined]) -> None:
-    """Describe scenes by the conventions, and note those that are not what they are without."""
+    """Describe scenes by the conventions as they are written, and note those that then differ."""
+    written = write_toml(learned.conventions, {}).encode()
+    read_back = parse_conventions(written, where=learned.conventions.where)
     for each in (*(each for group in learned.taught_by for each in group), *scenes):
         if each.scene is None:
             continue
         try:
-            again = describe_scene(root, each.key, conventions=learned.conventions)
+            again = describe_scene(root, each.key, conventions=read_back)
         except StereoGenBenchError as error:
             learned.problems.append(problem_of_scene(str(error)))
             continue
