@@ -84,7 +84,7 @@ class RangedFile(SeekableFile):
     that were fetched ahead come from there.
 
     Attributes:
-        failure: The error of the first fetch that failed; further fetches raise it again.
+        failure: The error of the first fetch that failed, which was raised; the file ends there.
     """
 
     is_far = True
@@ -134,6 +134,8 @@ class RangedFile(SeekableFile):
         super().close()
 
     def _bytes(self, start: int, stop: int) -> bytes:
+        if self.failure is not None:
+            return b""  # FFmpeg tries again, and PyAV raises the first error, if there is no other
         table = self._table
         if table is not None:
             header = table.header_bytes(start, stop)
@@ -150,8 +152,6 @@ class RangedFile(SeekableFile):
 
     def _piece(self, start: int, stop: int) -> tuple[int, bytes]:
         """Return bytes from start on, with where they begin: fetched ahead, or now."""
-        if self.failure is not None:
-            raise self.failure  # FFmpeg may take the first one for the file's end, and try again
         try:
             found = self._ahead(start)
             if found is None:

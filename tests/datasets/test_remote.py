@@ -101,7 +101,7 @@ def test_a_server_that_fails_now_and_then_changes_nothing(
     assert shards_served.answers == []
 
 
-def test_a_server_that_dies_in_the_middle_is_reported(large_shards, impatient):
+def test_a_server_that_dies_in_the_middle_is_reported_once(large_shards, impatient, capsys):
     with serving(large_shards) as web:
         pairs = StereoPairs(web.url, frames="all")
         assert "disparity" in pairs[0]
@@ -111,6 +111,7 @@ def test_a_server_that_dies_in_the_middle_is_reported(large_shards, impatient):
         r"at byte \d+ of \d+ \(.*Connection refused; 10 tries\). Check the network",
     ):
         pairs[6]
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("video", ["rgb.mp4", "depth.mkv"])
