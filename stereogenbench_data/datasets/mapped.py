@@ -29,7 +29,7 @@ from stereogenbench_data.datasets.loader import (
     PairsLoader,
     accelerates_epoch,
 )
-from stereogenbench_data.datasets.overview import as_html, in_one_line, pairs_table
+from stereogenbench_data.datasets.overview import in_one_line, pairs_table
 from stereogenbench_data.datasets.shared import SharedEpoch
 from stereogenbench_data.errors import (
     FieldError,
@@ -488,10 +488,6 @@ class _MappedScenes(Dataset[Sample]):
     def __repr__(self) -> str:
         """Return a summary."""
         return in_one_line(type(self).__name__, self.index, self.plan, self.request, self.chosen)
-
-    def _repr_html_(self) -> str:
-        """Return a summary for a notebook."""
-        return as_html(repr(self), self.index, self.plan)
 
     def to_pandas(self) -> "pandas.DataFrame":
         """Return the selected pairs as a table, a row each, with what the index says of them.

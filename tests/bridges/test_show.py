@@ -5,7 +5,7 @@ import pandas
 import pytest
 import torch
 
-from stereogenbench_data import SceneIndex, SceneViews, StereoPairs, show
+from stereogenbench_data import SceneViews, StereoPairs, show
 from stereogenbench_data.bridges.picture import NOT_MEASURED
 from stereogenbench_data.errors import FieldError
 
@@ -90,15 +90,3 @@ def test_the_table_has_a_row_for_each_selected_pair(small_release):
     assert row["baseline_cm"] == pytest.approx(100 * float(first["baseline_m"]))
     sweep = StereoPairs(small_release, pairs="sweep").to_pandas()
     assert sweep["right"].tolist()[0] == [1, 2, 3, 4, 5]
-
-
-def test_a_notebook_shows_a_selection_without_reading_more(small_release, monkeypatch):
-    pairs = StereoPairs(SceneIndex.open(small_release), pairs="all")
-    read = []
-    monkeypatch.setattr(SceneIndex, "column", lambda self, name, column=SceneIndex.column: (
-        read.append(name), column(self, name))[1])  # fmt: skip
-    shown = pairs._repr_html_()
-
-    assert "&lt;StereoPairs: 60 of 420 samples" in shown
-    assert shown.count("<tr") == 12  # a head, ten rows, and that more were left out
-    assert set(read) <= {"key", "split", "subset", "family", "map_name"}
