@@ -108,7 +108,8 @@ def readings(
             if forms == "all" or _is_settled(kind.split(), turn.unit, said):
                 tier = _tier(turn, kind.split(), said)
                 tier = max(tier, 1) if has_rotators and not is_rotator else tier
-                of_turn = [None] if _holds_places(turn) else places
+                holds_places = turn.values.shape[2:] in _WITH_PLACES
+                of_turn = [None] if holds_places else places
                 found += [(tier, turn, place, kind, each) for place in of_turn if place is not turn]
     for tier, turn, place, kind, each in sorted(found, key=itemgetter(0)):
         stated = UNITS_M.get((place or turn).unit, recorded.unit_m)
@@ -128,10 +129,6 @@ def _name(turn: Block, place: Block | None, kind: str, axes: str) -> str:
 def _is_place(block: Block) -> bool:
     named_turns = (_ROTATOR, ("rx", "ry", "rz"))
     return block.values.shape[2:] == (3,) and block.components not in named_turns
-
-
-def _holds_places(block: Block) -> bool:
-    return block.values.shape[2:] in ((4, 4), (16,), (3, 4), (12,))
 
 
 def poses_at(document: dict[str, Any], at: PosesAt, *, where: str) -> tuple[str, CameraPoses]:
@@ -229,6 +226,7 @@ def _read(
 
 
 _ROTATOR: Final = ("pitch", "yaw", "roll")
+_WITH_PLACES: Final = ((4, 4), (16,), (3, 4), (12,))
 _MIRROR: Final = np.array([1.0, -1.0, 1.0])
 
 

@@ -24,7 +24,6 @@ from stereogenbench_data.errors import (
     text_without_secrets,
 )
 from stereogenbench_data.geometry.camera import recorded_intrinsics
-from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.pose_evidence import (
     MatchedPoses,
     SidesError,
@@ -255,7 +254,9 @@ class Description:
             rig=rig,
             frames=frames,
             frame_rate_hz=next(iter(self.facts.values())).frame_rate_hz,
-            lateral_m=assumed_places_m(rig) if poses is None else _places_m(poses),
+            lateral_m=(
+                assumed_places_m(rig) if poses is None else tuple(lateral_offsets_m(poses).tolist())
+            ),
             rig_residual_px=(
                 0.0 if poses is None else rectification_residual_px(poses, recorded_intrinsics(rig))
             ),
@@ -573,10 +574,6 @@ def median_depth_m(root: str | Path, scene: Scene) -> float:
 def missing_video(key: str, name: str) -> str:
     """Return what is remarked about a video that a scene lacks."""
     return f"{key}/{name}: is missing, and the scene is marked as complete"
-
-
-def _places_m(poses: CameraPoses) -> tuple[float, ...]:
-    return tuple(map(float, lateral_offsets_m(poses)))
 
 
 def assumed_places_m(rig: Rig) -> tuple[float, ...]:

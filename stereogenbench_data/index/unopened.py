@@ -200,7 +200,8 @@ def _row(
     places_m = assumed_places_m(rig)
     if not places_m:
         return None
-    if all(_is_mirrored(scene) for scene in alike):
+    ends = ((each.lateral_m[end] for end in each.rig.primary_pair) for each in alike)
+    if all(left_m > right_m for left_m, right_m in ends):  # numbered from right to left
         places_m = tuple(-place_m for place_m in places_m)
     lacking = [missing_video(key, name) for name in VIDEO_FILES
                if held_name(files, name) not in files]  # fmt: skip
@@ -248,12 +249,6 @@ def _of_baseline(
         marked = f"{key}/{COMPLETE_JSON}"
         labels = merged_labels(labels, parse_complete(folder.read(COMPLETE_JSON), where=marked)[0])
     return rig, labels, remarks
-
-
-def _is_mirrored(scene: Scene) -> bool:
-    """Return whether a scene's cameras stand the other way round than its primary pair says."""
-    left, right = scene.rig.primary_pair
-    return scene.lateral_m[left] > scene.lateral_m[right]
 
 
 class UnopenedScenes:

@@ -303,7 +303,8 @@ def leaves_at(document: Any, place: Place, *, where: str, way: Sequence[Step] = 
         try:
             nodes = [node[step] for node in nodes]
         except (KeyError, IndexError):
-            at = next(at for at, node in enumerate(nodes) if not _leads(node, step))
+            leads = (step < len(node) if type(step) is int else step in node for node in nodes)
+            at = [*leads].index(False)
             raise _missing(document, steps[: number + 1], nodes[at], at, lengths, where) from None
     if place.tail == "key":
         numbers = [numbers_in(key) for key in keys]
@@ -311,11 +312,6 @@ def leaves_at(document: Any, place: Place, *, where: str, way: Sequence[Step] = 
             raise SchemaError(f"{where}: {place.text}: a key has no such number in it")
         nodes = [each[place.number] for each in numbers]
     return nodes, tuple(lengths)
-
-
-def _leads(node: Any, step: Step) -> bool:
-    """Return whether a step leads on from a value of its kind."""
-    return step < len(node) if isinstance(step, int) else step in node
 
 
 def _missing(

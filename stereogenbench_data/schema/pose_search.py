@@ -287,14 +287,12 @@ def _key_of(elements: Sequence[Any], keys: Sequence[str]) -> str | None:
     named = {words(key): key for key in first}
     there = (named[key] for key in keys if key in named)
     numbered = (key for key in there if number_of(first[key]) is not None)
+    # Under "t" there may be seconds, which count nothing.
     return next(
-        (key for key in numbered if words(key) != "t" or not _are_times(elements, key)), None
-    )
-
-
-def _are_times(elements: Sequence[dict[str, Any]], key: str) -> bool:
-    """Return whether numbers are seconds, and count nothing."""
-    return any(type(each.get(key)) is float and not each[key].is_integer() for each in elements)
+        (key for key in numbered
+         if words(key) != "t" or all(number_of(each.get(key)) is not None for each in elements)),
+        None,
+    )  # fmt: skip
 
 
 def _step(frames: _Axis, place: str | None) -> int | None:

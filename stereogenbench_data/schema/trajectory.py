@@ -235,7 +235,8 @@ def _ordered(
         each = np.expand_dims(each, 1 - axis) if each.ndim == 1 else each
         if each.ndim == 2 and (each == each[:1] if axis else each == each[:, :1]).all():
             order = _order(each[0] if axis else each[:, 0], what, at, where)
-            values = values if _is_counting(order) else np.take(values, order, axis=axis)
+            if (order != np.arange(len(order))).any():
+                values = np.take(values, order, axis=axis)
             continue
         order = np.apply_along_axis(_order, axis, each, what, at, where)
         order = np.expand_dims(order, tuple(range(2, values.ndim)))
@@ -248,10 +249,6 @@ def first_frame(document: dict[str, Any], at: PosesAt) -> int | None:
     if at.frame is None:
         return None
     return int(_counted(document, at.frame, where="").min())
-
-
-def _is_counting(order: Int64[np.ndarray, " n"]) -> bool:
-    return bool((order == np.arange(len(order))).all())
 
 
 def _counted(document: dict[str, Any], text: str, *, where: str) -> Int64[np.ndarray, "..."]:
