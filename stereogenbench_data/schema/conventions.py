@@ -279,6 +279,10 @@ def _units_of(name: str, values: Mapping[str, Any]) -> Collection[str]:
 def _by_tables(tables: Mapping[str, Mapping[str, Any] | None]) -> dict[str, Any]:
     """Return the parts of a declaration that tables replace; None is that there are none."""
     numbers, parts = dict(BUILT_IN.numbers), dict[str, Any]()
+    if {"place", "value"} & (tables.get("focal_length") or {}).keys():
+        # Who says where it stands does not want it compared with what stands elsewhere.
+        for name in ("focal_length", "focal_length_px", "focal_length_y_px"):
+            del numbers[name]
     for name, values in tables.items():
         if values is None:
             parts[name] = None
@@ -292,7 +296,6 @@ def _by_tables(tables: Mapping[str, Mapping[str, Any] | None]) -> dict[str, Any]
             parts[name] = PrimaryPairAt(left=left, right=right, is_needed=is_needed)
         elif {"place", "value"} & values.keys():
             quantity = _AS.get(values.get("as", ""), name)
-            numbers.pop("focal_length", None) if name == "focal_length" else None
             numbers[quantity] = _number(quantity, values, is_needed=is_needed)
         else:
             from_release = numbers[name]

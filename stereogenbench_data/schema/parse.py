@@ -36,6 +36,7 @@ from stereogenbench_data.schema.places import (
     first_value,
     numbers_in,
     path_to,
+    place_at,
     value_at,
 )
 from stereogenbench_data.schema.records import Remark, Rig, SceneId, SceneLabels
@@ -245,6 +246,7 @@ _LENSES: Final = (0.04, 60.0)
 _RATIO: Final = 5e-3
 """How far a focal length in pixels, or a field of view, may be from focal length over sensor width:
 it is often rounded."""
+_NOT_COMPARED: Final = "or say in a file of conventions where [focal_length] stands"
 _CENTRE_PX: Final = 1.0
 """How far a principal point may be from the image's centre to be that centre: conventions of pixels
 differ by a half, and centres are written as whole pixels."""
@@ -384,7 +386,7 @@ class _RigFile:
                 self.problems.append(
                     f"{path}: means {ratio:.6g} focal lengths a sensor width, and focal length and "
                     f"sensor width in mm ({focal_at}, {sensor_at}) mean {found:.6g}. Correct the "
-                    f"wrong one"
+                    f"wrong one, {_NOT_COMPARED}"
                 )
         low, high = _DECLARED_LENSES if self._declared.stated else _LENSES
         if not low <= found <= high:
@@ -416,7 +418,7 @@ class _RigFile:
         if path and abs(by_mm_px - focal_y_px) > _RATIO * focal_y_px and not self.problems:
             self.problems.append(
                 f"{path}: is {focal_y_px:.6g} px, and by focal length and sensor in mm it is "
-                f"{by_mm_px:.6g} px. Correct the wrong one"
+                f"{by_mm_px:.6g} px. Correct the wrong one, {_NOT_COMPARED}"
             )
 
     def _principal_point(self, *size_px: int) -> tuple[float, float] | None:
@@ -453,7 +455,7 @@ class _RigFile:
                 told = "has no primary pair, so cameras are taken to be numbered from left to right"
                 self.remarks.append(Remark("primary pair", f"{self._where}: {told}"))
             return 0, 1
-        left, right = (camera_named(value) for _, value in ends)
+        left, right = (_camera_at(path, value) for path, value in ends)
         stated = self.document.get("primary_stereo_pair")
         if at == BUILT_IN.primary_pair and isinstance(stated, list):
             left = None if [*map(type, stated)] != [int, int] else left
@@ -461,7 +463,9 @@ class _RigFile:
             found = ", ".join(f"{path or 'nothing'} {brief(value)}" for path, value in ends)
             self.problems.append(
                 f"the primary pair must be a left and a right one of the cameras 0 to "
-                f"{CAMERA_COUNT - 1}, as numbers or names that end in Cam_00, found {found}"
+                f"{CAMERA_COUNT - 1}, as numbers or names that end in Cam_00, found {found}. Other "
+                f'names: [primary_pair] left = "$.its.place#0" is the first number in one, # the '
+                f"last"
             )
             return 0, 1
         return left, right
@@ -564,6 +568,15 @@ def camera_named(value: object) -> int | None:
     return value if type(value) is int else None
 
 
+def _camera_at(text: str, value: object) -> int | None:
+    """Return the camera that the value at a place stands for: with "#", one of its numbers."""
+    place = place_at(text)
+    if place.tail != "key":
+        return camera_named(value)
+    numbers = dict(enumerate(numbers_in(str(value))))
+    return numbers.get(place.number if place.number >= 0 else len(numbers) - 1)
+
+
 class _OddRow(Exception):
     """A row that has no pair of cameras with a baseline."""
 
@@ -583,9 +596,11 @@ def _row(at: PairsAt, row: Any, keys: str, way: tuple[str | int, ...]) -> tuple[
         else:
             a, b = _camera_of_row(row, keys, at.a, 0), _camera_of_row(row, keys, at.b, 1)
             stated = value_at(row, at.length) if at.length else row
-    except (LookupError, TypeError) as error:
-        told = f"{path_to(way)}: has no {error.args[0]}; it is {brief(row)}"
-        raise _OddRow(told) from error
+    except LookupError as error:
+        raise _OddRow(f"{path_to(way)}: has no {error.args[0]}; it is {brief(row)}") from error
+    except TypeError as error:
+        keys = ", ".join((at.a, at.b, at.length))
+        raise _OddRow(f"{path_to(way)}: must have the keys {keys}; it is {brief(row)}") from error
     if a is None or b is None or not 0 <= a - at.first < CAMERA_COUNT > b - at.first >= 0:
         raise _OddRow(
             f"{path_to(way)}: is of cameras {a} and {b}, and the rig has cameras {at.first} to "

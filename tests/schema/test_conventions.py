@@ -1,5 +1,6 @@
 """Files of conventions: what they may state, and what is refused with file, key, value and cure."""
 
+import contextlib
 import itertools
 import re
 
@@ -300,6 +301,7 @@ def test_baselines_in_each_form_are_read_where_a_file_says(rig_document, dumped,
 def test_a_lens_in_each_form_is_read_where_a_file_says(rig_document, dumped, lens, stated):
     rig_document["lens"] = lens
     del rig_document["camera_intrinsics"]["focal_length_mm"]
+    rig_document["camera_intrinsics"]["fx"] = 1.37  # which is then not compared
     (shape,) = read(f"format = 2\n{stated}\n".encode()).shapes
 
     rig = parse_rig(dumped(rig_document), where="b", declared=shape)[0]
@@ -328,6 +330,23 @@ def test_a_primary_pair_that_need_not_be_there_is_the_first_two_cameras(rig_docu
 
     assert rig.primary_pair == (0, 1)
     assert remark.about == "primary pair"
+
+
+@pytest.mark.parametrize(
+    ("left", "end", "found"),
+    [("Cam_03_C_1", "#0", 3), ("CineCameraActor_3", "#", 3), ("3", "#", 3), ("left", "#", None)],
+)
+def test_a_number_in_a_name_is_a_camera_where_a_file_says(rig_document, dumped, left, end, found):
+    rig_document["primary_stereo_pair"] = {"left_camera": left, "right_camera": 4}
+    pair = "$.primary_stereo_pair"
+    places = f'left = "{pair}.left_camera{end}"\nright = "{pair}.right_camera"'
+    (shape,) = read(f"format = 2\n[primary_pair]\n{places}\n".encode()).shapes
+    with pytest.raises(SchemaError, match=r'left = "\$\.its\.place#0" is the first number'):
+        parse_rig(dumped(rig_document), where="b")
+
+    with pytest.raises(SchemaError) if found is None else contextlib.nullcontext():
+        rig = parse_rig(dumped(rig_document), where="b", declared=shape)[0]
+        assert rig.primary_pair == (found, 4)
 
 
 @pytest.mark.parametrize("place", ["$.none", "$.pairwise_pairs[99]"])

@@ -168,6 +168,7 @@ LENGTH = r"pairwise_pairs\[3\]\.baseline_cm: must be a number above zero, found 
          r"pairwise_pairs\[7\].*0 and 2 is 13.5 cm here and 13.25 cm at \$\.pairwise_pairs\[1\]"),
         (keys(adjacent_pairs=[{"camera_index_a": 1, "camera_index_b": 2, "baseline_cm": 6.9}]),
          r"adjacent_pairs\[0\]\.b.*1 and 2 is 6.9 cm here and 6.75 cm at \$\.pairwise_pairs\[5\]"),
+        (keys(pairwise_pairs=[None]), r"pairs\[0\]: must have the keys camera_index_a,.* is null"),
         (keys(pairwise_pairs=[]), "each of the 15 pairs of cameras, and lacks 0-1"),
         (keys(pairwise_pairs={"0-1": 6.5}), r"pairwise_pairs\[\] is missing.*\[pairs\] rows = "),
         (lens(focal_length_mm=0.0325), r"0\.0325 mm.*0\.00137 widths"),
