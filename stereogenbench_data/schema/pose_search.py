@@ -176,11 +176,11 @@ def _places(
 def _places_in_list(
     node: list[Any], path: str, owner: str, axes: tuple[_Axis, ...], depth: int
 ) -> Iterator[PosesAt]:
+    if len(axes) == 2 and _shape_of(node) in _TRAILING:
+        yield from _numbered(path, axes)
+    elif len(node) == 1:  # a list of one shot, or of one vector
+        yield from _places(node[0], f"{path}[0]", owner, axes, depth + 1)
     if len(axes) == 2:
-        if _shape_of(node) in _TRAILING:
-            yield from _numbered(path, axes)
-        elif len(node) == 1:
-            yield from _places(node[0], f"{path}[0]", owner, axes, depth + 1)
         return
     inner = f"{path}[]"
     axis = _Axis(inner, owner, node)

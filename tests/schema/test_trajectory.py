@@ -115,9 +115,9 @@ def named(place):
             id="an order of its own",
         ),
         pytest.param(
-            lambda d: {"frames": [[{"loc": p} for k, _, p in poses_of(d) if k == f]
-                                  for f in range(3)]},
-            id="lists in lists",
+            lambda d: {"shots": [{"frames": [[{"loc": p} for k, _, p in poses_of(d) if k == f]
+                                             for f in range(3)]}]},
+            id="lists in lists, of one shot",
         ),
         pytest.param(
             lambda d: {"frames": [{"t": f / 15, "cameras": [{"loc": p} for k, _, p in poses_of(d)
