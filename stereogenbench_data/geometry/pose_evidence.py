@@ -29,7 +29,7 @@ from stereogenbench_data.schema.pose_search import RecordedPoses, recorded_in
 from stereogenbench_data.schema.records import Rig, Scene
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from stereogenbench_data.schema.text import shortened
-from stereogenbench_data.schema.trajectory import first_frame, parse_trajectory
+from stereogenbench_data.schema.trajectory import first_frame, parse_trajectory, require_order
 from stereogenbench_data.schema.units import UNITS_M
 
 _DEVIATION_CM: Final = 0.1
@@ -120,6 +120,8 @@ def settled_poses(
         if isinstance(error, SidesError) or not odd:
             raise
         raise SchemaError(f"{where}: {odd[0]}.") from error
+    if settled.at.frame is None and named is None:
+        require_order(document, settled.at, where=where)
     first = first_frame(document, settled.at)
     form = settled.form if named is None else "|".join(settled.names)
     return replace(settled, at=replace(settled.at, first=first), form=form)

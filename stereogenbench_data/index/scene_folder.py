@@ -7,6 +7,7 @@ an existing row.
 
 import functools
 import math
+import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -462,7 +463,7 @@ class Description:
         for name in (name for name in self.files if name in read or name not in FILES):
             with suppress(SchemaError):
                 text, stem = self.folder.read(name), name.rpartition(".")[0]
-                if b"depth" in (stem.encode() + text).lower():
+                if re.search(rb"(?i)depth|zbuffer", stem.encode() + text):
                     document = parse_object(text, where=name)
                     stated += stated_in_json(
                         document, name=self.where(name), about="" if name in read else stem,

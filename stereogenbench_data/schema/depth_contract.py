@@ -51,6 +51,9 @@ _OTHER_MEANING: Final = re.compile(
     r"normali[sz]\w*|distance_to_cam\w*|range_image)(?![a-z])"
 )
 """Words of a depth that is no length along the optical axis, or not the stored number times one."""
+_DEPTHS: Final = frozenset({"depth", "depthmap", "zbuffer", "zdepth"})
+_NAMES_DEPTH: Final = re.compile(r"(?:.*[/_])?depth(?:map|\.[a-z0-9]+)?")
+"""What an object names, such as the file cam_00_depth.mkv, if its scale and unit are of depth."""
 _OTHER_DEPTHS: Final = re.compile(r"depth_of_field|(?:bit|colou?r)_depth|(?:^|_)dof(?:_|$)")
 _TECHNICAL: Final = frozenset(
     {"encoder", "duration", "creation", "handler", "vendor", "language", "brand", "brands",
@@ -145,17 +148,19 @@ def stated_in_json(
         document: The file as parsed JSON.
         name: Its path, for messages.
         about: The name of a file that is itself about depth: its keys need not name it.
-        is_prose: Whether it describes a scene: then texts count only below keys of a scale.
+        is_prose: Whether it describes a scene: then texts count only below keys of a scale, as
+            whatever stands in a list.
     """
     found: list[Statement] = []
-    for path, key, value in _nodes_of(document):
-        place = words(f"{about} {path}")
+    for path, key, value, owner in _nodes_of(document):
+        place = words(f"{about} {path} {owner}")
         parts = words(key).split("_")
-        if "depth" not in place.split("_") or _OTHER_DEPTHS.search(place):
+        if _DEPTHS.isdisjoint(place.split("_")) or _OTHER_DEPTHS.search(place):
             continue
         if not ({*place.split("_")}.isdisjoint(_STATISTICS) and _RANGES.isdisjoint(parts)):
             continue
-        if is_prose and _SCALES.isdisjoint(parts):
+        is_scale = not _SCALES.isdisjoint(parts) or _ratio(words(key)) is not None
+        if not is_scale and (is_prose or "[" in path):
             continue
         text = value.strip() if isinstance(value, str) else json.dumps(value)
         statement = _stated(words(key), text, f"{name}: {path} is", "metadata")
@@ -164,22 +169,26 @@ def stated_in_json(
     return found
 
 
-def _nodes_of(document: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
-    """Yield path, key and value of each text and number, also of lists of the six cameras."""
-    waiting: list[tuple[str, str, Any, int]] = [("$", "", document, 0)]
-    for path, key, node, depth in waiting:  # which grows
+def _nodes_of(document: dict[str, Any]) -> Iterator[tuple[str, str, Any, str]]:
+    """Yield path, key and value of each text and number, and what the object says that it is of."""
+    waiting: list[tuple[str, str, Any, int, str]] = [("$", "", document, 0, "")]
+    for path, key, node, depth, owner in waiting:  # which grows
         is_open = depth < _DEEPEST and len(waiting) < _MOST_NODES
-        if isinstance(node, list) and len(node) == CAMERA_COUNT and is_open:
-            waiting += [(f"{path}[{at}]", key, node[at], depth + 1) for at in range(CAMERA_COUNT)]
+        if isinstance(node, list) and is_open:
+            waiting += [(f"{path}[{at}]", key, each, depth + 1, owner)
+                        for at, each in enumerate(node)]  # fmt: skip
         elif isinstance(node, dict) and is_open:
             is_of_cameras = {*map(number_of, node)} == {*range(CAMERA_COUNT)}
+            texts = (each for each in node.values() if isinstance(each, str) and depth > 0)
+            of_depth = any(_NAMES_DEPTH.fullmatch(each.lower()) for each in texts)
+            owner = "depth" if of_depth else owner
             waiting += [
                 (child_path(path, each), key if is_of_cameras or each == "value" else each,
-                 node[each], depth + 1)
+                 node[each], depth + 1, owner)
                 for each in node
             ]  # fmt: skip
         elif isinstance(node, str | int | float):
-            yield path, key, node
+            yield path, key, node, owner
 
 
 def _refused(place: str, text: str, origin: Origin, why: str) -> Statement:

@@ -8,7 +8,8 @@
     $.frames[].cameras[].location[x,y,z]    several values below, side by side
     $.cameras[].pose[0:3]                   a part of a list
     $.pose~                                 the numbers of a text
-    $.frames[].{}#                          the last number of the entry's key; #0 is its first
+    $.frames[].{}#, $.frames[].name#        the last number of the entry's key, or of a name; #0 is
+                                            its first
 
 There are no patterns: places come with an index from people whom nobody knows, and whatever they
 say, each value of a document is visited once for each place.
@@ -307,9 +308,10 @@ def leaves_at(document: Any, place: Place, *, where: str, way: Sequence[Step] = 
             at = [*leads].index(False)
             raise _missing(document, steps[: number + 1], nodes[at], at, lengths, where) from None
     if place.tail == "key":
-        numbers = [numbers_in(key) for key in keys]
+        texts = keys if isinstance(steps[-1], Entries) else map(str, nodes)
+        numbers = [numbers_in(text) for text in texts]
         if not all(len(each) > max(place.number, 0) for each in numbers):
-            raise SchemaError(f"{where}: {place.text}: a key has no such number in it")
+            raise SchemaError(f"{where}: {place.text}: a name has no such number in it")
         nodes = [each[place.number] for each in numbers]
     return nodes, tuple(lengths)
 

@@ -6,7 +6,7 @@ mean as poses is for `geometry.pose_forms` to say and for `geometry.pose_evidenc
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -44,6 +44,8 @@ COMPONENTS: Final = (
 _LARGEST: Final = 10**9
 """The largest number of a frame or a camera."""
 _MOST_VALUES: Final = 2_000_000
+_DEEPEST: Final = 3
+"""How deep in a frame is looked for what counts it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +115,8 @@ def read_block(document: dict[str, Any], at: PosesAt, text: str, *, where: str) 
         columns = [_numbers(document, place, at, way=way, where=where) for way in place.parts]
         values = np.stack(columns, axis=-1)
         known = next((each for each in COMPONENTS if {*each} == {*components}), None)
-        if known is not None and len(components) == len(known):
+        # Three that end in x, y and z stay in the order that is stated: they may be angles.
+        if known is not None and known[-1][-1] != "z" and len(components) == len(known):
             values = values[..., [components.index(each) for each in known]]
             components = COMPONENTS[0] if known == ("p", "y", "r") else known
     else:
@@ -242,6 +245,61 @@ def _ordered(
         order = np.expand_dims(order, tuple(range(2, values.ndim)))
         values = np.take_along_axis(values, order, axis=axis)
     return np.ascontiguousarray(values)
+
+
+_COUNTS: Final = re.compile(
+    r"(?:^|_)(?:frame|image|img|file|path|name|shot|index|idx|number|sequence|n|id|no)(?:_|$)"
+)
+_TIMES: Final = re.compile(r"time|stamp|tick|(?:^|_)(?:t|s|ms|sec|seconds)(?:_|$)")
+"""Words of keys of what counts frames, and of their times."""
+
+
+def require_order(document: dict[str, Any], at: PosesAt, *, where: str) -> None:
+    """Refuse frames whose order in their list is not that of what seems to count them.
+
+    Looked at are times, and numbers and names that have one step from frame to frame once sorted.
+
+    Args:
+        document: The file as parsed JSON.
+        at: Where poses stand; of frames that are in the order of their list.
+        where: The file's path, for messages.
+
+    Raises:
+        SchemaError: If so; it names the key.
+    """
+    place = place_at(str(at.rotation))
+    axes = [n for n, step in enumerate(place.steps) if isinstance(step, Every | Entries)]
+    frames_at = axes[1 if at.outer == "cameras" else 0] + 1
+    frames, lengths = leaves_at(document, Place(place.text, place.steps[:frames_at]), where=where)
+    counts: dict[str, list[Any]] = {}
+    for frame in frames[: lengths[-1]]:
+        for key, value in _named_values(frame):
+            counts.setdefault(key, []).append(value)
+    for key, values in counts.items():
+        own, digits = words(key.rpartition(".")[2]), [re.findall(r"[0-9]+", str(v)) for v in values]
+        is_time = _TIMES.search(own) is not None
+        if not (is_time or _COUNTS.search(own)) or not all(digits) or len(values) < lengths[-1]:
+            continue
+        are_numbers = {*map(type, values)} <= {int, float}
+        found = np.array(values if are_numbers else [float("".join(each)) for each in digits])
+        steps = np.diff(np.sort(found))
+        is_odd = len(steps) > 0 and (steps > 0).all() and (np.diff(found) < 0).any()
+        if is_odd and (is_time or (steps == steps[0]).all()):
+            first = ", ".join(brief(value) for value in values[:3])
+            raise SchemaError(
+                f"{where}: its frames are in another order than their {key} says: {first}, ... "
+                f"Sort them, or say where their numbers stand: frame below [poses] of conventions"
+            )
+
+
+def _named_values(node: Any, path: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """Yield the numbers and texts of a frame, also of an object in it and of its first camera."""
+    node = node[0] if type(node) is list and node else node
+    for key, value in node.items() if type(node) is dict and depth < _DEEPEST else ():
+        if type(value) in (int, float, str):
+            yield f"{path}{key}", value
+        else:
+            yield from _named_values(value, f"{path}{key}.", depth + 1)
 
 
 def first_frame(document: dict[str, Any], at: PosesAt) -> int | None:

@@ -236,6 +236,31 @@ def test_frames_that_count_by_twos_are_frames_in_order():
     assert (found.at.frame, found.at.first, found.at.step) == ("$.frames[].frame", 6, 2)
 
 
+@pytest.mark.parametrize(
+    "count",
+    [
+        lambda n: {"image": f"frame_{n:04d}.png"},
+        lambda n: {"meta": {"sequence_frame": 100 + n}},
+        lambda n: {"time": n / 15},
+        lambda n: {"timecode": f"00:00:05:{n:02d}"},
+        lambda n: {"cameras": [{"file": f"cam_{camera:02d}/{n}.png"} for camera in range(6)]},
+    ],
+)
+def test_frames_in_another_order_than_what_counts_them_are_refused(count):
+    document = json.loads(written("rotator", *TURNED))
+    for number, frame in enumerate(document["frames"]):
+        del frame["frame_index"]
+        more = count(number)
+        for pose, own in zip(frame["cameras"], more.pop("cameras", [{}] * 6), strict=True):
+            pose |= own
+        frame |= more | {"frames_left": 3 - number, "focus_number": [1, 3, 0][number]}
+    assert understood(json.dumps(document).encode()).at.frame is None
+
+    document["frames"].reverse()
+    with pytest.raises(SchemaError, match=r"in another order than their \S+ says.*frame below"):
+        understood(json.dumps(document).encode())
+
+
 angles = st.tuples(st.floats(-60, 60), st.floats(-180, 180), st.floats(-15, 15))
 
 

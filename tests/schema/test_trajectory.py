@@ -249,6 +249,15 @@ DECLARED = {
         {"frame": "$.rows[].n", "camera": "$.rows[].c", "outer": "rows"},
         "$.rows[].pose[0:3]",
     ),
+    "rows with two numbers in a name, components in an order of their own": (
+        lambda document: {"images": [
+            {"name": f"cam_{camera:02d}/{number:04d}.png", "t": {"z": x, "x": y, "y": z}}
+            for number, poses in enumerate(places(document).tolist())
+            for camera, (x, y, z) in enumerate(poses)
+        ][::-1]},
+        {"frame": "$.images[].name#1", "camera": "$.images[].name#0", "outer": "rows"},
+        "$.images[].t[z,x,y]",
+    ),
 }  # fmt: skip
 
 
