@@ -250,14 +250,16 @@ def _ordered(
 _COUNTS: Final = re.compile(
     r"(?:^|_)(?:frame|image|img|file|path|name|shot|index|idx|number|sequence|n|id|no)(?:_|$)"
 )
-_TIMES: Final = re.compile(r"time|stamp|tick|(?:^|_)(?:t|s|ms|sec|seconds)(?:_|$)")
+_TIMES: Final = re.compile(r"time|stamp|tick|(?:^|_)(?:t|ms|sec|seconds)(?:_|$)")
 """Words of keys of what counts frames, and of their times."""
+_ROUNDED: Final = 0.1
+"""By what share steps of times may differ."""
 
 
 def require_order(document: dict[str, Any], at: PosesAt, *, where: str) -> None:
     """Refuse frames whose order in their list is not that of what seems to count them.
 
-    Looked at are times, and numbers and names that have one step from frame to frame once sorted.
+    Looked at are numbers and names with one step from frame to frame once sorted, and times.
 
     Args:
         document: The file as parsed JSON.
@@ -282,9 +284,10 @@ def require_order(document: dict[str, Any], at: PosesAt, *, where: str) -> None:
             continue
         are_numbers = {*map(type, values)} <= {int, float}
         found = np.array(values if are_numbers else [float("".join(each)) for each in digits])
-        steps = np.diff(np.sort(found))
-        is_odd = len(steps) > 0 and (steps > 0).all() and (np.diff(found) < 0).any()
-        if is_odd and (is_time or (steps == steps[0]).all()):
+        steps, given = np.diff(np.sort(found)), np.diff(found)
+        is_odd = len(steps) > 0 and (steps > 0).all() and (given < 0).any()
+        is_regular = is_odd and np.allclose(steps, steps[0], rtol=_ROUNDED if is_time else 0)
+        if is_regular or (is_odd and is_time and (given < 0).all()):
             first = ", ".join(brief(value) for value in values[:3])
             raise SchemaError(
                 f"{where}: its frames are in another order than their {key} says: {first}, ... "
