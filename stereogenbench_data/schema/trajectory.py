@@ -248,9 +248,9 @@ def _ordered(
 
 
 _COUNTS: Final = re.compile(
-    r"(?:^|_)(?:frame|image|img|file|path|name|shot|index|idx|number|sequence|n|id|no)(?:_|$)"
+    r"time|stamp|tick|(?:^|_)(?:frame|image|img|file|path|name|shot|index|idx|number|sequence|n|id|no|"
+    r"t|ms|sec|seconds)(?:_|$)"
 )
-_TIMES: Final = re.compile(r"time|stamp|tick|(?:^|_)(?:t|ms|sec|seconds)(?:_|$)")
 """Words of keys of what counts frames, and of their times."""
 _ROUNDED: Final = 0.1
 """By what share steps of times may differ."""
@@ -259,7 +259,7 @@ _ROUNDED: Final = 0.1
 def require_order(document: dict[str, Any], at: PosesAt, *, where: str) -> None:
     """Refuse frames whose order in their list is not that of what seems to count them.
 
-    Looked at are numbers and names with one step from frame to frame once sorted, and times.
+    That are numbers, times and names that all fall, or that have one step once they are sorted.
 
     Args:
         document: The file as parsed JSON.
@@ -278,16 +278,15 @@ def require_order(document: dict[str, Any], at: PosesAt, *, where: str) -> None:
         for key, value in _named_values(frame):
             counts.setdefault(key, []).append(value)
     for key, values in counts.items():
-        own, digits = words(key.rpartition(".")[2]), [re.findall(r"[0-9]+", str(v)) for v in values]
-        is_time = _TIMES.search(own) is not None
-        if not (is_time or _COUNTS.search(own)) or not all(digits) or len(values) < lengths[-1]:
+        digits = [re.findall(r"[0-9]+", str(value)) for value in values]
+        is_count = _COUNTS.search(words(key.rpartition(".")[2])) and all(digits)
+        if not is_count or not 1 < len(values) == lengths[-1]:
             continue
         are_numbers = {*map(type, values)} <= {int, float}
         found = np.array(values if are_numbers else [float("".join(each)) for each in digits])
-        steps, given = np.diff(np.sort(found)), np.diff(found)
-        is_odd = len(steps) > 0 and (steps > 0).all() and (given < 0).any()
-        is_regular = is_odd and np.allclose(steps, steps[0], rtol=_ROUNDED if is_time else 0)
-        if is_regular or (is_odd and is_time and (given < 0).all()):
+        given, steps = np.diff(found), np.diff(np.sort(found))
+        is_regular = (steps > 0).all() and np.allclose(steps, steps[0], rtol=_ROUNDED)
+        if (given < 0).all() or (is_regular and (given < 0).any()):
             first = ", ".join(brief(value) for value in values[:3])
             raise SchemaError(
                 f"{where}: its frames are in another order than their {key} says: {first}, ... "
