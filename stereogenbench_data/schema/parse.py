@@ -36,7 +36,6 @@ from stereogenbench_data.schema.places import (
     first_value,
     numbers_in,
     path_to,
-    place_at,
     value_at,
 )
 from stereogenbench_data.schema.records import Remark, Rig, SceneId, SceneLabels
@@ -455,7 +454,7 @@ class _RigFile:
                 told = "has no primary pair, so cameras are taken to be numbered from left to right"
                 self.remarks.append(Remark("primary pair", f"{self._where}: {told}"))
             return 0, 1
-        left, right = (_camera_at(path, value) for path, value in ends)
+        left, right = (camera_named(value) for _, value in ends)
         stated = self.document.get("primary_stereo_pair")
         if at == BUILT_IN.primary_pair and isinstance(stated, list):
             left = None if [*map(type, stated)] != [int, int] else left
@@ -568,15 +567,6 @@ def camera_named(value: object) -> int | None:
     return value if type(value) is int else None
 
 
-def _camera_at(text: str, value: object) -> int | None:
-    """Return the camera that the value at a place stands for: with "#", one of its numbers."""
-    place = place_at(text)
-    if place.tail != "key":
-        return camera_named(value)
-    numbers = dict(enumerate(numbers_in(str(value))))
-    return numbers.get(place.number if place.number >= 0 else len(numbers) - 1)
-
-
 class _OddRow(Exception):
     """A row that has no pair of cameras with a baseline."""
 
@@ -618,11 +608,11 @@ def _camera_of_row(row: Any, keys: str, at: str, number: int) -> int | None:
     Raises:
         LookupError: If nothing stands there.
     """
-    if "#" not in at and at != "order":
-        return camera_named(value_at(row, at))
-    place, _, which = at.partition("#")
-    text = str(value_at(row, place)) if place not in ("", "order") else keys
-    return numbers_in(text)[int(which or -1)] + (number if at == "order" else 0)
+    if at == "order":
+        return numbers_in(keys)[-1] + number
+    if at.startswith("#"):
+        return numbers_in(keys)[int(at[1:] or -1)]
+    return camera_named(value_at(row, at))
 
 
 def found_pairs(document: dict[str, Any], pairs: PairsAt) -> PairsAt:

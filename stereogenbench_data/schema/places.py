@@ -179,7 +179,7 @@ def _value(document: Any, place: Place) -> Any:
             document = document[step]
         else:
             return _NOTHING
-    return document if place.tail in ("", "key") else at_end(document, place)
+    return at_end(document, place) if place.tail else document
 
 
 def at_end(value: Any, place: Place) -> Any:
@@ -188,6 +188,9 @@ def at_end(value: Any, place: Place) -> Any:
         return value[slice(*place.part)]
     if place.tail == "text" and type(value) is str and len(value) <= _LONGEST_TEXT:
         return [float(number) for number in _NUMBER.findall(value)]
+    if place.tail == "key":
+        numbers = numbers_in(str(value))
+        return numbers[place.number] if len(numbers) > max(place.number, 0) else _NOTHING
     if place.tail == "parts":
         parts = [_value(value, Place("", way)) for way in place.parts]
         return _NOTHING if _NOTHING in parts else parts

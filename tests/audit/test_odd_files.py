@@ -153,34 +153,34 @@ def all_poses(root, **how):
     return torch.stack([sample[field] for sample in samples for field in fields])
 
 
-def test_what_is_written_for_rows_of_frame_and_camera_is_read_back(
-    make_scene, root, rewrite, tmp_path
+OF_SIX_NUMBERS = """
+format = 2
+[poses]
+location = "$.frames[].cameras[].pose[0:3]"
+rotation = "$.frames[].cameras[].pose[3:6]"
+frame = "$.frames[].frame_index"
+camera = "$.frames[].cameras[].camera_index"
+outer = "frames"
+form = "rotator pitch yaw roll deg"
+axes = "unreal"
+unit = "cm"
+"""
+
+
+@pytest.mark.parametrize(("change", "stated"), [(as_rows, None), (as_six_numbers, OF_SIX_NUMBERS)])
+def test_rows_are_read_as_written_and_angles_in_a_part_of_a_list_as_a_file_says(
+    make_scene, root, rewrite, tmp_path, change, stated
 ):
     folder, file = make_scene(), tmp_path / "conventions.toml"
     rewrite(folder / "trajectory.json", tilted)
     usual = all_poses(root)
-    rewrite(folder / "trajectory.json", as_rows)
-
-    written = invoke("conventions", root, "-o", file, "--pictures", "0", "--workers", "1")
-
-    assert written.exit_code == 0, written.output
-    assert 'outer = "rows"' in file.read_text()
-    assert torch.equal(all_poses(root, conventions=file), usual)
-
-
-def test_angles_in_a_part_of_a_list_are_read_where_a_file_says_so(
-    make_scene, root, rewrite, tmp_path
-):
-    folder, file = make_scene(), tmp_path / "conventions.toml"
-    rewrite(folder / "trajectory.json", tilted)
-    usual = all_poses(root)
-    rewrite(folder / "trajectory.json", as_six_numbers)
-    file.write_text(
-        'format = 2\n[poses]\nlocation = "$.frames[].cameras[].pose[0:3]"\n'
-        'rotation = "$.frames[].cameras[].pose[3:6]"\nframe = "$.frames[].frame_index"\n'
-        'camera = "$.frames[].cameras[].camera_index"\nouter = "frames"\n'
-        'form = "rotator pitch yaw roll deg"\naxes = "unreal"\nunit = "cm"\n'
-    )
+    rewrite(folder / "trajectory.json", change)
+    if stated is not None:
+        file.write_text(stated)
+    else:
+        written = invoke("conventions", root, "-o", file, "--pictures", "0", "--workers", "1")
+        assert written.exit_code == 0, written.output
+        assert 'outer = "rows"' in file.read_text()
 
     assert torch.equal(all_poses(root, conventions=file), usual)
 
