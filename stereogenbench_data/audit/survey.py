@@ -223,9 +223,7 @@ def _learning(
     for number, (shape, group) in enumerate(
         zip(learned.conventions.shapes, learned.taught_by, strict=True)
     ):
-        keys_there = {each.keys for each in group}
-        alike = [each.scene for each in (*group, *learned.verified)
-                 if each.keys in keys_there and each.scene]  # fmt: skip
+        alike = [each.scene for each in group if each.scene]
         if not alike or alike[0].remark("poses", "left"):
             scene = alike[0] if alike and pictured else None
             _note_candidates(surveyed, number, group[0].key, scene)
@@ -441,12 +439,9 @@ def _note(
 
 
 def _head(surveyed: Survey) -> list[str]:
-    learned = surveyed.learned
-    others = 0 if learned is None else len(learned.verified)
-    looked = counted(len(surveyed.examined), "scene")
     return [
         "Conventions: where quantities stand in the files of this dataset and how they are read.",
-        f"Learned from {looked}; {others} of them verified what the others taught.",
+        f"Learned from {counted(len(surveyed.examined), 'scene')}.",
         "Use it: StereoPairs(..., conventions='conventions.toml'), or --conventions of a command.",
         "Edit it: what the data contradict is refused with the figures. Tables that it leaves out "
         "are the release's. Test it: `stereogenbench conventions ROOT --check FILE`.",

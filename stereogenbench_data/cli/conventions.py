@@ -41,7 +41,7 @@ def conventions(  # noqa: PLR0913 - one parameter an option
 
     Reads some scenes, spread over families, maps and keys of files, and says where each quantity
     stands, how it is read and how that is known; the doctor measures the depth of some by their
-    pictures. Other scenes verify it. What is not settled has candidates as comments, best first.
+    pictures. What is not settled has candidates as comments, best first.
     Without -o the file is printed. Give it to any command with --conventions. The last line says
     what is settled and what to do next; the exit status is 1 if something is not settled.
 
@@ -67,8 +67,7 @@ def conventions(  # noqa: PLR0913 - one parameter an option
     if check is None and out is None:
         typer.echo(found.toml, nl=False)
     usable = sum(each.scene is not None for each in found.examined)
-    verified = "" if found.learned is None else f", {len(found.learned.verified)} verified the rest"
-    typer.echo(f"{counted(usable, 'scene')} of {len(found.examined)} read{verified}", err=True)
+    typer.echo(f"{counted(usable, 'scene')} of {len(found.examined)} read", err=True)
     told = [f"depth: {line}" for line in found.verdicts] + found.poses
     told += [f"NOT SETTLED: {line}" for line in found.unsettled]
     if out is not None:

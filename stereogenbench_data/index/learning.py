@@ -1,13 +1,13 @@
 """Learning conventions from some scenes: how poses and depth are read, by files and numbers alone.
 
 Scenes with the same keys have one decision, made by the first of them; decisions that are equal are
-one shape. Others then verify: described by the conventions, they must be what they are without.
-What pictures say of depth is added by `audit.survey`.
+one shape. Described by the conventions as they are written, all must be what they are without. What
+pictures say of depth is added by `audit.survey`.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import zip_longest
+from itertools import chain, islice, zip_longest
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -23,7 +23,6 @@ from stereogenbench_data.index.scene_folder import (
     keys_in,
 )
 from stereogenbench_data.index.tree import folder_of
-from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.schema.conventions import Conventions, parse_conventions, write_toml
 from stereogenbench_data.schema.declaration import (
     UNKNOWN,
@@ -84,7 +83,6 @@ class Examined:
         keys: The keys of its files, as `Declaration.has` names them.
         shape: What conventions would state about it.
         notes: For each table of the conventions, what was found and how it is known.
-        depth: What the first depth video is; None where none can be opened.
         scene: Its row; None where it cannot be used.
         problem: Why not; "" where it can.
         lacks_mark: Whether it has no completion mark.
@@ -94,7 +92,6 @@ class Examined:
     keys: frozenset[str]
     shape: Declaration
     notes: Notes
-    depth: StreamFacts | None
     scene: Scene | None
     problem: str = ""
     lacks_mark: bool = False
@@ -107,13 +104,11 @@ class Learned:
     Attributes:
         conventions: What is stated; shapes are in the order of `taught_by`.
         taught_by: For each shape, the scenes that were looked at for it, the deciding one first.
-        verified: Other scenes that are the same with the conventions as without.
         problems: What is not understood or contradicts itself.
     """
 
     conventions: Conventions
     taught_by: list[list[Examined]]
-    verified: list[Examined] = field(default_factory=list)
     problems: list[Problem] = field(default_factory=list)
 
 
@@ -161,38 +156,14 @@ def examine(root: str | Path, key: str, *, conventions: Conventions | None = Non
         problem = str(error)
     shape, notes = Declaration(), Notes()
     if scene is not None and described is not None:
-        _note_camera(scene, notes)
         named, notes["poses"] = _learned_poses(scene, described.understood)
         shape = replace(shape, poses=named)
-    depth = described.depths[0] if described is not None and described.depths else None
-    notes["depth"] = [] if depth is None else _depth_notes(depth, scene)
+        notes["depth"] = _depth_notes(scene, described)
     names = [name for name in (BASELINE_JSON, TRAJECTORY_JSON) if name in files]
     return Examined(
-        key, keys_in(folder, names), shape, notes, depth, scene, problem,
+        key, keys_in(folder, names), shape, notes, scene, problem,
         lacks_mark=COMPLETE_JSON not in files,
     )  # fmt: skip
-
-
-def _note_camera(scene: Scene, notes: Notes) -> None:
-    rig = scene.rig
-    focal_px = rig.focal_mm / rig.sensor_width_mm * rig.image_width_px
-    notes.setdefault("focal_length", []).append(
-        f"{rig.focal_mm:.6g} mm on a sensor {rig.sensor_width_mm:.6g} mm wide: {focal_px:.6g} px "
-        f"in pictures {rig.image_width_px} px wide"
-    )
-    left, right = rig.primary_pair
-    apart_cm = (scene.lateral_m[right] - scene.lateral_m[left]) * 100
-    by = "the baselines alone" if scene.remark("poses") else "the poses"
-    notes.setdefault("primary_pair", []).append(
-        f"by {by}, camera {left} is {apart_cm:.6g} cm to the left of camera {right}"
-    )
-    videos = f"the videos have {rig.image_width_px}x{rig.image_height_px} pixels, which counts"
-    notes.setdefault("image_width", []).append(videos)
-    for about, table in (("size", "image_width"), ("pixels", "sensor_height"),
-                         ("principal point", "principal_x"),
-                         ("baselines", "baselines"), ("left", "primary_pair")):  # fmt: skip
-        if scene.remark(about):
-            notes.setdefault(table, []).append(scene.remark(about).removeprefix(f"{scene.id.key}/"))
 
 
 def _learned_poses(scene: Scene, found: MatchedPoses | None) -> tuple[PosesAt | None, list[str]]:
@@ -215,13 +186,13 @@ def _learned_poses(scene: Scene, found: MatchedPoses | None) -> tuple[PosesAt | 
     return None if scene.remark("world") else found.at, notes
 
 
-def _depth_notes(facts: StreamFacts, scene: Scene | None) -> list[str]:
+def _depth_notes(scene: Scene, described: Description) -> list[str]:
+    depths = (facts for name, facts in described.facts.items() if name.endswith("_depth.mkv"))
     notes = [
         f"stored by codec {facts.codec} as {facts.pixel_format}, {facts.frames} frames; tags: "
         f"{', '.join(sorted(facts.tags)) or 'none'}"
+        for facts in islice(depths, 1)
     ]
-    if scene is None:
-        return notes
     if scene.depth_unit_source[0] == "unreadable":
         return [*notes, f"the unit is not understood: {scene.remark('depth')}"]
     where = _UNIT_SOURCES[scene.depth_unit_source[0]]
@@ -237,7 +208,7 @@ _UNIT_SOURCES: Final = {
 
 
 def learn(root: str | Path, examined: Sequence[Examined]) -> Learned:
-    """Return the conventions that scenes teach, verified by every second scene of a shape.
+    """Return the conventions that scenes teach, and what is wrong with them.
 
     Args:
         root: The folder that holds ``train`` and ``eval``, or its URL.
@@ -246,15 +217,10 @@ def learn(root: str | Path, examined: Sequence[Examined]) -> Learned:
     usable = [each for each in examined if each.scene is not None]
     problems = [problem_of_scene(each.problem) for each in examined if each.scene is None]
     decided_by: dict[frozenset[str], Examined] = {}
-    teaching, others = list[Examined](), list[Examined]()
-    for each in usable or examined:
-        is_new = each.keys not in decided_by
-        decided_by.setdefault(each.keys, each)
-        is_teaching = is_new or len(teaching) <= len(others)
-        (teaching if is_teaching else others).append(each)
     groups: dict[str, list[Examined]] = {}
-    for each in teaching:
-        groups.setdefault(decided_by[each.keys].shape.text(), []).append(each)
+    for each in usable or examined:
+        deciding = decided_by.setdefault(each.keys, each)
+        groups.setdefault(deciding.shape.text(), []).append(each)
     by_size = sorted(groups.values(), key=len, reverse=True)
     shapes: list[tuple[Declaration, list[Examined]]] = []
     for group in by_size:
@@ -277,7 +243,7 @@ def learn(root: str | Path, examined: Sequence[Examined]) -> Learned:
     ]
     conventions = Conventions(tuple(shape for shape, _ in shapes), "the conventions learned")
     learned = Learned(conventions, [group for _, group in shapes], problems=problems)
-    verify(root, learned, others if usable else [])
+    verify(root, learned)
     return learned
 
 
@@ -298,11 +264,11 @@ def _stated_depth(group: Sequence[Examined]) -> DepthAs | None:
     return DepthAs(encoding=encoding)
 
 
-def verify(root: str | Path, learned: Learned, scenes: Iterable[Examined]) -> None:
+def verify(root: str | Path, learned: Learned) -> None:
     """Describe scenes by the conventions as they are written, and note those that then differ."""
     written = write_toml(learned.conventions, {}).encode()
     read_back = parse_conventions(written, where=learned.conventions.where)
-    for each in (*(each for group in learned.taught_by for each in group), *scenes):
+    for each in chain.from_iterable(learned.taught_by):
         if each.scene is None:
             continue
         try:
@@ -313,8 +279,6 @@ def verify(root: str | Path, learned: Learned, scenes: Iterable[Examined]) -> No
         if _essence(again) != _essence(each.scene):
             told = f"{each.key}: is read otherwise by the conventions learned."
             learned.problems.append(Problem(told))
-        elif not any(each in group for group in learned.taught_by):
-            learned.verified.append(each)
 
 
 def _essence(scene: Scene) -> Scene:

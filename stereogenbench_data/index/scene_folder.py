@@ -153,7 +153,6 @@ class Description:
     Attributes:
         remarks: What is odd.
         facts: What the videos that can be used are, by their names.
-        depths: What the depth videos that can be opened are, also those that cannot be used.
         understood: The poses; None where there are none.
     """
 
@@ -164,7 +163,6 @@ class Description:
         self.remarks: list[Remark] = []
         self.shape: Declaration | None = None
         self.facts: dict[str, StreamFacts] = {}
-        self.depths: list[StreamFacts] = []
         self.understood: MatchedPoses | None = None
         self.tables: dict[str, SeekTable] = {}
         self.unread: dict[str, str] = {}
@@ -309,7 +307,6 @@ class Description:
         if is_picture and facts.is_colour is None:
             facts = probe(video, name=where)
         if name in _DEPTHS:  # lossy depth passes: a `DepthEncoding` may accept it
-            self.depths.append(facts)
             require_depth_stream(
                 codec=depth_coding(facts), pixel_format=facts.pixel_format,
                 encoding=ANY_DEPTH, name=where,
