@@ -6,7 +6,7 @@ The user's cache keeps the described scenes, so a killed run continues where it 
 import hashlib
 import json
 import warnings
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -18,7 +18,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, no_advance, require_workers
-from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
+from stereogenbench_data.errors import StereoGenBenchError, StorageError
 from stereogenbench_data.geometry.pose_evidence import MatchedPoses, settled_poses
 from stereogenbench_data.index.left_out import reasons_told
 from stereogenbench_data.index.rows import json_of, scene_of_json
@@ -42,9 +42,8 @@ from stereogenbench_data.index.tree import (
     stamp_of,
 )
 from stereogenbench_data.index.tree_cache import NOTHING_KEPT, TreeCache
-from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.media.heads import END_BYTES
-from stereogenbench_data.schema.conventions import Conventions, depth_of
+from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.declaration import BUILT_IN, Declaration
 from stereogenbench_data.schema.document import brief
 from stereogenbench_data.schema.parse import parse_rig, parse_scene_key
@@ -286,14 +285,6 @@ class Tree:
         opened = "all" if videos is None else sorted(videos)
         how = self.valid_depth, self.checksums
         return repr((folder.key, opened, *how, stamp_of(folder.stamps())))
-
-    def describe(self, folder: SceneFolder, videos: Collection[str] | None = None) -> Scene:
-        """Return a scene as its files say, or as the user's cache holds it; see `describe_scene`.
-
-        Raises:
-            StorageError: If it cannot be used.
-        """
-        return self.kept(self.name_of(folder, videos)) or self.opened(folder, videos)[0]
 
     def opened(
         self, folder: SceneFolder, videos: Collection[str] | None = None
@@ -654,7 +645,7 @@ def report_of(tree: Tree, of_keys: Mapping[str, Outcome]) -> TreeReport:
         incomplete=incomplete,
         broken=dict(sorted((tree.refused | broken).items())),
         odd=_odd_ones(scenes),
-        notes=(*subsets, *named, *remarks_told(found), *_depth_notes(found)),
+        notes=(*subsets, *named, *remarks_told(found)),
         is_part=tree.is_part,
     )
 
@@ -696,24 +687,3 @@ def _without_unfetched(scenes: list[Scene]) -> list[Scene]:
         remarks += [Remark("videos", "; ".join(left))] if left else []
         kept.append(replace(scene, remarks=tuple(remarks)))
     return kept
-
-
-def _depth_notes(scenes: list[Scene]) -> list[str]:
-    """Describe depth that loading refuses unless the user's `DepthEncoding` accepts it."""
-    videos: dict[tuple[str, str], list[tuple[Scene, int]]] = defaultdict(list)
-    for scene in scenes:
-        stored = zip(scene.depth_codec, scene.depth_pixel_format, strict=True)
-        for camera, kind in enumerate(stored):
-            videos[kind].append((scene, camera))
-    notes = []
-    for (codec, pixel_format), found in videos.items():
-        (scene, camera), others = found[0], len(found) - 1
-        name = f"{scene.id.key}/{depth_name(camera)}"
-        try:
-            require_depth_stream(
-                codec=codec, pixel_format=pixel_format, encoding=depth_of(scene), name=name
-            )
-        except MediaError as error:
-            more = f" ({counted(others, 'other video')} likewise.)" if others else ""
-            notes.append(f"{error}{more}")
-    return notes

@@ -362,11 +362,8 @@ class UnopenedScenes:
         """Return a scene that is as its row says."""
         key = row.id.key
         opened = frozenset(VIDEO_FILES) if videos is None else videos
-        try:
-            scene = self.tree.describe(self.tree.folder(key), videos)
-        except StereoGenBenchError as error:
-            differences = [str(error)]
-        else:
+        scene = self.tree.settling(self.tree.folder(key), videos).found
+        if isinstance(scene, Scene):
             # Fewer videos may have more key frames in common; the order is by those of the row.
             if opened != {*VIDEO_FILES} and (
                 not any(name.endswith(".mp4") for name in opened)
@@ -374,14 +371,16 @@ class UnopenedScenes:
             ):
                 scene = replace(scene, key_frames=row.key_frames)
             differences = [*_differences(row, scene, opened, self.baselines)]
-        if differences:
-            self.tree.cache.forget_tables()
-            told = shortened("; ".join(differences), _LONGEST_TOLD)
-            raise StorageError(
-                f"{shown(self.tree.root)}: {key} is not as the scenes that were opened first: "
-                f"{told.rstrip('.')}. {self.cures()}"
-            )
-        return replace(scene, id=row.id)
+            if not differences:
+                return replace(scene, id=row.id)
+        else:
+            differences = [str(scene)]
+        self.tree.cache.forget_tables()
+        told = shortened("; ".join(differences), _LONGEST_TOLD)
+        raise StorageError(
+            f"{shown(self.tree.root)}: {key} is not as the scenes that were opened first: "
+            f"{told.rstrip('.')}. {self.cures()}"
+        )
 
     def captions(self, keys: Iterable[str]) -> list[str]:
         """Return the captions of scenes; one that cannot be read is empty."""
