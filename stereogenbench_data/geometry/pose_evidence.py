@@ -79,11 +79,6 @@ class MatchedPoses:
     at: PosesAt
     form: str | None
 
-    @property
-    def first_frame(self) -> int:
-        """The least number that frames have, 0 where they have none."""
-        return self.at.first or 0
-
 
 def settled_poses(
     text: bytes, rig: Rig, *, where: str, named: PosesAt | None = None

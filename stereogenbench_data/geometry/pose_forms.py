@@ -146,7 +146,10 @@ def poses_at(document: dict[str, Any], at: PosesAt, *, where: str) -> tuple[str,
     place = None if at.location is None else read_block(document, at, at.location, where=where)
     form = str(at.form)
     kinds = _kinds(turn, is_rotation=True)
-    kind = next((each for each in kinds if form in (each, _short(each))), "")
+    # "rotator deg" and "quaternion" do, as components have names or one order.
+    short = {each.replace(" pitch yaw roll", "").replace(" xyzw", ""): each
+             for each in reversed(kinds)}  # fmt: skip
+    kind = form if form in kinds else short.get(form, "")
     if not kind or at.axes not in AXES:
         raise SchemaError(
             f"{where}: {at.rotation} is not of the form {shortened(form)!r} with "
@@ -189,15 +192,6 @@ def poses_named(document: dict[str, Any], name: str, *, where: str) -> CameraPos
         f"{where}: has no poses of the form {shortened(name, 200)}. Run `stereogenbench index` "
         f"again."
     )
-
-
-def _short(kind: str) -> str:
-    """Return a form as it may be written, as its components have names or one order.
-
-    >>> _short("rotator pitch yaw roll deg"), _short("quaternion xyzw")
-    ('rotator deg', 'quaternion')
-    """
-    return kind.replace(" pitch yaw roll", "").replace(" xyzw", "")
 
 
 def _read(

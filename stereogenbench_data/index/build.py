@@ -42,7 +42,6 @@ from stereogenbench_data.index.tree import (
     stamp_of,
 )
 from stereogenbench_data.index.tree_cache import NOTHING_KEPT, TreeCache
-from stereogenbench_data.media.heads import END_BYTES
 from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.schema.declaration import BUILT_IN, Declaration
 from stereogenbench_data.schema.document import brief
@@ -213,7 +212,8 @@ class Tree:
             stamps += files.items()
         refused = self.refused | dict(sorted(refused.items()))
         is_marked = self.is_marked or any(COMPLETE_JSON in each for each in files.values())
-        chosen = (self.is_part, sorted(self.train_maps()), is_marked, refused, self.keys)
+        maps = {scene.map_name for scene in self.ids.values() if scene.split == "train"}
+        chosen = (self.is_part, sorted(maps), is_marked, refused, self.keys)
         digest = hashlib.sha256(repr(chosen).encode())
         for each in stamps:
             digest.update(repr(each).encode())
@@ -243,10 +243,6 @@ class Tree:
         if self.is_marked and COMPLETE_JSON not in files:
             raise unfinished(key)
         return files
-
-    def train_maps(self) -> set[str]:
-        """Return the maps of the scenes in train, wanted or not."""
-        return {scene.map_name for scene in self.ids.values() if scene.split == "train"}
 
     @property
     def stated(self) -> Declaration | None:
@@ -395,10 +391,7 @@ def walk_tree(
         workers = 1
     bare = replace(tree, keys=(), ids={}, refused={}, files={})
     if tree.remote is not None:
-        size_bytes = sum(_asked_bytes(tree.files[each.key]) for each in pending)
-        tell_requests(
-            tree.root, len(pending), each=_REQUESTS, what="all files", size_bytes=size_bytes
-        )
+        tell_requests(tree.root, len(pending), each=_REQUESTS, what="all files")
     others = engine.map(bare.outcome, pending, name=lambda folder: folder.key, workers=workers)
     for outcome in others:
         outcomes[outcome.key] = outcome
@@ -512,30 +505,16 @@ class ManyReadsWarning(UserWarning):
     """So much is read that it takes a while."""
 
 
-def tell_requests(
-    root: str | Path, scenes: int, *, each: int, what: str, size_bytes: int | None = None
-) -> None:
+def tell_requests(root: str | Path, scenes: int, *, each: int, what: str) -> None:
     """Warn of the requests that scenes behind a URL take, if a server may let them wait."""
     requests, where = scenes * each, shown(root)
     if requests > _WARN_ABOVE_REQUESTS:
-        size = "" if size_bytes is None else f" some {_size(size_bytes)}"
         message = (
-            f"{where}: reads {what} of {scenes} scenes,{size} in {requests:,} requests: on the Hub "
+            f"{where}: reads {what} of {scenes} scenes in {requests:,} requests: on the Hub "
             f"without a login some {requests // 600} minutes. An interrupted run goes on where it "
             f"stopped; an index holds them: `stereogenbench index {where}`."
         )
         warnings.warn(message, ManyReadsWarning, stacklevel=2)
-
-
-def _asked_bytes(files: Files) -> int:
-    """Return how many bytes of a scene behind a URL are asked for."""
-    return sum(min(size, 2 * END_BYTES if name[:4] == "cam_" else size)
-               for name, (size, _) in files.items())  # fmt: skip
-
-
-def _size(size_bytes: int) -> str:
-    """Return a number of bytes for messages."""
-    return f"{size_bytes / 1e9:,.1f} GB" if size_bytes >= 1e9 else f"{size_bytes / 1e6:,.1f} MB"
 
 
 def find_tree(

@@ -393,7 +393,7 @@ class Description:
         count = frames if found is None else found.poses.frame_count
         told = f"{where}: has poses of {count} frames, and the videos have {frames}"
         # Without the last frame poses are those of the others; without the first they are not.
-        fewest = 0 if found is None or found.first_frame else -MOST_EXTRA_FRAMES
+        fewest = 0 if found is None or found.at.first else -MOST_EXTRA_FRAMES
         if not fewest <= count - frames <= MOST_EXTRA_FRAMES:
             found, reason = None, f"{told}."
         if found is None:

@@ -79,12 +79,8 @@ class Place:
     @property
     def axes(self) -> int:
         """How many steps lead to all elements of a list or an object."""
-        return sum(isinstance(step, Every | Entries) for step in self.steps + self.parts_steps)
-
-    @property
-    def parts_steps(self) -> tuple[Step, ...]:
-        """The way to the first of the values that stand side by side."""
-        return self.parts[0] if self.parts else ()
+        steps = self.steps + (self.parts[0] if self.parts else ())
+        return sum(isinstance(step, Every | Entries) for step in steps)
 
 
 @functools.lru_cache(maxsize=1024)
