@@ -147,7 +147,7 @@ class SceneFolder:
             is_there = path.exists()
             return "is empty: fetch it again" if is_there else "is a link to a file that is missing"
         try:
-            with path.open("rb") as file:
+            with path.open("rb", buffering=0) as file:
                 is_pointer = size < _LEAST_BYTES and file.read(len(_POINTER)) == _POINTER
                 file.seek(-min(size, _END_OF_JSON), os.SEEK_END)
                 is_cut = name == TRAJECTORY_JSON and not file.read().rstrip().endswith((b"}", b"]"))

@@ -36,6 +36,7 @@ from stereogenbench_data.schema.places import (
     first_value,
     numbers_in,
     path_to,
+    place_at,
     value_at,
 )
 from stereogenbench_data.schema.records import Remark, Rig, SceneId, SceneLabels
@@ -297,6 +298,9 @@ class _RigFile:
         self._declared, self._where = declared, where
         self.problems: list[str] = []
         self.remarks: list[Remark] = []
+        inner = document.get("camera_intrinsics")
+        inner = inner if isinstance(inner, dict) else {}
+        self._keys = frozenset((*document, *(f"camera_intrinsics.{key}" for key in inner)))
 
     def rig(self, size_px: Pair | None) -> Rig:
         """Return the rig; what it lacks is a problem."""
@@ -323,9 +327,7 @@ class _RigFile:
 
     def _missing(self, what: str, places: Sequence[str], lines: str) -> None:
         """Add that something is missing, with the lines that say where it stands."""
-        inner = self.document.get("camera_intrinsics")
-        inner = inner if isinstance(inner, dict) else {}
-        keys = listed_keys([*self.document, *(f"camera_intrinsics.{key}" for key in inner)])
+        keys = listed_keys(self._keys)
         self.problems.append(
             f"{' or '.join(places)} is missing, where {what} stands; the keys are: {keys}. If it "
             f"stands elsewhere, say where in a file of conventions: format = 2, then {lines}"
@@ -336,7 +338,7 @@ class _RigFile:
         at = self._declared.numbers.get(name, NumberAt())
         if at.value is not None:
             return f"[{name}] of the conventions", at.value * _scale(at)
-        path, value = first_value(self.document, at.places)
+        path, value = first_value(self.document, _possible(at.places, self._keys))
         if not path or (value is None and name != "image_width"):
             return "", 0.0
         value = value[0] if path[-1] == "~" and value else value
@@ -547,6 +549,18 @@ class _RigFile:
 _CAMERAS: Final = frozenset(range(CAMERA_COUNT))
 _SHARE: Final = 0.05
 """A point further off the centre by one share of both sides is the centre of another size."""
+
+
+@functools.lru_cache(maxsize=256)  # thousands of files have the same keys
+def _possible(places: tuple[str, ...], keys: frozenset[str]) -> tuple[str, ...]:
+    """Return the places whose first key, or first two in the intrinsics, a file has."""
+
+    def is_there(text: str) -> bool:
+        way = [step for step in place_at(text).steps[:2] if isinstance(step, str)]
+        way = way if way[:1] == ["camera_intrinsics"] else way[:1]
+        return not way or ".".join(way) in keys
+
+    return tuple(filter(is_there, places))
 
 
 def _scale(at: NumberAt) -> float:
