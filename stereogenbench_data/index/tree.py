@@ -25,13 +25,18 @@ from typing import Any, Final, TypeVar
 
 from stereogenbench_data.errors import (
     SchemaError,
+    StereoGenBenchError,
     StorageError,
     explain_os_errors,
 )
 from stereogenbench_data.index.tree_cache import NOTHING_KEPT, TreeCache
 from stereogenbench_data.media.container import BinaryFile
 from stereogenbench_data.media.heads import END_BYTES
-from stereogenbench_data.schema.document import MAX_TEXT_BYTES, require_text_size
+from stereogenbench_data.schema.document import (
+    MAX_TEXT_BYTES,
+    parse_document,
+    require_text_size,
+)
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
@@ -150,11 +155,17 @@ class SceneFolder:
             with path.open("rb", buffering=0) as file:
                 is_pointer = size < _LEAST_BYTES and file.read(len(_POINTER)) == _POINTER
                 file.seek(-min(size, _END_OF_JSON), os.SEEK_END)
-                is_cut = name == TRAJECTORY_JSON and not file.read().rstrip().endswith((b"}", b"]"))
+                _, is_indented, line = file.read().rstrip().rpartition(b"\n")
         except OSError as error:
             return f"cannot be read ({error.strerror})"
         if is_pointer:
             return "is a Git LFS pointer and not the file: run `git lfs pull`"
+        is_cut = name == TRAJECTORY_JSON and not line.endswith((b"}", b"]"))
+        if name == TRAJECTORY_JSON and is_indented and line[:1].isspace():  # an inner bracket
+            try:
+                parse_document(self.read(name), where=name)
+            except StereoGenBenchError:
+                is_cut = True
         return "is cut short: fetch it again" if is_cut else ""
 
     def fetch(self, names: Iterable[str]) -> None:
@@ -182,7 +193,7 @@ class SceneFolder:
 _LEAST_BYTES: Final = 1024
 """No video is smaller, and every Git LFS pointer is."""
 _POINTER: Final = b"version https://git-lfs"
-_END_OF_JSON: Final = 16
+_END_OF_JSON: Final = 64
 _VIDEOS: Final = frozenset({*VIDEO_FILES, *PACKED_DEPTH_NAMES.values()})
 _LARGE: Final = _VIDEOS | {BASELINE_JSON, TRAJECTORY_JSON}
 

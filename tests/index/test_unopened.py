@@ -210,9 +210,11 @@ def test_what_a_listing_or_json_shows_is_told_once_and_left_out_where_it_is_need
     assert len(StereoPairs(pairs.index, pairs=(2, 3), fields=["left"]).plan.scene_rows) == 74
 
 
-def test_a_trajectory_that_was_cut_stops_only_fields_that_need_poses(tree):
+@pytest.mark.parametrize("end", [b"0", b"}"], ids=["in a number", "after an inner bracket"])
+def test_a_trajectory_that_was_cut_stops_only_fields_that_need_poses(tree, end):
     path = tree / ODD / "trajectory.json"
-    put(path, path.read_bytes()[:-200])
+    whole = json.dumps(json.loads(path.read_bytes()), indent=2).encode()
+    put(path, whole[: whole.rindex(end, 0, -200) + 1])
 
     with pytest.warns(IncompleteSceneWarning, match=rf"{ODD}/trajectory.json: is cut short"):
         plain = StereoPairs(tree, split="train")
