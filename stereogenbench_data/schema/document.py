@@ -92,7 +92,7 @@ def parse_document(text: bytes, *, where: str) -> Any:
         place = f"line {error.lineno}, column {error.colno}"
         place += f" (character {min(error.pos, length)} of {length})"
         cure = "The file looks truncated: copy it" if is_cut else "Copy it"
-        told = f"not valid JSON: {error.msg} at {place}. {cure}"
+        told = f"not valid JSON: {error.msg.removesuffix(' starting at')} at {place}. {cure}"
     except ValueError as error:
         told = f"not valid JSON: {error}. Copy the file"
     raise SchemaError(f"{where}: {told} from the release again.")
