@@ -57,8 +57,9 @@ _NAMES_DEPTH: Final = re.compile(r"(?:.*[/_])?depth(?:map|\.[a-z0-9]+)?")
 _OTHER_DEPTHS: Final = re.compile(r"depth_of_field|(?:bit|colou?r)_depth|(?:^|_)dof(?:_|$)")
 _TECHNICAL: Final = frozenset(
     {"encoder", "duration", "creation", "handler", "vendor", "language", "brand", "brands",
-     "statistics", "bps", "timecode", "software", "mimetype", "time"}
+     "statistics", "bps", "timecode", "software", "mimetype", "time", "rgb", "color", "colour"}
 )  # fmt: skip
+"""Words of keys of tags that are not about depth."""
 _STATISTICS: Final = frozenset(
     {"stat", "stats", "statistics", "valid", "observed", "mean", "median", "std", "percentile",
      "ratio", "share", "percent", "histogram", "coverage"}

@@ -101,7 +101,7 @@ def test_json_that_says_nothing_of_the_unit_leaves_it_open(document):
 @pytest.mark.parametrize(
     "tags",
     [
-        {"encoder": "Lavf61.7.100", "DURATION": "00:00:05.4"},
+        {"encoder": "Lavf61.7.100", "DURATION": "00:00:05.4", "RGB_SCALE": "255"},
         {"title": "AssetsvilleTown_scene_1166 depth 16 bit"},
         {"comment": "Rendered by Unreal 5.3 with a 35 mm lens, 1280x1280"},
         {"description": "ray-traced"},
