@@ -80,8 +80,8 @@ def order_quality(order: EpochOrder, plan: Plan, *, batches: int = _LONG) -> Ord
 
 
 def _content(numbers: Int64[np.ndarray, "b n"], plan: Plan, *, epoch: int) -> BatchContent:
-    scenes = plan.scenes_of(numbers)
-    windows = (numbers - plan.first_sample[scenes]) // plan.pairs_of(scenes)
+    scenes = np.searchsorted(plan.first_sample, numbers, side="right") - 1
+    windows = (numbers - plan.first_sample[scenes]) // np.diff(plan.first_pair)[scenes]
     frames = np.array(
         [plan.locate(number, epoch=epoch).frames[0] for number in numbers.ravel().tolist()]
     ).reshape(numbers.shape)

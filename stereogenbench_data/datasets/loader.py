@@ -16,12 +16,11 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from inspect import signature
 from time import perf_counter
 from typing import Any, Final, NamedTuple, SupportsIndex
 
-import numpy as np
 import torch
 from torch.utils.data import DataLoader, DistributedSampler, SequentialSampler
 
@@ -33,12 +32,6 @@ from stereogenbench_data.datasets.epoch_rule import EPOCH_DEFAULTS, EpochOptions
 from stereogenbench_data.datasets.workers import Workers, pids_for
 from stereogenbench_data.errors import PassError, StateError, StereoGenBenchError
 from stereogenbench_data.samples.load import Work
-from stereogenbench_data.selection.order import EpochOrder, Numbers
-from stereogenbench_data.selection.plan import Plan
-
-_DESCRIBED_SAMPLES: Final = 100_000
-_DESCRIBED_BATCHES: Final = 200
-"""`LoaderStats.mixing` is computed for at most this number of samples and of batches."""
 
 
 class LoaderOptions(EpochOptions, total=False):
@@ -69,8 +62,6 @@ class LoaderStats(NamedTuple):
         workers: How many worker processes run for it.
         videos_open: How many videos this process has open for it; each worker has its own.
         videos_limit: How many videos a process opens for it at most.
-        mixing: How many scenes and moments a batch shows, beside one of a fully shuffled sampler,
-            in one line (of the first batches of epoch 0); empty of more than 100,000 samples.
         waiting: The share of the time that the loop has waited for batches, from the beginning of
             the latest pass to its latest batch; starting the workers counts.
         packets_decoded: How many packets were given to decoders, by all workers, in all passes.
@@ -84,7 +75,6 @@ class LoaderStats(NamedTuple):
     workers: int
     videos_open: int
     videos_limit: int
-    mixing: str
     waiting: float
     packets_decoded: int
     frames_used: int
@@ -297,7 +287,6 @@ class PairsLoader(DataLoader[Any]):
             workers=len(pids),
             videos_open=videos.videos_open,
             videos_limit=videos.videos_limit,
-            mixing=self._mixing,
             waiting=self._waited_s / self._passed_s if self._passed_s else 0.0,
             packets_decoded=work.packets_decoded,
             frames_used=work.frames_used,
@@ -308,20 +297,6 @@ class PairsLoader(DataLoader[Any]):
         """Return what was done for this loader, by its workers or this process, in all passes."""
         self.making.work.add(self.dataset.take_work())
         return copy.copy(self.making.work)
-
-    @cached_property
-    def _mixing(self) -> str:
-        # Epochs differ little, and the order of the current one stays as it is kept.
-        batches, plan = self.batches, self.batches.dataset.plan
-        if len(plan) > _DESCRIBED_SAMPLES:
-            return ""
-        order = EpochOrder(plan.runs, batches.rule, epoch=0)
-        found = [order.batch(number) for number in range(order.batches)[:_DESCRIBED_BATCHES]]
-        drawn = np.random.default_rng(0).integers(0, len(plan), (len(found), len(found[0])))
-        return (
-            f"a batch of {batches.batch_size} shows {_scenes_and_moments(found, plan)} "
-            f"({_scenes_and_moments([*drawn], plan)} fully shuffled)"
-        )
 
     def __repr__(self) -> str:
         """Return a summary."""
@@ -415,17 +390,6 @@ class PairsLoader(DataLoader[Any]):
         self._begun_passes -= 1
         if self._begun_passes == 0 and self._gradient_state is not None:
             self._gradient_state._remove_dataloader(self)
-
-
-def _scenes_and_moments(batches: list[Numbers], plan: Plan) -> str:
-    """Return how many different scenes and moments a batch shows on average."""
-    scenes = [plan.scenes_of(batch) for batch in batches]
-    moments = [
-        of * len(plan) + (batch - plan.first_sample[of]) // plan.pairs_of(of)
-        for of, batch in zip(scenes, batches, strict=True)
-    ]
-    counts = [np.mean([len(np.unique(each)) for each in kind]) for kind in (scenes, moments)]
-    return f"{counts[0]:.1f} scenes and {counts[1]:.1f} moments"
 
 
 class LoaderPass(Iterator[Any]):

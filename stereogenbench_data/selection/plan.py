@@ -482,18 +482,6 @@ class Plan:
             digest.update(np.ascontiguousarray(numbers, dtype="<i8").tobytes())
         return digest.hexdigest()
 
-    def scenes_of(self, numbers: Int64[np.ndarray, "*n"]) -> Int64[np.ndarray, "*n"]:
-        """Return the place of each sample's scene among the scenes of the plan."""
-        scenes: Int64[np.ndarray, "*n"] = (
-            np.searchsorted(self.first_sample, numbers, side="right") - 1
-        )
-        return scenes
-
-    def pairs_of(self, scenes: Int64[np.ndarray, "*n"]) -> Int64[np.ndarray, "*n"]:
-        """Return how many samples show each moment of scenes, by their places in the plan."""
-        pairs: Int64[np.ndarray, "*n"] = self.first_pair[scenes + 1] - self.first_pair[scenes]
-        return pairs
-
     def locate(self, number: int, *, epoch: int, group: int = 0) -> Address:
         """Return where a sample comes from; only random frames depend on the epoch.
 
