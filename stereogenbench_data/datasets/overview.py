@@ -57,14 +57,11 @@ def pairs_table(index: SceneIndex, plan: Plan) -> "pandas.DataFrame":
         import pandas
     except ImportError as error:
         raise ExtraError("a table needs pandas: pip install pandas.") from error
-    pairs = plan.pairs
-    targets = pairs.targets
-    scenes = np.repeat(np.arange(len(plan.scene_rows)), np.diff(plan.first_pair))
-    samples = np.diff(plan.first_sample) // np.diff(plan.first_pair)
+    pairs, counts = plan.pairs, np.diff(plan.first_pair)
+    targets, baselines = pairs.targets, baselines_cm(index, pairs)
+    is_single = targets.shape[1] == 1
     columns: dict[str, Any] = {name: index.column(name)[pairs.row] for name in _FACTS}
-    columns |= {"left": pairs.source, "right": targets[:, 0], "samples": samples[scenes]}
-    if targets.shape[1] > 1:
-        columns["right"] = targets.tolist()
-    baselines = baselines_cm(index, pairs)
-    columns["baseline_cm"] = [*(baselines[:, 0] if baselines.shape[1] == 1 else baselines)]
+    columns |= {"left": pairs.source, "right": targets[:, 0] if is_single else targets.tolist()}
+    columns["samples"] = np.repeat(np.diff(plan.first_sample) // counts, counts)
+    columns["baseline_cm"] = baselines[:, 0] if is_single else [*baselines]
     return pandas.DataFrame(columns)
