@@ -405,11 +405,6 @@ class SampleDecoder:
         """What this process has open."""
         return self._streams.stats
 
-    @property
-    def work(self) -> Work:
-        """What this process has done."""
-        return self._streams.work
-
     def take_work(self) -> Work:
         """Return what this process has done since this was asked before."""
         work, self._streams.work = self._streams.work, Work()
