@@ -3,6 +3,7 @@
 import math
 import os
 import warnings
+from contextlib import suppress
 from typing import Literal, NamedTuple
 
 import torch.distributed
@@ -153,13 +154,9 @@ def warn_of_division(order: EpochOrder, share: WorkerShare, *, videos_per_scene:
 
 def videos_allowed() -> int:
     """Return how many videos this process may have open."""
-    return max(OPEN_STREAMS, _most_files() - SPARE_FILES)
-
-
-def _most_files() -> int:
-    """Return how many files this process may open; 512 where the system does not say."""
-    try:
+    files = 512  # where the system does not say
+    with suppress(ImportError):
         import resource
-    except ImportError:
-        return 512
-    return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+
+        files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    return max(OPEN_STREAMS, files - SPARE_FILES)
