@@ -395,14 +395,9 @@ class PairGeometry(ViewPairMaps):
     @once
     def target_from_source(self) -> Motions:
         """Source camera's coordinates to the target camera's, in metres."""
-        poses = self._facts.poses
-        transforms: Motions = np.stack(
-            [
-                poses.cam_from_cam(frame, target=self._target, source=self._source)
-                for frame in self._views.frames
-            ]
-        )
-        return _as_seen(transforms, self._views)
+        poses, views = self._facts.poses, self._views
+        way = {"target": self._target, "source": self._source}
+        return _as_seen([poses.cam_from_cam(frame, **way) for frame in views.frames], views)
 
     @property
     def assumed_motion(self) -> Motions:
@@ -450,12 +445,10 @@ class PairGeometry(ViewPairMaps):
         return self._splat(blank)[1]
 
 
-def _as_seen(transforms: Motions, views: Views) -> Motions:
+def _as_seen(transforms: list[Float64[np.ndarray, "4 4"]], views: Views) -> Motions:
     """Return motions in the world that the views show, which a flip has mirrored."""
-    if views.world == "as recorded":
-        return transforms
-    mirrored: Motions = MIRROR_X @ transforms @ MIRROR_X
-    return mirrored
+    motions: Motions = np.stack(transforms)
+    return motions if views.world == "as recorded" else MIRROR_X @ motions @ MIRROR_X
 
 
 @dataclass(eq=False)
@@ -532,8 +525,5 @@ class PairSample:
 
     def world_from(self, camera: int) -> Motions:
         """Return a camera's poses at the sample's frames."""
-        poses = self.facts.poses
-        transforms: Motions = np.stack(
-            [poses.world_from_cam(frame, camera) for frame in self.views.frames]
-        )
-        return _as_seen(transforms, self.views)
+        poses, views = self.facts.poses, self.views
+        return _as_seen([poses.world_from_cam(frame, camera) for frame in views.frames], views)
