@@ -148,11 +148,7 @@ class Crop:
     def __call__(self, views: Views, generator: Generator) -> Views:
         """Return cropped views."""
         old = views.intrinsics
-        if (
-            min(self.top, self.left) < 0
-            or self.top + self.height > old.height_px
-            or self.left + self.width > old.width_px
-        ):
+        if self.top + self.height > old.height_px or self.left + self.width > old.width_px:
             raise FieldError(
                 f"{self} reaches beyond a picture of {old.width_px} x {old.height_px} pixels."
             )
