@@ -353,9 +353,7 @@ def _windows(
             f"length={length}: {layout} takes clips of {unit}N+1 frames and cuts others: give "
             f"{below} or {below + unit}."
         )
-    spec: Any = ("clips", length, stride, *(() if step is None else (step,)))
-    parse_frames(spec)
-    return cast("FramesSpec", spec)
+    return cast("FramesSpec", ("clips", length, stride, *(() if step is None else (step,))))
 
 
 def _facts(sample: Sample, frames: tuple[int, ...], options: ClipOptions) -> dict[str, Any]:
