@@ -239,10 +239,6 @@ class OrderedBatch(NamedTuple):
     ends_run: Bool[np.ndarray, " n"]
     stream: Numbers
 
-    def part(self, start: int, stop: int) -> "OrderedBatch":
-        """Return a part of it, by places."""
-        return OrderedBatch(*(each[start:stop] for each in self))
-
 
 class EpochOrder:
     """The batches of one epoch by their number; a group is prepared when first asked for.
@@ -380,9 +376,6 @@ class _Pieces(NamedTuple):
     begin: Numbers
     stop: Numbers
 
-    def take(self, places: Numbers) -> "_Pieces":
-        return _Pieces(self.run[places], self.begin[places], self.stop[places])
-
 
 class _Group:
     """One shuffle group: streams of pieces, merged by the times of their samples.
@@ -402,7 +395,8 @@ class _Group:
         draws = (raw >> np.uint64(11)) * 2.0**-53
         self._offset, self._drift = draws[0], DRIFT * (2 * draws[1] - 1)
         self._salt = int(order.raw(1, part=-1)[0])
-        streams = [pieces.take(found) for found in _dealt(pieces, streams=count)]
+        dealt = _dealt(pieces, streams=count)
+        streams = [_Pieces(*(each[places] for each in pieces)) for places in dealt]
         # Evenly spread over the streams, so that few streams are apart, too. Cubes spread nearly as
         # wide as the shares themselves, with a quarter before them instead of half.
         before = max(_START_RUNS, _START_SHARE * len(self._runs.pairs))
@@ -433,7 +427,7 @@ class _Group:
         while start < stop:
             begin = start - int(self._starts[chunk])
             end = min(stop, int(self._starts[chunk + 1])) - int(self._starts[chunk])
-            found.append(self._chunk(chunk).part(begin, end))
+            found.append([each[begin:end] for each in self._chunk(chunk)])
             start, chunk = start + end - begin, chunk + 1
         return OrderedBatch(*map(np.concatenate, zip(*found, strict=True)))
 
