@@ -122,14 +122,10 @@ def may_pass(filters: Mapping[str, Any]) -> Callable[[SceneId], bool] | None:
         return None
 
     def passes(scene: SceneId) -> bool:
-        values = {
-            "split": scene.split, "subset": scene.subset, "family": scene.family,
-            "map": scene.map_name,
-        }  # fmt: skip
         return all(
             any(str(part).strip("/").lower() in scene.key.lower() for part in wanted)
             if name == "scenes"
-            else values[name] in wanted
+            else getattr(scene, _TEXT_COLUMNS[name]) in wanted
             for name, wanted in of_path.items()
         )
 
@@ -534,9 +530,7 @@ def _within(index: SceneIndex, pairs: PairList, wanted: BaselineSpec) -> PairLis
     found = baselines_cm(index, pairs)
     names = [wanted] if isinstance(wanted, str) else wanted
     if isinstance(names, Sequence) and names and isinstance(names[0], str):
-        keep = np.zeros(found.shape, dtype=bool)
-        for name in names:
-            keep |= in_bin(found, str(name))
+        keep = np.logical_or.reduce([in_bin(found, str(name)) for name in names])
     else:
         low, high = require_range("baseline_cm", wanted)
         keep = (found >= low) & (found <= high)
