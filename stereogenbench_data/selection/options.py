@@ -40,14 +40,12 @@ def require_options(
 
 def options_of(call: Callable[..., Any]) -> list[str]:
     """Return the names of the options of a call, in the order of their declaration."""
-    names: list[str] = []
-    for parameter in inspect.signature(call).parameters.values():
-        if parameter.kind is inspect.Parameter.KEYWORD_ONLY or (
-            parameter.kind is inspect.Parameter.POSITIONAL_OR_KEYWORD
-            and parameter.default is not inspect.Parameter.empty
-        ):
-            names.append(parameter.name)
-    return names
+    return [
+        name
+        for name, each in inspect.signature(call).parameters.items()
+        if each.kind is each.KEYWORD_ONLY
+        or (each.kind is each.POSITIONAL_OR_KEYWORD and each.default is not each.empty)
+    ]
 
 
 def split_options(options: Mapping[str, Any], kind: Any) -> tuple[Any, Any]:
