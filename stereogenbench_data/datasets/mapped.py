@@ -664,12 +664,11 @@ def _check_of(check: Check, plan: Plan) -> Literal["opened", "metadata"]:
         SelectionError: If there is no such check.
     """
     _require_one_of("check", check, Check)
+    if check != "read":
+        return check
     frames = int(plan.frame_counts[0])
     clip = len(plan.windows.window(0, frames=frames, draw=(0,)))
-    is_mostly_read = 2 * clip * plan.windows.count(frames) >= frames
-    if check == "read":
-        return "opened" if is_mostly_read else "metadata"
-    return check
+    return "opened" if 2 * clip * plan.windows.count(frames) >= frames else "metadata"
 
 
 def _without_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> Plan:
