@@ -16,7 +16,6 @@ from stereogenbench_data.bridges.in_memory import columns
 from stereogenbench_data.errors import DescriptorError, explain_os_errors, needs_extra
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.records import SceneId
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     CAMERA_PAIRS,
@@ -26,12 +25,6 @@ from stereogenbench_data.schema.text import counted, markdown_text
 from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.sources.location import is_remote, local_path
 from stereogenbench_data.sources.members import require_own_files
-
-
-def split_name(scene: SceneId) -> str:
-    """Return the name of a scene's split on the Hub, which has no subsets."""
-    return scene.split if scene.subset is None else f"{scene.split}_{scene.subset}"
-
 
 CARD_NAME: Final = "README.md"
 MARK: Final = "<!-- made by stereogenbench publish card -->"
@@ -167,9 +160,10 @@ def _configs(index: SceneIndex) -> _Configs:
     for row in range(len(index)):
         scene = index.scene(row)
         path = next(iter(scene.members.values())).path
+        # The Hub has no subsets of splits.
+        split = scene.id.split if scene.id.subset is None else f"{scene.id.split}_{scene.id.subset}"
         for config in ("all", scene.id.family):
-            splits = found.setdefault(config, {})
-            splits.setdefault(split_name(scene.id), set()).add(path)
+            found.setdefault(config, {}).setdefault(split, set()).add(path)
     configs = {}
     for config in ["all", *sorted(found.keys() - {"all"})]:
         names = sorted(found[config], key=lambda split: (split != "train", split))
