@@ -68,27 +68,18 @@ def list_options(*defaults: Mapping[str, Any]) -> Callable[[Call], Call]:
 
     def listed(call: Call) -> Call:
         signature = inspect.signature(call)
-        *named, unpacked = signature.parameters.values()
+        *parameters, unpacked = signature.parameters.values()
         (options,) = get_args(unpacked.annotation)
-        kinds = {
-            name: kind
-            for name, kind in get_type_hints(options).items()
-            if name not in signature.parameters
-        }
-        added = [_option(name, kind, known) for name, kind in kinds.items()]
+        for name, kind in get_type_hints(options).items():
+            if name not in signature.parameters:
+                otherwise = None if type(None) in get_args(kind) else Told("see its options")
+                default = known.get(name, otherwise)
+                parameters.append(
+                    inspect.Parameter(name, unpacked.KEYWORD_ONLY, default=default, annotation=kind)
+                )
         call.__dict__["__signature__"] = ListedSignature(
-            [*named, *added], return_annotation=signature.return_annotation
+            parameters, return_annotation=signature.return_annotation
         )
         return call
 
     return listed
-
-
-def _option(name: str, kind: Any, known: Mapping[str, Any]) -> inspect.Parameter:
-    otherwise = None if type(None) in get_args(kind) else Told("see its options")
-    return inspect.Parameter(
-        name,
-        inspect.Parameter.KEYWORD_ONLY,
-        annotation=kind,
-        default=known.get(name, otherwise),
-    )
