@@ -6,7 +6,7 @@ shows typer the fields in its place.
 
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -34,7 +34,8 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
     """Return a command that has, for typer, one option for each field of its groups.
 
     Args:
-        command: A function. Each parameter whose type is a dataclass is a group of options.
+        command: A function. Each parameter whose type is a dataclass is a group of options, which
+            are keyword-only.
     """
     parameters = inspect.signature(command).parameters
     groups: dict[str, Any] = {
@@ -47,17 +48,12 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
             values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
         command(**values)
 
-    required, keyword_only = inspect.Parameter.empty, inspect.Parameter.KEYWORD_ONLY
     options: list[inspect.Parameter] = []
     for name, parameter in parameters.items():
-        if name not in groups:
-            options.append(parameter.replace(kind=keyword_only))
-            continue
-        for field in fields(groups[name]):
-            default = required if field.default is MISSING else field.default
-            options.append(
-                inspect.Parameter(field.name, keyword_only, default=default, annotation=field.type)
-            )
+        if name in groups:
+            options += inspect.signature(groups[name]).parameters.values()
+        else:
+            options.append(parameter.replace(kind=parameter.KEYWORD_ONLY))
     described: Any = called
     described.__signature__ = inspect.Signature(options)
     called.__annotations__ = {option.name: option.annotation for option in options}
@@ -305,8 +301,7 @@ class SceneOptions:
             elif name in filters:
                 _refuse_two(name, filters[name], value)
             filters[name] = value
-        (default,) = (each.default for each in fields(self) if each.name == "split")
-        if "split" in filters and self.split != default:
+        if "split" in filters and self.split != type(self).split:
             _refuse_two("split", self.split, *filters["split"])
         return filters if self.split in (None, "all") else {"split": self.split} | filters
 
