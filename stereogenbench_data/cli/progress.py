@@ -6,15 +6,11 @@ If stderr is not a terminal, as in the log of a batch job, a line is printed eve
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Final
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 Report = Callable[[int, int], None]
-
-_BYTES_IN: Final = {"MB": 1_000_000}
-"""Units of progress that is reported in bytes, with the bytes in each."""
 
 
 @contextmanager
@@ -29,7 +25,7 @@ def progress_bar(doing: str, *, unit: str, log_every_s: float = 60) -> Iterator[
         unit: What is counted. For "MB", pass done and total in bytes.
         log_every_s: Seconds between two lines where stderr is not a terminal.
     """
-    divisor = _BYTES_IN.get(unit, 1)
+    divisor = 1_000_000 if unit == "MB" else 1
     console = Console(stderr=True)
     bar = Progress(
         TextColumn(doing),
