@@ -270,10 +270,7 @@ class _Moments:
             depth_m = torch.where(self.measured, (unit_m / units).to(torch.float32), 0.0)
         if self.contract.kind == "planar":
             return depth_m
-        fx_px, fy_px, cx_px, cy_px = (
-            self.batch["intrinsics"][:, row, column, None, None, None, None]
-            for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))
-        )
+        fx_px, fy_px, cx_px, cy_px = _lens(self.batch["intrinsics"][:, None, None, None, None])
         lengths: torch.Tensor = ray_per_planar(
             depth_m, focal_px=(fx_px, fy_px), centre_px=(cx_px, cy_px)
         )
@@ -391,11 +388,14 @@ class _Pairs(ViewPairMaps):
         return torch.stack([_taken(camera, self._sources), _taken(camera, targets)], dim=-1)
 
 
+def _lens(camera_matrix: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Return focal lengths and principal points (fx, fy, cx, cy) of matrices (..., 3, 3)."""
+    return tuple(camera_matrix[..., row, col] for row, col in ((0, 0), (1, 1), (0, 2), (1, 2)))
+
+
 def _inverse(camera_matrix: torch.Tensor) -> torch.Tensor:
     """Return K^-1 of matrices K without skew."""
-    fx_px, fy_px, cx_px, cy_px = (
-        camera_matrix[..., row, column] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))
-    )
+    fx_px, fy_px, cx_px, cy_px = _lens(camera_matrix)
     zero, one = torch.zeros_like(fx_px), torch.ones_like(fx_px)
     rows = [(1 / fx_px, zero, -cx_px / fx_px), (zero, 1 / fy_px, -cy_px / fy_px), (zero, zero, one)]
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
