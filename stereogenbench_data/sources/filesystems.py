@@ -184,7 +184,10 @@ class FilesystemTransport:
             raise self._no_permission(error) from None
         except ImportError as error:
             extra = _EXTRAS.get(self._url.partition("://")[0])
-            raise _not_installed(self._where, error, extra=extra) from None
+            other = ExtraError(
+                f"{self._where}: needs a package that is not installed ({error}). Install it."
+            )
+            raise (missing_extra(self._where, extra, error) if extra else other) from None
         except ValueError:
             raise StorageError(
                 f"{self._where}: not a URL that fsspec can open. Correct it, or fetch the data and "
@@ -209,25 +212,6 @@ class FilesystemTransport:
             f"{self._where}: permission denied ({_reason(error)}). Log in to its store, or ask for "
             f"access."
         )
-
-
-@contextmanager
-def require_installed(where: str, *, extra: str) -> Iterator[None]:
-    """Name the extra that has what the block imports, if it is not installed.
-
-    Raises:
-        StorageError: If an import fails.
-    """
-    try:
-        yield
-    except ImportError as error:
-        raise _not_installed(where, error, extra=extra) from None
-
-
-def _not_installed(where: str, error: ImportError, *, extra: str | None) -> ExtraError:
-    if extra:
-        return missing_extra(where, extra, error)
-    return ExtraError(f"{where}: needs a package that is not installed ({error}). Install it.")
 
 
 def _answer(error: BaseException) -> tuple[int, float]:

@@ -14,8 +14,8 @@ from urllib.parse import quote, unquote
 
 import urllib3
 
-from stereogenbench_data.errors import StorageError
-from stereogenbench_data.sources.filesystems import FilesystemTransport, require_installed
+from stereogenbench_data.errors import StorageError, needs_extra
+from stereogenbench_data.sources.filesystems import FilesystemTransport
 from stereogenbench_data.sources.location import Depth, Listing, shown
 from stereogenbench_data.sources.retry import MISSING, MissingObject, ProcessLock
 from stereogenbench_data.sources.web import WebTransport
@@ -102,13 +102,13 @@ class HubTransport(WebTransport):
 
     def listed(self, timeout_s: float, depth: Depth) -> Listing:
         """List a folder, of which the Hub lists a thousand files a request."""
+        with needs_extra(self._where, "hub"):
+            from huggingface_hub import HfApi
         if is_offline():
             raise StorageError(
                 f"{self._where}: HF_HUB_OFFLINE is set, and the Hub's cache does not hold whole "
                 f"folders. Unset it, or pass an index or a folder of this machine."
             )
-        with require_installed(self._where, extra="hub"):
-            from huggingface_hub import HfApi
         folder, commit = self._file.path.strip("/"), self._commit(timeout_s, of="folder")
         endpoint, token = _settings()
         with FilesystemTransport(self._where).named_errors():
@@ -134,7 +134,7 @@ class HubTransport(WebTransport):
         return self._cached
 
     def _find(self, timeout_s: float) -> FilesystemTransport | None:
-        with require_installed(self._where, extra="hub"):
+        with needs_extra(self._where, "hub"):
             from huggingface_hub import constants, try_to_load_from_cache
         file, offline = self._file, is_offline()
         revision = file.revision if offline else self._commit(timeout_s)
@@ -154,8 +154,8 @@ class HubTransport(WebTransport):
 
     def _point_at(self, revision: str, path: str) -> None:
         """Take the address of a file by HTTP, and the login."""
-        with require_installed(self._where, extra="hub"):
-            from huggingface_hub.utils import build_hf_headers
+        from huggingface_hub.utils import build_hf_headers
+
         endpoint, token = _settings()
         login = build_hf_headers(token=token, library_name=_LIBRARY)
         self._headers = {"Accept-Encoding": "identity", **login}
@@ -199,7 +199,7 @@ def _settings() -> tuple[str, str | bool | None]:
     """Return where the Hub is, and the login: fsspec's settings, then huggingface_hub's."""
     import fsspec
 
-    with require_installed("hf://", extra="hub"):
+    with needs_extra("hf://", "hub"):
         from huggingface_hub import constants
     stated = fsspec.config.conf.get("hf", {})
     endpoint = str(stated.get("endpoint") or constants.ENDPOINT).rstrip("/")
