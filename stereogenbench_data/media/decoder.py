@@ -131,8 +131,8 @@ def steady_clock(
     return SteadyClock(stream.start_time, step) if agrees else None
 
 
-def clock_by_cues(container: InputContainer) -> tuple[SteadyClock, list[int]] | None:
-    """Return the clock that a Matroska header describes, and its key frames by their list.
+def times_by_cues(container: InputContainer) -> tuple[list[Fraction], list[int]] | None:
+    """Return the times of frames at the rate of a Matroska header, and the key frames it lists.
 
     None where the two do not agree, or one is missing.
     """
@@ -145,7 +145,9 @@ def clock_by_cues(container: InputContainer) -> tuple[SteadyClock, list[int]] | 
         container.seek(clock.latest(frames - 1), stream=stream)
     keys = [clock.index(entry.timestamp) for entry in stream.index_entries]
     known = [key for key in keys if key is not None]
-    return (clock, known) if len(known) == len(keys) and known[:1] == [0] else None
+    if len(known) != len(keys) or known[:1] != [0]:
+        return None
+    return [clock.start + i * clock.step for i in range(frames)], known
 
 
 def table_clock(container: InputContainer, *, name: str) -> TableClock:

@@ -28,11 +28,10 @@ from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.container import (
     SeekableFile,
     VideoFile,
-    frames_by_duration,
     open_container,
     stream_codec,
 )
-from stereogenbench_data.media.decoder import BLIND_JUMP, clock_by_cues
+from stereogenbench_data.media.decoder import BLIND_JUMP, times_by_cues
 from stereogenbench_data.media.depth_frames import PACKED_SUFFIX, DepthFrames
 from stereogenbench_data.media.heads import END_BYTES, Heads, heads_of, is_far
 
@@ -284,12 +283,12 @@ def _by_clusters(container: InputContainer, file: VideoFile) -> SeekTable | None
 
     The frames behind a key frame lie somewhere in its part.
     """
-    found = clock_by_cues(container)
+    found = times_by_cues(container)
     if found is None:
         return None
-    _, keys = found
+    times, keys = found
     places = [entry.pos for entry in container.streams.video[0].index_entries]
-    frames, end_bytes = frames_by_duration(container), container.size
+    frames, end_bytes = len(times), container.size
     last = _read(file, max(0, end_bytes - END_BYTES), end_bytes)
     cues = last.rfind(_CUES)
     if cues < 0:

@@ -14,7 +14,6 @@ from typing import Any, Final, Literal
 
 import av
 import numpy as np
-from av.container import InputContainer
 from av.video.frame import VideoFrame
 from av.video.reformatter import Interpolation, VideoReformatter
 from jaxtyping import UInt8, UInt16
@@ -28,7 +27,6 @@ from stereogenbench_data.media.container import (
     StreamFacts,
     VideoFile,
     exact,
-    frames_by_duration,
     is_colour_format,
     open_by_header,
     open_container,
@@ -42,9 +40,9 @@ from stereogenbench_data.media.decoder import (
     Decoder,
     TableClock,
     UnexpectedPicture,
-    clock_by_cues,
     steady_clock,
     table_clock,
+    times_by_cues,
 )
 from stereogenbench_data.media.depth_frames import PACKED_SUFFIX, DepthFrames
 from stereogenbench_data.media.heads import Heads, heads_of, is_far
@@ -112,7 +110,8 @@ def _probed(
         if not is_far(file) or stream.frames:
             ticks = table_clock(container, name=name).times
         else:
-            ticks = _by_header(container)
+            found = times_by_cues(container)
+            ticks = found and found[0]
         facts = stream_facts(container, name=name, frames=0)
         tick_s = exact(stream.time_base) or Fraction(1)
     if ticks is None:
@@ -121,14 +120,6 @@ def _probed(
         with open_container(file, name=name) as container:
             ticks = table_clock(container, name=name).times
     return replace(facts, frames=len(ticks), times=FrameTimes(ticks, tick_s))
-
-
-def _by_header(container: InputContainer) -> list[Fraction] | None:
-    """Return the times of frames at the rate of a Matroska header, if key frames agree with it."""
-    if (found := clock_by_cues(container)) is None:
-        return None
-    clock, _ = found
-    return [clock.start + i * clock.step for i in range(frames_by_duration(container))]
 
 
 class VideoReader(FrameReader):
