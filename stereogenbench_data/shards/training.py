@@ -49,7 +49,6 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.schema.training import FORMAT
 from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.sources.members import MemberSource
-from stereogenbench_data.sources.ranged_file import FileSlice, require_crc32
 
 _LARGEST_DENOMINATOR: Final = 100_000
 _DEPTH_BITS_A_PIXEL: Final = 1.5
@@ -117,7 +116,7 @@ class Derivation:
         """Return the derivation of some scenes of an index."""
         used = {member.path for scene in scenes for member in scene.members.values()}
         shards = {path: facts for path, facts in index.shards.items() if path in used}
-        source = MemberSource(index.root, shards=shards, revision=index.digest, retry=index.retry)
+        source = MemberSource(index.root, shards=shards, check="opened", retry=index.retry)
         return cls(settings, index.digest, source)
 
 
@@ -215,7 +214,7 @@ def derive_scene(
                 continue
             video = RELEASED_NAMES.get(name, name)
             content, where = _open_source(source, scene, video), source.label(scene, video)
-            target, error = folder / name, None
+            target, measured = folder / name, {}
             if name.endswith("_rgb.mp4"):
                 pictures = _source_pictures(content, scene, settings, name=where)
                 advance(0)
@@ -227,7 +226,7 @@ def derive_scene(
                     rate_hz=rate.limit_denominator(_LARGEST_DENOMINATOR),
                 )
                 advance(0)
-                error = measured_error(pictures, target, name=str(target))
+                measured = asdict(measured_error(pictures, target, name=str(target)))
                 found_keys = probe(target, name=str(target), pixel_format="later").key_frames
                 key_frames = set(found_keys) & (key_frames or set(found_keys))
             else:
@@ -240,7 +239,6 @@ def derive_scene(
                         encoding=settings.depth,
                     )
                 )
-            measured = {} if error is None else asdict(error)
             files[name] = _size_and_crc32(target) | measured
             advance(source_bytes(scene, [name]))
     except ShardError:
@@ -253,16 +251,12 @@ def derive_scene(
 
 
 def _open_source(source: MemberSource, scene: Scene, name: str) -> VideoFile:
-    """Return a source video: its path, or its bytes in memory where they have a checksum."""
-    opened, member = source.open(scene, name), scene.member(name)
+    """Return a source video, whose checksum was compared: its path, or its bytes in memory."""
+    opened = source.open(scene, name)
     if isinstance(opened, Path):
-        if member.crc32 is None:
-            return opened
-        opened = FileSlice(opened, member)
+        return opened
     with opened:
-        content = opened.read()
-    require_crc32(zlib.crc32(content), expected=member.crc32, name=source.label(scene, name))
-    return io.BytesIO(content)
+        return io.BytesIO(opened.read())
 
 
 def _source_pictures(
