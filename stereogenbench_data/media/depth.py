@@ -108,12 +108,6 @@ def _dtype(bits: str | None, order: str | None) -> str:
     return "u1" if bits is None else ">u2" if order == "be" else "<u2"
 
 
-def largest_number(pixel_format: str) -> int | None:
-    """Return the largest number that a pixel format stores, None if it stores no numbers."""
-    layout = _layout(pixel_format)
-    return None if layout is None else (1 << layout.bits) - 1
-
-
 def grey_format(pixel_format: str) -> str:
     """Return the pixel format of one grey plane that holds the numbers of a depth stream.
 
@@ -300,7 +294,8 @@ def measured(
         encoding: The depth encoding.
         pixel_format: FFmpeg's name of the stored pixel format: "max" is its largest number.
     """
-    largest = largest_number(pixel_format)
+    layout = _layout(pixel_format)
+    largest = None if layout is None else (1 << layout.bits) - 1
     answer = np.ones(units.shape, dtype=np.bool_)
     for number in encoding.no_depth:
         answer &= units != (largest if number == "max" else number)
