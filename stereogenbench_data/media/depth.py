@@ -370,7 +370,7 @@ def packed_depth(
     name: str,
     frames: int,
     size: tuple[int, int] | None = None,
-    encoding: DepthEncoding | None = None,
+    encoding: DepthEncoding = _ANY_BITS,
 ) -> bytes:
     """Return a depth video as a file of blosc2's frames.
 
@@ -380,18 +380,16 @@ def packed_depth(
         frames: How many frames it must have.
         size: (height, width) to take the nearest pixels of, as `resized_nearest` does; None for
             the stored size.
-        encoding: With a size, what streams are accepted (``accept``); those of any bits always
-            are, as their numbers are kept.
+        encoding: What streams are accepted (``accept``) beside those of any bits, whose numbers
+            are kept.
 
     Raises:
         ExtraError: If blosc2 is not installed.
         MediaError: If the video cannot be decoded or is not FFV1 of one grey plane, or what was
             packed does not read back as it was.
     """
-    accepted = _ANY_BITS
-    if size is not None and encoding is not None:
-        accept = _ANY_BITS.accept | encoding.accept
-        accepted = replace(_ANY_BITS, accept=accept, channels=encoding.channels)
+    accept = _ANY_BITS.accept | encoding.accept
+    accepted = replace(_ANY_BITS, accept=accept, channels=encoding.channels)
     chunks, digests, pts = [], [], []
     with open_video(video, name=name, frames=frames) as reader:
         facts = reader.facts
