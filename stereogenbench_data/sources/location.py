@@ -8,8 +8,6 @@ from urllib.parse import SplitResult, quote, unquote, urlsplit, urlunsplit
 from stereogenbench_data.errors import StorageError, url_without_secrets
 from stereogenbench_data.schema.text import shortened
 
-WEB_SCHEMES: Final = ("http", "https")
-
 Depth = Literal["one level", "all levels"]
 """How deep below a folder it is listed."""
 Listing = dict[str, tuple[int | None, str]]
@@ -27,7 +25,7 @@ def is_remote(location: str | Path) -> bool:
 
 def is_web(location: str) -> bool:
     """Return whether a location is a URL of a web server."""
-    return location.partition("://")[0].lower() in WEB_SCHEMES and "://" in location
+    return location.lower().startswith(("http://", "https://"))
 
 
 def local_path(location: str | Path) -> Path:
