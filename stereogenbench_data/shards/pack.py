@@ -107,7 +107,9 @@ def pack(  # noqa: PLR0913 - each is an option of the command
         blosc2_module()
     plan = plan_shards(index, target_bytes, depth_codec=depth_codec, training=training, rows=rows)
     out = Path(out)
-    _claim(plan, out)
+    what, cure = f"{out}: cannot be written to", "Pack into another folder."
+    with explain_os_errors(what, cure, kind=ShardError):
+        _claim(plan, out)
     plan_tasks = [
         ShardTask(
             shard,
@@ -143,23 +145,6 @@ def pack(  # noqa: PLR0913 - each is an option of the command
         index=None if missing else out / INDEX_NAME,
         scenes=sum(len(task.shard.scenes) for task in plan_tasks),
     )
-
-
-def _claim(plan: ShardPlan, out: Path) -> None:
-    """Write the plan into the folder; refuse before anything else is written.
-
-    Raises:
-        StorageError: If a file of the release leads out of it.
-        ShardError: If the folder cannot be written to, is in the release, or is of another plan.
-    """
-    if not is_remote(plan.root):
-        packed_scenes = (scene for shard in plan.shards for scene in shard.scenes)
-        sources = {file.path for scene in packed_scenes for file in scene.members.values()}
-        require_own_files(plan.root, sorted(sources))
-    with explain_os_errors(
-        f"{out}: cannot be written to", "Pack into another folder.", kind=ShardError
-    ):
-        _claim_folder(plan, out)
 
 
 def _derive(
@@ -208,15 +193,19 @@ def _write_index(shards: Mapping[str, SceneIndex], out: Path) -> None:
 # The folder of the shards: which plan it is for, and that it holds nothing else.
 
 
-def _claim_folder(plan: ShardPlan, out: Path) -> None:
+def _claim(plan: ShardPlan, out: Path) -> None:
     """Write the plan into the folder, unless it was; refuse before anything is written.
 
     Raises:
+        StorageError: If a file of the release leads out of it.
         ShardError: If the folder is in the release, or holds files of other plans.
         OSError: If it cannot be written to.
     """
     place = out / PARTS / _PLAN_FILE
     if not is_remote(plan.root):
+        packed_scenes = (scene for shard in plan.shards for scene in shard.scenes)
+        sources = {file.path for scene in packed_scenes for file in scene.members.values()}
+        require_own_files(plan.root, sorted(sources))
         root, there = Path(plan.root).resolve(), out.resolve()
         if there == root or any(there.is_relative_to(root / split) for split in ("train", "eval")):
             raise ShardError(
