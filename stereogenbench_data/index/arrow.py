@@ -81,15 +81,6 @@ def _stored_numbers(values: Any) -> np.ndarray:
     )
 
 
-def _stored_strings(values: Any) -> tuple[np.ndarray, bytes | pa.Buffer]:
-    """Return the strings of a column: lengths in bytes, (n,) int32, 0 for null, and all bytes."""
-    if len(values) == 0:
-        return np.empty(0, dtype=np.int32), b""
-    _, offsets, content = values.buffers()
-    ends = np.frombuffer(offsets, dtype=np.int32, count=len(values) + 1, offset=4 * values.offset)
-    return np.diff(ends), content.slice(int(ends[0]), int(ends[-1] - ends[0])) if content else b""
-
-
 def table_digest(table: pa.Table) -> str:
     """Return a sha256 of all names and values, however they are stored: 64 hex digits.
 
@@ -105,9 +96,9 @@ def table_digest(table: pa.Table) -> str:
 
 
 def _feed(digest: "hashlib._Hash", values: Any) -> None:
-    kind = values.type
-    digest.update(np.array([len(values)], dtype="<i8").tobytes())
-    known = as_numpy(values.is_valid()) if values.null_count else np.ones(len(values), dtype=bool)
+    kind, count = values.type, len(values)
+    digest.update(np.array([count], dtype="<i8").tobytes())
+    known = as_numpy(values.is_valid()) if values.null_count else np.ones(count, dtype=bool)
     digest.update(np.packbits(known).tobytes())
     if pa.types.is_struct(kind):
         for field in values.flatten():
@@ -117,12 +108,13 @@ def _feed(digest: "hashlib._Hash", values: Any) -> None:
         _feed(digest, values.flatten())
     elif pa.types.is_fixed_size_list(kind):
         _feed(digest, values.flatten())
-    elif pa.types.is_string(kind):
-        lengths, texts = _stored_strings(values)
-        _feed_numbers(digest, lengths)
-        digest.update(texts)
-    else:
+    elif not pa.types.is_string(kind):
         _feed_numbers(digest, values)
+    elif count:  # lengths in bytes, 0 for null, then all bytes
+        _, offsets, content = values.buffers()
+        ends = np.frombuffer(offsets, dtype=np.int32, count=count + 1, offset=4 * values.offset)
+        _feed_numbers(digest, np.diff(ends))
+        digest.update(content.slice(int(ends[0]), int(ends[-1] - ends[0])) if content else b"")
 
 
 def _feed_numbers(digest: "hashlib._Hash", values: Any) -> None:
