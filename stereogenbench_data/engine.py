@@ -404,7 +404,6 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
     if ray.is_initialized():
         yield
         return
-    in_main_thread = threading.current_thread() is threading.main_thread()
     on_end = signal.getsignal(signal.SIGTERM)
     if address == "auto":  # of which Ray itself takes no ray:// from there
         address = os.environ.get("RAY_ADDRESS") or address
@@ -423,7 +422,7 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
             f"{address}: no Ray cluster could be connected to ({_one_line(error)}). {cure}"
         ) from error
     try:
-        if in_main_thread and on_end is not None:
+        if threading.current_thread() is threading.main_thread() and on_end is not None:
             signal.signal(signal.SIGTERM, on_end)  # Ray has replaced it.
         yield
     finally:

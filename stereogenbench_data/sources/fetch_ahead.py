@@ -163,11 +163,9 @@ class FetchAhead:
         state = self._state
         with state.lock:
             found = _touching(state, place, at, at + 1)
-            if not found:
+            if not found or found[0].first > state.up_to:
                 return None
             part = found[0]
-            if part.first > state.up_to:
-                return None
         try:
             return part.start, part.data.result()
         except CancelledError:
