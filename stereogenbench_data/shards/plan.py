@@ -162,19 +162,15 @@ def plan_shards(
         for shard in shards
     ]
     whole: list[Any] = [target_bytes, content]
-    if training is not None:
-        whole += [training.describe(), index.digest]
-    text = json.dumps(whole, separators=(",", ":"))
-    settings: dict[str, Any] = {
-        "plan": hashlib.sha256(text.encode()).hexdigest(),
-        "target_bytes": target_bytes,
-        "shards": len(shards),
-    }
+    settings: dict[str, Any] = {"target_bytes": target_bytes, "shards": len(shards)}
     if depth_codec != "released":
         settings["depth"] = depth_codec
     if training is not None:
         settings["training"] = training.describe()
-    return ShardPlan(index.root, tuple(shards), settings)
+        whole += [training.describe(), index.digest]
+    text = json.dumps(whole, separators=(",", ":"))
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    return ShardPlan(index.root, tuple(shards), {"plan": digest} | settings)
 
 
 def _facts_of(scene: Scene) -> dict[str, Any]:
