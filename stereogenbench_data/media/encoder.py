@@ -237,9 +237,7 @@ class PictureCodec:
 
     def description(self) -> dict[str, Any]:
         """Return what ``training.json`` says of it."""
-        described = asdict(self)
-        del described["bits_a_pixel"]
-        return described
+        return {name: value for name, value in asdict(self).items() if name != "bits_a_pixel"}
 
 
 def _h264(rate_factor: int, *, key_frame_distance: int, bits_a_pixel: float) -> PictureCodec:
