@@ -81,7 +81,7 @@ class MatchedPoses:
 
 
 def settled_poses(
-    text: bytes, rig: Rig, *, where: str, named: PosesAt | None = None
+    text: bytes, rig: Rig, *, where: str, named: PosesAt | None = None, frames: int = 0
 ) -> MatchedPoses:
     """Return the poses of a ``trajectory.json`` that fit a rig, and where they stand in which form.
 
@@ -90,6 +90,8 @@ def settled_poses(
         rig: The rig of the scene.
         where: The file's path, for messages.
         named: How conventions read them; what it leaves open is settled.
+        frames: How many frames the videos have. Of several lists of poses, such as key frames
+            beside all frames, those of so many count.
 
     Raises:
         SchemaError: If no reading of its numbers passes, or several pass and disagree about where
@@ -106,6 +108,8 @@ def settled_poses(
         else:
             recorded = recorded_in(document, where=where)
             odd = recorded.odd
+            of_all = tuple(each for each in recorded.blocks if len(each.values) == frames)
+            recorded = replace(recorded, blocks=of_all or recorded.blocks)
             found = readings(recorded) if named is None else _readings_as(recorded, named)
         settled = _fitting(found, rig, where=where)
     except SchemaError as error:
@@ -160,6 +164,9 @@ def every_fitting(text: bytes, rig: Rig, *, where: str) -> list[tuple[PosesAt, s
     """
     document = parse_trajectory(text, where=where)
     recorded = recorded_in(document, where=where)
+    most = max(len(each.values) for each in recorded.blocks)
+    blocks = tuple(each for each in recorded.blocks if len(each.values) == most)
+    recorded = replace(recorded, blocks=blocks)
     try:
         if len(_fitting(readings(recorded), rig, where=where).names) == 1:
             return None
@@ -256,7 +263,7 @@ def poses_of(scene: Scene, text: bytes, *, where: str, form: str | None = None) 
     elif name:
         poses = poses_named(parse_trajectory(text, where=where), name, where=where)
     else:
-        return settled_poses(text, scene.rig, where=where).poses
+        return settled_poses(text, scene.rig, where=where, frames=scene.frames).poses
     return replace(poses, unit_m=float(unit_m)) if unit_m else poses
 
 
@@ -346,7 +353,9 @@ def _same(
 ) -> bool:
     """Return whether two readings look alike in the first, a middle and the last frame."""
     frames = (0, first.frame_count // 2, first.frame_count - 1)
-    return all(np.allclose(seen(first, each), seen(other, each), atol=_SAME) for each in frames)
+    return first.frame_count == other.frame_count and all(
+        np.allclose(seen(first, each), seen(other, each), atol=_SAME) for each in frames
+    )
 
 
 def _rig_at(poses: CameraPoses, frame: int) -> np.ndarray:

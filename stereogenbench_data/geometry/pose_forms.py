@@ -200,6 +200,8 @@ def _read(
     """Return the poses of a form, None where the numbers are not such rotations."""
     values = turn.values
     places = values[..., 3] if place is None else place.values
+    if len(places) != len(values):  # poses of other frames
+        return None
     if kind[0] == "matrix":
         values, places = _parted(values, kind, places)
     turns = _rotations(values, kind, turn.components)

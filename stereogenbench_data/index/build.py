@@ -192,7 +192,8 @@ class Tree:
         with suppress(StereoGenBenchError):
             rig, _, _ = parse_rig(folder.read(BASELINE_JSON), where=key, declared=declared)
             text = folder.read(TRAJECTORY_JSON)
-            found = settled_poses(text, rig, where=key, named=declared.poses)
+            frames = scene.found.frames if isinstance(scene.found, Scene) else 0
+            found = settled_poses(text, rig, where=key, named=declared.poses, frames=frames)
             return replace(self, settled=found)
         return self
 

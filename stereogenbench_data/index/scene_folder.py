@@ -389,7 +389,7 @@ class Description:
             SchemaError: If conventions state how poses are read, and they do not fit the rig.
         """
         where = self.where(TRAJECTORY_JSON)
-        found, reason = self.understand(rig, where)
+        found, reason = self.understand(rig, where, frames)
         count = frames if found is None else found.poses.frame_count
         told = f"{where}: has poses of {count} frames, and the videos have {frames}"
         # Without the last frame poses are those of the others; without the first they are not.
@@ -418,7 +418,7 @@ class Description:
             )
         return found
 
-    def understand(self, rig: Rig, where: str) -> tuple[MatchedPoses | None, str]:
+    def understand(self, rig: Rig, where: str, frames: int) -> tuple[MatchedPoses | None, str]:
         """Return poses that fit the rig, or why there are none."""
         named = None if self.shape is None else self.shape.poses
         if named is not None and named.form == UNKNOWN:
@@ -432,7 +432,7 @@ class Description:
             text = self.folder.read(TRAJECTORY_JSON)
             if self.settled is not None:
                 return declared_poses(text, rig, where=where, settled=self.settled), ""
-            return settled_poses(text, rig, where=where, named=named), ""
+            return settled_poses(text, rig, where=where, named=named, frames=frames), ""
         except SidesError as error:
             family, scale = parse_scene_key(self.key).family, error.scale
             # Poses in a unit by which the rig would be of no scene of the family are wrong.

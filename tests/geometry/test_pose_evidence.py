@@ -226,6 +226,19 @@ def test_poses_are_read_again_by_the_name_that_an_index_has(form):
     np.testing.assert_allclose(motions(poses), truth(*TURNED), atol=1e-9)
 
 
+def test_of_several_lists_of_poses_that_of_as_many_frames_as_the_videos_counts():
+    document = json.loads(written("rotator", *TURNED))
+    frames = document.pop("frames")
+    document |= {"keyframes": frames[::2], "preroll": frames[:1], "frames": frames}
+    text = json.dumps(document).encode()
+
+    found = settled_poses(text, RIG, where="trajectory.json", frames=len(frames))
+
+    np.testing.assert_allclose(motions(found.poses), truth(*TURNED), atol=1e-9)
+    with pytest.raises(SchemaError, match="several readings of its poses fit the rig"):
+        understood(text)
+
+
 def test_frames_that_count_by_twos_are_frames_in_order():
     document = json.loads(written("rotator", *TURNED))
     for frame in document["frames"]:

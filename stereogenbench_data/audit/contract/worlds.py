@@ -86,7 +86,7 @@ def rival_readings(scene: Scene, text: bytes) -> tuple[str, ...]:
     names = scene.pose_form.split("|") if scene.pose_form else []
     if names and is_stated(scene):
         with suppress(SchemaError):  # what conventions state is all that fits
-            names += settled_poses(text, scene.rig, where=where).names
+            names += settled_poses(text, scene.rig, where=where, frames=scene.frames).names
     found: dict[str, CameraPoses] = {}
     for name in names:
         poses = poses_of(scene, text, where=where, form=name)
