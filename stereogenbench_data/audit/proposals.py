@@ -214,9 +214,8 @@ def _pairs(
                 if np.ptp(ratio) <= _ALIKE * ratio.min():
                     off, why = 0.0, "they are the distances of the poses"
                     stated_m = float(np.median(each * unit_m / lengths)) * UNITS_M[pairs.unit] * 100
-                    units = (
-                        u for u in ("cm", "m", "mm") if abs(stated_m / UNITS_M[u] - 1) < _ALIKE
-                    )
+                    units = (u for u in ("cm", "m", "mm", "inch", "ft")
+                             if abs(stated_m / UNITS_M[u] - 1) < _ALIKE)  # fmt: skip
                     pairs = replace(pairs, unit=next(units, pairs.unit))
             near = difflib.SequenceMatcher(None, "pairwise_pairs", name).ratio()
             values = {key: getattr(pairs, key) for key in ("rows", "a", "b", "length", "unit")}

@@ -99,7 +99,7 @@ class Survey:
         is_odd = any(problem.about == "depth" for problem in self.problems)
         has_unit = not any("unreadable" in scene.depth_unit_source for scene in known)
         return {
-            BASELINE_JSON: is_read,
+            BASELINE_JSON: is_read and not any(s.remark("principal point") for s in known),
             "poses": is_read and not any(s.remark("poses", "world", "left") for s in known),
             "depth": is_read and not is_odd and bool(has_unit or stated),
         }
@@ -219,6 +219,9 @@ def _learning(
     learned = learn(root, found)
     surveyed = Survey(str(root), tuple(found), learned, problems=learned.problems)
     surveyed.notes.update(tables_of_notes(learned))
+    scenes = (each.scene for each in found if each.scene is not None)
+    points = (scene.remark("principal point") for scene in scenes)
+    surveyed.problems.extend(Problem(told, BASELINE_JSON) for told in points if told)
     shapes = []
     for number, (shape, group) in enumerate(
         zip(learned.conventions.shapes, learned.taught_by, strict=True)

@@ -214,11 +214,12 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> MatchedPoses:
         raise told
     if first is None or not passed:
         tried = "; ".join(f"{reason} ({name})" for reason, name in list(failures.items())[:_SHOWN])
-        raise SchemaError(
-            f"{where}: no reading of its poses fits the rig of baseline.json: "
-            f"{tried or 'it has no location with a rotation'}. It may be "
-            f"another scene's, or in another unit."
+        why = (
+            f"{tried}. It may be another scene's, or in another unit"
+            if tried
+            else ("it has no location with a rotation")
         )
+        raise SchemaError(f"{where}: no reading of its poses fits the rig of baseline.json: {why}.")
     taken = passed[0]
     others = [each for each in passed[1:] if not _same(each.poses, taken.poses, _rig_at)]
     if others:

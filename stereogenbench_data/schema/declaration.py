@@ -178,9 +178,10 @@ _MATRICES: Final = tuple(f"$.{above}{name}" for above in ("camera_intrinsics.", 
 def _in_pixels(names: Sequence[str], of_point: Sequence[str], row: int, column: int) -> NumberAt:
     """Return where a number in pixels may stand: by itself, in a point, or in a camera matrix."""
     places = [f"$.{above}{name}" for above in ("camera_intrinsics.", "") for name in names]
-    places += [f"{_CAMERA}principal_point{end}{part}" for end in ("", "_px") for part in of_point]
-    places += [f"{matrix}{at}" for matrix in _MATRICES
-               for at in (f"[{row}][{column}]", f"[{3 * row + column}]")]  # fmt: skip
+    points = [f"{_CAMERA}principal_point{end}" for end in ("", "_px", "_override")]
+    places += [f"{point}{part}" for point in points for part in of_point]
+    elements = f"[{row}][{column}]", f"[{3 * row + column}]", f".{names[0]}"
+    places += [f"{matrix}{element}" for matrix in _MATRICES for element in elements]
     return NumberAt(places=tuple(places), unit="px")
 
 
@@ -192,8 +193,8 @@ _NUMBERS: Final[Mapping[str, NumberAt]] = {
     "image_height": NumberAt(places=("$.image_height",), unit="px"),
     "focal_length_px": _in_pixels(("fx", "fx_px", "focal_length_px"), (), 0, 0),
     "focal_length_y_px": _in_pixels(("fy", "fy_px"), (), 1, 1),
-    "principal_x": _in_pixels(("cx", "cx_px"), ("[0]", ".x"), 0, 2),
-    "principal_y": _in_pixels(("cy", "cy_px"), ("[1]", ".y"), 1, 2),
+    "principal_x": _in_pixels(("cx", "cx_px", "principal_point_x"), ("[0]", ".x", ".cx"), 0, 2),
+    "principal_y": _in_pixels(("cy", "cy_px", "principal_point_y"), ("[1]", ".y", ".cy"), 1, 2),
 }
 _PAIRS: Final = PairsAt(
     rows="$.pairwise_pairs[]", a="camera_index_a", b="camera_index_b", length="baseline_cm"

@@ -37,18 +37,22 @@ _MOST_NODES: Final = 20_000
 _SCALES: Final = frozenset(
     {"scale", "scales", "zscale", "scaling", "factor", "unit", "units", "quantum", "lsb",
      "conversion", "gain", "coefficient", "multiplier", "divisor", "precision", "step",
-     "quantization", "quantisation"}
+     "quantization", "quantisation", "formula", "equation"}
 )  # fmt: skip
 """Words of keys under which a unit of depth stands."""
 _RANGES: Final = frozenset(
     {"near", "far", "znear", "zfar", "min", "max", "minimum", "maximum", "zmin", "zmax", "range",
-     "limits", "bounds", "offset", "bias"}
+     "limits", "bounds"}
 )  # fmt: skip
-"""Words of keys of the ends of a range, or of the depth of the stored number 0."""
+"""Words of keys of the ends of a range."""
+_OFFSETS: Final = frozenset({"offset", "bias", "shift"})
+"""Words of keys of the depth of the stored number 0."""
 _OTHER_MEANING: Final = re.compile(
     r"(?<![a-z])(?:inv(?:erse[d]?)?|disparit\w+|log(?:arithm\w*)?|non_?linear|gamma|sqrt|radial|"
     r"euclid\w*|reversed?|device|perspective|rays?(?!_trac|_cast|_march)|spherical|"
-    r"normali[sz]\w*|distance_to_cam\w*|range_image)(?![a-z])"
+    r"(?<![0-9_])1_(?:z|depth)|reciprocal|hyperbol\w*|exponential|ndc|colou?r_?map|turbo|float_?16|"
+    r"normali[sz]\w*|distance_to_cam\w*|range_image|slant_range|(?:kind|type|encoding) "
+    r"(?:range|distance))(?![a-z])"
 )
 """Words of a depth that is no length along the optical axis, or not the stored number times one."""
 _DEPTHS: Final = frozenset({"depth", "depthmap", "zbuffer", "zdepth"})
@@ -116,10 +120,7 @@ def stated_in_tags(tags: Mapping[str, str], *, name: str) -> list[Statement]:
         if not _TECHNICAL.isdisjoint(parts):
             continue
         if not _RANGES.isdisjoint(parts) and re.search(r"\d", text):
-            is_offset = not {"offset", "bias"}.isdisjoint(parts)
-            if not is_offset or re.search(r"[1-9]", text):
-                refused = _refused(place, text, "tag", MAY_BE_RANGE)
-                (found if is_offset else ranges).append(refused)
+            ranges.append(_refused(place, text, "tag", MAY_BE_RANGE))
             continue
         statement = _stated("_".join(parts), text, place, "tag")
         found += [] if statement is None else [statement]
@@ -199,10 +200,13 @@ def _refused(place: str, text: str, origin: Origin, why: str) -> Statement:
 def _stated(key: str, text: str, place: str, origin: Origin) -> Statement | None:
     """Return what stands under a key, in snake_case; None where it says nothing of the unit."""
     parts, low = key.split("_"), text.lower()
+    if not _OFFSETS.isdisjoint(parts) and re.search(r"\d", text):
+        is_zero = re.search(r"[1-9]", text) is None
+        return None if is_zero else _refused(place, text, origin, MAY_BE_RANGE)
     is_scale = not _SCALES.isdisjoint(parts) or _ratio(key) is not None
     if low in ("false", "no", "none", "null", "") and not (low == "" and is_scale):
-        is_planar = low == "false" and "planar" in parts
-        return _refused(place, text, origin, NO_LENGTH) if is_planar else None
+        is_denied = low in ("false", "no") and not {"planar", "linear"}.isdisjoint(parts)
+        return _refused(place, text, origin, NO_LENGTH) if is_denied else None
     has_other = _OTHER_MEANING.search(f"{key} {words(text)}" if len(text) < _LONGEST else key)
     if has_other:
         return _refused(place, text, origin, NO_LENGTH)

@@ -157,7 +157,9 @@ def _numbers(
     """Return the numbers at a place, by its axes, and then by the lists that stand there."""
     leaves, lengths = leaves_at(document, place, where=where, way=way)
     if place.tail in ("slice", "text"):
-        leaves = [at_end(leaf, place) for leaf in leaves]
+        taken = (at_end(leaf, place) for leaf in leaves)  # a list, or nothing
+        leaves = [each if type(each) is list else leaf
+                  for leaf, each in zip(leaves, taken, strict=True)]  # fmt: skip
     shape = list(lengths)
     while leaves and type(leaves[0]) is list and len(leaves) < _MOST_VALUES:
         count = len(leaves[0])
@@ -248,8 +250,8 @@ def _ordered(
 
 
 _COUNTS: Final = re.compile(
-    r"time|stamp|tick|(?:^|_)(?:frame|image|img|file|path|name|shot|index|idx|number|sequence|n|id|no|"
-    r"t|ms|sec|seconds)(?:_|$)"
+    r"time|stamp|tick|(?:^|_)(?:frame|image|img|picture|exr|file|path|name|shot|sample|step|order|index|"
+    r"idx|number|num|sequence|n|id|no|t|ms|sec|seconds|pts|dts|elapsed|clock|when)(?:_|$)"
 )
 """Words of keys of what counts frames, and of their times."""
 _ROUNDED: Final = 0.1

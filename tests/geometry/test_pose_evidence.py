@@ -254,7 +254,7 @@ def test_frames_that_count_by_twos_are_frames_in_order():
     [
         lambda n: {"image": f"frame_{n:04d}.png"},
         lambda n: {"meta": {"sequence_frame": 100 + n}},
-        lambda n: {"time": n / 15},
+        lambda n: {"elapsed": n / 15},
         lambda n: {"timecode": f"00:00:05:{n:02d}"},
         lambda n: {"cameras": [{"file": f"cam_{camera:02d}/{n}.png"} for camera in range(6)]},
     ],

@@ -124,6 +124,8 @@ DEPTH_FOO=0.001 | DEPTH_UNIT=m | scale=1/1000 | scale=0,001
 unit=furlong | scale=0.03937 in | scale=0.1; DEPTH_UNIT=mm | scale=0.1; unit=cm
 DEPTH_SCALE=65.535 | DEPTH_SCALE=1 | scale=1.0 | depth_encoding=inverse; scale=655
 encoding=log; scale=0.001 | depth_type=euclidean; scale=0.001 | disparity_scale=16
+scale=0.001; depth_encoding=1/z | scale=0.001; depth_shift=3 | scale=0.001; depth_linear=false
+scale=0.001; depth_kind=range | scale=0.001; depth_is=reciprocal
 scale=0.001; offset=0.5 | max_depth=100 | normalized=1 | near=10; far=10000
 depth_near=0.5 m; depth_far=80.5 m | depth_range=0.5-80.5 m
 projection=distance_to_camera; scale=0.001 | depth_format=uint16_mm | title=cam_00_depth_mm
@@ -156,6 +158,9 @@ def test_tags_that_do_not_tell_the_unit_are_refused_by_name(text):
         {"depth": {"type": "ray_distance", "scale": 0.001}},
         {"depth": {"annotator": "distance_to_camera", "unit": "mm"}},
         {"depth_kind": "spherical", "depth_scale": 0.001},
+        {"depth": {"offset": 0.5, "scale": 0.001}},
+        {"depth": {"linear": False, "scale": 0.001}},
+        {"depth_formula": "z = 65.535 / v"},
         {"depth_is_planar": False, "depth_scale": 0.001},
         {"depth_scale": {"value": "many"}},
     ],
