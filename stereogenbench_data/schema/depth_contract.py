@@ -204,9 +204,10 @@ def _stated(key: str, text: str, place: str, origin: Origin) -> Statement | None
         is_zero = re.search(r"[1-9]", text) is None
         return None if is_zero else _refused(place, text, origin, MAY_BE_RANGE)
     is_scale = not _SCALES.isdisjoint(parts) or _ratio(key) is not None
+    if low in ("false", "no", "0") and not {"planar", "linear"}.isdisjoint(parts):
+        return _refused(place, text, origin, NO_LENGTH)
     if low in ("false", "no", "none", "null", "") and not (low == "" and is_scale):
-        is_denied = low in ("false", "no") and not {"planar", "linear"}.isdisjoint(parts)
-        return _refused(place, text, origin, NO_LENGTH) if is_denied else None
+        return None
     has_other = _OTHER_MEANING.search(f"{key} {words(text)}" if len(text) < _LONGEST else key)
     if has_other:
         return _refused(place, text, origin, NO_LENGTH)

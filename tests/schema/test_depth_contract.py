@@ -125,7 +125,7 @@ unit=furlong | scale=0.03937 in | scale=0.1; DEPTH_UNIT=mm | scale=0.1; unit=cm
 DEPTH_SCALE=65.535 | DEPTH_SCALE=1 | scale=1.0 | depth_encoding=inverse; scale=655
 encoding=log; scale=0.001 | depth_type=euclidean; scale=0.001 | disparity_scale=16
 scale=0.001; depth_encoding=1/z | scale=0.001; depth_shift=3 | scale=0.001; depth_linear=false
-scale=0.001; depth_kind=range | scale=0.001; depth_is=reciprocal
+scale=0.001; depth_is_planar=0 | scale=0.001; depth_kind=range | scale=0.001; depth_is=reciprocal
 scale=0.001; offset=0.5 | max_depth=100 | normalized=1 | near=10; far=10000
 depth_near=0.5 m; depth_far=80.5 m | depth_range=0.5-80.5 m
 projection=distance_to_camera; scale=0.001 | depth_format=uint16_mm | title=cam_00_depth_mm
