@@ -9,7 +9,7 @@ from stereogenbench_data.schema.conventions import Conventions
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 from tests.audit.corruption import as_range, rewrite_depth
-from tests.cli.command import invoke
+from tests.cli.command import invoke, succeed
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +30,8 @@ def untagged(tmp_path_factory):
 def test_a_unit_that_nothing_states_is_measured_and_written(untagged, tmp_path):
     out = tmp_path / "conventions.toml"
 
-    result = invoke("conventions", untagged, "-o", out, "--pictures", 1, "--workers", 1)
+    result = succeed("conventions", untagged, "-o", out, "--pictures", 1, "--workers", 1)
 
-    assert result.exit_code == 0, result.output
     (shape,) = Conventions.read(out).shapes
     assert shape.depth.encoding.unit_m == pytest.approx(0.001, rel=0.005)
     assert "the release's default" in out.read_text()
@@ -93,8 +92,7 @@ def test_the_unit_of_a_range_is_not_measured_but_stated(detailed_release, tmp_pa
     assert "may be the range that stored numbers fill" in out.read_text()
     assert Conventions.read(out).shapes[0].depth is None
     out.write_text(f"[depth]\nunit_m = {69.5 / 65535}\noffset_m = 0.5\n")
-    stated = invoke("conventions", root, "--check", out, "--workers", 1)
-    assert stated.exit_code == 0, stated.stderr
+    succeed("conventions", root, "--check", out, "--workers", 1)
 
 
 def test_every_command_refuses_conventions_that_files_contradict(small_release, tmp_path):

@@ -11,7 +11,7 @@ from stereogenbench_data.audit.statistics import compared, statistics, statistic
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from tests.audit.release_counts import paper_scenes
-from tests.cli.command import invoke
+from tests.cli.command import succeed
 
 PLACES_CM = (0.0, 10.0, 25.0, 31.0, 61.0, 211.0)
 
@@ -123,11 +123,10 @@ def test_one_scene_less_is_seen_in_every_figure_that_it_moves(release):
 
 
 def test_the_command_compares_a_release_by_itself(written_release):
-    result = invoke("stats", written_release)
-    evaluated = invoke("stats", written_release, "--split", "eval", "--json")
+    result = succeed("stats", written_release)
+    evaluated = succeed("stats", written_release, "--split", "eval", "--json")
 
     row = "| train | Uniform | 3,870 | 1.0113 | 149.8906 | 52.7908 | 38.9500 | 43.2916 |"
-    assert result.exit_code == 0
     assert row in result.stdout
     assert "## Against the paper: 130 of 130 figures agree" in result.stdout
     assert "| same | scenes, train Uniform | 774 | 774 |" in result.stdout
@@ -137,12 +136,11 @@ def test_the_command_compares_a_release_by_itself(written_release):
 
 
 def test_the_command_writes_other_data_without_the_papers_figures(small_shards, tmp_path):
-    told = invoke(
+    told = succeed(
         "stats", small_shards, "--split", "train", "--json", "-o", tmp_path / "out" / "stats.json"
     )
-    shown = invoke("stats", small_shards, "-o", tmp_path / "out" / "stats.md")
+    shown = succeed("stats", small_shards, "-o", tmp_path / "out" / "stats.md")
 
-    assert shown.exit_code == 0
     assert "| train | - | Uniform | 2 |" in shown.stdout
     assert "Against the paper" not in shown.stdout
     document = json.loads(told.stdout)

@@ -23,6 +23,20 @@ def invoke(*words, **options):
     return CliRunner().invoke(app, [str(word) for word in words], **options)
 
 
+def succeed(*words):
+    """Return the result of the command, which must end with exit status 0."""
+    result = invoke(*words)
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def refused(*words):
+    """Return what the command says, as one line, that must end with exit status 2."""
+    result = invoke(*words, env={"COLUMNS": "300"})
+    assert result.exit_code == 2, result.output
+    return one_line(result.stderr)
+
+
 def run(*words, **options):
     """Return the ended process of the command, as a user runs it."""
     given = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options

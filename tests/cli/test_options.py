@@ -8,14 +8,7 @@ import pytest
 
 from stereogenbench_data.cli.options import DataOptions, SceneOptions, filter_of
 from stereogenbench_data.samples.fields import SwappedSizeWarning
-from tests.cli.command import CALLS, invoke, one_line
-
-
-def refused(*words):
-    """Return the message of a call that ends with exit status 2, as one line."""
-    shown = invoke(*words, env={"COLUMNS": "300"})
-    assert shown.exit_code == 2, shown.output
-    return one_line(shown.stderr)
+from tests.cli.command import CALLS, refused, succeed
 
 
 @pytest.mark.parametrize(
@@ -82,7 +75,7 @@ def test_every_command_takes_one_number_for_width_and_height(tmp_path):
         if "--size" in option.opts
     }
 
-    assert invoke(*words, "64").exit_code == 0
+    succeed(*words, "64")
     assert "WIDTHxHEIGHT" in refused(*words, "64x")
     assert ("pack",) in sizes
     for path, size in sizes.items():
@@ -94,9 +87,7 @@ def test_every_command_takes_one_number_for_width_and_height(tmp_path):
 def test_a_size_that_looks_swapped_gives_a_warning_that_names_the_option(small_shards, tmp_path):
     words = ["eval", "inputs", small_shards, tmp_path / "in", "--tier", "G2", "--frames", "first"]
     with pytest.warns(SwappedSizeWarning, match="--size 52x30"):
-        shown = invoke(*words, "--size", "30x52", "--workers", "1")
-
-    assert shown.exit_code == 0, shown.output
+        succeed(*words, "--size", "30x52", "--workers", "1")
 
 
 def test_losses_of_depth_are_accepted_beside_what_conventions_state(tmp_path):
@@ -120,8 +111,7 @@ def test_commands_read_depth_of_few_bits_where_the_loss_is_accepted(small_releas
         subprocess.run([*encode, "-vf", "format=gray10le", "-c:v", "ffv1", narrow], check=True)
         narrow.replace(path)
 
-    refused = invoke("show", root, "-o", out)
-    shown = invoke("show", root, "-o", out, "--accept", "10-bit")
+    assert "--accept" in refused("show", root, "-o", out)
+    succeed("show", root, "-o", out, "--accept", "10-bit")
 
-    assert "--accept" in one_line(refused.stderr)
-    assert (refused.exit_code, shown.exit_code, out.exists()) == (2, 0, True)
+    assert out.exists()
