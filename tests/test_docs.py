@@ -9,11 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
-import typer
 
 import stereogenbench_data
-from stereogenbench_data.cli.commands import app
-from tests.servers.tools import made_once, require_module, require_tool
+from tests.cli.command import CALLS
+from tests.servers.tools import chromium, made_once, require_module
 
 HOME = Path(__file__).resolve().parents[1]
 
@@ -48,21 +47,6 @@ def built(tmp_path_factory):
     return made_once(tmp_path_factory, "documentation", make) / "site"
 
 
-@pytest.fixture(scope="module")
-def browser():
-    """A browser without a window."""
-    webdriver = require_module("selenium.webdriver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = require_tool("chromium")
-    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage"):
-        options.add_argument(argument)
-    service = require_module("selenium.webdriver.chrome.service").Service(
-        executable_path=require_tool("chromedriver")
-    )
-    with webdriver.Chrome(options=options, service=service) as driver:
-        yield driver
-
-
 def text_of(site, page):
     return re.sub(r"<[^>]+>", "", (site / page / "index.html").read_text())
 
@@ -77,15 +61,11 @@ def test_the_strict_build_has_no_warning(built):
 def test_the_page_of_commands_names_every_command_and_option(built):
     page = text_of(built, "commands")
 
-    commands = dict(typer.main.get_command(app).commands)
-    for name, group in [*commands.items()]:
-        inner = getattr(group, "commands", {})
-        commands |= {f"{name} {each}": command for each, command in inner.items()}
-    assert {"export clips", "export colmap"} <= commands.keys()
-    for name, command in commands.items():
-        assert f"stereogenbench {name}" in page
-        for option in (option for parameter in command.params for option in parameter.opts):
-            assert option in page or not option.startswith("--"), f"{name} {option}"
+    assert {("export", "clips"), ("export", "colmap")} <= CALLS.keys()
+    for words, call in CALLS.items():
+        assert f"stereogenbench {' '.join(words)}" in page
+        for option in (option for parameter in call.params for option in parameter.opts):
+            assert option in page or not option.startswith("--"), f"{words} {option}"
 
 
 def test_the_tables_of_fields_in_the_file_are_those_of_the_code(pages):
@@ -180,16 +160,17 @@ return code.filter(each => each.scrollWidth > each.clientWidth).map(each => each
         pytest.param(390, ".highlight:not(.drawing)", id="phone"),
     ],
 )
-def test_no_line_of_code_is_cut_at_the_right_edge(built, browser, width_px, blocks):
+def test_no_line_of_code_is_cut_at_the_right_edge(built, width_px, blocks):
     screen = {"width": width_px, "height": 900, "deviceScaleFactor": 1, "mobile": width_px < 500}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
     pages = sorted(built.rglob("index.html"))
     cut = {}
-    for page in pages:
-        browser.get(page.as_uri())
-        cut[page.parent.name] = browser.execute_script(CUT_CODE, blocks)
-        width = browser.execute_script("return document.documentElement.scrollWidth")
-        assert width <= width_px, page
+    with chromium() as browser:
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+        for page in pages:
+            browser.get(page.as_uri())
+            cut[page.parent.name] = browser.execute_script(CUT_CODE, blocks)
+            width = browser.execute_script("return document.documentElement.scrollWidth")
+            assert width <= width_px, page
 
     assert {name: found for name, found in cut.items() if found} == {}
     assert len(pages) >= 12

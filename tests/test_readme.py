@@ -7,12 +7,10 @@ import warnings
 from pathlib import Path
 
 import pytest
-import typer
-from typer.testing import CliRunner
 
-from stereogenbench_data.cli.commands import app
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
+from tests.cli.command import CALLS, succeed
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 PAGES = sorted((README.parent / "docs").glob("*.md"))
@@ -57,8 +55,7 @@ def test_the_readme_runs_in_its_own_order_in_one_folder(tmp_path, monkeypatch):
             words = shlex.split(line, comments=True)
             if words[:1] == ["stereogenbench"] and words[1] != "browse":  # that serves until Ctrl-C
                 quick = ["--workers", "1"] if words[1] in ("synth", "pack") else []
-                ended = CliRunner().invoke(app, [*words[1:], *quick])
-                assert ended.exit_code == 0, f"{line}: {ended.output}"
+                succeed(*words[1:], *quick)
                 ran += 1
 
     assert ran == 7
@@ -96,12 +93,9 @@ def commands_of(path):
 @pytest.mark.parametrize("path", WITH_COMMANDS, ids=[path.stem for path in WITH_COMMANDS])
 def test_every_command_of_a_page_has_arguments_and_options_that_exist(path):
     for words in commands_of(path):
-        command = typer.main.get_command(app)
-        while hasattr(command, "commands"):
-            command, words = command.commands[words[0]], words[1:]
-
-        if words:
-            command.make_context(command.name, list(words))
+        (path,) = (each for each in CALLS if each == tuple(words[: len(each)]))
+        if given := words[len(path) :]:
+            CALLS[path].make_context(path[-1], given)
 
 
 def test_there_are_blocks_to_run():

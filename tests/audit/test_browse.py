@@ -10,7 +10,7 @@ import pytest
 from stereogenbench_data import SceneIndex, StereoPairs
 from tests.audit.browsing import run, serving
 from tests.audit.corruption import rewrite_depth
-from tests.servers.tools import require_module, require_tool
+from tests.servers.tools import chromium, require_module
 
 # The index names a scene that was left out, each time that it is opened.
 pytestmark = pytest.mark.filterwarnings(
@@ -18,9 +18,8 @@ pytestmark = pytest.mark.filterwarnings(
 )
 
 FLAGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-    "--disable-dev-shm-usage", "--window-size=1400,900",
+    "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--window-size=1400,900",
 )  # fmt: skip
 COPIES = 40
 """Each of the four scenes is listed so often, so that the list has to be scrolled."""
@@ -65,18 +64,9 @@ def address(data):
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
-    webdriver = require_module("selenium.webdriver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = require_tool("chromium")
-    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
-        options.add_argument(flag)
-    service = require_module("selenium.webdriver.chrome.service").Service(
-        executable_path=require_tool("chromedriver")
-    )
-    driver = webdriver.Chrome(options=options, service=service)
-    yield driver
-    driver.quit()
-    service.stop()
+    profile = f"--user-data-dir={tmp_path_factory.mktemp('profile')}"
+    with chromium(*FLAGS, profile) as driver:
+        yield driver
 
 
 class Page:

@@ -51,17 +51,6 @@ def test_a_wrong_quotient_ends_with_1_and_no_unit_to_paste(detailed_release, tmp
     assert verdict["choices"][2].endswith(" x what is recorded")
 
 
-def test_a_report_that_cannot_be_written_is_printed(detailed_release, tmp_path):
-    (tmp_path / "file").touch()
-    place = tmp_path / "file" / "doctor.json"
-
-    result = run(detailed_release, "--json", "-o", place)
-
-    assert result.exit_code == 2
-    assert str(tmp_path / "file") in result.stderr
-    assert json.loads(result.stdout)["verdicts"]
-
-
 def test_a_camera_that_does_not_fit_ends_with_1(detailed_release, tmp_path):
     (scene,) = detailed_release.glob("*/*/*/scene_*")
     rewrite_depth(copied(scene, tmp_path), scaled(0.5), cameras=[4])

@@ -85,11 +85,15 @@ def test_conventions_that_cannot_be_written_leave_those_that_were_there(small_re
     assert "--out: --check tests a file and writes none: leave it out." in told
 
 
-def test_a_statistic_is_printed_where_its_file_cannot_be_written(small_shards, tmp_path):
-    shown = invoke("stats", small_shards, "-o", tmp_path)
+@pytest.mark.parametrize(("form", "printed"), [((), "# Statistics of"), (("--json",), '{"root":')])
+def test_a_report_is_printed_where_its_file_cannot_be_written(
+    small_shards, tmp_path, form, printed
+):
+    shown = invoke("stats", small_shards, *form, "-o", tmp_path)
 
     assert shown.exit_code == 2
-    assert "# Statistics of" in shown.stdout
+    assert str(tmp_path) in shown.stderr
+    assert printed in shown.stdout
 
 
 def test_a_report_may_go_through_a_link_or_a_pipe(tmp_path):

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 from filelock import FileLock
@@ -51,6 +52,20 @@ def require_module(name: str) -> ModuleType:
     except ImportError:
         _missing(f"needs the Python module {name}")
         raise
+
+
+@contextmanager
+def chromium(*flags: str) -> Iterator[Any]:
+    """Open a Chromium without a window; where it is missing skip, or fail where CI is set."""
+    webdriver = require_module("selenium.webdriver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = require_tool("chromium")
+    for flag in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", *flags):
+        options.add_argument(flag)
+    services = require_module("selenium.webdriver.chrome.service")
+    service = services.Service(executable_path=require_tool("chromedriver"))
+    with webdriver.Chrome(options=options, service=service) as driver:
+        yield driver
 
 
 def killed_fork(act: Callable[[], object]) -> bool:

@@ -157,6 +157,7 @@ def test_every_error_is_made_of_one_text_that_shows_no_login():
         error = pickle.loads(pickle.dumps(kind("s3://K:PW@b/x: is gone.")))
         assert type(error) is kind
         assert error.args == ("s3://b/x : is gone.",)
+        assert len(kind.__mro__) > 3, f"{kind} has no second base"
     assert len(kinds) > 10
 
 
